@@ -1,0 +1,1 @@
+"""The black box: sources in, journals and columns out."""

@@ -1,0 +1,107 @@
+"""The contract of a source: what a plugin in ``blackbox/sources`` offers and may use.
+
+A source is a module whose file name is its name in ``black_box.yaml``. It defines
+
+- ``Config``: a frozen dataclass, built from the YAML block (see ``core.config``);
+- ``Source``: a class that takes ``(config, name)`` and offers ``topics`` and ``run``;
+- ``SAMPLE``: a block of YAML as one would write it, shown by ``amberbox plugins`` and checked.
+
+A source only listens. It always reads, stamps on receipt, and never waits for the disk: when the
+recorder's queue is full the message is dropped there and counted.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal, Protocol
+
+from amberbox.core.options import option
+from amberbox.core.types import Topic
+
+Keep = Literal["all", "ring", "incident", "none"]
+
+
+@dataclass(frozen=True)
+class ChangeOptions:
+    """Keep a message only when something in it has changed enough."""
+
+    absolute: float = option(0.0, "smallest change of a variable that counts")
+    relative: float = option(0.0, "the same as a fraction of the last kept value")
+    variables: Sequence[str] = option((), "variables to look at; all when absent")
+    bands: Mapping[str, float] = option({}, "absolute dead band per variable")
+    heartbeat_s: float = option(5.0, "keep a message at least this often", unit="s")
+
+
+@dataclass(frozen=True)
+class TopicOptions:
+    """What every source offers per topic; sources add their own by subclassing."""
+
+    name: str = option(doc="topic as on the bus")
+    type: str = option("", "message type; only checked where the bus tells it")
+    variable_names: Sequence[str] = option((), "variables to show; all when absent")
+    max_frequency: float | None = option(None, "keep at most this many per second", unit="Hz")
+    change: ChangeOptions | None = option(None, "keep only what changed")
+    keep: Keep = option("all", "keeping class")
+    stamp: str | None = option(None, "path of the own time stamp; '' for none")
+
+
+class Sink(Protocol):
+    """Where a source puts what it hears. All calls may come from any thread."""
+
+    def now_ns(self) -> int:
+        """Time of receipt for a message that arrives now (log time)."""
+
+    def topic(self, topic: Topic) -> int:
+        """Make a topic known and return its stream number; the same topic gives the same one."""
+
+    def message(self, stream: int, data: bytes, received_ns: int) -> None:
+        """Take one message as it came. Never blocks a live source; a full queue drops it, counted."""
+
+    def link_up(self, topic: str, peer: str, since_ns: int | None = None) -> None:
+        """Say that messages of ``peer`` on ``topic`` arrive from now on.
+
+        Closes the gap that is open for it. For a peer never seen before, ``since_ns`` is the last
+        moment at which it is known not to have published.
+        """
+
+    def link_down(self, topic: str, peer: str, reason: str) -> None:
+        """Say that nothing of ``peer`` on ``topic`` can arrive from now on; opens a gap."""
+
+    def event(self, kind: str, text: str, **details: Any) -> None:
+        """Record an event; ``kind`` is a short identifier, ``text`` one line for a person."""
+
+    def last_latched(self, topic: str) -> bytes | None:
+        """Return the last latched message of a topic in the store, also of an earlier run."""
+
+    def state(self) -> dict[str, Any]:
+        """Return what ``save_state`` was given last, also by an earlier run; empty at first."""
+
+    def save_state(self, state: Mapping[str, Any]) -> None:
+        """Keep a few values (JSON) of this source across restarts of the box."""
+
+
+class Source(Protocol):
+    """One configured block, ready to listen."""
+
+    lossless: bool
+    """True for files: ``message`` then waits for room instead of dropping."""
+
+    def topics(self) -> Sequence[TopicOptions]:
+        """Return the options of the topics configured; empty means every topic, unfiltered."""
+
+    def run(self, sink: Sink, stop: threading.Event) -> None:
+        """Listen until ``stop`` is set, or return when the input has ended.
+
+        A device that is missing is retried in here, with back-off and an event; an exception
+        ends the run and is recorded, then the recorder starts it again with back-off.
+        """
+
+
+@dataclass(frozen=True)
+class SourcePlugin:
+    """A source module as found by file name."""
+
+    name: str
+    module: Any = field(repr=False)

@@ -1,0 +1,214 @@
+"""What flows between the parts: topics and messages in, batches, gaps and watermarks out."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal, NamedTuple, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+IntArray: TypeAlias = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class Schema:
+    """A message definition as the source gave it (the fields of an MCAP schema).
+
+    ``encoding`` is ``ros1msg``, ``ros2msg``, ``ros2idl``, ``jsonschema`` or another MCAP name.
+    """
+
+    name: str
+    encoding: str
+    data: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Topic:
+    """One stream as a source found it on its bus.
+
+    ``message_encoding`` is MCAP's: ``ros1``, ``cdr``, ``json``, ``msgpack``. For ``json`` and
+    ``msgpack`` the schema may be None: the recorder infers it and widens it when it must.
+    """
+
+    name: str
+    message_encoding: str
+    schema: Schema | None = None
+    latched: bool = False
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Ragged:
+    """A list column: row ``i`` is ``values[offsets[i]:offsets[i + 1]]``.
+
+    ``offsets`` has one entry more than there are rows.
+    """
+
+    offsets: IntArray
+    values: NDArray[Any]
+
+    def __len__(self) -> int:
+        return len(self.offsets) - 1
+
+    def __getitem__(self, row: int) -> NDArray[Any]:
+        return self.values[self.offsets[row] : self.offsets[row + 1]]
+
+
+ColumnData: TypeAlias = "NDArray[Any] | Ragged"
+"""Numbers and bools as their own dtype; strings as object arrays of ``str``, binary as object
+arrays of ``bytes``; time and duration as int64 nanoseconds. A column with nulls is a numpy
+masked array (numbers) or holds None (objects). NaN is a value, not a null."""
+
+
+@dataclass(frozen=True, slots=True)
+class Column:
+    """A flat column: its name, where it stands in the message, and what it holds.
+
+    ``type`` is one of bool, int8..int64, uint8..uint64, float32, float64, string, binary, time,
+    duration, or ``list<...>`` of one of these. ``labels`` are the message's constants for it.
+    """
+
+    name: str
+    path: str
+    type: str
+    unit: str = ""
+    labels: Mapping[int, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class ItemSchema:
+    """The columns of a data item, and of its child tables by their path.
+
+    ``stamp`` is the path of the item's own time stamp (``header/stamp``), empty if it has none:
+    then ``timestamp`` is the time of receipt.
+    """
+
+    type: str
+    columns: tuple[Column, ...]
+    children: Mapping[str, ItemSchema] = field(default_factory=dict)
+    stamp: str = ""
+
+
+class Position(NamedTuple):
+    """Where a record stands: ``seq`` counts without holes within a writer's run."""
+
+    store_id: str
+    writer: str
+    run: int
+    seq: int
+
+
+@dataclass(frozen=True, slots=True)
+class WriterCursor:
+    """How far one writer's journal has been read.
+
+    All rows below ``(run, seq)`` are read; of the items in ``ahead`` also those below theirs.
+    """
+
+    run: int = 0
+    seq: int = 0
+    ahead: Mapping[str, int] = field(default_factory=dict)
+
+    def has_read(self, run: int, seq: int, item: str) -> bool:
+        """Tell whether a row lies before this cursor."""
+        return (run, seq) < (self.run, max(self.seq, self.ahead.get(item, 0)))
+
+
+@dataclass(frozen=True, slots=True)
+class Cursor:
+    """Where a follower stands in each writer's journal; text and back without loss."""
+
+    store_id: str = ""
+    writers: Mapping[str, WriterCursor] = field(default_factory=dict)
+
+    def to_json(self) -> str:
+        """Write the cursor as one line of JSON."""
+        writers = {w: [c.run, c.seq, dict(c.ahead)] for w, c in self.writers.items()}
+        return json.dumps({"store_id": self.store_id, "writers": writers})
+
+    @classmethod
+    def from_json(cls, text: str) -> Cursor:
+        """Read what ``to_json`` wrote."""
+        data = json.loads(text)
+        writers = {w: WriterCursor(*c) for w, c in data["writers"].items()}
+        return cls(data["store_id"], writers)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rows:
+    """Columns of equal length, as unrolled from a batch of messages of one schema.
+
+    ``children`` holds one table per sequence of structures. In a child table ``parent_row`` is
+    the row of the table above that each row belongs to, ``index`` its place in the sequence.
+    """
+
+    count: int
+    columns: Mapping[str, ColumnData]
+    children: Mapping[str, Rows] = field(default_factory=dict)
+    stamp_ns: IntArray | None = None
+    parent_row: IntArray | None = None
+    index: IntArray | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Batch:
+    """Rows of one item, one schema, one writer's run, in ``seq`` order.
+
+    ``timestamp_ns`` is the item's own stamp, else ``received_ns`` (the paper's rule);
+    ``received_ns`` is the corrected time of receipt, ``log_time_ns`` as it was written down.
+    """
+
+    item: str
+    schema: ItemSchema
+    writer: str
+    run: int
+    seq: IntArray
+    log_time_ns: IntArray
+    received_ns: IntArray
+    timestamp_ns: IntArray
+    columns: Mapping[str, ColumnData]
+    children: Mapping[str, Batch] = field(default_factory=dict)
+    cursor: Cursor = field(default_factory=Cursor)
+    topic: str = ""
+    source: str = ""
+
+    def __len__(self) -> int:
+        return len(self.seq)
+
+
+@dataclass(frozen=True, slots=True)
+class Gap:
+    """A range of the record that is not there, and why.
+
+    ``item`` is empty when the whole writer is meant; ``count`` is None when nobody can know.
+    """
+
+    writer: str
+    run: int
+    from_ns: int
+    to_ns: int
+    reason: str
+    item: str = ""
+    count: int | None = None
+    from_seq: int | None = None
+    to_seq: int | None = None
+    cursor: Cursor = field(default_factory=Cursor)
+
+
+@dataclass(frozen=True, slots=True)
+class Watermark:
+    """Everything of this writer received before ``received_ns`` has been delivered.
+
+    Rows at or above ``durable_seq`` of ``run`` are provisional: a power cut may take them.
+    """
+
+    writer: str
+    run: int
+    received_ns: int
+    durable_seq: int
+    cursor: Cursor = field(default_factory=Cursor)
+
+
+Level: TypeAlias = Literal["ok", "warn", "error", "stale", "unknown"]
