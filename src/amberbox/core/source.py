@@ -57,7 +57,7 @@ class Sink(Protocol):
         """Make a topic known and return its stream number; the same topic gives the same one."""
 
     def message(self, stream: int, data: bytes, received_ns: int) -> None:
-        """Take one message as it came. Never blocks a live source; a full queue drops it, counted."""
+        """Take one message as it came. Never blocks a live source: a full queue drops, counted."""
 
     def link_up(self, topic: str, peer: str, since_ns: int | None = None) -> None:
         """Say that messages of ``peer`` on ``topic`` arrive from now on.
