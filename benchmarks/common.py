@@ -1,0 +1,63 @@
+"""One measured number as a row, and how CPU time and rates are measured."""
+
+from __future__ import annotations
+
+import gc
+import statistics
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One measured number, beside the same number of a peer where there is one.
+
+    ``ratio`` says how many times better than the peer we are (above 1 is better for us),
+    ``note`` how it was measured or against which target.
+    """
+
+    name: str
+    value: float
+    unit: str
+    peer: str = ""
+    ratio: float | None = None
+    note: str = ""
+
+
+def cpu_s(work: Callable[[], object], repeats: int = 5) -> float:
+    """CPU seconds of this process that ``work`` takes: the median of ``repeats`` runs."""
+    return _median_s(work, repeats, time.process_time)
+
+
+def wall_s(work: Callable[[], object], repeats: int = 5) -> float:
+    """Wall-clock seconds that ``work`` takes: the median of ``repeats`` runs."""
+    return _median_s(work, repeats, time.perf_counter)
+
+
+def rate(count: int, work: Callable[[], object], repeats: int = 5) -> float:
+    """How many of ``count`` pieces ``work`` does per CPU second: the median of ``repeats`` runs."""
+    return count / max(cpu_s(work, repeats), 1e-9)
+
+
+def percentile(values: list[float], percent: float) -> float:
+    """The smallest value that at least ``percent`` of the values do not exceed."""
+    ordered = sorted(values)
+    rank = max(0, -int(-len(ordered) * percent // 100) - 1)
+    return ordered[rank]
+
+
+def _median_s(work: Callable[[], object], repeats: int, clock: Callable[[], float]) -> float:
+    work()  # caches, lazy imports and compiled decoders are not what is measured
+    return statistics.median(_once_s(work, clock) for _ in range(repeats))
+
+
+def _once_s(work: Callable[[], object], clock: Callable[[], float]) -> float:
+    gc.collect()
+    gc.disable()
+    try:
+        start_s = clock()
+        work()
+        return clock() - start_s
+    finally:
+        gc.enable()

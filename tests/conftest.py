@@ -1,0 +1,87 @@
+"""What all tests share: where the recordings are, and that nothing is skipped unseen in CI."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Generator
+from pathlib import Path
+
+import pytest
+
+SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+NO_DATA = "needs_data: the folder ../shared/data beside the repository is absent"
+SKIPPED: pytest.StashKey[list[tuple[str, str]]] = pytest.StashKey()
+
+
+def in_ci() -> bool:
+    """Tell whether a skipped test is to fail the run (``AMBERBOX_CI=1``)."""
+    return os.environ.get("AMBERBOX_CI", "") not in ("", "0")
+
+
+@pytest.fixture(scope="session")
+def shared_data() -> Path:
+    """Folder of the recordings and configurations that are not ours to ship; skips without it."""
+    if not SHARED_DATA.is_dir():
+        pytest.skip(NO_DATA)
+    return SHARED_DATA
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    config.stash[SKIPPED] = []
+    if in_ci() and not config.option.durations:
+        config.option.durations = 10
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    uses_data = "shared_data" in getattr(item, "fixturenames", ())
+    marked = item.get_closest_marker("needs_data") is not None
+    if uses_data and not marked:
+        pytest.fail("uses the fixture shared_data: mark it needs_data", pytrace=False)
+    if marked and not SHARED_DATA.is_dir():
+        pytest.skip(NO_DATA)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(
+    item: pytest.Item, call: pytest.CallInfo[None]
+) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    report = yield
+    if report.skipped and not hasattr(report, "wasxfail"):
+        item.config.stash[SKIPPED].append((report.nodeid, _reason(report.longrepr)))
+    return report
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_make_collect_report(
+    collector: pytest.Collector,
+) -> Generator[None, pytest.CollectReport, pytest.CollectReport]:
+    report = yield
+    if report.skipped:
+        collector.config.stash[SKIPPED].append((report.nodeid, _reason(report.longrepr)))
+    return report
+
+
+def _reason(longrepr: object) -> str:
+    text = longrepr[2] if isinstance(longrepr, tuple) else longrepr
+    return str(text).removeprefix("Skipped: ")
+
+
+def _unexcused(config: pytest.Config) -> list[tuple[str, str]]:
+    return [skip for skip in config.stash[SKIPPED] if skip[1] != NO_DATA]
+
+
+def pytest_sessionfinish(session: pytest.Session, exitstatus: int) -> None:
+    if in_ci() and exitstatus == pytest.ExitCode.OK and _unexcused(session.config):
+        session.exitstatus = pytest.ExitCode.TESTS_FAILED
+
+
+def pytest_terminal_summary(
+    terminalreporter: pytest.TerminalReporter, exitstatus: int, config: pytest.Config
+) -> None:
+    unexcused = _unexcused(config)
+    without_data = len(config.stash[SKIPPED]) - len(unexcused)
+    if in_ci() or without_data:
+        terminalreporter.write_line(f"tests skipped for want of ../shared/data: {without_data}")
+    if in_ci():
+        for where, reason in unexcused:
+            terminalreporter.write_line(f"FAILED, skipped in CI: {where}: {reason}", red=True)
