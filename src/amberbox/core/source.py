@@ -66,8 +66,11 @@ class Sink(Protocol):
         moment at which it is known not to have published.
         """
 
-    def link_down(self, topic: str, peer: str, reason: str) -> None:
-        """Say that nothing of ``peer`` on ``topic`` can arrive from now on; opens a gap."""
+    def link_down(self, topic: str, peer: str, reason: str, since_ns: int | None = None) -> None:
+        """Say that nothing of ``peer`` on ``topic`` can arrive from now on; opens a gap.
+
+        ``since_ns`` is given when the loss is noticed late: the gap begins there.
+        """
 
     def event(self, kind: str, text: str, **details: Any) -> None:
         """Record an event; ``kind`` is a short identifier, ``text`` one line for a person."""

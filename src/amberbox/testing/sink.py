@@ -45,8 +45,8 @@ class MemorySink:
     def link_up(self, topic: str, peer: str, since_ns: int | None = None) -> None:
         self._note_link("up", topic, peer, "", since_ns or self.now_ns())
 
-    def link_down(self, topic: str, peer: str, reason: str) -> None:
-        self._note_link("down", topic, peer, reason, self.now_ns())
+    def link_down(self, topic: str, peer: str, reason: str, since_ns: int | None = None) -> None:
+        self._note_link("down", topic, peer, reason, since_ns or self.now_ns())
 
     def event(self, kind: str, text: str, **details: Any) -> None:
         with self._lock:
