@@ -1,0 +1,90 @@
+"""Take secrets out of configuration, so that files and listings may leave the robot."""
+
+from __future__ import annotations
+
+import dataclasses
+import types
+import typing
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Union, get_args, get_origin
+
+from amberbox.core.config import WRAPPERS, field_keys
+from amberbox.core.nodes import Node
+
+MASK = "***"
+_TELLTALES = ("password", "passwd", "secret", "token", "passphrase", "private_key", "api_key")
+
+
+def secrets(cls: type[Any], node: Node) -> Iterator[Node]:
+    """Yield the values in a file that the configuration class marks as secret."""
+    kinds = typing.get_type_hints(cls)
+    for field in dataclasses.fields(cls):
+        for key in field_keys(field):
+            value = (node.mapping or {}).get(key)
+            if value is None:
+                continue
+            if field.metadata.get("secret"):
+                yield value
+            else:
+                yield from _secrets_below(kinds[field.name], value)
+
+
+def likely_secrets(node: Node, key: str = "") -> Iterator[Node]:
+    """Yield values whose key sounds secret, for blocks of which no class is known."""
+    if any(word in key.lower() for word in _TELLTALES):
+        yield node
+        return
+    for name, value in (node.mapping or {}).items():
+        yield from likely_secrets(value, name)
+    for entry in node.items or ():
+        yield from likely_secrets(entry, key)
+
+
+def redact(text: str, nodes: Iterable[Node]) -> str:
+    """Replace values in the text of their file; comments and layout stay."""
+    for start, end in sorted({node.span for node in nodes}, reverse=True):
+        line_end = "\n" if text[start:end].endswith("\n") else ""
+        if text[start:end].strip():
+            text = f'{text[:start]}"{MASK}"{line_end}{text[end:]}'
+    return text
+
+
+def as_plain(value: Any) -> Any:
+    """Turn a configuration into what JSON can hold, secrets masked."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {
+            field.name: _masked(getattr(value, field.name), field)
+            for field in dataclasses.fields(value)
+        }
+    if isinstance(value, Mapping):
+        return {str(key): as_plain(inner) for key, inner in value.items()}
+    if isinstance(value, Sequence) and not isinstance(value, str | bytes):
+        return [as_plain(inner) for inner in value]
+    return str(value) if isinstance(value, Path) else value
+
+
+def _masked(value: Any, field: dataclasses.Field[Any]) -> Any:
+    return MASK if field.metadata.get("secret") and value else as_plain(value)
+
+
+def _secrets_below(kind: Any, node: Node) -> Iterator[Node]:
+    origin = get_origin(kind)
+    if dataclasses.is_dataclass(kind) and isinstance(kind, type):
+        yield from secrets(kind, node)
+    elif origin in (Union, types.UnionType):
+        for member in get_args(kind):
+            yield from _secrets_below(member, node)
+    elif origin in (Sequence, tuple, list):
+        for entry in node.items or ():
+            yield from _secrets_below(get_args(kind)[0], _inner(entry))
+    elif origin in (Mapping, dict):
+        for entry in (node.mapping or {}).values():
+            yield from _secrets_below(get_args(kind)[1], entry)
+
+
+def _inner(node: Node) -> Node:
+    entries = node.mapping or {}
+    if len(entries) == 1 and (key := next(iter(entries))) in WRAPPERS:
+        return entries[key]
+    return node

@@ -1,0 +1,58 @@
+"""Quantities as people write them: ``5s``, ``10 min``, ``64 MB``, ``2 kHz``."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from fractions import Fraction
+
+TIME_NS: Mapping[str, int] = {
+    "ns": 1,
+    "us": 1_000,
+    "ms": 1_000_000,
+    "s": 1_000_000_000,
+    "min": 60_000_000_000,
+    "h": 3_600_000_000_000,
+    "d": 86_400_000_000_000,
+}
+"""Units of time and their length in nanoseconds; there is no ``m``, which might be a metre."""
+
+_BYTES: Mapping[str, int] = {
+    **{"B": 1, "kB": 10**3, "KB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12},
+    **{"KiB": 2**10, "MiB": 2**20, "GiB": 2**30, "TiB": 2**40},
+}
+_FREQUENCY: Mapping[str, int] = {"Hz": 1, "kHz": 1_000}
+_QUANTITY = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([A-Za-z]*)")
+
+
+def known_units(unit: str) -> Mapping[str, int]:
+    """Return the units that can be converted to ``unit`` with their sizes; empty for none."""
+    return next((table for table in (TIME_NS, _BYTES, _FREQUENCY) if unit in table), {})
+
+
+def in_unit(text: str, unit: str) -> Fraction:
+    """Convert a quantity such as ``10 min`` to ``unit`` exactly; a bare number is in ``unit``.
+
+    Raises ValueError with a sentence for the person who wrote it.
+    """
+    match = _QUANTITY.fullmatch(text.strip())
+    if match is None:
+        raise ValueError("is not a number")
+    number, written = Fraction(match[1]), match[2]
+    if not written or written == unit:
+        return number
+    units = known_units(unit)
+    if written not in units:
+        raise ValueError(_unknown_unit(written, units))
+    return number * units[written] / units[unit]
+
+
+def duration_ns(number: str, unit: str) -> int:
+    """Convert ``("5", "s")`` to nanoseconds."""
+    return round(in_unit(f"{number} {unit}", "ns"))
+
+
+def _unknown_unit(written: str, units: Mapping[str, int]) -> str:
+    if not units:
+        return f"has a unit '{written}' where a plain number is expected"
+    return f"has the unknown unit '{written}'; use one of {', '.join(units)}"
