@@ -1,0 +1,64 @@
+"""Names of data items and columns: derived from topics and paths, unique, never changed again."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Callable, Iterable, Mapping
+
+_NOT_IN_A_NAME = re.compile(r"[^A-Za-z0-9_]")
+_RESERVED = frozenset({"timestamp", "received", "seq", "index"})
+
+
+def identifier(text: str) -> str:
+    """Replace every character outside ``[A-Za-z0-9_]`` by ``_``; digits never come first."""
+    name = _NOT_IN_A_NAME.sub("_", text)
+    return name if name[:1] and not name[0].isdigit() else f"_{name}"
+
+
+def item_name(source: str, topic: str) -> str:
+    """Name the data item of a topic: ``/ropod/odom`` on ``ros`` is ``ros_ropod_odom``."""
+    return identifier(f"{source}_{topic.strip('/')}" if topic.strip("/") else source)
+
+
+def is_reserved(name: str) -> bool:
+    """Tell whether a column name belongs to us: time, place and parent of a row."""
+    folded = name.casefold()
+    return folded in _RESERVED or folded.startswith("parent_")
+
+
+def unique_names(
+    paths: Iterable[str], reserved: Callable[[str], bool] = is_reserved
+) -> dict[str, str]:
+    """Give each path a name of its own, compared without case.
+
+    The first path keeps the plain name; others, and those whose name is reserved, get ``_`` and
+    the first 4 hex digits of the path's SHA-256 (more, should those be taken as well).
+    """
+    return extend_names({}, paths, reserved)
+
+
+def extend_names(
+    names: Mapping[str, str],
+    paths: Iterable[str],
+    reserved: Callable[[str], bool] = is_reserved,
+) -> dict[str, str]:
+    """Name further paths without changing a name that was given before."""
+    extended = dict(names)
+    taken = {name.casefold() for name in extended.values()}
+    for path in paths:
+        if path not in extended:
+            extended[path] = _free_name(path, taken, reserved)
+            taken.add(extended[path].casefold())
+    return extended
+
+
+def _free_name(path: str, taken: set[str], reserved: Callable[[str], bool]) -> str:
+    plain = identifier(path)
+    if not reserved(plain) and plain.casefold() not in taken:
+        return plain
+    digest = hashlib.sha256(path.encode("utf-8", "surrogatepass")).hexdigest()
+    candidates = (f"{plain}_{digest[:count]}" for count in range(4, len(digest) + 1))
+    # parent_... stays reserved whatever is appended, so such names step aside with a "_" first
+    free = (f"_{name}" if reserved(name) else name for name in candidates)
+    return next(name for name in free if name.casefold() not in taken)
