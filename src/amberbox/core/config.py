@@ -109,7 +109,7 @@ def _dataclass(ctx: _Context, cls: type[Any], node: Node, where: str) -> Any:
         values |= {} if value is dataclasses.MISSING else {field.name: value}
     if not ok or any(value is _FAILED for value in values.values()):
         return _FAILED
-    return _checked(ctx, cls(**values), node, where)
+    return _instance(ctx, cls, values, node, where)
 
 
 def _known_keys(
@@ -163,8 +163,14 @@ def _field(
     return ctx.fail(node, where, f"the key '{field.name}' is missing", doc)
 
 
-def _checked(ctx: _Context, built: Any, node: Node, where: str) -> Any:
-    """Run the class's own check on the values together."""
+def _instance(ctx: _Context, cls: type[Any], values: dict[str, Any], node: Node, where: str) -> Any:
+    """Make the instance and run the class's own check on the values together."""
+    try:
+        built = cls(**values)
+    except AmberboxError as error:
+        return ctx.fail(node, where, error.what, error.hint)
+    except ValueError as error:
+        return ctx.fail(node, where, str(error))
     ok = True
     for finding in getattr(built, "check", tuple)():
         key, what = ("", finding) if isinstance(finding, str) else finding

@@ -166,10 +166,10 @@ class _Reader:
         if isinstance(raw, yaml.ScalarNode):
             value = scalar(raw.value) if raw.style is None else raw.value
             return Node(self.file, line, value, raw.value, span)
-        if isinstance(raw, yaml.SequenceNode):
-            entries = tuple(self.node(entry, depth + 1) for entry in raw.value)
-            return Node(self.file, line, entries, "", span)
-        return Node(self.file, line, self._mapping(raw, depth), "", span)
+        if isinstance(raw, yaml.MappingNode):
+            return Node(self.file, line, self._mapping(raw, depth), "", span)
+        entries = tuple(self.node(entry, depth + 1) for entry in raw.value)
+        return Node(self.file, line, entries, "", span)
 
     def _mapping(self, raw: yaml.MappingNode, depth: int) -> dict[str, Node]:
         entries: dict[str, Node] = {}

@@ -22,12 +22,13 @@ _BYTES: Mapping[str, int] = {
     **{"KiB": 2**10, "MiB": 2**20, "GiB": 2**30, "TiB": 2**40},
 }
 _FREQUENCY: Mapping[str, int] = {"Hz": 1, "kHz": 1_000}
-_QUANTITY = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([A-Za-z]*)")
+_SHARE: Mapping[str, int] = {"%": 1}
+_QUANTITY = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([A-Za-z]*|%)")
 
 
 def known_units(unit: str) -> Mapping[str, int]:
     """Return the units that can be converted to ``unit`` with their sizes; empty for none."""
-    return next((table for table in (TIME_NS, _BYTES, _FREQUENCY) if unit in table), {})
+    return next((table for table in (TIME_NS, _BYTES, _FREQUENCY, _SHARE) if unit in table), {})
 
 
 def in_unit(text: str, unit: str) -> Fraction:

@@ -1,0 +1,69 @@
+"""``robot.yaml``: who the robot is, where its record goes, and which server it reports to."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from amberbox.core.ids import derive_id, is_id
+from amberbox.core.options import option
+
+
+@dataclass(frozen=True)
+class StoreOptions:
+    """Where and how the record is kept."""
+
+    path: str = option("store", "folder of the record, relative to the robot folder")
+    quota: int | None = option(None, "most that the record may take", unit="B")
+    quota_percent: float = option(80.0, "the same as a share of the partition", unit="%")
+    min_free: int = option(1_000_000_000, "room that stays free on the partition", unit="B")
+    write_s: float = option(0.1, "a crash of the box loses at most this much", unit="s")
+    sync_s: float = option(1.0, "a power cut loses at most this much more", unit="s")
+    ring_s: float = option(300.0, "how long items of class ring are kept", unit="s")
+    queue: int = option(64_000_000, "memory for messages that wait for the disk", unit="B")
+    rotate_mb: float = option(64.0, "a journal file is closed at this size", unit="MB")
+    rotate_s: float = option(600.0, "a journal file is closed at this age", unit="s")
+
+    def check(self) -> Iterator[tuple[str, str]]:
+        """Say which values cannot work."""
+        above_zero = ("write_s", "sync_s", "ring_s", "queue", "rotate_mb", "rotate_s")
+        for key in above_zero:
+            if getattr(self, key) <= 0:
+                yield key, "must be above 0"
+        if self.min_free < 0:
+            yield "min_free", "must not be below 0"
+        if self.quota is not None and self.quota <= 0:
+            yield "quota", "must be above 0"
+        if not 0 < self.quota_percent <= 100:
+            yield "quota_percent", "must be above 0 and at most 100"
+        if self.sync_s < self.write_s:
+            yield "sync_s", f"must not be below write_s ({self.write_s:g} s)"
+
+
+@dataclass(frozen=True)
+class ServerOptions:
+    """The fleet server this robot reports to."""
+
+    url: str = option(doc="address of the fleet server, https://...")
+    token: str = option("", "the robot's key to the server", secret=True)
+
+    def check(self) -> Iterator[tuple[str, str]]:
+        """Say what is wrong with the address."""
+        if not self.url.startswith(("https://", "http://")):
+            yield "url", "must start with https:// or http://"
+
+
+@dataclass(frozen=True)
+class RobotConfig:
+    """Everything in ``robot.yaml``."""
+
+    id: str = option("", "name of the robot in addresses and on the server")
+    model: str = option("", "make and model")
+    software_version: str = option("", "version of the robot's own software")
+    store: StoreOptions = option(StoreOptions(), "where and how the record is kept")
+    server: ServerOptions | None = option(None, "the fleet server this robot reports to")
+
+    def check(self) -> Iterator[tuple[str, str]]:
+        """Say what is wrong with the id."""
+        if self.id and not is_id(self.id):
+            yield "id", f"'{self.id}' is no id (a-z 0-9 _ . -); '{derive_id(self.id)}' would be one"
