@@ -1,0 +1,79 @@
+"""The box's own channels: JSON with a published schema (docs/format.md)."""
+
+from __future__ import annotations
+
+from amberbox.core.types import Schema, Topic
+
+PREFIX = "amberbox/"
+SOURCE = "amberbox"
+
+RUN = "amberbox/run"
+CLOCK = "amberbox/clock"
+COUNTERS = "amberbox/counters"
+EVENT = "amberbox/event"
+GAP = "amberbox/gap"
+
+_TEXT = {"type": "string"}
+_COUNT = {"type": "integer"}
+_FIELDS: dict[str, dict[str, object]] = {
+    RUN: {
+        "writer": _TEXT,
+        "run": _COUNT,
+        "store_id": _TEXT,
+        "boot_id": _TEXT,
+        "robot": _TEXT,
+        "config_hash": _TEXT,
+        "version": _TEXT,
+        "items": _TEXT,
+        "input": _TEXT,
+    },
+    CLOCK: {"offset_ns": _COUNT, "synchronised": {"type": ["boolean", "null"]}},
+    COUNTERS: {
+        "items": {
+            "type": "array",
+            "items": {
+                "type": "object",
+                "properties": {
+                    "item": _TEXT,
+                    "received": _COUNT,
+                    "kept": _COUNT,
+                    "rate_limited": _COUNT,
+                    "unchanged": _COUNT,
+                    "dropped": _COUNT,
+                    "bytes": _COUNT,
+                    "last_received_ns": _COUNT,
+                },
+            },
+        }
+    },
+    EVENT: {"kind": _TEXT, "text": _TEXT, "source": _TEXT, "details": _TEXT},
+    GAP: {
+        "item": _TEXT,
+        "peer": _TEXT,
+        "from_ns": _COUNT,
+        "to_ns": {"type": ["integer", "null"]},
+        "reason": _TEXT,
+        "count": {"type": ["integer", "null"]},
+    },
+}
+
+
+def schema_of(name: str) -> Schema:
+    """JSON Schema of a reserved channel."""
+    import msgspec
+
+    document = {"type": "object", "title": name, "properties": _FIELDS[name]}
+    return Schema(name, "jsonschema", msgspec.json.encode(document))
+
+
+def topic_of(name: str) -> Topic:
+    """Return the topic of a reserved channel as it is written into MCAP.
+
+    It carries no MCAP schema: readers that know ROS 2 only refuse a file with others in it.
+    """
+    return Topic(name, "json", None)
+
+
+def names() -> list[str]:
+    """Names of all reserved channels."""
+    return list(_FIELDS)

@@ -1,0 +1,159 @@
+"""The store: a folder of journals and segments, its identity, its locks and its run counter."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import uuid
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO
+
+from amberbox.core.errors import AmberboxError, UsageError
+
+FOLDERS = {"main": "journal", "ring": "ring", "watch": "watch"}
+"""Folder of each writer's journal, inside the store."""
+SEGMENTS = "segments"
+_IDENTITY = "store.json"
+_RUN = "run"
+
+
+@dataclass(frozen=True, slots=True)
+class Store:
+    """A store on disk; ``id`` was made with it and tells it from a copy started anew."""
+
+    path: Path
+    id: str
+
+    def folder(self, writer: str) -> Path:
+        """Folder of a writer's journal."""
+        return self.path / FOLDERS[writer]
+
+    def journal_files(self, writer: str) -> list[Path]:
+        """Journal files of a writer in the order they were written."""
+        return sorted(self.folder(writer).glob("*.mcap"), key=_run_and_number)
+
+    def writers(self) -> list[str]:
+        """Writers that have a journal here."""
+        return [writer for writer in FOLDERS if self.folder(writer).is_dir()]
+
+    def next_run(self) -> int:
+        """Count one more run, never one that was used before, also after a power cut."""
+        run = 1 + max([self._counted(), *self._runs_on_disk()])
+        _replace(self.path / _RUN, str(run))
+        return run
+
+    def _counted(self) -> int:
+        try:
+            return int((self.path / _RUN).read_text())
+        except (OSError, ValueError):
+            return 0
+
+    def _runs_on_disk(self) -> list[int]:
+        return [_run_and_number(p)[0] for w in FOLDERS for p in self.journal_files(w)]
+
+
+def is_store(path: Path) -> bool:
+    """Tell whether a folder is a store."""
+    return (path / _IDENTITY).is_file()
+
+
+def open_store(path: Path) -> Store:
+    """Open a store that exists.
+
+    Raises AmberboxError when there is none, or its identity cannot be read.
+    """
+    try:
+        identity = json.loads((path / _IDENTITY).read_text())
+        return Store(path, str(identity["store_id"]))
+    except FileNotFoundError:
+        raise UsageError(f"{path} is not a store", "name a store or a robot folder") from None
+    except (OSError, ValueError, KeyError) as error:
+        raise AmberboxError(
+            f"{path / _IDENTITY} cannot be read: {error}", "restore the file from a copy"
+        ) from error
+
+
+def create_store(path: Path) -> Store:
+    """Open a store, or make a new one with an identity of its own.
+
+    Raises AmberboxError when the folder cannot be written.
+    """
+    if is_store(path):
+        return open_store(path)
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        _replace(path / _IDENTITY, json.dumps({"store_id": str(uuid.uuid4()), "format": 1}))
+    except OSError as error:
+        raise AmberboxError(
+            f"cannot write to the store {path}: {error.strerror}",
+            "choose a folder that can be written in robot.yaml store.path",
+        ) from error
+    return open_store(path)
+
+
+class WriterLock:
+    """Keeps a second writer of the same kind away from a store for as long as it is held."""
+
+    def __init__(self, store: Store, writer: str) -> None:
+        path = store.path / f"lock.{writer}"
+        try:
+            self._file: IO[str] = path.open("a+")
+        except OSError as error:
+            raise AmberboxError(
+                f"cannot write to the store {store.path}: {error.strerror}",
+                "choose a folder that can be written in robot.yaml store.path",
+            ) from error
+        try:
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            self._file.seek(0)
+            owner = self._file.read().strip() or "unknown"
+            self._file.close()
+            raise UsageError(
+                f"the store {store.path} is being written by process {owner} ({writer})",
+                "stop it first, or give this robot a store of its own in robot.yaml",
+            ) from None
+        self._file.truncate(0)
+        self._file.write(f"{os.getpid()}\n")
+        self._file.flush()
+
+    def release(self) -> None:
+        """Let others write."""
+        self._file.close()
+
+
+def is_locked(store: Store, writer: str) -> bool:
+    """Tell whether somebody is writing this journal right now."""
+    try:
+        with (store.path / f"lock.{writer}").open("r") as file:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except FileNotFoundError:
+        return False
+    except OSError:
+        return True
+    return False
+
+
+def _run_and_number(path: Path) -> tuple[int, int]:
+    try:
+        run, _, number = path.stem.split("-")
+        return int(run), int(number)
+    except ValueError:
+        return 0, 0
+
+
+def _replace(path: Path, text: str) -> None:
+    """Write a small file so that a power cut leaves the old or the new one."""
+    part = path.with_name(path.name + ".part")
+    with part.open("w") as file:
+        file.write(text)
+        file.flush()
+        os.fsync(file.fileno())
+    part.replace(path)
+    fd = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(fd)
+    finally:
+        os.close(fd)
