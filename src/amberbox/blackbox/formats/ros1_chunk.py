@@ -1,0 +1,168 @@
+"""What is inside a chunk of a ROS 1 bag: unpacking it and reading its messages fast."""
+
+from __future__ import annotations
+
+import bz2
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from struct import Struct
+from typing import Any, NamedTuple
+
+from amberbox.blackbox.formats.bytesource import MemoryBytes
+from amberbox.blackbox.formats.recording import RecordedMessage
+from amberbox.blackbox.formats.ros1_records import (
+    CONNECTION,
+    MESSAGE,
+    Fields,
+    Record,
+    parse_fields,
+    time_ns,
+    u32,
+    walk,
+)
+
+NS = 1_000_000_000
+_PIECE = 1 << 16
+
+
+@dataclass
+class ChunkContent:
+    """Messages in the order of the chunk, connections it defines, ranges that are broken."""
+
+    messages: list[RecordedMessage] = field(default_factory=list)
+    connections: dict[int, Fields] = field(default_factory=dict)
+    damage: list[tuple[int, int, str]] = field(default_factory=list)
+    """(offset inside the unpacked chunk, length, reason)"""
+
+    def add_damage(self, offset: int, length: int, reason: str) -> None:
+        """Note a range that cannot be read."""
+        self.damage.append((offset, length, reason))
+
+
+def unpack_chunk(compression: str, data: bytes, size: int) -> tuple[bytes, str]:
+    """Unpack a chunk as far as possible; the second value says what went wrong, if anything.
+
+    No more than ``size`` bytes, which the chunk's header promises, are unpacked.
+    """
+    if compression == "none":
+        return data, ""
+    make = _decompressors().get(compression)
+    if make is None:
+        return b"", f"compression {compression!r} is not known"
+    unpacked, problem = _unpack_pieces(make(), data, size + 1)
+    if not problem and len(unpacked) != size:
+        problem = f"unpacks to {len(unpacked)} bytes instead of {size}"
+    return unpacked, problem
+
+
+def _decompressors() -> Mapping[str, Callable[[], Any]]:
+    import lz4.frame  # type: ignore[import-untyped]  # the package has no type hints
+
+    return {"bz2": bz2.BZ2Decompressor, "lz4": lz4.frame.LZ4FrameDecompressor}
+
+
+def _unpack_pieces(decompressor: Any, data: bytes, limit: int) -> tuple[bytes, str]:
+    # in pieces, so that what lies before a broken byte is not lost
+    unpacked: list[bytes] = []
+    room = limit
+    for start in range(0, len(data), _PIECE):
+        try:
+            unpacked.append(decompressor.decompress(data[start : start + _PIECE], room))
+        except (OSError, EOFError, RuntimeError, ValueError) as error:
+            return b"".join(unpacked), f"cannot be unpacked from byte {start} on ({error})"
+        room -= len(unpacked[-1])
+        if decompressor.eof or room <= 0:
+            break
+    complete = decompressor.eof or room <= 0
+    return b"".join(unpacked), "" if complete else "compressed data end too early"
+
+
+def read_chunk(raw: bytes, topic_of: Mapping[int, int]) -> ChunkContent:
+    """Read an unpacked chunk; ``topic_of`` gives the topic index of a connection number.
+
+    Messages of connections that are not in it get the topic index -1.
+    """
+    content = ChunkContent()
+    source, offset = MemoryBytes(raw), 0
+    while offset < len(raw):
+        record = next(walk(source, offset, content.add_damage), None)
+        if record is None:
+            break
+        offset = _take(raw, record, topic_of, content)
+    return content
+
+
+def _take(raw: bytes, record: Record, topic_of: Mapping[int, int], content: ChunkContent) -> int:
+    """Take a record and, after a message, all that look like it; return where to go on."""
+    if record.operation == CONNECTION:
+        _add_connection(raw, record, content)
+    if record.operation != MESSAGE:
+        return record.end
+    layout = _layout_of(raw, record)
+    if layout is not None:
+        return _read_run(raw, record.offset, layout, topic_of, content.messages)
+    content.messages.append(_message_of(raw, record, topic_of))
+    return record.end
+
+
+class _Layout(NamedTuple):
+    """The fixed bytes of a message header, as one writer writes all of them."""
+
+    unpack: Callable[[bytes, int], tuple[bytes, int, bytes, int, bytes, int]]
+    fixed: tuple[bytes, bytes, bytes]
+    conn_first: bool
+    size: int
+
+
+def _layout_of(raw: bytes, record: Record) -> _Layout | None:
+    """Learn a header's layout; None if it has more fields than the usual three."""
+    head = raw[record.offset : record.data_offset]
+    conn_at, time_at = head.find(b"conn=") + 5, head.find(b"time=") + 5
+    if len(record.fields) != 3:
+        return None
+    conn_first = conn_at < time_at
+    first, second = sorted([(conn_at, "I", 4), (time_at, "Q", 8)])
+    after_first, after_second = first[0] + first[2], second[0] + second[2]
+    lengths = first[0], second[0] - after_first, len(head) - 4 - after_second
+    text = f"<{lengths[0]}s{first[1]}{lengths[1]}s{second[1]}{lengths[2]}sI"
+    unpack: Any = Struct(text).unpack_from
+    k0, _, k1, _, k2, _ = unpack(raw, record.offset)
+    return _Layout(unpack, (k0, k1, k2), conn_first, len(head))
+
+
+def _read_run(
+    raw: bytes,
+    offset: int,
+    layout: _Layout,
+    topic_of: Mapping[int, int],
+    messages: list[RecordedMessage],
+) -> int:
+    """Read messages as long as their headers have this layout; return where the run ends."""
+    unpack, (k0, k1, k2), conn_first, size = layout
+    new, append, size_of_raw = tuple.__new__, messages.append, len(raw)
+    while offset <= size_of_raw - size:
+        c0, first, c1, second, c2, length = unpack(raw, offset)
+        end = offset + size + length
+        if c0 != k0 or c1 != k1 or c2 != k2 or end > size_of_raw:
+            break
+        conn, time = (first, second) if conn_first else (second, first)
+        stamp = (time & 0xFFFFFFFF) * NS + (time >> 32)
+        data = raw[offset + size : end]
+        append(new(RecordedMessage, (topic_of.get(conn, -1), stamp, None, data)))
+        offset = end
+    return offset
+
+
+def _message_of(raw: bytes, record: Record, topic_of: Mapping[int, int]) -> RecordedMessage:
+    topic = topic_of.get(u32(record.fields[b"conn"]), -1)
+    data = raw[record.data_offset : record.end]
+    return RecordedMessage(topic, time_ns(record.fields[b"time"]), None, data)
+
+
+def _add_connection(raw: bytes, record: Record, content: ChunkContent) -> None:
+    fields = parse_fields(raw[record.data_offset : record.end])
+    if fields is None:
+        content.add_damage(record.offset, record.end - record.offset, "unreadable connection")
+    else:
+        merged = {**fields, b"topic": record.fields[b"topic"]}
+        content.connections[u32(record.fields[b"conn"])] = merged
