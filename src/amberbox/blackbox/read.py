@@ -47,6 +47,7 @@ class JournalFile:
     places: Sequence[ChunkPlace] = field(repr=False)
     damage: Sequence[Damage] = ()
     store_id: str = ""
+    walked: bool = False
 
     @property
     def rows(self) -> int:
@@ -105,6 +106,7 @@ def describe(found: FileScan, name: str) -> JournalFile:
         places=tuple(found.places),
         damage=tuple(found.damage),
         store_id=start.get("store_id", ""),
+        walked=found.walked,
     )
     return replace(journal, clock=_clock_points(journal, _places_of_clock(found)))
 
@@ -223,9 +225,16 @@ def batches_of(
     if not wanted or not any(journal.items.get(s.item) for s in wanted.values()):
         return
     clock = ClockTable(journal.clock)
+    low, high = clock.bounds()
+
+    def in_range(place: ChunkPlace) -> bool:
+        too_late = to_ns is not None and place.start_ns + low >= to_ns
+        too_early = from_ns is not None and place.end_ns + high < from_ns
+        return not too_late and not too_early
+
     piles: dict[int, _Pile] = {}
-    for chunk, first_seq in _chunks(journal, clock, from_ns, to_ns, on_gap):
-        seq, received = sequences(chunk, first_seq), clock.received(chunk.log_ns)
+    for chunk in sound_chunks(journal, in_range):
+        seq, received = sequences(chunk, journal.first_seq), clock.received(chunk.log_ns)
         inside = _inside(received, from_ns, to_ns)
         for number in np.unique(chunk.channel[inside]).tolist():
             if number not in wanted:
@@ -249,40 +258,80 @@ def _inside(received: IntArray, from_ns: int | None, to_ns: int | None) -> Any:
     return inside
 
 
-def _chunks(
-    journal: JournalFile,
-    clock: ClockTable,
-    from_ns: int | None,
-    to_ns: int | None,
-    on_gap: OnGap | None,
-) -> Iterator[tuple[Chunk, int]]:
-    """Decode the chunks that may hold rows of the range; a refused one makes us walk the file."""
-    low, high = clock.bounds()
+def sound_chunks(
+    journal: JournalFile, choose: Callable[[ChunkPlace], bool] = lambda place: True
+) -> Iterator[Chunk]:
+    """Decode the chosen chunks of a file in ``seq`` order.
+
+    When a checksum refuses one, the file is walked: what lies elsewhere than its index says (a
+    disk that swapped pages) is found, and only what is really damaged is missing.
+    """
+    next_seq = journal.first_seq
     with open_buffer(journal.path) as data:
         for place in journal.places:
-            too_late = to_ns is not None and place.start_ns + low >= to_ns
-            too_early = from_ns is not None and place.end_ns + high < from_ns
-            if too_late or too_early:
+            if not choose(place):
                 continue
             chunk = read_chunk(data, place)
             if chunk is None:
-                _tell_refused(journal, place, on_gap)
-            elif len(chunk):
-                yield chunk, journal.first_seq
+                break
+            if len(chunk):
+                next_seq = int(sequences(chunk, journal.first_seq)[-1]) + 1
+                yield chunk
+        else:
+            return
+    walked = walked_again(journal)
+
+    def rest(place: ChunkPlace) -> bool:
+        first = _first_seq(walked, place)
+        return (first is None or first >= next_seq) and choose(place)
+
+    if not journal.walked:
+        yield from sound_chunks(walked, rest)
 
 
-def _tell_refused(journal: JournalFile, place: ChunkPlace, on_gap: OnGap | None) -> None:
-    if on_gap is not None:
-        on_gap(
-            Gap(
-                journal.writer,
-                journal.run,
-                place.start_ns,
-                place.end_ns + 1,
-                f"{journal.name}: chunk at byte {place.offset} does not match its checksum",
-                count=place.count,
-            )  # fmt: skip
-        )
+def walked_again(journal: JournalFile) -> JournalFile:
+    """Describe a file by every chunk that holds, not by its summary."""
+    status = journal.path.stat()
+    return _walked(journal.path, journal.name, status.st_mtime_ns, status.st_size)
+
+
+@lru_cache(maxsize=64)
+def _walked(path: Path, name: str, _mtime_ns: int, _size: int) -> JournalFile:
+    return describe(scan(path, walk=True), name)
+
+
+def _first_seq(journal: JournalFile, place: ChunkPlace) -> int | None:
+    if place.first_sequence is None:
+        return None
+    return journal.first_seq + ((place.first_sequence - journal.first_seq) & 0xFFFFFFFF)
+
+
+def holes(journal: JournalFile) -> list[Gap]:
+    """Name what is missing between the chunks that hold, by sequence and time."""
+    gaps, expected, last_ns = [], journal.first_seq, journal.start_ns
+    for place in journal.places:
+        first = _first_seq(journal, place)
+        if first is not None and first > expected:
+            gaps.append(missing(journal, expected, first, last_ns, place.start_ns))
+        expected = (expected if first is None else first) + place.count
+        last_ns = place.end_ns
+    return gaps
+
+
+def missing(journal: JournalFile, from_seq: int, to_seq: int, from_ns: int, to_ns: int) -> Gap:
+    """Describe rows that were written and cannot be read."""
+    clock = ClockTable(journal.clock)
+    start, end = clock.received(np.array([from_ns, to_ns])).tolist()
+    return Gap(
+        journal.writer,
+        journal.run,
+        start,
+        end,
+        f"damaged: {journal.name}",
+        count=to_seq - from_seq,
+        from_seq=from_seq,
+        to_seq=to_seq,
+    )
 
 
 def _unpile(

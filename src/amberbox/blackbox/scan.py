@@ -66,8 +66,9 @@ class Walk:
     tag: str = ""
     grows: bool = False
     finished: bool = False
-    _trusted: int = 0
+    trusted: int = 0
     _failed: str = ""
+    _waits: bool = False
 
     def __iter__(self) -> Iterator[Found]:
         if self.at == 0:
@@ -79,14 +80,14 @@ class Walk:
                 yield from self._report_damage(self._offset_of(found))
                 self._trust(found)
                 yield found
-            elif self.at == before and not self._failed:
+            elif self.at == before and (self._waits or not self._failed):
                 break
         if not self.grows:
             yield from self._report_damage(len(self.data), "cut short")
 
     def _start(self) -> None:
         if bytes(self.data[: len(mcap.MAGIC)]) == mcap.MAGIC:
-            self.at = self._trusted = len(mcap.MAGIC)
+            self.at = self.trusted = len(mcap.MAGIC)
         else:
             self._failed = "no MCAP magic"
 
@@ -95,13 +96,13 @@ class Walk:
 
     def _trust(self, found: Found) -> None:
         if not isinstance(found, Damage):
-            self._trusted = found.end
+            self.trusted = found.end
 
     def _report_damage(self, until: int, reason: str = "") -> Iterator[Damage]:
         """Tell of the bytes since the last thing that held, if something went wrong there."""
         torn = reason if until > self.at else ""
-        if (self._failed or torn) and until > self._trusted and not self.finished:
-            yield Damage(self._trusted, until, self._failed or torn)
+        if (self._failed or torn) and until > self.trusted and not self.finished:
+            yield Damage(self.trusted, until, self._failed or torn)
         self._failed = ""
 
     def _step(self) -> Found | None:
@@ -148,7 +149,7 @@ class Walk:
     def _fail(self, reason: str) -> None:
         """Remember the damage and go back to right behind what held last."""
         self._failed = reason
-        self.at = max(self._trusted, len(mcap.MAGIC) if self._trusted else 0)
+        self.at = max(self.trusted, len(mcap.MAGIC) if self.trusted else 0)
 
     def _resync(self) -> Found | None:
         """Find the next chunk or start record that holds, from ``at`` on."""
@@ -157,7 +158,9 @@ class Walk:
             if found is not None:
                 self.at = found.end
                 return found
-        self.at = len(self.data)
+        self._waits = self.grows  # what is being written may complete a match
+        if not self.grows:
+            self.at = len(self.data)
         return None
 
     def _probe(self, offset: int) -> Chunk | Metadata | None:
@@ -295,6 +298,12 @@ def scan(path: Path, *, walk: bool = False) -> FileScan:
         if summary is not None:
             return _from_summary(path, data, start, summary)
         return _from_walk(path, data)
+
+
+def start_record(path: Path) -> Mapping[str, str]:
+    """Read what a journal file says about itself at its start; empty if it says nothing."""
+    with path.open("rb") as file:
+        return _start_record(file.read(1 << 16))
 
 
 def _start_record(data: Buffer) -> Mapping[str, str]:

@@ -32,7 +32,7 @@ class Store:
 
     def journal_files(self, writer: str) -> list[Path]:
         """Journal files of a writer in the order they were written."""
-        return sorted(self.folder(writer).glob("*.mcap"), key=_run_and_number)
+        return sorted(self.folder(writer).glob("*.mcap"), key=run_and_number)
 
     def writers(self) -> list[str]:
         """Writers that have a journal here."""
@@ -51,7 +51,7 @@ class Store:
             return 0
 
     def _runs_on_disk(self) -> list[int]:
-        return [_run_and_number(p)[0] for w in FOLDERS for p in self.journal_files(w)]
+        return [run_and_number(p)[0] for w in FOLDERS for p in self.journal_files(w)]
 
 
 def is_store(path: Path) -> bool:
@@ -136,7 +136,8 @@ def is_locked(store: Store, writer: str) -> bool:
     return False
 
 
-def _run_and_number(path: Path) -> tuple[int, int]:
+def run_and_number(path: Path) -> tuple[int, int]:
+    """Read run and file number from a journal's file name; zeros if it has none."""
     try:
         run, _, number = path.stem.split("-")
         return int(run), int(number)

@@ -1,0 +1,34 @@
+"""WHERE on the command line and in the API: a robot folder or a store becomes a store's path."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from amberbox.blackbox.store import is_store
+from amberbox.core.errors import UsageError
+
+
+def store_path(where: str | Path) -> Path:
+    """Find the store that ``where`` (a store or a robot folder) means.
+
+    Raises UsageError when there is none.
+    """
+    path = Path(where)
+    if is_store(path):
+        return path
+    if (path / "robot.yaml").is_file() or (path / "black_box.yaml").is_file():
+        from amberbox.blackbox.folder import load_folder
+
+        store = load_folder(path).store_path
+        if is_store(store):
+            return store
+        raise UsageError(
+            f"{path} has no record yet (no store at {store})",
+            f"record something first: amberbox record {path}",
+        )
+    if not path.exists():
+        raise UsageError(f"there is nothing at {path}", "name a robot folder or a store")
+    raise UsageError(
+        f"{path} is neither a store nor a robot folder",
+        "a store holds store.json, a robot folder holds robot.yaml and black_box.yaml",
+    )
