@@ -1,0 +1,51 @@
+# The same few words on every machine and in CI. Nothing but make, bash and Python 3.11+ is needed
+# to start; what else the tests need is installed when we may, and named when we may not.
+
+VENV := .venv
+BIN := $(VENV)/bin
+ALL := $(VENV)/.installed-all
+TEST := $(VENV)/.installed-test
+HOUSE := pyproject.toml tools/venv.sh tools/python.sh
+
+ROS := ros-core python3-rospy python3-roslaunch python3-rosbag \
+  python3-std-msgs python3-nav-msgs python3-sensor-msgs python3-geometry-msgs \
+  python3-diagnostic-msgs python3-tf2-msgs
+
+.DEFAULT_GOAL := help
+.PHONY: help demo test check bench venv debian clean
+
+help:  ## say what there is
+	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /\1\t/' | expand -t 10
+
+demo: $(ALL)  ## record a simulated robot, break it, show that nothing is lost (DEMO_SECONDS=60)
+	$(BIN)/amberbox demo
+
+test: $(TEST) debian  ## run all tests (PYTEST_ARGS="-k journal")
+	$(BIN)/python -m pytest $(PYTEST_ARGS)
+
+check: $(TEST)  ## lint, types, import directions, documentation
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/python -m tools.check_imports
+	$(BIN)/python -m tools.check_files
+	$(BIN)/python -m tools.check_docs
+
+bench: $(TEST)  ## measure the numbers that the documentation quotes (BENCH_ARGS="unroll query")
+	$(BIN)/python -m benchmarks.run $(BENCH_ARGS)
+
+venv: $(TEST)  ## only install
+
+debian:
+	@tools/apt.sh $(ROS) || echo "tests against a real ROS 1 master will be skipped" >&2
+
+clean:  ## remove what was installed and cached here
+	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .hypothesis build dist
+
+$(ALL): $(HOUSE) constraints/all.txt
+	VENV=$(VENV) tools/venv.sh all
+	@touch $@
+
+$(TEST): $(HOUSE) constraints/test.txt
+	VENV=$(VENV) tools/venv.sh test
+	@touch $(ALL) $@

@@ -1,0 +1,1 @@
+"""What decides, before the journal, whether a whole message is kept."""
