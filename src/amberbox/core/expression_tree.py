@@ -1,0 +1,177 @@
+"""The parts that an expression is made of, as a tree."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Literal, TypeAlias
+
+Kind: TypeAlias = Literal["number", "text", "condition", "null", "any"]
+"""What a value is: ``null`` if it is never known, ``any`` if only the data can tell."""
+
+
+class Fault(Exception):  # noqa: N818 - becomes an ExpressionError once the text is at hand
+    """What is wrong at a place of an expression, counted in characters from 0."""
+
+    def __init__(self, what: str, at: int, hint: str = "") -> None:
+        super().__init__(what)
+        self.what, self.at, self.hint = what, at, hint
+
+
+@dataclass(frozen=True, slots=True)
+class Tree:
+    """A part; ``at`` is its place in the text."""
+
+    at: int
+
+
+@dataclass(frozen=True, slots=True)
+class Constant(Tree):
+    """``3``, ``500ms`` (in seconds), ``'text'``, ``true``, ``null``."""
+
+    value: int | float | str | bool | None
+
+
+@dataclass(frozen=True, slots=True)
+class Address(Tree):
+    """The latest value of a variable, an output or a failure mode."""
+
+    name: str
+
+
+@dataclass(frozen=True, slots=True)
+class Negative(Tree):
+    """``-x``."""
+
+    inner: Tree
+
+
+@dataclass(frozen=True, slots=True)
+class Arithmetic(Tree):
+    """``x + y`` and ``- * / %``."""
+
+    operator: str
+    left: Tree
+    right: Tree
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison(Tree):
+    """``0 < x <= 5``: true if every neighbouring pair compares."""
+
+    operators: tuple[str, ...]
+    operands: tuple[Tree, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Not(Tree):
+    """``not x``."""
+
+    inner: Tree
+
+
+@dataclass(frozen=True, slots=True)
+class Logic(Tree):
+    """``x and y``, ``x or y``."""
+
+    operator: str
+    operands: tuple[Tree, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Call(Tree):
+    """A function of values at one instant, such as ``abs(x)``."""
+
+    name: str
+    arguments: tuple[Tree, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Age(Tree):
+    """Seconds since a variable was last known."""
+
+    inner: Address
+
+
+@dataclass(frozen=True, slots=True)
+class Window(Tree):
+    """A function of the samples of the last while, such as ``mean(x over 5s)``."""
+
+    name: str
+    inner: Tree
+    over_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class Held(Tree):
+    """``x for 5s``: the condition has been true without a break for that long."""
+
+    inner: Tree
+    for_ns: int
+
+
+_KINDS: dict[type[Tree], Kind] = {
+    **dict.fromkeys((Negative, Arithmetic, Age, Window), "number"),
+    **dict.fromkeys((Comparison, Not, Logic, Held), "condition"),
+}
+
+
+def kind_of(tree: Tree) -> Kind:
+    """Tell what a part gives, as far as its form says."""
+    if isinstance(tree, Constant):
+        return kind_of_value(tree.value)
+    if isinstance(tree, Call):
+        return "condition" if tree.name in ("known", "bit") else "number"
+    return _KINDS.get(type(tree), "any")
+
+
+def kind_of_value(value: object) -> Kind:
+    """Tell what a Python value is."""
+    if value is None:
+        return "null"
+    if isinstance(value, bool):
+        return "condition"
+    return "text" if isinstance(value, str) else "number"
+
+
+def children(tree: Tree) -> Iterator[Tree]:
+    """Yield the parts right below, in order."""
+    for field in dataclasses.fields(tree):
+        value = getattr(tree, field.name)
+        for part in value if isinstance(value, tuple) else (value,):
+            if isinstance(part, Tree):
+                yield part
+
+
+def walk(tree: Tree) -> Iterator[Tree]:
+    """Yield a tree and everything below it, from left to right."""
+    yield tree
+    for child in children(tree):
+        yield from walk(child)
+
+
+def with_addresses(tree: Tree, change: Callable[[Address], Address]) -> Tree:
+    """Return the tree with every address replaced."""
+    if isinstance(tree, Address):
+        return change(tree)
+    changed: dict[str, object] = {}
+    for field in dataclasses.fields(tree):
+        value = getattr(tree, field.name)
+        if isinstance(value, Tree):
+            changed[field.name] = with_addresses(value, change)
+        elif isinstance(value, tuple) and value and isinstance(value[0], Tree):
+            changed[field.name] = tuple(with_addresses(part, change) for part in value)
+    return dataclasses.replace(tree, **changed)  # type: ignore[arg-type]  # fields by name
+
+
+def history_ns(tree: Tree) -> int:
+    """Return how far back in time a tree looks."""
+    own = tree.over_ns if isinstance(tree, Window) else 0
+    own = tree.for_ns if isinstance(tree, Held) else own
+    return own + max((history_ns(child) for child in children(tree)), default=0)
+
+
+def needs_history(tree: Tree) -> bool:
+    """Tell whether a tree cannot be judged from the values of one instant."""
+    return any(isinstance(part, Window | Held | Age) for part in walk(tree))

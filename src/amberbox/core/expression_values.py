@@ -1,0 +1,214 @@
+"""Values of many instants at once, null known apart, and what can be done with them."""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import reduce
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from amberbox.core.expression_tree import Fault, Kind, kind_of_value
+from amberbox.core.types import Ragged
+
+Array: TypeAlias = NDArray[Any]
+Mask: TypeAlias = NDArray[np.bool_]
+
+_NAMES: dict[Kind, str] = {"text": "text", "number": "a number", "condition": "a condition"}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Values:
+    """One value per instant; ``data`` means nothing where ``null`` is true."""
+
+    data: Array
+    null: Mask
+    kind: Kind
+
+    def __len__(self) -> int:
+        return len(self.data)
+
+    def at(self, rows: Any) -> Values:
+        """Take some of the rows."""
+        return Values(self.data[rows], self.null[rows], self.kind)
+
+    def column(self) -> Array:
+        """Return a masked array, or an object array with None for texts and unknown values."""
+        if self.kind in ("number", "condition"):
+            return np.ma.MaskedArray(self.data, self.null)
+        column = self.data.astype(object)
+        column[self.null] = None
+        return column
+
+    def scalar(self, row: int) -> Any:
+        """Return one value as plain Python, None for null."""
+        if self.null[row]:
+            return None
+        value = self.data[row]
+        return value.item() if isinstance(value, np.generic) else value
+
+
+def values_of(column: Any, at: int) -> Values:
+    """Take over a column as batches and queries give it; a list may stand for an array."""
+    if isinstance(column, Ragged):
+        raise Fault("is a list; name one element of it", at, "such as: ranges[17]")
+    array = column if isinstance(column, np.ndarray) else _object_array(column)
+    null = np.ma.getmaskarray(array) if isinstance(array, np.ma.MaskedArray) else None
+    data = np.asarray(np.ma.getdata(array))
+    if data.dtype.kind in "biuf":
+        kind: Kind = "condition" if data.dtype.kind == "b" else "number"
+        return Values(data, np.zeros(len(data), bool) if null is None else null, kind)
+    return _from_objects(data.astype(object), null, at)
+
+
+def element_of(column: Any, index: int, at: int) -> Values:
+    """Take one element of each list of a list column; null where the list is shorter."""
+    if not isinstance(column, Ragged):
+        lists = [() if entry is None else entry for entry in column]
+        if any(isinstance(entry, str) or not hasattr(entry, "__len__") for entry in lists):
+            raise Fault("is no list", at)
+        return values_of([e[index] if index < len(e) else None for e in lists], at)
+    here = np.diff(column.offsets) > index
+    data = np.zeros(len(column), column.values.dtype)
+    data[here] = column.values[column.offsets[:-1][here] + index]
+    values = values_of(data, at)
+    return Values(values.data, values.null | ~here, values.kind)
+
+
+def constant(value: object, count: int) -> Values:
+    """Repeat one value."""
+    if value is None:
+        return Values(np.zeros(count), np.ones(count, bool), "null")
+    data = np.full(count, value, object if isinstance(value, str) else None)
+    return Values(data, np.zeros(count, bool), kind_of_value(value))
+
+
+def as_number(values: Values, wanted_by: str, at: int) -> Values:
+    """Return float64 values; conditions count as 0 and 1."""
+    if values.kind == "text":
+        raise Fault(f"{wanted_by} needs a number, got text", at)
+    return Values(values.data.astype(np.float64), values.null, "number")
+
+
+def as_condition(values: Values, wanted_by: str, at: int) -> Values:
+    """Return the same values if they are true or false."""
+    if values.kind in ("number", "text"):
+        hint = "compare it with something, such as: x > 0"
+        raise Fault(f"{wanted_by} needs a condition, got {_NAMES[values.kind]}", at, hint)
+    return Values(values.data.astype(bool), values.null, "condition")
+
+
+def arithmetic(sign: str, left: Values, right: Values) -> Values:
+    """Compute in float64 as IEEE 754 says: 1 / 0 is infinite, 0 / 0 is not a number."""
+    data = _ARITHMETIC[sign](left.data, right.data)
+    return Values(data, left.null | right.null, "number")
+
+
+def compare(sign: str, left: Values, right: Values, at: int) -> Values:
+    """Compare pairs: null where either is; whole numbers exactly, others as float64."""
+    null = left.null | right.null
+    kinds = {left.kind, right.kind}
+    if "null" in kinds:
+        return Values(np.zeros(len(null), bool), np.ones(len(null), bool), "condition")
+    if "text" in kinds and (len(kinds) > 1 or sign not in ("==", "!=")):
+        names = " with ".join(sorted(_NAMES[kind] for kind in (left.kind, right.kind)))
+        raise Fault(f"'{sign}' cannot compare {names}", at)
+    a, b = left.data, right.data
+    if "text" not in kinds and "f" in (a.dtype.kind, b.dtype.kind):
+        a, b = a.astype(np.float64), b.astype(np.float64)
+    return Values(np.asarray(_COMPARE[sign](a, b), bool), null, "condition")
+
+
+def negated(values: Values) -> Values:
+    """Return not x; unknown stays unknown."""
+    return Values(~values.data, values.null, "condition")
+
+
+def joined(word: str, parts: list[Values]) -> Values:
+    """Join conditions with ``and`` or ``or``: one false part decides ``and``, known or not."""
+    decisive = word == "or"
+    decided = reduce(operator.or_, [(p.data == decisive) & ~p.null for p in parts])
+    null = reduce(operator.or_, [p.null for p in parts]) & ~decided
+    return Values(np.where(decided, decisive, not decisive), null, "condition")
+
+
+def call(name: str, arguments: list[Values]) -> Values:
+    """Apply a function of one instant to float64 arguments; null if any of them is."""
+    null = reduce(operator.or_, [argument.null for argument in arguments])
+    if name == "bit":
+        return _bit(arguments[0].data, arguments[1].data, null)
+    return Values(_CALLS[name](*(argument.data for argument in arguments)), null, "number")
+
+
+def _bit(word: Array, number: Array, null: Mask) -> Values:
+    """Tell whether a bit is set; null for what is no whole number of at most 53 bits."""
+    fits = (word == np.floor(word)) & (np.abs(word) < 2.0**53)
+    fits &= (number == np.floor(number)) & (number >= 0) & (number < 53)
+    whole, place = (np.where(fits, x, 0).astype(np.int64) for x in (word, number))
+    return Values((whole >> place) & 1 == 1, null | ~fits, "condition")
+
+
+def _object_array(column: Any) -> Array:
+    array = np.empty(len(column), object)
+    array[:] = list(column)
+    return array
+
+
+def _from_objects(data: Array, mask: Mask | None, at: int) -> Values:
+    null = np.array([value is None for value in data], bool)
+    null = null if mask is None else null | mask
+    kinds = {_kind_of_object(value, at) for value in data[~null]}
+    if len(kinds) > 1:
+        raise Fault("holds values of different kinds: " + ", ".join(sorted(kinds)), at)
+    if not kinds:
+        return Values(np.zeros(len(data)), np.ones(len(data), bool), "null")
+    kind = kinds.pop()
+    if kind == "text":
+        return Values(data, null, kind)
+    return Values(_packed(np.where(null, 0, data), kind), null, kind)
+
+
+def _packed(data: Array, kind: Kind) -> Array:
+    if kind == "condition":
+        return data.astype(bool)
+    whole = all(isinstance(value, int | np.integer) and -(2**63) <= value < 2**63 for value in data)
+    return data.astype(np.int64 if whole else np.float64)
+
+
+def _kind_of_object(value: object, at: int) -> Kind:
+    if isinstance(value, bool | np.bool_):
+        return "condition"
+    if isinstance(value, int | float | np.integer | np.floating):
+        return "number"
+    if isinstance(value, str):
+        return "text"
+    raise Fault(f"a value of type {type(value).__name__} cannot be used", at)
+
+
+_ARITHMETIC: dict[str, Callable[[Array, Array], Array]] = {
+    "+": np.add,
+    "-": np.subtract,
+    "*": np.multiply,
+    "/": np.divide,
+    "%": np.mod,
+}
+_COMPARE: dict[str, Callable[[Any, Any], Any]] = {
+    "<": operator.lt,
+    "<=": operator.le,
+    ">": operator.gt,
+    ">=": operator.ge,
+    "==": operator.eq,
+    "!=": operator.ne,
+}
+_CALLS: dict[str, Callable[..., Array]] = {
+    "abs": np.abs,
+    "sqrt": np.sqrt,
+    "sin": np.sin,
+    "cos": np.cos,
+    "atan2": np.arctan2,
+    "min": lambda *columns: reduce(np.minimum, columns),
+    "max": lambda *columns: reduce(np.maximum, columns),
+}
