@@ -1,0 +1,186 @@
+"""The subscriber as a whole: watches the master and hands publishers to the subscriptions.
+
+The master is asked who publishes every ``poll_s``, in both modes. Registering adds that new
+publishers are announced at once. Asking as well costs little and heals what notifications
+cannot: a master that was restarted, or one whose three notification workers hang.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections.abc import Mapping, Sequence
+from queue import SimpleQueue
+
+from amberbox.blackbox.ros1.memory import Memory
+from amberbox.blackbox.ros1.names import global_name, host_and_port, is_loopback, own_host
+from amberbox.blackbox.ros1.node import Node
+from amberbox.blackbox.ros1.reports import Reports
+from amberbox.blackbox.ros1.settings import RefusedError, RosError, Settings
+from amberbox.blackbox.ros1.subscription import Subscription
+from amberbox.blackbox.ros1.xmlrpc import Graph, Master
+from amberbox.core.source import Sink
+
+LONGEST_WAIT_S = 2.0
+STOPPED = "the recorder stopped listening"
+NOT_FOLLOWED = frozenset({"/rosout", "/rosout_agg"})
+
+Update = tuple[str, Sequence[str]]
+
+
+class Client:
+    """Listens to topics (name to configured type, empty for any) until told to stop."""
+
+    def __init__(self, settings: Settings, topics: Mapping[str, str], sink: Sink) -> None:
+        self._settings = settings
+        self._sink = sink
+        self._memory = Memory(sink)
+        self._reports = Reports(sink, topics)
+        self._master = Master(settings)
+        self._subscriptions: dict[str, Subscription] = {}
+        self._registered: set[str] = set()
+        self._unheard_since: dict[str, float] = {}
+        self._updates: SimpleQueue[Update | None] = SimpleQueue()
+        self._node: Node | None = None
+        self._own_uri = ""
+        self._failures = 0
+        for topic in topics:
+            self._subscribe(topic)
+
+    def run(self, stop: threading.Event) -> None:
+        """Listen until ``stop``; raises only errors of ours."""
+        updates = threading.Thread(target=self._take_updates, name="ros-updates", daemon=True)
+        updates.start()
+        try:
+            self._start_node()
+            for subscription in self._subscriptions.values():
+                subscription.connect_remembered()
+            while not stop.is_set():
+                self._watch_master()
+                stop.wait(self._delay_s())
+                self._raise_failure()
+        finally:
+            self._close(updates)
+
+    def _start_node(self) -> None:
+        if self._settings.invisible:
+            return
+        host, _ = host_and_port(self._settings.master_uri)
+        bind_host = "127.0.0.1" if is_loopback(host) else ""
+        self._node = Node(
+            bind_host,
+            self._memory.port,
+            self._settings.master_uri,
+            lambda topic, uris: self._updates.put((topic, uris)),
+            self._reports.told_to_stop,
+        )
+        self._memory.use_port(self._node.port)
+        self._node.start()
+
+    def _take_updates(self) -> None:
+        """Handle the master's notices one after the other, apart from answering it."""
+        while (update := self._updates.get()) is not None:
+            topic, uris = update
+            subscription = self._subscriptions.get(global_name(topic))
+            if subscription is not None:
+                try:
+                    subscription.noticed(uris)
+                except Exception as error:
+                    self._reports.crashed(error)
+
+    def _watch_master(self) -> None:
+        """Ask the master once; whatever it does not answer is asked again later."""
+        asked_ns = self._sink.now_ns()
+        try:
+            graph = self._master.graph()
+            self._reports.master_found(self._settings.master_uri)
+            self._failures = 0
+            self._follow_new_topics(graph)
+            self._register(graph)
+            self._poll(asked_ns, graph)
+        except RosError as error:
+            self._failures += 1
+            self._reports.master_lost(self._settings.master_uri, error)
+        self._memory.save()
+
+    def _follow_new_topics(self, graph: Graph) -> None:
+        if self._settings.all_topics:
+            for topic in graph.publishers.keys() - self._subscriptions.keys() - NOT_FOLLOWED:
+                self._subscribe(topic)
+
+    def _subscribe(self, topic: str) -> None:
+        self._subscriptions[topic] = Subscription(
+            topic, self._sink, self._memory, self._settings, self._reports
+        )
+
+    def _register(self, graph: Graph) -> None:
+        """Register where the master does not name the box: at first, and when it forgot."""
+        if self._node is None:
+            return
+        own = self._settings.caller_id
+        forgotten = {t for t in self._registered if own not in graph.subscribers.get(t, ())}
+        if forgotten:
+            self._reports.forgotten(forgotten)
+        for topic in forgotten:
+            self._registered.discard(topic)
+            self._subscriptions[topic].master_restarted()
+        for topic in [t for t in self._subscriptions if t not in self._registered]:
+            uris = self._master.subscribe(topic, self._node_uri(self._node))
+            self._registered.add(topic)
+            self._subscriptions[topic].listed(uris)
+
+    def _node_uri(self, node: Node) -> str:
+        if not self._own_uri:
+            host = own_host(self._settings.advertise, os.environ, self._settings.master_uri)
+            self._own_uri = f"http://{host}:{node.port}/"
+        return self._own_uri
+
+    def _poll(self, asked_ns: int, graph: Graph) -> None:
+        for topic, subscription in self._subscriptions.items():
+            nodes = graph.publishers.get(topic, ())
+            subscription.polled(asked_ns, nodes, self._master.node_uri)
+            self._watch_unknown(topic, bool(nodes) or bool(subscription.peers()), graph)
+
+    def _watch_unknown(self, topic: str, is_known: bool, graph: Graph) -> None:
+        now_s = time.monotonic()
+        since_s = self._unheard_since.setdefault(topic, now_s)
+        if is_known:
+            del self._unheard_since[topic]
+        elif now_s - since_s >= self._settings.unknown_after_s:
+            self._reports.unknown_topic(topic, graph.publishers.keys() - {topic})
+
+    def _delay_s(self) -> float:
+        if not self._failures:
+            return self._settings.poll_s
+        longest_s = max(LONGEST_WAIT_S, self._settings.poll_s)
+        return min(self._settings.poll_s * 2.0 ** min(self._failures - 1, 16), longest_s)
+
+    def _raise_failure(self) -> None:
+        if self._reports.failure is not None:
+            raise self._reports.failure
+
+    def _close(self, updates: threading.Thread) -> None:
+        """End the links first: from then on nothing arrives, and the record says so."""
+        self._updates.put(None)
+        updates.join(self._settings.timeout_s)
+        for subscription in self._subscriptions.values():
+            subscription.close(STOPPED)
+        for subscription in self._subscriptions.values():
+            subscription.join(self._settings.timeout_s)
+        self._memory.save()
+        if self._node is not None:
+            self._unregister()
+            self._node.close()
+        self._master.close()
+
+    def _unregister(self) -> None:
+        if self._failures:
+            return  # the master is not there to be told
+        try:
+            for topic in sorted(self._registered):
+                self._master.unsubscribe(topic, self._own_uri)
+        except RefusedError:
+            return
+        except RosError as error:
+            self._reports.master_lost(self._settings.master_uri, error)

@@ -1,0 +1,102 @@
+"""What the box remembers of publishers across its own restarts.
+
+A master that was restarted does not know the publishers that are still alive; their last known
+addresses do. The digest of what each one latched tells a repeated delivery from a new message.
+"""
+
+from __future__ import annotations
+
+import threading
+from typing import Any
+
+from amberbox.core.source import Sink
+
+MOST_PER_TOPIC = 8
+
+Table = dict[str, dict[str, str]]
+
+
+class Memory:
+    """Node addresses and latched digests per topic and node, and the node server's port."""
+
+    def __init__(self, sink: Sink) -> None:
+        state = sink.state()
+        self._sink = sink
+        self._lock = threading.Lock()
+        self._saving = threading.Lock()
+        self._changed = False
+        self.port = int(state.get("port", 0))
+        self._uris: Table = _table(state.get("publishers"))
+        self._latched: Table = _table(state.get("latched"))
+
+    def uris(self, topic: str) -> list[str]:
+        """Return the addresses at which a topic was published when it was last heard."""
+        with self._lock:
+            return list(self._uris.get(topic, {}).values())
+
+    def knows(self, topic: str, node: str, uri: str) -> bool:
+        """Tell whether this very process of a node has been connected before."""
+        with self._lock:
+            return self._uris.get(topic, {}).get(node) == uri
+
+    def remember(self, topic: str, node: str, uri: str) -> None:
+        """Keep where a node is, at once: the box may be killed next."""
+        with self._lock:
+            nodes = self._uris.setdefault(topic, {})
+            if nodes.pop(node, None) != uri:
+                self._changed = True
+            nodes[node] = uri
+            for oldest in list(nodes)[:-MOST_PER_TOPIC]:
+                del nodes[oldest]
+                self._latched.get(topic, {}).pop(oldest, None)
+        self.save()
+
+    def forget(self, topic: str, uri: str) -> None:
+        """Drop an address that is known to publish the topic no more."""
+        with self._lock:
+            nodes = self._uris.get(topic, {})
+            for node in [node for node, at in nodes.items() if at == uri]:
+                del nodes[node]
+                self._latched.get(topic, {}).pop(node, None)
+                self._changed = True
+
+    def latched(self, topic: str, node: str) -> str | None:
+        """Return the digest of what a node latched last."""
+        with self._lock:
+            return self._latched.get(topic, {}).get(node)
+
+    def latch(self, topic: str, node: str, digest: str) -> None:
+        """Keep the digest of what a node latched; saved with the next ``save``."""
+        with self._lock:
+            self._latched.setdefault(topic, {})[node] = digest
+            self._changed = True
+
+    def use_port(self, port: int) -> None:
+        """Keep the node server's port, for the same address after a restart."""
+        self._changed |= port != self.port
+        self.port = port
+        self.save()
+
+    def save(self) -> None:
+        """Hand what changed to the store."""
+        with self._saving:  # readers wait for the lock of the tables only, never for the store
+            state = self._changed_state()
+            if state is not None:
+                self._sink.save_state(state)
+
+    def _changed_state(self) -> dict[str, Any] | None:
+        with self._lock:
+            if not self._changed:
+                return None
+            self._changed = False
+            tables = {"publishers": self._uris, "latched": self._latched}
+            copies = {
+                name: {t: dict(n) for t, n in table.items()} for name, table in tables.items()
+            }
+            return {"port": self.port, **copies}
+
+
+def _table(saved: Any) -> Table:
+    if not isinstance(saved, dict):
+        return {}
+    return {str(t): {str(n): str(v) for n, v in nodes.items()} for t, nodes in saved.items()}

@@ -1,0 +1,121 @@
+"""Calls to a ROS 1 master or node: XML-RPC with a time limit, answers checked."""
+
+from __future__ import annotations
+
+import http.client
+import xmlrpc.client
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+from xml.parsers.expat import ExpatError
+
+from amberbox.blackbox.ros1.names import host_and_port, mapped, mapped_host
+from amberbox.blackbox.ros1.settings import NoAnswerError, RefusedError, Settings
+
+
+class _TimedTransport(xmlrpc.client.Transport):
+    """Gives up after a while; keeps its connection between calls."""
+
+    def __init__(self, timeout_s: float) -> None:
+        super().__init__()
+        self._timeout_s = timeout_s
+
+    def make_connection(self, host: Any) -> http.client.HTTPConnection:
+        if self._connection and host == self._connection[0] and self._connection[1]:
+            return self._connection[1]
+        connection = http.client.HTTPConnection(str(host), timeout=self._timeout_s)
+        self._connection = host, connection
+        return connection
+
+
+class Api:
+    """One master or node that answers ``(code, text, value)``; for one thread."""
+
+    def __init__(self, uri: str, settings: Settings) -> None:
+        self.uri = uri
+        self._caller_id = settings.caller_id
+        address = mapped(uri, settings.hosts)
+        transport = _TimedTransport(settings.timeout_s)
+        self._proxy = xmlrpc.client.ServerProxy(address, transport, allow_none=True)
+
+    def call(self, method: str, *arguments: Any) -> Any:
+        """Call a method; raise NoAnswerError or RefusedError."""
+        try:
+            answer = getattr(self._proxy, method)(self._caller_id, *arguments)
+            code, text, value = answer
+        except OSError as error:
+            raise NoAnswerError(f"{self.uri}: {error.strerror or error}") from error
+        except (http.client.HTTPException, xmlrpc.client.Error, ExpatError) as error:
+            raise NoAnswerError(f"{self.uri} does not speak ROS: {error}") from error
+        except (TypeError, ValueError) as error:
+            raise NoAnswerError(f"{self.uri} gave no ROS answer to {method}: {error}") from error
+        if code != 1:
+            raise RefusedError(f"{self.uri} refused {method}: {text}")
+        return value
+
+    def close(self) -> None:
+        """End the connection that is kept between calls."""
+        self._proxy("close")()
+
+
+@dataclass(frozen=True)
+class Graph:
+    """Who publishes and who subscribes what, as the master knows it."""
+
+    publishers: Mapping[str, Sequence[str]]
+    subscribers: Mapping[str, Sequence[str]]
+
+
+class Master:
+    """The calls to the ROS master that a listener needs."""
+
+    def __init__(self, settings: Settings) -> None:
+        self._api = Api(settings.master_uri, settings)
+
+    def graph(self) -> Graph:
+        """Ask who publishes and subscribes what."""
+        try:
+            publishers, subscribers, _ = self._api.call("getSystemState")
+            return Graph(dict(publishers), dict(subscribers))
+        except (TypeError, ValueError) as error:
+            raise NoAnswerError(f"{self._api.uri} gave no system state: {error}") from error
+
+    def node_uri(self, node: str) -> str:
+        """Ask where a node can be called; RefusedError if the master does not know it."""
+        return str(self._api.call("lookupNode", node))
+
+    def subscribe(self, topic: str, own_uri: str) -> list[str]:
+        """Register as a subscriber; return the URIs of the publishers."""
+        return [str(uri) for uri in self._api.call("registerSubscriber", topic, "*", own_uri)]
+
+    def unsubscribe(self, topic: str, own_uri: str) -> None:
+        """Take the registration back."""
+        self._api.call("unregisterSubscriber", topic, own_uri)
+
+    def close(self) -> None:
+        """End the connection."""
+        self._api.close()
+
+
+def request_topic(node_uri: str, topic: str, settings: Settings) -> tuple[str, int]:
+    """Ask a publisher where to connect for a topic; return host and TCP port."""
+    try:
+        api = Api(node_uri, settings)
+    except ValueError as error:
+        raise NoAnswerError(str(error)) from error
+    try:
+        answer = api.call("requestTopic", topic, [["TCPROS"]])
+        _, host, port = answer
+        return mapped_host(str(host), settings.hosts), int(port)
+    except (TypeError, ValueError) as error:
+        raise RefusedError(f"{node_uri} offers no TCPROS connection for {topic}") from error
+    finally:
+        api.close()
+
+
+def host_of(uri: str) -> str:
+    """Return the host of a URI for messages, or the URI itself."""
+    try:
+        return host_and_port(uri)[0]
+    except ValueError:
+        return uri

@@ -1,0 +1,114 @@
+"""ROS 1: topics of a robot with a ROS master, message definitions taken from the wire."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+from amberbox.blackbox.ros1.client import Client
+from amberbox.blackbox.ros1.names import DEFAULT_MASTER, global_name, is_global_name, master_uri
+from amberbox.blackbox.ros1.settings import Settings
+from amberbox.core.errors import UsageError
+from amberbox.core.options import option
+from amberbox.core.source import Sink, TopicOptions
+
+SAMPLE = """\
+- ros:
+    ros_master_uri: http://localhost:11311
+    topics:
+      - topic:
+          name: /odom
+          variable_names: [pose/pose/position/x, pose/pose/position/y]
+          max_frequency: 10
+      - topic: {name: /scan}
+"""
+
+
+@dataclass(frozen=True)
+class Config:
+    """The ``ros`` block."""
+
+    ros_master_uri: str = option("", "the master; ROS_MASTER_URI, else localhost when absent")
+    topics: Sequence[TopicOptions] = option((), "topics to record, of any type")
+    all_topics: bool = option(False, "record every topic the master knows, /rosout excepted")
+    invisible: bool = option(False, "find publishers by asking only, never register as a node")
+    poll_s: float = option(1.0, "how often the master is asked who publishes", unit="s")
+    hosts: Mapping[str, str] = option({}, "addresses of host names that do not resolve here")
+    caller_id: str = option("/amberbox", "name of the box as a ROS node; one per box and master")
+    advertise: str = option("", "own address for the master; ROS_HOSTNAME, ROS_IP when absent")
+    tcp_nodelay: bool = option(True, "ask publishers to send small messages without delay")
+    max_message_mb: float = option(1024.0, "longer messages are taken for garbage", unit="MB")
+    dead_after_s: float = option(40.0, "a silent peer is probed and given up after", unit="s")
+
+    def check(self) -> Iterator[tuple[str, str]]:
+        """Say which values cannot work; opens nothing."""
+        yield from self._check_addresses()
+        yield from self._check_topics()
+        if not 0.05 <= self.poll_s <= 3600:
+            yield "poll_s", "must be between 0.05 and 3600 seconds"
+        if not 0 < self.max_message_mb <= 4095:
+            yield "max_message_mb", "must be above 0, and TCPROS allows 4095 at most"
+        if not 4 <= self.dead_after_s <= 86400:
+            yield "dead_after_s", "must be between 4 seconds and a day"
+
+    def _check_addresses(self) -> Iterator[tuple[str, str]]:
+        if self.ros_master_uri:
+            try:
+                master_uri(self.ros_master_uri)
+            except ValueError as error:
+                yield "ros_master_uri", f"{error}; write http://HOST:11311"
+        if not is_global_name(global_name(self.caller_id)):
+            yield "caller_id", f"'{self.caller_id}' is not a name ROS allows for a node"
+
+    def _check_topics(self) -> Iterator[tuple[str, str]]:
+        if not self.topics and not self.all_topics:
+            yield "topics", "names no topic; list them, or write 'all_topics: true'"
+        seen: dict[str, str] = {}
+        for name in (topic.name for topic in self.topics):
+            whole = global_name(name)
+            if not is_global_name(whole):
+                yield "topics", f"'{name}' is not a name ROS allows for a topic"
+            elif seen.setdefault(whole, name) != name:
+                yield "topics", f"'{seen[whole]}' and '{name}' are the same topic"
+
+
+class Source:
+    """A ROS 1 subscriber in pure Python; records message bytes as they come."""
+
+    lossless = False
+
+    def __init__(self, config: Config, name: str) -> None:
+        self._config = config
+        self._name = name
+
+    def topics(self) -> Sequence[TopicOptions]:
+        """Return the topics configured, with the leading slash that ROS gives them."""
+        return [replace(topic, name=global_name(topic.name)) for topic in self._config.topics]
+
+    def run(self, sink: Sink, stop: threading.Event) -> None:
+        """Listen until ``stop``; master and publishers may come, go and return."""
+        types = {topic.name: topic.type for topic in self.topics()}
+        Client(settings(self._config), types, sink).run(stop)
+
+
+def settings(config: Config) -> Settings:
+    """Complete a configuration from the environment; raise UsageError for a bad master URI."""
+    text = config.ros_master_uri or os.environ.get("ROS_MASTER_URI") or DEFAULT_MASTER
+    try:
+        uri = master_uri(text)
+    except ValueError as error:
+        raise UsageError(f"ros_master_uri: {error}", "write http://HOST:11311") from error
+    return Settings(
+        master_uri=uri,
+        caller_id=global_name(config.caller_id),
+        hosts=config.hosts,
+        advertise=config.advertise,
+        invisible=config.invisible,
+        all_topics=config.all_topics,
+        poll_s=config.poll_s,
+        tcp_nodelay=config.tcp_nodelay,
+        message_limit=round(config.max_message_mb * 1_000_000),
+        dead_after_s=config.dead_after_s,
+    )
