@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -58,8 +59,12 @@ class Expression:
 
     def addresses(self) -> tuple[str, ...]:
         """Return the addresses it reads, in order, each once."""
-        names = (part.name for part in walk(self.tree) if isinstance(part, Address))
-        return tuple(dict.fromkeys(names))
+        return tuple(address.name for address in self._reads)
+
+    @cached_property
+    def _reads(self) -> tuple[Address, ...]:
+        found = (part for part in walk(self.tree) if isinstance(part, Address))
+        return tuple({address.name: address for address in found}.values())
 
     @property
     def kind(self) -> Kind:
@@ -92,7 +97,9 @@ class Expression:
         """
         now = np.zeros(1, np.int64)
         with _located(self.text):
-            series = series_of(self.tree, {name: (now, [value]) for name, value in values.items()})
+            series = series_of(
+                self._reads, {name: (now, [value]) for name, value in values.items()}
+            )
             where = Instants(series, now, slice(0, 1), has_time=False)
             return _python(evaluate(self.tree, where).scalar(0))
 
@@ -104,7 +111,7 @@ class Expression:
         """
         times_ns = _checked_times(times_ns, "the rows")
         with _located(self.text):
-            series = series_of(self.tree, {name: (times_ns, c) for name, c in columns.items()})
+            series = series_of(self._reads, {name: (times_ns, c) for name, c in columns.items()})
             return evaluate(self.tree, rows_of(self.tree, series, times_ns)).column()
 
     def evaluate_series(
@@ -118,7 +125,7 @@ class Expression:
         instants = np.atleast_1d(np.asarray(at_ns, np.int64))
         checked = {n: (_checked_times(t, f"'{n}'"), values) for n, (t, values) in series.items()}
         with _located(self.text):
-            where = Instants(series_of(self.tree, checked), instants)
+            where = Instants(series_of(self._reads, checked), instants)
             values = evaluate(self.tree, where)
         return _python(values.scalar(0)) if np.ndim(at_ns) == 0 else values.column()
 

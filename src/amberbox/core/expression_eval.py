@@ -69,25 +69,27 @@ class Instants:
         return Instants(self.series, times_ns)
 
 
-def series_of(tree: Tree, columns: Mapping[str, tuple[IntArray, Any]]) -> dict[str, Series]:
-    """Look up every address of a tree; raise Fault for one that is not there."""
-    found: dict[str, Series] = {}
-    for part in walk(tree):
-        if isinstance(part, Address) and part.name not in found:
-            found[part.name] = _series(part, columns)
-    return found
+def series_of(
+    reads: Iterable[Address], columns: Mapping[str, tuple[IntArray, Any]]
+) -> dict[str, Series]:
+    """Look up every address that a tree reads; raise Fault for one that is not there."""
+    return {address.name: _series(address, columns) for address in reads}
 
 
 def evaluate(tree: Tree, where: Instants) -> Values:
     """Return the value of a tree at each instant."""
     with np.errstate(all="ignore"):
-        return _VALUE[type(tree)](tree, where)
+        return _value(tree, where)
 
 
 def rows_of(tree: Tree, series: Mapping[str, Series], times_ns: IntArray) -> Instants:
     """Evaluate row by row where no history is needed, else at the instants of the rows."""
     whole = None if needs_history(tree) else slice(0, len(times_ns))
     return Instants(series, times_ns, whole)
+
+
+def _value(tree: Tree, where: Instants) -> Values:
+    return _VALUE[type(tree)](tree, where)
 
 
 def _series(part: Address, columns: Mapping[str, tuple[IntArray, Any]]) -> Series:
@@ -125,11 +127,11 @@ def _address(tree: Address, where: Instants) -> Values:
 
 
 def _number(tree: Tree, where: Instants, wanted_by: str) -> Values:
-    return on.as_number(evaluate(tree, where), wanted_by, tree.at)
+    return on.as_number(_value(tree, where), wanted_by, tree.at)
 
 
 def _condition(tree: Tree, where: Instants, wanted_by: str) -> Values:
-    return on.as_condition(evaluate(tree, where), wanted_by, tree.at)
+    return on.as_condition(_value(tree, where), wanted_by, tree.at)
 
 
 def _negative(tree: Negative, where: Instants) -> Values:
@@ -144,7 +146,7 @@ def _arithmetic(tree: Arithmetic, where: Instants) -> Values:
 
 
 def _comparison(tree: Comparison, where: Instants) -> Values:
-    sides = [evaluate(operand, where) for operand in tree.operands]
+    sides = [_value(operand, where) for operand in tree.operands]
     pairs = zip(tree.operators, sides, sides[1:], strict=False)
     return on.joined("and", [on.compare(sign, a, b, tree.at) for sign, a, b in pairs])
 
@@ -160,7 +162,7 @@ def _logic(tree: Logic, where: Instants) -> Values:
 
 def _call(tree: Call, where: Instants) -> Values:
     if tree.name == "known":
-        null = evaluate(tree.arguments[0], where).null
+        null = _value(tree.arguments[0], where).null
         return Values(~null, np.zeros(len(null), bool), "condition")
     return on.call(tree.name, [_number(part, where, tree.name) for part in tree.arguments])
 
@@ -197,9 +199,9 @@ def _samples(tree: Window, where: Instants) -> tuple[IntArray, Values]:
     if len(clocks) == 1 and not needs_history(tree.inner):
         rows = slice(*(int(np.searchsorted(clocks[0], t, "right")) for t in (since, until)))
         times_ns = clocks[0][rows]
-        return times_ns, evaluate(tree.inner, Instants(where.series, times_ns, rows))
+        return times_ns, _value(tree.inner, Instants(where.series, times_ns, rows))
     times_ns = _between(clocks, since, until)
-    return times_ns, evaluate(tree.inner, where.moved(times_ns))
+    return times_ns, _value(tree.inner, where.moved(times_ns))
 
 
 def _held(tree: Held, where: Instants) -> Values:
