@@ -89,19 +89,12 @@ class _OpenFile:
 class JournalWriter:
     """Appends messages of one run to a series of MCAP files. Not thread-safe: one owner."""
 
-    def __init__(
-        self,
-        options: JournalOptions,
-        *,
-        on_new_file: Callable[[], None] | None = None,
-        chain: str = EMPTY_CHAIN,
-    ) -> None:
+    def __init__(self, options: JournalOptions, *, chain: str = EMPTY_CHAIN) -> None:
         self.options = options
         self.next_seq = 0
         self.durable_seq = 0
         self.chain = chain
         self.bytes_written = 0
-        self._on_new_file = on_new_file
         self._schemas: dict[Schema, int] = {}
         self._channels: list[Channel] = []
         self._records: list[bytes] = []
@@ -332,8 +325,6 @@ class JournalWriter:
             os.close(fd)
             path.unlink()
             raise
-        if self._on_new_file is not None:
-            self._on_new_file()
 
     def _start_values(self, file: _OpenFile) -> dict[str, str]:
         options = self.options

@@ -344,3 +344,17 @@ def _unpile(
             on_gap(gap)
     if made.batch is not None:
         yield made.batch
+
+
+def last_message(store: Path, item: str) -> bytes | None:
+    """Return the newest latched message of an item, repeated ones included."""
+    for journal in reversed(journals(store)):
+        numbers = [n for n, s in journal.streams.items() if s.item == item and s.topic.latched]
+        found = None
+        for chunk in sound_chunks(journal) if numbers else ():
+            rows = np.flatnonzero(np.isin(chunk.channel, numbers))
+            if len(rows):
+                found = chunk.messages(rows[-1:])[0]
+        if found is not None:
+            return found
+    return None

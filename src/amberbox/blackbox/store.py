@@ -41,7 +41,7 @@ class Store:
     def next_run(self) -> int:
         """Count one more run, never one that was used before, also after a power cut."""
         run = 1 + max([self._counted(), *self._runs_on_disk()])
-        _replace(self.path / _RUN, str(run))
+        replace_file(self.path / _RUN, str(run))
         return run
 
     def _counted(self) -> int:
@@ -84,7 +84,7 @@ def create_store(path: Path) -> Store:
         return open_store(path)
     try:
         path.mkdir(parents=True, exist_ok=True)
-        _replace(path / _IDENTITY, json.dumps({"store_id": str(uuid.uuid4()), "format": 1}))
+        replace_file(path / _IDENTITY, json.dumps({"store_id": str(uuid.uuid4()), "format": 1}))
     except OSError as error:
         raise AmberboxError(
             f"cannot write to the store {path}: {error.strerror}",
@@ -145,7 +145,7 @@ def run_and_number(path: Path) -> tuple[int, int]:
         return 0, 0
 
 
-def _replace(path: Path, text: str) -> None:
+def replace_file(path: Path, text: str) -> None:
     """Write a small file so that a power cut leaves the old or the new one."""
     part = path.with_name(path.name + ".part")
     with part.open("w") as file:

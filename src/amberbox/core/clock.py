@@ -69,3 +69,7 @@ class RunClock:
     def offset_ns(self) -> int:
         """Wall minus log time: 0 until the wall clock is stepped or slewed."""
         return self.clock.wall_ns() - self.now_ns()
+
+    def synchronised(self) -> bool | None:
+        """Tell whether the wall clock is disciplined; None if nobody can know."""
+        return self.clock.synchronised()

@@ -1,0 +1,92 @@
+"""Gap records: from when to when nothing of a publisher could be heard, and why."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+Write = Callable[[dict[str, Any]], None]
+
+
+@dataclass
+class GapLog:
+    """Keeps the gaps that are open, per item and peer, and writes each as it opens and closes.
+
+    The record of the opening has ``to_ns`` null: should the box die, the gap lasts at least to
+    the end of its record, and the next run opens its own from there.
+    """
+
+    write: Write
+    start_ns: int
+    _open: dict[tuple[str, str], tuple[int, str]] = field(default_factory=dict)
+    _known: set[tuple[str, str]] = field(default_factory=set)
+
+    def __post_init__(self) -> None:
+        self._lock = threading.Lock()
+
+    def expect(self, item: str, reason: str) -> None:
+        """Open the gap that every configured item has until its first publisher is heard."""
+        with self._lock:
+            self._begin(item, "", self.start_ns, reason)
+
+    def up(self, item: str, peer: str, now_ns: int, since_ns: int | None) -> None:
+        """Close what is open for a peer; for a new one write what it may have said before."""
+        with self._lock:
+            first = self._open.get((item, ""))
+            closed = self._end(item, "", peer, now_ns)
+            closed |= self._end(item, peer, peer, now_ns)
+            new = (item, peer) not in self._known
+            self._known.add((item, peer))
+            if new and not closed and first is None:
+                start = self.start_ns if since_ns is None else max(since_ns, self.start_ns)
+                self._write(item, peer, start, now_ns, "publisher not connected yet")
+
+    def down(self, item: str, peer: str, now_ns: int, reason: str) -> None:
+        """Open a gap for a peer that was lost."""
+        with self._lock:
+            self._known.add((item, peer))
+            self._begin(item, peer, now_ns, reason)
+
+    def dropped(self, item: str, from_ns: int, to_ns: int, count: int) -> None:
+        """Write what the box itself had to drop."""
+        self._write(item, "", from_ns, to_ns, "dropped: queue full", count)
+
+    def close(self, now_ns: int) -> None:
+        """End everything that is open: the run is over."""
+        with self._lock:
+            for (item, peer), (from_ns, reason) in self._open.items():
+                self._write(item, peer, from_ns, now_ns, reason)
+            self._open.clear()
+
+    def _begin(self, item: str, peer: str, from_ns: int, reason: str) -> None:
+        if (item, peer) not in self._open:
+            self._open[item, peer] = (from_ns, reason)
+            self._write(item, peer, from_ns, None, reason)
+
+    def _end(self, item: str, key: str, peer: str, now_ns: int) -> bool:
+        opened = self._open.pop((item, key), None)
+        if opened is not None:
+            self._write(item, peer, opened[0], now_ns, opened[1])
+        return opened is not None
+
+    def _write(
+        self,
+        item: str,
+        peer: str,
+        from_ns: int,
+        to_ns: int | None,
+        reason: str,
+        count: int | None = None,
+    ) -> None:
+        self.write(
+            {
+                "item": item,
+                "peer": peer,
+                "from_ns": from_ns,
+                "to_ns": to_ns,
+                "reason": reason,
+                "count": count,
+            }
+        )

@@ -1,0 +1,115 @@
+"""The keeper: turns finished journals into segments and trims the ring, beside the recorder.
+
+It runs as a process of its own at low priority, so that nothing it does can hold up recording.
+Only the keeper deletes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import signal
+import sys
+import threading
+from collections.abc import Sequence
+from pathlib import Path
+
+from amberbox.blackbox.read import JournalFile, journal_file
+from amberbox.blackbox.segments import build_segments, can_build, merge_small
+from amberbox.blackbox.store import Store, WriterLock, is_locked, open_store
+from amberbox.core.clock import NS
+from amberbox.core.errors import AmberboxError, UsageError
+
+PERIOD_S = 2.0
+
+
+class Keeper:
+    """Keeps one store; ``step`` does what there is to do now."""
+
+    def __init__(self, store: Store, ring_s: float) -> None:
+        self._store = store
+        self._ring_s = ring_s
+        self._with_segments = can_build()
+        self._refused: set[str] = set()
+
+    def step(self, stop: threading.Event) -> None:
+        """Build the segments of sealed journals, then trim the ring."""
+        if self._with_segments:
+            self._build(stop)
+        self._trim_ring()
+
+    def _build(self, stop: threading.Event) -> None:
+        from amberbox.blackbox import manifest
+
+        done = manifest.read(self._store.path).journals
+        built = 0
+        for journal in self.sealed("main"):
+            if stop.is_set():
+                return
+            if journal.name not in done and journal.name not in self._refused:
+                built += self._build_one(journal)
+        if built:
+            merge_small(self._store.path)
+
+    def _build_one(self, journal: JournalFile) -> int:
+        try:
+            build_segments(self._store.path, journal)
+        except (AmberboxError, OSError, ValueError) as error:
+            self._refused.add(journal.name)  # its rows stay readable in the journal
+            print(f"amberbox keeper: {journal.name}: no segments: {error}", file=sys.stderr)
+            return 0
+        return 1
+
+    def sealed(self, writer: str) -> list[JournalFile]:
+        """Return the journal files that nobody writes any more."""
+        paths = self._store.journal_files(writer)
+        if is_locked(self._store, writer):
+            paths = paths[:-1]
+        files = [journal_file(path, f"{path.parent.name}/{path.name}") for path in paths]
+        return [journal for journal in files if journal.rows]
+
+    def _trim_ring(self) -> None:
+        """Delete ring files that ended longer ago than the ring is long."""
+        files = self.sealed("ring")
+        newest_ns = max((journal.end_ns for journal in files), default=0)
+        for journal in files:
+            if journal.end_ns < newest_ns - self._ring_s * NS:
+                journal.path.unlink(missing_ok=True)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Keep a store until told to stop, or until the recorder that started this is gone."""
+    parser = argparse.ArgumentParser(prog="python -m amberbox.blackbox.keeper")
+    parser.add_argument("store", type=Path)
+    parser.add_argument("--ring-s", type=float, default=300.0)
+    parser.add_argument("--parent", type=int, default=0)
+    parser.add_argument("--once", action="store_true")
+    options = parser.parse_args(arguments)
+    stop = threading.Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: stop.set())
+    os.nice(10)
+    try:
+        store = open_store(options.store)
+        lock = WriterLock(store, "keeper")
+    except UsageError as error:
+        print(f"amberbox keeper: {error}", file=sys.stderr)
+        return error.exit_code
+    keeper = Keeper(store, options.ring_s)
+    while True:
+        keeper.step(stop)
+        gone = options.parent and os.getppid() != options.parent
+        if options.once or gone or stop.wait(PERIOD_S):
+            break
+    lock.release()
+    return 0
+
+
+def seal(store: Store) -> None:
+    """Build what can be built once, as an import does at its end."""
+    if can_build():
+        Keeper(store, ring_s=float("inf")).step(threading.Event())
+
+
+if __name__ == "__main__":
+    sys.exit(main())

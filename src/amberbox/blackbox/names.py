@@ -1,0 +1,40 @@
+"""Names of a store's items: given once, unique, kept for good."""
+
+from __future__ import annotations
+
+import json
+import threading
+from pathlib import Path
+
+from amberbox.blackbox.store import replace_file
+from amberbox.core.names import extend_names, item_name
+
+_FILE = "names.json"
+
+
+class ItemNames:
+    """Gives each topic of each source its item name, the same in every run of a store."""
+
+    def __init__(self, store: Path) -> None:
+        self._path = store / _FILE
+        self._lock = threading.Lock()
+        self._names: dict[str, str] = {}
+        try:
+            self._names = json.loads(self._path.read_text())
+        except (OSError, ValueError):  # a new store, or a file that is made again from topics
+            self._names = {}
+
+    def name(self, source: str, topic: str) -> str:
+        """Return the item name of a topic; one that would collide gets a suffix of its own."""
+        key = f"{source} {topic.strip('/')}"
+        with self._lock:
+            if key not in self._names:
+                self._names = self._extended(key, item_name(source, topic))
+                replace_file(self._path, json.dumps(self._names, indent=0))
+            return self._names[key]
+
+    def _extended(self, key: str, plain: str) -> dict[str, str]:
+        """Let the plain name stand if it is free, else name the key by its path."""
+        if plain.casefold() not in {name.casefold() for name in self._names.values()}:
+            return {**self._names, key: plain}
+        return extend_names(self._names, [key], lambda name: False)

@@ -1,0 +1,102 @@
+"""One topic on its way into the journal: its item, its filters, its counters."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+from amberbox.blackbox.filters.change import ChangeFilter
+from amberbox.blackbox.filters.rate import RateLimit
+from amberbox.blackbox.unroll.compile import Unroller, unroller
+from amberbox.core.errors import AmberboxError
+from amberbox.core.source import TopicOptions
+from amberbox.core.types import Topic
+
+
+@dataclass(slots=True)
+class Counters:
+    """What happened to an item's messages since the start of the run."""
+
+    received: int = 0
+    kept: int = 0
+    rate_limited: int = 0
+    unchanged: int = 0
+    dropped: int = 0
+    bytes: int = 0
+    last_received_ns: int = 0
+
+
+@dataclass(slots=True)
+class Item:
+    """A data item: what is configured for it, and what all its streams share."""
+
+    name: str
+    source: str
+    topic: str
+    options: TopicOptions
+    counters: Counters = field(default_factory=Counters)
+    rate: RateLimit | None = None
+    change: ChangeFilter | None = None
+    drops: tuple[int, int, int] | None = None
+    """First and last time and count of messages dropped since the last gap record."""
+    last_latched: bytes | None = None
+    reported: Counters = field(default_factory=Counters)
+    malformed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.options.max_frequency:
+            self.rate = RateLimit(self.options.max_frequency)
+
+    @property
+    def writer(self) -> str:
+        """Journal that this item's keeping class is written to."""
+        return "main" if self.options.keep == "all" else "ring"
+
+    def describe(self) -> dict[str, Any]:
+        """Say in the run record what is configured for the item."""
+        options = asdict(self.options)
+        return {
+            "source": self.source,
+            "topic": self.topic,
+            "type": self.options.type,
+            "variables": list(self.options.variable_names),
+            "max_frequency": self.options.max_frequency,
+            "keep": self.options.keep,
+            "change": options["change"],
+        }
+
+
+@dataclass(slots=True)
+class Stream:
+    """One definition of an item's messages; a change of type makes another stream."""
+
+    item: Item
+    topic: Topic
+    channel: int = -1
+    stamps: Unroller | None = None
+    infers: bool = False
+
+    @property
+    def counters(self) -> Counters:
+        """Counters of the item."""
+        return self.item.counters
+
+    def drop(self, received_ns: int) -> None:
+        """Count a message that found no room."""
+        self.item.counters.dropped += 1
+        first, _, count = self.item.drops or (received_ns, received_ns, 0)
+        self.item.drops = (first, received_ns, count + 1)
+
+    def stamp_ns(self, data: bytes, received_ns: int) -> int:
+        """Return the message's own time stamp, else the time of receipt."""
+        if self.stamps is None:
+            return received_ns
+        return self.stamps.stamp_ns(data) or received_ns
+
+    def compile(self) -> str:
+        """Build the unroller before the first row; return what is wrong with the definition."""
+        try:
+            self.stamps = unroller(self.topic, self.item.options.stamp)
+        except AmberboxError as error:
+            return error.what
+        return ""
