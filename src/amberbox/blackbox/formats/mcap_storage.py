@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
 from amberbox.blackbox import mcap
-from amberbox.blackbox.chunk import Chunk
+from amberbox.blackbox.chunk import Chunk, open_chunk
+from amberbox.blackbox.formats.compression import unpack
 from amberbox.blackbox.formats.definitions import Definitions
 from amberbox.blackbox.formats.recording import (
     Damage,
@@ -38,6 +38,7 @@ class McapFile:
     buffer: Any
     close: Callable[[], None]
     topic_of: dict[int, int] = field(default_factory=dict)
+    torn: Chunk | None = None
 
     def damaged(self, offset: int, length: int, reason: str) -> None:
         """Note what cannot be read."""
@@ -58,12 +59,15 @@ def open_mcap(path: Path, report: Report) -> McapFile:
         ) from None
     file = McapFile(path, report, contents, buffer, mapping.__exit__)
     _note_state(file)
+    file.torn = _torn_chunk(file)
     return file
 
 
 def _covers_everything(contents: FileScan) -> bool:
+    counts = contents.summary.counts
     indexed = sum(place.count for place in contents.places)
-    return bool(contents.places) and indexed == sum(contents.summary.counts.values())
+    defined = contents.summary.channels.keys() >= counts.keys()
+    return bool(contents.places) and defined and indexed == counts.total()
 
 
 def _note_state(file: McapFile) -> None:
@@ -74,6 +78,36 @@ def _note_state(file: McapFile) -> None:
             file.damaged(damage.from_offset, length, damage.reason)
     if not file.contents.finished and not has_no_summary:
         file.report.add_note(f"{file.path.name} was never finished; it has no summary")
+
+
+def _torn_chunk(file: McapFile) -> Chunk | None:
+    """Return what there is of a chunk that the end of the file cut through."""
+    last = file.contents.damage[-1] if file.contents.damage else None
+    if last is None or last.to_offset != file.contents.size:
+        return None
+    at = last.from_offset + _whole_records(file.buffer[last.from_offset :])
+    head = mcap.parse_chunk_head(file.buffer, at)
+    if head is None:
+        return None
+    body, _ = unpack(head.compression, bytes(file.buffer[head.data_offset :]), head.size)
+    chunk = open_chunk(body[: _whole_records(body)], head.offset, file.contents.size)
+    if chunk is None or not len(chunk):
+        return None
+    file.report.add_note(f"{len(chunk)} messages come from a torn chunk that no checksum covers")
+    file.contents.summary.schemas.update(chunk.schemas)
+    file.contents.summary.channels.update(chunk.channels)
+    return chunk
+
+
+def _whole_records(body: bytes | memoryview) -> int:
+    """Return the length of the records that are complete."""
+    at = 0
+    while at + mcap.RECORD_HEAD <= len(body):
+        end = at + mcap.RECORD_HEAD + int.from_bytes(body[at + 1 : at + 9], "little")
+        if end > len(body):
+            break
+        at = end
+    return at
 
 
 def add_topics(file: McapFile, table: TopicTable, definitions: Definitions) -> None:
@@ -90,17 +124,21 @@ def add_topics(file: McapFile, table: TopicTable, definitions: Definitions) -> N
 
 
 def _sample(file: McapFile, channel: int) -> bytes | None:
-    chunks = (read_chunk(file.buffer, place) for place in file.contents.places)
-    found = (c.messages(c.rows_of(channel)[:1]) for c in chunks if c is not None)
-    return next((messages[0] for messages in islice(found, 100) if messages), None)
+    chunks = (read_chunk(file.buffer, place) for place in file.contents.places[:100])
+    found = (c.messages(c.rows_of(channel)[:1]) for c in (*chunks, file.torn) if c is not None)
+    return next((messages[0] for messages in found if messages), None)
 
 
 def find_parts(file: McapFile) -> list[Part]:
     """Make a part of each chunk."""
-    return [
+    parts = [
         Part(place.start_ns, place.end_ns, place.count, partial(load_chunk, file, place))
         for place in file.contents.places
     ]
+    if file.torn is not None:
+        first, last = int(file.torn.log_ns.min()), int(file.torn.log_ns.max())
+        parts.append(Part(first, last, len(file.torn), partial(_messages, file, file.torn)))
+    return parts
 
 
 def load_chunk(file: McapFile, place: ChunkPlace) -> list[RecordedMessage]:

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from amberbox.blackbox.formats.bytesource import FileBytes
+from amberbox.blackbox.formats.compression import unpack
 from amberbox.blackbox.formats.recording import (
     Damage,
     Part,
@@ -26,7 +27,6 @@ from amberbox.blackbox.formats.recording import (
 from amberbox.blackbox.formats.ros1_chunk import (
     ChunkContent,
     read_chunk,
-    unpack_chunk,
 )
 from amberbox.blackbox.formats.ros1_records import (
     BAG_HEADER,
@@ -79,7 +79,8 @@ class _Bag:
         self.connections: dict[int, Fields] = {}
         self.topics: list[Topic] = []
         self.topic_of: dict[int, int] = {}
-        self.index_at = 0
+        self.index_at: int | None = None
+        self.chunk_count = 0
 
     def damaged(self, offset: int, length: int, reason: str) -> None:
         self.report.add_damage(Damage(self.path.name, offset, length, reason))
@@ -96,6 +97,7 @@ class _Bag:
         """Find chunks and connections; look into a chunk only where the index is incomplete."""
         for record in walk(self.file, len(MAGIC), self._skipped):
             self._note(record)
+        self._check_complete()
         for chunk in self.chunks:
             if chunk.start_ns is None or not self.connections.keys() >= chunk.expected.keys():
                 self._look_into(chunk)
@@ -122,8 +124,22 @@ class _Bag:
                 "decrypt it first: rosbag decompress with the key at hand",
             )
         self.index_at = int.from_bytes(fields[b"index_pos"], "little")
+        self.chunk_count = u32(fields[b"chunk_count"])
         if not self.index_at:
             self.report.add_note("the bag was never closed; it has no index")
+
+    def _check_complete(self) -> None:
+        """Compare what was found with what the bag's header promises."""
+        size = self.file.size
+        if self.index_at is None:
+            self.damaged(len(MAGIC), size - len(MAGIC), "the bag's header is missing")
+        elif self.index_at > size:
+            self.damaged(size, self.index_at - size, "the file is cut short")
+        found = sum(not chunk.is_loose for chunk in self.chunks)
+        if found < self.chunk_count:
+            self.damaged(
+                0, size, f"{self.chunk_count - found} of {self.chunk_count} chunks missing"
+            )
 
     def _note_index(self, record: Record, chunk: _Chunk) -> None:
         data = self.file.read(record.data_offset, record.data_length)
@@ -172,7 +188,7 @@ class _Bag:
 
     def _read(self, chunk: _Chunk, topic_of: Mapping[int, int]) -> ChunkContent:
         data = self.file.read(chunk.data_offset, chunk.data_length)
-        raw, problem = unpack_chunk(chunk.compression, data, chunk.unpacked_size)
+        raw, problem = unpack(chunk.compression, data, chunk.unpacked_size)
         if problem:
             self.damaged(chunk.offset, self._length(chunk), f"chunk {problem}")
         content = read_chunk(raw, topic_of)

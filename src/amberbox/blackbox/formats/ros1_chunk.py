@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import bz2
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from struct import Struct
@@ -22,7 +21,6 @@ from amberbox.blackbox.formats.ros1_records import (
 )
 
 NS = 1_000_000_000
-_PIECE = 1 << 16
 
 
 @dataclass
@@ -37,44 +35,6 @@ class ChunkContent:
     def add_damage(self, offset: int, length: int, reason: str) -> None:
         """Note a range that cannot be read."""
         self.damage.append((offset, length, reason))
-
-
-def unpack_chunk(compression: str, data: bytes, size: int) -> tuple[bytes, str]:
-    """Unpack a chunk as far as possible; the second value says what went wrong, if anything.
-
-    No more than ``size`` bytes, which the chunk's header promises, are unpacked.
-    """
-    if compression == "none":
-        return data, ""
-    make = _decompressors().get(compression)
-    if make is None:
-        return b"", f"compression {compression!r} is not known"
-    unpacked, problem = _unpack_pieces(make(), data, size + 1)
-    if not problem and len(unpacked) != size:
-        problem = f"unpacks to {len(unpacked)} bytes instead of {size}"
-    return unpacked, problem
-
-
-def _decompressors() -> Mapping[str, Callable[[], Any]]:
-    import lz4.frame  # type: ignore[import-untyped]  # the package has no type hints
-
-    return {"bz2": bz2.BZ2Decompressor, "lz4": lz4.frame.LZ4FrameDecompressor}
-
-
-def _unpack_pieces(decompressor: Any, data: bytes, limit: int) -> tuple[bytes, str]:
-    # in pieces, so that what lies before a broken byte is not lost
-    unpacked: list[bytes] = []
-    room = limit
-    for start in range(0, len(data), _PIECE):
-        try:
-            unpacked.append(decompressor.decompress(data[start : start + _PIECE], room))
-        except (OSError, EOFError, RuntimeError, ValueError) as error:
-            return b"".join(unpacked), f"cannot be unpacked from byte {start} on ({error})"
-        room -= len(unpacked[-1])
-        if decompressor.eof or room <= 0:
-            break
-    complete = decompressor.eof or room <= 0
-    return b"".join(unpacked), "" if complete else "compressed data end too early"
 
 
 def read_chunk(raw: bytes, topic_of: Mapping[int, int]) -> ChunkContent:

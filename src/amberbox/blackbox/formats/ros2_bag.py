@@ -15,7 +15,7 @@ import yaml
 import zstandard
 
 from amberbox.blackbox.formats import mcap_storage, sqlite_storage
-from amberbox.blackbox.formats.definitions import Definitions
+from amberbox.blackbox.formats.definitions import DISTRIBUTIONS, Definitions
 from amberbox.blackbox.formats.recording import (
     Damage,
     Part,
@@ -105,7 +105,7 @@ def _magic(path: Path) -> bytes:
 def _open_sqlite(path: Path, bag: _Bag) -> list[Part]:
     database = sqlite_storage.open_database(path, bag.report)
     bag.stack.callback(database.close)
-    if not bag.definitions.distribution:
+    if bag.definitions.distribution not in DISTRIBUTIONS:
         bag.definitions.distribution = sqlite_storage.distribution_of(database)
     topic_of = sqlite_storage.add_topics(database, bag.table, bag.definitions)
     return _unpacking(sqlite_storage.find_parts(database, topic_of), path, bag)
