@@ -59,7 +59,15 @@ class _Block:
         return (self.node.mapping or {}).get("name")
 
 
-def read_blocks(root: Node, sources: str, problems: list[Problem]) -> tuple[SourceBlock, ...]:
+@dataclass(frozen=True)
+class Blocks:
+    """What ``black_box.yaml`` says; ``not_built`` names sources that are yet to come."""
+
+    sources: tuple[SourceBlock, ...] = ()
+    not_built: tuple[str, ...] = ()
+
+
+def read_blocks(root: Node, sources: str, problems: list[Problem]) -> Blocks:
     """Check every block against its source's ``Config``; what is wrong goes to ``problems``."""
     blocks = list(_split(root, problems))
     plugins = find(sources, defines=("Config", "Source"))
@@ -72,7 +80,12 @@ def read_blocks(root: Node, sources: str, problems: list[Problem]) -> tuple[Sour
     ]
     if not blocks and not any(problem.is_error for problem in problems):
         problems.append(root.problem("file", "lists nothing to record", "add a source block"))
-    return tuple(block for block in built if block is not None)
+    to_come = (block.plugin for block in blocks if _is_to_come(block, plugins))
+    return Blocks(tuple(block for block in built if block), tuple(dict.fromkeys(to_come)))
+
+
+def _is_to_come(block: _Block, plugins: Mapping[str, Plugin]) -> bool:
+    return block.plugin in NOT_BUILT_YET and block.plugin not in plugins
 
 
 def _split(root: Node, problems: list[Problem]) -> Iterator[_Block]:
@@ -111,7 +124,7 @@ def _defaults(blocks: Sequence[_Block], problems: list[Problem]) -> Node | None:
 def _is_known(block: _Block, plugins: Mapping[str, Plugin], problems: list[Problem]) -> bool:
     if block.plugin == DEFAULTS or block.plugin in plugins:
         return block.plugin in plugins
-    if block.plugin in NOT_BUILT_YET:
+    if _is_to_come(block, plugins):
         what = f"source '{block.plugin}' is not built yet: block ignored"
         problems.append(block.node.problem(block.plugin, what, is_error=False))
         return False

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from amberbox.blackbox.blocks import SourceBlock, read_blocks
+from amberbox.blackbox.blocks import Blocks, SourceBlock, read_blocks
 from amberbox.blackbox.robot import RobotConfig
 from amberbox.core.config import build, load_yaml, refuse
 from amberbox.core.errors import Problem, UsageError
@@ -24,7 +24,7 @@ class RobotFolder:
     """What a robot folder says, checked.
 
     ``config_hash`` is the SHA-256 over the folder's files; ``notes`` are findings that stop
-    nothing: legacy keys, blocks whose source is not built yet.
+    nothing: legacy keys, blocks whose source is not built yet (named in ``not_built``).
     """
 
     path: Path
@@ -32,6 +32,7 @@ class RobotFolder:
     blocks: tuple[SourceBlock, ...]
     config_hash: str
     notes: tuple[Problem, ...] = field(default=())
+    not_built: tuple[str, ...] = field(default=())
 
     @property
     def store_path(self) -> Path:
@@ -62,12 +63,14 @@ def inspect_folder(
     problems: list[Problem] = []
     robot = _read_robot(place, problems)
     blocks = _read_black_box(place / BLACK_BOX_FILE if path.is_dir() else path, sources, problems)
+    problems.sort(key=lambda problem: (problem.file, problem.line))
     if robot is None or any(problem.is_error for problem in problems):
         return None, problems
     files = _files(place, robot) if path.is_dir() else [path, *_existing(place / ROBOT_FILE)]
     digest = hash_files({_relative(file, place): file for file in files})
     notes = tuple(problem for problem in problems if not problem.is_error)
-    return RobotFolder(place, robot, blocks, digest, notes), problems
+    folder = RobotFolder(place, robot, blocks.sources, digest, notes, blocks.not_built)
+    return folder, problems
 
 
 def hash_files(files: Mapping[str, Path]) -> str:
@@ -92,13 +95,13 @@ def _read_robot(place: Path, problems: list[Problem]) -> RobotConfig | None:
     return dataclasses.replace(robot, id=robot.id or derived) if robot else None
 
 
-def _read_black_box(path: Path, sources: str, problems: list[Problem]) -> tuple[SourceBlock, ...]:
+def _read_black_box(path: Path, sources: str, problems: list[Problem]) -> Blocks:
     if not path.exists():
         hint = f"it says what to listen to; 'amberbox new' shows how a {BLACK_BOX_FILE} looks"
         problems.append(Problem(str(path), 1, "file", "is not there", hint))
-        return ()
+        return Blocks()
     node = load_yaml(path, problems)
-    return read_blocks(node, sources, problems) if node else ()
+    return read_blocks(node, sources, problems) if node else Blocks()
 
 
 def _files(place: Path, robot: RobotConfig) -> list[Path]:

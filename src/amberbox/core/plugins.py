@@ -71,9 +71,11 @@ def find(
     return dict(sorted(found.items()))
 
 
-def get(package: str, name: str, extra_dirs: Sequence[Path] = ()) -> Plugin:
+def get(
+    package: str, name: str, extra_dirs: Sequence[Path] = (), defines: Collection[str] = ()
+) -> Plugin:
     """Return one plugin; raise UsageError with the nearest name if there is none."""
-    known = find(package, extra_dirs)
+    known = find(package, extra_dirs, defines)
     if name not in known:
         kind = package.rpartition(".")[2].removesuffix("s")
         what = f"there is no {kind} '{name}'{did_you_mean(name, known)}"

@@ -6,6 +6,8 @@ import re
 from collections.abc import Mapping
 from fractions import Fraction
 
+from amberbox.core.errors import UsageError
+
 TIME_NS: Mapping[str, int] = {
     "ns": 1,
     "us": 1_000,
@@ -51,6 +53,20 @@ def in_unit(text: str, unit: str) -> Fraction:
 def duration_ns(number: str, unit: str) -> int:
     """Convert ``("5", "s")`` to nanoseconds."""
     return round(in_unit(f"{number} {unit}", "ns"))
+
+
+def parse_duration_s(text: str) -> float:
+    """Read a duration such as ``30s`` or ``5 min``, a bare number in seconds.
+
+    Raises UsageError for anything else, and for a duration below 0.
+    """
+    try:
+        seconds = float(in_unit(text, "s"))
+    except ValueError as error:
+        raise UsageError(f"'{text}' {error}", "write a duration as 30s or 5 min") from None
+    if seconds < 0:
+        raise UsageError(f"'{text}' lies below 0", "write a duration as 30s or 5 min")
+    return seconds
 
 
 def _unknown_unit(written: str, units: Mapping[str, int]) -> str:

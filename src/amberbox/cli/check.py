@@ -1,0 +1,89 @@
+"""Judge a robot folder without touching a device, and show what would be recorded."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Sequence
+from typing import Any
+
+from amberbox.blackbox.folder import RobotFolder, inspect_folder
+from amberbox.blackbox.plan import PlannedItem, planned_items
+from amberbox.cli._text import in_columns
+from amberbox.core.errors import ConfigurationError, Problem
+from amberbox.core.redaction import as_plain
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of this verb."""
+    parser.add_argument("folder", help="a robot folder, or a single black_box.yaml")
+    parser.add_argument("--json", action="store_true", help="print JSON")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print all problems and notes, and the plan if there is no error; return 0 or 2."""
+    folder, problems = inspect_folder(args.folder)
+    items = planned_items(folder, problems) if folder else []
+    ok = not any(problem.is_error for problem in problems)
+    if args.json:
+        print(json.dumps(_report(folder, items, problems, ok), indent=2))
+    else:
+        print("\n".join(_lines(args.folder, folder, items, problems)))
+    return 0 if ok else ConfigurationError.exit_code
+
+
+def _report(
+    folder: RobotFolder | None, items: Sequence[PlannedItem], problems: Sequence[Problem], ok: bool
+) -> dict[str, Any]:
+    report: dict[str, Any] = {"ok": ok, "problems": [as_plain(problem) for problem in problems]}
+    if folder is None:
+        return report
+    return report | {
+        "robot": as_plain(folder.robot),
+        "store": str(folder.store_path),
+        "config_hash": folder.config_hash,
+        "sources": [{"name": block.name, "plugin": block.plugin} for block in folder.blocks],
+        "items": [as_plain(item) for item in items],
+        "not_built": list(folder.not_built),
+    }
+
+
+def _lines(
+    name: str,
+    folder: RobotFolder | None,
+    items: Sequence[PlannedItem],
+    problems: Sequence[Problem],
+) -> list[str]:
+    errors = [str(problem) for problem in problems if problem.is_error]
+    notes = [str(problem) for problem in problems if not problem.is_error]
+    verdict = f"{_count(errors, 'error')}, {_count(notes, 'note')}" if errors else "fine"
+    plan = _plan(folder, items) if folder and not errors else []
+    return [*plan, *notes, *errors, f"{name}: {verdict}"]
+
+
+def _count(of: Sequence[object], what: str) -> str:
+    return f"{len(of)} {what}{'' if len(of) == 1 else 's'}"
+
+
+def _plan(folder: RobotFolder, items: Sequence[PlannedItem]) -> list[str]:
+    facts = [
+        ("robot", " ".join(part for part in (folder.robot.id, folder.robot.model) if part)),
+        ("store", str(folder.store_path)),
+        ("configuration", folder.config_hash[:16]),
+        ("not built yet", ", ".join(folder.not_built) or "-"),
+    ]
+    listening = {item.source for item in items}
+    open_ended = [block.name for block in folder.blocks if block.name not in listening]
+    everything = [f"  {name}: everything it hears" for name in open_ended]
+    return [*in_columns(facts, ""), "would record:", *everything, *in_columns(_table(items)), ""]
+
+
+def _table(items: Sequence[PlannedItem]) -> list[tuple[str, ...]]:
+    header = ("item", "topic", "type", "at most", "keep", "variables")
+    return [header, *(_row(item) for item in items)] if items else []
+
+
+def _row(item: PlannedItem) -> tuple[str, ...]:
+    rate = "-" if item.max_frequency is None else f"{item.max_frequency:g} Hz"
+    variables = str(len(item.variables)) if item.variables else "all"
+    return item.item, item.topic, item.type or "as heard", rate, item.keep, variables

@@ -1,0 +1,84 @@
+"""Start a robot folder: commented files that pass 'amberbox check' as they are."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+from amberbox.blackbox.folder import BLACK_BOX_FILE, ROBOT_FILE, SOURCES, load_folder
+from amberbox.core.errors import UsageError
+from amberbox.core.ids import derive_id
+from amberbox.core.plugins import get
+
+_ROBOT = """\
+# Who this robot is, and where its record goes. All keys: docs/configuration.md
+
+id: "{id}"                 # name in addresses and on the server: a-z 0-9 _ . -
+model: ""                  # make and model
+software_version: ""       # version of the robot's own software
+
+store:
+  path: store              # folder of the record, relative to this one
+  # quota: 50 GB           # most that the record may take; 80 % of the partition when absent
+  # min_free: 1 GB         # room that stays free on the partition
+  # ring_s: 5 min          # how long topics with 'keep: ring' are kept
+
+# server:
+#   url: https://fleet.example.org
+#   token: ""              # stays in this folder, is never sent on
+"""
+
+_BLACK_BOX = """\
+# What the box listens to: one block per source. 'amberbox plugins' lists the sources,
+# 'amberbox plugins {plugin}' shows all keys of this one.
+
+- default_parameters:
+    max_frequency: 100     # Hz, for listed topics that do not state their own
+
+{sample}"""
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of this verb."""
+    parser.add_argument("folder", help="folder to make, or one without these files")
+    parser.add_argument(
+        "--from", dest="source", default="sim", metavar="SOURCE", help="source to start with [sim]"
+    )
+    parser.add_argument("--json", action="store_true", help="print JSON")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Write the files; never over files that are there."""
+    folder = Path(args.folder)
+    files = _files(folder, args.source)
+    _refuse_to_overwrite(folder, files)
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, text in files.items():
+        (folder / name).write_text(text, encoding="utf-8")
+    load_folder(folder)
+    if args.json:
+        print(json.dumps({"folder": str(folder), "files": sorted(files)}))
+    else:
+        print(f"wrote {' and '.join(sorted(files))} in {folder}")
+        print(f"next: look at them, then amberbox check {folder}, amberbox record {folder}")
+    return 0
+
+
+def _files(folder: Path, source: str) -> dict[str, str]:
+    plugin = get(SOURCES, source, defines=("Config", "Source"))
+    sample = plugin.load().SAMPLE
+    robot = _ROBOT.replace("{id}", derive_id(folder.resolve().name))
+    black_box = _BLACK_BOX.replace("{plugin}", plugin.name).replace("{sample}", sample)
+    return {ROBOT_FILE: robot, BLACK_BOX_FILE: black_box}
+
+
+def _refuse_to_overwrite(folder: Path, files: dict[str, str]) -> None:
+    if folder.exists() and not folder.is_dir():
+        raise UsageError(f"'{folder}' is a file", "name a folder")
+    there = [name for name in files if (folder / name).exists()]
+    if there:
+        what = f"'{folder}' has {' and '.join(there)} already, nothing was written"
+        raise UsageError(
+            what, f"edit what is there, or name another folder; amberbox check {folder}"
+        )
