@@ -1,0 +1,64 @@
+"""Import recordings: ROS 1 and ROS 2 bags and MCAP files become part of a store."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from amberbox.blackbox.importing import ImportReport, import_recordings
+
+_BAR = 30
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the verb's arguments."""
+    parser.add_argument("inputs", nargs="+", type=Path, metavar="INPUT",
+                        help="bag file, folder of a ROS 2 bag, or MCAP file")  # fmt: skip
+    parser.add_argument("--store", required=True, type=Path, metavar="DIR",
+                        help="store to import into; made if it is not there")  # fmt: skip
+    parser.add_argument("--source", default="ros", metavar="NAME",
+                        help="first word of the item names (default: ros)")  # fmt: skip
+    parser.add_argument("--json", action="store_true", help="print the report as JSON")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Import and report; 1 if anything in the inputs was damaged."""
+    started = time.monotonic()
+    progress = _bar() if sys.stderr.isatty() and not args.json else lambda fraction: None
+    reports = import_recordings(
+        args.inputs, args.store, source=args.source, progress=progress
+    )
+    if args.json:
+        print(json.dumps([_as_json(report) for report in reports], indent=2))
+    else:
+        print("\n".join(line for report in reports for line in report.lines()))
+        total = sum(report.messages for report in reports)
+        print(f"{total} messages in {time.monotonic() - started:.1f} s, now in {args.store}")
+    return 1 if any(report.damage for report in reports) else 0
+
+
+def _as_json(report: ImportReport) -> dict[str, object]:
+    return {
+        "path": str(report.path),
+        "messages": report.messages,
+        "items": report.items,
+        "notes": report.notes,
+        "damage": report.damage,
+        "already_imported": report.known,
+    }
+
+
+def _bar() -> Callable[[float], None]:
+    """Draw a progress bar on stderr."""
+
+    def draw(fraction: float) -> None:
+        full = round(min(max(fraction, 0.0), 1.0) * _BAR)
+        end = "\n" if fraction >= 1.0 else ""
+        print(f"\r[{'#' * full}{'.' * (_BAR - full)}] {fraction:4.0%}", end=end, file=sys.stderr,
+              flush=True)  # fmt: skip
+
+    return draw

@@ -1,0 +1,119 @@
+"""Record a robot: listen to everything its black_box.yaml names and keep it."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import signal
+import sys
+import threading
+import time
+from dataclasses import asdict
+
+from amberbox.blackbox.folder import load_folder
+from amberbox.blackbox.recorder import Recorder, RecorderState
+from amberbox.core.units import in_unit
+
+_TABLE_S = 1.0
+_HEADINGS = ("item", "rate Hz", "kept", "filtered", "dropped", "bytes")
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the verb's arguments."""
+    parser.add_argument("folder", metavar="FOLDER", help="robot folder")
+    parser.add_argument(
+        "--for", dest="duration", metavar="TIME", type=_seconds,
+        help="stop by itself after this long, such as 30s or 5 min",
+    )  # fmt: skip
+    parser.add_argument(
+        "--json", action="store_true", help="one JSON object per second instead of the table"
+    )
+    parser.add_argument("--quiet", action="store_true", help="print nothing while recording")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Record until stopped by a signal, by ``--for``, or by the end of all inputs."""
+    recorder = Recorder(load_folder(args.folder))
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: recorder.stop.set())
+    if args.duration is not None:
+        timer = threading.Timer(args.duration, recorder.stop.set)
+        timer.daemon = True
+        timer.start()
+    view = threading.Thread(target=_watch, args=(recorder, args), daemon=True)
+    if not args.quiet:
+        view.start()
+    recorder.run()
+    if not args.quiet:
+        view.join(2 * _TABLE_S)
+        print(_last_line(recorder.state(), str(recorder.store.path)), file=sys.stderr)
+    return 0
+
+
+def _seconds(text: str) -> float:
+    try:
+        return float(in_unit(text, "s"))
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(f"'{text}' {error}") from None
+
+
+def _watch(recorder: Recorder, args: argparse.Namespace) -> None:
+    """Show what is being recorded, once a second."""
+    lines, started = 0, time.monotonic()
+    while not recorder.stop.wait(_TABLE_S):
+        state = recorder.state()
+        if args.json:
+            print(json.dumps(asdict(state)), flush=True)
+        elif sys.stdout.isatty():
+            lines = _redraw(table(state, time.monotonic() - started), lines)
+        elif round(time.monotonic() - started) % 10 == 0:
+            print(summary(state), flush=True)
+
+
+def _redraw(rows: list[str], before: int) -> int:
+    up = f"\x1b[{before}A" if before else ""
+    print(up + "".join(f"\x1b[K{row}\n" for row in rows), end="", flush=True)
+    return len(rows)
+
+
+def table(state: RecorderState, elapsed_s: float) -> list[str]:
+    """Lay the live table out as lines of text."""
+    rows = [_HEADINGS, *(
+        (i.name, f"{i.rate_hz:.1f}", str(i.kept), str(i.filtered), str(i.dropped), size(i.bytes))
+        for i in state.items
+    )]  # fmt: skip
+    widths = [max(len(row[column]) for row in rows) for column in range(len(_HEADINGS))]
+    lines = [
+        row[0].ljust(widths[0])
+        + "".join("  " + c.rjust(w) for c, w in zip(row[1:], widths[1:], strict=True))
+        for row in rows
+    ]
+    foot = f"{elapsed_s:.0f} s, written {size(state.written_bytes)}, "
+    foot += f"queue {size(state.queue_bytes)}, disk left {size(state.disk_free_bytes)}"
+    trouble = [f"DISK: {state.disk_error}"] if state.disk_error else []
+    return [*lines, foot, *trouble]
+
+
+def summary(state: RecorderState) -> str:
+    """Say in one line what the table says."""
+    kept = sum(item.kept for item in state.items)
+    dropped = sum(item.dropped for item in state.items)
+    rate = sum(item.rate_hz for item in state.items)
+    text = f"{len(state.items)} items, {rate:.0f} messages/s, {kept} kept, {dropped} dropped, "
+    text += f"{size(state.written_bytes)} written, {size(state.disk_free_bytes)} left"
+    return f"{text}; DISK: {state.disk_error}" if state.disk_error else text
+
+
+def _last_line(state: RecorderState, store: str) -> str:
+    kept = sum(item.kept for item in state.items)
+    return f"recorded {kept} messages of {len(state.items)} items in {store}"
+
+
+def size(count: int) -> str:
+    """Write a number of bytes for people."""
+    value = float(count)
+    for unit in ("B", "kB", "MB", "GB"):
+        if value < 1000:
+            return f"{value:.0f} {unit}" if unit == "B" else f"{value:.1f} {unit}"
+        value /= 1000
+    return f"{value:.1f} TB"
