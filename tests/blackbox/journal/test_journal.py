@@ -212,9 +212,9 @@ def test_damage_costs_only_the_chunks_it_touches(
     path, rows = finished(tmp_path_factory.mktemp("damage"), seed=5)
     sound = scan(path)
     data = bytearray(path.read_bytes())
+    ends = [place.offset for place in sound.places[1:]] + [len(data)]
     start, end = damage(data, random.Random(seed))
     path.write_bytes(data)
-    ends = [place.offset for place in sound.places[1:]] + [len(data)]
     kept: list[Row] = []
     at = 0
     for place, chunk_end in zip(sound.places, ends, strict=True):
