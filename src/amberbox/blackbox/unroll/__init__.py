@@ -1,0 +1,1 @@
+"""Unrolling: messages of any type become flat, typed columns, compiled from their definition."""

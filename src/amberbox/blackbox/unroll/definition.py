@@ -1,0 +1,169 @@
+"""Message definitions of ROS 1 and ROS 2 as types and constants, parsed by ``rosbags``."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from amberbox.core.errors import AmberboxError
+from amberbox.core.types import Schema
+
+if TYPE_CHECKING:
+    from rosbags.interfaces.typing import FieldDesc, Typesdict
+
+HEADER = "std_msgs/msg/Header"
+SIZES = {
+    "bool": 1,
+    "int8": 1,
+    "uint8": 1,
+    "int16": 2,
+    "uint16": 2,
+    "int32": 4,
+    "uint32": 4,
+    "int64": 8,
+    "uint64": 8,
+    "float32": 4,
+    "float64": 8,
+    "time": 8,
+    "duration": 8,
+}
+"""Bytes of the primitives of fixed size."""
+
+TIME = "builtin_interfaces/msg/Time"
+DURATION = "builtin_interfaces/msg/Duration"
+FILLER = "structure_needs_at_least_one_member"
+
+_SEPARATOR = re.compile(r"^={80}[ \t]*$\n?", re.MULTILINE)
+_CONSTANT = re.compile(r"^[ \t]*[\w/<=]+[ \t]+\w+[ \t]*=.*$", re.MULTILINE)
+
+
+@dataclass(frozen=True, slots=True)
+class FieldType:
+    """Type of one field.
+
+    ``base`` is a primitive (``float64``, ``string``, ``wstring``, ``time``, ``duration``) or the
+    full name of a structure. ``count`` is None for a single value, 0.. for a fixed array,
+    -1 for a sequence.
+    """
+
+    base: str
+    count: int | None = None
+
+    SEQUENCE = -1
+
+
+@dataclass(frozen=True, slots=True)
+class Structure:
+    """Fields in wire order, and the constants of a message."""
+
+    fields: tuple[tuple[str, FieldType], ...]
+    constants: tuple[tuple[str, str, object], ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Definition:
+    """A message type with all structures it needs, by their full names (``pkg/msg/Type``)."""
+
+    root: str
+    structures: Mapping[str, Structure]
+
+
+def parse_definition(schema: Schema) -> Definition:
+    """Parse a ``ros1msg``, ``ros2msg`` or ``ros2idl`` schema.
+
+    Raises ``AmberboxError`` when the text is no definition or a type in it is missing.
+    """
+    from rosbags.typesys.msg import normalize_msgtype
+
+    types = _parse(schema)
+    root = normalize_msgtype(schema.name)
+    structures: dict[str, Structure] = {}
+    _collect(root, types, structures, schema, ())
+    return Definition(root, structures)
+
+
+def _parse(schema: Schema) -> Typesdict:
+    text = schema.data.decode("utf-8", "replace").replace("\r\n", "\n")
+    parse = _parse_idl if schema.encoding in ("ros2idl", "omgidl") else _parse_msg
+    try:
+        return parse(text, schema.name)
+    except Exception as error:  # rosbags raises many kinds on text that is no definition
+        raise AmberboxError(
+            f"cannot read the definition of {schema.name}: {_last_line(error)}",
+            "the messages are still recorded; their columns need a definition that rosbags reads",
+        ) from error
+
+
+def _last_line(error: Exception) -> str:
+    return next(iter(reversed(str(error).splitlines())), type(error).__name__)
+
+
+def _parse_msg(text: str, name: str) -> Typesdict:
+    from rosbags.typesys import TypesysError, get_types_from_msg
+
+    normal = _SEPARATOR.sub("=" * 80 + "\n", text)
+    try:
+        return get_types_from_msg(normal, name)
+    except TypesysError:
+        # rosbags refuses constants such as kRate=1 or A__B=1, which ROS allows
+        return get_types_from_msg(_CONSTANT.sub("", normal), name)
+
+
+def _parse_idl(text: str, _name: str) -> Typesdict:
+    from rosbags.typesys import get_types_from_idl
+
+    types: Typesdict = {}
+    for part in _SEPARATOR.split(text):
+        body = re.sub(r"\AIDL: .*\n", "", part)
+        if body.strip():
+            types.update(get_types_from_idl(body))
+    return types
+
+
+_ALIASES = {"char": "uint8", TIME: "time", DURATION: "duration"}
+_PRIMITIVES = {*SIZES, "byte", "string", "wstring"}
+
+
+def _collect(
+    name: str,
+    types: Typesdict,
+    done: dict[str, Structure],
+    schema: Schema,
+    inside: tuple[str, ...],
+) -> None:
+    if name in done:
+        return
+    if name in inside or name not in types:
+        what = "contains itself" if name in inside else "is missing"
+        raise AmberboxError(
+            f"the definition of {schema.name} cannot be unrolled: {name} {what}",
+            "the messages are still recorded, but have no columns",
+        )
+    constants, fields = types[name]
+    typed = tuple((field, _field_type(desc, types)) for field, desc in fields)
+    for _, field_type in typed:
+        if field_type.base not in _PRIMITIVES:
+            _collect(field_type.base, types, done, schema, (*inside, name))
+    done[name] = Structure(
+        typed, tuple((_ALIASES.get(kind, kind), label, value) for label, kind, value in constants)
+    )
+
+
+def _field_type(desc: FieldDesc, types: Typesdict) -> FieldType:
+    from rosbags.interfaces import Nodetype
+
+    if desc[0] == Nodetype.ARRAY:
+        return FieldType(_base(desc[1][0], types), desc[1][1])
+    if desc[0] == Nodetype.SEQUENCE:
+        return FieldType(_base(desc[1][0], types), FieldType.SEQUENCE)
+    return FieldType(_base((desc[0], desc[1]), types))
+
+
+def _base(desc: tuple[object, str | tuple[str, int]], types: Typesdict) -> str:
+    """Give a type one name; rosbags takes the ``wstring`` of a .msg for a structure."""
+    name = desc[1] if isinstance(desc[1], str) else desc[1][0]
+    if name not in types and name.endswith("/wstring"):
+        return "wstring"
+    return _ALIASES.get(name, name)
