@@ -316,10 +316,10 @@ def _to_number(kind: type[int] | type[float], node: Node, unit: str) -> int | fl
 def _lossless(kind: type[int] | type[float], value: int | float) -> int | float:
     if isinstance(value, float) and math.isnan(value):
         raise ValueError("is not a number")
-    if kind is int and value != value // 1:
-        raise ValueError("is not whole")
     if kind is int and math.isinf(value):
         raise ValueError("is not finite")
+    if kind is int and value != value // 1:
+        raise ValueError("is not whole")
     try:
         converted = kind(value)
     except OverflowError:

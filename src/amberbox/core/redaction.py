@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 import types
 import typing
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -42,11 +43,10 @@ def likely_secrets(node: Node, key: str = "") -> Iterator[Node]:
 
 
 def redact(text: str, nodes: Iterable[Node]) -> str:
-    """Replace values in the text of their file; comments and layout stay."""
+    """Replace values in the text of their file; comments, layout and anchors stay."""
     for start, end in sorted({node.span for node in nodes}, reverse=True):
-        line_end = "\n" if text[start:end].endswith("\n") else ""
         if text[start:end].strip():
-            text = f'{text[:start]}"{MASK}"{line_end}{text[end:]}'
+            text = text[:start] + _mask(text[start:end]) + text[end:]
     return text
 
 
@@ -62,6 +62,12 @@ def as_plain(value: Any) -> Any:
     if isinstance(value, Sequence) and not isinstance(value, str | bytes):
         return [as_plain(inner) for inner in value]
     return str(value) if isinstance(value, Path) else value
+
+
+def _mask(written: str) -> str:
+    anchor = re.match(r"&\S+\s+", written)
+    line_end = "\n" if written.endswith("\n") else ""
+    return (anchor[0] if anchor else "") + f"'{MASK}'{line_end}"
 
 
 def _masked(value: Any, field: dataclasses.Field[Any]) -> Any:

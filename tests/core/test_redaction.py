@@ -1,0 +1,81 @@
+"""Secrets leave files and listings."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import yaml
+
+from amberbox.core.nodes import Node, parse_yaml
+from amberbox.core.options import option
+from amberbox.core.redaction import as_plain, likely_secrets, redact, secrets
+
+
+@dataclass(frozen=True)
+class Login:
+    """Has a secret with another spelling."""
+
+    user: str = option("")
+    password: str = option("", secret=True, aliases=("pass",))
+
+
+@dataclass(frozen=True)
+class Box:
+    """Has secrets at every place that can hold one."""
+
+    token: str = option("", secret=True)
+    login: Login | None = option(None)
+    topics: Sequence[Login] = option(())
+    by_name: Mapping[str, Login] = option({})
+    keys: Sequence[str] = option((), secret=True)
+
+
+TEXT = """\
+token: "swordfish"   # keep this comment
+login: {user: bob, pass: swordfish}
+topics:
+  - topic: {password: 'sword fish', user: eve}
+  - password: >
+      swordfish
+    user: ada
+by_name:
+  x: {password: &p swordfish}
+  y: {password: *p}
+keys: [swordfish, a]
+"""
+
+
+def tree(text: str) -> Node:
+    root = parse_yaml(text, "f", [])
+    assert root is not None
+    return root
+
+
+def test_secrets_are_cut_out_of_the_text() -> None:
+    redacted = redact(TEXT, secrets(Box, tree(TEXT)))
+    assert "swordfish" not in redacted
+    assert "sword fish" not in redacted
+    assert "# keep this comment" in redacted
+    plain = yaml.safe_load(redacted)
+    assert plain["login"] == {"user": "bob", "pass": "***"}
+    assert plain["topics"][1] == {"password": "***", "user": "ada"}
+    assert plain["keys"] == "***"
+
+
+def test_unknown_blocks_lose_what_sounds_secret() -> None:
+    text = "host: a\nmqtt_password: x1\nnested: [{api_key: x2, Token: x3, tokens: {a: x4}}]\n"
+    redacted = redact(text, likely_secrets(tree(text)))
+    assert yaml.safe_load(redacted)["host"] == "a"
+    assert not any(secret in redacted for secret in ("x1", "x2", "x3", "x4"))
+
+
+def test_listings_mask_secrets() -> None:
+    box = Box("swordfish", Login("bob", "swordfish"), (Login("eve"),), {"x": Login("", "s")})
+    assert as_plain(box) == {
+        "token": "***",
+        "login": {"user": "bob", "password": "***"},
+        "topics": [{"user": "eve", "password": ""}],
+        "by_name": {"x": {"user": "", "password": "***"}},
+        "keys": [],
+    }
