@@ -25,7 +25,7 @@ class Owner(Protocol):
         """Take a finished handshake; return where messages go, None to end it."""
 
     def closed(self, link: Link, reason: str, since_ns: int | None) -> None:
-        """Take the end of a connection that ``opened`` accepted."""
+        """Take the end of a connection that ``opened`` accepted, and since when it is dead."""
 
     def failed(self, link: Link, error: RosError) -> None:
         """Take a failed attempt to connect."""
@@ -149,7 +149,7 @@ class Link:
             self._count_use(reader)
             return f"connection lost: {error.strerror}", self._last_heard_ns(reader)
         self._count_use(reader)
-        return ENDED, None
+        return ENDED, self._now_ns()
 
     def _count_use(self, reader: Reader) -> None:
         if reader.has_read:

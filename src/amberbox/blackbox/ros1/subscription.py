@@ -15,7 +15,7 @@ from amberbox.blackbox.ros1.sightings import Sightings
 from amberbox.blackbox.ros1.tcpros import Publisher
 from amberbox.core.source import Sink
 
-UNREGISTER_WAIT_S = 0.05  # a clean exit unregisters first, the notice may come second
+UNREGISTER_WAIT_S = 0.2  # a clean exit unregisters first, the notice may come second
 REPLACED = "replaced by a newer connection"
 GONE = "publisher gone"
 

@@ -1,0 +1,89 @@
+"""What is remembered of publishers, latched messages and sightings."""
+
+from __future__ import annotations
+
+from amberbox.blackbox.ros1.latched import LatchedFilter, digest
+from amberbox.blackbox.ros1.memory import MOST_PER_TOPIC, Memory
+from amberbox.blackbox.ros1.sightings import Sightings
+from amberbox.testing import MemorySink
+
+
+def test_publishers_are_remembered_across_restarts() -> None:
+    sink = MemorySink()
+    memory = Memory(sink)
+    memory.remember("/a", "/n", "http://h:1/")
+    memory.use_port(4711)
+    again = Memory(sink)
+    assert again.uris("/a") == ["http://h:1/"]
+    assert again.knows("/a", "/n", "http://h:1/") and not again.knows("/a", "/n", "http://h:2/")
+    assert again.port == 4711
+
+
+def test_a_node_that_moved_is_remembered_once_and_forgotten_when_it_leaves() -> None:
+    sink = MemorySink()
+    memory = Memory(sink)
+    memory.remember("/a", "/n", "http://h:1/")
+    memory.latch("/a", "/n", "digest")
+    memory.remember("/a", "/n", "http://h:2/")
+    assert memory.uris("/a") == ["http://h:2/"]
+    memory.forget("/a", "http://h:2/")
+    memory.save()
+    assert Memory(sink).uris("/a") == [] and Memory(sink).latched("/a", "/n") is None
+
+
+def test_anonymous_nodes_do_not_pile_up() -> None:
+    memory = Memory(MemorySink())
+    for number in range(MOST_PER_TOPIC + 5):
+        memory.remember("/a", f"/n{number}", f"http://h:{number}/")
+    uris = memory.uris("/a")
+    assert len(uris) == MOST_PER_TOPIC and uris[-1] == f"http://h:{MOST_PER_TOPIC + 4}/"
+
+
+def test_nothing_is_saved_without_a_change() -> None:
+    sink = MemorySink(saved={"port": 7, "publishers": "garbage"})
+    memory = Memory(sink)
+    memory.use_port(7)
+    memory.save()
+    assert sink.saved == {"port": 7, "publishers": "garbage"} and memory.uris("/a") == []
+
+
+def test_a_digest_leaves_the_sequence_number_out() -> None:
+    assert digest(b"\1\0\0\0rest", True) == digest(b"\2\0\0\0rest", True)
+    assert digest(b"\1\0\0\0rest", False) != digest(b"\2\0\0\0rest", False)
+
+
+def filtered(known: frozenset[str], messages: list[bytes]) -> tuple[list[bytes], int]:
+    kept: list[bytes] = []
+    repeats: list[None] = []
+    latched = LatchedFilter(
+        "/map",
+        "/n",
+        False,
+        known,
+        Memory(MemorySink()),
+        lambda data, _: kept.append(data),
+        lambda: repeats.append(None),
+    )
+    for message in messages:
+        latched(message, 0)
+    return kept, len(repeats)
+
+
+def test_only_a_first_message_that_is_known_is_left_out() -> None:
+    known = frozenset({digest(b"map", False)})
+    assert filtered(known, [b"map", b"map", b"new"]) == ([b"map", b"new"], 1)
+    assert filtered(known, [b"new", b"map"]) == ([b"new", b"map"], 0)
+    assert filtered(frozenset(), [b"map"]) == ([b"map"], 0)
+
+
+def test_a_publisher_is_absent_until_the_question_before_the_first_that_named_it() -> None:
+    sightings = Sightings(start_ns=100)
+    assert sightings.absent_until_ns("/n") == 100
+    sightings.polled(200, [])
+    assert sightings.absent_until_ns("/n") == 200
+    sightings.polled(300, ["/n"])
+    sightings.polled(400, ["/n"])
+    assert sightings.absent_until_ns("/n") == 200
+    assert sightings.absent_until_ns("/other") == 400
+    sightings.polled(500, [])
+    assert sightings.absent_until_ns("/n") == 500
