@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Any
 
@@ -106,6 +106,10 @@ class Flat:
             self.timestamp_ns[rows],
             {name: col.take(column, rows) for name, column in self.columns.items()},
         )
+
+    def with_columns(self, columns: Mapping[str, ColumnData]) -> Flat:
+        """Return the same rows with these columns only."""
+        return replace(self, columns=columns)
 
 
 def join(flats: Sequence[Flat]) -> Flat:

@@ -115,15 +115,31 @@ class Deletion:
     at_ns: int
 
 
+@dataclass(frozen=True, slots=True)
+class Journal:
+    """A journal whose rows are all in segments, but those in ``gaps``.
+
+    ``selection`` are the variables configured for its items.
+    """
+
+    name: str
+    head: str
+    writer: str
+    run: int
+    first_seq: int
+    end_seq: int
+    gaps: tuple[Gap, ...] = ()
+    selection: Mapping[str, Sequence[str]] = field(default_factory=dict)
+
+
 @dataclass(frozen=True)
 class Manifest:
     """What the manifest says now."""
 
     schemas: Mapping[str, TableSchema] = field(default_factory=dict)
     segments: Mapping[str, tuple[Segment, ...]] = field(default_factory=dict)
-    journals: frozenset[str] = frozenset()
+    journals: Mapping[str, Journal] = field(default_factory=dict)
     deletions: tuple[Deletion, ...] = ()
-    gaps: tuple[Gap, ...] = ()
     damage: tuple[str, ...] = ()
     last_hash: str = _FIRST_HASH
 
@@ -205,9 +221,8 @@ def _manifest(records: list[dict[str, Any]], damage: list[str], last_hash: str) 
     return Manifest(
         schemas,
         _by_item(live.values()),
-        frozenset(record["journal"] for record in done),
+        {record["journal"]: _journal_from_json(record) for record in done},
         tuple(deletions),
-        tuple(Gap(**gap) for record in done for gap in record.get("gaps", ())),
         tuple(damage),
         last_hash,
     )
@@ -242,15 +257,26 @@ def schema_record(schema: TableSchema) -> dict[str, Any]:
     return {"kind": "schema", "id": schema.id, "schema": schema.to_json()}
 
 
-def journal_record(journal: str, head: str, gaps: Sequence[Gap] = ()) -> dict[str, Any]:
-    """Say that all rows of a journal are in segments now, but those in ``gaps``."""
-    record = {"kind": "journal", "journal": journal, "head": head}
-    return {**record, "gaps": [_gap_to_json(gap) for gap in gaps]} if gaps else record
+def journal_record(journal: Journal) -> dict[str, Any]:
+    """Say that all rows of a journal are in segments now."""
+    gaps = [_gap_to_json(gap) for gap in journal.gaps]
+    fields = {name: getattr(journal, name) for name in _JOURNAL_FIELDS}
+    return {"kind": "journal", "journal": journal.name, **fields, "gaps": gaps}
+
+
+_JOURNAL_FIELDS = ("head", "writer", "run", "first_seq", "end_seq", "selection")
+_GAP_FIELDS = (
+    "writer", "run", "from_ns", "to_ns", "reason", "item", "count", "from_seq", "to_seq",
+)  # fmt: skip
+
+
+def _journal_from_json(record: Mapping[str, Any]) -> Journal:
+    fields = {name: record[name] for name in _JOURNAL_FIELDS}
+    return Journal(record["journal"], gaps=tuple(Gap(**g) for g in record["gaps"]), **fields)
 
 
 def _gap_to_json(gap: Gap) -> dict[str, Any]:
-    names = ("writer", "run", "from_ns", "to_ns", "reason", "item", "count", "from_seq", "to_seq")
-    return {name: getattr(gap, name) for name in names}
+    return {name: getattr(gap, name) for name in _GAP_FIELDS}
 
 
 def deleted_record(path: str, reason: str, at_ns: int) -> dict[str, Any]:

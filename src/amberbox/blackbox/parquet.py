@@ -6,7 +6,7 @@ import hashlib
 import json
 import os
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -232,12 +232,5 @@ def _split_parts(whole: Flat, parts: Sequence[Part], rows: IntArray) -> list[Fla
     for part, start, stop in zip(parts, cuts[:-1], cuts[1:], strict=True):
         if stop > start:
             piece = whole.take(slice(int(start), int(stop)))
-            flats.append(_of_run(piece, part))
+            flats.append(replace(piece, writer=part.writer, run=part.run))
     return flats
-
-
-def _of_run(flat: Flat, part: Part) -> Flat:
-    return Flat(
-        flat.schema, part.writer, part.run, flat.seq, flat.log_time_ns,
-        flat.received_ns, flat.timestamp_ns, flat.columns,
-    )  # fmt: skip

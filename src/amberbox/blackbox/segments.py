@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import json
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -15,7 +16,7 @@ from amberbox.blackbox import manifest as mf
 from amberbox.blackbox.flat import Flat, TableSchema, flatten, join
 from amberbox.blackbox.manifest import Part, Segment
 from amberbox.blackbox.parquet import TableFile, describe, read_segment
-from amberbox.blackbox.read import JournalFile, batches_of
+from amberbox.blackbox.read import JournalFile, batches_of, run_messages
 from amberbox.blackbox.scan import open_buffer, read_chunk
 from amberbox.core.types import ColumnData, Gap, IntArray, Ragged
 
@@ -110,7 +111,11 @@ def build_segments(store: Path, journal: JournalFile) -> list[Segment]:
     new = [schema for schema in builders if schema.id not in known.schemas]
     records = [mf.schema_record(schema) for schema in new]
     records += [mf.segment_record(segment) for segment in segments]
-    mf.append(store, [*records, mf.journal_record(journal.name, journal.chain, gaps)])
+    done = mf.Journal(
+        journal.name, journal.chain, journal.writer, journal.run,
+        journal.first_seq, journal.end_seq, tuple(gaps), selection_of(journal),
+    )  # fmt: skip
+    mf.append(store, [*records, mf.journal_record(done)])
     return segments
 
 
@@ -135,6 +140,13 @@ def message_bytes(journal: JournalFile) -> dict[str, int]:
                 if not stream.repeated:
                     sizes[stream.item] = sizes.get(stream.item, 0) + int(lengths[number])
     return sizes
+
+
+def selection_of(journal: JournalFile) -> dict[str, list[str]]:
+    """Return the variables that were configured for a journal's items."""
+    items = json.loads(run_messages(journal).get("items") or "{}")
+    chosen = {item: options.get("variables") for item, options in items.items()}
+    return {item: list(names) for item, names in chosen.items() if names}
 
 
 def _flats(known: mf.Manifest, journal: JournalFile, gaps: list[Gap]) -> Iterator[Flat]:
@@ -258,10 +270,27 @@ def rebuild(store: Path) -> list[str]:
     kept = _without_replaced(segments)
     records = [mf.schema_record(schema) for schema in schemas.values()]
     records += [mf.segment_record(segment) for segment in kept]
-    heads = {part.journal: part.head for segment in kept for part in segment.parts}
-    gone = [name for name in heads if not (store / name).exists()]
-    mf.replace(store, [*records, *(mf.journal_record(name, heads[name]) for name in gone)])
+    records += [
+        mf.journal_record(journal)
+        for journal in _journals_of(kept)
+        if not (store / journal.name).exists()
+    ]
+    mf.replace(store, records)
     return bad
+
+
+def _journals_of(segments: Sequence[Segment]) -> list[mf.Journal]:
+    """Tell from segments which journals they came from, and how far these reached."""
+    parts: dict[str, list[Part]] = {}
+    for part in (part for segment in segments for part in segment.parts):
+        parts.setdefault(part.journal, []).append(part)
+    return [
+        mf.Journal(
+            name, found[0].head, found[0].writer, found[0].run,
+            min(part.first_seq for part in found), 1 + max(part.last_seq for part in found),
+        )
+        for name, found in parts.items()
+    ]  # fmt: skip
 
 
 def _without_replaced(segments: Sequence[Segment]) -> list[Segment]:

@@ -1,0 +1,83 @@
+"""What verbs share when they print: tables, JSON, files, time ranges."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import re
+import sys
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO, Any
+
+from amberbox.blackbox.tabletext import grid
+from amberbox.core.errors import UsageError
+
+
+def print_json(value: Any) -> None:
+    """Print a value as JSON for programs and people."""
+    print(json.dumps(value, indent=2, ensure_ascii=False))
+
+
+def print_grid(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
+    """Print a table for the eye."""
+    print(grid(header, list(rows)))
+
+
+def size(count: int) -> str:
+    """Write a number of bytes for a person."""
+    value = float(count)
+    for unit in ("B", "kB", "MB", "GB"):
+        if value < 1000:
+            return f"{value:.0f} {unit}" if unit == "B" else f"{value:.1f} {unit}"
+        value /= 1000
+    return f"{value:.1f} TB"
+
+
+def tell(notes: Iterable[str]) -> None:
+    """Say on stderr what could not be read."""
+    for note in notes:
+        print(f"note: {note}", file=sys.stderr)
+
+
+@contextmanager
+def text_output(path: str | None) -> Iterator[IO[str]]:
+    """Open the file to write to, or stdout."""
+    if path is None:
+        yield sys.stdout
+        return
+    with writable(path).open("w", encoding="utf-8", newline="") as file:
+        yield file
+
+
+def writable(path: str) -> Path:
+    """Return a path whose folder exists.
+
+    Raises UsageError when it cannot be written.
+    """
+    target = Path(path)
+    folder = target.parent
+    if not folder.is_dir():
+        raise UsageError(f"cannot write {path}: there is no folder {folder}", "make it first")
+    if target.is_dir() or not os.access(target if target.exists() else folder, os.W_OK):
+        raise UsageError(f"cannot write {path}", "choose a file in a folder that can be written")
+    return target
+
+
+def accept_relative_times(parser: argparse.ArgumentParser) -> None:
+    """Let ``--from -10m`` stand as a value: argparse would take it for an option."""
+    parser._negative_number_matcher = re.compile(r"-\d")
+
+
+def add_range(parser: argparse.ArgumentParser) -> None:
+    """Add ``--from``, ``--to`` and ``--by``."""
+    accept_relative_times(parser)
+    times = "ISO (UTC), epoch, -10m before the last record, now or now-10m"
+    parser.add_argument("--from", dest="from_", metavar="T", help=f"first time: {times}")
+    parser.add_argument("--to", metavar="T", help="end of the range, not included")
+    parser.add_argument(
+        "--by", choices=("received", "timestamp"), default="received",
+        help="go by time of receipt (default) or by the item's own stamps",
+    )  # fmt: skip

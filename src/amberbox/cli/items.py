@@ -1,0 +1,50 @@
+"""List what was recorded: data items with rows, rates and times."""
+
+from __future__ import annotations
+
+import argparse
+
+from amberbox.blackbox.overview import ItemInfo
+from amberbox.blackbox.query import open as open_record
+from amberbox.cli._output import print_grid, print_json, size
+from amberbox.core.clock import NS
+from amberbox.core.timetext import format_time
+
+_HEADER = ("item", "type", "rows", "rate Hz", "first (UTC)", "last (UTC)", "stamp offset s", "size")
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the verb's arguments."""
+    parser.add_argument("where", metavar="WHERE", help="robot folder, store or recording file")
+    parser.add_argument("--json", action="store_true", help="a list of objects")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print the items of a record."""
+    with open_record(args.where) as record:
+        items = record.items()
+    if args.json:
+        print_json([item.to_json() for item in items])
+    elif items:
+        print_grid(_HEADER, map(_row, items))
+    else:
+        print("nothing has been recorded yet")
+    return 0
+
+
+def _row(item: ItemInfo) -> tuple[object, ...]:
+    return (
+        item.name,
+        item.type,
+        item.rows,
+        item.rate_hz,
+        _short(item.first_ns),
+        _short(item.last_ns),
+        None if item.stamp_offset_s is None else round(item.stamp_offset_s, 4),
+        size(item.bytes) if item.bytes else None,
+    )
+
+
+def _short(time_ns: int) -> str:
+    """Milliseconds are enough for the eye."""
+    return format_time(time_ns - time_ns % (NS // 1000))[:23]

@@ -1,0 +1,107 @@
+"""Print the variables of a data item as a table, CSV, JSON or Parquet."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable
+from typing import IO
+
+from amberbox.blackbox.livequery import follow_tables
+from amberbox.blackbox.query import Record
+from amberbox.blackbox.query import open as open_record
+from amberbox.blackbox.table import Table
+from amberbox.blackbox.tabletext import write_grid
+from amberbox.cli._output import add_range, tell, text_output, writable
+from amberbox.core.errors import UsageError
+
+FORMATS = ("table", "csv", "json", "parquet")
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the verb's arguments."""
+    parser.add_argument("where", metavar="WHERE", help="robot folder, store or recording file")
+    parser.add_argument("item", metavar="ITEM", help="data item; 'amberbox items' lists them")
+    parser.add_argument(
+        "variables", metavar="VAR", nargs="*",
+        help="column, path or end of a path, ranges[17], received, seq",
+    )  # fmt: skip
+    add_range(parser)
+    parser.add_argument(
+        "--points", type=int, metavar="N", help="thin out to N rows, keeping extremes"
+    )
+    parser.add_argument("--follow", action="store_true", help="go on with rows as they come")
+    parser.add_argument(
+        "--format", choices=FORMATS, help="default: by the ending of -o, else table"
+    )
+    parser.add_argument("-o", "--output", metavar="FILE", help="write to a file")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print rows, and with ``--follow`` go on until stopped."""
+    form = chosen_format(args.format, args.output)
+    with open_record(args.where) as record:
+        if args.follow:
+            return _follow(record, args, form)
+        table = record.query(
+            args.item, args.variables or None, args.from_, args.to, args.by, args.points
+        )
+    write(table, form, args.output)
+    tell(table.notes)
+    return 0
+
+
+def chosen_format(named: str | None, output: str | None) -> str:
+    """Return the format that was named, else the one that the file's ending says."""
+    ending = output.rpartition(".")[2] if output else ""
+    form = named or (ending if ending in FORMATS else "table")
+    if form == "parquet" and output is None:
+        raise UsageError("Parquet needs a file", "add -o rows.parquet")
+    return form
+
+
+def write(table: Table, form: str, output: str | None) -> None:
+    """Write a table in one of ``FORMATS``."""
+    if form == "parquet":
+        table.to_parquet(writable(str(output)))
+        return
+    with text_output(output) as file:
+        _WRITERS[form](table, file)
+
+
+def _write_grid(table: Table, file: IO[str]) -> None:
+    write_grid(file, table.fields, table.columns)
+
+
+_WRITERS: dict[str, Callable[[Table, IO[str]], None]] = {
+    "table": _write_grid,
+    "csv": lambda table, file: table.to_csv(file),
+    "json": lambda table, file: table.to_json(file),
+}
+
+
+def _follow(record: Record, args: argparse.Namespace, form: str) -> int:
+    """Stream rows; JSON comes as one object per line."""
+    if form == "parquet" or args.points is not None or args.to is not None:
+        raise UsageError("--follow prints rows as they come", "leave out parquet, --points, --to")
+    if args.by != "received":
+        raise UsageError("--follow goes by time of receipt", "leave out --by")
+    with text_output(args.output) as file:
+        first = True
+        try:
+            for table in follow_tables(record, args.item, args.variables or None, args.from_):
+                _stream(table, form, file, header=first)
+                first = False
+        except KeyboardInterrupt:
+            print(file=sys.stderr)
+    return 0
+
+
+def _stream(table: Table, form: str, file: IO[str], *, header: bool) -> None:
+    if form == "json":
+        table.to_json(file, lines=True)
+    elif form == "csv":
+        table.to_csv(file, header=header)
+    else:
+        write_grid(file, table.fields, table.columns, header=header, steady=True)
+    file.flush()

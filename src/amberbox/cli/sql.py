@@ -1,0 +1,29 @@
+"""Ask the record in SQL: one view per data item (DuckDB)."""
+
+from __future__ import annotations
+
+import argparse
+
+from amberbox.blackbox.query import open as open_record
+from amberbox.cli._output import tell
+from amberbox.cli.query import FORMATS, chosen_format, write
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the verb's arguments."""
+    parser.add_argument("where", metavar="WHERE", help="robot folder, store or recording file")
+    parser.add_argument("statement", metavar="SQL", help='such as "select ... from ros_odom"')
+    parser.add_argument(
+        "--format", choices=FORMATS, help="default: by the ending of -o, else table"
+    )
+    parser.add_argument("-o", "--output", metavar="FILE", help="write to a file")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print the answer to a SELECT."""
+    form = chosen_format(args.format, args.output)
+    with open_record(args.where) as record:
+        table = record.sql(args.statement)
+    write(table, form, args.output)
+    tell(table.notes)
+    return 0
