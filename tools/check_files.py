@@ -1,4 +1,4 @@
-"""Check every committed file: no address of a package index, no path of one machine, no leftovers."""
+"""Check every committed file: no package index address, no path of one machine, no leftovers."""
 
 from __future__ import annotations
 
