@@ -1,0 +1,180 @@
+"""Recordings as a source: ROS 1 and ROS 2 bags and MCAP files, replayed as if they were live."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from amberbox.blackbox.formats import Recording, open_recording
+from amberbox.core.clock import NS
+from amberbox.core.errors import AmberboxError
+from amberbox.core.options import option
+from amberbox.core.source import Sink, TopicOptions
+
+SAMPLE = """\
+- recording:
+    path: recordings/*.bag
+    speed: 2
+    topics:
+      - topic: {name: /odom, max_frequency: 10}
+"""
+_NOT_WORTH_WAITING_NS = 500_000
+
+
+@dataclass(frozen=True)
+class Config:
+    """The ``recording`` block."""
+
+    path: str | Sequence[str] = option(
+        doc="file or bag folder, * and ** allowed; several play one after the other",
+        aliases=("paths",),
+    )
+    speed: float | Literal["max"] = option(1.0, "times the original speed, or max for no waiting")
+    topics: Sequence[TopicOptions] = option((), "topics to replay; all when absent")
+    loop: bool = option(False, "start again at the end")
+    start_s: float = option(0.0, "leave out this much at the start of each recording", unit="s")
+    duration_s: float | None = option(None, "play this much of each recording", unit="s")
+
+    @property
+    def patterns(self) -> Sequence[str]:
+        """The paths as a list."""
+        return [self.path] if isinstance(self.path, str) else self.path
+
+    def check(self) -> Iterator[tuple[str, str]]:
+        """Say which values cannot work; opens nothing."""
+        if not all(self.patterns) or not self.patterns:
+            yield "path", "names no file"
+        if self.speed != "max" and not 0 < self.speed < float("inf"):
+            yield "speed", "must be above 0, or max"
+        if self.start_s < 0:
+            yield "start_s", "must not be negative"
+        if self.duration_s is not None and self.duration_s <= 0:
+            yield "duration_s", "must be above 0"
+
+
+class Source:
+    """Replays recordings; messages are stamped on receipt like those of a robot."""
+
+    lossless = True
+
+    def __init__(self, config: Config, name: str) -> None:
+        self.config = config
+        self.name = name
+        self.progress = 0.0
+        """Fraction of all recordings that has been replayed (of this round, if it loops)."""
+
+    def topics(self) -> Sequence[TopicOptions]:
+        return self.config.topics
+
+    def run(self, sink: Sink, stop: threading.Event) -> None:
+        """Replay until the end, or until ``stop`` is set if the recordings loop.
+
+        Raises AmberboxError if there is no recording at the path or one cannot be read.
+        """
+        paths = find_paths(self.config.patterns)
+        while not stop.is_set():
+            for number, path in enumerate(paths):
+                self._play(path, number / len(paths), 1 / len(paths), sink, stop)
+            if not self.config.loop:
+                break
+
+    def _play(
+        self, path: Path, before: float, share: float, sink: Sink, stop: threading.Event
+    ) -> None:
+        with open_recording(path) as recording:
+            streams = self._streams(recording, path, sink)
+            messages = _chosen(recording, self.config)
+            pace = _Pace(self.config.speed, stop)
+            for topic_index, log_time_ns, _, data in messages:
+                if not pace.wait_for(log_time_ns):
+                    break
+                stream = streams[topic_index]
+                if stream is not None:
+                    sink.message(stream, data, sink.now_ns())
+                    self.progress = before + share * recording.progress
+            _say_goodbye(recording, path, streams, sink, stop)
+        if not stop.is_set():
+            self.progress = before + share
+
+    def _streams(self, recording: Recording, path: Path, sink: Sink) -> list[int | None]:
+        """Announce the topics to replay; None for those that are left out."""
+        wanted = {topic.name for topic in self.config.topics}
+        names = {topic.name for topic in recording.topics}
+        for name in sorted(wanted - names):
+            sink.event("topic_missing", f"{path.name} has no topic {name}", topic=name)
+        chosen = [t if not wanted or t.name in wanted else None for t in recording.topics]
+        for name in dict.fromkeys(topic.name for topic in chosen if topic is not None):
+            sink.link_up(name, path.name)
+        return [None if topic is None else sink.topic(topic) for topic in chosen]
+
+
+def find_paths(patterns: Sequence[str]) -> list[Path]:
+    """Return what the patterns match, each pattern's matches sorted; raises AmberboxError."""
+    paths = []
+    for pattern in patterns:
+        matches = _matches(Path(pattern).expanduser())
+        if not matches:
+            raise AmberboxError(
+                f"there is no recording at {pattern}", f"paths are seen from {Path.cwd()}"
+            )
+        paths += matches
+    return paths
+
+
+def _matches(pattern: Path) -> list[Path]:
+    if pattern.exists():  # also when its name has brackets in it
+        return [pattern]
+    parts = pattern.relative_to(pattern.anchor)
+    return sorted(Path(pattern.anchor).glob(str(parts)))
+
+
+def _chosen(recording: Recording, config: Config) -> Iterator[tuple[int, int, int | None, bytes]]:
+    if not config.start_s and config.duration_s is None:
+        return recording.messages()
+    from_ns = (recording.report.start_ns or 0) + round(config.start_s * NS)
+    to_ns = None if config.duration_s is None else from_ns + round(config.duration_s * NS)
+    return recording.messages(from_ns, to_ns)
+
+
+class _Pace:
+    """Waits until a message is due by the monotonic clock."""
+
+    def __init__(self, speed: float | Literal["max"], stop: threading.Event) -> None:
+        self._speed = speed
+        self._stop = stop
+        self._start: tuple[int, int] | None = None
+
+    def wait_for(self, log_time_ns: int) -> bool:
+        """Wait for the turn of a message; False if it is never to come."""
+        if self._speed == "max":
+            return not self._stop.is_set()
+        now_ns = time.monotonic_ns()
+        if self._start is None:
+            self._start = log_time_ns, now_ns
+        first_ns, began_ns = self._start
+        due_ns = began_ns + (log_time_ns - first_ns) / self._speed
+        if due_ns - now_ns < _NOT_WORTH_WAITING_NS:
+            return not self._stop.is_set()
+        return not self._stop.wait((due_ns - now_ns) / NS)
+
+
+def _say_goodbye(
+    recording: Recording,
+    path: Path,
+    streams: Sequence[int | None],
+    sink: Sink,
+    stop: threading.Event,
+) -> None:
+    reason = "stopped" if stop.is_set() else "end of recording"
+    replayed = [t.name for t, s in zip(recording.topics, streams, strict=True) if s is not None]
+    for name in dict.fromkeys(replayed):
+        sink.link_down(name, path.name, reason)
+    for note in recording.report.notes:
+        sink.event("recording_note", f"{path.name}: {note}", path=str(path))
+    for damage in recording.report.damage:
+        details = {"path": str(path), "offset": damage.offset, "length": damage.length}
+        sink.event("recording_damaged", str(damage), **details)

@@ -1,0 +1,314 @@
+"""ZeroMQ publishers: JSON or msgpack, topic and payload in two frames or in one."""
+
+from __future__ import annotations
+
+import re
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from amberbox.core.options import option
+from amberbox.core.source import Sink, TopicOptions
+from amberbox.core.types import Topic
+
+SAMPLE = """\
+- zmq:
+    endpoint: tcp://localhost:5555
+    topics:
+      - topic: {name: events, type: json, max_frequency: 30}
+      - topic: {name: pose, url: tcp://192.168.1.7, port: 5556, type: msgpack}
+"""
+UNNAMED = "message"
+"""Topic of messages in one frame that name none."""
+
+_POLL_MS = 100
+_AT_ONCE = 500  # messages of one publisher before the others have their turn
+_KEY_LENGTH = 40  # characters of a CURVE key in Z85
+_BYTE_ORDER_MARK = b"\xef\xbb\xbf"
+_NAME_AND_JSON = re.compile(rb"([^\s{\[\"]+)[ \t\0]+([{\[].*)", re.DOTALL)
+
+
+@dataclass(frozen=True)
+class ZmqTopic(TopicOptions):
+    """A topic; ``name`` is what messages start with, as ZeroMQ subscribes by prefix."""
+
+    type: str = option("", "json or msgpack; told apart by the first byte when absent")
+    endpoint: str = option("", "its publisher, tcp://HOST:PORT; the block's when absent")
+    url: str = option("", "its publisher's host, tcp://HOST, used with 'port'")
+    port: int | None = option(None, "its publisher's port")
+
+
+@dataclass(frozen=True)
+class Config:
+    """The ``zmq`` block."""
+
+    endpoint: str | Sequence[str] = option(
+        "", "publisher, tcp://HOST:PORT or ipc://PATH, or several"
+    )
+    url: str = option(
+        "", "publisher's host, tcp://HOST, used with 'port'", aliases=("publisher_url",)
+    )
+    port: int | None = option(None, "publisher's port")
+    topics: Sequence[ZmqTopic] = option((), "topics to record; all when absent")
+    max_message_mb: float = option(256.0, "longer messages end the connection", unit="MB")
+    curve_server_key: str = option("", "publisher's public CURVE key, 40 characters")
+    curve_public_key: str = option("", "own public CURVE key; made anew when absent")
+    curve_secret_key: str = option("", "own secret CURVE key", secret=True)
+
+    def check(self) -> Iterator[tuple[str, str]]:
+        """Say which values cannot work; opens nothing."""
+        if not self.topics and not self._own_endpoints():
+            yield "endpoint", "names no publisher; write tcp://HOST:PORT"
+        for endpoint in self._own_endpoints():
+            yield from (("endpoint", what) for what in _wrong_with(endpoint))
+        for topic in self.topics:
+            yield from (("topics", f"'{topic.name}': {what}") for what in self._wrong_topic(topic))
+        yield from self._check_keys()
+        if self.max_message_mb <= 0:
+            yield "max_message_mb", "must be above 0"
+
+    def _check_keys(self) -> Iterator[tuple[str, str]]:
+        for key in ("curve_server_key", "curve_public_key", "curve_secret_key"):
+            if len(getattr(self, key)) not in (0, _KEY_LENGTH):
+                yield key, f"a CURVE key has {_KEY_LENGTH} characters (Z85)"
+        if bool(self.curve_public_key) != bool(self.curve_secret_key):
+            yield "curve_public_key", "goes together with curve_secret_key"
+        if self.curve_secret_key and not self.curve_server_key:
+            yield "curve_server_key", "is needed to use CURVE"
+
+    def _wrong_topic(self, topic: ZmqTopic) -> Iterator[str]:
+        if topic.type not in ("", "json", "msgpack"):
+            yield f"type '{topic.type}' is neither json nor msgpack"
+        endpoints = self._endpoints_of(topic)
+        if not endpoints:
+            yield "names no publisher; write endpoint: tcp://HOST:PORT"
+        for endpoint in endpoints:
+            yield from _wrong_with(endpoint)
+
+    def publishers(self) -> Mapping[str, Sequence[ZmqTopic]]:
+        """Topics by publisher; an empty list stands for every topic."""
+        found: dict[str, list[ZmqTopic]] = {}
+        for topic in self.topics:
+            for endpoint in self._endpoints_of(topic):
+                found.setdefault(endpoint, []).append(topic)
+        return found if self.topics else {endpoint: [] for endpoint in self._own_endpoints()}
+
+    def _own_endpoints(self) -> Sequence[str]:
+        listed = [self.endpoint] if isinstance(self.endpoint, str) else list(self.endpoint)
+        return [e for e in (*listed, _join(self.url, self.port)) if e]
+
+    def _endpoints_of(self, topic: ZmqTopic) -> Sequence[str]:
+        if topic.endpoint:
+            return [topic.endpoint]
+        if topic.url or topic.port:
+            return [_join(topic.url or self.url, topic.port or self.port)]
+        return self._own_endpoints()
+
+
+def _join(url: str, port: int | None) -> str:
+    """Make ``tcp://host:port`` of what older configurations give in two keys."""
+    if not url:
+        return "" if port is None else f"tcp://localhost:{port}"
+    full = url if "://" in url else f"tcp://{url}"
+    return full if port is None else f"{full}:{port}"
+
+
+def _wrong_with(endpoint: str) -> Iterator[str]:
+    transport, separator, rest = endpoint.partition("://")
+    host, _, port = rest.rpartition(":")
+    if not separator or transport not in ("tcp", "ipc"):
+        yield f"'{endpoint}' is no address; write tcp://HOST:PORT or ipc://PATH"
+    elif transport == "tcp" and not (host and port.isdecimal() and 0 < int(port) < 65536):
+        yield f"'{endpoint}' has no port; write tcp://HOST:PORT"
+    elif transport == "tcp" and host in ("*", "0.0.0.0", "[::]"):  # refused here
+        yield f"'{endpoint}' is where a publisher binds; name its host"
+
+
+class Source:
+    """A subscriber; it never pulls, requests or publishes, so nobody misses a message."""
+
+    lossless = False
+
+    def __init__(self, config: Config, name: str) -> None:
+        self.config = config
+        self.name = name
+
+    def topics(self) -> Sequence[TopicOptions]:
+        return self.config.topics
+
+    def run(self, sink: Sink, stop: threading.Event) -> None:
+        """Listen to all publishers of the block in one thread until ``stop`` is set."""
+        import zmq
+
+        context = zmq.Context()
+        links = [_Link(e, topics, sink) for e, topics in self.config.publishers().items()]
+        poller = zmq.Poller()
+        try:
+            for link in links:
+                link.connect(context, self.config)
+                poller.register(link.socket, zmq.POLLIN)
+                poller.register(link.monitor, zmq.POLLIN)
+            while not stop.is_set():
+                ready = dict(poller.poll(_POLL_MS))
+                for link in links:
+                    link.serve(ready)
+        finally:
+            for link in links:
+                link.close()
+            context.destroy(linger=0)
+
+
+@dataclass
+class _Link:
+    """The connection to one publisher; ZeroMQ itself connects and connects again."""
+
+    endpoint: str
+    options: Sequence[ZmqTopic]
+    sink: Sink
+    is_up: bool = False
+    streams: dict[tuple[bytes, str], int] = field(default_factory=dict)
+    seen: dict[str, None] = field(default_factory=dict)
+    told: set[str] = field(default_factory=set)
+    types: Mapping[bytes, str] = field(default_factory=dict)
+    socket: Any = None
+    monitor: Any = None
+
+    def connect(self, context: Any, config: Config) -> None:
+        """Subscribe; returns at once, whether the publisher is there or not."""
+        import zmq
+
+        self.types = {topic.name.encode(): topic.type for topic in self.options}
+        self.seen = dict.fromkeys(topic.name for topic in self.options)
+        self.socket = context.socket(zmq.SUB)
+        # the queue must never be the place where messages are dropped: that would not be counted
+        self.socket.rcvhwm = 0
+        self.socket.maxmsgsize = int(config.max_message_mb * 1e6)
+        self.socket.reconnect_ivl_max = 1000
+        self.socket.ipv6 = True
+        self.socket.setsockopt(zmq.TCP_KEEPALIVE, 1)
+        self.socket.setsockopt(zmq.TCP_KEEPALIVE_IDLE, 10)
+        self.socket.setsockopt(zmq.TCP_KEEPALIVE_INTVL, 5)
+        self.socket.setsockopt(zmq.TCP_KEEPALIVE_CNT, 3)
+        _use_keys(self.socket, config)
+        self.monitor = self.socket.get_monitor_socket()
+        for prefix in self.types or (b"",):
+            self.socket.subscribe(prefix)
+        self.socket.connect(self.endpoint)
+
+    def serve(self, ready: Mapping[Any, int]) -> None:
+        """Take what has arrived."""
+        if self.monitor in ready:
+            self._take_monitor_events()
+        if self.socket in ready:
+            self._take_messages(_AT_ONCE)
+
+    def close(self) -> None:
+        """Say that nothing more is heard."""
+        if self.is_up:
+            self._down("stopped")
+        if self.socket is not None:
+            self.socket.disable_monitor()
+
+    def _take_monitor_events(self) -> None:
+        import zmq
+        from zmq.utils.monitor import parse_monitor_message
+
+        while True:
+            try:
+                event = parse_monitor_message(self.monitor.recv_multipart(zmq.NOBLOCK))
+            except zmq.Again:
+                return
+            self._take_monitor_event(str(zmq.Event(event["event"]).name), event["value"])
+
+    def _take_monitor_event(self, kind: str, value: int) -> None:
+        if kind == "HANDSHAKE_SUCCEEDED" and not self.is_up:
+            self._up()
+        elif kind == "DISCONNECTED" and self.is_up:
+            self._take_messages(None)
+            self._down("publisher disconnected")
+        elif kind == "CONNECT_RETRIED":
+            text = f"no publisher answers at {self.endpoint}; it is tried again"
+            self._tell_once("unreachable", text)
+        elif kind.startswith("HANDSHAKE_FAILED"):
+            text = f"{self.endpoint} refuses the connection; are the CURVE keys right?"
+            self._tell_once("handshake_failed", text, code=value)
+
+    def _up(self) -> None:
+        self.is_up = True
+        self.told -= {"unreachable", "handshake_failed"}
+        for topic in self.seen:
+            self.sink.link_up(topic, self.endpoint)
+
+    def _down(self, reason: str) -> None:
+        self.is_up = False
+        for topic in self.seen:
+            self.sink.link_down(topic, self.endpoint, reason)
+
+    def _tell_once(self, kind: str, text: str, **details: Any) -> None:
+        if kind not in self.told:
+            self.told.add(kind)
+            self.sink.event(kind, text, endpoint=self.endpoint, **details)
+
+    def _take_messages(self, limit: int | None) -> None:
+        import zmq
+
+        receive: Callable[[int], list[bytes]] = self.socket.recv_multipart
+        taken = 0
+        while limit is None or taken < limit:
+            try:
+                frames = receive(zmq.NOBLOCK)
+            except zmq.Again:
+                return
+            self._take(frames, self.sink.now_ns())
+            taken += 1
+
+    def _take(self, frames: list[bytes], received_ns: int) -> None:
+        topic, payload = _split(frames, self.types)
+        if len(frames) > 2:
+            text = f"a message of {len(frames)} frames; those after the topic are joined"
+            self._tell_once("many_frames", text, topic=topic.decode(errors="backslashreplace"))
+        encoding = self.types.get(topic) or detect_encoding(payload)
+        stream = self.streams.get((topic, encoding))
+        if stream is None:
+            stream = self._new_stream(topic, encoding)
+        self.sink.message(stream, payload, received_ns)
+
+    def _new_stream(self, topic: bytes, encoding: str) -> int:
+        name = topic.decode(errors="backslashreplace") or UNNAMED
+        stream = self.streams[topic, encoding] = self.sink.topic(Topic(name, encoding))
+        if name not in self.seen:
+            self.seen[name] = None
+            if self.is_up:
+                self.sink.link_up(name, self.endpoint)
+        return stream
+
+
+def _use_keys(socket: Any, config: Config) -> None:
+    """Encrypt with CURVE if the publisher's key is given."""
+    import zmq
+
+    if not config.curve_server_key:
+        return
+    own = (config.curve_public_key.encode(), config.curve_secret_key.encode())
+    socket.curve_publickey, socket.curve_secretkey = own if own[1] else zmq.curve_keypair()
+    socket.curve_serverkey = config.curve_server_key.encode()
+
+
+def _split(frames: Sequence[bytes], names: Mapping[bytes, str]) -> tuple[bytes, bytes]:
+    """Return topic and payload of a message; a single frame may hold both."""
+    if len(frames) > 1:
+        return frames[0], frames[1] if len(frames) == 2 else b"".join(frames[1:])
+    frame = frames[0]
+    match = _NAME_AND_JSON.match(frame)
+    if match is not None:
+        return match[1], match[2]
+    prefixes = [name for name in names if name and frame.startswith(name)]
+    name = max(prefixes, key=len, default=b"")
+    return name, frame[len(name) :].lstrip(b" \t\0") if name else frame
+
+
+def detect_encoding(payload: bytes) -> str:
+    """Tell JSON text from msgpack: every msgpack map or array starts above ASCII, no JSON does."""
+    is_text = payload[:1] < b"\x80" or payload.startswith(_BYTE_ORDER_MARK)
+    return "json" if is_text else "msgpack"

@@ -1,0 +1,213 @@
+"""The zmq source against real publishers: order, loss, restarts, keys."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import msgpack  # type: ignore[import-untyped]  # the package has no type hints
+import pytest
+import zmq
+
+from amberbox.blackbox.sources.zmq import Config, Source, ZmqTopic
+from amberbox.testing.contract import ObservedSink, observe
+
+
+@pytest.fixture
+def context() -> Iterator[zmq.Context[Any]]:
+    made = zmq.Context()
+    yield made
+    made.destroy(linger=0)
+
+
+def bind_publisher(context: zmq.Context[Any], port: int = 0) -> tuple[zmq.Socket[Any], int]:
+    socket = context.socket(zmq.XPUB)  # shows subscriptions, otherwise a PUB
+    socket.sndhwm = 0
+    if port:
+        socket.bind(f"tcp://127.0.0.1:{port}")
+        return socket, port
+    return socket, socket.bind_to_random_port("tcp://127.0.0.1")
+
+
+def await_subscription(socket: zmq.Socket[Any]) -> bytes:
+    assert socket.poll(5000), "nobody subscribed"
+    subscription = socket.recv()
+    assert subscription[:1] == b"\1"
+    return subscription[1:]
+
+
+def wait_until(condition: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + 5
+    while not condition():
+        assert time.monotonic() < deadline, "it did not happen within 5 s"
+        time.sleep(0.005)
+
+
+def links(sink: ObservedSink) -> list[tuple[str, str, str]]:
+    return [(way, topic, reason) for way, topic, _, reason, _ in sink.links]
+
+
+@pytest.mark.parametrize(("kind", "pack"), [("json", json.dumps), ("msgpack", msgpack.packb)])
+@pytest.mark.parametrize("is_told", [True, False])
+def test_every_message_after_the_subscription_arrives_once_in_order(
+    context: zmq.Context[Any], kind: str, pack: Callable[[Any], Any], is_told: bool
+) -> None:
+    publisher, port = bind_publisher(context)
+    sent = []
+    for number in range(2000):
+        packed = pack({"n": number, "v": [1.5, number / 7], "name": "wheel"})
+        sent.append(packed.encode() if isinstance(packed, str) else packed)
+    topic = ZmqTopic(name="wheels", type=kind if is_told else "")
+    config = Config(endpoint=f"tcp://127.0.0.1:{port}", topics=[topic])
+    with observe(Source(config, "zmq")) as sink:
+        assert await_subscription(publisher) == b"wheels"
+        for payload in sent:
+            publisher.send_multipart([b"wheels", payload])
+        assert sink.wait_for("wheels", 2000) == sent
+        assert [(t.name, t.message_encoding, t.schema) for t in sink.topics] == [
+            ("wheels", kind, None)
+        ]
+    assert links(sink) == [("up", "wheels", ""), ("down", "wheels", "stopped")]
+
+
+def test_without_topics_everything_is_recorded(context: zmq.Context[Any]) -> None:
+    publisher, port = bind_publisher(context)
+    with observe(Source(Config(url="tcp://127.0.0.1", port=port), "zmq")) as sink:
+        assert await_subscription(publisher) == b""
+        publisher.send_multipart([b"a", b'{"x": 1}'])
+        publisher.send_multipart([b"b/\xff", msgpack.packb({"x": 2})])
+        publisher.send(b'{"alone": true}')
+        publisher.send(b'pose {"x": 3}')
+        publisher.send_multipart([b"c", b'{"x"', b": 4}"])
+        publisher.send_multipart([b"c", b'{"x"', b": 5}"])
+        publisher.send_multipart([b"a", msgpack.packb([1])])
+        publisher.send_multipart([b"bad", b"{not json"])
+        assert sink.wait_for("bad", 1) == [b"{not json"]
+        assert sink.of("a") == [b'{"x": 1}', msgpack.packb([1])]
+        assert sink.of("b/\\xff") == [msgpack.packb({"x": 2})]
+        assert sink.of("message") == [b'{"alone": true}']
+        assert sink.of("pose") == [b'{"x": 3}']
+        assert sink.of("c") == [b'{"x": 4}', b'{"x": 5}']
+        assert [kind for kind, _, _ in sink.events] == ["many_frames"]
+        wait_until(lambda: len(sink.open_links()) == 6)
+
+
+def test_publisher_restart_is_seen_and_survived(context: zmq.Context[Any]) -> None:
+    publisher, port = bind_publisher(context)
+    config = Config(topics=[ZmqTopic(name="odom", url="127.0.0.1", port=port)])
+    with observe(Source(config, "zmq")) as sink:
+        await_subscription(publisher)
+        publisher.send_multipart([b"odom", b'{"n": 1}'])
+        sink.wait_for("odom", 1)
+        publisher.close(linger=0)
+        wait_until(lambda: not sink.open_links())
+        publisher, _ = bind_publisher(context, port)
+        await_subscription(publisher)
+        publisher.send_multipart([b"odom", b'{"n": 2}'])
+        assert sink.wait_for("odom", 2) == [b'{"n": 1}', b'{"n": 2}']
+        wait_until(lambda: len(sink.links) == 3)
+    assert links(sink) == [
+        ("up", "odom", ""),
+        ("down", "odom", "publisher disconnected"),
+        ("up", "odom", ""),
+        ("down", "odom", "stopped"),
+    ]
+
+
+def test_publisher_that_comes_late_is_announced_and_found(context: zmq.Context[Any]) -> None:
+    probe, port = bind_publisher(context)
+    probe.close(linger=0)
+    config = Config(endpoint=f"tcp://127.0.0.1:{port}", topics=[ZmqTopic(name="odom")])
+    with observe(Source(config, "zmq")) as sink:
+        wait_until(lambda: bool(sink.events))
+        assert sink.events[0][0] == "unreachable"
+        assert links(sink) == []
+        publisher, _ = bind_publisher(context, port)
+        await_subscription(publisher)
+        publisher.send_multipart([b"odom", b"{}"])
+        sink.wait_for("odom", 1)
+        wait_until(lambda: links(sink) == [("up", "odom", "")])
+    assert len(sink.events) == 1
+
+
+def test_several_publishers_in_one_block(context: zmq.Context[Any]) -> None:
+    first, first_port = bind_publisher(context)
+    second, second_port = bind_publisher(context)
+    topics = [
+        ZmqTopic(name="a", endpoint=f"tcp://127.0.0.1:{first_port}"),
+        ZmqTopic(name="b", url="tcp://127.0.0.1", port=second_port),
+    ]
+    with observe(Source(Config(topics=topics), "zmq")) as sink:
+        assert await_subscription(first) == b"a"
+        assert await_subscription(second) == b"b"
+        for number in range(200):
+            first.send_multipart([b"a", str(number).encode()])
+            second.send_multipart([b"b", str(-number).encode()])
+        assert sink.wait_for("a", 200) == [str(n).encode() for n in range(200)]
+        assert sink.wait_for("b", 200) == [str(-n).encode() for n in range(200)]
+        peers = dict(sink.open_links())
+        assert peers["a"] == f"tcp://127.0.0.1:{first_port}"
+        assert peers["b"] == f"tcp://127.0.0.1:{second_port}"
+
+
+def test_another_subscriber_misses_nothing(context: zmq.Context[Any]) -> None:
+    publisher, port = bind_publisher(context)
+    other = context.socket(zmq.SUB)
+    other.subscribe(b"")
+    other.connect(f"tcp://127.0.0.1:{port}")
+    await_subscription(publisher)
+    publisher.setsockopt(zmq.XPUB_VERBOSE, 1)
+    with observe(Source(Config(endpoint=f"tcp://127.0.0.1:{port}"), "zmq")) as sink:
+        await_subscription(publisher)
+        for number in range(300):
+            publisher.send_multipart([b"t", str(number).encode()])
+        sink.wait_for("t", 300)
+    for number in range(300):
+        assert other.poll(2000)
+        assert other.recv_multipart() == [b"t", str(number).encode()]
+    assert not publisher.poll(0) or publisher.recv() == b"\0"  # at most the unsubscription
+
+
+@pytest.mark.parametrize("has_own_key", [True, False])
+def test_curve_keys(context: zmq.Context[Any], has_own_key: bool) -> None:
+    public, secret = zmq.curve_keypair()
+    own_public, own_secret = zmq.curve_keypair()
+    publisher = context.socket(zmq.XPUB)
+    publisher.curve_server = True
+    publisher.curve_secretkey = secret
+    port = publisher.bind_to_random_port("tcp://127.0.0.1")
+    config = Config(
+        endpoint=f"tcp://127.0.0.1:{port}",
+        curve_server_key=public.decode(),
+        curve_public_key=own_public.decode() if has_own_key else "",
+        curve_secret_key=own_secret.decode() if has_own_key else "",
+    )
+    assert list(config.check()) == []
+    with observe(Source(config, "zmq")) as sink:
+        await_subscription(publisher)
+        publisher.send_multipart([b"t", b"{}"])
+        assert sink.wait_for("t", 1) == [b"{}"]
+
+
+def test_wrong_curve_key_is_an_event(context: zmq.Context[Any]) -> None:
+    _, secret = zmq.curve_keypair()
+    publisher = context.socket(zmq.XPUB)
+    publisher.curve_server = True
+    publisher.curve_secretkey = secret
+    port = publisher.bind_to_random_port("tcp://127.0.0.1")
+    other_public, _ = zmq.curve_keypair()
+    config = Config(endpoint=f"tcp://127.0.0.1:{port}", curve_server_key=other_public.decode())
+    with observe(Source(config, "zmq")) as sink:
+        wait_until(lambda: bool(sink.events))
+    assert sink.events[0][0] == "handshake_failed"
+    assert links(sink) == []
+
+
+def test_stop_is_heard_within_a_fifth_of_a_second(context: zmq.Context[Any]) -> None:
+    publisher, port = bind_publisher(context)
+    with observe(Source(Config(endpoint=f"tcp://127.0.0.1:{port}"), "zmq")):
+        await_subscription(publisher)
+        before = time.monotonic()
+    assert time.monotonic() - before < 0.2
