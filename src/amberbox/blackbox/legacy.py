@@ -11,7 +11,6 @@ LEGACY_KEYS: Mapping[str, str] = {
     "default_parameters.db_export_dir": "ignored, nothing is dumped; use 'amberbox query -o FILE'",
     "ros.topics.metadata": "ignored, names and types are recorded with the data",
     "zmq.topics.metadata": "ignored, names and types are recorded with the data",
-    "zmq.publisher_url": "ignored, give each topic its 'url'",
 }
 """Path of a key in ``black_box.yaml``, without the places in lists, to the note that is shown."""
 

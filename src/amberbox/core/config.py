@@ -303,7 +303,7 @@ def _to_number(kind: type[int] | type[float], node: Node, unit: str) -> int | fl
     value = node.value
     if isinstance(value, str):
         value = scalar(value)
-    if isinstance(value, str) and (known_units(unit) or "e" in value.lower()):
+    if isinstance(value, str) and known_units(unit) and value[:1] in "+-.0123456789":
         exact = in_unit(value, unit)
         value = int(exact) if exact.denominator == 1 else float(exact)
     if isinstance(value, str) and value.lstrip("+-").isdigit():

@@ -34,10 +34,8 @@ class Plugin:
         try:
             return importlib.import_module(self.target) if self.target else self._load_file()
         except ImportError as error:
-            missing = f"pip install {error.name}" if error.name else ""
-            raise AmberboxError(
-                f"plugin '{self.name}' cannot be loaded: {error}", missing
-            ) from error
+            what = f"plugin '{self.name}' cannot be loaded: {error}"
+            raise AmberboxError(what, install_hint(self.name)) from error
 
     def _load_file(self) -> ModuleType:
         digits = hashlib.sha256(str(self.path).encode()).hexdigest()[:8]

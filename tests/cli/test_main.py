@@ -1,0 +1,154 @@
+"""The program: finding verbs, exit status, errors in two lines."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from amberbox import __version__
+from amberbox.cli import main as program
+from amberbox.cli.main import main
+from amberbox.core.errors import AmberboxError, ConfigurationError, Problem
+from amberbox.core.plugins import Plugin
+
+VERB = '''\
+"""Does what the test wants."""
+from amberbox.core.errors import AmberboxError
+
+def configure(parser):
+    parser.add_argument("--number", type=int, default=0)
+
+def run(args):
+    return action(args)
+
+def action(args):
+    return args.number
+'''
+
+
+@pytest.fixture
+def verb(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Plugin:
+    """The only verb there is, ``work``; tests replace its ``action``."""
+    path = tmp_path / "work.py"
+    path.write_text(VERB)
+    plugin = Plugin("work", "Does what the test wants.", "", path)
+    module = plugin.load()
+    monkeypatch.setattr(Plugin, "load", lambda self: module)
+    monkeypatch.setattr(program, "verbs", lambda: {"work": plugin})
+    return plugin
+
+
+def failing(verb: Plugin, monkeypatch: pytest.MonkeyPatch, error: BaseException) -> None:
+    def action(args: object) -> int:
+        raise error
+
+    monkeypatch.setattr(verb.load(), "action", action)
+
+
+def test_help_lists_everyday_verbs_first(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--help"]) == 0
+    text = capsys.readouterr().out
+    places = [text.index(f"\n  {name} ") for name in ("new", "check", "record", "query", "plugins")]
+    assert places == sorted(places)
+    assert "Start a robot folder" in text
+
+
+def test_help_imports_no_verb() -> None:
+    code = (
+        "import sys; from amberbox.cli.main import main; main(['--help']);"
+        "sys.exit(any(n.startswith('amberbox.cli.') and n != 'amberbox.cli.main'"
+        " or n in ('numpy', 'pyarrow') for n in sys.modules))"
+    )
+    assert subprocess.run([sys.executable, "-c", code], stdout=subprocess.DEVNULL).returncode == 0
+
+
+def test_version_and_no_verb(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out == f"amberbox {__version__}\n"
+    assert main([]) == 2
+    assert "usage: amberbox VERB" in capsys.readouterr().out
+
+
+def test_every_verb_explains_itself(capsys: pytest.CaptureFixture[str]) -> None:
+    for name, verb in program.verbs().items():
+        assert verb.summary, name
+        assert main([name, "--help"]) == 0
+        assert f"usage: amberbox {name}" in capsys.readouterr().out
+    assert main(["help", "check"]) == 0
+    assert "usage: amberbox check" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["chekc"], "error: unknown verb 'chekc'; did you mean 'check'?\nhint: amberbox --help\n"),
+        (["--verbos"], "error: unknown option '--verbos'\nhint: amberbox --help\n"),
+        (["check"],
+         "error: the following arguments are required: folder\nhint: amberbox check --help\n"),
+        (["check", "x", "--jsno"],
+         "error: unrecognized arguments: --jsno\nhint: amberbox check --help\n"),
+    ],
+)  # fmt: skip
+def test_wrong_usage(
+    arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(arguments) == 2
+    assert capsys.readouterr().err == message
+
+
+def test_exit_status_is_the_verbs(verb: Plugin) -> None:
+    assert main(["work", "--number", "1"]) == 1
+    assert main(["-v", "work", "-v"]) == 0
+
+
+PROBLEM = Problem("f.yaml", 3, "a.b", "is wrong")
+
+
+@pytest.mark.parametrize(
+    ("error", "status", "message"),
+    [
+        (AmberboxError("disk full", "make room"), 1, "error: disk full\nhint: make room\n"),
+        (AmberboxError("disk full"), 1, "error: disk full\n"),
+        (ConfigurationError([PROBLEM]), 2,
+         "f.yaml:3: a.b: is wrong\nerror: 1 error in the configuration\n"),
+        (FileNotFoundError(2, "No such file or directory", "x"), 1,
+         "error: x: No such file or directory\n"),
+        (ZeroDivisionError("oh"), 1, "error: ZeroDivisionError: oh\nhint: this is a defect of "
+         "amberbox; AMBERBOX_DEBUG=1 shows where it happened\n"),
+        (KeyboardInterrupt(), 130, ""),
+    ],
+)  # fmt: skip
+def test_errors_speak_twice(
+    verb: Plugin,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    error: BaseException,
+    status: int,
+    message: str,
+) -> None:
+    failing(verb, monkeypatch, error)
+    assert main(["work"]) == status
+    assert capsys.readouterr().err == message
+
+
+def test_debug_shows_the_trace(
+    verb: Plugin, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    failing(verb, monkeypatch, AmberboxError("disk full"))
+    monkeypatch.setenv("AMBERBOX_DEBUG", "1")
+    assert main(["work"]) == 1
+    assert "Traceback" in capsys.readouterr().err
+
+
+def test_closed_pipe_is_quiet(tmp_path: Path) -> None:
+    read, write = os.pipe()
+    os.close(read)
+    command = [sys.executable, "-m", "amberbox", "--help"]
+    done = subprocess.run(command, stdout=write, stderr=subprocess.PIPE, text=True, check=False)
+    os.close(write)
+    assert done.stderr == ""
+    assert done.returncode == 141
