@@ -132,13 +132,9 @@ def _fits(path: str, pattern: str) -> bool:
 
 
 def closest(name: str, known: Sequence[str]) -> str:
-    """Return the names as a hint, the ones most like ``name`` first."""
-    close = difflib.get_close_matches(name, known, n=3, cutoff=0.5)
+    """Return the known names as a hint, the ones most like ``name`` first."""
+    close = difflib.get_close_matches(name, known, n=3, cutoff=0.6)
     close += [other for other in known if name in other and other not in close][:3]
-    if close:
-        return f"did you mean {' or '.join(close)}?"
-    return (
-        "there are: "
-        + (", ".join(known[:20]) or "no data items")
-        + (", ..." if len(known) > 20 else "")
-    )
+    shown = ", ".join(known[:20]) + (", ..." if len(known) > 20 else "")
+    listing = f"there are: {shown}" if known else "nothing has been recorded yet"
+    return f"did you mean {' or '.join(close)}? {listing}" if close else listing
