@@ -17,6 +17,12 @@ from amberbox.blackbox.unroll.places import Evenly, Objects, Scattered
 from amberbox.blackbox.unroll.walk import MISFITS, Slots, Walker, compile_walker
 from amberbox.blackbox.unroll.wire import Plan, text_slots
 
+MOST_LAYOUTS = 8
+_MOST_SPANS = 32
+_PADDING = 3
+"""Bytes between a string and the next prefix that are compared as if they belonged to it."""
+_MESSAGES_PER_NEW_LAYOUT = 256
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Layout:
@@ -76,25 +82,22 @@ def find_layout(plan: Plan, walker: Walker, message: bytes, big_endian: bool) ->
         big_endian,
         slots,
         _merged(message, checks),
-        _merged(message, checks + strings),
+        _merged(message, checks + strings, gap=_PADDING),
         {slot: alone.texts(slot, slot + 1, wide) for slot, wide in text_slots(plan.table)},
     )
 
 
-def _merged(message: bytes, checks: Sequence[tuple[int, int]]) -> tuple[tuple[int, bytes], ...]:
-    """Cut the checked bytes out of a message, neighbours in one piece."""
+def _merged(
+    message: bytes, checks: Sequence[tuple[int, int]], gap: int = 0
+) -> tuple[tuple[int, bytes], ...]:
+    """Cut the checked bytes out of a message, near neighbours in one piece."""
     merged: list[list[int]] = []
     for place, size in sorted(checks):
-        if merged and place <= merged[-1][1]:
+        if merged and place <= merged[-1][1] + gap:
             merged[-1][1] = max(merged[-1][1], place + size)
         elif size:
             merged.append([place, place + size])
     return tuple((start, message[start:end]) for start, end in merged)
-
-
-MOST_LAYOUTS = 8
-_MOST_SPANS = 32
-_MESSAGES_PER_NEW_LAYOUT = 256
 
 
 class TooManyLayoutsError(Exception):
