@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import socket
 import time
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -23,17 +24,17 @@ def context() -> Iterator[zmq.Context[Any]]:
 
 
 def bind_publisher(context: zmq.Context[Any], port: int = 0) -> tuple[zmq.Socket[Any], int]:
-    socket = context.socket(zmq.XPUB)  # shows subscriptions, otherwise a PUB
-    socket.sndhwm = 0
+    publisher = context.socket(zmq.XPUB)  # shows subscriptions, otherwise a PUB
+    publisher.sndhwm = 0
     if port:
-        socket.bind(f"tcp://127.0.0.1:{port}")
-        return socket, port
-    return socket, socket.bind_to_random_port("tcp://127.0.0.1")
+        publisher.bind(f"tcp://127.0.0.1:{port}")
+        return publisher, port
+    return publisher, publisher.bind_to_random_port("tcp://127.0.0.1")
 
 
-def await_subscription(socket: zmq.Socket[Any]) -> bytes:
-    assert socket.poll(5000), "nobody subscribed"
-    subscription = socket.recv()
+def await_subscription(publisher: zmq.Socket[Any]) -> bytes:
+    assert publisher.poll(5000), "nobody subscribed"
+    subscription = publisher.recv()
     assert subscription[:1] == b"\1"
     return subscription[1:]
 
@@ -117,8 +118,8 @@ def test_publisher_restart_is_seen_and_survived(context: zmq.Context[Any]) -> No
 
 
 def test_publisher_that_comes_late_is_announced_and_found(context: zmq.Context[Any]) -> None:
-    probe, port = bind_publisher(context)
-    probe.close(linger=0)
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        port = probe.getsockname()[1]
     config = Config(endpoint=f"tcp://127.0.0.1:{port}", topics=[ZmqTopic(name="odom")])
     with observe(Source(config, "zmq")) as sink:
         wait_until(lambda: bool(sink.events))
