@@ -1,0 +1,36 @@
+"""docs/configuration.md names every key, and its examples load."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from amberbox.blackbox.blocks import DefaultParameters
+from amberbox.blackbox.folder import load_folder
+from amberbox.blackbox.legacy import LEGACY_KEYS
+from amberbox.blackbox.robot import RobotConfig
+from amberbox.core.describe import describe
+from amberbox.core.source import TopicOptions
+
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "configuration.md"
+
+
+def test_every_key_is_documented() -> None:
+    page = PAGE.read_text(encoding="utf-8")
+    general = [row.key for row in describe(DefaultParameters, "default_parameters.")]
+    robot = [row.key for row in describe(RobotConfig) if row.key not in ("store", "server")]
+    topic = [row.key for row in describe(TopicOptions)]
+    for key in (*general, *robot, *topic):
+        assert f"| `{key}` |" in page, key
+    for key, note in LEGACY_KEYS.items():
+        assert f"`{key}`" in page
+        assert note in page
+
+
+def test_examples_load(tmp_path: Path) -> None:
+    robot, black_box = re.findall(r"```yaml\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
+    (tmp_path / "robot.yaml").write_text(robot)
+    (tmp_path / "black_box.yaml").write_text(black_box)
+    built = load_folder(tmp_path)
+    assert built.notes == ()
+    assert [topic.max_frequency for topic in built.blocks[0].config.topics] == [5, 10]
