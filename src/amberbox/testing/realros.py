@@ -76,15 +76,52 @@ class Processes:
         self.running.append(process)
         return process
 
+    def output(self, command: Sequence[str], port: int) -> str:
+        """Run a ROS tool to its end and return what it prints."""
+        return subprocess.run(
+            command, env=ros_environment(port), capture_output=True, text=True, check=True
+        ).stdout
+
     def master(self, port: int) -> subprocess.Popen[bytes]:
         """Start a master and wait until it answers."""
         process = self.start(["/usr/bin/rosmaster", "--core", "-p", str(port)], port)
         wait_until(lambda: answers(port), 15, "the ROS master answers")
         return process
 
-    def robot(self, script: Path, port: int, truth: Path, *options: str) -> subprocess.Popen[bytes]:
+
+@dataclass
+class Ros:
+    """A place to run a master and robots in; every robot keeps a truth file of its own."""
+
+    processes: Processes
+    port: int
+    folder: Path
+    script: Path
+    robots: int = 0
+
+    @property
+    def uri(self) -> str:
+        """The master's address."""
+        return f"http://127.0.0.1:{self.port}"
+
+    def master(self) -> subprocess.Popen[bytes]:
+        """Start a master, and wait for it."""
+        return self.processes.master(self.port)
+
+    def robot(self, *options: str) -> subprocess.Popen[bytes]:
         """Start the test robot; its options are described at the top of the script."""
-        return self.start([PYTHON, str(script), "--truth", str(truth), *options], port)
+        self.robots += 1
+        truth = self.folder / f"truth-{self.robots}.jsonl"
+        command = [PYTHON, str(self.script), "--truth", str(truth), *options]
+        return self.processes.start(command, self.port)
+
+    def truths(self) -> list[Path]:
+        """Return the truth files of all robots so far."""
+        return sorted(self.folder.glob("truth-*.jsonl"))
+
+    def published(self) -> dict[str, list[Published]]:
+        """Return what all robots have published, per topic and in order."""
+        return published(self.truths())
 
 
 def end(process: subprocess.Popen[bytes], number: int = signal.SIGTERM) -> None:
@@ -166,11 +203,11 @@ class GapSink(MemorySink):
         super().link_down(topic, peer, reason, since_ns)
         self.open_gaps[topic, peer] = since_ns or self.now_ns()
 
-    def all_gaps(self, topic: str) -> list[Interval]:
-        """Return the gaps of a topic, those still open until now."""
+    def all_gaps(self, topic: str, until_ns: int) -> list[Interval]:
+        """Return the gaps of a topic, those still open until the end that is given."""
         still_open = [at for (name, _), at in self.open_gaps.items() if name == topic]
         whole = [] if topic in self.gaps else [self.run_from_ns]
-        return self.gaps.get(topic, []) + [(at, self.now_ns()) for at in still_open + whole]
+        return self.gaps.get(topic, []) + [(at, until_ns) for at in still_open + whole]
 
 
 @dataclass(frozen=True)
@@ -183,6 +220,8 @@ class Verdict:
     unknown: list[str]
     repeated: list[str]
     in_order: bool
+    needless: list[Published]
+    """Recorded messages that were published well inside a gap."""
 
     @property
     def is_right(self) -> bool:
@@ -209,6 +248,7 @@ def judge(
         unknown=[body for body in bodies if body not in order],
         repeated=[body for body, count in _counts(bodies).items() if count > 1],
         in_order=places == sorted(places),
+        needless=[m for m in truth if m.body in got and _is_in(m.wall_ns, gaps, -tolerance_ns)],
     )
 
 

@@ -15,7 +15,9 @@ from amberbox.core.source import TopicOptions
 
 def configure(text: str) -> tuple[Config | None, list[str]]:
     problems: list[Problem] = []
-    config = build(Config, parse_yaml(text, "black_box.yaml"), problems)
+    node = parse_yaml(text, "black_box.yaml", problems)
+    assert node is not None
+    config = build(Config, node, problems)
     return config, [problem.what for problem in problems]
 
 

@@ -270,6 +270,7 @@ class Robot:
     def make_map(self, n: int, stamp: Any) -> Any:
         message = OccupancyGrid()
         message.header.frame_id = "map"
+        message.header.stamp = stamp
         message.info.resolution = 0.05
         message.info.width = message.info.height = 100
         message.data = [(i * self.options.map_seed) % 101 for i in range(100 * 100)]
