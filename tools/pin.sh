@@ -22,7 +22,7 @@ compile() {  # NAME EXTRA_OPTION...
         --no-emit-index-url --no-emit-trusted-host --no-emit-find-links \
         --output-file "$target" "$@" pyproject.toml
     # An extra that names other extras of ours appears as this folder: not a package to install.
-    sed -i -e '/^#/d' -e '/^amberbox @/d' "$target"
+    sed -i -e '/^#/d' -e '/^amberbox @/d' -e '/^$/d' "$target"
 }
 
 compile all --extra all "$@"

@@ -1,0 +1,93 @@
+"""Planted imports against the directions are found, allowed ones are not."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from tools.check_imports import check
+from tools.findings import ROOT
+
+MODULES = (
+    "__init__",
+    "core/__init__",
+    "core/types",
+    "blackbox/__init__",
+    "blackbox/journal",
+    "blackbox/recorder",
+    "blackbox/query",
+    "blackbox/ros1/__init__",
+    "blackbox/sources/__init__",
+    "blackbox/sources/ros",
+    "blackbox/sources/zmq",
+    "diagnosis/covering",
+    "fleet/server",
+    "cli/record",
+)
+
+
+def tree(folder: Path, **planted: str) -> Path:
+    """Make a package of empty modules; ``planted`` gives some of them a text."""
+    source = folder / "src"
+    for module in MODULES:
+        path = source / "amberbox" / f"{module}.py"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(planted.get(module.replace("/", "_"), ""))
+    return source
+
+
+@pytest.mark.parametrize(
+    ("module", "text", "complaint"),
+    [
+        ("core_types", "import amberbox.blackbox.journal", "may not know"),
+        ("core_types", "from amberbox.blackbox import journal", "may not know"),
+        ("core_types", "from ..blackbox import journal", "may not know"),
+        ("core_types", "def f():\n    import amberbox.cli.record", "may not know"),
+        ("blackbox_query", "from amberbox.fleet import server", "may not know"),
+        ("diagnosis_covering", "from amberbox.blackbox.query import x", "may not know"),
+        ("fleet_server", "import amberbox.cli.record", "may not know"),
+        ("blackbox_sources_ros", "from amberbox.blackbox.sources import zmq", "another plugin"),
+        ("blackbox_sources_ros", "from . import zmq", "another plugin"),
+        ("blackbox_sources_ros", "import amberbox.blackbox.journal", "core and its protocol"),
+        ("blackbox_query", "import pyarrow.parquet", "at its top"),
+        ("blackbox_sources_zmq", "import zmq", "at its top"),
+        ("cli_record", "try:\n    import polars\nexcept ImportError: pass", "at its top"),
+        ("blackbox_recorder", "def f():\n    import pyarrow", "record process"),
+        ("core_types", "def f():\n    from pyarrow import parquet", "record process"),
+    ],
+)
+def test_a_forbidden_import_is_found(
+    tmp_path: Path, module: str, text: str, complaint: str
+) -> None:
+    found = check(tree(tmp_path, **{module: text}))
+    assert [complaint in finding.what for finding in found] == [True]
+    assert found[0].line == len(text.splitlines()) - ("except" in text)
+
+
+def test_pyarrow_is_found_behind_a_module_that_the_recorder_imports(tmp_path: Path) -> None:
+    planted = {
+        "blackbox_recorder": "from amberbox.blackbox import query",
+        "blackbox_query": "def f():\n    import pyarrow",
+    }
+    assert ["record process" in f.what for f in check(tree(tmp_path, **planted))] == [True]
+
+
+def test_allowed_imports_are_not_complained_about(tmp_path: Path) -> None:
+    planted = {
+        "core_types": "from __future__ import annotations\nimport numpy",
+        "blackbox_query": "from amberbox.core.types import x\ndef f():\n    import pyarrow",
+        "blackbox_sources_ros": "import amberbox.blackbox.ros1\nfrom amberbox.core import types",
+        "blackbox_sources_zmq": (
+            "from typing import TYPE_CHECKING\n"
+            "if TYPE_CHECKING:\n    import zmq\n"
+            "def f():\n    import zmq"
+        ),
+        "fleet_server": "import amberbox.blackbox.query, amberbox.diagnosis.covering",
+        "cli_record": "from amberbox.fleet import server\nfrom amberbox import __version__",
+    }
+    assert check(tree(tmp_path, **planted)) == []
+
+
+def test_the_project_keeps_its_directions() -> None:
+    assert check(ROOT / "src") == []

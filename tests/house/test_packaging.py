@@ -1,0 +1,113 @@
+"""Constraints pin everything with hashes, the wheel is whole, extras stay optional."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+import sys
+import tomllib
+import zipfile
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+
+from tools.check_files import committed
+from tools.findings import ROOT
+
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
+EXTRAS: dict[str, list[str]] = PROJECT["project"]["optional-dependencies"]
+CONSTRAINTS = ["all", "test"]
+OPTIONAL = ["pyarrow", "duckdb", "tsdownsample", "matplotlib", "zmq", "msgpack", "pandas"]
+OPTIONAL += ["polars", "mcap", "mcap_ros1_support", "foxglove"]
+
+
+def pins(file: str) -> dict[str, tuple[str, int]]:
+    """Return version and number of hashes of each package in a constraints file."""
+    text = (ROOT / "constraints" / f"{file}.txt").read_text().replace("\\\n", " ")
+    found: dict[str, tuple[str, int]] = {}
+    for line in text.splitlines():
+        package, *hashes = line.split()
+        name, _, version = package.partition("==")
+        assert version and re.fullmatch(r"[\w.-]+", name), line
+        assert all(re.fullmatch(r"--hash=sha256:[0-9a-f]{64}", one) for one in hashes), line
+        found[canonicalize_name(name)] = (version, len(hashes))
+    return found
+
+
+@pytest.mark.parametrize("name", CONSTRAINTS)
+def test_every_package_is_pinned_with_hashes_and_nothing_else_is_said(name: str) -> None:
+    assert len(pins(name)) > 20
+    assert all(hashes for _, hashes in pins(name).values())
+
+
+@pytest.mark.parametrize("name", CONSTRAINTS)
+def test_pins_lie_in_the_ranges_we_promise(name: str) -> None:
+    pinned = pins(name)
+    wanted = [*PROJECT["project"]["dependencies"], *PROJECT["build-system"]["requires"]]
+    wanted += [text for extra in _extras(name) for text in EXTRAS[extra]]
+    for requirement in map(Requirement, wanted):
+        if requirement.name != "amberbox":
+            version, _ = pinned[canonicalize_name(requirement.name)]
+            assert requirement.specifier.contains(version), requirement
+
+
+def test_tests_run_with_the_versions_that_users_get() -> None:
+    everything = pins("test")
+    assert {package: everything[package] for package in pins("all")} == pins("all")
+
+
+def test_all_names_every_extra_but_the_test_one() -> None:
+    (own,) = map(Requirement, EXTRAS["all"])
+    assert own.extras == set(EXTRAS) - {"all", "test"}
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> zipfile.ZipFile:
+    """Build the wheel from the committed files alone."""
+    folder = tmp_path_factory.mktemp("wheel")
+    for path in committed(ROOT):
+        if path.startswith(("src/", "pyproject.toml", "README.md", "LICENSE")):
+            (folder / path).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy(ROOT / path, folder / path)
+    command = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps"]
+    command += ["--no-build-isolation", "--wheel-dir", str(folder / "dist"), str(folder)]
+    subprocess.run(command, check=True, capture_output=True)
+    (built,) = (folder / "dist").glob("amberbox-*.whl")
+    return zipfile.ZipFile(built)
+
+
+def test_the_wheel_holds_every_file_of_the_package(wheel: zipfile.ZipFile) -> None:
+    ours = {path.removeprefix("src/") for path in committed(ROOT) if path.startswith("src/")}
+    assert "amberbox/py.typed" in ours
+    assert ours <= set(wheel.namelist())
+
+
+def test_the_wheel_holds_licence_and_program(wheel: zipfile.ZipFile) -> None:
+    names = {Path(name).name: name for name in wheel.namelist()}
+    licence = wheel.read(names["LICENSE"]).decode()
+    assert licence == (ROOT / "LICENSE").read_text()
+    assert "Apache License" in licence
+    assert b"amberbox = amberbox.cli.main:main" in wheel.read(names["entry_points.txt"])
+
+
+def test_every_module_imports_with_none_of_the_optional_packages() -> None:
+    """Recording runs with none of them installed; who needs one asks for it when used."""
+    program = f"""
+import importlib, pkgutil, sys
+for name in {OPTIONAL}:
+    sys.modules[name] = None
+import amberbox
+for info in pkgutil.walk_packages(amberbox.__path__, "amberbox."):
+    if not info.name.endswith("__main__"):
+        importlib.import_module(info.name)
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.stderr == ""
+    assert done.returncode == 0
+
+
+def _extras(name: str) -> list[str]:
+    return [extra for extra in EXTRAS if extra != "test" or name == "test"]
