@@ -12,7 +12,7 @@ import numpy as np
 from amberbox.blackbox import reserved
 from amberbox.blackbox.clocktable import ClockTable
 from amberbox.blackbox.mcap import Channel
-from amberbox.blackbox.unroll.compile import UnrollError, Unroller, unroller
+from amberbox.blackbox.unroll import UnrollError, Unroller, unroller
 from amberbox.core.names import identifier, item_name
 from amberbox.core.types import Batch, Gap, IntArray, ItemSchema, Rows, Schema, Topic
 

@@ -101,7 +101,19 @@ def _import(
     source: str,
     progress: Progress,
 ) -> ImportReport:
-    recording = open_recording(path)
+    with open_recording(path) as recording:
+        return _copy_all(recording, path, store, digest, topics, source, progress)
+
+
+def _copy_all(
+    recording: Recording,
+    path: Path,
+    store: Store,
+    digest: str,
+    topics: Sequence[TopicOptions],
+    source: str,
+    progress: Progress,
+) -> ImportReport:
     clock = RecordedClock(recording.report.start_ns or 0)
     options = PipelineOptions(
         robot=path.stem, boot_id=digest[:8], input=digest, queue_bytes=1 << 40, counts_silence=False

@@ -18,14 +18,13 @@ import numpy as np
 
 from amberbox import __version__
 from amberbox.blackbox import reserved
-from amberbox.blackbox.filters.change import ChangeFilter
 from amberbox.blackbox.gaplog import GapLog
 from amberbox.blackbox.intake import Intake
 from amberbox.blackbox.journal import JournalOptions, JournalWriter, SyncMark
 from amberbox.blackbox.names import ItemNames
 from amberbox.blackbox.store import Store, WriterLock
 from amberbox.blackbox.streams import Counters, Item, Stream
-from amberbox.blackbox.unroll.compile import UnrollError
+from amberbox.blackbox.unroll import UnrollError
 from amberbox.blackbox.unroll.infer import widen
 from amberbox.core.clock import NS
 from amberbox.core.source import TopicOptions
@@ -215,8 +214,7 @@ class Pipeline:
         item.malformed += count
 
     def _unchanged(self, stream: Stream, kept: list[Message], places: list[int]) -> list[int]:
-        item = stream.item
-        if stream.stamps is None:
+        if stream.stamps is None or stream.change is None:
             return []
         try:
             rows = stream.stamps.rows([kept[place][1] for place in places])
@@ -224,13 +222,10 @@ class Pipeline:
             bad = {places[row] for row in error.bad}
             rest = [place for place in places if place not in bad]
             return self._unchanged(stream, kept, rest) if rest else []
-        if item.change is None:
-            assert item.options.change is not None
-            item.change = ChangeFilter(item.options.change, stream.stamps.schema)
         times = np.fromiter((kept[place][2] for place in places), np.int64, len(places))
-        mask = item.change.mask(rows, times)
+        mask = stream.change.mask(rows, times)
         dropped = [place for place, keep in zip(places, mask.tolist(), strict=True) if not keep]
-        item.counters.unchanged += len(dropped)
+        stream.counters.unchanged += len(dropped)
         return dropped
 
     def _note_drops(self) -> None:

@@ -20,13 +20,14 @@ import numpy as np
 from amberbox.blackbox import mcap
 from amberbox.blackbox.chunk import Chunk, decompress, index_offsets, open_chunk
 from amberbox.blackbox.journal import CHAIN_METADATA, START_METADATA
-from amberbox.blackbox.summary import Summary, read_summary
+from amberbox.blackbox.summary import Summary, is_finished, read_summary
 from amberbox.core.types import IntArray
 
 Buffer: TypeAlias = "bytes | memoryview"
 
 _KNOWN = {1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15}
 _LOOSE = {mcap.SCHEMA, mcap.CHANNEL, mcap.MESSAGE}
+_LOOSE_BYTES = 4 << 20
 _MARK = re.compile(
     rb"\x06.{36}(?:\x04\0\0\0zstd|\0\0\0\0.{8}[\x03\x04\x05]|\x03\0\0\0lz4)"
     rb"|\x0c.{8}(?:\x0e\0\0\0" + START_METADATA.encode() + rb"|\x0e\0\0\0"
@@ -218,7 +219,7 @@ class Walk:
     def _loose_messages(self) -> Found | None:
         """Take records that stand outside chunks, as other writers may leave them."""
         at, first = self.at, self.at
-        while at + 9 <= len(self.data) and self.data[at] in _LOOSE:
+        while at + 9 <= len(self.data) and self.data[at] in _LOOSE and at - first < _LOOSE_BYTES:
             (length,) = struct.unpack_from("<Q", self.data, at + 1)
             if at + 9 + length > len(self.data):
                 break
@@ -231,7 +232,7 @@ class Walk:
         return chunk
 
     def _data_end(self) -> None:
-        if read_summary(self.data) is None:
+        if not is_finished(self.data):
             if not self.grows:
                 self._fail("summary is damaged")
             return

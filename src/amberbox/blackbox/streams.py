@@ -7,7 +7,7 @@ from typing import Any
 
 from amberbox.blackbox.filters.change import ChangeFilter
 from amberbox.blackbox.filters.rate import RateLimit
-from amberbox.blackbox.unroll.compile import Unroller, unroller
+from amberbox.blackbox.unroll import Unroller, unroller
 from amberbox.core.errors import AmberboxError
 from amberbox.core.source import TopicOptions
 from amberbox.core.types import Topic
@@ -36,7 +36,6 @@ class Item:
     options: TopicOptions
     counters: Counters = field(default_factory=Counters)
     rate: RateLimit | None = None
-    change: ChangeFilter | None = None
     drops: tuple[int, int, int] | None = None
     """First and last time and count of messages dropped since the last gap record."""
     last_latched: bytes | None = None
@@ -75,6 +74,7 @@ class Stream:
     channel: int = -1
     stamps: Unroller | None = None
     infers: bool = False
+    change: ChangeFilter | None = None
 
     @property
     def counters(self) -> Counters:
@@ -94,9 +94,12 @@ class Stream:
         return self.stamps.stamp_ns(data) or received_ns
 
     def compile(self) -> str:
-        """Build the unroller before the first row; return what is wrong with the definition."""
+        """Build unroller and change filter before the first row; return what is wrong with them."""
+        options = self.item.options
         try:
-            self.stamps = unroller(self.topic, self.item.options.stamp)
+            self.stamps = unroller(self.topic, options.stamp)
+            if options.change is not None:
+                self.change = ChangeFilter(options.change, self.stamps.schema)
         except AmberboxError as error:
             return error.what
         return ""

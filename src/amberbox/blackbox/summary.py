@@ -116,6 +116,16 @@ def read_summary(data: bytes | memoryview) -> Summary | None:
         return None
 
 
+def is_finished(data: bytes | memoryview) -> bool:
+    """Tell whether a file has a sound end; the format lets it be without a summary."""
+    if read_summary(data) is not None:
+        return True
+    if len(data) < FOOTER_SIZE or bytes(data[-8:]) != mcap.MAGIC:
+        return False
+    opcode, length, start = struct.unpack_from("<BQQ", data, len(data) - FOOTER_SIZE)
+    return (opcode, length, start) == (mcap.FOOTER, 20, 0)
+
+
 def _parse(data: bytes | memoryview, start: int, end: int) -> Summary:
     summary, at = Summary(), start
     while at < end:
