@@ -9,8 +9,9 @@ from textwrap import dedent
 import pytest
 
 from amberbox.blackbox.folder import RobotFolder, inspect_folder, load_folder
+from amberbox.blackbox.plan import planned_items
 from amberbox.blackbox.robot import RobotConfig
-from amberbox.core.errors import ConfigurationError, UsageError
+from amberbox.core.errors import ConfigurationError, Problem, UsageError
 
 CONFIGS = Path(__file__).parent / "configs"
 MINIMAL = "- ros: {topics: [{name: /odom}]}\n"
@@ -299,3 +300,18 @@ def test_a_source_that_is_there_is_no_longer_to_come(tmp_path: Path, fake_source
 def test_no_empty_value_needs_a_crash(tmp_path: Path, fake_sources: str) -> None:
     with pytest.raises(ConfigurationError, match="fake: the key 'port' is missing"):
         load(folder(tmp_path, "- fake:\n"), fake_sources)
+
+
+def test_a_source_that_refuses_becomes_a_problem_of_the_plan(
+    tmp_path: Path, fake_sources: str
+) -> None:
+    fake = tmp_path / "path" / fake_sources / "fake.py"
+    refusal = "raise UsageError('no such bus', 'plug it in')"
+    text = fake.read_text().replace("def topics(self): return ()", f"def topics(self): {refusal}")
+    fake.write_text(
+        text.replace("class Source:", "from amberbox.core.errors import UsageError\nclass Source:")
+    )
+    built = load(folder(tmp_path, "# one\n- fake: {port: 1}\n"), fake_sources)
+    problems: list[Problem] = []
+    assert planned_items(built, problems, fake_sources) == []
+    assert str(problems[0]).startswith(f"{tmp_path / 'black_box.yaml'}:2: fake: no such bus")

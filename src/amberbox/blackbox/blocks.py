@@ -45,6 +45,7 @@ class SourceBlock:
     name: str
     config: Any
     line: int
+    file: str = ""
 
 
 @dataclass(frozen=True)
@@ -170,7 +171,7 @@ def _build(
     if config is None:
         return None
     problems.extend(_topic_problems(config, node, block.plugin))
-    return SourceBlock(block.plugin, name, config, block.node.line)
+    return SourceBlock(block.plugin, name, config, block.node.line, block.node.file)
 
 
 def _config_class(block: _Block, plugin: Plugin, problems: list[Problem]) -> type[Any] | None:

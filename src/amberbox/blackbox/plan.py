@@ -33,7 +33,7 @@ def planned_items(
 
     Sources are made but not run, so nothing is opened; one that refuses becomes a problem.
     """
-    items = [item for block in folder.blocks for item in _items(block, folder, problems, sources)]
+    items = [item for block in folder.blocks for item in _items(block, problems, sources)]
     names: dict[str, str] = {}
     return [_named(item, names) for item in items]
 
@@ -48,15 +48,12 @@ def _named(item: PlannedItem, names: dict[str, str]) -> PlannedItem:
     return item
 
 
-def _items(
-    block: SourceBlock, folder: RobotFolder, problems: list[Problem], sources: str
-) -> Iterator[PlannedItem]:
+def _items(block: SourceBlock, problems: list[Problem], sources: str) -> Iterator[PlannedItem]:
     try:
         source = get(sources, block.plugin).load().Source(block.config, block.name)
         topics = source.topics()
     except AmberboxError as error:
-        file = str(folder.path / "black_box.yaml")
-        problems.append(Problem(file, block.line, block.name, error.what, error.hint))
+        problems.append(Problem(block.file, block.line, block.name, error.what, error.hint))
         return
     yield from (_item(block.name, topic) for topic in topics)
 
