@@ -79,23 +79,19 @@ def _keep(series: Sequence[Series], received_ns: IntArray, heartbeat_ns: float) 
 
 
 class _Banded:
-    """The series that have a dead band, ready to be compared with any row."""
+    """The series that have dead bands, ready to be compared with any row."""
 
     def __init__(
         self, series: Sequence[Series], received_ns: IntArray, heartbeat_ns: float
     ) -> None:
         self._received_ns = received_ns
         self._heartbeat_ns = heartbeat_ns
-        single = [one for one in series if one.band and one.offsets is None]
-        self._lists = [one for one in series if one.band and one.offsets is not None]
-        self._values = _matrix(single, len(received_ns))
-        self._absolute = np.array([one.band.absolute for one in single])
-        self._relative = np.array([one.band.relative for one in single])
+        self._series = [one for one in series if one.bands is not None]
 
     def next_kept(self, last: int, stop: int) -> int:
         """Return the first row after ``last`` and before ``stop`` to keep, else ``stop``.
 
-        Between the two no list changes its length, so lists form matrices as well.
+        No list changes its length from ``last`` to there.
         """
         start, width = last + 1, FIRST_WINDOW
         while start < stop:
@@ -109,38 +105,20 @@ class _Banded:
     def _exceeds(self, last: int, start: int, end: int) -> BoolArray:
         silent_ns = np.abs(self._received_ns[start:end] - self._received_ns[last])
         hits: BoolArray = silent_ns >= self._heartbeat_ns
-        if self._values.shape[1]:
-            hits |= _beyond(
-                self._values[start:end], self._values[last], self._absolute, self._relative
-            )
-        for one in self._lists:
-            reference = one.of_rows(last, last + 1).astype(np.float64)
-            if len(reference):
-                window = one.of_rows(start, end).astype(np.float64)
-                band = one.band
-                hits |= _beyond(
-                    window.reshape(end - start, -1), reference, band.absolute, band.relative
-                )
+        for one in self._series:
+            hits |= _beyond_band(one, last, start, end)
         return hits
 
 
-def _beyond(
-    window: NDArray[np.float64],
-    reference: NDArray[np.float64],
-    absolute: NDArray[np.float64] | float,
-    relative: NDArray[np.float64] | float,
-) -> BoolArray:
-    """Tell which rows of a window differ from a row by more than the wider of the two bands."""
+def _beyond_band(one: Series, last: int, start: int, end: int) -> BoolArray:
+    """Tell which rows differ from row ``last`` by more than the wider of the two bands."""
+    assert one.bands is not None
+    reference = one.of_rows(last, last + 1).astype(np.float64)
+    window = one.of_rows(start, end).reshape(end - start, *reference.shape)
     with np.errstate(invalid="ignore", over="ignore"):  # inf - inf: see _special
-        band = np.maximum(absolute, relative * np.abs(reference))
-        beyond = np.any(np.abs(window - reference) > band, axis=1)
-    return np.asarray(beyond, bool)
-
-
-def _matrix(single: Sequence[Series], count: int) -> NDArray[np.float64]:
-    if not single:
-        return np.empty((count, 0))
-    return np.stack([one.values.astype(np.float64) for one in single], axis=1)
+        width = np.maximum(one.bands.absolute, one.bands.relative * np.abs(reference))
+        beyond = np.abs(window - reference) > width
+    return np.asarray(beyond.any(axis=(1, 2)), bool)
 
 
 def _differs_from_row_before(series: Sequence[Series], count: int) -> BoolArray:
@@ -177,14 +155,14 @@ def _list_differs(one: Series) -> BoolArray:
 def _exact_parts(one: Series) -> list[NDArray[Any]]:
     """Return what of a series counts as changed by any difference."""
     nulls = [] if one.nulls is None else [one.nulls]
-    if not one.band:
+    if one.bands is None:
         return [one.values, *nulls]
     return [_special(one.values), *nulls] if one.values.dtype.kind == "f" else nulls
 
 
 def _special(values: NDArray[Any]) -> NDArray[np.int8]:
     """Mark what no dead band applies to: NaN and the two infinities."""
-    marks = np.zeros(len(values), np.int8)
+    marks = np.zeros(values.shape, np.int8)
     marks[np.isposinf(values)] = 1
     marks[np.isneginf(values)] = 2
     marks[np.isnan(values)] = 3
@@ -192,10 +170,11 @@ def _special(values: NDArray[Any]) -> NDArray[np.int8]:
 
 
 def _unequal(first: NDArray[Any], second: NDArray[Any]) -> BoolArray:
-    unequal: BoolArray = np.asarray(first != second, bool)
+    """Tell which lines differ in any value; NaN equals NaN."""
+    unequal = np.asarray(first != second, bool)
     if first.dtype.kind == "f":
         unequal &= ~(np.isnan(first) & np.isnan(second))
-    return unequal
+    return np.asarray(unequal.any(axis=1), bool)
 
 
 def _heartbeat_ns(heartbeat_s: float) -> float:

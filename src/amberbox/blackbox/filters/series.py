@@ -9,26 +9,25 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from amberbox.blackbox.filters.watched import Band, Watched
+from amberbox.blackbox.filters.watched import Bands, Group, Watched
 from amberbox.core.types import ColumnData, IntArray, Ragged, Rows
-
-EXACT = Band()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Series:
-    """Values of consecutive rows; row ``i`` has ``values[offsets[i]:offsets[i + 1]]``.
+    """Lines of values, one column each; row ``i`` has ``values[offsets[i]:offsets[i + 1]]``.
 
-    Without ``offsets`` each row has one value. Values that are null are 0, or None in objects.
+    Without ``offsets`` each row has one line. Values that are null are 0, or None in objects.
+    Without ``bands`` any difference is a change.
     """
 
     values: NDArray[Any]
     nulls: NDArray[np.bool_] | None
     offsets: IntArray | None
-    band: Band
+    bands: Bands | None = None
 
     def of_rows(self, first: int, last: int) -> NDArray[Any]:
-        """Return the values of rows ``first`` to ``last - 1``, one after the other."""
+        """Return the lines of rows ``first`` to ``last - 1``, one after the other."""
         return self.values[self._places(first, last)]
 
     def row(self, row: int) -> Series:
@@ -36,7 +35,7 @@ class Series:
         part = self._places(row, row + 1)
         nulls = None if self.nulls is None else self.nulls[part].copy()
         offsets = None if self.offsets is None else np.array([0, part.stop - part.start])
-        return Series(self.values[part].copy(), nulls, offsets, self.band)
+        return Series(self.values[part].copy(), nulls, offsets, self.bands)
 
     def _places(self, first: int, last: int) -> slice:
         if self.offsets is None:
@@ -50,14 +49,16 @@ def flatten(rows: Rows, watched: Watched, offsets: IntArray | None = None) -> It
     ``offsets`` says which rows of this table belong to each message, None if each is one message.
     Yields the same number of series, in the same order, for all batches of one schema.
     """
-    for name, band in watched.columns.items():
-        if name in watched.lists:
-            yield from _list_series(rows.columns[name], offsets, band)
-        else:
-            yield _series(rows.columns[name], offsets, band)
+    for group in watched.groups:
+        columns = [rows.columns[name] for name in group.names]
+        yield from (
+            _lists(columns[0], group, offsets)
+            if group.is_list
+            else [_series(columns, group, offsets)]
+        )
     for path, child in watched.children.items():
         starts = np.searchsorted(_parent_rows(rows.children[path]), np.arange(rows.count + 1))
-        yield Series(np.diff(starts), None, offsets, EXACT)
+        yield Series(np.diff(starts)[:, None], None, offsets)
         inner = starts if offsets is None else starts[offsets]
         yield from flatten(rows.children[path], child, inner)
 
@@ -67,18 +68,21 @@ def joined(first: Sequence[Series], then: Sequence[Series]) -> list[Series]:
     return [_join(one, other) for one, other in zip(first, then, strict=True)]
 
 
-def _series(column: ColumnData, offsets: IntArray | None, band: Band) -> Series:
-    assert not isinstance(column, Ragged)
-    if isinstance(column, np.ma.MaskedArray):
-        return Series(column.filled(0), np.ma.getmaskarray(column), offsets, band)
-    return Series(column, None, offsets, band)
+def _series(columns: Sequence[ColumnData], group: Group, offsets: IntArray | None) -> Series:
+    plain = [column for column in columns if not isinstance(column, Ragged)]
+    values = np.stack([np.ma.filled(column, 0) for column in plain], axis=1)
+    if not any(isinstance(column, np.ma.MaskedArray) for column in plain):
+        return Series(values, None, offsets, group.bands)
+    nulls = np.stack([np.ma.getmaskarray(column) for column in plain], axis=1)
+    return Series(values, nulls, offsets, group.bands)
 
 
-def _list_series(column: ColumnData, offsets: IntArray | None, band: Band) -> Iterator[Series]:
+def _lists(column: ColumnData, group: Group, offsets: IntArray | None) -> Iterator[Series]:
     """Yield the lengths (-1 for a null) and then the elements of a list column."""
     lists, lengths = _as_ragged(column)
-    yield Series(lengths, None, offsets, EXACT)
-    yield _series(lists.values, lists.offsets if offsets is None else lists.offsets[offsets], band)
+    yield Series(lengths[:, None], None, offsets)
+    inner = lists.offsets if offsets is None else lists.offsets[offsets]
+    yield _series([lists.values], group, inner)
 
 
 def _as_ragged(column: ColumnData) -> tuple[Ragged, IntArray]:
@@ -97,7 +101,7 @@ def _parent_rows(child: Rows) -> IntArray:
 
 def _join(first: Series, then: Series) -> Series:
     values = np.concatenate([_compact(first), _compact(then)])
-    return Series(values, _joined_nulls(first, then), _joined_offsets(first, then), then.band)
+    return Series(values, _joined_nulls(first, then), _joined_offsets(first, then), then.bands)
 
 
 def _compact(series: Series) -> NDArray[Any]:
@@ -112,8 +116,8 @@ def _joined_nulls(first: Series, then: Series) -> NDArray[np.bool_] | None:
 
 
 def _null_series(series: Series) -> Series:
-    nulls = np.zeros(len(series.values), bool) if series.nulls is None else series.nulls
-    return Series(nulls, None, series.offsets, EXACT)
+    nulls = np.zeros(series.values.shape, bool) if series.nulls is None else series.nulls
+    return Series(nulls, None, series.offsets)
 
 
 def _joined_offsets(first: Series, then: Series) -> IntArray | None:

@@ -5,6 +5,9 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+from numpy.typing import NDArray
+
 from amberbox.blackbox.unroll.select import select
 from amberbox.core.source import ChangeOptions
 from amberbox.core.types import Column, ItemSchema
@@ -28,12 +31,28 @@ class Band:
         return self.absolute > 0 or self.relative > 0
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Bands:
+    """The dead bands of some variables, side by side."""
+
+    absolute: NDArray[np.float64]
+    relative: NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Group:
+    """Columns that can be compared at once: of one type, all with a dead band or all without."""
+
+    names: tuple[str, ...]
+    bands: Bands | None
+    is_list: bool = False
+
+
 @dataclass(frozen=True, slots=True)
 class Watched:
-    """The columns of one table to look at, with the band of each, and its child tables."""
+    """The columns of one table to look at, and its child tables; a list column is a group."""
 
-    columns: Mapping[str, Band]
-    lists: frozenset[str]
+    groups: tuple[Group, ...]
     children: Mapping[str, Watched]
 
 
@@ -121,14 +140,29 @@ def _own_bands(
 def _tree(
     places: Mapping[str, _Place], bands: Mapping[str, Band], table: tuple[str, ...]
 ) -> Watched:
-    here = [
-        (places[path].column, band) for path, band in bands.items() if places[path].table == table
-    ]
+    here = [path for path in bands if places[path].table == table]
     below = _next_tables((places[path].table for path in bands), table)
     return Watched(
-        {column.name: band for column, band in here},
-        frozenset(column.name for column, _ in here if column.type.startswith("list<")),
+        tuple(_groups([places[path].column for path in here], [bands[path] for path in here])),
         {path: _tree(places, bands, (*table, path)) for path in below},
+    )
+
+
+def _groups(columns: Sequence[Column], bands: Sequence[Band]) -> Iterator[Group]:
+    alike: dict[tuple[str, bool, str], list[tuple[str, Band]]] = {}
+    for column, band in zip(columns, bands, strict=True):
+        is_list = column.type.startswith("list<")
+        key = (column.type, bool(band), column.name if is_list else "")
+        alike.setdefault(key, []).append((column.name, band))
+    for (_, has_band, list_name), members in alike.items():
+        names = tuple(name for name, _ in members)
+        side_by_side = _side_by_side([band for _, band in members]) if has_band else None
+        yield Group(names, side_by_side, bool(list_name))
+
+
+def _side_by_side(bands: Sequence[Band]) -> Bands:
+    return Bands(
+        np.array([band.absolute for band in bands]), np.array([band.relative for band in bands])
     )
 
 

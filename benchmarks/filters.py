@@ -1,0 +1,102 @@
+"""What the filters keep of jittering streams, and what they cost per message."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+import numpy as np
+
+from amberbox.blackbox.filters.change import ChangeFilter
+from amberbox.blackbox.filters.rate import RateLimit
+from amberbox.core.source import ChangeOptions
+from amberbox.core.types import Column, IntArray, ItemSchema, Rows
+from benchmarks.common import Row, cpu_s
+
+START_NS = 1_700_000_000_000_000_000
+MESSAGES = 6_000
+SEEDS = 20
+COLUMNS = 50
+BATCHES = 50
+
+
+def measure() -> list[Row]:
+    """Measure shares of messages kept and CPU time."""
+    return [*_kept_shares(), _after_a_stall(), _cost_of_rate_limit(), *_cost_of_change_filter()]
+
+
+def timer_paced(rate_hz: float, rng: np.random.Generator) -> IntArray:
+    """Arrivals around a steady schedule, each up to 30 % of a period early or late."""
+    places = np.arange(MESSAGES) + rng.uniform(-0.3, 0.3, MESSAGES)
+    return START_NS + (places * 1e9 / rate_hz).astype(np.int64)
+
+
+def drifting(rate_hz: float, rng: np.random.Generator) -> IntArray:
+    """Arrivals whose intervals vary by up to 30 %: a random walk around the schedule."""
+    intervals = (1 + rng.uniform(-0.3, 0.3, MESSAGES)) * 1e9 / rate_hz
+    return START_NS + np.cumsum(intervals).astype(np.int64)
+
+
+def _kept_shares() -> Iterator[Row]:
+    arrivals: dict[str, Callable[[float, np.random.Generator], IntArray]] = {
+        "each arrival +-30 % of a period": timer_paced,
+        "each interval +-30 %": drifting,
+    }
+    for jitter, arrive in arrivals.items():
+        for rate_hz in (10.0, 10.05):
+            shares = [_share(arrive(rate_hz, np.random.default_rng(seed))) for seed in range(SEEDS)]
+            name = f"kept of {rate_hz:g} Hz limited to 10 Hz, {jitter}"
+            note = f"worst of {SEEDS} streams of {MESSAGES:,} messages; to be >= 99"
+            yield Row(name, 100 * min(shares), "%", note=note)
+
+
+def _share(received_ns: IntArray) -> float:
+    return float(RateLimit(10).mask(received_ns).mean())
+
+
+def _after_a_stall() -> Row:
+    limit = RateLimit(10)
+    limit.mask(START_NS + np.arange(100) * 100_000_000)
+    burst_ns = START_NS + 15_000_000_000 + np.arange(50) * 10_000
+    kept = int(limit.mask(burst_ns).sum())
+    return Row("kept of the 50 messages that arrive at once after 5 s", kept, "messages")
+
+
+def _cost_of_rate_limit() -> Row:
+    received_ns = drifting(20.0, np.random.default_rng(0)).tolist()
+    accept = RateLimit(10).accept
+
+    def all_messages() -> None:
+        for time_ns in received_ns:
+            accept(time_ns)
+
+    return Row("rate limit, CPU per message", cpu_s(all_messages) / MESSAGES * 1e9, "ns")
+
+
+def _cost_of_change_filter() -> Iterator[Row]:
+    columns = tuple(Column(f"c{n}", f"c{n}", "float64") for n in range(COLUMNS))
+    schema = ItemSchema("demo/Wide", columns)
+    for rows in (10, 100):
+        for name, options in (
+            ("any difference", ChangeOptions()),
+            ("dead bands", ChangeOptions(absolute=0.05)),
+        ):
+            seconds = _change_s(schema, options, rows)
+            what = f"change filter ({name}), CPU per batch of {rows} rows x {COLUMNS} columns"
+            yield Row(what, seconds / BATCHES * 1e6, "us")
+
+
+def _change_s(schema: ItemSchema, options: ChangeOptions, rows: int) -> float:
+    rng = np.random.default_rng(1)
+    names = [column.name for column in schema.columns]
+    batches = [
+        Rows(rows, {name: np.cumsum(rng.normal(0, 0.001, rows)) for name in names})
+        for _ in range(BATCHES)
+    ]
+    times_ns = np.arange(rows, dtype=np.int64) * 10_000_000
+
+    def all_batches() -> None:
+        change = ChangeFilter(options, schema)
+        for number, batch in enumerate(batches):
+            change.mask(batch, times_ns + number * rows * 10_000_000)
+
+    return cpu_s(all_batches)
