@@ -11,18 +11,22 @@ import os
 import threading
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import replace
 from queue import SimpleQueue
 
 from amberbox.blackbox.ros1.memory import Memory
 from amberbox.blackbox.ros1.names import global_name, host_and_port, is_loopback, own_host
 from amberbox.blackbox.ros1.node import Node
 from amberbox.blackbox.ros1.reports import Reports
-from amberbox.blackbox.ros1.settings import RefusedError, RosError, Settings
+from amberbox.blackbox.ros1.settings import RosError, Settings
 from amberbox.blackbox.ros1.subscription import Subscription
 from amberbox.blackbox.ros1.xmlrpc import Graph, Master
 from amberbox.core.source import Sink
 
 LONGEST_WAIT_S = 2.0
+FAILURE_CHECK_S = 0.2
+STOP_S = 0.3
 STOPPED = "the recorder stopped listening"
 NOT_FOLLOWED = frozenset({"/rosout", "/rosout_agg"})
 
@@ -45,23 +49,35 @@ class Client:
         self._node: Node | None = None
         self._own_uri = ""
         self._failures = 0
+        self._ending = threading.Event()
+        self._changing = threading.Lock()
         for topic in topics:
             self._subscribe(topic)
 
     def run(self, stop: threading.Event) -> None:
         """Listen until ``stop``; raises only errors of ours."""
         updates = threading.Thread(target=self._take_updates, name="ros-updates", daemon=True)
-        updates.start()
+        watcher = threading.Thread(target=self._watch, name="ros-master", daemon=True)
         try:
             self._start_node()
+            updates.start()
             for subscription in self._subscriptions.values():
                 subscription.connect_remembered()
-            while not stop.is_set():
-                self._watch_master()
-                stop.wait(self._delay_s())
+            watcher.start()
+            while not stop.wait(FAILURE_CHECK_S):
                 self._raise_failure()
         finally:
-            self._close(updates)
+            self._close(updates, watcher)
+        self._raise_failure()
+
+    def _watch(self) -> None:
+        """Ask the master again and again; a thread of its own, for an answer may take long."""
+        try:
+            while not self._ending.is_set():
+                self._watch_master()
+                self._ending.wait(self._delay_s())
+        except Exception as error:
+            self._reports.crashed(error)
 
     def _start_node(self) -> None:
         if self._settings.invisible:
@@ -101,13 +117,16 @@ class Client:
             self._poll(asked_ns, graph)
         except RosError as error:
             self._failures += 1
-            self._reports.master_lost(self._settings.master_uri, error)
+            if not self._ending.is_set():
+                self._reports.master_lost(self._settings.master_uri, error)
         self._memory.save()
 
     def _follow_new_topics(self, graph: Graph) -> None:
         if self._settings.all_topics:
             for topic in graph.publishers.keys() - self._subscriptions.keys() - NOT_FOLLOWED:
-                self._subscribe(topic)
+                with self._changing:
+                    if not self._ending.is_set():
+                        self._subscribe(topic)
 
     def _subscribe(self, topic: str) -> None:
         self._subscriptions[topic] = Subscription(
@@ -160,27 +179,30 @@ class Client:
         if self._reports.failure is not None:
             raise self._reports.failure
 
-    def _close(self, updates: threading.Thread) -> None:
+    def _close(self, updates: threading.Thread, watcher: threading.Thread) -> None:
         """End the links first: from then on nothing arrives, and the record says so."""
+        with self._changing:
+            self._ending.set()
         self._updates.put(None)
-        updates.join(self._settings.timeout_s)
         for subscription in self._subscriptions.values():
             subscription.close(STOPPED)
+        end_s = time.monotonic() + STOP_S
         for subscription in self._subscriptions.values():
-            subscription.join(self._settings.timeout_s)
+            subscription.join(end_s)
+        for thread in (updates, watcher):
+            if thread.ident is not None:
+                thread.join(max(0.0, end_s - time.monotonic()))
         self._memory.save()
         if self._node is not None:
-            self._unregister()
+            if not self._failures and not watcher.is_alive():
+                self._unregister(time.monotonic() + STOP_S)
             self._node.close()
-        self._master.close()
 
-    def _unregister(self) -> None:
-        if self._failures:
-            return  # the master is not there to be told
-        try:
+    def _unregister(self, end_s: float) -> None:
+        """Take the registrations back, unless the master is slow to answer."""
+        master = Master(replace(self._settings, timeout_s=STOP_S))
+        with suppress(RosError):  # a registration that stays does no harm, the next run takes it
             for topic in sorted(self._registered):
-                self._master.unsubscribe(topic, self._own_uri)
-        except RefusedError:
-            return
-        except RosError as error:
-            self._reports.master_lost(self._settings.master_uri, error)
+                if time.monotonic() < end_s:
+                    master.unsubscribe(topic, self._own_uri)
+        master.close()

@@ -15,6 +15,7 @@ from amberbox.core.source import Sink
 
 PATIENCE = 4  # failed attempts before a publisher that does not answer is worth an event
 MOST_NAMES = 12
+LONGEST_TEXT = 500
 
 
 class Reports:
@@ -28,13 +29,17 @@ class Reports:
         self._said: set[tuple[str, ...]] = set()
         self._md5sums: dict[str, str] = {}
 
+    def _say(self, kind: str, text: str, **details: Any) -> None:
+        """Record an event; what others on the network wrote is kept to one line."""
+        self._sink.event(kind, " ".join(text.split())[:LONGEST_TEXT], **details)
+
     def once(self, key: tuple[str, ...], kind: str, text: str, **details: Any) -> None:
         """Record an event unless ``key`` has been reported and not been cleared."""
         with self._lock:
             is_news = key not in self._said
             self._said.add(key)
         if is_news:
-            self._sink.event(kind, text, **details)
+            self._say(kind, text, **details)
 
     def clear(self, *key: str) -> bool:
         """Let what starts with ``key`` be reported again; tell whether it had been."""
@@ -55,17 +60,17 @@ class Reports:
     def master_found(self, uri: str) -> None:
         """The master answers."""
         if self.clear("master"):
-            self._sink.event("ros_master_back", f"the ROS master answers again: {uri}", uri=uri)
+            self._say("ros_master_back", f"the ROS master answers again: {uri}", uri=uri)
 
     def forgotten(self, topics: Collection[str]) -> None:
         """The master has lost the registration: another one runs there now."""
         text = f"the ROS master had forgotten the box (restarted?), {len(topics)} topics again"
-        self._sink.event("ros_registered_again", text, topics=sorted(topics))
+        self._say("ros_registered_again", text, topics=sorted(topics))
 
     def told_to_stop(self, reason: str) -> None:
         """Somebody on the network asked the node to shut down."""
         text = f"a ROS node asked the box to shut down, which it does not: {reason}"
-        self._sink.event("ros_shutdown_refused", text, reason=reason)
+        self._say("ros_shutdown_refused", text, reason=reason)
 
     def unknown_topic(self, topic: str, known: Collection[str]) -> None:
         """Nobody publishes a topic."""
@@ -100,7 +105,7 @@ class Reports:
     def repeated(self, topic: str, node: str) -> None:
         """A latched message was delivered again."""
         text = f"{topic}: {node} delivered its latched message again; recorded once"
-        self._sink.event("ros_latched_repeat", text, topic=topic, node=node)
+        self._say("ros_latched_repeat", text, topic=topic, node=node)
 
     def definition(self, topic: str, publisher: Publisher) -> None:
         """A publisher told its type: compare with the configured and the last one."""
@@ -120,4 +125,4 @@ class Reports:
         if before != publisher.md5sum:
             text = f"{topic}: the message definition of {publisher.type} has changed"
             details = {"topic": topic, "before": before, "now": publisher.md5sum}
-            self._sink.event("ros_type_changed", text, **details)
+            self._say("ros_type_changed", text, **details)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable, Collection, Sequence
 from functools import partial
 
@@ -96,12 +97,12 @@ class Subscription:
             for link in self._links.values():
                 link.close(reason)
 
-    def join(self, timeout_s: float) -> None:
-        """Wait for the open links to end."""
+    def join(self, end_s: float) -> None:
+        """Wait for the open links to end, until a moment of the monotonic clock."""
         with self._lock:
             still_open = list(self._open.values())
         for link in still_open:
-            link.join(timeout_s)
+            link.join(max(0.0, end_s - time.monotonic()))
 
     def _is_fresh(self, uri: str) -> bool:
         link = self._links.get(uri)

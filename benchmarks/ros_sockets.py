@@ -1,0 +1,179 @@
+"""ROS 1 sockets: publishers in another process speak TCPROS to the box over several connections.
+
+No ROS is needed: ``amberbox.testing.rosnet`` has a master and publishers. Recording to disk is
+not part of it; the sink only counts.
+"""
+
+from __future__ import annotations
+
+import argparse
+import struct
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any
+
+from amberbox.blackbox.ros1.client import Client
+from amberbox.blackbox.ros1.framing import Framer
+from amberbox.blackbox.ros1.settings import Settings
+from amberbox.core.types import Topic
+from amberbox.testing.rosnet import RosMaster, RosPublisher, RosTopic
+from benchmarks.common import Row, cpu_s
+
+ODOMETRY_BYTES = 704
+IMAGE_BYTES = 920_000
+SECONDS = 3.0
+
+
+class CountingSink:
+    """Takes messages and only counts them, per stream."""
+
+    def __init__(self) -> None:
+        self.counts: dict[int, int] = {}
+        self._topics: list[Topic] = []
+
+    def now_ns(self) -> int:
+        return time.time_ns()
+
+    def topic(self, topic: Topic) -> int:
+        self._topics.append(topic)
+        self.counts[len(self._topics)] = 0
+        return len(self._topics)
+
+    def message(self, stream: int, data: bytes, received_ns: int) -> None:
+        self.counts[stream] += 1
+
+    def link_up(self, topic: str, peer: str, since_ns: int | None = None) -> None:
+        pass
+
+    def link_down(self, topic: str, peer: str, reason: str, since_ns: int | None = None) -> None:
+        pass
+
+    def event(self, kind: str, text: str, **details: Any) -> None:
+        pass
+
+    def last_latched(self, topic: str) -> bytes | None:
+        return None
+
+    def state(self) -> dict[str, Any]:
+        return {}
+
+    def save_state(self, state: Mapping[str, Any]) -> None:
+        pass
+
+    @property
+    def total(self) -> int:
+        return sum(self.counts.values())
+
+
+@contextmanager
+def publishing(sockets: int, rate_hz: float, size: int, burst: int = 1) -> Iterator[str]:
+    """Run publishers in a process of their own; give the address of their master.
+
+    Each socket sends ``burst`` messages per ``send``, ``rate_hz`` messages per second in all;
+    0 is as fast as it goes.
+    """
+    options = [str(sockets), str(rate_hz), str(size), str(burst)]
+    command = [sys.executable, "-m", "benchmarks.ros_sockets", *options]
+    process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    assert process.stdin is not None and process.stdout is not None
+    try:
+        yield process.stdout.readline().strip()
+    finally:
+        process.stdin.close()
+        process.wait(10)
+
+
+def topics(sockets: int) -> list[str]:
+    """Name one topic per socket."""
+    return [f"/bench/{number}" for number in range(sockets)]
+
+
+def measure() -> list[Row]:
+    """Measure framing alone, then sockets: flooded, at a robot's pace, with images."""
+    rows = [_framing()]
+    rows += _sockets("flooded over 8 sockets", 8, 0, ODOMETRY_BYTES, burst=50)
+    rows += _sockets("20,000 messages/s over 8 sockets", 8, 20_000, ODOMETRY_BYTES)
+    rows += _sockets("camera images, 0.92 MB at 100/s", 1, 100, IMAGE_BYTES)
+    return rows
+
+
+def _framing() -> Row:
+    frame = struct.pack("<I", ODOMETRY_BYTES) + bytes(ODOMETRY_BYTES)
+    count, data = 90, frame * 90
+
+    def cut() -> None:
+        framer = Framer(1 << 30)
+        for _ in range(500):
+            framer.room()[: len(data)] = data
+            framer.received(len(data))
+
+    value = cpu_s(cut) / (500 * count) * 1e6
+    return Row("framing in memory, 704 B", value, "us/message CPU")
+
+
+def _sockets(name: str, sockets: int, rate_hz: float, size: int, burst: int = 1) -> list[Row]:
+    with publishing(sockets, rate_hz, size, burst) as uri:
+        sink, stop = CountingSink(), threading.Event()
+        wanted = dict.fromkeys(topics(sockets), "")
+        client = Client(Settings(master_uri=uri), wanted, sink)
+        thread = threading.Thread(target=client.run, args=(stop,))
+        thread.start()
+        while len([count for count in sink.counts.values() if count]) < sockets:
+            time.sleep(0.01)
+        rate, cpu = _watch(sink)
+        stop.set()
+        thread.join()
+    return [
+        Row(f"{name}: received", rate, "messages/s"),
+        Row(f"{name}: CPU", cpu / rate * 1e6, "us/message CPU"),
+    ]
+
+
+def _watch(sink: CountingSink) -> tuple[float, float]:
+    """Return messages per second, and CPU seconds per second."""
+    count, wall_s, used_s = sink.total, time.perf_counter(), time.process_time()
+    time.sleep(SECONDS)
+    took_s = time.perf_counter() - wall_s
+    return (sink.total - count) / took_s, (time.process_time() - used_s) / took_s
+
+
+def _wait_for_end(ended: threading.Event) -> None:
+    sys.stdin.read()
+    ended.set()
+
+
+def publish(sockets: int, rate_hz: float, size: int, burst: int) -> None:
+    """Publish until standard input ends; print the master's address first."""
+    master = RosMaster()
+    offered = {topic: RosTopic() for topic in topics(sockets)}
+    publisher = RosPublisher("/bench", offered, master)
+    print(master.uri, flush=True)
+    ended = threading.Event()
+    threading.Thread(target=_wait_for_end, args=(ended,), daemon=True).start()
+    for topic in offered:
+        publisher.wait_for_subscribers(topic)
+    data = (struct.pack("<I", size) + bytes(size)) * burst
+    per_send_s = burst / rate_hz if rate_hz else 0.0
+    due_s = time.perf_counter()
+    while not ended.is_set():
+        for topic in offered:
+            due_s += per_send_s
+            if per_send_s and due_s > time.perf_counter():
+                time.sleep(max(0.0, due_s - time.perf_counter()))
+            try:
+                publisher.send(topic, data)
+            except OSError:
+                return
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description="Publish to the box over TCPROS.")
+    parser.add_argument("sockets", type=int)
+    parser.add_argument("rate_hz", type=float)
+    parser.add_argument("size", type=int)
+    parser.add_argument("burst", type=int)
+    publish(**vars(parser.parse_args()))
