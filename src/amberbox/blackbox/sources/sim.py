@@ -1,0 +1,173 @@
+"""A simulated robot as a source: deterministic by seed, at any speed, with faults on demand."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import msgspec
+
+from amberbox.core.clock import NS
+from amberbox.core.config import did_you_mean
+from amberbox.core.errors import UsageError
+from amberbox.core.options import option
+from amberbox.core.source import Sink, TopicOptions
+from amberbox.core.timetext import parse_time
+from amberbox.sim.catalogue import catalogue
+from amberbox.sim.mission import SCENARIOS
+from amberbox.sim.robot import START_NS, Robot
+from amberbox.sim.topics import TOPIC_BY_NAME, TOPICS
+
+SAMPLE = """\
+- sim:
+    seed: 7
+    speed: 1
+    faults:
+      - {id: wheel_front_left_motor_weak, at_s: 60, magnitude: 0.6}
+    topics:
+      - topic: {name: odom, max_frequency: 10}
+      - topic: {name: wheels}
+"""
+_NOT_WORTH_WAITING_NS = 500_000
+
+
+@dataclass(frozen=True)
+class FaultOptions:
+    """One fault to inject; ``python -m amberbox.sim --list-faults`` shows all."""
+
+    id: str = option(doc="fault of the catalogue")
+    at_s: float = option(0.0, "when it begins, after the robot's start", unit="s")
+    until_s: float | None = option(None, "when it ends; never when absent", unit="s")
+    magnitude: float | None = option(None, "how strong; the catalogue's default when absent")
+
+    def check(self) -> Iterator[tuple[str, str]]:
+        """Say what does not fit the catalogue."""
+        faults = catalogue()
+        if self.id not in faults:
+            yield "id", f"there is no fault '{self.id}'{did_you_mean(self.id, faults)}"
+            return
+        size = faults[self.id].magnitude
+        if self.magnitude is not None and not size.low <= self.magnitude <= size.high:
+            yield "magnitude", f"must lie from {size.low:g} to {size.high:g} {size.unit}"
+        if self.at_s < 0:
+            yield "at_s", "must not be negative"
+        if self.until_s is not None and self.until_s <= self.at_s:
+            yield "until_s", "must be later than at_s"
+
+
+@dataclass(frozen=True)
+class Config:
+    """The ``sim`` block."""
+
+    robot: str = option("ropod_001", "name of the simulated robot")
+    seed: int = option(1, "the same seed gives the same messages, byte for byte")
+    scenario: str = option("transport", "transport, charging or standing")
+    speed: float | Literal["max"] = option(1.0, "times real time, or max for no waiting")
+    start: str | None = option(None, "virtual start (RFC 3339); see times")
+    times: Literal["now", "virtual"] | None = option(
+        None, "time of receipt: the box's clock, or the robot's; virtual only if speed is max"
+    )
+    duration_s: float | None = option(None, "end after this much robot time", unit="s")
+    faults: Sequence[FaultOptions] = option((), "faults to inject")
+    topics: Sequence[TopicOptions] = option((), "topics to publish; all when absent")
+
+    @property
+    def is_virtual(self) -> bool:
+        """Whether messages are stamped with the robot's virtual time."""
+        return self.times == "virtual" if self.times else self.speed == "max"
+
+    def start_ns(self) -> int:
+        """Return the virtual start: as configured, else now, or a fixed day in virtual time."""
+        if self.start is not None:
+            return parse_time(self.start, time.time_ns, lambda: None)
+        return START_NS if self.is_virtual else time.time_ns()
+
+    def check(self) -> Iterator[tuple[str, str]]:
+        """Say which values cannot work."""
+        if self.speed != "max" and not 0 < self.speed < float("inf"):
+            yield "speed", "must be above 0, or max"
+        if self.scenario not in SCENARIOS:
+            names = ", ".join(SCENARIOS)
+            yield "scenario", f"must be one of {names}{did_you_mean(self.scenario, SCENARIOS)}"
+        if self.times == "virtual" and self.speed != "max":
+            yield "times", "virtual goes with speed max only: other speeds follow the box's clock"
+        if self.duration_s is not None and self.duration_s <= 0:
+            yield "duration_s", "must be above 0"
+        yield from self._check_names()
+
+    def _check_names(self) -> Iterator[tuple[str, str]]:
+        for topic in self.topics:
+            if topic.name not in TOPIC_BY_NAME:
+                near = did_you_mean(topic.name, TOPIC_BY_NAME)
+                yield "topics", f"the simulated robot has no topic '{topic.name}'{near}"
+        try:
+            self.start_ns()
+        except UsageError as error:
+            yield "start", error.what
+
+
+class Source:
+    """Runs one simulated robot and hands over what it publishes."""
+
+    def __init__(self, config: Config, name: str) -> None:
+        self.config = config
+        self.name = name
+        self.progress = 0.0
+        """Fraction of ``duration_s`` that is over."""
+
+    @property
+    def lossless(self) -> bool:
+        """Whether the robot waits for the recorder; a live one (speed 1) does not."""
+        return self.config.speed != 1
+
+    def topics(self) -> Sequence[TopicOptions]:
+        return self.config.topics
+
+    def run(self, sink: Sink, stop: threading.Event) -> None:
+        """Let the robot live until ``stop`` is set or its time is over."""
+        config = self.config
+        robot = make_robot(config)
+        streams = self._announce(sink)
+        for topic, sent_ns, data in self._messages(robot, stop):
+            if topic in streams:
+                received_ns = sent_ns if config.is_virtual else sink.now_ns()
+                sink.message(streams[topic], data, received_ns)
+        reason = "stopped" if stop.is_set() else "end of simulation"
+        for topic in streams:
+            sink.link_down(topic, config.robot, reason)
+
+    def _announce(self, sink: Sink) -> dict[str, int]:
+        wanted = {topic.name for topic in self.config.topics}
+        chosen = [spec for spec in TOPICS if not wanted or spec.name in wanted]
+        streams = {spec.name: sink.topic(spec.topic()) for spec in chosen}
+        for name in streams:
+            sink.link_up(name, self.config.robot)
+        return streams
+
+    def _messages(self, robot: Robot, stop: threading.Event) -> Iterator[tuple[str, int, bytes]]:
+        """Yield messages when their time has come."""
+        speed, end_s = self.config.speed, self.config.duration_s
+        encode = msgspec.json.Encoder().encode
+        began_ns = time.monotonic_ns()
+        for topic, sent_ns, message in robot.step_until(float("inf") if end_s is None else end_s):
+            if speed != "max":
+                due_ns = began_ns + (sent_ns - robot.start_ns) / speed
+                wait_ns = due_ns - time.monotonic_ns()
+                if wait_ns > _NOT_WORTH_WAITING_NS:
+                    stop.wait(wait_ns / NS)
+            if stop.is_set():
+                return
+            if end_s is not None:
+                self.progress = robot.now_s / end_s
+            yield topic, sent_ns, encode(message)
+
+
+def make_robot(config: Config) -> Robot:
+    """Return the robot of a configuration with its faults scheduled."""
+    robot = Robot(config.seed, config.robot, config.scenario, config.start_ns())
+    for fault in config.faults:
+        robot.inject(fault.id, fault.at_s, fault.magnitude, fault.until_s)
+    return robot

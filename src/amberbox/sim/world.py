@@ -1,0 +1,180 @@
+"""The hospital: walls, furniture, places, people walking by, and what a laser beam hits."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from amberbox.sim.noise import Noise
+
+Array = NDArray[np.float64]
+Point = tuple[float, float]
+CORRIDOR_Y = 1.5
+
+# Each line is a chain of wall corners. The corridor runs along x from 0 to 48, 3 m wide.
+_WALLS: tuple[tuple[Point, ...], ...] = (
+    ((8.0, 3), (5, 3), (0, 3), (0, 0), (4, 0), (4, -2.2), (6.4, -2.2), (6.4, 0), (14, 0)),
+    ((9.4, 3), (20, 3)),
+    ((21.4, 3), (39.8, 3)),
+    ((41.6, 3), (48, 3), (48, 0), (33.4, 0)),
+    ((15.4, 0), (32, 0)),
+    ((5, 3), (5, 9), (13, 9), (13, 3)),
+    ((16, 3), (16, 9), (25, 9), (25, 3)),
+    ((10, 0), (10, -6), (19, -6), (19, 0)),
+    ((28, 0), (28, -6), (37, -6), (37, 0)),
+    ((39.4, 3), (39.4, 6), (42, 6), (42, 3)),
+)
+_FURNITURE: tuple[tuple[float, float, float, float], ...] = (
+    (25.5, 2.8, 27.6, 3.0),
+    (35.0, 0.0, 36.2, 0.4),
+    (44.0, 2.8, 45.2, 3.0),
+    (5.4, 7.0, 6.3, 8.8),
+    (11.4, 7.0, 12.4, 8.8),
+    (16.5, 7.2, 18.5, 8.2),
+    (22.6, 7.2, 24.6, 8.2),
+    (10.2, -5.8, 11.0, -3.0),
+    (17.8, -5.6, 18.8, -3.0),
+    (34.4, -5.8, 36.8, -5.0),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Somewhere a task can send the robot: the way in from the corridor's middle line."""
+
+    name: str
+    way_in: tuple[Point, ...]
+
+    @property
+    def spot(self) -> Point:
+        """Return where the robot stands."""
+        return self.way_in[-1]
+
+
+PLACES = {
+    place.name: place
+    for place in (
+        Place("charging_station", ((5.2, CORRIDOR_Y), (5.2, -0.9))),
+        Place("ward_a", ((8.7, CORRIDOR_Y), (8.7, 6.0))),
+        Place("storage", ((14.7, CORRIDOR_Y), (14.7, -3.6))),
+        Place("ward_b", ((20.7, CORRIDOR_Y), (20.7, 6.0))),
+        Place("kitchen", ((32.7, CORRIDOR_Y), (32.7, -3.4))),
+        Place("elevator", ((40.7, CORRIDOR_Y), (40.7, 4.6))),
+    )
+}
+CART_PLACES = ("ward_a", "storage", "ward_b", "kitchen")
+
+
+def route(start: Place, goal: Place) -> list[Point]:
+    """Return the waypoints from one place to another, along the corridor's middle."""
+    return [*reversed(start.way_in[:-1]), *goal.way_in]
+
+
+def way_from(position: Point, goal: Place) -> list[Point]:
+    """Return waypoints from anywhere: out to the corridor by the nearest place's way, then in."""
+    if abs(position[1] - CORRIDOR_Y) < 1.0:
+        return list(goal.way_in)
+    nearest = min(PLACES.values(), key=lambda place: math.dist(place.spot, position))
+    return [goal.spot] if nearest is goal else route(nearest, goal)
+
+
+def _chain(points: tuple[Point, ...]) -> list[tuple[float, float, float, float]]:
+    return [(*a, *b) for a, b in pairwise(points)]
+
+
+def _box(x0: float, y0: float, x1: float, y1: float) -> list[tuple[float, float, float, float]]:
+    return _chain(((x0, y0), (x1, y0), (x1, y1), (x0, y1), (x0, y0)))
+
+
+def _building() -> Array:
+    walls = [segment for chain in _WALLS for segment in _chain(chain)]
+    boxes = [segment for box in _FURNITURE for segment in _box(*box)]
+    return np.array(walls + boxes, dtype=np.float64)
+
+
+class Person:
+    """Somebody who walks up and down the corridor and gives way to the robot."""
+
+    def __init__(self, x: float, y: float, speed: float) -> None:
+        self.x, self.y, self.speed = x, y, speed
+
+    def step(self, dt: float, robot: Point) -> None:
+        """Walk on; turn round at the ends and before the robot."""
+        ahead = (robot[0] - self.x) * self.speed > 0
+        if ahead and math.dist((self.x, self.y), robot) < 1.6:
+            self.speed = -self.speed
+        self.x += self.speed * dt
+        if not 1.0 < self.x < 47.0:
+            self.speed = math.copysign(self.speed, 24.0 - self.x)
+
+    def outline(self) -> list[tuple[float, float, float, float]]:
+        """Return the person as a small diamond."""
+        x, y, r = self.x, self.y, 0.22
+        return _chain(((x + r, y), (x, y + r), (x - r, y), (x, y - r), (x + r, y)))
+
+
+class Scene:
+    """Walls as lines that a laser can be cast against, prepared once for many beams."""
+
+    def __init__(self, segments: Array) -> None:
+        self.x0, self.y0, self.x1, self.y1 = segments.T.copy()
+        along_x, along_y = self.x1 - self.x0, self.y1 - self.y0
+        length = np.maximum(np.hypot(along_x, along_y), 1e-9)
+        self.normal_x, self.normal_y = -along_y / length, along_x / length
+        self.normal_angle = np.arctan2(self.normal_y, self.normal_x)
+        self.offset = self.normal_x * self.x0 + self.normal_y * self.y0
+
+
+class World:
+    """All that stands or walks around the robot."""
+
+    def __init__(self, noise: Noise) -> None:
+        self._building = _building()
+        self.people = [
+            Person(noise.uniform(10, 20), 0.45, noise.uniform(0.5, 1.1)),
+            Person(noise.uniform(28, 40), 2.5, -noise.uniform(0.5, 1.1)),
+        ]
+        self.step(0.0, (0.0, 0.0))
+
+    def step(self, dt: float, robot: Point) -> None:
+        """Let people walk."""
+        outlines: list[tuple[float, float, float, float]] = []
+        for person in self.people:
+            person.step(dt, robot)
+            outlines += person.outline()
+        self.scene = Scene(np.concatenate([self._building, np.array(outlines)]))
+
+
+CIRCLE = 240
+"""Beams in a full turn: one every 1.5 degrees."""
+_TURN = 2 * math.pi
+_STEP = _TURN / CIRCLE
+
+
+def cast(scene: Scene, origins: Array, beams: int, limit_m: float) -> Array:
+    """Return how far each beam gets until it hits something, metres, one row per origin.
+
+    An origin is (x, y, angle of its first beam); beams go round to the left in steps of 1.5
+    degrees. Each segment is asked only about the beams between its ends; beams that hit nothing
+    give ``limit_m``. All origins are cast at once, as the calls cost more than the numbers.
+    """
+    x, y, turn = origins.T[:, :, None]
+    angle_0 = np.arctan2(scene.y0 - y, scene.x0 - x)
+    span = np.arctan2(scene.y1 - y, scene.x1 - x) - angle_0
+    span -= _TURN * np.rint(span / _TURN)
+    low = (angle_0 + np.minimum(span, 0.0) - turn) % _TURN / _STEP
+    first = np.ceil(low).astype(np.intp)
+    counts = ((low + np.abs(span) / _STEP).astype(np.intp) - first + 1).ravel()
+    height = (scene.offset - scene.normal_x * x - scene.normal_y * y).ravel()
+    owner = np.repeat(np.arange(counts.size), counts)
+    shift = first.ravel() + counts - np.cumsum(counts)
+    beam = (np.arange(owner.size) + shift[owner]) % CIRCLE
+    against = (turn - scene.normal_angle).ravel()
+    distance = np.abs(height[owner] / np.cos(beam * _STEP + against[owner]))
+    nearest = np.full(len(origins) * CIRCLE, limit_m)
+    np.minimum.at(nearest, beam + owner // scene.x0.size * CIRCLE, distance)
+    return nearest.reshape(len(origins), CIRCLE)[:, :beams]

@@ -1,0 +1,121 @@
+"""The ``sim`` source: configuration, speeds, times and what it hands to the sink."""
+
+from __future__ import annotations
+
+import json
+import threading
+from typing import Any
+
+import pytest
+
+from amberbox.blackbox.sources import sim
+from amberbox.blackbox.sources.sim import Config, FaultOptions, Source
+from amberbox.core.config import build, parse_yaml
+from amberbox.core.errors import Problem
+from amberbox.core.source import TopicOptions
+from amberbox.sim import TOPICS
+from amberbox.sim.robot import START_NS
+from amberbox.testing import MemorySink
+
+
+def _run(config: Config) -> MemorySink:
+    sink = MemorySink()
+    Source(config, "sim").run(sink, threading.Event())
+    return sink
+
+
+def test_at_full_speed_the_stream_is_the_robots_own_in_virtual_time() -> None:
+    config = Config(seed=5, speed="max", duration_s=2.0)
+    sink, again = _run(config), _run(config)
+    assert sink.messages == again.messages
+    assert sink.messages[0][2] >= START_NS
+    assert sink.messages[-1][2] < START_NS + 2_000_000_000
+    assert [topic.name for topic in sink.topics] == [spec.name for spec in TOPICS]
+    assert len(sink.of("imu")) == pytest.approx(200, abs=2)
+
+
+def test_topics_carry_a_json_schema_and_the_stamp_of_the_start() -> None:
+    sink = _run(Config(speed="max", duration_s=0.5, start="2026-03-01T00:00:00Z"))
+    odom = next(topic for topic in sink.topics if topic.name == "odom")
+    assert odom.schema is not None and odom.schema.encoding == "jsonschema"
+    shape = json.loads(odom.schema.data)
+    assert shape["properties"]["twist"]["properties"]["linear"]["properties"]["x"] == {
+        "type": "number",
+        "unit": "m/s",
+    }
+    assert json.loads(sink.of("odom")[0])["header"]["stamp"]["sec"] == 1_772_323_200
+
+
+def test_only_the_topics_asked_for_come() -> None:
+    sink = _run(Config(speed="max", duration_s=1.0, topics=(TopicOptions("wifi"),)))
+    assert [topic.name for topic in sink.topics] == ["wifi"]
+    assert {stream for stream, _, _ in sink.messages} == {0}
+    assert [link[:2] for link in sink.links] == [("up", "wifi"), ("down", "wifi")]
+
+
+def test_a_limited_speed_is_kept_and_stamps_by_the_box() -> None:
+    config = Config(speed=4.0, duration_s=1.0)
+    sink = _run(config)
+    assert Source(config, "sim").lossless
+    assert not Source(Config(), "sim").lossless
+    took_ns = sink.messages[-1][2] - sink.messages[0][2]
+    assert took_ns > 200_000_000
+    assert abs(sink.messages[0][2] - sink.links[0][4]) < 2_000_000_000
+
+
+def test_stop_ends_an_endless_robot() -> None:
+    class _Stopping(MemorySink):
+        def message(self, stream: int, data: bytes, received_ns: int) -> None:
+            super().message(stream, data, received_ns)
+            if len(self.messages) == 30:
+                stop.set()
+
+    stop, sink = threading.Event(), _Stopping()
+    Source(Config(speed="max"), "sim").run(sink, stop)
+    assert len(sink.messages) == 30
+    assert sink.links[-1][3] == "stopped"
+
+
+def test_configured_faults_act_from_their_time_on() -> None:
+    fault = FaultOptions("wifi_weak", at_s=2.0, magnitude=50.0)
+    nominal = _run(Config(speed="max", duration_s=5.0))
+    faulty = _run(Config(speed="max", duration_s=5.0, faults=(fault,)))
+    assert nominal.of("wifi")[:2] == faulty.of("wifi")[:2]
+    assert not json.loads(faulty.of("wifi")[-1])["connected"]
+
+
+def _configure(text: str) -> tuple[Any, str]:
+    problems: list[Problem] = []
+    node = parse_yaml(text, "black_box.yaml", problems)
+    assert node is not None
+    config = build(Config, node, problems)
+    return config, "\n".join(map(str, problems))
+
+
+def test_the_sample_loads() -> None:
+    body = "\n".join(line[4:] for line in sim.SAMPLE.splitlines()[1:])
+    config, problems = _configure(body)
+    assert problems == ""
+    assert config.faults[0] == FaultOptions("wheel_front_left_motor_weak", 60.0, None, 0.6)
+    assert [topic.name for topic in config.topics] == ["odom", "wheels"]
+
+
+@pytest.mark.parametrize(
+    ("text", "part"),
+    [
+        ("speed: 0", "must be above 0, or max"),
+        ("scenario: transprt", "did you mean 'transport'"),
+        ("duration_s: -1", "must be above 0"),
+        ("{times: virtual, speed: 2}", "virtual goes with speed max only"),
+        ("topics: [{name: odometry}]", "no topic 'odometry'"),
+        ("start: yesterday", "start"),
+        ("faults: [{id: wifi_week}]", "did you mean 'wifi_weak'"),
+        ("faults: [{id: wifi_weak, magnitude: 99}]", "5 to 50 dB"),
+        ("faults: [{id: wifi_weak, at_s: -2}]", "must not be negative"),
+        ("faults: [{id: wifi_weak, at_s: 5, until_s: 4}]", "later than at_s"),
+    ],
+)
+def test_wrong_values_are_named(text: str, part: str) -> None:
+    config, problems = _configure(text)
+    assert config is None
+    assert part in problems
