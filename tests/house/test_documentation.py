@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
+import yaml
 
 from tools.check_docs import broken_links, check, configuration_keys
 from tools.findings import ROOT
@@ -94,18 +95,23 @@ def test_python_examples_run(tmp_path: Path) -> None:
     assert failures == []
 
 
-def test_yaml_examples_are_accepted(tmp_path: Path) -> None:
-    """Every fence marked ``yaml black_box`` is a black_box.yaml that ``amberbox check`` takes."""
-    failures = []
+def test_black_boxes_in_the_documentation_are_accepted(tmp_path: Path) -> None:
+    """Every list in a ``yaml`` fence is a black_box.yaml that ``amberbox check`` takes."""
+    checked, failures = 0, []
     for page in pages():
         for fence in fences(page.read_text(encoding="utf-8")):
-            if fence.info == "yaml black_box":
-                folder = tmp_path / f"{page.stem}_{fence.line}"
-                folder.mkdir()
-                (folder / "robot.yaml").write_text("id: example\n")
-                (folder / "black_box.yaml").write_text(fence.text)
-                command = [sys.executable, "-m", "amberbox.cli.main", "check", str(folder)]
-                done = subprocess.run(command, capture_output=True, text=True)
-                if done.returncode:
-                    failures.append(f"{page.name}:{fence.line}: {done.stdout}{done.stderr}")
+            if fence.info == "yaml" and isinstance(yaml.safe_load(fence.text), list):
+                checked += 1
+                status, said = _check_black_box(tmp_path / f"{page.stem}_{fence.line}", fence.text)
+                failures += [f"{page.name}:{fence.line}: {said}"] if status else []
     assert failures == []
+    assert checked
+
+
+def _check_black_box(folder: Path, text: str) -> tuple[int, str]:
+    folder.mkdir()
+    (folder / "robot.yaml").write_text("id: example\n")
+    (folder / "black_box.yaml").write_text(text)
+    command = [str(Path(sys.executable).with_name("amberbox")), "check", str(folder)]
+    done = subprocess.run(command, capture_output=True, text=True)
+    return done.returncode, done.stdout + done.stderr
