@@ -1,0 +1,124 @@
+"""Promises in the record: what survives ``kill -9`` and what survives a power cut."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import random
+import signal
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from amberbox.blackbox import read
+from amberbox.blackbox.folder import load_folder
+from amberbox.blackbox.recorder import Recorder
+from amberbox.blackbox.store import open_store
+from amberbox.core.clock import NS
+from amberbox.core.types import Batch
+
+KILLS = 50
+WRITE_S = 0.1
+SLACK_S = 0.05
+_FORK = multiprocessing.get_context("fork")
+
+pytest.importorskip("zmq", reason="the sender speaks ZMQ; pip install 'amberbox[zmq]'")
+
+
+def send(truth: Path, port: int) -> None:
+    """Publish numbered messages at 1 kHz; say of each when it was handed over, before sending."""
+    import zmq
+
+    context = zmq.Context()
+    socket = context.socket(zmq.PUB)
+    socket.setsockopt(zmq.SNDHWM, 0)
+    socket.bind(f"tcp://127.0.0.1:{port}")
+    file = truth.open("wb", buffering=0)
+    due = time.monotonic()
+    for number in range(10_000_000):
+        file.write(np.array([time.time_ns()], np.int64).tobytes())
+        socket.send_multipart([b"count", b'{"n":%d}' % number])
+        due += 0.001
+        time.sleep(max(0.0, due - time.monotonic()))
+
+
+def record(folder: Path) -> None:
+    Recorder(load_folder(folder), keeper=False).run()
+
+
+@pytest.fixture
+def sender(tmp_path: Path) -> Iterator[tuple[Path, int]]:
+    import socket
+
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = int(probe.getsockname()[1])
+    truth = tmp_path / "truth"
+    process = _FORK.Process(target=send, args=(truth, port), daemon=True)
+    process.start()
+    yield truth, port
+    process.kill()
+    process.join()
+
+
+@pytest.fixture
+def folder(tmp_path: Path, sender: tuple[Path, int]) -> Path:
+    robot = tmp_path / "robot"
+    robot.mkdir()
+    (robot / "robot.yaml").write_text(
+        f"id: crash_robot\nstore: {{write_s: {WRITE_S}, sync_s: 1}}\n"
+    )
+    (robot / "black_box.yaml").write_text(
+        f"- zmq:\n    endpoint: tcp://127.0.0.1:{sender[1]}\n    topics: [{{name: count}}]\n"
+    )
+    return robot
+
+
+def counted(store: Path) -> NDArray[np.int64]:
+    """Return the numbers that are in the record, in the order of their positions."""
+    found = [
+        (batch.run, batch.seq, batch.columns["n"])
+        for batch in read.batches(store, items={"zmq_count"})
+        if isinstance(batch, Batch)
+    ]
+    found.sort(key=lambda part: (part[0], int(part[1][0])))
+    numbers = [np.asarray(n, np.int64) for _, _, n in found]
+    return np.concatenate(numbers) if numbers else np.empty(0, np.int64)
+
+
+@pytest.mark.timeout(180)
+def test_kill_9_loses_only_the_last_write_interval(folder: Path, sender: tuple[Path, int]) -> None:
+    rng = random.Random(1)
+    kills: list[int] = []
+    for _ in range(KILLS):
+        process = _FORK.Process(target=record, args=(folder,))
+        process.start()
+        time.sleep(rng.uniform(0.35, 0.7))
+        kills.append(time.time_ns())
+        assert process.pid is not None
+        os.kill(process.pid, signal.SIGKILL)
+        process.join()
+    sent_ns = np.frombuffer(sender[0].read_bytes(), np.int64)
+    numbers = counted(open_store(folder / "store").path)
+    assert len(numbers) > KILLS * 100
+    assert (np.diff(numbers) > 0).all(), "a message is doubled or out of order"
+    missing = np.setdiff1d(np.arange(numbers[0], numbers[-1]), numbers)
+    lost = [n for n in missing.tolist() if not _may_be_lost(n, sent_ns, numbers, kills)]
+    assert not lost, f"{len(lost)} messages that had to survive are missing, first {lost[0]}"
+
+
+def _may_be_lost(
+    number: int, sent_ns: NDArray[np.int64], numbers: NDArray[np.int64], kills: list[int]
+) -> bool:
+    """A message may be missing if it came in the last interval before a kill, or while no
+    recorder was connected: between a kill and the first message of the next run."""
+    at = int(sent_ns[number])
+    after = int(numbers[np.searchsorted(numbers, number)])
+    for kill in kills:
+        if kill - (WRITE_S + SLACK_S) * NS <= at <= int(sent_ns[after]) and kill <= sent_ns[after]:
+            return True
+    return False
