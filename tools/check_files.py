@@ -32,7 +32,9 @@ def check(root: Path) -> list[Finding]:
 
 def committed(root: Path) -> list[str]:
     """Return the paths that are committed or about to be, relative to ``root``."""
-    listed = ["git", "ls-files", "--cached", "--others", "--exclude-standard", "-z"]
+    # In a container the checkout often belongs to another user, which git refuses by default.
+    git = ["git", "-c", "safe.directory=*"]
+    listed = [*git, "ls-files", "--cached", "--others", "--exclude-standard", "-z"]
     output = subprocess.run(listed, cwd=root, check=True, capture_output=True, text=True).stdout
     return sorted(path for path in output.split("\0") if path and (root / path).is_file())
 

@@ -82,6 +82,12 @@ def test_the_project_is_documented() -> None:
     assert check(ROOT) == []
 
 
+def test_design_notes_are_numbered() -> None:
+    """001-why.md, 002-...: each number once, without a hole."""
+    notes = sorted(path.name for path in (ROOT / "docs" / "notes").iterdir())
+    assert [name[:4] for name in notes] == [f"{n:03}-" for n in range(1, len(notes) + 1)]
+
+
 def test_python_examples_run(tmp_path: Path) -> None:
     """Every fence marked ``python run`` is a program that ends well in an empty folder."""
     failures = []
