@@ -6,7 +6,7 @@ constraints=constraints/${1:?usage: tools/venv.sh all|test}.txt
 venv=${VENV:-.venv}
 
 make_venv() {
-    "$python" -m venv "$venv" >/dev/null
+    "$python" -m venv "$venv"
 }
 
 # Debian keeps what venv needs in a package of its own.
@@ -19,7 +19,7 @@ install_venv_module() {
 
 if ! "$venv/bin/python" -m pip --version >/dev/null 2>&1; then
     python=$(tools/python.sh)
-    make_venv 2>/dev/null || { install_venv_module && make_venv; }
+    make_venv >/dev/null 2>&1 || { install_venv_module && make_venv; }
 fi
 "$venv/bin/python" -m pip install --quiet --disable-pip-version-check \
     --require-hashes --requirement "$constraints"
