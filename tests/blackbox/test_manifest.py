@@ -38,7 +38,7 @@ def segment(
 
 def journal(name: str) -> mf.Journal:
     gap = Gap("main", 1, 5, 6, "undecodable", "odom", 1, 3, 4)
-    return mf.Journal(name, "head", "main", 1, 0, 10, (gap,), {"odom": ["x"]})
+    return mf.Journal(name, "head", "main", 1, 0, 10, 100, 190, (gap,), {"odom": ["x"]})
 
 
 def test_what_is_appended_is_read(tmp_path: Path) -> None:

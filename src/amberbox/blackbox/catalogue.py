@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -15,7 +16,7 @@ from amberbox.blackbox.read import JournalFile, journals
 from amberbox.blackbox.segments import selection_of
 from amberbox.blackbox.store import open_store
 from amberbox.blackbox.variables import closest
-from amberbox.core.errors import UsageError
+from amberbox.core.errors import AmberboxError, UsageError
 from amberbox.core.types import Column
 
 
@@ -116,28 +117,18 @@ def look(store: Path, *, with_segments: bool = True) -> Catalogue:
 
 
 def journal_tables(journal: JournalFile) -> Iterator[TableSchema]:
-    """Give the tables of a journal's items that have rows."""
+    """Give the tables of a journal's items that have rows and columns."""
     for stream in journal.streams.values():
         if not stream.repeated and journal.items.get(stream.item):
-            schema = stream.unroller().schema
-            yield from tables_of(stream.item, schema, stream.topic.name, stream.source)
+            with suppress(AmberboxError):  # a message type without columns: kept, not shown
+                schema = stream.unroller().schema
+                yield from tables_of(stream.item, schema, stream.topic.name, stream.source)
 
 
 def item_of(journal: JournalFile, table: str) -> str | None:
     """Return the item of a journal whose messages hold a table's rows."""
-    return next(
-        (
-            stream.item
-            for stream in journal.streams.values()
-            if journal.items.get(stream.item)
-            and (table == stream.item or table.startswith(f"{stream.item}__"))
-            and any(
-                schema.item == table
-                for schema in tables_of(stream.item, stream.unroller().schema, "", "")
-            )
-        ),
-        None,
-    )
+    tables = (schema for schema in journal_tables(journal) if schema.item == table)
+    return next((schema.parent or schema.item for schema in tables), None)
 
 
 def _add(found: dict[str, list[TableSchema]], schema: TableSchema) -> None:

@@ -20,8 +20,8 @@ from amberbox.core.types import Batch, Column, ColumnData, IntArray, ItemSchema
 class TableSchema:
     """What a table's columns are; stands in each segment and in the manifest.
 
-    ``parent`` is the item that a child table belongs to: then ``seq`` is the parent's, and the
-    first columns are ``index`` and, for a grandchild, ``parent_index``.
+    ``parent`` is the item whose messages hold a child table: then ``seq`` is the message's, and
+    the first columns are ``index`` and, for a grandchild, ``parent_index``.
     """
 
     item: str
@@ -148,7 +148,7 @@ def _flatten(batch: Batch, parent: str, stamp: str) -> Iterator[Flat]:
         {column.name: batch.columns[column.name] for column in schema.columns},
     )
     for child in batch.children.values():
-        yield from _flatten(child, batch.item, stamp)
+        yield from _flatten(child, parent or batch.item, stamp)
 
 
 def _table(
@@ -169,15 +169,15 @@ def tables_of(item: str, schema: ItemSchema, topic: str, source: str) -> list[Ta
     tables = [_table(item, schema, (), "", schema.stamp, topic, source)]
     for path, child in schema.children.items():
         name = f"{item}__{identifier(path)}"
-        tables += _child_tables(name, child, tables[0], item, ("index",))
+        tables += _child_tables(name, child, tables[0], ("index",))
     return tables
 
 
 def _child_tables(
-    name: str, schema: ItemSchema, top: TableSchema, parent: str, keys: Sequence[str]
+    name: str, schema: ItemSchema, top: TableSchema, keys: Sequence[str]
 ) -> list[TableSchema]:
-    tables = [_table(name, schema, keys, parent, top.stamp, top.topic, top.source)]
+    tables = [_table(name, schema, keys, top.item, top.stamp, top.topic, top.source)]
     for path, child in schema.children.items():
         below = f"{name}__{identifier(path)}"
-        tables += _child_tables(below, child, top, name, ("index", "parent_index"))
+        tables += _child_tables(below, child, top, ("index", "parent_index"))
     return tables

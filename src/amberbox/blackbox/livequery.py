@@ -39,10 +39,8 @@ def follow_tables(
     lookback_s = _NOW_S
     if from_ns is not None and last_ns is not None:
         lookback_s = max((last_ns - from_ns) / NS, 0.0) + _NOW_S
-    top = schema
-    while top.parent:
-        top = catalogue.schema(top.parent)
-    for delivery in follow(record.path, {top.item}, lookback_s=lookback_s, live=live, stop=stop):
+    top = schema.parent or schema.item
+    for delivery in follow(record.path, {top}, lookback_s=lookback_s, live=live, stop=stop):
         if isinstance(delivery, Batch):
             for rows in _rows(delivery, schema.item, from_ns):
                 yield make_table(schema, wanted, merge([rows], schema, needed, "received"))

@@ -119,6 +119,7 @@ class Deletion:
 class Journal:
     """A journal whose rows are all in segments, but those in ``gaps``.
 
+    ``start_ns`` and ``end_ns`` are when its first and last record were received;
     ``selection`` are the variables configured for its items.
     """
 
@@ -128,6 +129,8 @@ class Journal:
     run: int
     first_seq: int
     end_seq: int
+    start_ns: int
+    end_ns: int
     gaps: tuple[Gap, ...] = ()
     selection: Mapping[str, Sequence[str]] = field(default_factory=dict)
 
@@ -264,7 +267,9 @@ def journal_record(journal: Journal) -> dict[str, Any]:
     return {"kind": "journal", "journal": journal.name, **fields, "gaps": gaps}
 
 
-_JOURNAL_FIELDS = ("head", "writer", "run", "first_seq", "end_seq", "selection")
+_JOURNAL_FIELDS = (
+    "head", "writer", "run", "first_seq", "end_seq", "start_ns", "end_ns", "selection",
+)  # fmt: skip
 _GAP_FIELDS = (
     "writer", "run", "from_ns", "to_ns", "reason", "item", "count", "from_seq", "to_seq",
 )  # fmt: skip

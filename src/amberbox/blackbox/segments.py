@@ -13,11 +13,13 @@ from pathlib import Path
 import numpy as np
 
 from amberbox.blackbox import manifest as mf
+from amberbox.blackbox.clocktable import ClockTable
 from amberbox.blackbox.flat import Flat, TableSchema, flatten, join
 from amberbox.blackbox.manifest import Part, Segment
 from amberbox.blackbox.parquet import TableFile, describe, read_segment
 from amberbox.blackbox.read import JournalFile, batches_of, run_messages
 from amberbox.blackbox.scan import open_buffer, read_chunk
+from amberbox.core.errors import AmberboxError
 from amberbox.core.types import ColumnData, Gap, IntArray, Ragged
 
 FOLDER = "segments"
@@ -111,12 +113,18 @@ def build_segments(store: Path, journal: JournalFile) -> list[Segment]:
     new = [schema for schema in builders if schema.id not in known.schemas]
     records = [mf.schema_record(schema) for schema in new]
     records += [mf.segment_record(segment) for segment in segments]
-    done = mf.Journal(
-        journal.name, journal.chain, journal.writer, journal.run,
-        journal.first_seq, journal.end_seq, tuple(gaps), selection_of(journal),
-    )  # fmt: skip
+    done = _done(journal, gaps)
     mf.append(store, [*records, mf.journal_record(done)])
     return segments
+
+
+def _done(journal: JournalFile, gaps: Sequence[Gap]) -> mf.Journal:
+    edges = np.array([journal.start_ns, journal.end_ns])
+    start_ns, end_ns = ClockTable(journal.clock).received(edges).tolist()
+    return mf.Journal(
+        journal.name, journal.chain, journal.writer, journal.run, journal.first_seq,
+        journal.end_seq, start_ns, end_ns, tuple(gaps), selection_of(journal),
+    )  # fmt: skip
 
 
 def _finish(builders: Mapping[TableSchema, _TableBuilder], journal: JournalFile) -> list[Segment]:
@@ -151,10 +159,25 @@ def selection_of(journal: JournalFile) -> dict[str, list[str]]:
 
 def _flats(known: mf.Manifest, journal: JournalFile, gaps: list[Gap]) -> Iterator[Flat]:
     """Give the rows that are not in a segment yet (all of them, but after a rebuild)."""
-    for batch in batches_of(journal, on_gap=gaps.append):
+    items = set()
+    for stream in journal.streams.values():
+        try:
+            stream.unroller()
+            items.add(stream.item)
+        except AmberboxError as error:
+            gaps.append(_kept_raw(journal, stream.item, error.what))
+    for batch in batches_of(journal, items, on_gap=gaps.append):
         for flat in flatten(batch):
             if len(flat) and journal.name not in known.complete(flat.schema.item):
                 yield flat
+
+
+def _kept_raw(journal: JournalFile, item: str, reason: str) -> Gap:
+    reason = f"no columns, only in {journal.name}: {reason}"
+    count = journal.items.get(item)
+    return Gap(
+        journal.writer, journal.run, journal.start_ns, journal.end_ns + 1, reason, item, count
+    )
 
 
 def _builder(
@@ -288,6 +311,7 @@ def _journals_of(segments: Sequence[Segment]) -> list[mf.Journal]:
         mf.Journal(
             name, found[0].head, found[0].writer, found[0].run,
             min(part.first_seq for part in found), 1 + max(part.last_seq for part in found),
+            min(part.from_ns for part in found), max(part.to_ns for part in found),
         )
         for name, found in parts.items()
     ]  # fmt: skip

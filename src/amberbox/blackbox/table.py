@@ -50,10 +50,13 @@ class Table:
         columns = {name: col.take(column, rows) for name, column in self.columns.items()}
         return Table(self.item, self.fields, columns, self.notes)
 
+    def values(self, name: str) -> list[Any]:
+        """Return a column as plain Python values; times as int, nulls as None."""
+        return tabletext.plain(self.columns[name])
+
     def rows(self) -> Iterator[dict[str, Any]]:
         """Give each row as plain Python values; times as int, nulls as None."""
-        values = [tabletext.plain(self.columns[name]) for name in self.names]
-        for row in zip(*values, strict=True):
+        for row in zip(*map(self.values, self.names), strict=True):
             yield dict(zip(self.names, row, strict=True))
 
     def to_arrow(self) -> pa.Table:
