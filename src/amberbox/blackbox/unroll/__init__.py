@@ -14,7 +14,8 @@ def unroller(topic: Topic, stamp: str | None = None) -> Unroller:
 
     ``stamp`` is the path of the message's own time stamp: None finds it (``header/stamp``), an
     empty text means that there is none. Raises ``AmberboxError`` for definitions and encodings
-    that cannot be unrolled, ``UsageError`` for a stamp that the message does not have.
+    that cannot be unrolled, ``UsageError`` for a stamp that a ROS message does not have. Schemas of
+    ``json`` and ``msgpack`` topics are those that ``infer.widen`` makes.
     """
     if topic.schema is None:
         raise AmberboxError(
@@ -25,6 +26,10 @@ def unroller(topic: Topic, stamp: str | None = None) -> Unroller:
         from amberbox.blackbox.unroll.ros import RosUnroller
 
         return RosUnroller(topic.schema, topic.message_encoding == "cdr", stamp)
+    if topic.message_encoding in ("json", "msgpack"):
+        from amberbox.blackbox.unroll.documents import DocumentUnroller
+
+        return DocumentUnroller(topic.schema, topic.message_encoding, stamp)
     raise AmberboxError(
         f"{topic.name}: messages in {topic.message_encoding!r} cannot be unrolled",
         "they are recorded as they come; ros1, cdr, json and msgpack have columns",

@@ -1,0 +1,247 @@
+"""What a JSON or MessagePack topic has said so far: the kinds of value seen at each place.
+
+Observing only ever adds kinds, so the shape in the end does not depend on the order of messages.
+A shape is written as a JSON Schema (draft 2020-12).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import msgspec
+
+from amberbox.core.types import Schema
+
+MOST_PROPERTIES = 256
+DEEPEST = 16
+"""Objects with more keys, and values nested deeper, are kept as JSON text in one column."""
+
+NAMES = "x-columns"
+"""Keyword for the paths of a table's columns in the order they were first seen, where the
+properties alone do not tell: names are given in that order and never change."""
+
+_DRAFT = "https://json-schema.org/draft/2020-12/schema"
+_OURS = "inferred from messages by amberbox"
+_ORDER = ("array", "boolean", "integer", "number", "object", "string", "null")
+_INT64 = range(-(2**63), 2**63)
+
+
+@dataclass(slots=True)
+class Shape:
+    """Kinds seen at one place, with the shapes below it.
+
+    ``kinds`` holds JSON's types and ``binary``. ``number`` covers ``integer``. An ``open`` shape
+    does not look further down. ``names`` is used where a table begins.
+    """
+
+    kinds: set[str] = field(default_factory=set)
+    properties: dict[str, Shape] = field(default_factory=dict)
+    items: Shape | None = None
+    open: bool = False
+    names: list[str] = field(default_factory=list)
+
+    def values(self) -> set[str]:
+        """Give the kinds without null."""
+        return self.kinds - {"null"}
+
+
+def nullable() -> Shape:
+    """Make the shape of a place that may always be missing: the top, or a property."""
+    return Shape({"null"})
+
+
+def observe(shape: Shape, value: Any, depth: int = 0) -> None:
+    """Add a decoded value to a shape; raises ValueError for numbers beyond all floats."""
+    kind = _kind(value)
+    shape.kinds.add(kind)
+    if kind == "number" or "number" in shape.kinds:
+        shape.kinds.discard("integer")
+    if kind == "object" and not shape.open:
+        _observe_object(shape, value, depth)
+    elif kind == "array" and not shape.open:
+        _observe_array(shape, value, depth)
+
+
+def _kind(value: Any) -> str:
+    match value:
+        case None:
+            return "null"
+        case bool():
+            return "boolean"
+        case int():
+            return "integer" if value in _INT64 else _checked_number(value)
+        case float():
+            return "number"
+        case str():
+            return "string"
+        case bytes():
+            return "binary"
+        case list():
+            return "array"
+        case _:
+            return "object"
+
+
+def _checked_number(value: int) -> str:
+    try:
+        float(value)
+    except OverflowError:
+        raise ValueError("a number beyond all floats") from None
+    return "number"
+
+
+def _observe_object(shape: Shape, value: Mapping[str, Any], depth: int) -> None:
+    for key, item in value.items():
+        if key not in shape.properties:
+            shape.properties[key] = nullable()
+        if depth >= DEEPEST or len(shape.properties) > MOST_PROPERTIES:
+            shape.open = True
+            shape.properties.clear()
+            return
+        observe(shape.properties[key], item, depth + 1)
+
+
+def _observe_array(shape: Shape, value: list[Any], depth: int) -> None:
+    shape.items = shape.items or Shape()
+    shape.items.open = shape.items.open or depth >= DEEPEST
+    for item in value:
+        # lists in lists become text as a whole: what is in them does not matter
+        if isinstance(item, list):
+            shape.items.kinds.add("array")
+        else:
+            observe(shape.items, item, depth + 1)
+
+
+# --------------------------------------------------------------------------------------- columns
+
+
+def column_kind(shape: Shape) -> str:
+    """Decide what a place becomes: a column type, ``nested``, ``children``, or '' for nothing.
+
+    Columns of mixed kinds are ``text``: strings as they are, everything else as JSON.
+    """
+    kinds = shape.values()
+    if len(kinds) != 1:
+        return "text" if kinds else ""
+    kind = next(iter(kinds))
+    if kind in _SCALARS:
+        return _SCALARS[kind]
+    if shape.open:
+        return "text"
+    return "nested" if kind == "object" else _list_kind(shape.items or Shape())
+
+
+_SCALARS = {
+    "boolean": "bool",
+    "integer": "int64",
+    "number": "float64",
+    "string": "string",
+    "binary": "binary",
+}
+
+
+def _list_kind(items: Shape) -> str:
+    kinds = items.values()
+    if not kinds:
+        return ""
+    if kinds == {"object"}:
+        return "text" if items.open else "children"
+    if kinds & {"object", "array"}:
+        return "text"
+    if len(kinds) > 1:
+        return "list<text>"
+    kind = _SCALARS[next(iter(kinds))]
+    if "null" in items.kinds:  # a null among numbers is how JSON writes NaN
+        kind = {"bool": "text", "int64": "float64"}.get(kind, kind)
+    return f"list<{kind}>"
+
+
+def escape(key: str) -> str:
+    """Write a key as part of a path, as JSON pointers do; an empty one as ``~2``."""
+    return key.replace("~", "~0").replace("/", "~1") or "~2"
+
+
+def places(shape: Shape, path: str = "") -> Iterator[tuple[str, Shape, str]]:
+    """List path, shape and kind of the columns and child tables of a table, in schema order.
+
+    A topic whose messages are not objects is one column ``value``.
+    """
+    kind = column_kind(shape)
+    if kind == "nested":
+        for key, inner in shape.properties.items():
+            yield from places(inner, f"{path}/{escape(key)}" if path else escape(key))
+    elif kind:
+        yield path or "value", shape, kind
+
+
+def remember_names(table: Shape) -> None:
+    """Append the paths of new columns to ``names``, in this table and those below."""
+    known = set(table.names)
+    for path, shape, kind in list(places(table)):
+        if kind == "children" and shape.items is not None:
+            remember_names(shape.items)
+        elif path not in known:
+            table.names.append(path)
+
+
+# ------------------------------------------------------------------------------------ JSON Schema
+
+
+def to_schema(shape: Shape, name: str) -> Schema:
+    """Write a shape as a JSON Schema document."""
+    head = {"$schema": _DRAFT, "$comment": _OURS, "title": name}
+    document = head | _to_json(shape, table=True)
+    return Schema(name, "jsonschema", msgspec.json.encode(document))
+
+
+def _to_json(shape: Shape, table: bool = False) -> dict[str, Any]:
+    types = {kind if kind != "binary" else "string" for kind in shape.kinds}
+    document: dict[str, Any] = {"type": [kind for kind in _ORDER if kind in types]}
+    if "binary" in shape.kinds:
+        document["contentEncoding"] = "base64"
+        if "string" in shape.kinds:
+            document["x-also-text"] = True
+    if shape.open:
+        return document | {"additionalProperties": True}
+    if "object" in shape.kinds:
+        document["properties"] = {k: _to_json(v) for k, v in shape.properties.items()}
+    if shape.items is not None:
+        document["items"] = _to_json(shape.items, table=True)
+    if table and shape.names and shape.names != _natural_names(shape):
+        document[NAMES] = shape.names
+    return document
+
+
+def _natural_names(table: Shape) -> list[str]:
+    return [path for path, _, kind in places(table) if kind != "children"]
+
+
+def from_schema(schema: Schema) -> Shape:
+    """Read a shape from the JSON Schema document that ``to_schema`` wrote.
+
+    Schemas of others may promise more than their messages keep; they start an empty shape.
+    """
+    try:
+        document = msgspec.json.decode(schema.data)
+    except msgspec.DecodeError:
+        return nullable()
+    ours = isinstance(document, dict) and document.get("$comment") == _OURS
+    return _from_json(document, table=True) if ours else nullable()
+
+
+def _from_json(document: Mapping[str, Any], table: bool = False) -> Shape:
+    types = document.get("type", [])
+    shape = Shape({types} if isinstance(types, str) else set(types))
+    if "contentEncoding" in document:
+        shape.kinds.add("binary")
+        if not document.get("x-also-text"):
+            shape.kinds.discard("string")
+    shape.open = document.get("additionalProperties") is True
+    shape.properties = {k: _from_json(v) for k, v in document.get("properties", {}).items()}
+    if "items" in document:
+        shape.items = _from_json(document["items"], table=True)
+    if table:
+        shape.names = list(document.get(NAMES) or _natural_names(shape))
+    return shape
