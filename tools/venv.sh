@@ -19,7 +19,10 @@ install_venv_module() {
 
 if ! "$venv/bin/python" -m pip --version >/dev/null 2>&1; then
     python=$(tools/python.sh)
-    make_venv >/dev/null 2>&1 || { install_venv_module && make_venv; }
+    if ! make_venv >/dev/null 2>&1; then
+        install_venv_module
+        make_venv
+    fi
 fi
 "$venv/bin/python" -m pip install --quiet --disable-pip-version-check \
     --require-hashes --requirement "$constraints"
