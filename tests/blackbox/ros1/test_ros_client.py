@@ -118,6 +118,7 @@ def test_what_has_arrived_is_delivered_when_the_box_stops(network: Network) -> N
     with listening(network.settings(), sink):
         talker = network.talker()
         talker.wait_for_subscribers(TOPIC)
+        wait_for_link(sink, "up")
         talker.publish(TOPIC, *[b"%d" % n for n in range(5000)])
     assert sink.of(TOPIC) == [b"%d" % n for n in range(5000)]
 
@@ -349,6 +350,20 @@ def _answer_nonsense(server: socket.socket) -> None:
     with connection:
         connection.recv(1 << 16)
         connection.sendall(b"220 ftp ready\r\n")
+
+
+def test_a_master_that_hangs_does_not_hold_up_the_end() -> None:
+    silent = socket.create_server(("127.0.0.1", 0))
+    with silent:
+        sink, stop = MemorySink(), threading.Event()
+        settings = Settings(f"http://127.0.0.1:{silent.getsockname()[1]}/", timeout_s=5.0)
+        thread = threading.Thread(target=Client(settings, {TOPIC: ""}, sink).run, args=(stop,))
+        thread.start()
+        connection, _ = silent.accept()
+        stop.set()
+        thread.join(1.0)
+        assert not thread.is_alive()
+        connection.close()
 
 
 def test_nobody_on_the_network_can_stop_the_box(network: Network) -> None:

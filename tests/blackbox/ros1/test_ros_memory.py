@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import threading
+
 from amberbox.blackbox.ros1.latched import LatchedFilter, digest
 from amberbox.blackbox.ros1.memory import MOST_PER_TOPIC, Memory
 from amberbox.blackbox.ros1.sightings import Sightings
 from amberbox.testing import MemorySink
+from amberbox.testing.realros import wait_until
 
 
 def test_publishers_are_remembered_across_restarts() -> None:
@@ -13,6 +16,7 @@ def test_publishers_are_remembered_across_restarts() -> None:
     memory = Memory(sink)
     memory.remember("/a", "/n", "http://h:1/")
     memory.use_port(4711)
+    memory.save()
     again = Memory(sink)
     assert again.uris("/a") == ["http://h:1/"]
     assert again.knows("/a", "/n", "http://h:1/") and not again.knows("/a", "/n", "http://h:2/")
@@ -45,6 +49,18 @@ def test_nothing_is_saved_without_a_change() -> None:
     memory.use_port(7)
     memory.save()
     assert sink.saved == {"port": 7, "publishers": "garbage"} and memory.uris("/a") == []
+
+
+def test_changes_are_saved_by_a_thread_of_their_own() -> None:
+    sink = MemorySink()
+    memory = Memory(sink)
+    thread = threading.Thread(target=memory.keep_saving)
+    thread.start()
+    memory.remember("/a", "/n", "http://h:1/")
+    wait_until(lambda: sink.saved, 5, "saved")
+    memory.end_saving()
+    thread.join(5)
+    assert not thread.is_alive() and Memory(sink).uris("/a") == ["http://h:1/"]
 
 
 def test_a_digest_leaves_the_sequence_number_out() -> None:

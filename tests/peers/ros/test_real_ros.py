@@ -188,7 +188,7 @@ def test_the_box_restarts_while_the_master_forgets(ros: Ros, invisible: bool) ->
     assert second.of(MAP) == []
 
 
-def test_the_box_is_killed_and_returns_under_the_same_address(ros: Ros) -> None:
+def test_the_box_returns_under_the_same_address(ros: Ros) -> None:
     ros.master()
     addresses = []
     saved: dict[str, Any] = {}

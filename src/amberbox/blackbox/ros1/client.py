@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from queue import SimpleQueue
@@ -56,28 +56,40 @@ class Client:
 
     def run(self, stop: threading.Event) -> None:
         """Listen until ``stop``; raises only errors of ours."""
-        updates = threading.Thread(target=self._take_updates, name="ros-updates", daemon=True)
-        watcher = threading.Thread(target=self._watch, name="ros-master", daemon=True)
+        threads = [
+            threading.Thread(target=work, name=f"ros-{name}", daemon=True)
+            for name, work in self._works().items()
+        ]
         try:
             self._start_node()
-            updates.start()
             for subscription in self._subscriptions.values():
                 subscription.connect_remembered()
-            watcher.start()
+            for thread in threads:
+                thread.start()
             while not stop.wait(FAILURE_CHECK_S):
                 self._raise_failure()
         finally:
-            self._close(updates, watcher)
+            self._close(threads)
         self._raise_failure()
 
+    def _works(self) -> dict[str, Callable[[], None]]:
+        """What has a thread of its own, for it may have to wait: notices, disk, master."""
+        return {
+            "notices": self._take_updates,
+            "memory": self._memory.keep_saving,
+            "master": self._watch,
+        }
+
     def _watch(self) -> None:
-        """Ask the master again and again; a thread of its own, for an answer may take long."""
+        """Ask the master again and again."""
         try:
             while not self._ending.is_set():
                 self._watch_master()
                 self._ending.wait(self._delay_s())
         except Exception as error:
             self._reports.crashed(error)
+        finally:
+            self._master.close()
 
     def _start_node(self) -> None:
         if self._settings.invisible:
@@ -119,7 +131,6 @@ class Client:
             self._failures += 1
             if not self._ending.is_set():
                 self._reports.master_lost(self._settings.master_uri, error)
-        self._memory.save()
 
     def _follow_new_topics(self, graph: Graph) -> None:
         if self._settings.all_topics:
@@ -179,22 +190,23 @@ class Client:
         if self._reports.failure is not None:
             raise self._reports.failure
 
-    def _close(self, updates: threading.Thread, watcher: threading.Thread) -> None:
+    def _close(self, threads: Sequence[threading.Thread]) -> None:
         """End the links first: from then on nothing arrives, and the record says so."""
         with self._changing:
             self._ending.set()
         self._updates.put(None)
+        self._memory.end_saving()
         for subscription in self._subscriptions.values():
             subscription.close(STOPPED)
         end_s = time.monotonic() + STOP_S
         for subscription in self._subscriptions.values():
             subscription.join(end_s)
-        for thread in (updates, watcher):
+        for thread in threads:
             if thread.ident is not None:
                 thread.join(max(0.0, end_s - time.monotonic()))
         self._memory.save()
         if self._node is not None:
-            if not self._failures and not watcher.is_alive():
+            if not self._failures and not any(thread.is_alive() for thread in threads):
                 self._unregister(time.monotonic() + STOP_S)
             self._node.close()
 

@@ -12,6 +12,7 @@ from typing import Any
 from amberbox.core.source import Sink
 
 MOST_PER_TOPIC = 8
+SAVE_EVERY_S = 0.2
 
 Table = dict[str, dict[str, str]]
 
@@ -25,6 +26,8 @@ class Memory:
         self._lock = threading.Lock()
         self._saving = threading.Lock()
         self._changed = False
+        self._news = threading.Event()
+        self._ended = threading.Event()
         self.port = int(state.get("port", 0))
         self._uris: Table = _table(state.get("publishers"))
         self._latched: Table = _table(state.get("latched"))
@@ -40,16 +43,15 @@ class Memory:
             return self._uris.get(topic, {}).get(node) == uri
 
     def remember(self, topic: str, node: str, uri: str) -> None:
-        """Keep where a node is, at once: the box may be killed next."""
+        """Keep where a node is."""
         with self._lock:
             nodes = self._uris.setdefault(topic, {})
             if nodes.pop(node, None) != uri:
-                self._changed = True
+                self._touch()
             nodes[node] = uri
             for oldest in list(nodes)[:-MOST_PER_TOPIC]:
                 del nodes[oldest]
                 self._latched.get(topic, {}).pop(oldest, None)
-        self.save()
 
     def forget(self, topic: str, uri: str) -> None:
         """Drop an address that is known to publish the topic no more."""
@@ -58,7 +60,7 @@ class Memory:
             for node in [node for node, at in nodes.items() if at == uri]:
                 del nodes[node]
                 self._latched.get(topic, {}).pop(node, None)
-                self._changed = True
+                self._touch()
 
     def latched(self, topic: str, node: str) -> str | None:
         """Return the digest of what a node latched last."""
@@ -66,20 +68,40 @@ class Memory:
             return self._latched.get(topic, {}).get(node)
 
     def latch(self, topic: str, node: str, digest: str) -> None:
-        """Keep the digest of what a node latched; saved with the next ``save``."""
+        """Keep the digest of what a node latched."""
         with self._lock:
             self._latched.setdefault(topic, {})[node] = digest
-            self._changed = True
+            self._touch()
 
     def use_port(self, port: int) -> None:
         """Keep the node server's port, for the same address after a restart."""
-        self._changed |= port != self.port
-        self.port = port
-        self.save()
+        with self._lock:
+            if port != self.port:
+                self.port = port
+                self._touch()
+
+    def keep_saving(self) -> None:
+        """Save what changed at once, then again after a while; for a thread of its own.
+
+        The store may make it wait; nobody who reads from a socket does.
+        """
+        while self._news.wait() and not self._ended.is_set():
+            self._news.clear()
+            self.save()
+            self._ended.wait(SAVE_EVERY_S)
+
+    def end_saving(self) -> None:
+        """Let ``keep_saving`` return."""
+        self._ended.set()
+        self._news.set()
+
+    def _touch(self) -> None:
+        self._changed = True
+        self._news.set()
 
     def save(self) -> None:
         """Hand what changed to the store."""
-        with self._saving:  # readers wait for the lock of the tables only, never for the store
+        with self._saving:
             state = self._changed_state()
             if state is not None:
                 self._sink.save_state(state)

@@ -194,7 +194,6 @@ class Subscription:
             reason = GONE
             self._memory.forget(self.topic, link.uri)
         self._take_down(link, reason, since_ns)
-        self._memory.save()
         self._reconcile()
         self._poke_parked()
 

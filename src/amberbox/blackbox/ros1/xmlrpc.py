@@ -7,10 +7,11 @@ import xmlrpc.client
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
-from xml.parsers.expat import ExpatError
+from xml.etree.ElementTree import ParseError
 
 from amberbox.blackbox.ros1.names import host_and_port, mapped, mapped_host
 from amberbox.blackbox.ros1.settings import NoAnswerError, RefusedError, Settings
+from amberbox.blackbox.ros1.xmlvalues import AnswerParser, AnswerReader
 
 
 class _TimedTransport(xmlrpc.client.Transport):
@@ -26,6 +27,10 @@ class _TimedTransport(xmlrpc.client.Transport):
         connection = http.client.HTTPConnection(str(host), timeout=self._timeout_s)
         self._connection = host, connection
         return connection
+
+    def getparser(self) -> Any:
+        parser = AnswerParser()
+        return parser, AnswerReader(parser)
 
 
 class Api:
@@ -45,9 +50,9 @@ class Api:
             code, text, value = answer
         except OSError as error:
             raise NoAnswerError(f"{self.uri}: {error.strerror or error}") from error
-        except (http.client.HTTPException, xmlrpc.client.Error, ExpatError) as error:
+        except (http.client.HTTPException, xmlrpc.client.Error, ParseError) as error:
             raise NoAnswerError(f"{self.uri} does not speak ROS: {error}") from error
-        except (TypeError, ValueError) as error:
+        except (LookupError, TypeError, ValueError) as error:
             raise NoAnswerError(f"{self.uri} gave no ROS answer to {method}: {error}") from error
         if code != 1:
             raise RefusedError(f"{self.uri} refused {method}: {text}")

