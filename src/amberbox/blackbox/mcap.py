@@ -5,6 +5,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 
 from amberbox.core.types import Schema
 
@@ -172,6 +173,7 @@ class Fields:
         return values
 
 
+@lru_cache(maxsize=1024)
 def parse_schema(content: bytes) -> tuple[int, Schema]:
     """Read a schema record's content."""
     fields = Fields(content)
@@ -179,8 +181,9 @@ def parse_schema(content: bytes) -> tuple[int, Schema]:
     return schema_id, Schema(fields.text(), fields.text(), fields.bytes())
 
 
+@lru_cache(maxsize=4096)
 def parse_channel(content: bytes) -> Channel:
-    """Read a channel record's content."""
+    """Read a channel record's content; chunks repeat theirs, so that what was read is kept."""
     fields = Fields(content)
     return Channel(
         fields.number("H"), fields.number("H"), fields.text(), fields.text(), fields.text_map()

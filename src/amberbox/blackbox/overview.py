@@ -15,7 +15,7 @@ from amberbox.blackbox.clocktable import ClockTable
 from amberbox.blackbox.flat import Flat, flatten
 from amberbox.blackbox.manifest import Part, part_clock
 from amberbox.blackbox.read import JournalFile, batches_of, journal_file
-from amberbox.blackbox.segments import median, message_bytes
+from amberbox.blackbox.segments import median
 from amberbox.core.clock import NS
 from amberbox.core.timetext import format_time
 
@@ -139,11 +139,11 @@ def _counted(path: Path, name: str, _mtime_ns: int, _size: int) -> dict[str, _Sh
     """Count a journal's rows by unrolling it; remembered until the file changes."""
     journal = journal_file(path, name)
     pieces: dict[str, list[Flat]] = {}
-    for batch in batches_of(journal):
+    sizes: dict[str, int] = {}
+    for batch in batches_of(journal, sizes=sizes):
         for flat in flatten(batch):
             if len(flat):
                 pieces.setdefault(flat.schema.item, []).append(flat.with_columns({}))
-    sizes = message_bytes(journal)
     return {table: _share(found, sizes.get(table, 0)) for table, found in pieces.items()}
 
 

@@ -215,8 +215,12 @@ def batches_of(
     from_ns: int | None = None,
     to_ns: int | None = None,
     on_gap: OnGap | None = None,
+    sizes: dict[str, int] | None = None,
 ) -> Iterator[Batch]:
-    """Yield the rows of one journal file, in large batches per item."""
+    """Yield the rows of one journal file, in large batches per item.
+
+    The bytes of each item's messages are added up in ``sizes``.
+    """
     wanted = {
         n: s
         for n, s in journal.streams.items()
@@ -241,6 +245,9 @@ def batches_of(
                 continue
             rows = np.flatnonzero(inside & (chunk.channel == number))
             size = int((chunk.ends[rows] - chunk.starts[rows]).sum())
+            if sizes is not None:
+                item = wanted[number].item
+                sizes[item] = sizes.get(item, 0) + size
             pile = piles.setdefault(number, _Pile())
             pile.add(seq[rows], chunk.log_ns[rows], chunk.messages(rows), size)
             if pile.full:

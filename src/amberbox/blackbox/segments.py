@@ -18,7 +18,6 @@ from amberbox.blackbox.flat import Flat, TableSchema, flatten, join
 from amberbox.blackbox.manifest import Part, Segment
 from amberbox.blackbox.parquet import TableFile, describe, read_segment
 from amberbox.blackbox.read import JournalFile, batches_of, run_messages
-from amberbox.blackbox.scan import open_buffer, read_chunk
 from amberbox.core.errors import AmberboxError
 from amberbox.core.types import ColumnData, Gap, IntArray, Ragged
 
@@ -102,11 +101,12 @@ def build_segments(store: Path, journal: JournalFile) -> list[Segment]:
     if journal.name in known.journals:
         return []
     gaps: list[Gap] = []
+    sizes: dict[str, int] = {}
     builders: dict[TableSchema, _TableBuilder] = {}
     try:
-        for flat in _flats(known, journal, gaps):
+        for flat in _flats(known, journal, gaps, sizes):
             _builder(builders, store, journal, flat.schema).add(flat)
-        segments = _finish(builders, journal)
+        segments = _finish(builders, journal, sizes)
     finally:
         for builder in builders.values():
             builder.file.discard()
@@ -127,27 +127,15 @@ def _done(journal: JournalFile, gaps: Sequence[Gap]) -> mf.Journal:
     )  # fmt: skip
 
 
-def _finish(builders: Mapping[TableSchema, _TableBuilder], journal: JournalFile) -> list[Segment]:
+def _finish(
+    builders: Mapping[TableSchema, _TableBuilder], journal: JournalFile, sizes: dict[str, int]
+) -> list[Segment]:
     files = Counter(schema.item for schema in builders)
-    sizes = message_bytes(journal)
     segments = []
     for schema, builder in builders.items():
         size = sizes.pop(schema.item, 0)  # once, should there be several versions
         segments.append(builder.finish(journal, files[schema.item], size))
     return segments
-
-
-def message_bytes(journal: JournalFile) -> dict[str, int]:
-    """Return the size of each item's messages in a journal."""
-    sizes: dict[str, int] = {}
-    with open_buffer(journal.path) as data:
-        for chunk in filter(None, (read_chunk(data, place) for place in journal.places)):
-            lengths = np.bincount(chunk.channel, chunk.ends - chunk.starts)
-            for number in np.unique(chunk.channel).tolist():
-                stream = journal.streams[number]
-                if not stream.repeated:
-                    sizes[stream.item] = sizes.get(stream.item, 0) + int(lengths[number])
-    return sizes
 
 
 def selection_of(journal: JournalFile) -> dict[str, list[str]]:
@@ -157,7 +145,9 @@ def selection_of(journal: JournalFile) -> dict[str, list[str]]:
     return {item: list(names) for item, names in chosen.items() if names}
 
 
-def _flats(known: mf.Manifest, journal: JournalFile, gaps: list[Gap]) -> Iterator[Flat]:
+def _flats(
+    known: mf.Manifest, journal: JournalFile, gaps: list[Gap], sizes: dict[str, int]
+) -> Iterator[Flat]:
     """Give the rows that are not in a segment yet (all of them, but after a rebuild)."""
     items = set()
     for stream in journal.streams.values():
@@ -166,7 +156,7 @@ def _flats(known: mf.Manifest, journal: JournalFile, gaps: list[Gap]) -> Iterato
             items.add(stream.item)
         except AmberboxError as error:
             gaps.append(_kept_raw(journal, stream.item, error.what))
-    for batch in batches_of(journal, items, on_gap=gaps.append):
+    for batch in batches_of(journal, items, on_gap=gaps.append, sizes=sizes):
         for flat in flatten(batch):
             if len(flat) and journal.name not in known.complete(flat.schema.item):
                 yield flat
