@@ -155,7 +155,7 @@ def _fault(entry: dict[str, Any], where: str) -> Fault:
             effects=tuple(Effect(**effect) for effect in entry["effects"]),
             affects=tuple(entry["affects"]),
             shows_in=tuple(entry["shows_in"]),
-            visible_s=entry.get("visible_s", 4.0),
+            visible_s=entry.get("visible_s", 3.0),
             scenario=entry.get("scenario", "transport"),
         )
     except (KeyError, TypeError, ValueError) as error:

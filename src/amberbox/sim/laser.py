@@ -131,9 +131,9 @@ class Laser:
 def look_around(lasers: Sequence[Laser], pose: Pose2D, scene: Scene) -> list[View]:
     """Return for each laser what a map lets expect and what its beams really meet."""
     believed = [laser.origin(pose, 0.0) for laser in lasers]
-    if not any(laser.yaw_rad for laser in lasers):
-        return [View(row, row) for row in cast(scene, np.array(believed), BEAMS, RANGE_MAX_M)]
-    true = [laser.origin(pose, laser.yaw_rad) for laser in lasers]
-    rows = cast(scene, np.array(believed + true), BEAMS, RANGE_MAX_M)
-    count = len(lasers)
-    return [View(*pair) for pair in zip(rows[:count], rows[count:], strict=True)]
+    turned = [laser for laser in lasers if laser.yaw_rad]
+    true = [laser.origin(pose, laser.yaw_rad) for laser in turned]
+    rows = iter(cast(scene, np.array(believed + true), BEAMS, RANGE_MAX_M))
+    expected = [next(rows) for _ in lasers]
+    pairs = zip(lasers, expected, strict=True)
+    return [View(row, next(rows) if laser in turned else row) for laser, row in pairs]

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import heapq
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 from amberbox.core.clock import NS
@@ -21,8 +22,8 @@ from amberbox.sim.mission import SCENARIOS, Planner
 from amberbox.sim.navigation import Navigation
 from amberbox.sim.noise import Noise
 from amberbox.sim.safety import Safety
-from amberbox.sim.software import Host, LogLine
-from amberbox.sim.topics import TOPIC_BY_NAME, TOPICS, TopicSpec
+from amberbox.sim.software import Host, LogLine, Node
+from amberbox.sim.topics import TOPICS, TopicSpec
 from amberbox.sim.wifi import Wifi
 from amberbox.sim.world import PLACES, World
 
@@ -38,6 +39,18 @@ _PARTS = ("base", "bus", "battery", "wifi", "host", "safety", *_LASERS_AND_SENSO
 
 Message = tuple[str, int, dict[str, Any]]
 Reading = tuple[int, dict[str, Any]]
+
+
+@dataclass(slots=True)
+class _Outlet:
+    """One topic on its way out: who publishes it, how far it has counted, its delays."""
+
+    topic: str
+    frame_id: str
+    node: Node
+    noise: Noise
+    count: int = 0
+    last_sent_ns: int = 0
 
 
 class Robot:
@@ -61,21 +74,19 @@ class Robot:
         self._ticks = 0
         self._order = 0
         self._waiting: list[tuple[int, int, str, dict[str, Any]]] = []
-        self._counts = {spec.name: 0 for spec in TOPICS}
-        self._last_sent = {spec.name: 0 for spec in TOPICS}
         self._command = (0.0, 0.0, 0.0)
         self._command_ns = 0
         self._stuck_s = 0.0
         self._log: list[LogLine] = []
         self._injector = Injector(seed, self.parts)
-        self._plan = _plan()
+        self._outlets = {spec.name: self._outlet(spec) for spec in TOPICS}
+        self._plan = _plan(self._outlets)
 
     def _build(self, scenario: str) -> None:
         setting = SCENARIOS[scenario]
         where = PLACES[setting["place"]].spot
         start = Pose2D(where[0], where[1], 1.5708)
         noise = self._noise
-        self._timing = {spec.name: noise(f"timing {spec.name}") for spec in TOPICS}
         self.world = World(noise("world"))
         self.base = Base(noise, start)
         self.odometry = Odometry(start)
@@ -94,6 +105,10 @@ class Robot:
 
     def _noise(self, name: str) -> Noise:
         return Noise(self.seed, name)
+
+    def _outlet(self, spec: TopicSpec) -> _Outlet:
+        node = self.host.nodes[spec.node or "supervisor"]
+        return _Outlet(spec.name, spec.frame_id, node, self._noise(f"timing {spec.name}"))
 
     @property
     def now_ns(self) -> int:
@@ -176,8 +191,8 @@ class Robot:
             self._move(0.02)
         if phase % 10 == 0:
             self._feel(0.1)
-        for spec, make in self._plan[phase]:
-            self._publish(spec, make(self))
+        for outlet, make in self._plan[phase]:
+            self._publish(outlet, make(self))
         if self.executor.events or self.executor.log or self._log:
             self._speak()
 
@@ -240,33 +255,33 @@ class Robot:
         self.localisation.reset()
         self._log.append(LogLine(20, "supervisor", "robot moved by hand to the corridor"))
 
-    def _publish(self, spec: TopicSpec, reading: Reading | None) -> None:
-        if reading is None or not self.host.is_working(spec.node):
+    def _publish(self, outlet: _Outlet, reading: Reading | None) -> None:
+        if reading is None or not outlet.node.is_working:
             return
         acquired_ns, body = reading
-        name, slowness = spec.name, self.host.slowness
-        delay_ns = 300_000 + round(abs(self._timing[name].normal(250_000.0 * slowness)) * slowness)
-        sent_ns = max(self.now_ns + delay_ns, self._last_sent[name] + 1000)
-        self._last_sent[name] = sent_ns
-        self._counts[name] = count = self._counts[name] + 1
+        slowness = self.host.slowness
+        delay_ns = 300_000 + int(abs(outlet.noise.normal(250_000.0 * slowness)) * slowness)
+        sent_ns = max(self.now_ns + delay_ns, outlet.last_sent_ns + 1000)
+        outlet.last_sent_ns = sent_ns
+        outlet.count += 1
         self._order += 1
-        stamp = divmod(acquired_ns + round(self.host.clock_shift_s * NS), NS)
+        sec, nanosec = divmod(acquired_ns + round(self.host.clock_shift_s * NS), NS)
         header = {
-            "seq": count,
-            "stamp": {"sec": stamp[0], "nanosec": stamp[1]},
-            "frame_id": spec.frame_id,
+            "seq": outlet.count,
+            "stamp": {"sec": sec, "nanosec": nanosec},
+            "frame_id": outlet.frame_id,
         }
         message = {"header": header, **body}
-        heapq.heappush(self._waiting, (sent_ns, self._order, name, message))
+        heapq.heappush(self._waiting, (sent_ns, self._order, outlet.topic, message))
 
     def _speak(self) -> None:
         """Publish the events and log lines that came up since the last tick."""
         events, self.executor.events = self.executor.events, []
         lines, self._log, self.executor.log = self._log + self.executor.log, [], []
         for event in events:
-            self._publish(_TASKS, (self.now_ns, event))
+            self._publish(self._outlets["tasks"], (self.now_ns, event))
         for line in lines:
-            self._publish(_LOG, (self.now_ns, line._asdict()))
+            self._publish(self._outlets["log"], (self.now_ns, line._asdict()))
 
     def _read_imu(self) -> Reading:
         vx, _, yaw_rate = self.base.twist
@@ -317,7 +332,6 @@ class Robot:
 
 
 Make = Callable[[Robot], "Reading | None"]
-_TASKS, _LOG = TOPIC_BY_NAME["tasks"], TOPIC_BY_NAME["log"]
 
 
 def _scan_reading(laser: Laser) -> Reading | None:
@@ -329,14 +343,14 @@ def _distance(point: tuple[float, float], pose: Pose2D) -> float:
     return (point[0] - pose.x) ** 2 + (point[1] - pose.y) ** 2
 
 
-def _plan() -> list[list[tuple[TopicSpec, Make]]]:
+def _plan(outlets: Mapping[str, _Outlet]) -> list[list[tuple[_Outlet, Make]]]:
     """Return for each tick of a second what is published in it; slow topics are spread out."""
-    plan: list[list[tuple[TopicSpec, Make]]] = [[] for _ in range(TICKS_PER_S)]
+    plan: list[list[tuple[_Outlet, Make]]] = [[] for _ in range(TICKS_PER_S)]
     for index, spec in enumerate(TOPICS):
         if spec.rate_hz == 0:
             continue
         make: Make = getattr(Robot, f"_read_{spec.name}")
         period = round(TICKS_PER_S / spec.rate_hz)
         for tick in range(index % period, TICKS_PER_S, period):
-            plan[tick].append((spec, make))
+            plan[tick].append((outlets[spec.name], make))
     return plan

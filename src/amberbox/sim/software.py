@@ -52,7 +52,7 @@ class Node:
     @property
     def is_working(self) -> bool:
         """Whether it does its work now."""
-        return self.pid != 0 and self.killed < 0.5 and self.stalled < 0.5
+        return self.killed < 0.5 and self.stalled < 0.5 and self.pid != 0
 
     @property
     def rss_mb(self) -> float:
@@ -124,9 +124,8 @@ class Host:
         return 1.0 + 0.25 * max(0.0, self.load_percent)
 
     def is_working(self, name: str) -> bool:
-        """Whether a process does its work; a name of none is always there."""
-        node = self.nodes.get(name)
-        return node is None or node.is_working
+        """Whether a process does its work."""
+        return self.nodes[name].is_working
 
     def step(self, dt: float) -> list[LogLine]:
         """Advance by ``dt``; return new log lines."""

@@ -284,7 +284,7 @@ TOPICS: tuple[TopicSpec, ...] = (
         "log",
         0,
         "",
-        "",
+        "supervisor",
         "Log messages (level 10 debug, 20 info, 30 warning, 40 error, 50 fatal).",
         record(level=integer(), name=text(), msg=text()),
     ),

@@ -153,6 +153,11 @@ CIRCLE = 240
 """Beams in a full turn: one every 1.5 degrees."""
 _TURN = 2 * math.pi
 _STEP = _TURN / CIRCLE
+_ORIGINS = 4
+_ROWS = np.arange(_ORIGINS)[:, None]
+# Beams of each origin stand in two rounds, so that a segment may go on past the first beam.
+_COS = np.cos(np.arange(2 * CIRCLE * _ORIGINS) * _STEP)
+_SIN = np.sin(np.arange(2 * CIRCLE * _ORIGINS) * _STEP)
 
 
 def cast(scene: Scene, origins: Array, beams: int, limit_m: float) -> Array:
@@ -160,21 +165,27 @@ def cast(scene: Scene, origins: Array, beams: int, limit_m: float) -> Array:
 
     An origin is (x, y, angle of its first beam); beams go round to the left in steps of 1.5
     degrees. Each segment is asked only about the beams between its ends; beams that hit nothing
-    give ``limit_m``. All origins are cast at once, as the calls cost more than the numbers.
+    give ``limit_m``. Up to four origins are cast at once: calls cost more than numbers.
     """
     x, y, turn = origins.T[:, :, None]
+    count = len(origins)
     angle_0 = np.arctan2(scene.y0 - y, scene.x0 - x)
     span = np.arctan2(scene.y1 - y, scene.x1 - x) - angle_0
     span -= _TURN * np.rint(span / _TURN)
-    low = (angle_0 + np.minimum(span, 0.0) - turn) % _TURN / _STEP
+    low = (angle_0 + np.minimum(span, 0.0) - turn) / _TURN
+    low = (low - np.floor(low)) * CIRCLE
     first = np.ceil(low).astype(np.intp)
-    counts = ((low + np.abs(span) / _STEP).astype(np.intp) - first + 1).ravel()
+    sizes = ((low + np.abs(span) / _STEP).astype(np.intp) - first + 1).ravel()
     height = (scene.offset - scene.normal_x * x - scene.normal_y * y).ravel()
-    owner = np.repeat(np.arange(counts.size), counts)
-    shift = first.ravel() + counts - np.cumsum(counts)
-    beam = (np.arange(owner.size) + shift[owner]) % CIRCLE
-    against = (turn - scene.normal_angle).ravel()
-    distance = np.abs(height[owner] / np.cos(beam * _STEP + against[owner]))
-    nearest = np.full(len(origins) * CIRCLE, limit_m)
-    np.minimum.at(nearest, beam + owner // scene.x0.size * CIRCLE, distance)
-    return nearest.reshape(len(origins), CIRCLE)[:, :beams]
+    cos, sin = np.cos(turn), np.sin(turn)
+    along = (cos * scene.normal_x + sin * scene.normal_y).ravel()
+    across = (sin * scene.normal_x - cos * scene.normal_y).ravel()
+    owner = np.repeat(np.arange(sizes.size), sizes)
+    start = (first + _ROWS[:count] * 2 * CIRCLE).ravel() + sizes - np.cumsum(sizes)
+    beam = np.arange(owner.size) + start[owner]
+    distance = np.abs(height[owner] / (_COS[beam] * along[owner] - _SIN[beam] * across[owner]))
+    nearest = np.full(count * 2 * CIRCLE, limit_m)
+    np.minimum.at(nearest, beam, distance)
+    rows = nearest.reshape(count, 2, CIRCLE)
+    met: Array = np.minimum(rows[:, 0, :beams], rows[:, 1, :beams])
+    return met
