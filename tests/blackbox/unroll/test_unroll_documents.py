@@ -62,9 +62,6 @@ def cells(rows: Rows, name: str) -> list[Any]:
     return list(column.tolist())
 
 
-# ------------------------------------------------------------------------- the schema as it grows
-
-
 def test_the_paper_s_kind_of_message() -> None:
     values = [{"header": {"type": "TASK", "timestamp": 1.5e9}, "payload": {"x": 1, "ok": True}}]
     schema, task, messages = learn(values)
@@ -198,9 +195,6 @@ def test_schemas_of_others_are_not_relied_on() -> None:
     assert widen(broken, [b'{"x": 1}'], "json", "t")[0].data.startswith(b'{"$schema"')
 
 
-# ------------------------------------------------------------------------------------- properties
-
-
 @settings(max_examples=150, deadline=None)
 @given(MESSAGES, ENCODINGS, st.randoms(use_true_random=False), st.integers(1, 3))
 def test_widening_does_not_depend_on_order(
@@ -270,9 +264,6 @@ def test_any_bytes_are_a_value_or_named_malformed(message: bytes, encoding: str)
             task.rows([good, message, good])
         assert caught.value.bad == bad
     assert task.rows([good, good] if bad else [good, message, good]).count == 3 - len(bad)
-
-
-# ----------------------------------------------------------------------------- single conventions
 
 
 @pytest.mark.parametrize(

@@ -129,9 +129,6 @@ def typed_messages(draw: st.DrawFn) -> tuple[Type, list[Any]]:
     return kind, [drawn[number] for number in order]
 
 
-# ---------------------------------------------------------------- the reference: one message flat
-
-
 def leaf(desc: Any, item: Any) -> Any:
     """Give one value as a column holds it."""
     if desc[0] == Nodetype.NAME:
@@ -221,9 +218,6 @@ def assert_identical(left: Rows, right: Rows, schema: ItemSchema) -> None:
     check_form(left, schema)
     check_form(right, schema)
     assert same(as_dictionaries(left, schema), as_dictionaries(right, schema))
-
-
-# ------------------------------------------------------------------------------------- properties
 
 
 @pytest.mark.parametrize("cdr", [False, True])

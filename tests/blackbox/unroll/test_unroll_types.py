@@ -141,11 +141,14 @@ def test_big_endian_cdr_reads_as_little_endian_does() -> None:
         assert values["e"].tolist() == [-1, 5] and values["t"] == 3 * NS + 4
 
 
-def test_other_encapsulations_than_plain_cdr_are_misfits() -> None:
-    for header in (b"\0\2\0\0", b"\0\7\0\0", b"\1\0\0\0", b"\0", b""):
-        with pytest.raises(UnrollError) as caught:
-            cdr("int32 a\n").rows([b"\0\1\0\0\5\0\0\0", header + b"\5\0\0\0" * (len(header) > 3)])
-        assert caught.value.bad == (1,)
+@pytest.mark.parametrize("by_layout", [True, False])
+@pytest.mark.parametrize("header", [b"\0\2\0\0", b"\0\7\0\0", b"\1\0\0\0", b"\0", b""])
+def test_other_encapsulations_than_plain_cdr_are_misfits(header: bytes, by_layout: bool) -> None:
+    number = RosUnroller(Schema("p/msg/T", "ros2msg", b"int32 a\n"), True, by_layout=by_layout)
+    good = b"\0\1\0\0\5\0\0\0"
+    with pytest.raises(UnrollError) as caught:
+        number.rows([good, header + good[4:] * (len(header) > 3), good])
+    assert caught.value.bad == (1,)
 
 
 def test_strings_cdr() -> None:
@@ -261,9 +264,16 @@ def test_own_stamp_of_header_and_its_zero() -> None:
     assert second.stamp_ns(message) == 9 * NS + 8
 
 
-def test_own_stamp_behind_a_string() -> None:
-    late = ros1("string name\ntime stamp\n")
-    message = struct.pack("<I2sII", 2, b"ab", 3, 4)
+@pytest.mark.parametrize(
+    ("text", "before"),
+    [
+        ("string name\ntime stamp\n", struct.pack("<I2s", 2, b"ab")),
+        ("int8 a\nstring name\ntime stamp\n", struct.pack("<bI2s", 1, 2, b"ab")),
+    ],
+)
+def test_own_stamp_behind_a_string(text: str, before: bytes) -> None:
+    late = ros1(text)
+    message = before + struct.pack("<II", 3, 4)
     assert late.schema.stamp == "stamp" and late.stamp_ns(message) == 3 * NS + 4
     assert late.stamp_ns(message[:-1]) is None
 

@@ -17,8 +17,9 @@ from amberbox.blackbox.unroll.decode import (
     plain,
     text_of,
 )
+from amberbox.blackbox.unroll.jsonschema import from_schema
 from amberbox.blackbox.unroll.places import objects
-from amberbox.blackbox.unroll.shapes import Shape, column_kind, escape, from_schema, places
+from amberbox.blackbox.unroll.shapes import Shape, column_kind, escape, places
 from amberbox.blackbox.unroll.stamps import stamp_of
 from amberbox.core.names import unique_names
 from amberbox.core.types import Column, ColumnData, IntArray, ItemSchema, Ragged, Rows, Schema
@@ -145,9 +146,6 @@ def _masked(values: Sequence[Any], dtype: Any) -> ColumnData:
     if not any(missing):
         return np.array(values, dtype)
     return np.ma.MaskedArray(np.array([0 if v is None else v for v in values], dtype), missing)
-
-
-# ------------------------------------------------------------------------------------- own stamps
 
 
 def _own_stamp(shape: Shape, stamp: str | None) -> str:

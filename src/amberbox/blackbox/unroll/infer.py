@@ -8,14 +8,8 @@ from functools import lru_cache
 import msgspec
 
 from amberbox.blackbox.unroll.decode import MalformedError, decode_plain, is_exact, make_decoder
-from amberbox.blackbox.unroll.shapes import (
-    Shape,
-    from_schema,
-    nullable,
-    observe,
-    remember_names,
-    to_schema,
-)
+from amberbox.blackbox.unroll.jsonschema import from_schema, to_schema
+from amberbox.blackbox.unroll.shapes import Shape, nullable, observe, remember_names
 from amberbox.core.types import Schema
 
 

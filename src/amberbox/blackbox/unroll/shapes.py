@@ -1,7 +1,6 @@
 """What a JSON or MessagePack topic has said so far: the kinds of value seen at each place.
 
 Observing only ever adds kinds, so the shape in the end does not depend on the order of messages.
-A shape is written as a JSON Schema (draft 2020-12).
 """
 
 from __future__ import annotations
@@ -10,21 +9,10 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-import msgspec
-
-from amberbox.core.types import Schema
-
 MOST_PROPERTIES = 256
 DEEPEST = 16
 """Objects with more keys, and values nested deeper, are kept as JSON text in one column."""
 
-NAMES = "x-columns"
-"""Keyword for the paths of a table's columns in the order they were first seen, where the
-properties alone do not tell: names are given in that order and never change."""
-
-_DRAFT = "https://json-schema.org/draft/2020-12/schema"
-_OURS = "inferred from messages by amberbox"
-_ORDER = ("array", "boolean", "integer", "number", "object", "string", "null")
 _INT64 = range(-(2**63), 2**63)
 
 
@@ -114,9 +102,6 @@ def _observe_array(shape: Shape, value: list[Any], depth: int) -> None:
             observe(shape.items, item, depth + 1)
 
 
-# --------------------------------------------------------------------------------------- columns
-
-
 def column_kind(shape: Shape) -> str:
     """Decide what a place becomes: a column type, ``nested``, ``children``, or '' for nothing.
 
@@ -184,64 +169,3 @@ def remember_names(table: Shape) -> None:
             remember_names(shape.items)
         elif path not in known:
             table.names.append(path)
-
-
-# ------------------------------------------------------------------------------------ JSON Schema
-
-
-def to_schema(shape: Shape, name: str) -> Schema:
-    """Write a shape as a JSON Schema document."""
-    head = {"$schema": _DRAFT, "$comment": _OURS, "title": name}
-    document = head | _to_json(shape, table=True)
-    return Schema(name, "jsonschema", msgspec.json.encode(document))
-
-
-def _to_json(shape: Shape, table: bool = False) -> dict[str, Any]:
-    types = {kind if kind != "binary" else "string" for kind in shape.kinds}
-    document: dict[str, Any] = {"type": [kind for kind in _ORDER if kind in types]}
-    if "binary" in shape.kinds:
-        document["contentEncoding"] = "base64"
-        if "string" in shape.kinds:
-            document["x-also-text"] = True
-    if shape.open:
-        return document | {"additionalProperties": True}
-    if "object" in shape.kinds:
-        document["properties"] = {k: _to_json(v) for k, v in shape.properties.items()}
-    if shape.items is not None:
-        document["items"] = _to_json(shape.items, table=True)
-    if table and shape.names and shape.names != _natural_names(shape):
-        document[NAMES] = shape.names
-    return document
-
-
-def _natural_names(table: Shape) -> list[str]:
-    return [path for path, _, kind in places(table) if kind != "children"]
-
-
-def from_schema(schema: Schema) -> Shape:
-    """Read a shape from the JSON Schema document that ``to_schema`` wrote.
-
-    Schemas of others may promise more than their messages keep; they start an empty shape.
-    """
-    try:
-        document = msgspec.json.decode(schema.data)
-    except msgspec.DecodeError:
-        return nullable()
-    ours = isinstance(document, dict) and document.get("$comment") == _OURS
-    return _from_json(document, table=True) if ours else nullable()
-
-
-def _from_json(document: Mapping[str, Any], table: bool = False) -> Shape:
-    types = document.get("type", [])
-    shape = Shape({types} if isinstance(types, str) else set(types))
-    if "contentEncoding" in document:
-        shape.kinds.add("binary")
-        if not document.get("x-also-text"):
-            shape.kinds.discard("string")
-    shape.open = document.get("additionalProperties") is True
-    shape.properties = {k: _from_json(v) for k, v in document.get("properties", {}).items()}
-    if "items" in document:
-        shape.items = _from_json(document["items"], table=True)
-    if table:
-        shape.names = list(document.get(NAMES) or _natural_names(shape))
-    return shape

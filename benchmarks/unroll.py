@@ -1,0 +1,109 @@
+"""Unrolling messages into columns, side by side with rosbags reading and flattening them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from amberbox.blackbox.unroll import Unroller, unroller
+from amberbox.blackbox.unroll.infer import widen
+from amberbox.blackbox.unroll.ros import RosUnroller
+from amberbox.core.types import Schema, Topic
+from benchmarks.common import Row, rate
+from benchmarks.mix import START_NS, make_message, store
+
+BATCH = 100
+BATCHES = 20
+TARGETS = {"Odometry": "to be > 1 M and >= 20 times", "Imu": "to be > 1 M and >= 20 times"}
+TYPES = (
+    "nav_msgs/msg/Odometry",
+    "sensor_msgs/msg/Imu",
+    "sensor_msgs/msg/JointState",
+    "geometry_msgs/msg/Pose",
+    "sensor_msgs/msg/LaserScan",
+    "diagnostic_msgs/msg/DiagnosticArray",
+)
+
+
+def measure() -> list[Row]:
+    """Measure rows per CPU second, by layout and with the decoder for many layouts."""
+    ros = [row for name in TYPES for cdr in (False, True) for row in _of_type(name, cdr)]
+    return [*ros, *_of_json()]
+
+
+def _of_type(name: str, cdr: bool) -> Iterator[Row]:
+    types = store()
+    rng = np.random.default_rng(1)
+    write = types.serialize_cdr if cdr else types.serialize_ros1
+    read = types.deserialize_cdr if cdr else types.deserialize_ros1
+    count = BATCH * (BATCHES if "Diagnostic" not in name else 2)
+    made = (make_message(types, name, k, START_NS + k * 10**7, rng) for k in range(count))
+    messages = [bytes(write(message, name)) for message in made]
+    text, _ = types.generate_msgdef(name, ros_version=2 if cdr else 1)
+    schema = Schema(name, "ros2msg" if cdr else "ros1msg", text.encode())
+    peer = rate(count, lambda: [flatten(read(message, name)) for message in messages], 3)
+    kind, wire = name.rpartition("/")[2], "CDR" if cdr else "ROS 1"
+    for way, by_layout in (("by layout", True), ("one by one", False)):
+        unroll = RosUnroller(schema, cdr, by_layout=by_layout)
+        value = rate(count, _in_batches(unroll, messages))
+        what = f"{kind}, {wire}, {len(unroll.schema.columns)} columns, {way}"
+        note = TARGETS.get(kind, "") if by_layout else "for topics of many layouts"
+        yield Row(what, value, "rows/s", f"rosbags + flatten {peer:,.0f}", value / peer, note)
+
+
+def _in_batches(unroll: Unroller, messages: Sequence[bytes]) -> Callable[[], None]:
+    batches = [messages[start : start + BATCH] for start in range(0, len(messages), BATCH)]
+
+    def all_batches() -> None:
+        for batch in batches:
+            unroll.rows(batch)
+
+    return all_batches
+
+
+def flatten(message: Any) -> dict[str, Any]:
+    """Flatten an object of rosbags into one dictionary, fixed arrays up to 64 unrolled."""
+    flat: dict[str, Any] = {}
+    _flatten(message, "", flat)
+    return flat
+
+
+def _flatten(value: Any, name: str, flat: dict[str, Any]) -> None:
+    if isinstance(value, float | int | str):
+        flat[name] = value
+    elif hasattr(value, "__msgtype__"):
+        for key, inner in vars(value).items():
+            _flatten(inner, f"{name}_{key}" if name else key, flat)
+    elif isinstance(value, np.ndarray) and len(value) <= 64:
+        for index, item in enumerate(value.tolist()):
+            flat[f"{name}_{index}"] = item
+    elif isinstance(value, list) and value and hasattr(value[0], "__msgtype__"):
+        for index, item in enumerate(value):
+            _flatten(item, f"{name}_{index}", flat)
+    else:
+        flat[name] = value
+
+
+def _of_json() -> Iterator[Row]:
+    rng = np.random.default_rng(1)
+    messages = [
+        msgspec.json.encode(
+            {
+                "header": {"timestamp": START_NS / 1e9 + k, "type": "WHEEL"},
+                "wheels": [
+                    {"velocity": v, "current": 1.5, "ok": True} for v in rng.random(4).tolist()
+                ],
+                "pose": {"x": k * 0.1, "y": 1.0, "theta": 0.0},
+            }
+        )
+        for k in range(BATCH * BATCHES)
+    ]
+    schema, _ = widen(None, messages[:1], "json", "wheel")
+    what = "JSON with a child table of 4"
+    checked = rate(len(messages), lambda: widen(schema, messages, "json", "wheel"))
+    yield Row(f"{what}, schema unchanged", checked, "messages/s")
+    task = unroller(Topic("/wheel", "json", schema))
+    yield Row(f"{what}, rows", rate(len(messages), _in_batches(task, messages)), "rows/s")

@@ -1,0 +1,77 @@
+"""Shapes of JSON and MessagePack topics written as JSON Schema (draft 2020-12), and read back."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import msgspec
+
+from amberbox.blackbox.unroll.shapes import Shape, nullable, places
+from amberbox.core.types import Schema
+
+NAMES = "x-columns"
+"""Keyword for the paths of a table's columns in the order they were first seen, where the
+properties alone do not tell: names are given in that order and never change."""
+
+_DRAFT = "https://json-schema.org/draft/2020-12/schema"
+_OURS = "inferred from messages by amberbox"
+_ORDER = ("array", "boolean", "integer", "number", "object", "string", "null")
+
+
+def to_schema(shape: Shape, name: str) -> Schema:
+    """Write a shape as a JSON Schema document."""
+    head = {"$schema": _DRAFT, "$comment": _OURS, "title": name}
+    document = head | _to_json(shape, table=True)
+    return Schema(name, "jsonschema", msgspec.json.encode(document))
+
+
+def _to_json(shape: Shape, table: bool = False) -> dict[str, Any]:
+    types = {kind if kind != "binary" else "string" for kind in shape.kinds}
+    document: dict[str, Any] = {"type": [kind for kind in _ORDER if kind in types]}
+    if "binary" in shape.kinds:
+        document["contentEncoding"] = "base64"
+        if "string" in shape.kinds:
+            document["x-also-text"] = True
+    if shape.open:
+        return document | {"additionalProperties": True}
+    if "object" in shape.kinds:
+        document["properties"] = {k: _to_json(v) for k, v in shape.properties.items()}
+    if shape.items is not None:
+        document["items"] = _to_json(shape.items, table=True)
+    if table and shape.names and shape.names != _natural_names(shape):
+        document[NAMES] = shape.names
+    return document
+
+
+def _natural_names(table: Shape) -> list[str]:
+    return [path for path, _, kind in places(table) if kind != "children"]
+
+
+def from_schema(schema: Schema) -> Shape:
+    """Read a shape from the JSON Schema document that ``to_schema`` wrote.
+
+    Schemas of others may promise more than their messages keep; they start an empty shape.
+    """
+    try:
+        document = msgspec.json.decode(schema.data)
+    except msgspec.DecodeError:
+        return nullable()
+    ours = isinstance(document, dict) and document.get("$comment") == _OURS
+    return _from_json(document, table=True) if ours else nullable()
+
+
+def _from_json(document: Mapping[str, Any], table: bool = False) -> Shape:
+    types = document.get("type", [])
+    shape = Shape({types} if isinstance(types, str) else set(types))
+    if "contentEncoding" in document:
+        shape.kinds.add("binary")
+        if not document.get("x-also-text"):
+            shape.kinds.discard("string")
+    shape.open = document.get("additionalProperties") is True
+    shape.properties = {k: _from_json(v) for k, v in document.get("properties", {}).items()}
+    if "items" in document:
+        shape.items = _from_json(document["items"], table=True)
+    if table:
+        shape.names = list(document.get(NAMES) or _natural_names(shape))
+    return shape
