@@ -161,6 +161,21 @@ def test_names_stay_when_paths_come_later() -> None:
     assert names.items() <= {column.path: column.name for column in later.columns}.items()
 
 
+@pytest.mark.parametrize("encoding", ["json", "msgpack"])
+def test_messages_that_say_nothing_new_are_recognised_in_c(
+    encoding: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    values = [
+        {"i": 1, "f": 1.5, "s": "a", "l": [1, None], "m": [[1], []], "e": [], "n": None},
+        {"o": {"x": [{"y": True}, None]}, "mixed": 1, "by_id": {f"k{n}": n for n in range(300)}},
+        {"mixed": {"a": [1, "b", {"c": 2}]}},
+    ]
+    schema, _, messages = learn(values, encoding)
+    monkeypatch.delattr("amberbox.blackbox.unroll.infer.decode_plain")
+    monkeypatch.delattr("amberbox.blackbox.unroll.decode.decode_plain")
+    assert widen(schema, messages, encoding, "task")[0] is schema
+
+
 def test_objects_used_as_maps_become_text() -> None:
     values = [{"by_id": {f"id{n}": n}} for n in range(MOST_PROPERTIES + 1)]
     _, task, messages = learn(values)

@@ -109,9 +109,9 @@ def _structure(shape: Shape, exact: bool) -> Any:
 
 
 def _list(shape: Shape, exact: bool) -> Any:
-    if shape.open:
+    if shape.items is None:
         return list[Any]
-    if shape.items is None or not shape.items.kinds:
+    if not shape.items.kinds:
         return _EMPTY
     if not exact and column_kind(shape) == "list<text>":
         return list[Any]

@@ -38,7 +38,8 @@ def _to_json(shape: Shape, table: bool = False) -> dict[str, Any]:
     if "object" in shape.kinds:
         document["properties"] = {k: _to_json(v) for k, v in shape.properties.items()}
     if shape.items is not None:
-        document["items"] = _to_json(shape.items, table=True)
+        empty = not shape.items.kinds  # no item was ever seen
+        document["items"] = False if empty else _to_json(shape.items, table=True)
     if table and shape.names and shape.names != _natural_names(shape):
         document[NAMES] = shape.names
     return document
@@ -71,7 +72,7 @@ def _from_json(document: Mapping[str, Any], table: bool = False) -> Shape:
     shape.open = document.get("additionalProperties") is True
     shape.properties = {k: _from_json(v) for k, v in document.get("properties", {}).items()}
     if "items" in document:
-        shape.items = _from_json(document["items"], table=True)
+        shape.items = _from_json(document["items"] or {}, table=True)
     if table:
         shape.names = list(document.get(NAMES) or _natural_names(shape))
     return shape

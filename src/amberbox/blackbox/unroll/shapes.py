@@ -21,7 +21,8 @@ class Shape:
     """Kinds seen at one place, with the shapes below it.
 
     ``kinds`` holds JSON's types and ``binary``. ``number`` covers ``integer``. An ``open`` shape
-    does not look further down. ``names`` is used where a table begins.
+    does not look further down, nor does a list without ``items``. ``names`` is used where a table
+    begins.
     """
 
     kinds: set[str] = field(default_factory=set)
@@ -86,7 +87,7 @@ def _observe_object(shape: Shape, value: Mapping[str, Any], depth: int) -> None:
             shape.properties[key] = nullable()
         if depth >= DEEPEST or len(shape.properties) > MOST_PROPERTIES:
             shape.open = True
-            shape.properties.clear()
+            shape.properties, shape.items = {}, None
             return
         observe(shape.properties[key], item, depth + 1)
 
