@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Container, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -12,7 +12,7 @@ from amberbox.blackbox import manifest as mf
 from amberbox.blackbox.columns import wider
 from amberbox.blackbox.flat import TableSchema, tables_of
 from amberbox.blackbox.manifest import Manifest, Segment
-from amberbox.blackbox.read import JournalFile, journals
+from amberbox.blackbox.read import JournalFile, journal_file
 from amberbox.blackbox.segments import selection_of
 from amberbox.blackbox.store import open_store
 from amberbox.blackbox.variables import closest
@@ -31,12 +31,18 @@ class Catalogue:
     store: Path
     manifest: Manifest
     with_segments: bool = True
-    existing: frozenset[str] = field(default=frozenset())
+    existing: tuple[str, ...] = ()
 
-    @cached_property
-    def journals(self) -> list[JournalFile]:
-        """All journal files, opened when first asked for."""
-        return journals(self.store) if self.existing else []
+    def journals(self, skip: Container[str]) -> Iterator[JournalFile]:
+        """Open the journal files that are not named in ``skip``, in the order of writing."""
+        for name in self.existing:
+            if name not in skip:
+                yield journal_file(self.store / name, name)
+
+    @property
+    def done(self) -> Collection[str]:
+        """Names of the journals whose rows are all in segments."""
+        return self.manifest.journals.keys() if self.with_segments else ()
 
     @cached_property
     def schemas(self) -> dict[str, list[TableSchema]]:
@@ -45,13 +51,10 @@ class Catalogue:
         for segments in self.manifest.segments.values() if self.with_segments else ():
             for segment in segments:
                 _add(found, self.manifest.schemas[segment.schema])
-        for journal in self.journals if not self._is_all_covered() else ():
+        for journal in self.journals(skip=self.done):
             for schema in journal_tables(journal):
                 _add(found, schema)
         return found
-
-    def _is_all_covered(self) -> bool:
-        return self.with_segments and self.existing <= self.manifest.journals.keys()
 
     def schema(self, table: str) -> TableSchema:
         """Return the union of a table's versions: every column, in its widest type.
@@ -85,15 +88,14 @@ class Catalogue:
         chosen: dict[str, Sequence[str]] = {}
         for done in self.manifest.journals.values():
             chosen.update(done.selection)
-        for journal in self.journals if not self._is_all_covered() else ():
-            if journal.name not in self.manifest.journals:
-                chosen.update(selection_of(journal))
+        for journal in self.journals(skip=self.manifest.journals.keys()):
+            chosen.update(selection_of(journal))
         return chosen
 
     def still_holds(self) -> bool:
         """Tell whether no journal went while the segments for it came."""
-        open_ones = self.existing - self.manifest.journals.keys()
-        return all((self.store / name).exists() for name in open_ones)
+        waiting = (name for name in self.existing if name not in self.manifest.journals)
+        return all((self.store / name).exists() for name in waiting)
 
     def without(self, segment: Segment) -> Catalogue:
         """Return the same without a segment that turned out to be damaged."""
@@ -108,7 +110,7 @@ def _without(manifest: Manifest, segment: Segment) -> Manifest:
 def look(store: Path, *, with_segments: bool = True) -> Catalogue:
     """Look at a store. Journals first: one that goes meanwhile is in the manifest already."""
     opened = open_store(store)
-    existing = frozenset(
+    existing = tuple(
         f"{path.parent.name}/{path.name}"
         for writer in opened.writers()
         for path in opened.journal_files(writer)

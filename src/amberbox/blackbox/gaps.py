@@ -70,7 +70,7 @@ def _ends(catalogue: Catalogue) -> Iterator[tuple[int, int]]:
     for segments in catalogue.manifest.segments.values():
         for segment in segments:
             yield segment.parts[-1].run, segment.received_range_ns[1]
-    for journal in catalogue.journals:
+    for journal in catalogue.journals(skip=catalogue.done):
         if journal.rows:
             end = np.array([journal.end_ns])
             yield journal.run, int(ClockTable(journal.clock).received(end)[0])

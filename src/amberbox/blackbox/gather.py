@@ -115,8 +115,8 @@ def from_journals(catalogue: Catalogue, request: Request) -> Gathered:
 def _add_journals(found: Gathered, catalogue: Catalogue, request: Request) -> None:
     covered = catalogue.covered(request.table)
     span = request.span if request.by == "received" else (None, None)
-    for journal in catalogue.journals if not catalogue.existing <= covered else ():
-        item = None if journal.name in covered else item_of(journal, request.table)
+    for journal in catalogue.journals(skip=covered):
+        item = item_of(journal, request.table)
         if item is not None:
             found.pieces += journal_rows(journal, item, request, span, found.gaps)
 

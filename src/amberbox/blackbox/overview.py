@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from amberbox.blackbox.catalogue import Catalogue, union
+from amberbox.blackbox.catalogue import Catalogue, item_of, union
 from amberbox.blackbox.clocktable import ClockTable
 from amberbox.blackbox.flat import Flat, flatten
 from amberbox.blackbox.manifest import Part, part_clock
@@ -113,14 +113,10 @@ def _shares(catalogue: Catalogue, table: str) -> Iterator[_Share]:
     for segment in catalogue.segments(table):
         for part in segment.parts:
             yield _share_of_part(part)
-    covered = catalogue.covered(table)
-    if catalogue.existing <= covered:
-        return
-    for journal in catalogue.journals:
-        if journal.name not in covered:
-            share = _journal_shares(journal).get(table)
-            if share is not None:
-                yield share
+    for journal in catalogue.journals(skip=catalogue.covered(table)):
+        share = _journal_shares(journal).get(table) if item_of(journal, table) else None
+        if share is not None:
+            yield share
 
 
 def _share_of_part(part: Part) -> _Share:

@@ -27,6 +27,7 @@ _GROUP_BYTES = 16 << 20
 SMALL_ROWS = 6_000
 _MERGED_BYTES = 64 << 20
 MERGE_COUNT = 6
+_SIZED_ROWS = 16
 
 
 def can_build() -> bool:
@@ -87,7 +88,9 @@ def _size(column: ColumnData) -> int:
         return column.offsets.nbytes + _size(column.values)
     if column.dtype != object:
         return column.nbytes
-    return sum(64 if value is None else 64 + len(value) for value in column)
+    sample = column[:: max(len(column) // _SIZED_ROWS, 1)]
+    known = [len(value) for value in sample if value is not None]
+    return len(column) * (64 + sum(known) // max(len(sample), 1))
 
 
 def build_segments(store: Path, journal: JournalFile) -> list[Segment]:
