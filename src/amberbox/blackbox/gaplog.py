@@ -34,12 +34,11 @@ class GapLog:
     def up(self, item: str, peer: str, now_ns: int, since_ns: int | None) -> None:
         """Close what is open for a peer; for a new one write what it may have said before."""
         with self._lock:
-            first = self._open.get((item, ""))
-            closed = self._end(item, "", peer, now_ns)
-            closed |= self._end(item, peer, peer, now_ns)
+            closed = self._end(item, "", now_ns)
+            closed |= self._end(item, peer, now_ns)
             new = (item, peer) not in self._known
             self._known.add((item, peer))
-            if new and not closed and first is None:
+            if new and not closed:
                 start = self.start_ns if since_ns is None else max(since_ns, self.start_ns)
                 self._write(item, peer, start, now_ns, "publisher not connected yet")
 
@@ -65,8 +64,8 @@ class GapLog:
             self._open[item, peer] = (from_ns, reason)
             self._write(item, peer, from_ns, None, reason)
 
-    def _end(self, item: str, key: str, peer: str, now_ns: int) -> bool:
-        opened = self._open.pop((item, key), None)
+    def _end(self, item: str, peer: str, now_ns: int) -> bool:
+        opened = self._open.pop((item, peer), None)
         if opened is not None:
             self._write(item, peer, opened[0], now_ns, opened[1])
         return opened is not None

@@ -1,0 +1,196 @@
+"""The whole box against a real ROS master: what was published is in the store, or in a gap."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+
+import amberbox
+from amberbox.blackbox import read
+from amberbox.core.errors import UsageError
+from amberbox.testing.realros import (
+    Published,
+    Ros,
+    Verdict,
+    body_of,
+    end,
+    judge,
+    read_truth,
+    wait_until,
+)
+
+NAMES = ("odom", "scan", "imu", "battery", "state", "map")
+POLL_S = 0.25
+
+
+class Box:
+    """The recorder as a user runs it: a robot folder and a process."""
+
+    def __init__(self, ros: Ros, invisible: bool) -> None:
+        self.folder = ros.folder / "folder"
+        self.store = self.folder / "store"
+        self.folder.mkdir()
+        topics = "".join(f"        - topic: {{name: /robot/{name}}}\n" for name in NAMES)
+        extra = f"    invisible: true\n    poll_s: {POLL_S}\n" if invisible else ""
+        text = f"- ros:\n    ros_master_uri: {ros.uri}\n{extra}    topics:\n{topics}"
+        (self.folder / "black_box.yaml").write_text(text)
+        (self.folder / "robot.yaml").write_text("id: test_robot\n")
+        self.log = ros.folder / "box.log"
+        self.process: subprocess.Popen[bytes] | None = None
+
+    def start(self) -> None:
+        environment = {**os.environ, "ROS_IP": "127.0.0.1"}
+        with self.log.open("ab") as log:
+            self.process = subprocess.Popen(
+                [sys.executable, "-m", "amberbox", "record", str(self.folder)],
+                stdout=log, stderr=log, env=environment,
+            )  # fmt: skip
+
+    def kill(self) -> None:
+        assert self.process is not None
+        end(self.process, signal.SIGKILL)
+
+    def stop(self) -> None:
+        assert self.process is not None
+        end(self.process)
+        assert self.process.returncode == 0, self.log.read_text()
+
+    def rows(self, item: str) -> int:
+        """Count an item's rows; what is being written counts, too."""
+        try:
+            return sum(journal.items.get(item, 0) for journal in read.journals(self.store))
+        except UsageError:  # the store is about to be made
+            return 0
+
+    def wait_for_more(self, item: str = "ros_robot_odom", count: int = 15) -> None:
+        before = self.rows(item)
+        wait_until(lambda: self.rows(item) >= before + count, 20, f"more rows of {item}")
+
+    def bodies(self, item: str) -> list[str]:
+        """Return what is recorded of an item, raw and in order, as the truth file names it."""
+        found = []
+        for journal in read.journals(self.store):
+            numbers = [n for n, s in journal.streams.items() if s.item == item and not s.repeated]
+            for chunk in read.sound_chunks(journal):
+                rows = np.flatnonzero(np.isin(chunk.channel, numbers))
+                found += [body_of(data, has_header=True) for data in chunk.messages(rows)]
+        return found
+
+
+def verdicts(ros: Ros, box: Box, tolerance_s: float) -> dict[str, Verdict]:
+    record = amberbox.open(box.store)
+    found = {}
+    for topic, truth in ros.published().items():
+        item = "ros_" + topic.strip("/").replace("/", "_")
+        gaps = [(gap.from_ns, gap.to_ns) for gap in record.gaps(item)]
+        found[topic] = judge(truth, box.bodies(item), gaps, tolerance_s)
+    return found
+
+
+def assert_all_accounted_for(ros: Ros, box: Box, *, invisible: bool = False) -> None:
+    found = verdicts(ros, box, POLL_S + 0.2 if invisible else 0.2)
+    wrong = {topic: verdict for topic, verdict in found.items() if not verdict.is_right}
+    assert found
+    assert not wrong, {t: (v.unexplained[:3], v.repeated[:3], v.in_order) for t, v in wrong.items()}
+    assert found["/robot/odom"].recorded > 25
+
+
+@contextmanager
+def running(ros: Ros, *, invisible: bool = False) -> Iterator[Box]:
+    box = Box(ros, invisible)
+    box.start()
+    wait_until(lambda: box.rows("amberbox_run"), 20, "the box records")
+    try:
+        yield box
+    finally:
+        if box.process is not None and box.process.poll() is None:
+            box.stop()
+
+
+def test_values_are_equal_to_what_was_published(ros: Ros) -> None:
+    ros.master()
+    with running(ros) as box:
+        robot = ros.robot("--wait-for", "1", "--duration", "2")
+        assert robot.wait(20) == 0
+        time.sleep(0.3)
+    assert_all_accounted_for(ros, box)
+    record = amberbox.open(box.folder)
+    truth: list[Published] = ros.published()["/robot/odom"]
+    entries = [e for e in read_truth(ros.truths()[0]) if e["k"] == "pub"]
+    stamps = [e["stamp"] for e in entries if e["topic"] == "/robot/odom"]
+    table = record.query("ros_robot_odom")
+    assert len(table) == len(truth)
+    assert np.asarray(table["timestamp"]).tolist() == stamps
+    items = {item.name: item for item in record.items()}
+    assert items["ros_robot_state"].type == "test_robot/WheelState"
+    scan = record.query("ros_robot_scan", ["ranges"])
+    assert any(np.isinf(scan["ranges"][row]).any() for row in range(len(scan)))
+
+
+Act = Callable[[Ros, Box], None]
+
+
+def kill_box(ros: Ros, box: Box) -> None:
+    box.kill()
+    time.sleep(0.3)
+    box.start()
+
+
+def kill_robot(ros: Ros, box: Box) -> None:
+    end(robots(ros)[-1], signal.SIGKILL)
+    time.sleep(0.3)
+    ros.robot("--map-seed", str(ros.robots))
+
+
+def kill_master(ros: Ros, box: Box) -> None:
+    end(masters(ros)[-1], signal.SIGKILL)
+    time.sleep(0.3)
+    ros.master()
+
+
+def robots(ros: Ros) -> list[subprocess.Popen[bytes]]:
+    return [p for p in ros.processes.running if "robot.py" in str(p.args)]
+
+
+def masters(ros: Ros) -> list[subprocess.Popen[bytes]]:
+    return [p for p in ros.processes.running if "rosmaster" in str(p.args)]
+
+
+ORDERS: dict[str, tuple[Act, ...]] = {
+    "robot": (kill_robot,),
+    "box": (kill_box,),
+    "robot, box": (kill_robot, kill_box),
+    "box, robot": (kill_box, kill_robot),
+    "master, robot": (kill_master, kill_robot),
+    "master, box": (kill_master, kill_box),
+    "box, master, robot": (kill_box, kill_master, kill_robot),
+    "robot, master, box": (kill_robot, kill_master, kill_box),
+    "master, box, robot": (kill_master, kill_box, kill_robot),
+}
+
+
+DIFFERENT_WHEN_INVISIBLE = ("robot, box", "master, box", "box, robot")
+CASES = [(order, False) for order in ORDERS] + [(o, True) for o in DIFFERENT_WHEN_INVISIBLE]
+
+
+@pytest.mark.parametrize(("order", "invisible"), CASES)
+def test_every_message_is_recorded_or_lies_in_a_gap(ros: Ros, order: str, invisible: bool) -> None:
+    ros.master()
+    with running(ros, invisible=invisible) as box:
+        ros.robot()
+        box.wait_for_more()
+        for act in ORDERS[order]:
+            act(ros, box)
+            if act is not kill_master or act is ORDERS[order][-1]:
+                box.wait_for_more()
+        end(robots(ros)[-1])
+        time.sleep(0.3)
+    assert_all_accounted_for(ros, box, invisible=invisible)
