@@ -12,7 +12,8 @@ import numpy as np
 from amberbox.blackbox import reserved
 from amberbox.blackbox.clocktable import ClockTable
 from amberbox.blackbox.mcap import Channel
-from amberbox.blackbox.unroll import UnrollError, Unroller, unroller
+from amberbox.blackbox.unroll import Unroller, UnrollError, unroller
+from amberbox.core.errors import AmberboxError
 from amberbox.core.names import identifier, item_name
 from amberbox.core.types import Batch, Gap, IntArray, ItemSchema, Rows, Schema, Topic
 
@@ -75,6 +76,8 @@ def make_batch(
         rows = stream.unroller().rows(messages)
     except UnrollError as error:
         return _without_bad(writer, run, stream, seq, log_ns, messages, clock, error)
+    except AmberboxError as error:  # no definition, or one that nobody can read: raw is kept
+        return Made(None, [_undecodable(writer, run, stream.item, seq, log_ns, error.what)])
     received = clock.received(log_ns)
     stamp = received if rows.stamp_ns is None else np.where(rows.stamp_ns, rows.stamp_ns, received)
     return Made(
@@ -105,20 +108,35 @@ def _without_bad(
     clock: ClockTable,
     error: UnrollError,
 ) -> Made:
-    bad = set(error.bad) or set(range(len(messages)))
-    good = np.array([row for row in range(len(messages)) if row not in bad], np.int64)
+    bad = np.array(error.bad, np.int64)
+    good = np.setdiff1d(np.arange(len(messages)), bad)
     gaps = [
-        Gap(
-            writer, run, int(log_ns[row]), int(log_ns[row]) + 1, f"undecodable: {error.what}",
-            stream.item, 1, int(seq[row]), int(seq[row]) + 1,
+        _undecodable(
+            writer, run, stream.item, seq[row : row + 1], log_ns[row : row + 1], error.what
         )
-        for row in sorted(bad)
-    ]  # fmt: skip
+        for row in bad.tolist()
+    ]
     if not len(good):
         return Made(None, gaps)
     rest = [messages[row] for row in good.tolist()]
     made = make_batch(writer, run, stream, seq[good], log_ns[good], rest, clock)
     return Made(made.batch, [*gaps, *made.gaps])
+
+
+def _undecodable(
+    writer: str, run: int, item: str, seq: IntArray, log_ns: IntArray, why: str
+) -> Gap:
+    return Gap(
+        writer,
+        run,
+        int(log_ns[0]),
+        int(log_ns[-1]) + 1,
+        f"undecodable: {why}",
+        item,
+        len(seq),
+        int(seq[0]),
+        int(seq[-1]) + 1,
+    )
 
 
 def _children(

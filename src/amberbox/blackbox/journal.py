@@ -26,7 +26,8 @@ from amberbox.core.types import IntArray, Schema, Topic
 
 CHUNK_BYTES = 1 << 20
 """Larger writes are split into chunks of about this size; a larger message has its own."""
-SCHEMA_REPEAT_NS = 10 * NS
+SCHEMA_REPEAT_NS = (NS, 10 * NS)
+"""Schemas are repeated after as long as the file is old, but within these limits."""
 COMPRESSION_LEVEL = 1
 START_METADATA = "amberbox/start"
 CHAIN_METADATA = "amberbox/chain"
@@ -218,7 +219,10 @@ class JournalWriter:
         for number in used:
             schema_id = self._channels[number].schema_id
             if schema_id and now_ns >= file.schemas_at_ns.get(schema_id, 0):
-                file.schemas_at_ns[schema_id] = now_ns + SCHEMA_REPEAT_NS
+                pause_ns = min(
+                    max(now_ns - file.opened_ns, SCHEMA_REPEAT_NS[0]), SCHEMA_REPEAT_NS[1]
+                )
+                file.schemas_at_ns[schema_id] = now_ns + pause_ns
                 parts.append(mcap.schema_record(schema_id, self._schema(schema_id)))
         parts.extend(self._records[number] for number in used)
         return b"".join(parts)

@@ -342,6 +342,10 @@ def _from_walk(path: Path, data: Buffer) -> FileScan:
         else:
             _take_chunk(result, found)
     result.finished = walk.finished
+    summary = read_summary(data)
+    if summary is not None:  # it has a checksum of its own: definitions whose chunks are damaged
+        result.summary.schemas = {**summary.schemas, **result.summary.schemas}
+        result.summary.channels = {**summary.channels, **result.summary.channels}
     if result.start:
         result.places = _in_order(result)
     return result
