@@ -15,18 +15,25 @@ _PER_BUCKET = 4
 
 
 def downsample(columns: Sequence[ColumnData], count: int, points: int) -> IntArray:
-    """Choose at most ``points`` of ``count`` rows, in order (at least 4 per column).
+    """Choose at most ``points`` of ``count`` rows, in order.
 
     The rows are cut into buckets of equal length. Of each column every bucket keeps its
     smallest and its largest value, its first and last row, and one missing value (null or NaN)
-    if it has any, so that a gap stays a gap. Columns that are not numbers keep the first and
-    last row of each bucket. ``tsdownsample`` is used where installed, with the same guarantee.
+    if it has any, so that a gap stays a gap; this takes at least 5 points per column, with fewer
+    something has to go. Columns that are not numbers keep the first and last row of each bucket.
+    ``tsdownsample`` is used where installed, with the same guarantee.
     """
     if count <= points:
         return np.arange(count)
     share = max(points // max(len(columns), 1), _PER_BUCKET)
     chosen = [_choose(column, share) for column in columns] or [_edges(count, points // 2)]
-    return np.unique(np.concatenate(chosen))
+    rows = np.unique(np.concatenate(chosen))
+    return rows if len(rows) <= points else rows[_evenly(len(rows), points)]
+
+
+def _evenly(count: int, points: int) -> IntArray:
+    places: IntArray = np.linspace(0, count - 1, points).astype(np.int64)
+    return places
 
 
 def _choose(column: ColumnData, points: int) -> IntArray:

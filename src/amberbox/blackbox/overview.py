@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from amberbox.blackbox import reserved
 from amberbox.blackbox.catalogue import Catalogue, item_of, union
 from amberbox.blackbox.clocktable import ClockTable
 from amberbox.blackbox.flat import Flat, flatten
@@ -67,9 +68,10 @@ class _Share:
 
 
 def overview(catalogue: Catalogue) -> list[ItemInfo]:
-    """Describe each table that has rows; items first recorded come first."""
-    infos = [_info(catalogue, table) for table in catalogue.schemas]
-    return [info for info in infos if info is not None]
+    """Describe each table that has rows, by name; the box's own channels come last."""
+    infos = [_info(catalogue, table) for table in sorted(catalogue.schemas)]
+    known = [info for info in infos if info is not None]
+    return sorted(known, key=lambda info: info.source == reserved.SOURCE)
 
 
 def _info(catalogue: Catalogue, table: str) -> ItemInfo | None:

@@ -92,7 +92,7 @@ def _roots(
 
 def _suggestion(columns: Sequence[Column], name: str) -> str:
     names = [c.name for c in columns]
-    candidates = {c.path: c.path for c in columns} | {n: n for n in names}
+    candidates = {c.path: c.path for c in columns} | {c.name: c.path for c in columns}
     candidates |= {"/".join(tokens(c.path)[-2:]): c.path for c in columns}
     close = difflib.get_close_matches(name, candidates, n=3, cutoff=0.5)
     if close:

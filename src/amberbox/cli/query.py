@@ -14,6 +14,7 @@ from amberbox.blackbox.table import Table
 from amberbox.blackbox.tabletext import write_grid
 from amberbox.cli._output import add_range, tell, text_output, writable
 from amberbox.core.errors import UsageError
+from amberbox.core.timetext import format_time
 
 FORMATS = ("table", "csv", "json", "parquet")
 
@@ -46,9 +47,17 @@ def run(args: argparse.Namespace) -> int:
         table = record.query(
             args.item, args.variables or None, args.from_, args.to, args.by, args.points
         )
+        notes = [*table.notes, *([] if len(table) else [_nothing(record, table.item)])]
     write(table, form, args.output)
-    tell(table.notes)
+    tell(notes)
     return 0
+
+
+def _nothing(record: Record, item: str) -> str:
+    """Say where the rows are when the range has none."""
+    known = next(info for info in record.items() if info.name == item)
+    first, last = format_time(known.first_ns), format_time(known.last_ns)
+    return f"no rows in this range; {item} has {known.rows} from {first} to {last}"
 
 
 def chosen_format(named: str | None, output: str | None) -> str:
