@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import threading
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -89,8 +90,10 @@ class BlockSink:
 
     def _new_stream(self, topic: Topic) -> Stream:
         item = self._pipeline.items[self._item(topic.name)]
-        stream = Stream(item, topic)
-        stream.infers = topic.schema is None and topic.message_encoding in INFERRED
+        infers = topic.message_encoding in INFERRED
+        if infers:  # what is really sent counts, not what was declared
+            topic = replace(topic, schema=None)
+        stream = Stream(item, topic, infers=infers)
         known = [s for s in self._streams if s.item is item]
         if known and not stream.infers:
             self._tell_of_change(known[-1].topic, topic, item.name)
