@@ -16,6 +16,7 @@ from packaging.utils import canonicalize_name
 
 from tools.check_files import committed
 from tools.findings import ROOT
+from tools.import_graph import imports, modules
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 EXTRAS: dict[str, list[str]] = PROJECT["project"]["optional-dependencies"]
@@ -64,6 +65,22 @@ def test_all_names_every_extra_but_the_test_one() -> None:
     assert own.extras == set(EXTRAS) - {"all", "test"}
 
 
+def test_what_we_import_is_what_we_declare() -> None:
+    """At the top of a module only what is always installed, in functions also the extras."""
+    always = set(map(_package, PROJECT["project"]["dependencies"]))
+    sometimes = always | {_package(text) for extra in _extras("all") for text in EXTRAS[extra]}
+    sometimes |= {"pandas", "polars"}  # users who ask for their tables have them
+    known = modules(ROOT / "src")
+    undeclared = {
+        f"{module}:{entry.line} imports {entry.target}"
+        for module, path in known.items()
+        for entry in imports(module, path, known)
+        if _distribution(entry.target) not in (sometimes if entry.lazy else always) | {None}
+        and not module.startswith("amberbox.testing")
+    }
+    assert undeclared == set()
+
+
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> zipfile.ZipFile:
     """Build the wheel from the committed files alone."""
@@ -107,6 +124,18 @@ for info in pkgutil.walk_packages(amberbox.__path__, "amberbox."):
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     assert done.stderr == ""
     assert done.returncode == 0
+
+
+def _package(requirement: str) -> str:
+    return canonicalize_name(Requirement(requirement).name)
+
+
+def _distribution(module: str) -> str | None:
+    """Return the package that brings a module; None if Python does, or we."""
+    top = module.partition(".")[0]
+    if top in sys.stdlib_module_names or top == "amberbox":
+        return None
+    return {"yaml": "pyyaml", "zmq": "pyzmq"}.get(top, canonicalize_name(top))
 
 
 def _extras(name: str) -> list[str]:
