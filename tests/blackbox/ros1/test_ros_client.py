@@ -15,6 +15,7 @@ import pytest
 
 from amberbox.blackbox.ros1.client import Client
 from amberbox.blackbox.ros1.settings import Settings
+from amberbox.core.types import Topic
 from amberbox.testing import MemorySink
 from amberbox.testing.realros import free_port, wait_until
 from amberbox.testing.rosnet import RosMaster, RosPublisher, RosTopic
@@ -447,6 +448,34 @@ def test_a_sink_that_is_stuck_holds_nobody_else(network: Network) -> None:
         assert sink.of(TOPIC) == [b"free"]
         release.set()
         sink.wait_for(TOPIC, 2)
+
+
+def test_messages_that_wait_for_their_type_are_stamped_when_they_come(network: Network) -> None:
+    is_built, asked = threading.Event(), threading.Event()
+
+    class SlowTypes(MemorySink):
+        def topic(self, topic: Topic) -> int:
+            asked.set()
+            is_built.wait(10)
+            return super().topic(topic)
+
+    sink = SlowTypes()
+    with listening(network.settings(), sink):
+        talker = network.talker()
+        talker.wait_for_subscribers(TOPIC)
+        wait_for_link(sink, "up")
+        assert asked.wait(5)
+        calls = len(network.master.calls)
+        talker.publish(TOPIC, b"one", b"two")
+        talker.hang_up(TOPIC)
+        wait_until(lambda: len(network.master.calls) > calls + 2, 5, "two more polls")
+        released_ns = sink.now_ns()
+        is_built.set()
+        sink.wait_for(TOPIC, 2)
+    assert sink.of(TOPIC) == [b"one", b"two"]
+    assert max(received_ns for _, _, received_ns in sink.messages) < released_ns
+    down_ns = next(at for way, _, _, _, at in sink.links if way == "down")
+    assert down_ns < released_ns
 
 
 def test_an_error_of_the_sink_ends_the_run(network: Network) -> None:

@@ -6,9 +6,8 @@ import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
+from amberbox.blackbox.ros1.held import Deliver
 from amberbox.blackbox.ros1.memory import Memory
-
-Deliver = Callable[[bytes, int], None]
 
 
 def digest(data: bytes, has_header: bool) -> str:

@@ -16,6 +16,7 @@ from amberbox.blackbox.ros1.xmlrpc import request_topic
 from amberbox.core.clock import NS
 
 ENDED = "the publisher closed the connection"
+FAILED = "the recorder failed"
 
 
 class Owner(Protocol):
@@ -128,23 +129,21 @@ class Link:
         self.is_parked = deliver is None
         if deliver is None:
             return
-        reason: str = "the reader failed"
+        reason: str = FAILED
         since_ns: int | None = None
         try:
             reason, since_ns = self._read(sock, deliver)
         finally:
             self._owner.closed(self, self._closing or reason, since_ns)
 
-    def _read(
-        self, sock: socket.socket, deliver: Callable[[bytes, int], None]
-    ) -> tuple[str, int | None]:
+    def _read(self, sock: socket.socket, deliver: Callable[[bytes, int], None]) -> tuple[str, int]:
         reader = Reader(sock, self._settings.message_limit, self._now_ns)
         self.failures += 1  # until the connection has been of use
         try:
             reader.run(deliver)
         except MalformedError as error:
             self._owner.malformed(self, error)
-            return f"malformed data: {error.what}", None
+            return f"malformed data: {error.what}", self._now_ns()
         except OSError as error:
             self._count_use(reader)
             return f"connection lost: {error.strerror}", self._last_heard_ns(reader)

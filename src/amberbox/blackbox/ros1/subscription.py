@@ -7,14 +7,16 @@ import time
 from collections.abc import Callable, Collection, Sequence
 from functools import partial
 
-from amberbox.blackbox.ros1.latched import Deliver, LatchedFilter, digest
-from amberbox.blackbox.ros1.link import ENDED, Link
+from amberbox.blackbox.ros1.held import Deliver, HeldDelivery
+from amberbox.blackbox.ros1.latched import LatchedFilter, digest
+from amberbox.blackbox.ros1.link import ENDED, FAILED, Link
 from amberbox.blackbox.ros1.memory import Memory
 from amberbox.blackbox.ros1.reports import PATIENCE, Reports
 from amberbox.blackbox.ros1.settings import RefusedError, RosError, Settings
 from amberbox.blackbox.ros1.sightings import Sightings
 from amberbox.blackbox.ros1.tcpros import Publisher
 from amberbox.core.source import Sink
+from amberbox.core.types import Topic
 
 UNREGISTER_WAIT_S = 0.2  # a clean exit unregisters first, the notice may come second
 REPLACED = "replaced by a newer connection"
@@ -39,6 +41,8 @@ class Subscription:
         self._open: dict[str, Link] = {}
         self._listed: frozenset[str] = frozenset()
         self._is_closed = False
+        self._topics: set[Topic] = set()
+        self._waiting: dict[Link, HeldDelivery] = {}
 
     def connect_remembered(self) -> None:
         """Try the publishers of the last run: the master may have forgotten them."""
@@ -145,7 +149,11 @@ class Subscription:
                 return None
             if rival is not None:
                 self._replace(rival)
-            return self._take_up(link, publisher)
+            try:
+                return self._take_up(link, publisher)
+            except Exception:
+                self._take_down(link, FAILED, None)
+                raise
 
     def _replace(self, rival: Link) -> None:
         """Finish a connection whose node is back elsewhere, so that the order is kept."""
@@ -154,8 +162,7 @@ class Subscription:
         self._take_down(rival, REPLACED, None)
 
     def _take_up(self, link: Link, publisher: Publisher) -> Deliver | None:
-        deliver = self._deliver(link, publisher)
-        self._memory.remember(self.topic, link.peer, link.uri)
+        """Say that the link is up before anything that takes time: messages arrive from now on."""
         link.was_unregistered.clear()
         with self._lock:
             if link.is_closing:
@@ -163,33 +170,53 @@ class Subscription:
             self._open[link.peer] = link
             since_ns = self.sightings.absent_until_ns(link.peer)
             self._sink.link_up(self.topic, link.peer, since_ns)
+        is_known = self._memory.knows(self.topic, link.peer, link.uri)
+        self._memory.remember(self.topic, link.peer, link.uri)
         self._reports.connected(self.topic, link.uri)
-        return deliver
-
-    def _deliver(self, link: Link, publisher: Publisher) -> Deliver:
         self._reports.definition(self.topic, publisher)
-        stream = self._sink.topic(publisher.topic(self.topic))
+        topic = publisher.topic(self.topic)
+        delivery = partial(self._delivery, topic, link, publisher.has_header(), is_known)
+        return delivery() if topic in self._topics else self._held(link, delivery)
+
+    def _held(self, link: Link, delivery: Callable[[], Deliver]) -> HeldDelivery:
+        """Hold messages back while a thread makes a new topic known, which may take a while."""
+        held = self._waiting[link] = HeldDelivery()
+        name = f"ros-type{self.topic}"
+        arguments = (held, delivery)
+        threading.Thread(target=self._release, args=arguments, name=name, daemon=True).start()
+        return held
+
+    def _release(self, held: HeldDelivery, delivery: Callable[[], Deliver]) -> None:
+        try:
+            held.release(delivery())
+        except Exception as error:
+            self._reports.crashed(error)
+            held.release(lambda data, received_ns: None)  # the run is over, with this error
+
+    def _delivery(self, topic: Topic, link: Link, has_header: bool, is_known: bool) -> Deliver:
+        stream = self._sink.topic(topic)
+        self._topics.add(topic)
         deliver = partial(self._sink.message, stream)
-        if not publisher.latching:
+        if not topic.latched:
             return deliver
-        has_header = publisher.has_header()
         repeated = partial(self._reports.repeated, self.topic, link.peer)
-        known = self._known(link, has_header)
+        known = self._known(link.peer, has_header) if is_known else frozenset()
         return LatchedFilter(
             self.topic, link.peer, has_header, known, self._memory, deliver, repeated
         )
 
-    def _known(self, link: Link, has_header: bool) -> frozenset[str]:
-        """Return what this process has delivered last, as the store and the state know it."""
-        if not self._memory.knows(self.topic, link.peer, link.uri):
-            return frozenset()
-        known = {self._memory.latched(self.topic, link.peer)}
+    def _known(self, node: str, has_header: bool) -> frozenset[str]:
+        """Return what a process has delivered last, as the store and the state know it."""
+        known = {self._memory.latched(self.topic, node)}
         last = self._sink.last_latched(self.topic)
         known.add(None if last is None else digest(last, has_header))
         return frozenset(content for content in known if content is not None)
 
     def closed(self, link: Link, reason: str, since_ns: int | None) -> None:
         """Account for the end of a connection."""
+        held = self._waiting.pop(link, None)
+        if held is not None:
+            held.wait(self._settings.timeout_s)
         if reason == ENDED and self._has_unregistered(link):
             reason = GONE
             self._memory.forget(self.topic, link.uri)
