@@ -11,6 +11,7 @@ import os
 import signal
 import sys
 import threading
+import time
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -21,6 +22,8 @@ from amberbox.core.clock import NS
 from amberbox.core.errors import AmberboxError, UsageError
 
 PERIOD_S = 2.0
+PATIENCE_S = 10.0
+"""After the recorder was killed its keeper lives on for a moment; the next one waits for it."""
 
 
 class Keeper:
@@ -91,7 +94,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     os.nice(10)
     try:
         store = open_store(options.store)
-        lock = WriterLock(store, "keeper")
+        lock = _lock(store, PATIENCE_S if options.parent else 0.0, stop)
     except UsageError as error:
         print(f"amberbox keeper: {error}", file=sys.stderr)
         return error.exit_code
@@ -103,6 +106,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
             break
     lock.release()
     return 0
+
+
+def _lock(store: Store, patience_s: float, stop: threading.Event) -> WriterLock:
+    end = time.monotonic() + patience_s
+    while True:
+        try:
+            return WriterLock(store, "keeper")
+        except UsageError:
+            if time.monotonic() >= end or stop.wait(0.2):
+                raise
 
 
 def seal(store: Store) -> None:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import msgspec
+
+from amberbox.blackbox.unroll.jsonschema import OURS
 from amberbox.core.types import Schema, Topic
 
 PREFIX = "amberbox/"
@@ -60,10 +63,7 @@ _FIELDS: dict[str, dict[str, object]] = {
 
 def schema_of(name: str) -> Schema:
     """JSON Schema of a reserved channel."""
-    import msgspec
-
-    # the unroller believes only schemas with this mark: others may promise more than they keep
-    marks = {"$comment": "inferred from messages by amberbox", "title": name}
+    marks = {"$comment": OURS, "title": name}
     document = {**marks, "type": "object", "properties": _FIELDS[name]}
     return Schema(name, "jsonschema", msgspec.json.encode(document))
 

@@ -12,6 +12,7 @@ from dataclasses import asdict
 
 from amberbox.blackbox.folder import load_folder
 from amberbox.blackbox.recorder import Recorder, RecorderState
+from amberbox.cli._output import size
 from amberbox.core.units import in_unit
 
 _TABLE_S = 1.0
@@ -107,13 +108,3 @@ def summary(state: RecorderState) -> str:
 def _last_line(state: RecorderState, store: str) -> str:
     kept = sum(item.kept for item in state.items)
     return f"recorded {kept} messages of {len(state.items)} items in {store}"
-
-
-def size(count: int) -> str:
-    """Write a number of bytes for people."""
-    value = float(count)
-    for unit in ("B", "kB", "MB", "GB"):
-        if value < 1000:
-            return f"{value:.0f} {unit}" if unit == "B" else f"{value:.1f} {unit}"
-        value /= 1000
-    return f"{value:.1f} TB"

@@ -15,13 +15,14 @@ NAMES = "x-columns"
 properties alone do not tell: names are given in that order and never change."""
 
 _DRAFT = "https://json-schema.org/draft/2020-12/schema"
-_OURS = "inferred from messages by amberbox"
+OURS = "every message fits: amberbox"
+"""Comment of documents that promise the columns of their messages, as those of others may not."""
 _ORDER = ("array", "boolean", "integer", "number", "object", "string", "null")
 
 
 def to_schema(shape: Shape, name: str) -> Schema:
     """Write a shape as a JSON Schema document."""
-    head = {"$schema": _DRAFT, "$comment": _OURS, "title": name}
+    head = {"$schema": _DRAFT, "$comment": OURS, "title": name}
     document = head | _to_json(shape, table=True)
     return Schema(name, "jsonschema", msgspec.json.encode(document))
 
@@ -58,7 +59,7 @@ def from_schema(schema: Schema) -> Shape:
         document = msgspec.json.decode(schema.data)
     except msgspec.DecodeError:
         return nullable()
-    ours = isinstance(document, dict) and document.get("$comment") == _OURS
+    ours = isinstance(document, dict) and document.get("$comment") == OURS
     return _from_json(document, table=True) if ours else nullable()
 
 

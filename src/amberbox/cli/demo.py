@@ -1,0 +1,242 @@
+"""Show the main job: record a simulated robot, kill the box once, and lose nothing."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+import amberbox
+from amberbox.blackbox import read
+from amberbox.core.clock import NS
+from amberbox.core.errors import AmberboxError
+
+FAULT = "wheel_front_left_motor_weak"
+SHOWN = ("sensors_front_left_current_1_q", "sensors_front_right_current_1_q")
+PASSENGER = "recording_odom"
+_LOST_AT_KILL_S = 0.15
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the verb's arguments."""
+    parser.add_argument(
+        "--seconds", type=float, default=float(os.environ.get("DEMO_SECONDS", "20")),
+        help="how long the robot runs (default: 20, or DEMO_SECONDS)",
+    )  # fmt: skip
+    parser.add_argument("--keep", type=Path, metavar="DIR",
+                        help="folder for the robot and its record (default: a new one)")  # fmt: skip
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the demonstration; 0 only if every step worked."""
+    if args.seconds < 8:
+        raise AmberboxError("the demonstration needs at least 8 seconds", "DEMO_SECONDS=20")
+    place = args.keep or Path(tempfile.mkdtemp(prefix="amberbox-demo-"))
+    place.mkdir(parents=True, exist_ok=True)
+    demo = Demo(place, args.seconds)
+    for step in (demo.prepare, demo.record, demo.account, demo.show):
+        step()
+    print(f"\nEverything is in {place}. Go on with:")
+    for verb in (
+        "items {}",
+        "query {} zmq_odom --points 5",
+        "sql {} 'select count(*) from zmq_imu'",
+    ):
+        print("  amberbox " + verb.format(demo.folder))
+    return 0
+
+
+@dataclass
+class Demo:
+    """The demonstration, step by step."""
+
+    place: Path
+    seconds: float
+    kills_ns: list[int] = field(default_factory=list)
+
+    @property
+    def folder(self) -> Path:
+        """The robot folder."""
+        return self.place / "robot"
+
+    @property
+    def truth(self) -> Path:
+        """What the robot says it has sent."""
+        return self.place / "truth.jsonl"
+
+    def prepare(self) -> None:
+        """Make a recording that will be replayed beside the robot."""
+        say("A recording is made: a minute of a simulated robot, as fast as the machine can.")
+        maker = self.place / "maker"
+        sim = "seed: 3\n    speed: max\n    duration_s: 60"
+        write_folder(
+            maker, "maker", f"- sim:\n    {sim}\n    topics: [{{topic: {{name: odom}}}}]\n"
+        )
+        amberbox_verb("record", str(maker), "--quiet")
+        journal = next(iter(sorted((maker / "store" / "journal").glob("*.mcap"))))
+        self.recording = self.place / "yesterday.mcap"
+        self.recording.write_bytes(journal.read_bytes())
+        rows = read.journal_file(self.recording).items.get("sim_odom", 0)
+        self.recorded_before = rows
+        check(rows > 0, f"{rows} messages in {self.recording.name}, an ordinary MCAP file")
+
+    def record(self) -> None:
+        """Record the live robot and the recording; kill the box once; make a part fail."""
+        say(
+            "A simulated robot speaks ZMQ; the black box listens, and replays the recording beside."
+        )
+        with robot(self.truth) as (process, endpoint):
+            write_folder(self.folder, "demo_robot", self._blocks(endpoint))
+            box = start_box(self.folder)
+            time.sleep(self.seconds * 0.3)
+            tell_robot(process, f"fault {FAULT}")
+            print(f"  a fault begins: {FAULT}")
+            time.sleep(self.seconds * 0.2)
+            box.send_signal(signal.SIGKILL)
+            box.wait()
+            self.kills_ns.append(time.time_ns())
+            print("  the box is killed with kill -9, and started again")
+            box = start_box(self.folder)
+            time.sleep(self.seconds * 0.5)
+        time.sleep(0.5)
+        box.send_signal(signal.SIGTERM)
+        check(box.wait(30) == 0, "the box stopped cleanly")
+
+    def _blocks(self, endpoint: str) -> str:
+        return (
+            f"- zmq:\n    endpoint: {endpoint}\n    topics: []\n"
+            f"- recording:\n    path: {self.recording}\n    speed: 20\n"
+        )
+
+    def account(self) -> None:
+        """Compare the record with what the robot says it has sent."""
+        say("Is anything lost? The robot's own account against the record:")
+        sent = sent_messages(self.truth)
+        kept = kept_messages(self.folder / "store")
+        gaps = [(g.from_ns, g.to_ns) for g in amberbox.open(self.folder).gaps() if g.item]
+        lost = {key: at for key, at in sent.items() if key not in kept}
+        explained = sum(self._may_be_missing(at, gaps) for at in lost.values())
+        doubled = sum(count - 1 for count in kept.values())
+        print(f"  sent {len(sent)}, recorded {len(kept)}, "
+              f"missing while the box was dead {explained}, lost {len(lost) - explained}")  # fmt: skip
+        check(len(kept) > 0 and not doubled, "every message is there once")
+        check(explained == len(lost), "what is missing lies in the gap that the record names")
+
+    def _may_be_missing(self, at_ns: int, gaps: list[tuple[int, int]]) -> bool:
+        """Only what came in the last write interval before the kill, or until the restart, may."""
+        edge = round(_LOST_AT_KILL_S * NS)
+        in_gap = any(start - edge <= at_ns <= end + edge for start, end in gaps)
+        return in_gap or any(kill - edge <= at_ns <= kill for kill in self.kills_ns)
+
+    def show(self) -> None:
+        """Show the items, and the fault in a plot."""
+        say("What is in the record:")
+        amberbox_verb("items", str(self.folder))
+        for name in ("fault.png", "fault.html"):
+            plot = self.place / name
+            amberbox_verb("plot", str(self.folder), "zmq_wheels", *SHOWN, "-o", str(plot))
+            check(plot.stat().st_size > 1000, f"the currents of two wheels are drawn in {plot}")
+        record = amberbox.open(self.folder)
+        rows = sum(item.rows for item in record.items() if item.name == PASSENGER)
+        check(rows > 0, f"{rows} messages of the recording went the same way")
+
+
+def say(text: str) -> None:
+    """Announce a step."""
+    print(f"\n== {text}", flush=True)
+
+
+def check(fine: bool, text: str) -> None:
+    """Print the outcome of a step; stop the demonstration when it failed."""
+    if not fine:
+        raise AmberboxError(f"the demonstration failed: not true that {text}", "please report this")
+    print(f"  ok: {text}", flush=True)
+
+
+def write_folder(folder: Path, name: str, blocks: str) -> None:
+    """Write a robot folder."""
+    folder.mkdir(exist_ok=True)
+    (folder / "robot.yaml").write_text(f"id: {name}\n")
+    (folder / "black_box.yaml").write_text(blocks)
+
+
+def amberbox_verb(*arguments: str) -> None:
+    """Run a verb as a user would."""
+    print("  $ amberbox " + " ".join(arguments), flush=True)
+    done = subprocess.run([sys.executable, "-m", "amberbox", *arguments], check=False)
+    if done.returncode:
+        raise AmberboxError(f"amberbox {arguments[0]} ended with {done.returncode}", "see above")
+
+
+def start_box(folder: Path) -> subprocess.Popen[bytes]:
+    """Start recording and wait until the first journal is there."""
+    before = journals(folder)
+    box = subprocess.Popen([sys.executable, "-m", "amberbox", "record", str(folder), "--quiet"])
+    wait_until(lambda: len(journals(folder)) > len(before) or box.poll() is not None)
+    check(box.poll() is None, "the box records")
+    return box
+
+
+def journals(folder: Path) -> list[Path]:
+    """Return the journal files of a robot folder."""
+    return sorted((folder / "store" / "journal").glob("*.mcap"))
+
+
+def wait_until(condition: Callable[[], bool], timeout_s: float = 30.0) -> None:
+    """Wait for something that another process does."""
+    end = time.monotonic() + timeout_s
+    while not condition():
+        if time.monotonic() > end:
+            raise AmberboxError("the demonstration waited in vain", "is the machine very busy?")
+        time.sleep(0.02)
+
+
+@contextmanager
+def robot(truth: Path) -> Iterator[tuple[subprocess.Popen[str], str]]:
+    """Run the simulated robot; it begins to move when the box listens."""
+    command = [sys.executable, "-m", "amberbox.sim", "--zmq", "tcp://127.0.0.1:*", "--wait"]
+    process = subprocess.Popen(
+        [*command, "--seed", "7", "--truth", str(truth)],
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    assert process.stdout is not None
+    try:
+        yield process, process.stdout.readline().split()[-1]
+    finally:
+        process.terminate()
+        process.wait(10)
+
+
+def tell_robot(process: subprocess.Popen[str], line: str) -> None:
+    """Send the simulated robot a command."""
+    assert process.stdin is not None
+    process.stdin.write(line + "\n")
+    process.stdin.flush()
+
+
+def sent_messages(truth: Path) -> dict[tuple[str, int], int]:
+    """Return topic and number of every message sent, with its stamp."""
+    lines = [json.loads(line) for line in truth.read_text().splitlines() if line.endswith("}")]
+    return {(line["topic"], line["seq"]): line["stamp_ns"] for line in lines}
+
+
+def kept_messages(store: Path) -> Counter[tuple[str, int]]:
+    """Count topic and number of every message in the record."""
+    kept: Counter[tuple[str, int]] = Counter()
+    for batch in read.batches(store):
+        if batch.source == "zmq" and "header_seq" in batch.columns:
+            numbers = np.asarray(batch.columns["header_seq"]).tolist()
+            kept.update((batch.topic, number) for number in numbers)
+    return kept
