@@ -46,5 +46,5 @@ def run(args: argparse.Namespace) -> int:
         plot = drawing(record, args)
     target.write_bytes(_DRAW[kind](plot))
     tell(plot.notes)
-    print(f"{target}: {sum(len(c.times_ns) for c in plot.curves)} points of {plot.rows} rows")
+    print(f"{target}: {len(plot.curves)} curves over {plot.rows} rows")
     return 0
