@@ -36,7 +36,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="how long the robot runs (default: 20, or DEMO_SECONDS)",
     )  # fmt: skip
     parser.add_argument("--keep", type=Path, metavar="DIR",
-                        help="folder for the robot and its record (default: a new one)")  # fmt: skip
+                        help="folder for robot and record (default: a new one)")  # fmt: skip
 
 
 def run(args: argparse.Namespace) -> int:
@@ -125,12 +125,18 @@ class Demo:
         say("Is anything lost? The robot's own account against the record:")
         sent = sent_messages(self.truth)
         kept = kept_messages(self.folder / "store")
-        gaps = [(g.from_ns, g.to_ns) for g in amberbox.open(self.folder).gaps() if g.item]
+        gaps: dict[str, list[tuple[int, int]]] = {}
+        for gap in amberbox.open(self.folder).gaps():
+            gaps.setdefault(gap.item, []).append((gap.from_ns, gap.to_ns))
         lost = {key: at for key, at in sent.items() if key not in kept}
-        explained = sum(self._may_be_missing(at, gaps) for at in lost.values())
+        explained = sum(
+            self._may_be_missing(at, gaps.get(f"zmq_{topic}", []))
+            for (topic, _), at in lost.items()
+        )
         doubled = sum(count - 1 for count in kept.values())
-        print(f"  sent {len(sent)}, recorded {len(kept)}, "
-              f"missing while the box was dead {explained}, lost {len(lost) - explained}")  # fmt: skip
+        lost_for_good = len(lost) - explained
+        print(f"  sent {len(sent)}, recorded {len(kept)}, missing while the box was dead"
+              f" {explained}, lost {lost_for_good}")  # fmt: skip
         check(len(kept) > 0 and not doubled, "every message is there once")
         check(explained == len(lost), "what is missing lies in the gap that the record names")
 

@@ -60,10 +60,7 @@ def _run(options: argparse.Namespace) -> int:
         raise UsageError("nowhere to publish", "--zmq tcp://127.0.0.1:5556, or --list-faults")
     for_s = float("inf") if options.for_time is None else parse_duration_s(options.for_time)
     plan = Plan(_speed(options.speed), for_s, options.truth)
-    start_ns = parse_time(options.start or "now", time.time_ns, lambda: None)
-    robot = Robot(options.seed, options.robot, options.scenario, start_ns)
-    for text in options.fault:
-        robot.inject(*parse_fault(text))
+    faults = [parse_fault(text) for text in options.fault]
     publisher = open_publisher(options.zmq)
     stop = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
@@ -72,6 +69,10 @@ def _run(options: argparse.Namespace) -> int:
     threading.Thread(target=listen, args=(sys.stdin, orders), daemon=True).start()
     if options.wait:
         wait_for_subscriber(publisher, stop)
+    start_ns = parse_time(options.start or "now", time.time_ns, lambda: None)
+    robot = Robot(options.seed, options.robot, options.scenario, start_ns)
+    for fault in faults:
+        robot.inject(*fault)
     sent = publish(robot, publisher, plan, orders, stop)
     publisher.close()
     print(f"published {sent} messages in {robot.now_s:.2f} s of robot time", flush=True)

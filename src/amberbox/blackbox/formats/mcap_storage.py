@@ -20,11 +20,13 @@ from amberbox.blackbox.formats.recording import (
     TopicTable,
 )
 from amberbox.blackbox.formats.ros2_qos import is_latched
+from amberbox.blackbox.reserved import SOURCE
 from amberbox.blackbox.scan import ChunkPlace, FileScan, open_buffer, read_chunk, scan
 from amberbox.core.errors import AmberboxError
 from amberbox.core.types import Topic
 
 MAGIC = mcap.MAGIC
+_UNKNOWN, _BOOKKEEPING = -1, -2
 _FOOTER_WITHOUT_SUMMARY = bytes([mcap.FOOTER]) + (20).to_bytes(8, "little") + bytes(16)
 
 
@@ -114,13 +116,23 @@ def add_topics(file: McapFile, table: TopicTable, definitions: Definitions) -> N
     """Add the channels of a file to the topics."""
     summary = file.contents.summary
     for number, channel in sorted(summary.channels.items()):
+        if _is_bookkeeping(channel):
+            file.topic_of[number] = _BOOKKEEPING
+            continue
         schema = summary.schemas.get(channel.schema_id)
         if schema is not None and not schema.data and channel.message_encoding == "cdr":
             schema = definitions.schema(schema.name, partial(_sample, file, number))
         latched = is_latched(channel.metadata.get("offered_qos_profiles", ""))
-        latched = latched or channel.metadata.get("latching") in ("1", "true")
+        marks = (channel.metadata.get("latching"), channel.metadata.get("latched"))
+        latched = latched or bool({"1", "true"}.intersection(marks))
         topic = Topic(channel.topic, channel.message_encoding, schema, latched)
         file.topic_of[number] = table.add(topic)
+
+
+def _is_bookkeeping(channel: mcap.Channel) -> bool:
+    """Tell what a box wrote about itself in a journal, and repeated messages, from data."""
+    marks = channel.metadata
+    return "run" in marks and (marks.get("source") == SOURCE or marks.get("repeated") == "1")
 
 
 def _sample(file: McapFile, channel: int) -> bytes | None:
@@ -163,11 +175,11 @@ def _messages(file: McapFile, chunk: Chunk) -> list[RecordedMessage]:
         strict=True,
     )
     messages = [
-        new(RecordedMessage, (topic_of.get(channel, -1), log, publish, body[start:end]))
+        new(RecordedMessage, (topic_of.get(channel, _UNKNOWN), log, publish, body[start:end]))
         for channel, log, publish, start, end in rows
     ]
     known = [message for message in messages if message[0] >= 0]
-    if len(known) < len(messages):
-        lost = len(messages) - len(known)
+    lost = sum(message[0] == _UNKNOWN for message in messages)
+    if lost:
         file.damaged(chunk.offset, chunk.end - chunk.offset, f"{lost} messages of unknown channels")
     return known
