@@ -12,7 +12,7 @@ ROS := ros-core python3-rospy python3-roslaunch python3-rosbag \
   python3-diagnostic-msgs python3-tf2-msgs
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test check bench venv debian clean
+.PHONY: help demo test check lint types rules bench venv debian clean
 
 help:  ## say what there is
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /\1\t/' | expand -t 10
@@ -23,10 +23,16 @@ demo: $(ALL)  ## record a simulated robot, break it, show that nothing is lost (
 test: $(TEST) debian  ## run all tests (PYTEST_ARGS="-k journal")
 	$(BIN)/python -m pytest $(PYTEST_ARGS)
 
-check: $(TEST)  ## lint, types, import directions, documentation
+check: lint types rules  ## lint, types, import directions, files, documentation (make -k check: all at once)
+
+lint: $(TEST)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+
+types: $(TEST)
 	$(BIN)/mypy
+
+rules: $(TEST)
 	$(BIN)/python -m tools.check_imports
 	$(BIN)/python -m tools.check_files
 	$(BIN)/python -m tools.check_docs

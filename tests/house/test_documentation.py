@@ -79,7 +79,7 @@ def test_configuration_keys_are_found() -> None:
 
 
 def test_the_project_is_documented() -> None:
-    assert check(ROOT) == []
+    assert "\n".join(finding.what for finding in check(ROOT)) == ""
 
 
 def test_design_notes_are_numbered() -> None:
