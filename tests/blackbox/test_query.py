@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -230,3 +231,10 @@ def test_whole_numbers_widen_to_floats(tmp_path: Path) -> None:
     record = amberbox.open(tmp_path)
     assert record.variables("state").columns[0].type == "float64"
     assert record.query("state", ["a"]).values("a") == [float(2**53), 1.5]
+
+
+def test_importing_amberbox_alone_is_cheap() -> None:
+    code = "import sys, amberbox; assert 'numpy' not in sys.modules; amberbox.open"
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        _ = amberbox.nothing
