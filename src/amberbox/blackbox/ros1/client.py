@@ -51,6 +51,7 @@ class Client:
         self._failures = 0
         self._ending = threading.Event()
         self._changing = threading.Lock()
+        self._building = threading.Lock()
         for topic in topics:
             self._subscribe(topic)
 
@@ -141,7 +142,7 @@ class Client:
 
     def _subscribe(self, topic: str) -> None:
         self._subscriptions[topic] = Subscription(
-            topic, self._sink, self._memory, self._settings, self._reports
+            topic, self._sink, self._memory, self._settings, self._reports, self._building
         )
 
     def _register(self, graph: Graph) -> None:

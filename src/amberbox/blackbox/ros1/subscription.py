@@ -27,7 +27,13 @@ class Subscription:
     """Keeps the links of one topic; called by the master's watcher, notices and the links."""
 
     def __init__(
-        self, topic: str, sink: Sink, memory: Memory, settings: Settings, reports: Reports
+        self,
+        topic: str,
+        sink: Sink,
+        memory: Memory,
+        settings: Settings,
+        reports: Reports,
+        building: threading.Lock,
     ) -> None:
         self.topic = topic
         self.sightings = Sightings(sink.now_ns())
@@ -35,6 +41,7 @@ class Subscription:
         self._memory = memory
         self._settings = settings
         self._reports = reports
+        self._building = building
         self._lock = threading.RLock()
         self._opening = threading.Lock()
         self._links: dict[str, Link] = {}
@@ -188,7 +195,8 @@ class Subscription:
 
     def _release(self, held: HeldDelivery, delivery: Callable[[], Deliver]) -> None:
         try:
-            held.release(delivery())
+            with self._building:  # one at a time, so that readers get to run in between
+                held.release(delivery())
         except Exception as error:
             self._reports.crashed(error)
             held.release(lambda data, received_ns: None)  # the run is over, with this error
