@@ -1,6 +1,7 @@
 """Reads XML-RPC answers with the C parser of ElementTree.
 
-A large robot's system state takes the standard library's reader 20 ms of each second, this one 4.
+The box asks the master for the system state every second; on a large robot that is 100 kB, and
+reading it with the standard library takes more than twice the time.
 """
 
 from __future__ import annotations
