@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from amberbox.blackbox.journal import JournalOptions, JournalWriter
+from amberbox.blackbox.journal.writer import JournalOptions, JournalWriter
 from benchmarks import mix
 from benchmarks.common import Row, cpu_s
 
@@ -104,7 +104,7 @@ def write_mcap(data: mix.Mix, path: Path) -> None:
             data.numbers, data.times_ns, data.messages, strict=True
         ):
             writer.add_message(channels[number], time_ns, message, time_ns)
-        writer.finish()
+        writer.finish()  # type: ignore[no-untyped-call]  # the library leaves it untyped
 
 
 def write_rosbags(data: mix.Mix, path: Path) -> None:

@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from amberbox.blackbox.journal import JournalOptions, JournalWriter
-from amberbox.blackbox.query import Record
-from amberbox.blackbox.read import JournalFile, journals
-from amberbox.blackbox.segments import build_segments
+from amberbox.blackbox.follow.read import JournalFile, journals
+from amberbox.blackbox.journal.writer import JournalOptions, JournalWriter
+from amberbox.blackbox.query.record import Record
+from amberbox.blackbox.segments.build import build_segments
 from amberbox.blackbox.store import create_store
 from amberbox.core.clock import NS
 from amberbox.core.types import Schema, Topic
@@ -194,7 +194,7 @@ def _record_and_build(made: mix.Mix, tick_ns: int, stores: Iterator[Path]) -> No
 
 
 def _real_recordings() -> Iterator[Row]:
-    from amberbox.blackbox.importing import import_recordings
+    from amberbox.blackbox.recorder.importing import import_recordings
 
     shares = []
     for name in REAL if RECORDINGS.is_dir() else ():

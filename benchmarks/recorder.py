@@ -13,8 +13,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from amberbox.blackbox import read
-from amberbox.blackbox.follow import follow
+import numpy as np
+
+from amberbox.blackbox.follow import read
+from amberbox.blackbox.follow.follow import follow
 from amberbox.blackbox.store import is_store
 from amberbox.core.types import Batch
 from benchmarks.common import Row, percentile
@@ -91,7 +93,7 @@ def _delays_ms(robot: Path, stop: threading.Event) -> list[float]:
     for delivery in follow(robot / "store", ["zmq_t"], stop=stop):
         now_ns = time.time_ns()
         if isinstance(delivery, Batch):
-            delays += [(now_ns - sent) / 1e6 for sent in delivery.columns["t"].tolist()]
+            delays += [(now_ns - sent) / 1e6 for sent in np.asarray(delivery.columns["t"]).tolist()]
         if time.monotonic() > end:
             stop.set()
     return delays[50:]
@@ -134,7 +136,7 @@ def totals(store: Path) -> tuple[int, int]:
     dropped: dict[str, int] = {}
     for batch in read.batches(store, ["amberbox_counters"]):
         rows = batch.children["items"].columns
-        names = rows["item"].tolist()
-        kept.update(zip(names, rows["kept"].tolist(), strict=True))
-        dropped.update(zip(names, rows["dropped"].tolist(), strict=True))
+        names = np.asarray(rows["item"]).tolist()
+        kept.update(zip(names, np.asarray(rows["kept"]).tolist(), strict=True))
+        dropped.update(zip(names, np.asarray(rows["dropped"]).tolist(), strict=True))
     return sum(kept.values()), sum(dropped.values())

@@ -3,7 +3,7 @@
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from amberbox.blackbox.query import open as open
+    from amberbox.blackbox.query.record import open as open
 
 __version__ = "0.1.0"
 
@@ -11,7 +11,7 @@ __version__ = "0.1.0"
 def __getattr__(name: str) -> Any:
     """Import ``open`` when it is first used: ``import amberbox`` alone stays cheap."""
     if name == "open":
-        from amberbox.blackbox.query import open as open_record
+        from amberbox.blackbox.query.record import open as open_record
 
         return open_record
     raise AttributeError(f"module 'amberbox' has no attribute {name!r}")

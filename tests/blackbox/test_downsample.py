@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from amberbox.blackbox.columns import objects
-from amberbox.blackbox.downsample import downsample
+from amberbox.blackbox.query.downsample import downsample
+from amberbox.blackbox.segments.columns import objects
 from amberbox.core.types import ColumnData, Ragged
 
 

@@ -8,9 +8,9 @@ from textwrap import dedent
 
 import pytest
 
-from amberbox.blackbox.folder import RobotFolder, inspect_folder, load_folder
-from amberbox.blackbox.plan import planned_items
-from amberbox.blackbox.robot import RobotConfig
+from amberbox.blackbox.folder.folder import RobotFolder, inspect_folder, load_folder
+from amberbox.blackbox.folder.plan import planned_items
+from amberbox.blackbox.folder.robot import RobotConfig
 from amberbox.core.errors import ConfigurationError, Problem, UsageError
 
 CONFIGS = Path(__file__).parent / "configs"

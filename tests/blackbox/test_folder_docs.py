@@ -5,10 +5,10 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from amberbox.blackbox.blocks import DefaultParameters
-from amberbox.blackbox.folder import load_folder
-from amberbox.blackbox.legacy import LEGACY_KEYS
-from amberbox.blackbox.robot import RobotConfig
+from amberbox.blackbox.folder.blocks import DefaultParameters
+from amberbox.blackbox.folder.folder import load_folder
+from amberbox.blackbox.folder.legacy import LEGACY_KEYS
+from amberbox.blackbox.folder.robot import RobotConfig
 from amberbox.core.describe import describe
 from amberbox.core.source import TopicOptions
 

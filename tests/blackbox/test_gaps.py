@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 import amberbox
-from amberbox.blackbox import segments
-from amberbox.blackbox.read import journals
+from amberbox.blackbox.follow.read import journals
+from amberbox.blackbox.segments import build as segments
 from amberbox.core.clock import NS
 from amberbox.core.errors import UsageError
 from amberbox.testing.records import BATTERY, T0_NS, FakeRun, build_segments_of, fill_store

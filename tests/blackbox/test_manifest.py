@@ -10,9 +10,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from amberbox.blackbox import manifest as mf
-from amberbox.blackbox.clocktable import ClockTable
-from amberbox.blackbox.flat import TableSchema
+from amberbox.blackbox.journal.clocktable import ClockTable
+from amberbox.blackbox.segments import manifest as mf
+from amberbox.blackbox.segments.flat import TableSchema
 from amberbox.core.types import Column, Gap
 
 SCHEMA = TableSchema(

@@ -12,11 +12,11 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from amberbox.blackbox import columns as col
-from amberbox.blackbox.encoding import choose
-from amberbox.blackbox.flat import Flat, TableSchema, join
-from amberbox.blackbox.manifest import Part, Segment
-from amberbox.blackbox.parquet import TableFile, describe, read_segment
+from amberbox.blackbox.segments import columns as col
+from amberbox.blackbox.segments.encoding import choose
+from amberbox.blackbox.segments.flat import Flat, TableSchema, join
+from amberbox.blackbox.segments.manifest import Part, Segment
+from amberbox.blackbox.segments.parquet import TableFile, describe, read_segment
 from amberbox.core.types import Column, ColumnData, Ragged
 
 T0 = 1_790_000_000_000_000_000

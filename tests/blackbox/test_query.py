@@ -12,9 +12,10 @@ import numpy as np
 import pytest
 
 import amberbox
-from amberbox.blackbox import query, segments
-from amberbox.blackbox.livequery import follow_tables
-from amberbox.blackbox.read import journals
+from amberbox.blackbox.follow.read import journals
+from amberbox.blackbox.query import record as query
+from amberbox.blackbox.query.livequery import follow_tables
+from amberbox.blackbox.segments import build as segments
 from amberbox.core.clock import NS
 from amberbox.core.errors import UsageError
 from amberbox.testing.records import (

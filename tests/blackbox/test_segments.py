@@ -9,10 +9,11 @@ from typing import Any
 import pytest
 
 import amberbox
-from amberbox.blackbox import manifest as mf
-from amberbox.blackbox import query, segments
-from amberbox.blackbox.catalogue import look
-from amberbox.blackbox.read import journals
+from amberbox.blackbox.follow.read import journals
+from amberbox.blackbox.query import record as query
+from amberbox.blackbox.query.catalogue import look
+from amberbox.blackbox.segments import build as segments
+from amberbox.blackbox.segments import manifest as mf
 from amberbox.core.clock import NS
 from amberbox.testing.records import BATTERY, T0_NS, FakeRun, build_segments_of, fill_store
 

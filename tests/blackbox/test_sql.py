@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 import amberbox
-from amberbox.blackbox.read import journals
+from amberbox.blackbox.follow.read import journals
 from amberbox.core.errors import AmberboxError, UsageError
 from amberbox.testing.records import (
     BATTERY,

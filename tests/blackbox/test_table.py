@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 import amberbox
-from amberbox.blackbox.query import Record
+from amberbox.blackbox.query.record import Record
 from amberbox.testing.records import T0_NS, fill_store
 
 MS = 1_000_000

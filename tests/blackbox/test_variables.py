@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from amberbox.blackbox.variables import closest, find, resolve, select
+from amberbox.blackbox.query.variables import closest, find, resolve, select
 from amberbox.core.errors import UsageError
 from amberbox.core.types import Column
 

@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from amberbox.blackbox.folder import SOURCES
+from amberbox.blackbox.folder.folder import SOURCES
 from amberbox.cli import plugins as verb
 from amberbox.cli.main import main
 from amberbox.core.config import build, parse_yaml

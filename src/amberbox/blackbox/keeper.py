@@ -15,8 +15,8 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from amberbox.blackbox.read import JournalFile, journal_file
-from amberbox.blackbox.segments import build_segments, can_build, merge_small
+from amberbox.blackbox.follow.read import JournalFile, journal_file
+from amberbox.blackbox.segments.build import build_segments, can_build, merge_small
 from amberbox.blackbox.store import Store, WriterLock, is_locked, open_store
 from amberbox.core.clock import NS
 from amberbox.core.errors import AmberboxError, UsageError
@@ -42,7 +42,7 @@ class Keeper:
         self._trim_ring()
 
     def _build(self, stop: threading.Event) -> None:
-        from amberbox.blackbox import manifest
+        from amberbox.blackbox.segments import manifest
 
         done = manifest.read(self._store.path).journals
         built = 0

@@ -17,7 +17,7 @@ def store_path(where: str | Path) -> Path:
     if is_store(path):
         return path
     if (path / "robot.yaml").is_file() or (path / "black_box.yaml").is_file():
-        from amberbox.blackbox.folder import load_folder
+        from amberbox.blackbox.folder.folder import load_folder
 
         store = load_folder(path).store_path
         if is_store(store):

@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
 
-from amberbox.blackbox.tabletext import grid
+from amberbox.blackbox.query.tabletext import grid
 from amberbox.core.errors import UsageError
 
 

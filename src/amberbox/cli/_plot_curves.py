@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from amberbox.blackbox.columns import null_mask
-from amberbox.blackbox.downsample import downsample
-from amberbox.blackbox.query import Record
-from amberbox.blackbox.table import Table
+from amberbox.blackbox.query.downsample import downsample
+from amberbox.blackbox.query.record import Record
+from amberbox.blackbox.query.table import Table
+from amberbox.blackbox.segments.columns import null_mask
 from amberbox.core.clock import NS
 from amberbox.core.errors import AmberboxError, UsageError
 from amberbox.core.types import Column, ColumnData, Gap, IntArray, Ragged

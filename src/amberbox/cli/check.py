@@ -7,8 +7,8 @@ import json
 from collections.abc import Sequence
 from typing import Any
 
-from amberbox.blackbox.folder import RobotFolder, inspect_folder
-from amberbox.blackbox.plan import PlannedItem, planned_items
+from amberbox.blackbox.folder.folder import RobotFolder, inspect_folder
+from amberbox.blackbox.folder.plan import PlannedItem, planned_items
 from amberbox.cli._text import in_columns
 from amberbox.core.errors import ConfigurationError, Problem
 from amberbox.core.redaction import as_plain

@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 import amberbox
-from amberbox.blackbox import read
+from amberbox.blackbox.follow import read
 from amberbox.core.clock import NS
 from amberbox.core.errors import AmberboxError
 

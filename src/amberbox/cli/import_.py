@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from amberbox.blackbox.importing import ImportReport, import_recordings
+from amberbox.blackbox.recorder.importing import ImportReport, import_recordings
 
 _BAR = 30
 
@@ -29,9 +29,7 @@ def run(args: argparse.Namespace) -> int:
     """Import and report; 1 if anything in the inputs was damaged."""
     started = time.monotonic()
     progress = _bar() if sys.stderr.isatty() and not args.json else lambda fraction: None
-    reports = import_recordings(
-        args.inputs, args.store, source=args.source, progress=progress
-    )
+    reports = import_recordings(args.inputs, args.store, source=args.source, progress=progress)
     if args.json:
         print(json.dumps([_as_json(report) for report in reports], indent=2))
     else:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import argparse
 
-from amberbox.blackbox.overview import ItemInfo
-from amberbox.blackbox.query import open as open_record
+from amberbox.blackbox.query.overview import ItemInfo
+from amberbox.blackbox.query.record import open as open_record
 from amberbox.cli._output import print_grid, print_json, size
 from amberbox.core.clock import NS
 from amberbox.core.timetext import format_time

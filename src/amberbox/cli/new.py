@@ -6,7 +6,7 @@ import argparse
 import json
 from pathlib import Path
 
-from amberbox.blackbox.folder import BLACK_BOX_FILE, ROBOT_FILE, SOURCES, load_folder
+from amberbox.blackbox.folder.folder import BLACK_BOX_FILE, ROBOT_FILE, SOURCES, load_folder
 from amberbox.core.errors import UsageError
 from amberbox.core.ids import derive_id
 from amberbox.core.plugins import get

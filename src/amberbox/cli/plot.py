@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable
 
-from amberbox.blackbox.query import open as open_record
+from amberbox.blackbox.query.record import open as open_record
 from amberbox.cli._output import add_range, tell, writable
 from amberbox.cli._plot_curves import Drawing, drawing
 from amberbox.cli._plot_image import draw_image

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
-from amberbox.blackbox.folder import SOURCES
+from amberbox.blackbox.folder.folder import SOURCES
 from amberbox.cli._text import in_columns
 from amberbox.core.describe import OptionRow, describe
 from amberbox.core.plugins import Plugin, find, get, install_hint, missing_packages

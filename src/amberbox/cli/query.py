@@ -7,11 +7,11 @@ import sys
 from collections.abc import Callable
 from typing import IO
 
-from amberbox.blackbox.livequery import follow_tables
-from amberbox.blackbox.query import Record
-from amberbox.blackbox.query import open as open_record
-from amberbox.blackbox.table import Table
-from amberbox.blackbox.tabletext import write_grid
+from amberbox.blackbox.query.livequery import follow_tables
+from amberbox.blackbox.query.record import Record
+from amberbox.blackbox.query.record import open as open_record
+from amberbox.blackbox.query.table import Table
+from amberbox.blackbox.query.tabletext import write_grid
 from amberbox.cli._output import add_range, tell, text_output, writable
 from amberbox.core.errors import UsageError
 from amberbox.core.timetext import format_time

@@ -10,8 +10,8 @@ import threading
 import time
 from dataclasses import asdict
 
-from amberbox.blackbox.folder import load_folder
-from amberbox.blackbox.recorder import Recorder, RecorderState
+from amberbox.blackbox.folder.folder import load_folder
+from amberbox.blackbox.recorder.recorder import Recorder, RecorderState
 from amberbox.cli._output import size
 from amberbox.core.units import in_unit
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from amberbox.blackbox.query import open as open_record
+from amberbox.blackbox.query.record import open as open_record
 from amberbox.cli._output import tell
 from amberbox.cli.query import FORMATS, chosen_format, write
 

@@ -9,9 +9,10 @@ from typing import Any
 
 import msgspec
 
-from amberbox.blackbox import reserved, segments
-from amberbox.blackbox.journal import JournalOptions, JournalWriter
-from amberbox.blackbox.read import journals
+from amberbox.blackbox.follow.read import journals
+from amberbox.blackbox.journal import reserved
+from amberbox.blackbox.journal.writer import JournalOptions, JournalWriter
+from amberbox.blackbox.segments import build as segments
 from amberbox.blackbox.store import FOLDERS, create_store
 from amberbox.blackbox.unroll.infer import widen
 from amberbox.core.clock import NS

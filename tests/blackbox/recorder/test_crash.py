@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from amberbox.blackbox import read
-from amberbox.blackbox.folder import load_folder
-from amberbox.blackbox.recorder import Recorder
+from amberbox.blackbox.folder.folder import load_folder
+from amberbox.blackbox.follow import read
+from amberbox.blackbox.recorder.recorder import Recorder
 from amberbox.blackbox.store import open_store
 from amberbox.core.clock import NS
 from amberbox.core.types import Batch

@@ -7,13 +7,14 @@ import threading
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from amberbox.blackbox.follow import follow
-from amberbox.blackbox.pipeline import Pipeline, PipelineOptions
-from amberbox.blackbox.sink import BlockSink
+from amberbox.blackbox.follow.follow import follow
+from amberbox.blackbox.recorder.pipeline import Pipeline, PipelineOptions
+from amberbox.blackbox.recorder.sink import BlockSink
 from amberbox.blackbox.store import create_store
 from amberbox.core.clock import NS, RunClock
 from amberbox.core.types import Batch, Cursor, Gap, Schema, Topic, Watermark
@@ -52,7 +53,7 @@ class Box:
 
 
 def rows_of(batch: Batch) -> list[Row]:
-    return [(batch.item, n) for n in batch.columns["data"].tolist()]
+    return [(batch.item, n) for n in np.asarray(batch.columns["data"]).tolist()]
 
 
 def numbered(rng: random.Random, start: int) -> list[Row]:
@@ -61,7 +62,8 @@ def numbered(rng: random.Random, start: int) -> list[Row]:
 
 def history(store: Path, seed: int) -> list[Row]:
     """Write several runs, some of which crash; return everything in the order it was said."""
-    rng, clock, said = random.Random(seed), ManualClock(), []
+    rng, clock = random.Random(seed), ManualClock()
+    said: list[Row] = []
     for _ in range(rng.randint(1, 3)):
         box = Box(store, clock)
         for _ in range(rng.randint(1, 12)):

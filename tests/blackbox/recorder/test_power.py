@@ -5,13 +5,14 @@ from __future__ import annotations
 import random
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from amberbox.blackbox import read
-from amberbox.blackbox.pipeline import Pipeline, PipelineOptions
-from amberbox.blackbox.sink import BlockSink
+from amberbox.blackbox.follow import read
+from amberbox.blackbox.recorder.pipeline import Pipeline, PipelineOptions
+from amberbox.blackbox.recorder.sink import BlockSink
 from amberbox.blackbox.store import create_store
 from amberbox.core.clock import NS, RunClock
 from amberbox.core.types import Schema, Topic
@@ -60,7 +61,11 @@ def test_everything_synced_survives(
     last_sync_ns = max(at for marks in synced.values() for at, _ in marks)
     end_ns = ManualClock().wall_ns() + ticks * round(WRITE_S * NS)
     assert end_ns - last_sync_ns <= (SYNC_S + WRITE_S) * NS
-    found = [n for b in read.batches(store, {"ros_count"}) for n in b.columns["data"].tolist()]
+    found = [
+        n
+        for b in read.batches(store, {"ros_count"})
+        for n in np.asarray(b.columns["data"]).tolist()
+    ]
     survivors = round((last_sync_ns - ManualClock().wall_ns()) / (WRITE_S / 10 * NS))
     assert found[:survivors] == list(range(survivors))
     assert found == sorted(set(found))

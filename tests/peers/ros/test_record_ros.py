@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import amberbox
-from amberbox.blackbox import read
+from amberbox.blackbox.follow import read
 from amberbox.core.errors import UsageError
 from amberbox.testing.realros import (
     Published,

@@ -8,8 +8,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from amberbox.blackbox import mcap
-from amberbox.blackbox.chunk import Chunk, open_chunk
 from amberbox.blackbox.formats.compression import unpack
 from amberbox.blackbox.formats.definitions import Definitions
 from amberbox.blackbox.formats.recording import (
@@ -20,8 +18,10 @@ from amberbox.blackbox.formats.recording import (
     TopicTable,
 )
 from amberbox.blackbox.formats.ros2_qos import is_latched
-from amberbox.blackbox.reserved import SOURCE
-from amberbox.blackbox.scan import ChunkPlace, FileScan, open_buffer, read_chunk, scan
+from amberbox.blackbox.journal import mcap
+from amberbox.blackbox.journal.chunk import Chunk, open_chunk
+from amberbox.blackbox.journal.reserved import SOURCE
+from amberbox.blackbox.journal.scan import ChunkPlace, FileScan, open_buffer, read_chunk, scan
 from amberbox.core.errors import AmberboxError
 from amberbox.core.types import Topic
 

@@ -1,0 +1,1 @@
+"""Rows out of journals, in order and with a cursor: what everything behind the recorder reads."""

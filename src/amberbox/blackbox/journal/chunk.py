@@ -1,0 +1,203 @@
+"""One chunk of an MCAP file, checked and laid open."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import zstandard
+from numpy.typing import NDArray
+
+from amberbox.blackbox.journal import mcap
+from amberbox.blackbox.journal.mcap import MESSAGE_HEAD, Channel, ChunkHead
+from amberbox.core.types import IntArray, Schema
+
+MAX_CHUNK_BYTES = 1 << 32
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Chunk:
+    """Messages of one chunk as parallel arrays, with the definitions it carries."""
+
+    offset: int
+    end: int
+    channel: NDArray[np.uint16]
+    sequence: NDArray[np.uint32]
+    log_ns: IntArray
+    publish_ns: IntArray
+    starts: IntArray
+    ends: IntArray
+    body: bytes
+    schemas: Mapping[int, Schema]
+    channels: Mapping[int, Channel]
+
+    def __len__(self) -> int:
+        return len(self.channel)
+
+    def rows_of(self, channel: int) -> IntArray:
+        """Return the row numbers of one channel."""
+        return np.flatnonzero(self.channel == channel)
+
+    def messages(self, rows: IntArray) -> list[bytes]:
+        """Return the message bytes of some rows."""
+        body = self.body
+        spans = zip(self.starts[rows].tolist(), self.ends[rows].tolist(), strict=True)
+        return [body[a:b] for a, b in spans]
+
+
+def decompress(head: ChunkHead, data: bytes | memoryview) -> bytes | None:
+    """Return a chunk's records if decompression, size and CRC agree, else None."""
+    if head.size > MAX_CHUNK_BYTES or head.data_offset + head.data_length > len(data):
+        return None
+    packed = data[head.data_offset : head.data_offset + head.data_length]
+    body = _unpack(head.compression, packed, head.size)
+    if body is None or len(body) != head.size:
+        return None
+    if head.crc and zlib.crc32(body) != head.crc:
+        return None
+    return body
+
+
+def _unpack(compression: str, packed: bytes | memoryview, size: int) -> bytes | None:
+    if compression == "":
+        return bytes(packed)
+    if compression == "zstd":
+        try:
+            return zstandard.ZstdDecompressor().decompress(packed, max_output_size=size)
+        except zstandard.ZstdError:
+            return None
+    if compression == "lz4":
+        return _unpack_lz4(bytes(packed))
+    return None
+
+
+def _unpack_lz4(packed: bytes) -> bytes | None:
+    import lz4.frame  # type: ignore[import-untyped]  # it ships no types; only others use it
+
+    try:
+        return bytes(lz4.frame.decompress(packed))
+    except (RuntimeError, ValueError, EOFError):
+        return None
+
+
+def open_chunk(body: bytes, offset: int, end: int, offsets: IntArray | None = None) -> Chunk | None:
+    """Lay a chunk's records open; None if they do not fit together.
+
+    ``offsets`` are the message offsets its indices state. They are only believed if they cover the
+    records without a hole, otherwise the records are walked one by one.
+    """
+    try:
+        schemas, channels, at = _definitions(body)
+        starts = _believe(body, at, offsets)
+        if starts is None:
+            starts = _walk(body, at, schemas, channels)
+    except (ValueError, struct.error, IndexError):
+        return None
+    return _columns(body, starts, offset, end, schemas, channels)
+
+
+def _definitions(body: bytes) -> tuple[dict[int, Schema], dict[int, Channel], int]:
+    schemas: dict[int, Schema] = {}
+    channels: dict[int, Channel] = {}
+    at = 0
+    while at < len(body) and body[at] in (mcap.SCHEMA, mcap.CHANNEL):
+        at = _define(body, at, schemas, channels)
+    return schemas, channels, at
+
+
+def _define(body: bytes, at: int, schemas: dict[int, Schema], channels: dict[int, Channel]) -> int:
+    (length,) = struct.unpack_from("<Q", body, at + 1)
+    content = body[at + 9 : at + 9 + length]
+    if body[at] == mcap.SCHEMA:
+        number, schema = mcap.parse_schema(content)
+        schemas[number] = schema
+    else:
+        channel = mcap.parse_channel(content)
+        channels[channel.id] = channel
+    return at + 9 + int(length)
+
+
+def _believe(body: bytes, at: int, offsets: IntArray | None) -> IntArray | None:
+    """Check stated offsets: each message must begin where the one before ends."""
+    if offsets is None or not len(offsets):
+        return None
+    starts = np.sort(offsets)
+    if int(starts[0]) != at or int(starts[-1]) + MESSAGE_HEAD > len(body):
+        return None
+    ends = starts + 9 + _numbers(body, "<u8", 7)[starts + 1].astype(np.int64)
+    whole = np.array_equal(ends[:-1], starts[1:]) and int(ends[-1]) == len(body)
+    opcodes = np.frombuffer(body, np.uint8)[starts]
+    return starts if whole and bool((opcodes == mcap.MESSAGE).all()) else None
+
+
+def _walk(
+    body: bytes, at: int, schemas: dict[int, Schema], channels: dict[int, Channel]
+) -> IntArray:
+    """Find the messages record by record, as files of others need it."""
+    starts, size = [], len(body)
+    while at < size:
+        opcode, length = struct.unpack_from("<BQ", body, at)
+        if at + 9 + length > size:
+            raise ValueError("a record is longer than its chunk")
+        if opcode == mcap.MESSAGE:
+            if length < MESSAGE_HEAD - 9:
+                raise ValueError("a message record is too short")
+            starts.append(at)
+        elif opcode in (mcap.SCHEMA, mcap.CHANNEL):
+            _define(body, at, schemas, channels)
+        at += 9 + length
+    return np.array(starts, np.int64)
+
+
+def _columns(
+    body: bytes,
+    starts: IntArray,
+    offset: int,
+    end: int,
+    schemas: Mapping[int, Schema],
+    channels: Mapping[int, Channel],
+) -> Chunk:
+    lengths = _take(body, "<u8", 7, starts + 1).astype(np.int64)
+    return Chunk(
+        offset=offset,
+        end=end,
+        channel=_take(body, "<u2", 1, starts + 9),
+        sequence=_take(body, "<u4", 3, starts + 11),
+        log_ns=_take(body, "<u8", 7, starts + 15).astype(np.int64),
+        publish_ns=_take(body, "<u8", 7, starts + 23).astype(np.int64),
+        starts=starts + MESSAGE_HEAD,
+        ends=starts + 9 + lengths,
+        body=body,
+        schemas=schemas,
+        channels=channels,
+    )
+
+
+def _numbers(body: bytes, kind: str, tail: int) -> NDArray[Any]:
+    """View bytes as numbers that begin at every byte."""
+    return np.ndarray((max(len(body) - tail, 0),), kind, body, 0, (1,))
+
+
+def _take(body: bytes, kind: str, tail: int, at: IntArray) -> NDArray[Any]:
+    if not len(at):
+        return np.empty(0, kind)
+    return _numbers(body, kind, tail)[at]
+
+
+def sequences(chunk: Chunk, base: int) -> IntArray:
+    """Widen the 32-bit sequence numbers of a chunk to positions at or after ``base``."""
+    low = chunk.sequence.astype(np.int64)
+    widened: IntArray = base + ((low - base) & 0xFFFFFFFF)
+    return widened
+
+
+def index_offsets(records: Sequence[tuple[int, bytes]]) -> IntArray:
+    """Collect the message offsets of message index records (channel, entries)."""
+    if not records:
+        return np.empty(0, np.int64)
+    entries = np.frombuffer(b"".join(data for _, data in records), "<i8")
+    return entries[1::2].astype(np.int64)

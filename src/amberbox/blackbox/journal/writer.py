@@ -1,0 +1,411 @@
+"""The journal writer: MCAP files made for power cuts.
+
+One ``write`` puts complete chunks with their indices into the file, visible to readers and safe
+from ``kill -9``. ``mark_sync`` closes a link of the hash chain and returns what makes it durable.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import zlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import zstandard
+from numpy.typing import NDArray
+
+from amberbox.blackbox.journal import mcap
+from amberbox.blackbox.journal.head import Head, HeadFile
+from amberbox.blackbox.journal.mcap import MESSAGE_HEAD, Channel
+from amberbox.blackbox.journal.summary import IndexedChunk, Summary
+from amberbox.core.clock import NS
+from amberbox.core.types import IntArray, Schema, Topic
+
+CHUNK_BYTES = 1 << 20
+"""Larger writes are split into chunks of about this size; a larger message has its own."""
+SCHEMA_REPEAT_NS = (NS, 10 * NS)
+"""Schemas are repeated after as long as the file is old, but within these limits."""
+COMPRESSION_LEVEL = 1
+START_METADATA = "amberbox/start"
+CHAIN_METADATA = "amberbox/chain"
+EMPTY_CHAIN = "0" * 64
+
+
+@dataclass(frozen=True, slots=True)
+class JournalOptions:
+    """Where a journal lies, who writes it, and when a new file begins."""
+
+    folder: Path
+    store_id: str
+    writer: str
+    run: int
+    boot_id: str
+    rotate_bytes: int = 64_000_000
+    rotate_ns: int = 600 * NS
+
+    @property
+    def tag(self) -> str:
+        """Mark of this run in every chunk: blocks of other files are told apart by it."""
+        return f"{self.store_id[:8]}-{self.writer}-{self.run}"
+
+    def file_name(self, number: int) -> str:
+        """Name a file by run, boot and number, never by the wall clock."""
+        return f"{self.run:06d}-{self.boot_id.replace('-', '')[:8]}-{number:04d}.mcap"
+
+
+@dataclass(slots=True)
+class SyncMark:
+    """What has to reach the disk; ``wait`` may run in another thread."""
+
+    fds: list[int]
+    close: list[int]
+    seq: int
+    done: Callable[[int], None]
+
+    def wait(self) -> None:
+        """Flush everything written before the mark; then ``seq`` is the durable end."""
+        for fd in self.fds:
+            os.fdatasync(fd)
+        for fd in self.close:
+            os.close(fd)
+        self.done(self.seq)
+
+
+@dataclass(slots=True)
+class _OpenFile:
+    fd: int
+    path: Path
+    number: int
+    opened_ns: int
+    size: int = 0
+    summary: Summary = field(default_factory=Summary)
+    schemas_at_ns: dict[int, int] = field(default_factory=dict)
+    block: hashlib._Hash = field(default_factory=hashlib.sha256)
+    block_start: int = 0
+
+
+class JournalWriter:
+    """Appends messages of one run to a series of MCAP files. Not thread-safe: one owner."""
+
+    def __init__(self, options: JournalOptions, *, chain: str = EMPTY_CHAIN) -> None:
+        self.options = options
+        self.next_seq = 0
+        self.durable_seq = 0
+        self.chain = chain
+        self.bytes_written = 0
+        self._schemas: dict[Schema, int] = {}
+        self._channels: list[Channel] = []
+        self._records: list[bytes] = []
+        self._file: _OpenFile | None = None
+        self._files = 0
+        self._closing: list[int] = []
+        self._zstd = zstandard.ZstdCompressor(level=COMPRESSION_LEVEL, write_content_size=True)
+        options.folder.mkdir(parents=True, exist_ok=True)
+        self._head = HeadFile(options.folder)
+
+    def channel(self, topic: Topic, metadata: Mapping[str, str]) -> int:
+        """Register a channel and return its number, the same in all files of this run."""
+        schema_id = 0
+        if topic.schema is not None:
+            schema_id = self._schemas.setdefault(topic.schema, len(self._schemas) + 1)
+        marks = {**metadata, "run": self.options.tag}
+        channel = Channel(len(self._channels), schema_id, topic.name, topic.message_encoding, marks)
+        self._channels.append(channel)
+        self._records.append(mcap.channel_record(channel))
+        return channel.id
+
+    @property
+    def path(self) -> Path | None:
+        """The file that is being written, if there is one."""
+        return self._file.path if self._file else None
+
+    def rotation_due(self, now_ns: int) -> bool:
+        """Tell whether the file is full or old enough for a new one."""
+        file = self._file
+        if file is None:
+            return False
+        too_old = now_ns - file.opened_ns >= self.options.rotate_ns
+        return file.size >= self.options.rotate_bytes or too_old
+
+    def write(
+        self,
+        channels: Sequence[int] | NDArray[np.uint16],
+        log_ns: Sequence[int] | IntArray,
+        publish_ns: Sequence[int] | IntArray,
+        messages: Sequence[bytes],
+    ) -> None:
+        """Write messages in their order as complete chunks.
+
+        Raises OSError when the disk does not take them: the file then ends where it ended before.
+        """
+        log = np.asarray(log_ns, np.int64)
+        if self._file is None:
+            self._open(int(log[0]))
+        numbers = np.asarray(channels, np.uint16)
+        publish = np.asarray(publish_ns, np.int64)
+        lengths = np.fromiter(map(len, messages), np.int64, len(messages))
+        for start, stop in _chunk_ranges(lengths):
+            part = slice(start, stop)
+            self._write_chunk(
+                numbers[part], log[part], publish[part], lengths[part], messages[start:stop]
+            )
+
+    def _write_chunk(
+        self,
+        channels: NDArray[np.uint16],
+        log: IntArray,
+        publish: IntArray,
+        lengths: IntArray,
+        messages: Sequence[bytes],
+    ) -> None:
+        file = self._opened()
+        order = np.argsort(channels, kind="stable")
+        grouped = channels[order]
+        firsts = np.flatnonzero(np.concatenate(([True], grouped[1:] != grouped[:-1])))
+        used = grouped[firsts].tolist()
+        start_ns, end_ns = int(log.min()), int(log.max())
+        prefix = self._definitions(file, used, end_ns)
+        body, starts = self._frame(prefix, channels, log, publish, lengths, messages)
+        compression = "zstd" if len(messages) > 1 or len(body) <= CHUNK_BYTES else ""
+        data = self._zstd.compress(body) if compression else bytes(body)
+        chunk = mcap.chunk_record(start_ns, end_ns, len(body), zlib.crc32(body), compression, data)
+        entries = np.empty((len(order), 2), np.int64)
+        entries[:, 0], entries[:, 1] = log[order], starts[order]
+        bounds = [*(firsts * 16).tolist(), len(order) * 16]
+        raw = entries.tobytes()
+        offset = file.size
+        self._append([chunk, *(
+            mcap.message_index_record(channel, raw[a:b])
+            for channel, a, b in zip(used, bounds[:-1], bounds[1:], strict=True)
+        )])  # fmt: skip
+        counts = (np.diff(bounds) // 16).tolist()
+        self._note(file, used, counts, IndexedChunk(
+            start_ns, end_ns, offset, len(chunk), _index_offsets(used, counts, offset + len(chunk)),
+            file.size - offset - len(chunk), compression, len(data), len(body),
+        ))  # fmt: skip
+        self.next_seq += len(messages)
+
+    def _frame(
+        self,
+        prefix: bytes,
+        channels: NDArray[np.uint16],
+        log: IntArray,
+        publish: IntArray,
+        lengths: IntArray,
+        messages: Sequence[bytes],
+    ) -> tuple[bytearray, IntArray]:
+        """Lay messages out behind the definitions, their 31-byte heads written column-wise."""
+        body = bytearray(MESSAGE_HEAD).join([prefix, *messages])
+        starts = np.empty(len(lengths), np.int64)
+        starts[0] = len(prefix)
+        np.cumsum(lengths[:-1] + MESSAGE_HEAD, out=starts[1:])
+        starts[1:] += len(prefix)
+        u1, u2, u4, u8 = _overlapping_views(body)
+        sequence = np.arange(self.next_seq, self.next_seq + len(lengths)) & 0xFFFFFFFF
+        u1[starts] = mcap.MESSAGE
+        u8[starts + 1] = lengths + (MESSAGE_HEAD - 9)
+        u2[starts + 9] = channels
+        u4[starts + 11] = sequence
+        u8[starts + 15] = log
+        u8[starts + 23] = publish
+        return body, starts
+
+    def _definitions(self, file: _OpenFile, used: Sequence[int], now_ns: int) -> bytes:
+        """Repeat the channels a chunk uses always, their schemas now and then."""
+        parts = []
+        for number in used:
+            schema_id = self._channels[number].schema_id
+            if schema_id and now_ns >= file.schemas_at_ns.get(schema_id, 0):
+                pause_ns = min(
+                    max(now_ns - file.opened_ns, SCHEMA_REPEAT_NS[0]), SCHEMA_REPEAT_NS[1]
+                )
+                file.schemas_at_ns[schema_id] = now_ns + pause_ns
+                parts.append(mcap.schema_record(schema_id, self._schema(schema_id)))
+        parts.extend(self._records[number] for number in used)
+        return b"".join(parts)
+
+    def _schema(self, schema_id: int) -> Schema:
+        return next(schema for schema, number in self._schemas.items() if number == schema_id)
+
+    def _note(
+        self, file: _OpenFile, used: Sequence[int], counts: Sequence[int], chunk: IndexedChunk
+    ) -> None:
+        summary = file.summary
+        for number, count in zip(used, counts, strict=True):
+            channel = self._channels[number]
+            summary.counts[number] += count
+            summary.channels[number] = channel
+            if channel.schema_id:
+                summary.schemas[channel.schema_id] = self._schema(channel.schema_id)
+        first = not summary.chunks
+        summary.start_ns = chunk.start_ns if first else min(summary.start_ns, chunk.start_ns)
+        summary.end_ns = max(summary.end_ns, chunk.end_ns)
+        summary.chunks.append(chunk)
+
+    def mark_sync(self) -> SyncMark:
+        """Close a link of the chain and return what makes everything so far durable."""
+        file, fds = self._file, list(self._closing)
+        if file is not None:
+            if file.size > file.block_start:
+                self._write_chain(file)
+            fds.append(file.fd)
+        mark = SyncMark(fds, self._closing, self.next_seq, self._set_durable)
+        self._closing = []
+        return mark
+
+    def _set_durable(self, seq: int) -> None:
+        self.durable_seq = max(self.durable_seq, seq)
+
+    def _write_chain(self, file: _OpenFile) -> None:
+        block = file.block.hexdigest()
+        self.chain = hashlib.sha256(bytes.fromhex(self.chain + block)).hexdigest()
+        values = {
+            "from": str(file.block_start),
+            "to": str(file.size),
+            "block": block,
+            "chain": self.chain,
+            "next_seq": str(self.next_seq),
+        }
+        file.block, file.block_start = hashlib.sha256(), file.size
+        self._append_metadata(file, CHAIN_METADATA, values)
+
+    def _append_metadata(self, file: _OpenFile, name: str, values: Mapping[str, str]) -> None:
+        data = mcap.metadata_record(name, values)
+        file.summary.metadata.append((file.size, len(data), name))
+        self._append([data])
+
+    def publish_head(self, watermark_ns: int) -> None:
+        """Tell followers how far this journal reaches, without touching the journal itself."""
+        file = self._file
+        self._head.write(
+            Head(
+                store_id=self.options.store_id,
+                run=self.options.run,
+                next_seq=self.next_seq,
+                durable_seq=self.durable_seq,
+                watermark_ns=watermark_ns,
+                file=file.path.name if file else "",
+                size=file.size if file else 0,
+            )
+        )
+
+    def rotate(self) -> None:
+        """Finish the file; the next write begins a new one."""
+        file = self._file
+        if file is None:
+            return
+        try:
+            self._write_chain(file)
+            self._append([file.summary.encode(file.size)])
+        finally:  # without its end the file is read by walking it
+            self._closing.append(file.fd)
+            self._file = None
+
+    def close(self) -> None:
+        """Finish the file and make everything durable."""
+        self.rotate()
+        self.mark_sync().wait()
+        self._head.close()
+
+    def _opened(self) -> _OpenFile:
+        assert self._file is not None
+        return self._file
+
+    def _open(self, now_ns: int) -> None:
+        folder = self.options.folder
+        path = folder / self.options.file_name(self._files)
+        fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND, 0o644)
+        self._files += 1
+        file = self._file = _OpenFile(fd, path, self._files - 1, now_ns)
+        try:
+            self._append([mcap.MAGIC + mcap.header(self._profile())])
+            self._append_metadata(file, START_METADATA, self._start_values(file))
+            _sync_folder(folder)
+        except OSError:
+            self._file = None
+            os.close(fd)
+            path.unlink()
+            raise
+
+    def _start_values(self, file: _OpenFile) -> dict[str, str]:
+        options = self.options
+        return {
+            "store_id": options.store_id,
+            "writer": options.writer,
+            "run": str(options.run),
+            "boot_id": options.boot_id,
+            "file": str(file.number),
+            "first_seq": str(self.next_seq),
+            "chain": self.chain,
+        }
+
+    def _profile(self) -> str:
+        encodings = {channel.message_encoding for channel in self._channels}
+        if "cdr" in encodings:
+            return "ros2"
+        return "ros1" if "ros1" in encodings else ""
+
+    def _append(self, parts: Sequence[bytes]) -> None:
+        file = self._opened()
+        data = b"".join(parts)
+        try:
+            _write_all(file.fd, data)
+        except OSError:
+            os.ftruncate(file.fd, file.size)  # our own torn tail, nothing acknowledged
+            raise
+        file.block.update(data)
+        file.size += len(data)
+        self.bytes_written += len(data)
+
+
+def _overlapping_views(
+    body: bytearray,
+) -> tuple[NDArray[np.uint8], NDArray[np.uint16], NDArray[np.uint32], NDArray[np.uint64]]:
+    """View bytes as numbers that begin at every byte, for column-wise writing."""
+    size = len(body)
+    return (
+        np.ndarray((size,), "<u1", body, 0, (1,)),
+        np.ndarray((size - 1,), "<u2", body, 0, (1,)),
+        np.ndarray((size - 3,), "<u4", body, 0, (1,)),
+        np.ndarray((size - 7,), "<u8", body, 0, (1,)),
+    )
+
+
+def _chunk_ranges(lengths: IntArray) -> list[tuple[int, int]]:
+    """Split a write into chunks of about CHUNK_BYTES; larger messages stand alone."""
+    total = int(lengths.sum())
+    if total <= CHUNK_BYTES:
+        return [(0, len(lengths))] if len(lengths) else []
+    ends = np.cumsum(lengths)
+    ranges, start = [], 0
+    while start < len(lengths):
+        base = int(ends[start] - lengths[start])
+        stop = max(start + 1, int(np.searchsorted(ends, base + CHUNK_BYTES, "right")))
+        ranges.append((start, stop))
+        start = stop
+    return ranges
+
+
+def _index_offsets(used: Sequence[int], counts: Sequence[int], start: int) -> list[tuple[int, int]]:
+    offsets = []
+    for channel, count in zip(used, counts, strict=True):
+        offsets.append((channel, start))
+        start += 15 + 16 * count
+    return offsets
+
+
+def _write_all(fd: int, data: bytes) -> None:
+    view = memoryview(data)
+    while view:
+        view = view[os.write(fd, view) :]
+
+
+def _sync_folder(folder: Path) -> None:
+    fd = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(fd)
+    finally:
+        os.close(fd)

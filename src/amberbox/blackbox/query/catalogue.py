@@ -1,0 +1,154 @@
+"""What a store holds right now: tables, their schemas, and where their rows lie."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Container, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+from amberbox.blackbox.follow.read import JournalFile, journal_file
+from amberbox.blackbox.query.variables import closest
+from amberbox.blackbox.segments import manifest as mf
+from amberbox.blackbox.segments.build import selection_of
+from amberbox.blackbox.segments.columns import wider
+from amberbox.blackbox.segments.flat import TableSchema, tables_of
+from amberbox.blackbox.segments.manifest import Manifest, Segment
+from amberbox.blackbox.store import open_store
+from amberbox.core.errors import AmberboxError, UsageError
+from amberbox.core.types import Column
+
+
+@dataclass(frozen=True)
+class Catalogue:
+    """One look at a store: its manifest and its journal files.
+
+    ``with_segments`` is false where segments cannot be read (no pyarrow): then all rows come
+    from journals, as far as these are still there.
+    """
+
+    store: Path
+    manifest: Manifest
+    with_segments: bool = True
+    existing: tuple[str, ...] = ()
+
+    def journals(self, skip: Container[str]) -> Iterator[JournalFile]:
+        """Open the journal files that are not named in ``skip``, in the order of writing."""
+        for name in self.existing:
+            if name not in skip:
+                yield journal_file(self.store / name, name)
+
+    @property
+    def done(self) -> Collection[str]:
+        """Names of the journals whose rows are all in segments."""
+        return self.manifest.journals.keys() if self.with_segments else ()
+
+    @cached_property
+    def schemas(self) -> dict[str, list[TableSchema]]:
+        """Return the versions of each table's schema, oldest first."""
+        found: dict[str, list[TableSchema]] = {}
+        for segments in self.manifest.segments.values() if self.with_segments else ():
+            for segment in segments:
+                _add(found, self.manifest.schemas[segment.schema])
+        for journal in self.journals(skip=self.done):
+            for schema in journal_tables(journal):
+                _add(found, schema)
+        return found
+
+    def schema(self, table: str) -> TableSchema:
+        """Return the union of a table's versions: every column, in its widest type.
+
+        Raises UsageError for a table that is not there.
+        """
+        name = table if table in self.schemas else _by_case(table, self.schemas)
+        if name is None:
+            raise UsageError(
+                f"there is no data item {table!r}", closest(table, sorted(self.schemas))
+            )
+        return union(self.schemas[name])
+
+    def segments(self, table: str) -> Sequence[Segment]:
+        """Return the segments to read for a table, in order."""
+        if not self.with_segments:
+            return ()
+        complete = self.manifest.complete(table, self.existing)
+        found = self.manifest.segments.get(table, ())
+        return [s for s in found if all(part.journal in complete for part in s.parts)]
+
+    def covered(self, table: str) -> frozenset[str]:
+        """Return the journals that need not be read for a table."""
+        if not self.with_segments:
+            return frozenset()
+        return self.manifest.complete(table, self.existing)
+
+    @cached_property
+    def selection(self) -> dict[str, Sequence[str]]:
+        """Return the variables configured for each item, the newest journal's word counting."""
+        chosen: dict[str, Sequence[str]] = {}
+        for done in self.manifest.journals.values():
+            chosen.update(done.selection)
+        for journal in self.journals(skip=self.manifest.journals.keys()):
+            chosen.update(selection_of(journal))
+        return chosen
+
+    def still_holds(self) -> bool:
+        """Tell whether no journal went while the segments for it came."""
+        waiting = (name for name in self.existing if name not in self.manifest.journals)
+        return all((self.store / name).exists() for name in waiting)
+
+    def without(self, segment: Segment) -> Catalogue:
+        """Return the same without a segment that turned out to be damaged."""
+        return replace(self, manifest=_without(self.manifest, segment))
+
+
+def _without(manifest: Manifest, segment: Segment) -> Manifest:
+    rest = tuple(other for other in manifest.segments[segment.item] if other is not segment)
+    return replace(manifest, segments={**manifest.segments, segment.item: rest})
+
+
+def look(store: Path, *, with_segments: bool = True) -> Catalogue:
+    """Look at a store. Journals first: one that goes meanwhile is in the manifest already."""
+    opened = open_store(store)
+    existing = tuple(
+        f"{path.parent.name}/{path.name}"
+        for writer in opened.writers()
+        for path in opened.journal_files(writer)
+    )
+    return Catalogue(store, mf.read(store), with_segments, existing)
+
+
+def journal_tables(journal: JournalFile) -> Iterator[TableSchema]:
+    """Give the tables of a journal's items that have rows and columns."""
+    for stream in journal.streams.values():
+        if not stream.repeated and journal.items.get(stream.item):
+            with suppress(AmberboxError):  # a message type without columns: kept, not shown
+                schema = stream.unroller().schema
+                yield from tables_of(stream.item, schema, stream.topic.name, stream.source)
+
+
+def item_of(journal: JournalFile, table: str) -> str | None:
+    """Return the item of a journal whose messages hold a table's rows."""
+    tables = (schema for schema in journal_tables(journal) if schema.item == table)
+    return next((schema.parent or schema.item for schema in tables), None)
+
+
+def _add(found: dict[str, list[TableSchema]], schema: TableSchema) -> None:
+    versions = found.setdefault(schema.item, [])
+    if schema not in versions:
+        versions.append(schema)
+
+
+def _by_case(table: str, known: dict[str, list[TableSchema]]) -> str | None:
+    return next((name for name in known if name.casefold() == table.casefold()), None)
+
+
+def union(versions: Sequence[TableSchema]) -> TableSchema:
+    """Join schema versions: columns by name, each in the widest type (int, float, string)."""
+    columns: dict[str, Column] = {}
+    for schema in versions:
+        for column in schema.columns:
+            known = columns.get(column.name)
+            kind = wider(known.type, column.type) if known else column.type
+            columns[column.name] = replace(column, type=kind)
+    return replace(versions[-1], columns=tuple(columns.values()))

@@ -1,0 +1,135 @@
+"""What is missing from a record and why: recorded gaps, damage, deletions."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from amberbox.blackbox.follow.follow import follow
+from amberbox.blackbox.journal import reserved
+from amberbox.blackbox.journal.clocktable import ClockTable
+from amberbox.blackbox.query.catalogue import Catalogue
+from amberbox.blackbox.query.gather import Request, Span, gather
+from amberbox.blackbox.query.tabletext import plain
+from amberbox.blackbox.segments.flat import Flat
+from amberbox.blackbox.segments.manifest import Journal
+from amberbox.blackbox.segments.parquet import overlaps
+from amberbox.core.types import Gap
+
+_FIELDS = ("item", "peer", "from_ns", "to_ns", "reason", "count")
+
+
+def gaps(catalogue: Catalogue, item: str | None, span: Span) -> list[Gap]:
+    """List gaps that meet ``[from, to)``, in order of time, of one item or of all."""
+    known = [*_recorded(catalogue), *_holes(catalogue), *_deleted(catalogue)]
+    chosen = [gap for gap in known if _concerns(gap, item, span)]
+    return sorted(chosen, key=lambda gap: (gap.from_ns, gap.to_ns, gap.item))
+
+
+def _concerns(gap: Gap, item: str | None, span: Span) -> bool:
+    last_ns = max(gap.to_ns - 1, gap.from_ns)
+    return (item is None or gap.item in ("", item)) and overlaps(gap.from_ns, last_ns, span)
+
+
+def _recorded(catalogue: Catalogue) -> Iterator[Gap]:
+    """Read the gap channel; a gap that was never closed lasts to the end of its run."""
+    table = next((n for n, v in catalogue.schemas.items() if v[-1].topic == reserved.GAP), None)
+    if table is None:
+        return
+    found: dict[tuple[object, ...], tuple[Gap, bool]] = {}
+    for piece in gather(catalogue, Request(table, _FIELDS)).pieces:
+        for gap, peer, is_open in _gap_rows(piece):
+            found[gap.run, gap.item, peer, gap.from_ns, gap.reason] = gap, is_open
+    ends = _run_ends(catalogue) if any(is_open for _, is_open in found.values()) else {}
+    for gap, is_open in found.values():
+        end = max(ends.get(gap.run, gap.from_ns), gap.from_ns + 1) if is_open else gap.to_ns
+        yield replace(gap, to_ns=end)
+
+
+def _gap_rows(piece: Flat) -> Iterator[tuple[Gap, str, bool]]:
+    columns = [plain(piece.columns[name]) for name in _FIELDS]
+    offsets = (piece.received_ns - piece.log_time_ns).tolist()
+    for offset, row in zip(offsets, zip(*columns, strict=True), strict=True):
+        item, peer, from_ns, to_ns, reason, count = row
+        end = (from_ns if to_ns is None else to_ns) + offset
+        gap = Gap(piece.writer, piece.run, from_ns + offset, end, reason, item, count)
+        yield gap, peer, to_ns is None
+
+
+def _run_ends(catalogue: Catalogue) -> dict[int, int]:
+    """Return when the last row of each run was received."""
+    ends: dict[int, int] = {}
+    for run, end_ns in _ends(catalogue):
+        ends[run] = max(ends.get(run, end_ns), end_ns)
+    return ends
+
+
+def _ends(catalogue: Catalogue) -> Iterator[tuple[int, int]]:
+    for segments in catalogue.manifest.segments.values():
+        for segment in segments:
+            yield segment.parts[-1].run, segment.received_range_ns[1]
+    for journal in catalogue.journals(skip=catalogue.done):
+        if journal.rows:
+            end = np.array([journal.end_ns])
+            yield journal.run, int(ClockTable(journal.clock).received(end)[0])
+
+
+def last_received_ns(catalogue: Catalogue) -> int | None:
+    """Return when the newest record was received."""
+    return max((end_ns for _, end_ns in _ends(catalogue)), default=None)
+
+
+def _holes(catalogue: Catalogue) -> Iterator[Gap]:
+    """Walk the journals for rows that are not there; what lives on in segments is no gap."""
+    if not catalogue.existing:
+        return
+    for delivery in follow(catalogue.store, items=(), live=False):
+        if isinstance(delivery, Gap) and delivery.from_seq is not None:
+            yield from _outside_segments(delivery, catalogue)
+
+
+def _outside_segments(gap: Gap, catalogue: Catalogue) -> Iterator[Gap]:
+    """Cut out of a gap the journals whose rows are in segments."""
+    assert gap.from_seq is not None
+    reached, since_ns = gap.from_seq, gap.from_ns
+    end = gap.from_seq if gap.to_seq is None else gap.to_seq
+    for journal in _covered(catalogue, gap):
+        if journal.first_seq > reached:
+            yield _piece(gap, reached, min(journal.first_seq, end), since_ns, journal.start_ns)
+        if journal.end_seq > reached:
+            reached, since_ns = journal.end_seq, journal.end_ns
+    if reached < end or gap.to_seq is None:
+        yield _piece(gap, reached, end, since_ns, gap.to_ns)
+
+
+def _covered(catalogue: Catalogue, gap: Gap) -> list[Journal]:
+    if not catalogue.with_segments:
+        return []
+    found = [
+        journal
+        for journal in catalogue.manifest.journals.values()
+        if (journal.writer, journal.run) == (gap.writer, gap.run)
+        and journal.end_seq > (gap.from_seq or 0)
+        and journal.first_seq < (gap.to_seq or 0)
+    ]
+    return sorted(found, key=lambda journal: journal.first_seq)
+
+
+def _piece(gap: Gap, from_seq: int, to_seq: int, from_ns: int, to_ns: int) -> Gap:
+    count = to_seq - from_seq if gap.count is not None else None
+    return replace(gap, from_seq=from_seq, to_seq=to_seq, count=count, from_ns=from_ns, to_ns=to_ns)
+
+
+def _deleted(catalogue: Catalogue) -> Iterator[Gap]:
+    for journal in catalogue.manifest.journals.values():
+        if journal.name not in catalogue.existing:
+            yield from journal.gaps
+    for deletion in catalogue.manifest.deletions:
+        for part in deletion.segment.parts:
+            if part.journal not in catalogue.existing:
+                yield Gap(
+                    part.writer, part.run, part.from_ns, part.to_ns + 1,
+                    f"deleted: {deletion.reason}", deletion.segment.item, part.rows,
+                )  # fmt: skip

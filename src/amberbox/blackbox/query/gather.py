@@ -1,0 +1,204 @@
+"""Gather the rows of a table from segments and journals, each row exactly once, in order."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import TypeAlias
+
+import numpy as np
+
+from amberbox.blackbox.follow.read import JournalFile, batches_of
+from amberbox.blackbox.query.catalogue import Catalogue, item_of
+from amberbox.blackbox.segments import columns as col
+from amberbox.blackbox.segments.flat import Flat, TableSchema, flatten
+from amberbox.blackbox.segments.manifest import Part, Segment
+from amberbox.blackbox.segments.parquet import overlaps, read_segment
+from amberbox.core.types import ColumnData, Gap, IntArray
+
+Span: TypeAlias = tuple[int | None, int | None]
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """Which rows and columns of a table are wanted; ``[from, to)`` by ``received`` or stamp."""
+
+    table: str
+    names: Collection[str]
+    span: Span = (None, None)
+    by: str = "received"
+
+
+@dataclass(slots=True)
+class Gathered:
+    """Rows as they lie, piece by piece, and what could not be read."""
+
+    pieces: list[Flat] = field(default_factory=list)
+    gaps: list[Gap] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+
+class _DamagedSegmentError(Exception):
+    def __init__(self, segment: Segment, reason: str) -> None:
+        super().__init__(reason)
+        self.segment = segment
+
+
+def gather(catalogue: Catalogue, request: Request) -> Gathered:
+    """Read the rows of a request; a segment that is damaged is replaced by its journal."""
+    found = Gathered()
+    while True:
+        try:
+            found.pieces = list(_segment_rows(catalogue, request))
+            break
+        except _DamagedSegmentError as damage:
+            _tell_damaged(found, catalogue, damage.segment, str(damage))
+            catalogue = catalogue.without(damage.segment)
+    _add_journals(found, catalogue, request)
+    if not catalogue.with_segments:
+        _tell_unreadable(found, catalogue, request)
+    pieces = (_cut(piece, request) for piece in found.pieces)
+    found.pieces = [piece for piece in pieces if len(piece)]
+    return found
+
+
+def _segment_rows(catalogue: Catalogue, request: Request) -> Iterator[Flat]:
+    for segment in catalogue.segments(request.table):
+        if not _may_hold(segment, request):
+            continue
+        schema = catalogue.manifest.schemas[segment.schema]
+        try:
+            yield from read_segment(
+                catalogue.store, segment, schema, request.names, request.span, request.by
+            )
+        except FileNotFoundError:  # joined or deleted meanwhile: whoever asks looks again
+            raise
+        except (OSError, ValueError) as error:
+            raise _DamagedSegmentError(segment, str(error).splitlines()[0]) from error
+
+
+def _may_hold(segment: Segment, request: Request) -> bool:
+    bounds = segment.received_range_ns if request.by == "received" else segment.stamp_range_ns
+    return overlaps(*bounds, request.span)
+
+
+def _tell_damaged(found: Gathered, catalogue: Catalogue, segment: Segment, reason: str) -> None:
+    lost = [part for part in segment.parts if part.journal not in catalogue.existing]
+    if not lost:
+        found.notes.append(f"{segment.path} is damaged, its journal was read instead ({reason})")
+    for part in lost:
+        found.notes.append(f"{segment.path} is damaged, {part.rows} rows are lost ({reason})")
+        found.gaps.append(_gap_of(segment, part, f"{segment.path} is damaged"))
+
+
+def _tell_unreadable(found: Gathered, catalogue: Catalogue, request: Request) -> None:
+    """Without pyarrow, rows whose journal is gone are out of reach: say so."""
+    for segment in catalogue.manifest.segments.get(request.table, ()):
+        for part in segment.parts if _may_hold(segment, request) else ():
+            if part.journal not in catalogue.existing:
+                found.notes.append(f"{segment.path}: {part.rows} rows need pyarrow to be read")
+                found.gaps.append(_gap_of(segment, part, "needs pyarrow to be read"))
+
+
+def _gap_of(segment: Segment, part: Part, reason: str) -> Gap:
+    return Gap(part.writer, part.run, part.from_ns, part.to_ns + 1, reason, segment.item, part.rows)
+
+
+def from_journals(catalogue: Catalogue, request: Request) -> Gathered:
+    """Read only the rows that are in no segment."""
+    found = Gathered()
+    _add_journals(found, catalogue, request)
+    found.pieces = [piece for piece in found.pieces if len(piece)]
+    return found
+
+
+def _add_journals(found: Gathered, catalogue: Catalogue, request: Request) -> None:
+    covered = catalogue.covered(request.table)
+    span = request.span if request.by == "received" else (None, None)
+    for journal in catalogue.journals(skip=covered):
+        item = item_of(journal, request.table)
+        if item is not None:
+            found.pieces += journal_rows(journal, item, request, span, found.gaps)
+
+
+def journal_rows(
+    journal: JournalFile, item: str, request: Request, span: Span, gaps: list[Gap]
+) -> Iterator[Flat]:
+    """Give a table's rows of one journal, with the wanted columns only."""
+    for batch in batches_of(journal, {item}, *span, on_gap=gaps.append):
+        for flat in flatten(batch):
+            if flat.schema.item == request.table and len(flat):
+                kept = {n: c for n, c in flat.columns.items() if n in request.names}
+                yield flat.with_columns(kept)
+
+
+def _cut(piece: Flat, request: Request) -> Flat:
+    """Keep the rows of the range."""
+    times = piece.received_ns if request.by == "received" else piece.timestamp_ns
+    from_ns, to_ns = request.span
+    inside = np.ones(len(times), bool)
+    if from_ns is not None:
+        inside &= times >= from_ns
+    if to_ns is not None:
+        inside &= times < to_ns
+    return piece if inside.all() else piece.take(inside)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Merged:
+    """The rows of all pieces in order, each column in the union's type."""
+
+    seq: IntArray
+    received_ns: IntArray
+    timestamp_ns: IntArray
+    columns: dict[str, ColumnData]
+
+
+def merge(pieces: Sequence[Flat], schema: TableSchema, names: Sequence[str], by: str) -> Merged:
+    """Order rows by (time, writer, run, seq) and fill with nulls what a version did not have."""
+    ordered = sorted(pieces, key=lambda p: (int(p.received_ns[0]), p.writer, p.run, int(p.seq[0])))
+    kinds = {column.name: column.type for column in schema.columns}
+    merged = Merged(
+        _joined([piece.seq for piece in ordered]),
+        _joined([piece.received_ns for piece in ordered]),
+        _joined([piece.timestamp_ns for piece in ordered]),
+        {name: _column(ordered, name, kinds[name]) for name in names},
+    )
+    order = _order(ordered, merged.received_ns if by == "received" else merged.timestamp_ns, merged)
+    return merged if order is None else _take(merged, order)
+
+
+def _joined(arrays: Sequence[IntArray]) -> IntArray:
+    return np.concatenate(arrays) if arrays else np.empty(0, np.int64)
+
+
+def _column(pieces: Sequence[Flat], name: str, kind: str) -> ColumnData:
+    parts = []
+    for piece in pieces:
+        known = piece.schema.column(name)
+        if known is None:
+            parts.append(col.nulls(kind, len(piece)))
+        else:
+            parts.append(col.cast(piece.columns[name], known.type, kind))
+    return col.concatenate(parts) if parts else col.empty(kind)
+
+
+def _order(pieces: Sequence[Flat], times: IntArray, merged: Merged) -> IntArray | None:
+    """Return the order of rows; None when they are in order as they are."""
+    if len({piece.writer for piece in pieces}) <= 1 and bool((np.diff(times) >= 0).all()):
+        return None
+    lengths = [len(piece) for piece in pieces]
+    writers = sorted({piece.writer for piece in pieces})
+    writer = np.repeat([writers.index(piece.writer) for piece in pieces], lengths)
+    run = np.repeat([piece.run for piece in pieces], lengths)
+    order: IntArray = np.lexsort((merged.seq, run, writer, times))
+    return order
+
+
+def _take(merged: Merged, rows: col.RowIndex) -> Merged:
+    return Merged(
+        merged.seq[rows],
+        merged.received_ns[rows],
+        merged.timestamp_ns[rows],
+        {name: col.take(column, rows) for name, column in merged.columns.items()},
+    )

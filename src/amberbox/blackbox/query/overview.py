@@ -1,0 +1,152 @@
+"""What a record holds, item by item: rows, times, rates, the stamps' distance from receipt."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from amberbox.blackbox.follow.read import JournalFile, batches_of, journal_file
+from amberbox.blackbox.journal import reserved
+from amberbox.blackbox.journal.clocktable import ClockTable
+from amberbox.blackbox.query.catalogue import Catalogue, item_of, union
+from amberbox.blackbox.segments.build import median
+from amberbox.blackbox.segments.flat import Flat, flatten
+from amberbox.blackbox.segments.manifest import Part, part_clock
+from amberbox.core.clock import NS
+from amberbox.core.timetext import format_time
+
+
+@dataclass(frozen=True, slots=True)
+class ItemInfo:
+    """One data item or child table of a record.
+
+    ``stamp_offset_s`` is how far stamps lie behind receipt (median over the record), None
+    without stamps; ``bytes`` counts the messages as received (0 for child tables).
+    """
+
+    name: str
+    source: str
+    topic: str
+    type: str
+    rows: int
+    first_ns: int
+    last_ns: int
+    rate_hz: float | None
+    stamp_offset_s: float | None
+    bytes: int
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the item as JSON has it: times are RFC 3339 strings."""
+        return {
+            "name": self.name,
+            "source": self.source,
+            "topic": self.topic,
+            "type": self.type,
+            "rows": self.rows,
+            "first": format_time(self.first_ns),
+            "last": format_time(self.last_ns),
+            "rate_hz": self.rate_hz,
+            "stamp_offset_s": self.stamp_offset_s,
+            "bytes": self.bytes,
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class _Share:
+    """What one journal adds to an item."""
+
+    rows: int
+    first_ns: int
+    last_ns: int
+    bytes: int
+    stamp_offset_ns: int | None
+
+
+def overview(catalogue: Catalogue) -> list[ItemInfo]:
+    """Describe each table that has rows, by name; the box's own channels come last."""
+    infos = [_info(catalogue, table) for table in sorted(catalogue.schemas)]
+    known = [info for info in infos if info is not None]
+    return sorted(known, key=lambda info: info.source == reserved.SOURCE)
+
+
+def _info(catalogue: Catalogue, table: str) -> ItemInfo | None:
+    shares = list(_shares(catalogue, table))
+    rows = sum(share.rows for share in shares)
+    if not rows:
+        return None
+    schema = union(catalogue.schemas[table])
+    first, last = min(s.first_ns for s in shares), max(s.last_ns for s in shares)
+    return ItemInfo(
+        table,
+        schema.source,
+        schema.topic,
+        schema.type,
+        rows,
+        first,
+        last,
+        _rate(rows, first, last),
+        _stamp_offset_s(shares),
+        sum(share.bytes for share in shares),
+    )
+
+
+def _rate(rows: int, first_ns: int, last_ns: int) -> float | None:
+    return round((rows - 1) * NS / (last_ns - first_ns), 3) if last_ns > first_ns else None
+
+
+def _stamp_offset_s(shares: Sequence[_Share]) -> float | None:
+    """Median over the journals' medians, each counting by its rows."""
+    known = sorted(
+        (share.stamp_offset_ns, share.rows) for share in shares if share.stamp_offset_ns is not None
+    )
+    if not known:
+        return None
+    passed = np.cumsum([rows for _, rows in known])
+    middle = int(np.searchsorted(passed, passed[-1] / 2))
+    return known[middle][0] / NS
+
+
+def _shares(catalogue: Catalogue, table: str) -> Iterator[_Share]:
+    for segment in catalogue.segments(table):
+        for part in segment.parts:
+            yield _share_of_part(part)
+    for journal in catalogue.journals(skip=catalogue.covered(table)):
+        share = _journal_shares(journal).get(table) if item_of(journal, table) else None
+        if share is not None:
+            yield share
+
+
+def _share_of_part(part: Part) -> _Share:
+    edges = np.array([part.from_ns, part.to_ns])
+    first, last = ClockTable(part_clock(part)).received(edges).tolist()
+    return _Share(part.rows, first, last, part.bytes, part.stamp_offset_ns)
+
+
+def _journal_shares(journal: JournalFile) -> dict[str, _Share]:
+    status = journal.path.stat()
+    return _counted(journal.path, journal.name, status.st_mtime_ns, status.st_size)
+
+
+@lru_cache(maxsize=256)
+def _counted(path: Path, name: str, _mtime_ns: int, _size: int) -> dict[str, _Share]:
+    """Count a journal's rows by unrolling it; remembered until the file changes."""
+    journal = journal_file(path, name)
+    pieces: dict[str, list[Flat]] = {}
+    sizes: dict[str, int] = {}
+    for batch in batches_of(journal, sizes=sizes):
+        for flat in flatten(batch):
+            if len(flat):
+                pieces.setdefault(flat.schema.item, []).append(flat.with_columns({}))
+    return {table: _share(found, sizes.get(table, 0)) for table, found in pieces.items()}
+
+
+def _share(pieces: Sequence[Flat], size: int) -> _Share:
+    first = min(int(piece.received_ns.min()) for piece in pieces)
+    last = max(int(piece.received_ns.max()) for piece in pieces)
+    ages = [p.received_ns - p.timestamp_ns for p in pieces if p.schema.stamp]
+    return _Share(sum(map(len, pieces)), first, last, size, median(ages))

@@ -1,0 +1,254 @@
+"""Open a record and ask it: items, variables, rows of a time range, gaps, events."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal, TypeVar
+
+import numpy as np
+
+from amberbox.blackbox.journal import reserved
+from amberbox.blackbox.query import gaps as gap_list
+from amberbox.blackbox.query.catalogue import Catalogue, look
+from amberbox.blackbox.query.downsample import downsample
+from amberbox.blackbox.query.gather import Merged, Request, gather, merge
+from amberbox.blackbox.query.overview import ItemInfo, overview
+from amberbox.blackbox.query.table import Table
+from amberbox.blackbox.query.variables import Wanted, resolve, select
+from amberbox.blackbox.segments import columns as col
+from amberbox.blackbox.segments.build import can_build
+from amberbox.blackbox.segments.flat import TableSchema
+from amberbox.blackbox.store import is_store
+from amberbox.blackbox.where import store_path
+from amberbox.core.errors import AmberboxError, UsageError
+from amberbox.core.timetext import parse_time
+from amberbox.core.types import Column, ColumnData, Gap, ItemSchema
+
+By = Literal["received", "timestamp"]
+Time = int | str | None
+Answer = TypeVar("Answer")
+
+_KEYS = {
+    "timestamp": "time",
+    "received": "time",
+    "seq": "int64",
+    "parent_seq": "int64",
+}
+_ATTEMPTS = 3
+
+
+@dataclass(frozen=True)
+class Record:
+    """A record opened for reading; a live one shows more each time it is asked.
+
+    ``temporary`` holds the store that recording files were imported into; it goes with this
+    object, or with ``close``.
+    """
+
+    path: Path
+    temporary: tempfile.TemporaryDirectory[str] | None = None
+
+    def __enter__(self) -> Record:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Remove the temporary store, if there is one."""
+        if self.temporary is not None:
+            self.temporary.cleanup()
+
+    def items(self) -> list[ItemInfo]:
+        """Return what was recorded: each data item and child table with rows, rates, times."""
+        return self._ask(overview)
+
+    def variables(self, item: str) -> ItemSchema:
+        """Return the columns of an item: the union over all versions of its schema.
+
+        Raises UsageError for an item that is not there.
+        """
+        schema = self._ask(lambda catalogue: catalogue.schema(item))
+        return ItemSchema(schema.type, schema.columns, {}, schema.stamp)
+
+    def query(
+        self,
+        item: str,
+        variables: Sequence[str] | None = None,
+        from_: Time = None,
+        to: Time = None,
+        by: By = "received",
+        points: int | None = None,
+    ) -> Table:
+        """Return ``timestamp`` and variables of an item for ``[from_, to)``, in order of time.
+
+        Times are nanoseconds since the Unix epoch or texts (ISO, epoch, ``-10m``, ``now``).
+        Without ``variables`` the table has the ones chosen in ``black_box.yaml``, else all;
+        ``received`` and ``seq`` come when named. ``points`` thins out, keeping extremes. Without
+        pyarrow the journals are read instead of the segments: slower, with the same result.
+
+        Raises UsageError for unknown or ambiguous names and for times that cannot be read.
+        """
+        span = self.time_ns(from_), self.time_ns(to)
+        return self._ask(lambda c: _query(c, item, variables, span, by, points))
+
+    def time_ns(self, moment: Time) -> int | None:
+        """Read a time as ``query`` does; ``-10m`` counts from the last record."""
+        if not isinstance(moment, str):
+            return moment
+        return parse_time(moment, time.time_ns, self.last_ns)
+
+    def last_ns(self) -> int | None:
+        """Return when the last record was received; None in an empty store."""
+        return self._ask(gap_list.last_received_ns)
+
+    def gaps(self, item: str | None = None, from_: Time = None, to: Time = None) -> list[Gap]:
+        """Return what is missing in ``[from_, to)`` and why, of one item or of all."""
+        span = self.time_ns(from_), self.time_ns(to)
+        return self._ask(lambda catalogue: gap_list.gaps(catalogue, item, span))
+
+    def sql(self, statement: str) -> Table:
+        """Answer a SELECT: each item and child table is a view (see ``blackbox.sql``)."""
+        from amberbox.blackbox.query.sql import run_sql
+
+        return self._ask(lambda catalogue: run_sql(catalogue, statement))
+
+    def events(self, from_: Time = None, to: Time = None) -> Table:
+        """Return what happened to the box: its event channel as a table."""
+        topics = {info.topic: info.name for info in self.items()}
+        if reserved.EVENT not in topics:
+            return Table("events", (Column("timestamp", "timestamp", "time"),),
+                         {"timestamp": np.empty(0, np.int64)})  # fmt: skip
+        return self.query(topics[reserved.EVENT], None, from_, to)
+
+    def _ask(self, question: Callable[[Catalogue], Answer]) -> Answer:
+        """Answer from one look at the store; look again when files moved on meanwhile."""
+        for _ in range(_ATTEMPTS):
+            catalogue = look(self.path, with_segments=can_build())
+            try:
+                answer = question(catalogue)
+            except FileNotFoundError:
+                continue
+            if catalogue.still_holds():
+                return answer
+        raise AmberboxError(
+            f"the files of {self.path} changed while they were being read",
+            "ask again, for a shorter range if it is a long one",
+        )
+
+
+def open(where: str | Path) -> Record:
+    """Open a robot folder, a store, or recording files (bag, MCAP), for reading.
+
+    Raises UsageError when there is none of these at ``where``.
+    """
+    path = Path(where)
+    if _is_recording(path):
+        return _import(path)
+    return Record(store_path(path))
+
+
+def _is_recording(path: Path) -> bool:
+    if is_store(path) or (path / "robot.yaml").exists() or (path / "black_box.yaml").exists():
+        return False
+    return path.is_file() or (path / "metadata.yaml").is_file()
+
+
+def _import(path: Path) -> Record:
+    from amberbox.blackbox.recorder.importing import import_recordings
+
+    folder = tempfile.TemporaryDirectory(prefix="amberbox-")
+    store = Path(folder.name) / "store"
+    import_recordings([path], store)
+    return Record(store, folder)
+
+
+def _query(
+    catalogue: Catalogue,
+    item: str,
+    names: Sequence[str] | None,
+    span: tuple[int | None, int | None],
+    by: By,
+    points: int | None,
+) -> Table:
+    if by not in ("received", "timestamp"):
+        raise UsageError(f"rows are ordered by received or timestamp, not by {by!r}")
+    if points is not None and points < 1:
+        raise UsageError("points must be 1 or more")
+    schema = catalogue.schema(item)
+    wanted = wanted_columns(catalogue, schema, names)
+    needed = needed_columns(wanted)
+    found = gather(catalogue, Request(schema.item, needed, span, by))
+    notes = [*found.notes, *(f"{gap.item or gap.writer}: {gap.reason}" for gap in found.gaps)]
+    table = make_table(schema, wanted, merge(found.pieces, schema, needed, by), notes)
+    return table if points is None else _thinned(table, points)
+
+
+def needed_columns(wanted: Sequence[Wanted]) -> list[str]:
+    """Name the variables that have to be read."""
+    return list(dict.fromkeys(w.column.name for w in wanted if w.column.name not in _KEYS))
+
+
+def wanted_columns(
+    catalogue: Catalogue, schema: TableSchema, names: Sequence[str] | None
+) -> list[Wanted]:
+    """Say which columns to show: timestamp first, then what was named or configured."""
+    keys = {name: Wanted(name, Column(name, name, kind)) for name, kind in _KEYS.items()}
+    if not schema.parent:
+        del keys["parent_seq"]
+    if names is None:
+        shown = [Wanted(c.name, c) for c in _configured(catalogue, schema)]
+        first = ["timestamp", "parent_seq"] if schema.parent else ["timestamp"]
+        return [*(keys[name] for name in first), *shown]
+    found = {"timestamp": keys["timestamp"]}
+    for name in names:
+        key = keys.get(name)
+        for wanted in [key] if key else resolve(schema.columns, [name], schema.item):
+            found.setdefault(wanted.name, wanted)
+    return list(found.values())
+
+
+def _configured(catalogue: Catalogue, schema: TableSchema) -> Sequence[Column]:
+    if schema.parent:
+        return schema.columns
+    chosen = catalogue.selection.get(schema.item, [])
+    return select(schema.columns, chosen) or schema.columns
+
+
+def make_table(
+    schema: TableSchema, wanted: Sequence[Wanted], rows: Merged, notes: Sequence[str] = ()
+) -> Table:
+    """Put the columns that were asked for into a table, elements of lists picked out."""
+    fields = tuple(_field(w) for w in wanted)
+    columns = {w.name: _values(w, rows) for w in wanted}
+    return Table(schema.item, fields, columns, tuple(dict.fromkeys(notes)))
+
+
+def _field(wanted: Wanted) -> Column:
+    if wanted.element is None:
+        return wanted.column
+    kind = col.element_type(wanted.column.type) or wanted.column.type
+    return replace(wanted.column, name=wanted.name, type=kind)
+
+
+def _values(wanted: Wanted, rows: Merged) -> ColumnData:
+    keys: dict[str, Any] = {
+        "timestamp": rows.timestamp_ns,
+        "received": rows.received_ns,
+        "seq": rows.seq,
+        "parent_seq": rows.seq,
+    }
+    name = wanted.column.name
+    if name in keys:
+        return keys[name]  # type: ignore[no-any-return]  # one of the arrays above
+    column = rows.columns[name]
+    return column if wanted.element is None else col.element(column, wanted.element)
+
+
+def _thinned(table: Table, points: int) -> Table:
+    variables = [table.columns[name] for name in table.names if name not in _KEYS]
+    return table.take(downsample(variables, len(table), points))

@@ -1,0 +1,267 @@
+"""SQL over a record: DuckDB with one view per data item, shut off from everything else."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+from amberbox.blackbox.query.catalogue import Catalogue
+from amberbox.blackbox.query.gather import Request, from_journals, gather, merge
+from amberbox.blackbox.query.table import Table
+from amberbox.blackbox.segments.columns import NUMPY_TYPES, element_type
+from amberbox.blackbox.segments.columns_io import arrow_type, from_arrow
+from amberbox.blackbox.segments.flat import TableSchema
+from amberbox.blackbox.segments.manifest import ClockPoints
+from amberbox.blackbox.segments.parquet import seq_name, stored_name
+from amberbox.core.errors import AmberboxError, UsageError
+from amberbox.core.types import Column, ColumnData
+
+if TYPE_CHECKING:
+    import duckdb
+    import pyarrow as pa
+
+_TYPES = {
+    "bool": "BOOLEAN",
+    "int8": "TINYINT",
+    "int16": "SMALLINT",
+    "int32": "INTEGER",
+    "int64": "BIGINT",
+    "uint8": "UTINYINT",
+    "uint16": "USMALLINT",
+    "uint32": "UINTEGER",
+    "uint64": "UBIGINT",
+    "float32": "FLOAT",
+    "float64": "DOUBLE",
+    "string": "VARCHAR",
+    "binary": "BLOB",
+    "duration": "BIGINT",
+}
+
+
+def run_sql(catalogue: Catalogue, statement: str) -> Table:
+    """Answer a SELECT over the views of a record; times are UTC.
+
+    Each data item and child table is a view: ``timestamp``, its variables, ``received``, ``seq``
+    (``parent_seq`` in child tables). DuckDB sees the store's segments and nothing else: no other
+    file, no network, no extension, and it changes nothing.
+
+    Raises AmberboxError when DuckDB refuses the statement, UsageError without DuckDB or when the
+    statement is not a single SELECT, DESCRIBE, SHOW or EXPLAIN.
+    """
+    duckdb = _duckdb()
+    with duckdb.connect(":memory:") as connection:
+        connection.execute("SET TimeZone = 'UTC'")
+        files: list[str] = []
+        for table in sorted(catalogue.schemas):
+            _create_view(connection, catalogue, table, files)
+        _shut_off(connection, files)
+        try:
+            _refuse_all_but_questions(connection, statement)
+            return _to_table(connection.sql(statement).to_arrow_table())
+        except duckdb.Error as error:
+            raise AmberboxError(f"SQL: {error}", _hint(catalogue)) from error
+
+
+def _refuse_all_but_questions(connection: duckdb.DuckDBPyConnection, statement: str) -> None:
+    kinds = [parsed.type.name for parsed in connection.extract_statements(statement)]
+    if len(kinds) != 1 or kinds[0] not in ("SELECT", "EXPLAIN"):
+        raise UsageError(
+            f"SQL: expected one SELECT, not {' and '.join(kinds) or 'nothing'}",
+            "sql only reads; SELECT, DESCRIBE, SHOW TABLES and EXPLAIN work",
+        )
+
+
+def _duckdb() -> Any:
+    try:
+        import duckdb
+    except ImportError:
+        raise UsageError("sql needs DuckDB", "pip install 'amberbox[query]'") from None
+    return duckdb
+
+
+def _hint(catalogue: Catalogue) -> str:
+    return "views: " + ", ".join(sorted(catalogue.schemas))
+
+
+def _shut_off(connection: duckdb.DuckDBPyConnection, files: Sequence[str]) -> None:
+    connection.execute("SET autoinstall_known_extensions = false")
+    connection.execute("SET autoload_known_extensions = false")
+    connection.execute("SET python_enable_replacements = false")
+    connection.execute(f"SET allowed_paths = [{', '.join(map(_quoted, files))}]")
+    connection.execute("SET enable_external_access = false")
+    connection.execute("SET lock_configuration = true")
+
+
+def _create_view(
+    connection: duckdb.DuckDBPyConnection, catalogue: Catalogue, table: str, files: list[str]
+) -> None:
+    schema = catalogue.schema(table)
+    groups = {} if _needs_text(catalogue, schema) else _groups(catalogue, table)
+    selects = [_select(schema, version, steps, paths) for (version, steps), paths in groups.items()]
+    files += (path for paths in groups.values() for path in paths)
+    rest = _journal_rows(catalogue, schema, also_segments=not groups)
+    if rest is not None:
+        connection.register(f"{table}:journal", rest)
+        selects.append(f"SELECT * FROM {_name(f'{table}:journal')}")
+    connection.execute(f"CREATE VIEW {_name(table)} AS {' UNION ALL '.join(selects)}")
+
+
+def _groups(catalogue: Catalogue, table: str) -> dict[tuple[TableSchema, ClockPoints], list[str]]:
+    """Group a table's segments by schema version and clock: each group is one SELECT."""
+    groups: dict[tuple[TableSchema, ClockPoints], list[str]] = {}
+    for segment in catalogue.segments(table):
+        version = catalogue.manifest.schemas[segment.schema]
+        path = str((catalogue.store / segment.path).resolve())
+        groups.setdefault((version, _steps(segment.clock)), []).append(path)
+    return groups
+
+
+def _select(
+    schema: TableSchema, version: TableSchema, steps: ClockPoints, paths: Sequence[str]
+) -> str:
+    columns = ", ".join(_columns(schema, version, steps))
+    return f"SELECT {columns} FROM read_parquet([{', '.join(map(_quoted, paths))}])"
+
+
+def _needs_text(catalogue: Catalogue, schema: TableSchema) -> bool:
+    """Numbers that became text are converted by us, so that SQL and query say the same."""
+    kinds = {column.name: column.type for column in schema.columns}
+    return any(
+        column.type != kinds[column.name] and "string" in kinds[column.name]
+        for version in catalogue.schemas[schema.item]
+        for column in version.columns
+    )
+
+
+def _steps(clock: ClockPoints) -> ClockPoints:
+    """Leave out points that change nothing: most files have one offset from end to end."""
+    kept = clock[:1]
+    for point in clock[1:]:
+        if point[1] != kept[-1][1]:
+            kept = (*kept, point)
+    return kept if len(kept) > 1 else ((0, kept[0][1]),)
+
+
+def _columns(schema: TableSchema, version: TableSchema, steps: ClockPoints) -> list[str]:
+    received = f"make_timestamp_ns(log_time + {_offset(steps)})"
+    stamp = '"timestamp"::TIMESTAMP_NS' if schema.stamp else received
+    return [
+        f'{stamp} AS "timestamp"',
+        *(_column(column, version) for column in schema.columns),
+        f'{received} AS "received"',
+        _name(seq_name(schema)),
+    ]
+
+
+def _offset(steps: ClockPoints) -> str:
+    if len(steps) == 1:
+        return str(steps[0][1])
+    cases = " ".join(f"WHEN log_time >= {at} THEN {offset}" for at, offset in reversed(steps[1:]))
+    return f"CASE {cases} ELSE {steps[0][1]} END"
+
+
+def _column(column: Column, version: TableSchema) -> str:
+    known = version.column(column.name)
+    if known is None:
+        return f"NULL::{_sql_type(column.type)} AS {_name(column.name)}"
+    stored = _name(stored_name(column.name))
+    if known.type != column.type:
+        stored = f"{stored}::{_sql_type(column.type)}"
+    return f"{stored} AS {_name(column.name)}"
+
+
+def _sql_type(column_type: str) -> str:
+    inner = element_type(column_type)
+    if inner is not None:
+        return f"{_sql_type(inner)}[]"
+    return _TYPES.get(column_type, "TIMESTAMP_NS")
+
+
+def _name(name: str) -> str:
+    return '"' + name.replace('"', '""') + '"'
+
+
+def _quoted(text: str) -> str:
+    return "'" + text.replace("'", "''") + "'"
+
+
+def _journal_rows(
+    catalogue: Catalogue, schema: TableSchema, *, also_segments: bool
+) -> pa.Table | None:
+    """Return the rows that no segment serves, as an Arrow table with the view's columns."""
+    names = [column.name for column in schema.columns]
+    request = Request(schema.item, names)
+    found = gather(catalogue, request) if also_segments else from_journals(catalogue, request)
+    if not found.pieces and not also_segments:
+        return None
+    rows = merge(found.pieces, schema, names, "received")
+    seq = seq_name(schema)
+    fields = (
+        Column("timestamp", "timestamp", "time"),
+        *schema.columns,
+        Column("received", "received", "time"),
+        Column(seq, seq, "int64"),
+    )
+    keys: dict[str, ColumnData] = {"received": rows.received_ns, seq: rows.seq}
+    columns = {"timestamp": rows.timestamp_ns, **rows.columns, **keys}
+    return _without_zone(Table(schema.item, fields, columns).to_arrow())
+
+
+def _without_zone(table: pa.Table) -> pa.Table:
+    """Make times plain UTC, as the segments' are in the views."""
+    import pyarrow as pa
+
+    plain = pa.timestamp("ns")
+    kinds = [plain if pa.types.is_timestamp(f.type) else f.type for f in table.schema]
+    return table.cast(pa.schema(list(zip(table.schema.names, kinds, strict=True))))
+
+
+def _to_table(answer: pa.Table) -> Table:
+    """Turn DuckDB's answer into a table; what we have no type for becomes text."""
+    fields, columns = [], {}
+    for name, array in zip(_distinct(answer.column_names), answer.columns, strict=True):
+        kind, known = _known(array)
+        fields.append(Column(name, name, kind))
+        columns[name] = from_arrow(known, kind)
+    return Table("sql", tuple(fields), columns)
+
+
+def _distinct(names: Sequence[str]) -> list[str]:
+    """Tell columns of the same name apart: ``a``, ``a_2``."""
+    seen: dict[str, int] = {}
+    distinct = []
+    for name in names:
+        seen[name] = seen.get(name, 0) + 1
+        distinct.append(name if seen[name] == 1 else f"{name}_{seen[name]}")
+    return distinct
+
+
+def _known(array: pa.ChunkedArray) -> tuple[str, pa.ChunkedArray]:
+    import pyarrow as pa
+
+    kind = array.type
+    if pa.types.is_timestamp(kind):
+        return "time", array.cast(pa.timestamp("ns"))
+    if pa.types.is_decimal(kind):
+        return _decimal(array)
+    if pa.types.is_list(kind):
+        inner, _ = _known(pa.chunked_array([], kind.value_type))
+        if array.type == arrow_type(f"list<{inner}>"):
+            return f"list<{inner}>", array
+    for name in (*NUMPY_TYPES, "string", "binary"):
+        if kind == arrow_type(name):
+            return name, array
+    texts = [None if value is None else str(value) for value in array.to_pylist()]
+    return "string", pa.chunked_array([pa.array(texts, pa.string())])
+
+
+def _decimal(array: pa.ChunkedArray) -> tuple[str, pa.ChunkedArray]:
+    """DuckDB sums integers in 128 bits: give them back as integers where they fit."""
+    import pyarrow as pa
+
+    if array.type.scale == 0:
+        try:
+            return "int64", array.cast(pa.int64())
+        except pa.ArrowInvalid:
+            return "float64", array.cast(pa.float64())
+    return "float64", array.cast(pa.float64())

@@ -1,0 +1,95 @@
+"""A table: what a query gives; named, typed columns that go to Arrow, pandas, polars or a file."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import IO, TYPE_CHECKING, Any
+
+from amberbox.blackbox.query import tabletext
+from amberbox.blackbox.segments import columns as col
+from amberbox.core.types import Column, ColumnData
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import polars as pl
+    import pyarrow as pa
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Table:
+    """Rows in order of time. ``fields`` say what each column is (type, unit, labels).
+
+    A column is a numpy array, a masked array where values may be null, an object array of
+    strings or bytes, or ``Ragged`` for lists. Times are int64 nanoseconds since the Unix epoch.
+    ``notes`` name what could not be read.
+    """
+
+    item: str
+    fields: tuple[Column, ...]
+    columns: Mapping[str, ColumnData]
+    notes: tuple[str, ...] = field(default=())
+
+    def __len__(self) -> int:
+        return len(next(iter(self.columns.values()), ()))
+
+    def __getitem__(self, name: str) -> ColumnData:
+        return self.columns[name]
+
+    def __repr__(self) -> str:
+        return tabletext.preview(self.item, self.fields, self.columns, len(self))
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the columns."""
+        return [column.name for column in self.fields]
+
+    def take(self, rows: col.RowIndex) -> Table:
+        """Return the given rows."""
+        columns = {name: col.take(column, rows) for name, column in self.columns.items()}
+        return Table(self.item, self.fields, columns, self.notes)
+
+    def values(self, name: str) -> list[Any]:
+        """Return a column as plain Python values; times as int, nulls as None."""
+        return tabletext.plain(self.columns[name])
+
+    def rows(self) -> Iterator[dict[str, Any]]:
+        """Give each row as plain Python values; times as int, nulls as None."""
+        for row in zip(*map(self.values, self.names), strict=True):
+            yield dict(zip(self.names, row, strict=True))
+
+    def to_arrow(self) -> pa.Table:
+        """Return a pyarrow Table; times are ``timestamp[ns, UTC]``."""
+        import pyarrow as pa
+
+        from amberbox.blackbox.segments.columns_io import to_arrow
+
+        arrays = [to_arrow(self.columns[f.name], f.type) for f in self.fields]
+        return pa.Table.from_arrays(arrays, names=self.names)
+
+    def to_pandas(self) -> pd.DataFrame:
+        """Return a pandas DataFrame."""
+        return self.to_arrow().to_pandas()
+
+    def to_polars(self) -> pl.DataFrame:
+        """Return a polars DataFrame."""
+        import polars as pl
+
+        frame = pl.from_arrow(self.to_arrow())
+        assert isinstance(frame, pl.DataFrame)
+        return frame
+
+    def to_csv(self, file: IO[str], *, header: bool = True) -> None:
+        """Write comma-separated values: times as RFC 3339, nulls empty, lists as JSON."""
+        tabletext.write_csv(file, self.fields, self.columns, header=header)
+
+    def to_json(self, file: IO[str], *, lines: bool = False) -> None:
+        """Write a JSON array of objects, or one object per line; times as RFC 3339 strings."""
+        tabletext.write_json(file, self.fields, self.columns, lines=lines)
+
+    def to_parquet(self, path: Path | str) -> None:
+        """Write a Parquet file (zstd)."""
+        import pyarrow.parquet as pq
+
+        pq.write_table(self.to_arrow(), str(path), compression="zstd")

@@ -1,0 +1,171 @@
+"""Columns as text: CSV, JSON, and tables for the eye."""
+
+from __future__ import annotations
+
+import base64
+import csv
+import json
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import IO, Any
+
+import numpy as np
+
+from amberbox.blackbox.segments import columns as col
+from amberbox.core.timetext import format_times
+from amberbox.core.types import Column, ColumnData, Ragged
+
+_CHUNK = 10_000
+_EDGE_ROWS = 5
+_CELL_WIDTH = 40
+_STEADY_WIDTH = 14
+_STEADY_WIDTHS = {"time": 30, "bool": 5, "string": 20}
+
+Fields = Sequence[Column]
+Columns = Mapping[str, ColumnData]
+
+
+def plain(column: ColumnData) -> list[Any]:
+    """Return a column as Python values; nulls are None, lists are lists."""
+    if isinstance(column, Ragged):
+        return [column[row].tolist() for row in range(len(column))]
+    listed: list[Any] = column.tolist()
+    if column.dtype == object:
+        return [v.tolist() if isinstance(v, np.ndarray) else v for v in listed]
+    return listed
+
+
+def speakable(column: ColumnData, column_type: str) -> list[Any]:
+    """Return a column as JSON has it: times RFC 3339, binary base64, NaN and inf as text."""
+    if column_type in ("time", "list<time>"):
+        column = _times(column)
+    values = plain(column)
+    if "float" in column_type:
+        return [_finite(value) for value in values]
+    return [_base64(value) for value in values] if "binary" in column_type else values
+
+
+def _times(column: ColumnData) -> ColumnData:
+    if isinstance(column, Ragged):
+        return Ragged(column.offsets, format_times(column.values).astype(object))
+    if column.dtype == object:
+        return col.objects(None if v is None else format_times(v).tolist() for v in column)
+    texts = format_times(np.ma.getdata(column)).astype(object)
+    texts[col.null_mask(column)] = None
+    return texts
+
+
+def _finite(value: Any) -> Any:
+    """JSON has no NaN and no infinity: they become the words that ``float`` reads."""
+    if isinstance(value, list):
+        return [_finite(element) for element in value]
+    if value is None or math.isfinite(value):
+        return value
+    return "NaN" if math.isnan(value) else "Infinity" if value > 0 else "-Infinity"
+
+
+def _base64(value: Any) -> Any:
+    if isinstance(value, list):
+        return [_base64(element) for element in value]
+    return base64.b64encode(value).decode() if isinstance(value, bytes) else value
+
+
+def write_csv(file: IO[str], fields: Fields, columns: Columns, *, header: bool = True) -> None:
+    """Write CSV with a header line; a list stands as JSON in its cell."""
+    writer = csv.writer(file, lineterminator="\n")
+    if header:
+        writer.writerow([column.name for column in fields])
+    for chunk in _chunks(fields, columns):
+        writer.writerows(zip(*(map(_cell, column) for column in chunk), strict=True))
+
+
+def _cell(value: Any) -> Any:
+    if isinstance(value, list):
+        return json.dumps(value)
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    return value
+
+
+def _chunks(fields: Fields, columns: Columns) -> Iterator[list[list[Any]]]:
+    count = len(columns[fields[0].name]) if fields else 0
+    for start in range(0, count, _CHUNK):
+        rows = slice(start, start + _CHUNK)
+        yield [speakable(col.take(columns[f.name], rows), f.type) for f in fields]
+
+
+def write_json(file: IO[str], fields: Fields, columns: Columns, *, lines: bool = False) -> None:
+    """Write one object per row, in an array or one per line."""
+    names = [column.name for column in fields]
+    separator, first = ("", "") if lines else (",\n", "[")
+    for chunk in _chunks(fields, columns):
+        for row in zip(*chunk, strict=True):
+            file.write(first + json.dumps(dict(zip(names, row, strict=True))))
+            file.write("\n" if lines else "")
+            first = separator
+    if not lines:
+        file.write("[]\n" if first == "[" else "]\n")
+
+
+def grid(
+    header: Sequence[str],
+    rows: Iterable[Sequence[Any]],
+    *,
+    with_header: bool = True,
+    least_widths: Sequence[int] = (),
+) -> str:
+    """Lay out cells in columns; numbers to the right, the rest to the left."""
+    table = [[_shown(value) for value in row] for row in rows]
+    numeric = [_is_number(cells) for cells in zip(*table, strict=True)] or [False] * len(header)
+    widths = [max(map(len, cells)) for cells in zip(header, *table, strict=True)]
+    if least_widths:
+        widths = [max(pair) for pair in zip(widths, least_widths, strict=True)]
+    lines = [_line(row, widths, numeric) for row in table]
+    if with_header:
+        lines = [_line(header, widths, numeric), "  ".join("-" * w for w in widths), *lines]
+    return "\n".join(lines)
+
+
+def _line(cells: Sequence[str], widths: Sequence[int], right: Sequence[bool]) -> str:
+    aligned = [
+        cell.rjust(width) if number else cell.ljust(width)
+        for cell, width, number in zip(cells, widths, right, strict=True)
+    ]
+    return "  ".join(aligned).rstrip()
+
+
+def _shown(value: Any) -> str:
+    if value is None:
+        return "-"
+    text = f"{value:.9g}" if isinstance(value, float) else str(_cell(value))
+    text = text.replace("\n", "\\n")
+    return text if len(text) <= _CELL_WIDTH else text[: _CELL_WIDTH - 3] + "..."
+
+
+def _is_number(cells: Sequence[str]) -> bool:
+    return all(cell in ("-", "nan", "NaN") or cell.lstrip("-+")[:1].isdigit() for cell in cells)
+
+
+def write_grid(
+    file: IO[str], fields: Fields, columns: Columns, *, header: bool = True, steady: bool = False
+) -> None:
+    """Write all rows as a table for the eye; ``steady`` keeps widths alike from call to call."""
+    titles = [f"{c.name} [{c.unit}]" if c.unit else c.name for c in fields]
+    rows = (row for chunk in _chunks(fields, columns) for row in zip(*chunk, strict=True))
+    widths = [_STEADY_WIDTHS.get(c.type, _STEADY_WIDTH) for c in fields] if steady else ()
+    file.write(grid(titles, rows, with_header=header, least_widths=widths) + "\n")
+
+
+def preview(item: str, fields: Fields, columns: Columns, count: int) -> str:
+    """Show the first and last rows of a table."""
+    if count <= 2 * _EDGE_ROWS:
+        shown = np.arange(count)
+    else:
+        shown = np.r_[0:_EDGE_ROWS, count - _EDGE_ROWS : count]
+    cells = [speakable(col.take(columns[f.name], shown), f.type) for f in fields]
+    text = grid([column.name for column in fields], zip(*cells, strict=True))
+    if len(shown) < count:
+        lines = text.splitlines()
+        lines.insert(2 + _EDGE_ROWS, "...")
+        text = "\n".join(lines)
+    return f"{item}: {count} rows\n{text}"

@@ -1,0 +1,187 @@
+"""Import recordings: the same pipeline as live data, on the recording's own time."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from amberbox.blackbox.follow import read
+from amberbox.blackbox.formats.open import open_recording
+from amberbox.blackbox.formats.recording import Recording
+from amberbox.blackbox.keeper import seal
+from amberbox.blackbox.recorder.pipeline import Pipeline, PipelineOptions
+from amberbox.blackbox.recorder.sink import BlockSink
+from amberbox.blackbox.store import Store, create_store
+from amberbox.core.errors import AmberboxError
+from amberbox.core.source import TopicOptions
+
+TICK_BYTES = 1 << 20
+SOURCE = "ros"
+"""Source name of imported items: the same item names as if the robot had been recorded live."""
+
+Progress = Callable[[float], None]
+
+
+@dataclass
+class RecordedClock:
+    """Time inside a recording: that of the newest message read."""
+
+    at_ns: int = 0
+
+    def now_ns(self) -> int:
+        return self.at_ns
+
+    def offset_ns(self) -> int:
+        return 0
+
+    def new_epoch(self) -> None:
+        """Do nothing: time inside a recording does not step."""
+
+    def synchronised(self) -> bool | None:
+        return None
+
+
+@dataclass
+class ImportReport:
+    """What an import did with one input."""
+
+    path: Path
+    messages: int = 0
+    items: dict[str, int] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+    damage: list[str] = field(default_factory=list)
+    known: bool = False
+
+    def lines(self) -> list[str]:
+        """Write the report for a person."""
+        if self.known:
+            return [f"{self.path}: is in the store already, nothing was done"]
+        counts = [f"  {item}: {count}" for item, count in sorted(self.items.items())]
+        damage = [f"  damaged: {text}" for text in self.damage]
+        notes = [f"  note: {text}" for text in self.notes]
+        return [f"{self.path}: {self.messages} messages", *counts, *damage, *notes]
+
+
+def import_recordings(
+    paths: Sequence[Path],
+    store_path: Path,
+    *,
+    topics: Sequence[TopicOptions] = (),
+    source: str = SOURCE,
+    progress: Progress = lambda fraction: None,
+    segments: bool = True,
+) -> list[ImportReport]:
+    """Import recordings into a store, one run each; one that is there already is left out.
+
+    Log times are the recording's own, stamps stay with the messages. Raises AmberboxError when
+    an input cannot be read or the store not written.
+    """
+    store = create_store(store_path)
+    known = _inputs(store)
+    reports = []
+    for path in paths:
+        digest = digest_of(path)
+        if digest in known:
+            reports.append(ImportReport(path, known=True))
+            continue
+        reports.append(_import(path, store, digest, topics, source, progress))
+        known.add(digest)
+    if segments:
+        seal(store)
+    return reports
+
+
+def _import(
+    path: Path,
+    store: Store,
+    digest: str,
+    topics: Sequence[TopicOptions],
+    source: str,
+    progress: Progress,
+) -> ImportReport:
+    with open_recording(path) as recording:
+        return _copy_all(recording, path, store, digest, topics, source, progress)
+
+
+def _copy_all(
+    recording: Recording,
+    path: Path,
+    store: Store,
+    digest: str,
+    topics: Sequence[TopicOptions],
+    source: str,
+    progress: Progress,
+) -> ImportReport:
+    clock = RecordedClock(recording.report.start_ns or 0)
+    options = PipelineOptions(
+        robot=path.stem, boot_id=digest[:8], input=digest, queue_bytes=1 << 40, counts_silence=False
+    )
+    pipeline = Pipeline(store, clock, options)
+    pipeline.event("imported", f"import of {path.name}", source, sha256=digest)
+    sink = BlockSink(pipeline, source, topics, lossless=True)
+    chosen = {option.name for option in topics}
+    try:
+        _copy(recording, pipeline, sink, clock, chosen, progress)
+    finally:
+        pipeline.close()
+    items = {name: item.counters.kept for name, item in pipeline.items.items()}
+    report = recording.report
+    return ImportReport(
+        path, sum(items.values()), items, list(report.notes), [str(d) for d in report.damage]
+    )
+
+
+def _copy(
+    recording: Recording,
+    pipeline: Pipeline,
+    sink: BlockSink,
+    clock: RecordedClock,
+    chosen: set[str],
+    progress: Progress,
+) -> None:
+    streams: dict[int, int] = {}
+    start_ns, end_ns = recording.report.start_ns or 0, recording.report.end_ns or 0
+    for index, log_ns, _, data in recording.messages():
+        if index not in streams:
+            topic = recording.topics[index]
+            streams[index] = sink.topic(topic) if not chosen or topic.name in chosen else -1
+        if streams[index] < 0:
+            continue
+        clock.at_ns = max(clock.at_ns, log_ns)
+        sink.message(streams[index], data, log_ns)
+        if pipeline.intake.size_bytes >= TICK_BYTES:
+            _tick(pipeline)
+            progress((log_ns - start_ns) / max(end_ns - start_ns, 1))
+    _tick(pipeline)
+    progress(1.0)
+
+
+def _tick(pipeline: Pipeline) -> None:
+    pipeline.tick()
+    if pipeline.disk_error:
+        raise AmberboxError(
+            f"the store {pipeline.store.path} does not take data: {pipeline.disk_error}",
+            "make room or choose another store, then import again",
+        )
+
+
+def digest_of(path: Path) -> str:
+    """SHA-256 of a recording: of the file, or of all files of a folder with their names."""
+    if not path.exists():
+        raise AmberboxError(f"there is no recording at {path}", "check the path")
+    files = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
+    total = hashlib.sha256()
+    for file in files:
+        if path.is_dir():
+            total.update(file.relative_to(path).as_posix().encode() + b"\0")
+        with file.open("rb") as opened:
+            total.update(hashlib.file_digest(opened, "sha256").digest())
+    return total.hexdigest()
+
+
+def _inputs(store: Store) -> set[str]:
+    """Digests of what was imported before and finished."""
+    files = read.journals(store.path)
+    return {str(read.run_messages(f).get("input") or "") for f in files if f.finished} - {""}

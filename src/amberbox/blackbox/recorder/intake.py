@@ -1,0 +1,68 @@
+"""The recorder's queue: bounded, never in a source's way, every drop counted."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import dataclass, field
+
+from amberbox.blackbox.recorder.streams import Stream
+
+_OVERHEAD = 120
+"""Bytes a queued message takes beside its payload."""
+
+
+@dataclass
+class Intake:
+    """Holds messages between the sources' threads and the writer."""
+
+    limit_bytes: int
+    wake: threading.Event = field(default_factory=threading.Event)
+
+    def __post_init__(self) -> None:
+        self._room = threading.Condition()
+        self._queue: list[tuple[Stream, bytes, int]] = []
+        self._bytes = 0
+        self._waiting_bytes = 0
+
+    def put(self, stream: Stream, data: bytes, received_ns: int) -> None:
+        """Take a message, or drop and count it when the queue is full. Never waits."""
+        size = len(data) + _OVERHEAD
+        with self._room:
+            stream.counters.received += 1
+            stream.counters.last_received_ns = received_ns
+            if self._bytes + self._waiting_bytes + size > self.limit_bytes:
+                stream.drop(received_ns)
+                return
+            self._bytes += size
+            self._queue.append((stream, data, received_ns))
+
+    def put_waiting(self, stream: Stream, data: bytes, received_ns: int) -> None:
+        """Take a message of a file: wait for room instead of dropping."""
+        size = len(data) + _OVERHEAD
+        with self._room:
+            while self._queue and self._bytes + self._waiting_bytes + size > self.limit_bytes:
+                self.wake.set()
+                self._room.wait(1.0)
+            stream.counters.received += 1
+            stream.counters.last_received_ns = received_ns
+            self._bytes += size
+            self._queue.append((stream, data, received_ns))
+
+    @property
+    def size_bytes(self) -> int:
+        """Bytes that wait, the ones being written included."""
+        return self._bytes + self._waiting_bytes
+
+    def take(self) -> list[tuple[Stream, bytes, int]]:
+        """Take everything off the queue; its bytes count until ``release``."""
+        with self._room:
+            taken, self._queue = self._queue, []
+            self._waiting_bytes += self._bytes
+            self._bytes = 0
+        return taken
+
+    def release(self) -> None:
+        """Say that what was taken has been written."""
+        with self._room:
+            self._waiting_bytes = 0
+            self._room.notify_all()

@@ -1,0 +1,113 @@
+"""What a source sees of the recorder: topics become items, messages go into the queue."""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from amberbox.blackbox.follow import read
+from amberbox.blackbox.recorder.pipeline import Pipeline
+from amberbox.blackbox.recorder.streams import Stream
+from amberbox.blackbox.store import replace_file
+from amberbox.core.source import TopicOptions
+from amberbox.core.types import Topic
+
+INFERRED = ("json", "msgpack")
+
+
+class BlockSink:
+    """The sink of one configured block."""
+
+    def __init__(
+        self, pipeline: Pipeline, name: str, topics: Sequence[TopicOptions], *, lossless: bool
+    ) -> None:
+        self._pipeline = pipeline
+        self._name = name
+        self._options = {options.name: options for options in topics}
+        self._streams: list[Stream] = []
+        self._numbers: dict[Topic, int] = {}
+        self._lock = threading.Lock()
+        self._put = pipeline.intake.put_waiting if lossless else pipeline.intake.put
+        self.now_ns = pipeline.clock.now_ns
+
+    def expect_topics(self) -> None:
+        """Open the gap of each configured topic: nothing of it is heard yet."""
+        for options in self._options.values():
+            item = self._pipeline.item(self._name, options.name, options)
+            if options.keep != "none":
+                self._pipeline.gaps.expect(item.name, "publisher not connected yet")
+
+    def topic(self, topic: Topic) -> int:
+        with self._lock:
+            if topic not in self._numbers:
+                self._streams.append(self._new_stream(topic))
+                self._numbers[topic] = len(self._streams) - 1
+            return self._numbers[topic]
+
+    def message(self, stream: int, data: bytes, received_ns: int) -> None:
+        self._put(self._streams[stream], data, received_ns)
+
+    def link_up(self, topic: str, peer: str, since_ns: int | None = None) -> None:
+        self._pipeline.gaps.up(self._item(topic), peer, self.now_ns(), since_ns)
+
+    def link_down(self, topic: str, peer: str, reason: str, since_ns: int | None = None) -> None:
+        at_ns = self.now_ns() if since_ns is None else since_ns
+        self._pipeline.gaps.down(self._item(topic), peer, at_ns, reason)
+
+    def event(self, kind: str, text: str, **details: Any) -> None:
+        self._pipeline.event(kind, text, self._name, **details)
+
+    def last_latched(self, topic: str) -> bytes | None:
+        item = self._pipeline.items.get(self._item(topic))
+        if item is None:
+            return None
+        if item.last_latched is None:
+            item.last_latched = read.last_message(self._pipeline.store.path, item.name)
+        return item.last_latched
+
+    def state(self) -> dict[str, Any]:
+        try:
+            values = json.loads(self._state_file().read_text())
+        except (OSError, ValueError):  # none yet; or torn, then the source finds out anew
+            return {}
+        return values if isinstance(values, dict) else {}
+
+    def save_state(self, state: Mapping[str, Any]) -> None:
+        path = self._state_file()
+        path.parent.mkdir(exist_ok=True)
+        replace_file(path, json.dumps(state))
+
+    def _state_file(self) -> Path:
+        return self._pipeline.store.path / "state" / f"{self._name}.json"
+
+    def _item(self, topic: str) -> str:
+        options = self._options.get(topic) or TopicOptions(name=topic)
+        return self._pipeline.item(self._name, topic, options).name
+
+    def _new_stream(self, topic: Topic) -> Stream:
+        item = self._pipeline.items[self._item(topic.name)]
+        infers = topic.message_encoding in INFERRED
+        if infers:  # what is really sent counts, not what was declared
+            topic = replace(topic, schema=None)
+        stream = Stream(item, topic, infers=infers)
+        known = [s for s in self._streams if s.item is item]
+        if known and not stream.infers:
+            self._tell_of_change(known[-1].topic, topic, item.name)
+        wrong = "" if stream.infers else stream.compile()
+        if wrong:
+            self.event(
+                "undecodable", f"{item.name}: {wrong}; raw messages are kept", item=item.name
+            )
+        return stream
+
+    def _tell_of_change(self, old: Topic, new: Topic, item: str) -> None:
+        before = old.schema.name if old.schema else old.message_encoding
+        after = new.schema.name if new.schema else new.message_encoding
+        text = f"{item}: the definition changed from {before} to {after}"
+        if before == after:
+            text = f"{item}: the definition of {after} changed"
+        self.event("type_changed", text, item=item, before=before, after=after)

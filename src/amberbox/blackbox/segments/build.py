@@ -1,0 +1,345 @@
+"""Turn sealed journals into Parquet segments, join small ones, and rebuild the manifest."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from amberbox.blackbox.follow.read import JournalFile, batches_of, run_messages
+from amberbox.blackbox.journal.clocktable import ClockTable
+from amberbox.blackbox.segments import manifest as mf
+from amberbox.blackbox.segments.flat import Flat, TableSchema, flatten, join
+from amberbox.blackbox.segments.manifest import Part, Segment
+from amberbox.blackbox.segments.parquet import TableFile, describe, read_segment
+from amberbox.core.errors import AmberboxError
+from amberbox.core.types import ColumnData, Gap, IntArray, Ragged
+
+FOLDER = "segments"
+GROUP_ROWS = 60_000
+_GROUP_BYTES = 16 << 20
+SMALL_ROWS = 6_000
+_MERGED_BYTES = 64 << 20
+MERGE_COUNT = 6
+_SIZED_ROWS = 16
+
+
+def can_build() -> bool:
+    """Tell whether segments can be written and read here (pyarrow is installed)."""
+    return importlib.util.find_spec("pyarrow") is not None
+
+
+@dataclass
+class _TableBuilder:
+    """Collects one table's rows of one journal and writes them in row groups."""
+
+    file: TableFile
+    waiting: list[Flat] = field(default_factory=list)
+    rows: int = 0
+    bytes: int = 0
+    bounds: list[tuple[int, ...]] = field(default_factory=list)
+    ages: list[IntArray] = field(default_factory=list)
+
+    def add(self, flat: Flat) -> None:
+        self.waiting.append(flat)
+        self.rows += len(flat)
+        self.bytes += sum(_size(column) for column in flat.columns.values())
+        self.bounds.append(_bounds(flat))
+        if flat.schema.stamp:
+            self.ages.append(flat.received_ns - flat.timestamp_ns)
+        if self.rows >= GROUP_ROWS or self.bytes >= _GROUP_BYTES:
+            self.write()
+
+    def write(self) -> None:
+        if self.waiting:
+            self.file.write(join(self.waiting))
+        self.waiting, self.rows, self.bytes = [], 0, 0
+
+    def finish(self, journal: JournalFile, files: int, size: int) -> Segment:
+        self.write()
+        lows = np.min([bound[0::2] for bound in self.bounds], axis=0).tolist()
+        highs = np.max([bound[1::2] for bound in self.bounds], axis=0).tolist()
+        part = Part(
+            journal.name, journal.chain, journal.writer, journal.run, lows[0], highs[0],
+            self.file.rows, lows[1], highs[1], lows[2], highs[2], files, size,
+            median(self.ages), tuple(journal.clock),
+        )  # fmt: skip
+        return self.file.finish([part])
+
+
+def median(ages: Sequence[IntArray]) -> int | None:
+    """Return the median of received minus stamp; None without stamps."""
+    return int(np.median(np.concatenate(ages))) if ages else None
+
+
+def _bounds(flat: Flat) -> tuple[int, ...]:
+    keys = (flat.seq, flat.log_time_ns, flat.timestamp_ns)
+    return tuple(int(edge) for key in keys for edge in (key.min(), key.max()))
+
+
+def _size(column: ColumnData) -> int:
+    if isinstance(column, Ragged):
+        return column.offsets.nbytes + _size(column.values)
+    if column.dtype != object:
+        return column.nbytes
+    sample = column[:: max(len(column) // _SIZED_ROWS, 1)]
+    known = [len(value) for value in sample if value is not None]
+    return len(column) * (64 + sum(known) // max(len(sample), 1))
+
+
+def build_segments(store: Path, journal: JournalFile) -> list[Segment]:
+    """Write a sealed journal's rows as one Parquet file per table and enter them in the manifest.
+
+    A journal that is in the manifest already is left alone. A crash on the way leaves files that
+    the next call overwrites; readers use the journal until its entries are durable. What cannot
+    be decoded is entered as gaps.
+    """
+    known = mf.read(store)
+    if journal.name in known.journals:
+        return []
+    gaps: list[Gap] = []
+    sizes: dict[str, int] = {}
+    builders: dict[TableSchema, _TableBuilder] = {}
+    try:
+        for flat in _flats(known, journal, gaps, sizes):
+            _builder(builders, store, journal, flat.schema).add(flat)
+        segments = _finish(builders, journal, sizes)
+    finally:
+        for builder in builders.values():
+            builder.file.discard()
+    new = [schema for schema in builders if schema.id not in known.schemas]
+    records = [mf.schema_record(schema) for schema in new]
+    records += [mf.segment_record(segment) for segment in segments]
+    done = _done(journal, gaps)
+    mf.append(store, [*records, mf.journal_record(done)])
+    return segments
+
+
+def _done(journal: JournalFile, gaps: Sequence[Gap]) -> mf.Journal:
+    edges = np.array([journal.start_ns, journal.end_ns])
+    start_ns, end_ns = ClockTable(journal.clock).received(edges).tolist()
+    return mf.Journal(
+        journal.name, journal.chain, journal.writer, journal.run, journal.first_seq,
+        journal.end_seq, start_ns, end_ns, tuple(gaps), selection_of(journal),
+    )  # fmt: skip
+
+
+def _finish(
+    builders: Mapping[TableSchema, _TableBuilder], journal: JournalFile, sizes: dict[str, int]
+) -> list[Segment]:
+    files = Counter(schema.item for schema in builders)
+    segments = []
+    for schema, builder in builders.items():
+        size = sizes.pop(schema.item, 0)  # once, should there be several versions
+        segments.append(builder.finish(journal, files[schema.item], size))
+    return segments
+
+
+def selection_of(journal: JournalFile) -> dict[str, list[str]]:
+    """Return the variables that were configured for a journal's items."""
+    items = json.loads(run_messages(journal).get("items") or "{}")
+    chosen = {item: options.get("variables") for item, options in items.items()}
+    return {item: list(names) for item, names in chosen.items() if names}
+
+
+def _flats(
+    known: mf.Manifest, journal: JournalFile, gaps: list[Gap], sizes: dict[str, int]
+) -> Iterator[Flat]:
+    """Give the rows that are not in a segment yet (all of them, but after a rebuild)."""
+    items = set()
+    for stream in journal.streams.values():
+        try:
+            stream.unroller()
+            items.add(stream.item)
+        except AmberboxError as error:
+            gaps.append(_kept_raw(journal, stream.item, error.what))
+    for batch in batches_of(journal, items, on_gap=gaps.append, sizes=sizes):
+        for flat in flatten(batch):
+            if len(flat) and journal.name not in known.complete(flat.schema.item):
+                yield flat
+
+
+def _kept_raw(journal: JournalFile, item: str, reason: str) -> Gap:
+    reason = f"no columns, only in {journal.name}: {reason}"
+    count = journal.items.get(item)
+    return Gap(
+        journal.writer, journal.run, journal.start_ns, journal.end_ns + 1, reason, item, count
+    )
+
+
+def _builder(
+    builders: dict[TableSchema, _TableBuilder],
+    store: Path,
+    journal: JournalFile,
+    schema: TableSchema,
+) -> _TableBuilder:
+    if schema not in builders:
+        version = 1 + sum(other.item == schema.item for other in builders)
+        path = _path(schema.item, journal.name, version)
+        builders[schema] = _TableBuilder(TableFile(store, path, schema))
+    return builders[schema]
+
+
+def _path(item: str, journal: str, version: int) -> str:
+    folder, _, name = journal.rpartition("/")
+    writer = "" if folder in ("", "journal") else f"{folder}-"
+    number = f".{version}" if version > 1 else ""
+    return f"{FOLDER}/{item}/{writer}{Path(name).stem}{number}.parquet"
+
+
+def merge_small(store: Path) -> list[Segment]:
+    """Join neighbouring small segments, so that slow items do not fill the disk with files.
+
+    Whenever 6 segments of one table (one hour at 10 minutes each) of fewer than 6,000 rows
+    stand side by side, they become one. What was joined is deleted once the manifest says so.
+    """
+    known = mf.read(store)
+    merged = []
+    for item in known.segments:
+        for group in _small_groups(known.segments[item]):
+            merged.append(_merge(store, known.schemas[group[0].schema], group))
+    return merged
+
+
+def _small_groups(segments: Sequence[Segment]) -> Iterator[list[Segment]]:
+    """Find runs of small segments of one writer and schema whose log time only grows."""
+    group: list[Segment] = []
+    for segment in sorted(segments, key=_order):
+        if not (group and _may_follow(group, segment)):
+            if len(group) >= MERGE_COUNT:
+                yield group
+            group = []
+        if segment.rows < SMALL_ROWS and segment.bytes < _MERGED_BYTES:
+            group.append(segment)
+    if len(group) >= MERGE_COUNT:
+        yield group
+
+
+def _order(segment: Segment) -> tuple[str, int, int]:
+    first = segment.parts[0]
+    return first.writer, first.run, first.first_seq
+
+
+def _may_follow(group: Sequence[Segment], segment: Segment) -> bool:
+    last, first = group[-1].parts[-1], segment.parts[0]
+    same = group[-1].schema == segment.schema and last.writer == first.writer
+    size = sum(member.bytes for member in group) + segment.bytes
+    return same and last.to_ns < first.from_ns and size < _MERGED_BYTES
+
+
+def _merge(store: Path, schema: TableSchema, group: Sequence[Segment]) -> Segment:
+    first = Path(group[0].path)
+    stem = first.stem.partition("+")[0]
+    count = sum(len(segment.parts) for segment in group)
+    file = TableFile(store, str(first.with_name(f"{stem}+{count}.parquet")), schema)
+    names = {column.name for column in schema.columns}
+    flats = [flat for s in group for flat in read_segment(store, s, schema, names)]
+    try:
+        for start in _group_starts(flats):
+            file.write(start)
+        segment = file.finish([part for member in group for part in member.parts])
+    finally:
+        file.discard()
+    replaced = [member.path for member in group]
+    mf.append(store, [mf.segment_record(segment, replaced)])
+    for path in replaced:
+        (store / path).unlink(missing_ok=True)
+    return segment
+
+
+def _group_starts(flats: Sequence[Flat]) -> Iterator[Flat]:
+    """Join rows up to the size of a row group."""
+    waiting: list[Flat] = []
+    for flat in flats:
+        waiting.append(flat)
+        if sum(map(len, waiting)) >= GROUP_ROWS:
+            yield join(waiting)
+            waiting = []
+    if waiting:
+        yield join(waiting)
+
+
+def rebuild(store: Path) -> list[str]:
+    """Write the manifest anew from the segments' own metadata; return files that are no good.
+
+    Journals that still exist are not entered as done: ``build_segments`` then adds the tables
+    that a crash may have left out.
+    """
+    schemas: dict[str, TableSchema] = {}
+    segments: list[Segment] = []
+    bad: list[str] = []
+    for path in sorted((store / FOLDER).glob("*/*.parquet")):
+        name = str(path.relative_to(store))
+        try:
+            schema, segment = describe(store, name)
+        except (OSError, ValueError, KeyError, TypeError):
+            bad.append(name)
+            continue
+        schemas[schema.id] = schema
+        segments.append(segment)
+    kept = _without_replaced(segments)
+    records = [mf.schema_record(schema) for schema in schemas.values()]
+    records += [mf.segment_record(segment) for segment in kept]
+    records += [
+        mf.journal_record(journal)
+        for journal in _journals_of(kept)
+        if not (store / journal.name).exists()
+    ]
+    mf.replace(store, records)
+    return bad
+
+
+def _journals_of(segments: Sequence[Segment]) -> list[mf.Journal]:
+    """Tell from segments which journals they came from, and how far these reached."""
+    parts: dict[str, list[Part]] = {}
+    for part in (part for segment in segments for part in segment.parts):
+        parts.setdefault(part.journal, []).append(part)
+    return [
+        mf.Journal(
+            name, found[0].head, found[0].writer, found[0].run,
+            min(part.first_seq for part in found), 1 + max(part.last_seq for part in found),
+            min(part.from_ns for part in found), max(part.to_ns for part in found),
+        )
+        for name, found in parts.items()
+    ]  # fmt: skip
+
+
+def _without_replaced(segments: Sequence[Segment]) -> list[Segment]:
+    """Leave out segments whose rows are in a joined one too, as a crash may leave them."""
+    kept: list[Segment] = []
+    seen: set[tuple[str, str, str]] = set()
+    for segment in sorted(segments, key=lambda s: -len(s.parts)):
+        keys = {(segment.item, segment.schema, part.journal) for part in segment.parts}
+        if not keys <= seen:
+            kept.append(segment)
+            seen |= keys
+    return sorted(kept, key=_order)
+
+
+def remove_leftovers(store: Path) -> int:
+    """Delete temporary files and joined segments that a crash left behind."""
+    known = mf.read(store)
+    live = {segment.path for found in known.segments.values() for segment in found}
+    removed = 0
+    for path in (store / FOLDER).glob("*/*"):
+        name = str(path.relative_to(store))
+        covered = path.suffix == ".parquet" and name not in live and _is_merged(store, name, known)
+        if path.name.endswith(".tmp") or covered:
+            with suppress(OSError):
+                path.unlink()
+                removed += 1
+    return removed
+
+
+def _is_merged(store: Path, name: str, known: mf.Manifest) -> bool:
+    try:
+        _, segment = describe(store, name)
+    except (OSError, ValueError, KeyError, TypeError):
+        return False
+    return all(part.journal in known.complete(segment.item) for part in segment.parts)

@@ -1,0 +1,108 @@
+"""Columns between memory and Arrow, without losing a bit."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from amberbox.blackbox.segments import columns as col
+from amberbox.core.types import ColumnData, Ragged
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+_LARGEST_OFFSET = 2**31 - 1
+
+
+def arrow_type(column_type: str) -> pa.DataType:
+    """Return the Arrow type of a column; times are UTC, durations stay integer nanoseconds."""
+    import pyarrow as pa
+
+    inner = col.element_type(column_type)
+    if inner is not None:
+        return pa.list_(arrow_type(inner))
+    special = {
+        "time": pa.timestamp("ns", tz="UTC"),
+        "duration": pa.int64(),
+        "bool": pa.bool_(),
+        "string": pa.string(),
+        "binary": pa.binary(),
+    }
+    return special.get(column_type) or pa.from_numpy_dtype(col.numpy_type(column_type))
+
+
+def to_arrow(column: ColumnData, column_type: str) -> pa.Array:
+    """Turn a column into an Arrow array of the type that ``arrow_type`` says."""
+    import pyarrow as pa
+
+    if isinstance(column, Ragged):
+        return _list_array(column, column_type)
+    kind = arrow_type(column_type)
+    if column.dtype == object:
+        return pa.array(column.tolist(), type=kind)
+    if isinstance(column, np.ma.MaskedArray):
+        plain = np.ascontiguousarray(column.data)
+        array = pa.array(plain, mask=np.ma.getmaskarray(column))
+    else:
+        array = pa.array(np.ascontiguousarray(column))
+    return array if array.type == kind else _as_type(array, kind)
+
+
+def _as_type(array: pa.Array, kind: pa.DataType) -> pa.Array:
+    import pyarrow as pa
+
+    return array.view(kind) if pa.types.is_timestamp(kind) else array.cast(kind)
+
+
+def _list_array(column: Ragged, column_type: str) -> pa.Array:
+    import pyarrow as pa
+
+    lists = col.compact(column)
+    inner = col.element_type(column_type)
+    values = to_arrow(lists.values, inner or "binary")
+    if len(lists.values) > _LARGEST_OFFSET:
+        return pa.LargeListArray.from_arrays(pa.array(lists.offsets), values)
+    return pa.ListArray.from_arrays(pa.array(lists.offsets.astype(np.int32)), values)
+
+
+def from_arrow(array: pa.ChunkedArray | pa.Array, column_type: str) -> ColumnData:
+    """Turn an Arrow array back into the column that it was made of."""
+    import pyarrow as pa
+
+    chunks = array.chunks if isinstance(array, pa.ChunkedArray) else [array]
+    if not chunks:
+        return col.empty(column_type)
+    return col.concatenate([_from_chunk(chunk, column_type) for chunk in chunks])
+
+
+def _from_chunk(array: pa.Array, column_type: str) -> ColumnData:
+    import pyarrow as pa
+
+    inner = col.element_type(column_type)
+    if inner is not None:
+        return _from_list(array, inner)
+    if column_type not in col.NUMPY_TYPES:
+        return np.asarray(array.to_numpy(zero_copy_only=False), object)
+    if pa.types.is_timestamp(array.type):
+        array = array.view(pa.int64())
+    if array.null_count == 0:
+        return _numbers(array)
+    filled = array.fill_null(False if column_type == "bool" else 0)
+    return np.ma.masked_array(_numbers(filled), mask=~_numbers(array.is_valid()))
+
+
+def _numbers(array: pa.Array) -> NDArray[Any]:
+    return np.asarray(array.to_numpy(zero_copy_only=False))
+
+
+def _from_list(array: pa.Array, inner: str) -> ColumnData:
+    values = _from_chunk(array.values, inner)
+    assert not isinstance(values, Ragged)
+    lists = Ragged(_numbers(array.offsets).astype(np.int64), values)
+    if array.null_count == 0:
+        return lists
+    rows = col.lists_as_objects(lists)
+    rows[~_numbers(array.is_valid())] = None
+    return rows

@@ -1,0 +1,183 @@
+"""Flat tables: every item and every child table as rows of its own, with its own schema."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from amberbox.blackbox.segments import columns as col
+from amberbox.core.names import identifier
+from amberbox.core.types import Batch, Column, ColumnData, IntArray, ItemSchema
+
+
+@dataclass(frozen=True, slots=True)
+class TableSchema:
+    """What a table's columns are; stands in each segment and in the manifest.
+
+    ``parent`` is the item whose messages hold a child table: then ``seq`` is the message's, and
+    the first columns are ``index`` and, for a grandchild, ``parent_index``.
+    """
+
+    item: str
+    type: str
+    columns: tuple[Column, ...]
+    stamp: str = ""
+    parent: str = ""
+    topic: str = ""
+    source: str = ""
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the schema as plain data."""
+        names = ("item", "type", "stamp", "parent", "topic", "source")
+        return {name: getattr(self, name) for name in names} | {
+            "columns": [_column_to_json(column) for column in self.columns]
+        }
+
+    @classmethod
+    def from_json(cls, data: Mapping[str, Any]) -> TableSchema:
+        """Read what ``to_json`` returned."""
+        columns = tuple(_column_from_json(column) for column in data["columns"])
+        return cls(**{**data, "columns": columns})
+
+    @property
+    def id(self) -> str:
+        """Name the schema by what it says: 16 hex digits."""
+        return _schema_id(self)
+
+    def column(self, name: str) -> Column | None:
+        """Find a column by its exact name."""
+        return next((column for column in self.columns if column.name == name), None)
+
+    def __hash__(self) -> int:
+        return hash((self.item, self.type, len(self.columns)))
+
+
+def _column_to_json(column: Column) -> dict[str, Any]:
+    data: dict[str, Any] = {"name": column.name, "path": column.path, "type": column.type}
+    if column.unit:
+        data["unit"] = column.unit
+    if column.labels:
+        data["labels"] = {str(number): text for number, text in column.labels.items()}
+    return data
+
+
+def _column_from_json(data: Mapping[str, Any]) -> Column:
+    labels = {int(number): text for number, text in data.get("labels", {}).items()}
+    return Column(data["name"], data["path"], data["type"], data.get("unit", ""), labels)
+
+
+@lru_cache(maxsize=4096)
+def _schema_id(schema: TableSchema) -> str:
+    text = json.dumps(schema.to_json(), sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Flat:
+    """Rows of one table: one schema, one writer's run. ``seq`` is the parent's in a child."""
+
+    schema: TableSchema
+    writer: str
+    run: int
+    seq: IntArray
+    log_time_ns: IntArray
+    received_ns: IntArray
+    timestamp_ns: IntArray
+    columns: Mapping[str, ColumnData] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(self.seq)
+
+    def take(self, rows: col.RowIndex) -> Flat:
+        """Return the given rows."""
+        return Flat(
+            self.schema,
+            self.writer,
+            self.run,
+            self.seq[rows],
+            self.log_time_ns[rows],
+            self.received_ns[rows],
+            self.timestamp_ns[rows],
+            {name: col.take(column, rows) for name, column in self.columns.items()},
+        )
+
+    def with_columns(self, columns: Mapping[str, ColumnData]) -> Flat:
+        """Return the same rows with these columns only."""
+        return replace(self, columns=columns)
+
+
+def join(flats: Sequence[Flat]) -> Flat:
+    """Join rows of one schema and one writer's run."""
+    first = flats[0]
+    if len(flats) == 1:
+        return first
+    return Flat(
+        first.schema,
+        first.writer,
+        first.run,
+        np.concatenate([flat.seq for flat in flats]),
+        np.concatenate([flat.log_time_ns for flat in flats]),
+        np.concatenate([flat.received_ns for flat in flats]),
+        np.concatenate([flat.timestamp_ns for flat in flats]),
+        {name: col.concatenate([f.columns[name] for f in flats]) for name in first.columns},
+    )
+
+
+def flatten(batch: Batch) -> Iterator[Flat]:
+    """Give a batch and its child tables, recursively, as flat tables."""
+    yield from _flatten(batch, "", batch.schema.stamp)
+
+
+def _flatten(batch: Batch, parent: str, stamp: str) -> Iterator[Flat]:
+    keys = [key for key in ("index", "parent_index") if parent and key in batch.columns]
+    schema = _table(batch.item, batch.schema, keys, parent, stamp, batch.topic, batch.source)
+    yield Flat(
+        schema,
+        batch.writer,
+        batch.run,
+        batch.seq,
+        batch.log_time_ns,
+        batch.received_ns,
+        batch.timestamp_ns,
+        {column.name: batch.columns[column.name] for column in schema.columns},
+    )
+    for child in batch.children.values():
+        yield from _flatten(child, parent or batch.item, stamp)
+
+
+def _table(
+    item: str,
+    schema: ItemSchema,
+    keys: Sequence[str],
+    parent: str,
+    stamp: str,
+    topic: str,
+    source: str,
+) -> TableSchema:
+    columns = (*(Column(key, key, "int64") for key in keys), *schema.columns)
+    return TableSchema(item, schema.type, columns, stamp, parent, topic, source)
+
+
+def tables_of(item: str, schema: ItemSchema, topic: str, source: str) -> list[TableSchema]:
+    """Return the schemas of the tables that an item's batches flatten to."""
+    tables = [_table(item, schema, (), "", schema.stamp, topic, source)]
+    for path, child in schema.children.items():
+        name = f"{item}__{identifier(path)}"
+        tables += _child_tables(name, child, tables[0], ("index",))
+    return tables
+
+
+def _child_tables(
+    name: str, schema: ItemSchema, top: TableSchema, keys: Sequence[str]
+) -> list[TableSchema]:
+    tables = [_table(name, schema, keys, top.item, top.stamp, top.topic, top.source)]
+    for path, child in schema.children.items():
+        below = f"{name}__{identifier(path)}"
+        tables += _child_tables(below, child, top, ("index", "parent_index"))
+    return tables

@@ -1,0 +1,242 @@
+"""One Parquet file of one table: written with an encoding per column, read by time range."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from amberbox.blackbox.journal.clocktable import ClockTable
+from amberbox.blackbox.segments import encoding
+from amberbox.blackbox.segments.columns_io import from_arrow, to_arrow
+from amberbox.blackbox.segments.flat import Flat, TableSchema
+from amberbox.blackbox.segments.manifest import (
+    ClockPoints,
+    Part,
+    Segment,
+    part_from_json,
+    sync_folder,
+)
+from amberbox.core.types import IntArray
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+METADATA = b"amberbox"
+_LEVEL = 3
+_KEYS = ("log_time", "timestamp")
+
+
+def seq_name(schema: TableSchema) -> str:
+    """Name the column that holds ``seq``: in a child table it is the parent's."""
+    return "parent_seq" if schema.parent else "seq"
+
+
+def key_names(schema: TableSchema) -> tuple[str, ...]:
+    """Name the columns that stand before an item's own."""
+    return (seq_name(schema), *_KEYS)
+
+
+def stored_name(name: str) -> str:
+    """Name a variable's column in the file: one that is called like ours steps aside."""
+    return f"{name}:" if name.casefold() == "log_time" else name
+
+
+class TableFile:
+    """Writes one table's Parquet file beside its final name, then moves it there."""
+
+    def __init__(self, store: Path, path: str, schema: TableSchema) -> None:
+        self.path = path
+        self.schema = schema
+        self._store = store
+        self._final = store / path
+        self._temporary = self._final.with_name(f".{self._final.name}.tmp")
+        self._writer: pq.ParquetWriter | None = None
+        self.rows = 0
+
+    def write(self, flat: Flat) -> None:
+        """Write rows as one row group; the first one decides the encodings."""
+        import pyarrow as pa
+
+        names, types, columns = self._layout(flat)
+        arrays = [to_arrow(column, kind) for column, kind in zip(columns, types, strict=True)]
+        table = pa.Table.from_arrays(arrays, names=names)
+        if self._writer is None:
+            choices = {
+                name: encoding.choose(column, kind)
+                for name, column, kind in zip(names, columns, types, strict=True)
+            }
+            self._writer = self._open(table.schema, choices)
+        self._writer.write_table(table, row_group_size=len(flat))
+        self.rows += len(flat)
+
+    def _layout(self, flat: Flat) -> tuple[list[str], list[str], list[Any]]:
+        names = [*key_names(self.schema), *(stored_name(c.name) for c in self.schema.columns)]
+        types = ["int64", "int64", "time", *(column.type for column in self.schema.columns)]
+        own = [flat.columns[column.name] for column in self.schema.columns]
+        return names, types, [flat.seq, flat.log_time_ns, flat.timestamp_ns, *own]
+
+    def _open(self, schema: pa.Schema, choices: Mapping[str, str]) -> pq.ParquetWriter:
+        import pyarrow.parquet as pq
+
+        self._final.parent.mkdir(parents=True, exist_ok=True)
+        leaves = {_leaf(schema.field(name)): choice for name, choice in choices.items()}
+        return pq.ParquetWriter(
+            self._temporary,
+            schema,
+            compression="zstd",
+            compression_level=_LEVEL,
+            use_dictionary=[leaf for leaf, c in leaves.items() if c == encoding.DICTIONARY],
+            column_encoding={leaf: c for leaf, c in leaves.items() if c != encoding.DICTIONARY},
+            write_statistics=list(key_names(self.schema)),
+            write_page_checksum=True,
+            store_schema=False,
+        )
+
+    def finish(self, parts: Sequence[Part]) -> Segment:
+        """Close the file, make it durable under its name and describe it."""
+        assert self._writer is not None
+        description = {"version": 1, "schema": self.schema.to_json(), "parts": parts_json(parts)}
+        text = json.dumps(description, separators=(",", ":"))
+        self._writer.add_key_value_metadata({METADATA.decode(): text})
+        self._writer.close()
+        sha256, size = _sync_and_hash(self._temporary)
+        self._temporary.rename(self._final)
+        sync_folder(self._final.parent)
+        return Segment(
+            self.path, self.schema.item, self.schema.id, self.rows, size, sha256, tuple(parts)
+        )
+
+    def discard(self) -> None:
+        """Leave nothing behind, after an error."""
+        if self._writer is not None:
+            self._writer.close()
+        self._temporary.unlink(missing_ok=True)
+
+
+def parts_json(parts: Sequence[Part]) -> list[dict[str, Any]]:
+    """Return parts as plain data."""
+    return [asdict(part) for part in parts]
+
+
+def _leaf(field: pa.Field) -> str:
+    import pyarrow as pa
+
+    return f"{field.name}.list.element" if pa.types.is_list(field.type) else str(field.name)
+
+
+def _sync_and_hash(path: Path) -> tuple[str, int]:
+    with path.open("r+b") as file:
+        digest = hashlib.file_digest(file, "sha256").hexdigest()
+        os.fsync(file.fileno())
+        return digest, file.tell()
+
+
+def describe(store: Path, path: str) -> tuple[TableSchema, Segment]:
+    """Read back from a segment's own metadata what the manifest says about it."""
+    import pyarrow.parquet as pq
+
+    metadata = pq.read_metadata(store / path)
+    data = json.loads(metadata.metadata[METADATA])
+    schema = TableSchema.from_json(data["schema"])
+    parts = tuple(part_from_json(part) for part in data["parts"])
+    sha256, size = _sync_and_hash(store / path)
+    rows = int(metadata.num_rows)
+    return schema, Segment(path, schema.item, schema.id, rows, size, sha256, parts)
+
+
+def read_segment(
+    store: Path,
+    segment: Segment,
+    schema: TableSchema,
+    names: Collection[str],
+    span: tuple[int | None, int | None] = (None, None),
+    by: str = "received",
+) -> list[Flat]:
+    """Read the named columns of the row groups that may hold rows of ``[from, to)``.
+
+    Row groups are chosen by their statistics: rows outside of the range may come along. Gives
+    one ``Flat`` per part of the segment.
+    """
+    import pyarrow.parquet as pq
+
+    with pq.ParquetFile(
+        store / segment.path, memory_map=True, page_checksum_verification=True
+    ) as file:
+        groups = _groups_in_range(file.metadata, schema, segment.clock, span, by)
+        wanted = [column for column in schema.columns if column.name in names]
+        columns = [*key_names(schema), *(stored_name(column.name) for column in wanted)]
+        table = file.read_row_groups(groups, columns=columns, use_threads=len(columns) > 8)
+        first_rows = _first_rows(file.metadata)
+    starts = np.concatenate(
+        [np.arange(first_rows[g], first_rows[g + 1]) for g in groups] or [np.empty(0, np.int64)]
+    )
+    whole = _to_flat(table, segment, schema, [column.name for column in wanted])
+    return _split_parts(whole, segment.parts, starts)
+
+
+def _first_rows(metadata: pq.FileMetaData) -> IntArray:
+    counts = [metadata.row_group(g).num_rows for g in range(metadata.num_row_groups)]
+    return np.concatenate(([0], np.cumsum(counts, dtype=np.int64)))
+
+
+def _groups_in_range(
+    metadata: pq.FileMetaData,
+    schema: TableSchema,
+    clock: ClockPoints,
+    span: tuple[int | None, int | None],
+    by: str,
+) -> list[int]:
+    offsets = [offset for _, offset in clock] if by == "received" else [0]
+    column = list(key_names(schema)).index("log_time" if by == "received" else "timestamp")
+    chosen = []
+    for group in range(metadata.num_row_groups):
+        statistics = metadata.row_group(group).column(column).statistics
+        low = statistics.min_raw + min(offsets)
+        high = statistics.max_raw + max(offsets)
+        if overlaps(low, high, span):
+            chosen.append(group)
+    return chosen
+
+
+def overlaps(low: int, high: int, span: tuple[int | None, int | None]) -> bool:
+    """Tell whether ``[low, high]`` meets ``[from, to)``; None is open."""
+    from_ns, to_ns = span
+    return (from_ns is None or high >= from_ns) and (to_ns is None or low < to_ns)
+
+
+def _to_flat(table: pa.Table, segment: Segment, schema: TableSchema, names: list[str]) -> Flat:
+    types = {column.name: column.type for column in schema.columns}
+    log_time = _integers(table[_KEYS[0]])
+    received = ClockTable(segment.clock).received(log_time)
+    stamps = _integers(table.column("timestamp")) if schema.stamp else received
+    part = segment.parts[0]
+    columns = {name: from_arrow(table[stored_name(name)], types[name]) for name in names}
+    seq = _integers(table[seq_name(schema)])
+    return Flat(schema, part.writer, part.run, seq, log_time, received, stamps, columns)
+
+
+def _integers(array: pa.ChunkedArray) -> IntArray:
+    column = from_arrow(array, "time")
+    assert isinstance(column, np.ndarray)
+    return column
+
+
+def _split_parts(whole: Flat, parts: Sequence[Part], rows: IntArray) -> list[Flat]:
+    if len(parts) == 1:
+        return [whole] if len(whole) else []
+    ends = np.cumsum([part.rows for part in parts])
+    cuts = np.searchsorted(rows, np.concatenate(([0], ends)))
+    flats = []
+    for part, start, stop in zip(parts, cuts[:-1], cuts[1:], strict=True):
+        if stop > start:
+            piece = whole.take(slice(int(start), int(stop)))
+            flats.append(replace(piece, writer=part.writer, run=part.run))
+    return flats
