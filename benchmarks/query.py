@@ -194,7 +194,7 @@ def _record_and_build(made: mix.Mix, tick_ns: int, stores: Iterator[Path]) -> No
 
 
 def _real_recordings() -> Iterator[Row]:
-    from amberbox.blackbox.recorder.importing import import_recordings
+    from amberbox.blackbox.importing import import_recordings
 
     shares = []
     for name in REAL if RECORDINGS.is_dir() else ():

@@ -11,10 +11,10 @@ import pyarrow.parquet as pq
 import pytest
 
 import amberbox
+from amberbox.blackbox.importing import import_recordings
 from amberbox.blackbox.query import record as query
 from amberbox.blackbox.query.record import Record
 from amberbox.blackbox.query.table import Table
-from amberbox.blackbox.recorder.importing import import_recordings
 from amberbox.blackbox.segments.columns import compact, null_mask
 from amberbox.core.types import ColumnData, Ragged
 from amberbox.testing.records import build_segments_of, fill_store

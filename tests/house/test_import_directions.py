@@ -40,7 +40,7 @@ def tree(folder: Path, **planted: str) -> Path:
 @pytest.mark.parametrize(
     ("module", "text", "complaint"),
     [
-        ("core_types", "import amberbox.blackbox.journal.writer", "may not know"),
+        ("core_types", "import amberbox.blackbox.store", "may not know"),
         ("core_types", "from amberbox.blackbox import journal", "may not know"),
         ("core_types", "from ..blackbox import journal", "may not know"),
         ("core_types", "def f():\n    import amberbox.cli.record", "may not know"),
@@ -51,7 +51,7 @@ def tree(folder: Path, **planted: str) -> Path:
         ("blackbox_sources_ros", "from . import zmq", "another plugin"),
         (
             "blackbox_sources_ros",
-            "import amberbox.blackbox.journal.writer",
+            "import amberbox.blackbox.store",
             "core and its protocol",
         ),
         ("blackbox_query", "import pyarrow.parquet", "at its top"),

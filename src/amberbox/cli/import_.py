@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from amberbox.blackbox.recorder.importing import ImportReport, import_recordings
+from amberbox.blackbox.importing import ImportReport, import_recordings
 
 _BAR = 30
 

@@ -159,7 +159,7 @@ def _is_recording(path: Path) -> bool:
 
 
 def _import(path: Path) -> Record:
-    from amberbox.blackbox.recorder.importing import import_recordings
+    from amberbox.blackbox.importing import import_recordings
 
     folder = tempfile.TemporaryDirectory(prefix="amberbox-")
     store = Path(folder.name) / "store"

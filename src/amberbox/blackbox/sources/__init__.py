@@ -1,0 +1,1 @@
+"""Sources: one file for each bus or kind of recording the box can listen to."""
