@@ -35,9 +35,10 @@ def measure() -> list[Row]:
             "decode, flatten, BSON": lambda: encode_bson(data),
         }
         rates = {name: count / cpu_s(work, 3) for name, work in peers.items()}
-        full = count / cpu_s(lambda: write_ours(data, place / "ours", FULL_SPEED_WRITE), 3)
-        slow = count / cpu_s(lambda: write_ours(data, place / "ours", ROBOT_WRITE), 3)
-        size = sum(path.stat().st_size for path in (place / "ours").glob("*.mcap"))
+        ours = Ours(data)
+        full = count / cpu_s(lambda: ours.write(place, FULL_SPEED_WRITE), 3)
+        slow = count / cpu_s(lambda: ours.write(place, ROBOT_WRITE), 3)
+        size = sum(path.stat().st_size for path in ours.last.glob("*.mcap"))
     rows = [
         Row("journal at full speed, write_s 0.1", full, "messages/s", name, full / rate)
         for name, rate in rates.items()
@@ -49,21 +50,32 @@ def measure() -> list[Row]:
     return rows + [Row(name, rate, "messages/s") for name, rate in rates.items()]
 
 
-def write_ours(data: mix.Mix, folder: Path, per_write: int) -> None:
-    """Write the mix in portions, with a sync after every tenth."""
-    shutil.rmtree(folder, ignore_errors=True)
-    writer = JournalWriter(JournalOptions(folder, "0" * 8, "main", 1, "0" * 8))
-    channels = [writer.channel(topic, {"item": topic.name}) for topic in data.topics]
-    numbers = np.array(channels, np.uint16)[data.numbers]
-    times = np.array(data.times_ns)
-    for portion, start in enumerate(range(0, len(data.messages), per_write)):
-        part = slice(start, start + per_write)
-        if writer.rotation_due(int(times[start])):
-            writer.rotate()
-        writer.write(numbers[part], times[part], times[part], data.messages[part])
-        if portion % WRITES_PER_SYNC == WRITES_PER_SYNC - 1:
-            writer.mark_sync().wait()
-    writer.close()
+class Ours:
+    """Our journal; each run writes into a folder of its own."""
+
+    def __init__(self, data: mix.Mix) -> None:
+        self.data = data
+        self.numbers = np.array(data.numbers, np.uint16)
+        self.times = np.array(data.times_ns)
+        self.runs = 0
+        self.last = Path()
+
+    def write(self, place: Path, per_write: int) -> None:
+        """Write the mix in portions, with a sync after every tenth."""
+        self.runs += 1
+        self.last = place / f"ours-{self.runs}"
+        writer = JournalWriter(JournalOptions(self.last, "0" * 8, "main", 1, "0" * 8))
+        for topic in self.data.topics:
+            writer.channel(topic, {"item": topic.name})
+        for portion, start in enumerate(range(0, len(self.data.messages), per_write)):
+            part = slice(start, start + per_write)
+            if writer.rotation_due(int(self.times[start])):
+                writer.rotate()
+            times = self.times[part]
+            writer.write(self.numbers[part], times, times, self.data.messages[part])
+            if portion % WRITES_PER_SYNC == WRITES_PER_SYNC - 1:
+                writer.mark_sync().wait()
+        writer.close()
 
 
 def write_foxglove(data: mix.Mix, path: Path) -> None:

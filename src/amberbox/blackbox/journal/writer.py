@@ -97,6 +97,7 @@ class JournalWriter:
         self.chain = chain
         self.bytes_written = 0
         self._schemas: dict[Schema, int] = {}
+        self._schema_list: list[Schema] = []
         self._channels: list[Channel] = []
         self._records: list[bytes] = []
         self._file: _OpenFile | None = None
@@ -111,6 +112,7 @@ class JournalWriter:
         schema_id = 0
         if topic.schema is not None:
             schema_id = self._schemas.setdefault(topic.schema, len(self._schemas) + 1)
+            self._schema_list = list(self._schemas)
         marks = {**metadata, "run": self.options.tag}
         channel = Channel(len(self._channels), schema_id, topic.name, topic.message_encoding, marks)
         self._channels.append(channel)
@@ -228,7 +230,7 @@ class JournalWriter:
         return b"".join(parts)
 
     def _schema(self, schema_id: int) -> Schema:
-        return next(schema for schema, number in self._schemas.items() if number == schema_id)
+        return self._schema_list[schema_id - 1]
 
     def _note(
         self, file: _OpenFile, used: Sequence[int], counts: Sequence[int], chunk: IndexedChunk
