@@ -8,13 +8,15 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from copy import copy
+from dataclasses import dataclass, field
 from operator import itemgetter
 from pathlib import Path
 from typing import Any, Protocol
 
 import msgspec
 import numpy as np
+from msgspec import structs
 
 from amberbox import __version__
 from amberbox.blackbox.journal import reserved
@@ -22,7 +24,7 @@ from amberbox.blackbox.journal.writer import JournalOptions, JournalWriter, Sync
 from amberbox.blackbox.recorder.gaplog import GapLog
 from amberbox.blackbox.recorder.intake import Intake
 from amberbox.blackbox.recorder.names import ItemNames
-from amberbox.blackbox.recorder.streams import Counters, Item, Stream
+from amberbox.blackbox.recorder.streams import Item, Stream
 from amberbox.blackbox.store import Store, WriterLock
 from amberbox.blackbox.unroll import UnrollError
 from amberbox.blackbox.unroll.infer import widen
@@ -266,8 +268,8 @@ class Pipeline:
         changed = []
         for item in list(self.items.values()):
             if item.counters != item.reported:
-                item.reported = Counters(**asdict(item.counters))
-                changed.append({"item": item.name, **asdict(item.counters)})
+                item.reported = copy(item.counters)
+                changed.append({"item": item.name, **structs.asdict(item.counters)})
         silent = self.options.counts_silence and now_ns - self._counted_ns >= HEARTBEAT_NS
         if changed or silent:
             self._counted_ns = now_ns

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
+import msgspec
+
 from amberbox.blackbox.filters.change import ChangeFilter
 from amberbox.blackbox.filters.rate import RateLimit
 from amberbox.blackbox.unroll import Unroller, unroller
@@ -13,8 +15,7 @@ from amberbox.core.source import TopicOptions
 from amberbox.core.types import Topic
 
 
-@dataclass(slots=True)
-class Counters:
+class Counters(msgspec.Struct):
     """What happened to an item's messages since the start of the run."""
 
     received: int = 0
