@@ -119,6 +119,8 @@ def describe(found: FileScan, name: str) -> JournalFile:
 
 
 def _end_seq(found: FileScan, first_seq: int) -> int:
+    if found.indexed is not None:
+        return first_seq + found.indexed
     if not found.places:
         return first_seq
     last = found.places[-1]

@@ -84,7 +84,19 @@ class WriterTail:
         skip_before = _skipper(journal, self.run, self.seq)
         for chunk in sound_chunks(journal, skip_before):
             yield from self._deliver(chunk, journal, clock, journal.streams)
+        yield from self._missing_end(journal)
         self._done = run_and_number(path)
+
+    def _missing_end(self, journal: JournalFile) -> Iterator[Gap]:
+        """Tell of rows at a file's end: by number if its index counts them, else that some were."""
+        last_ns = journal.end_ns if self._last_ns is None else self._last_ns
+        if self.run == journal.run and self.seq < journal.end_seq:
+            gap = missing(journal, self.seq, journal.end_seq, last_ns, journal.end_ns)
+            self.seq, self.ahead = journal.end_seq, {}
+            yield self._at(gap)
+        elif journal.damage and _ends_damaged(journal):
+            gap = missing(journal, self.seq, self.seq, last_ns, last_ns)
+            yield self._at(replace(gap, count=None, to_seq=None))
 
     def _grow(self, path: Path) -> Iterator[Delivery]:
         """Deliver what has been added to the file being written."""
@@ -214,6 +226,10 @@ def _is_finished(path: Path) -> bool:
         return read_summary(data) is not None
 
 
+def _ends_damaged(journal: JournalFile) -> bool:
+    return not journal.places or journal.damage[-1].to_offset == journal.bytes
+
+
 def _outline(live: _Live, writer: str, run: int, number: int) -> JournalFile:
     return JournalFile(
         name=f"{live.path.parent.name}/{live.path.name}", path=live.path, writer=writer, run=run,
@@ -237,7 +253,7 @@ def _first_of_interest(files: list[Path], run: int, seq: int) -> int:
 
 
 def _starts_at(path: Path) -> int:
-    return int(start_record(path).get("first_seq", 0))
+    return int(start_record(path).get("first_seq", 1 << 62))
 
 
 def _skipper(journal: JournalFile, run: int, seq: int) -> Any:

@@ -285,6 +285,8 @@ class FileScan:
     walked: bool = False
     summary: Summary = field(default_factory=Summary)
     places: list[ChunkPlace] = field(default_factory=list)
+    indexed: int | None = None
+    """How many messages the file was finished with, also where some are damaged now."""
     damage: list[Damage] = field(default_factory=list)
 
 
@@ -295,10 +297,11 @@ def scan(path: Path, *, walk: bool = False) -> FileScan:
     """
     with open_buffer(path) as data:
         start = _start_record(data)
-        summary = None if walk else read_summary(data)
-        if summary is not None:
-            return _from_summary(path, data, start, summary)
-        return _from_walk(path, data)
+        summary = read_summary(data)
+        headless = summary is not None and not start and _tag_of(summary)
+        if summary is None or walk or headless:
+            return _from_walk(path, data, summary)
+        return _from_summary(path, data, start, summary)
 
 
 def start_record(path: Path) -> Mapping[str, str]:
@@ -331,7 +334,7 @@ def _from_summary(path: Path, data: Buffer, start: Mapping[str, str], summary: S
     return result
 
 
-def _from_walk(path: Path, data: Buffer) -> FileScan:
+def _from_walk(path: Path, data: Buffer, summary: Summary | None) -> FileScan:
     result = FileScan(path, len(data), walked=True)
     walk = Walk(data)
     for found in walk:
@@ -342,13 +345,30 @@ def _from_walk(path: Path, data: Buffer) -> FileScan:
         else:
             _take_chunk(result, found)
     result.finished = walk.finished
-    summary = read_summary(data)
     if summary is not None:  # it has a checksum of its own: definitions whose chunks are damaged
         result.summary.schemas = {**summary.schemas, **result.summary.schemas}
         result.summary.channels = {**summary.channels, **result.summary.channels}
+        result.indexed = summary.counts.total()
+    if not result.start:
+        result.start = _start_by_mark(result)
     if result.start:
         result.places = _in_order(result)
     return result
+
+
+def _tag_of(summary: Summary) -> str:
+    return next((c.metadata["run"] for c in summary.channels.values() if "run" in c.metadata), "")
+
+
+def _start_by_mark(result: FileScan) -> Mapping[str, str]:
+    """Tell from the mark of its chunks whose file this is, when its start is damaged."""
+    parts = _tag_of(result.summary).split("-")
+    if len(parts) != 3 or not result.places:
+        return {}
+    first = min(place.first_sequence or 0 for place in result.places)
+    result.indexed = None  # of what stood before the first sound chunk nothing is known
+    keys = ("store_id", "writer", "run", "first_seq")
+    return dict(zip(keys, (*parts, str(first)), strict=True))
 
 
 def _take_metadata(result: FileScan, found: Metadata) -> None:
