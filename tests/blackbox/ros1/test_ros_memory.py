@@ -68,20 +68,22 @@ def test_a_digest_leaves_the_sequence_number_out() -> None:
     assert digest(b"\1\0\0\0rest", False) != digest(b"\2\0\0\0rest", False)
 
 
-def filtered(known: frozenset[str], messages: list[bytes]) -> tuple[list[bytes], int]:
+def filtered(
+    known: frozenset[str], messages: list[bytes], has_header: bool = False, every_s: float = 0.0
+) -> tuple[list[bytes], int]:
     kept: list[bytes] = []
     repeats: list[None] = []
     latched = LatchedFilter(
         "/map",
         "/n",
-        False,
+        has_header,
         known,
         Memory(MemorySink()),
         lambda data, _: kept.append(data),
         lambda: repeats.append(None),
     )
-    for message in messages:
-        latched(message, 0)
+    for place, message in enumerate(messages):
+        latched(message, round(place * every_s * 1e9))
     return kept, len(repeats)
 
 
@@ -90,6 +92,12 @@ def test_only_a_first_message_that_is_known_is_left_out() -> None:
     assert filtered(known, [b"map", b"map", b"new"]) == ([b"map", b"new"], 1)
     assert filtered(known, [b"new", b"map"]) == ([b"new", b"map"], 0)
     assert filtered(frozenset(), [b"map"]) == ([b"map"], 0)
+
+
+def test_a_message_that_comes_twice_as_the_link_begins_is_kept_once() -> None:
+    twice = [b"\1\0\0\0map", b"\2\0\0\0map"]
+    assert filtered(frozenset(), twice, has_header=True) == (twice[:1], 1)
+    assert filtered(frozenset(), twice, has_header=True, every_s=1.5) == (twice, 0)
 
 
 def test_a_publisher_is_absent_until_the_question_before_the_first_that_named_it() -> None:
