@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from dataclasses import dataclass, field
 
-from amberbox.blackbox.recorder.streams import Stream
+from amberbox.blackbox.recorder.streams import Drops, Item, Stream
 
 _OVERHEAD = 120
 """Bytes a queued message takes beside its payload."""
@@ -47,6 +47,12 @@ class Intake:
             stream.counters.last_received_ns = received_ns
             self._bytes += size
             self._queue.append((stream, data, received_ns))
+
+    def take_drops(self, item: Item) -> Drops | None:
+        """Return what was dropped of an item since the last call."""
+        with self._room:
+            drops, item.drops = item.drops, None
+        return drops
 
     @property
     def size_bytes(self) -> int:

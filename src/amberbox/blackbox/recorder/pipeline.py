@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from copy import copy
 from dataclasses import dataclass, field
 from operator import itemgetter
@@ -90,6 +91,7 @@ class Pipeline:
         self.names = ItemNames(self.store.path)
         self._own: list[tuple[str, bytes, int]] = []
         self._own_lock = threading.Lock()
+        self._items_lock = threading.Lock()
         self._writers: dict[str, JournalWriter] = {"main": self._writer("main")}
         self._own_channels: dict[tuple[str, str], int] = {}
         self._channels: dict[tuple[str, Topic, str], int] = {}
@@ -100,7 +102,8 @@ class Pipeline:
         self._clock_offset_ns = 0
         self._counted_ns = 0
         self._disk_error = ""
-        start = self.clock.now_ns() if self.start_gap_ns is None else self.start_gap_ns
+        now_ns = self.clock.now_ns()  # the clock may have been set back since the last run
+        start = now_ns if self.start_gap_ns is None else min(self.start_gap_ns, now_ns)
         self.gaps = GapLog(lambda values: self.own(reserved.GAP, values), start)
 
     def _writer(self, writer: str) -> JournalWriter:
@@ -118,12 +121,13 @@ class Pipeline:
     def item(self, source: str, topic: str, options: TopicOptions) -> Item:
         """Return the data item of a topic, making it at its first mention."""
         name = self.names.name(source, topic)
-        item = self.items.get(name)
-        if item is None:
-            item = self.items[name] = Item(name, source, topic, options)
-            if options.keep in ("ring", "incident"):
-                self._writers.setdefault("ring", self._writer("ring"))
-        return item
+        with self._items_lock:
+            item = self.items.get(name)
+            if item is None:
+                item = self.items[name] = Item(name, source, topic, options)
+                if options.keep in ("ring", "incident") and "ring" not in self._writers:
+                    self._writers["ring"] = self._writer("ring")
+            return item
 
     def own(self, topic: str, values: Mapping[str, Any]) -> None:
         """Write a record of the box's own, stamped now."""
@@ -148,8 +152,9 @@ class Pipeline:
         if self._flush(now_ns):
             self.intake.release()
             self._follow_wall_clock()
-        for writer in self._writers.values():
-            writer.publish_head(now_ns if not self._disk_error else 0)
+        with suppress(OSError):  # a hint for followers only, and the flush has told of the disk
+            for writer in list(self._writers.values()):
+                writer.publish_head(now_ns if not self._disk_error else 0)
 
     def _advance(self) -> int:
         """Return the time of this tick; never before the one of the last tick."""
@@ -232,7 +237,7 @@ class Pipeline:
 
     def _note_drops(self) -> None:
         for item in list(self.items.values()):
-            drops, item.drops = item.drops, None
+            drops = self.intake.take_drops(item)
             if drops is not None:
                 self.gaps.dropped(item.name, drops[0], drops[1] + 1, drops[2])
 
@@ -295,12 +300,14 @@ class Pipeline:
         writer = self._writers[name]
         if writer.rotation_due(now_ns):
             writer.rotate()
-        if writer.path is None:
-            rows[:0] = self._preamble(name, rows[0][1])
+        preamble = self._preamble(name, rows[0][1]) if writer.path is None else []
+        rows[:0] = preamble
         before = writer.next_seq
         try:
             writer.write(*_columns(rows))
         finally:  # what was written in whole chunks before an error is not written again
+            if writer.path is None:  # no file was made: the next attempt has its own preamble
+                del rows[: len(preamble)]
             del rows[: writer.next_seq - before]
 
     def _note_disk_error(self, error: OSError) -> None:
@@ -400,7 +407,7 @@ class Pipeline:
 
     def mark_sync(self) -> list[SyncMark]:
         """Return what makes everything written so far durable."""
-        return [writer.mark_sync() for writer in self._writers.values()]
+        return [writer.mark_sync() for writer in list(self._writers.values())]
 
     def close(self) -> None:
         """Write the rest, finish the files, give the store free."""
@@ -414,12 +421,12 @@ class Pipeline:
     @property
     def bytes_written(self) -> int:
         """Bytes this run has put into its journals."""
-        return sum(writer.bytes_written for writer in self._writers.values())
+        return sum(writer.bytes_written for writer in list(self._writers.values()))
 
     @property
     def journal_paths(self) -> list[Path]:
         """Files being written right now."""
-        return [writer.path for writer in self._writers.values() if writer.path]
+        return [writer.path for writer in list(self._writers.values()) if writer.path]
 
 
 def _columns(rows: Sequence[Any]) -> tuple[Any, Any, Any, Any]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field
-from typing import Any
+from typing import Any, TypeAlias
 
 import msgspec
 
@@ -27,6 +27,10 @@ class Counters(msgspec.Struct):
     last_received_ns: int = 0
 
 
+Drops: TypeAlias = tuple[int, int, int]
+"""First and last time and count of messages dropped since the last gap record."""
+
+
 @dataclass(slots=True)
 class Item:
     """A data item: what is configured for it, and what all its streams share."""
@@ -37,8 +41,7 @@ class Item:
     options: TopicOptions
     counters: Counters = field(default_factory=Counters)
     rate: RateLimit | None = None
-    drops: tuple[int, int, int] | None = None
-    """First and last time and count of messages dropped since the last gap record."""
+    drops: Drops | None = None
     last_latched: bytes | None = None
     reported: Counters = field(default_factory=Counters)
     malformed: int = 0
