@@ -9,7 +9,6 @@ from dataclasses import dataclass, field
 from amberbox.blackbox.ros1.held import Deliver
 from amberbox.blackbox.ros1.memory import Memory
 
-
 _FIRST_MOMENT_NS = 1_000_000_000
 
 
@@ -23,8 +22,9 @@ class LatchedFilter:
     """Passes the messages of one connection on, except one that was delivered already.
 
     A publisher repeats its latched message to who connects; rospy does so even when it is just
-    publishing it to all, so that it comes twice within the first moment of a connection. Only the process that delivered a message before can repeat it (``known`` is empty for
-    another): what a restarted publisher says anew is recorded, even if it is the same.
+    publishing it to all, so that it comes twice within the first moment of a connection. Only the
+    process that delivered a message before can repeat it (``known`` is empty for another): what a
+    restarted publisher says anew is recorded, even if it is the same.
     """
 
     topic: str
