@@ -74,10 +74,24 @@ class Keeper:
     def _trim_ring(self) -> None:
         """Delete ring files that ended longer ago than the ring is long."""
         files = self.sealed("ring")
-        newest_ns = max((journal.end_ns for journal in files), default=0)
-        for journal in files:
-            if journal.end_ns < newest_ns - self._ring_s * NS:
+        for journal, age_ns in zip(files, ages(files), strict=True):
+            if age_ns > self._ring_s * NS:
                 journal.path.unlink(missing_ok=True)
+
+
+def ages(files: Sequence[JournalFile]) -> list[int]:
+    """Tell how long before the end of the last file each one ended, in ns.
+
+    Files of a run follow each other without a pause: where their times do not, the clock was set.
+    """
+    found: list[int] = []
+    age_ns = 0
+    for journal, after in zip(reversed(files), [None, *reversed(files)], strict=False):
+        if after is not None:
+            pause_ns = after.start_ns - journal.end_ns if after.run != journal.run else 0
+            age_ns += max(0, pause_ns) + max(0, after.end_ns - after.start_ns)
+        found.append(age_ns)
+    return found[::-1]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

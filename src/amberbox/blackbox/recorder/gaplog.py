@@ -52,6 +52,14 @@ class GapLog:
         """Write what the box itself had to drop."""
         self._write(item, "", from_ns, to_ns, "dropped: queue full", count)
 
+    def shift(self, step_ns: int) -> None:
+        """Move the beginnings of what is open: log time has begun anew."""
+        with self._lock:
+            self.start_ns += step_ns
+            self._open = {
+                key: (from_ns + step_ns, reason) for key, (from_ns, reason) in self._open.items()
+            }
+
     def close(self, now_ns: int) -> None:
         """End everything that is open: the run is over."""
         with self._lock:

@@ -167,8 +167,8 @@ class Pipeline:
             item = stream.item
             if item.options.keep == "none":
                 continue
-            if received_ns < floor:  # stamped just before the last tick, queued just after it
-                message = (stream, message[1], floor)
+            if not floor <= received_ns <= now_ns:  # stamped before a tick or a new epoch
+                message = (stream, message[1], min(max(received_ns, floor), now_ns))
             if item.rate is not None and not item.rate.accept(message[2]):
                 item.counters.rate_limited += 1
                 continue
@@ -256,12 +256,20 @@ class Pipeline:
             self._pending.setdefault(item.writer, []).append(row)
         self._count(now_ns)
         for name, data, at_ns in self._take_own():
-            at_ns = max(at_ns, self._last_tick_ns)
-            row = (self._own_channel("main", name), at_ns, at_ns, data)
-            self._pending.setdefault("main", []).append(row)
+            at_ns = min(max(at_ns, self._last_tick_ns), max(now_ns, self.clock.now_ns()))
+            for writer in self._writers_of(name):
+                row = (self._own_channel(writer, name), at_ns, at_ns, data)
+                self._pending.setdefault(writer, []).append(row)
         for rows in self._pending.values():
             rows.sort(key=itemgetter(1))
         self._last_tick_ns = now_ns
+
+    def _writers_of(self, name: str) -> list[str]:
+        """Own records go to the main journal, those of the clock to every file that is open."""
+        if name != reserved.CLOCK:
+            return ["main"]
+        writers = list(self._writers.items())
+        return [name for name, writer in writers if name == "main" or writer.path]
 
     def _take_own(self) -> list[tuple[str, bytes, int]]:
         with self._own_lock:
@@ -398,11 +406,15 @@ class Pipeline:
             self.own(reserved.CLOCK, values)
 
     def _new_epoch(self, step_ns: int) -> None:
-        for writer in self._writers.values():
-            writer.rotate()
+        for writer in list(self._writers.values()):
+            with suppress(OSError):  # on a full disk the file stays without its end
+                writer.rotate()
+        before_ns = self.clock.now_ns()
         self.clock.new_epoch()
-        self._clock_offset_ns, self._clock_written_ns = 0, self.clock.now_ns()
-        self._floor_ns = self._last_tick_ns = self._counted_ns = 0
+        now_ns = self.clock.now_ns()
+        self.gaps.shift(now_ns - before_ns)
+        self._clock_offset_ns, self._clock_written_ns = 0, now_ns
+        self._floor_ns = self._last_tick_ns = self._counted_ns = now_ns
         self.event("clock_step", f"the wall clock stepped by {step_ns / NS:.3f} s: new epoch")
 
     def mark_sync(self) -> list[SyncMark]:
