@@ -38,14 +38,19 @@ def _recorded(catalogue: Catalogue) -> Iterator[Gap]:
     table = next((n for n, v in catalogue.schemas.items() if v[-1].topic == reserved.GAP), None)
     if table is None:
         return
-    found: dict[tuple[object, ...], tuple[Gap, bool]] = {}
-    for piece in gather(catalogue, Request(table, _FIELDS)).pieces:
+    still_open: dict[tuple[object, ...], Gap] = {}
+    pieces = gather(catalogue, Request(table, _FIELDS)).pieces
+    for piece in sorted(pieces, key=lambda piece: (piece.run, int(piece.seq[0]))):
         for gap, peer, is_open in _gap_rows(piece):
-            found[gap.run, gap.item, peer, gap.from_ns, gap.reason] = gap, is_open
-    ends = _run_ends(catalogue) if any(is_open for _, is_open in found.values()) else {}
-    for gap, is_open in found.values():
-        end = max(ends.get(gap.run, gap.from_ns), gap.from_ns + 1) if is_open else gap.to_ns
-        yield replace(gap, to_ns=end)
+            key = (gap.run, gap.item, peer, gap.reason)
+            if is_open:  # of a publisher one gap is open at a time
+                still_open[key] = gap
+            else:
+                still_open.pop(key, None)
+                yield gap
+    ends = _run_ends(catalogue) if still_open else {}
+    for gap in still_open.values():
+        yield replace(gap, to_ns=max(ends.get(gap.run, gap.from_ns), gap.from_ns + 1))
 
 
 def _gap_rows(piece: Flat) -> Iterator[tuple[Gap, str, bool]]:
