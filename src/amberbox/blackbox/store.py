@@ -5,6 +5,7 @@ from __future__ import annotations
 import fcntl
 import json
 import os
+import time
 import uuid
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +18,9 @@ FOLDERS = {"main": "journal", "ring": "ring", "watch": "watch"}
 SEGMENTS = "segments"
 _IDENTITY = "store.json"
 _RUN = "run"
+_LOCK_TRIES = 10
+_LOCK_PAUSE_S = 0.02
+"""A reader that asks whether a lock is held holds it itself for some microseconds."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,16 +109,14 @@ class WriterLock:
                 f"cannot write to the store {store.path}: {error.strerror}",
                 "choose a folder that can be written in robot.yaml store.path",
             ) from error
-        try:
-            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
+        if not _lock(self._file):
             self._file.seek(0)
             owner = self._file.read().strip() or "unknown"
             self._file.close()
             raise UsageError(
                 f"the store {store.path} is being written by process {owner} ({writer})",
                 "stop it first, or give this robot a store of its own in robot.yaml",
-            ) from None
+            )
         self._file.truncate(0)
         self._file.write(f"{os.getpid()}\n")
         self._file.flush()
@@ -122,6 +124,18 @@ class WriterLock:
     def release(self) -> None:
         """Let others write."""
         self._file.close()
+
+
+def _lock(file: IO[str]) -> bool:
+    """Take a lock; try again for a moment, for it may be a reader that looks at it."""
+    for _ in range(_LOCK_TRIES):
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            time.sleep(_LOCK_PAUSE_S)
+        else:
+            return True
+    return False
 
 
 def is_locked(store: Store, writer: str) -> bool:

@@ -59,7 +59,8 @@ def follow(
         for writer, tail in tails.items():
             for delivery in tail.step():
                 moved = True
-                here = {w: _not_before(t.position(), floor.get(w)) for w, t in tails.items()}
+                here = dict(floor)
+                here |= {w: _not_before(t.position(), floor.get(w)) for w, t in tails.items()}
                 here[writer] = _not_before(_of(delivery, writer), floor.get(writer))
                 yield replace(delivery, cursor=Cursor(store.id, here))
         if not moved and (not live or stop.wait(poll_s)):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Container, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
@@ -23,7 +24,7 @@ from amberbox.blackbox.journal.scan import (
     read_chunk,
     scan,
 )
-from amberbox.blackbox.store import open_store
+from amberbox.blackbox.store import Store, open_store
 from amberbox.core.types import Batch, Gap, IntArray
 
 BATCH_ROWS = 4096
@@ -65,12 +66,16 @@ class JournalFile:
 def journals(store: Path) -> list[JournalFile]:
     """List a store's journal files in the order they were written, writer by writer."""
     opened = open_store(store)
-    return [
-        journal_file(path, f"{path.parent.name}/{path.name}")
-        for writer in opened.writers()
-        for path in opened.journal_files(writer)
-        if path.exists()
-    ]
+    return [journal for writer in opened.writers() for journal in files_of(opened, writer)]
+
+
+def files_of(store: Store, writer: str) -> list[JournalFile]:
+    """List one writer's journal files; those that are deleted meanwhile are left out."""
+    found = []
+    for path in store.journal_files(writer):
+        with suppress(FileNotFoundError):
+            found.append(journal_file(path, f"{path.parent.name}/{path.name}"))
+    return found
 
 
 def journal_file(path: Path, name: str = "") -> JournalFile:

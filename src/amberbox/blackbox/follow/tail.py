@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -11,12 +12,17 @@ import msgspec
 import numpy as np
 
 from amberbox.blackbox.follow.batching import Made, Stream, make_batch, stream_of
-from amberbox.blackbox.follow.read import JournalFile, journal_file, missing, sound_chunks
+from amberbox.blackbox.follow.read import (
+    JournalFile,
+    files_of,
+    journal_file,
+    missing,
+    sound_chunks,
+)
 from amberbox.blackbox.journal import reserved
 from amberbox.blackbox.journal.chunk import Chunk, sequences
 from amberbox.blackbox.journal.clocktable import ClockTable
 from amberbox.blackbox.journal.head import Head, read_head
-from amberbox.blackbox.journal.mcap import Channel
 from amberbox.blackbox.journal.scan import ChunkPlace, Metadata, Walk, open_buffer, start_record
 from amberbox.blackbox.journal.summary import read_summary
 from amberbox.blackbox.store import Store, is_locked, run_and_number
@@ -36,7 +42,6 @@ class _Live:
     trusted: int = 0
     first_seq: int = 0
     schemas: dict[int, Schema] = field(default_factory=dict)
-    channels: dict[int, Channel] = field(default_factory=dict)
     streams: dict[int, Stream] = field(default_factory=dict)
     clock: list[tuple[int, int]] = field(default_factory=list)
 
@@ -52,6 +57,7 @@ class WriterTail:
         self.items = items
         self.run, self.seq, self.ahead = start.run, start.seq, dict(start.ahead)
         self._done: tuple[int, int] = (-1, -1)
+        self._ends_at: tuple[int, int] = (-1, 0)
         self._live: _Live | None = None
         self._last_ns: int | None = None
         self._watermark: tuple[int, int, int] = (0, 0, 0)
@@ -62,15 +68,16 @@ class WriterTail:
 
     def step(self) -> Iterator[Delivery]:
         """Yield what has come since the last step."""
-        alive = is_locked(self.store, self.writer)  # both before the files: never too much
-        head = read_head(self.store.folder(self.writer))
+        head = read_head(self.store.folder(self.writer))  # before the files: never too much
         files = [p for p in self.store.journal_files(self.writer) if run_and_number(p) > self._done]
-        files = files[_first_of_interest(files, self.run, self.seq) :]
-        for path in files:
-            if path is files[-1] and alive and not _is_finished(path):
-                yield from self._grow(path)
-            else:
-                yield from self._static(path)
+        alive = is_locked(self.store, self.writer)  # after the files: nobody writes these any more
+        with suppress(FileNotFoundError):  # deleted meanwhile: the next step says what is missing
+            files = files[_first_of_interest(files, self.run, self.seq) :]
+            for path in files:
+                if path is files[-1] and alive and not _is_finished(path):
+                    yield from self._grow(path)
+                else:
+                    yield from self._static(path)
         if head is not None:
             yield from self._watermark_of_head(head)
 
@@ -85,6 +92,7 @@ class WriterTail:
         for chunk in sound_chunks(journal, skip_before):
             yield from self._deliver(chunk, journal, clock, journal.streams)
         yield from self._missing_end(journal)
+        self._ends_at = (journal.run, journal.end_seq)
         self._done = run_and_number(path)
 
     def _missing_end(self, journal: JournalFile) -> Iterator[Gap]:
@@ -118,8 +126,8 @@ class WriterTail:
     def _live_chunk(self, live: _Live, chunk: Chunk) -> Iterator[Delivery]:
         live.schemas.update(chunk.schemas)
         for number, channel in chunk.channels.items():
-            if number not in live.channels:
-                live.channels[number] = channel
+            known = live.streams.get(number)
+            if known is None or (known.topic.schema is None and channel.schema_id in chunk.schemas):
                 live.streams[number] = stream_of(channel, live.schemas)
         live.clock.extend(_clock_points(chunk, live.streams))
         run, number = run_and_number(live.path)
@@ -131,6 +139,7 @@ class WriterTail:
     def _enter(self, run: int, first_seq: int, journal: JournalFile) -> Iterator[Gap]:
         """Go over to another run, or to a later file after some were deleted."""
         if run > self.run:
+            yield from self._set_back(journal)
             self.run, self.seq, self.ahead = run, 0, {}
         if first_seq > self.seq:
             start = self._last_ns if self._last_ns is not None else journal.start_ns
@@ -140,6 +149,15 @@ class WriterTail:
                 gap.writer, run, gap.from_ns, gap.to_ns, "deleted or lost with its file",
                 count=gap.count, from_seq=gap.from_seq, to_seq=gap.to_seq,
             ))  # fmt: skip
+
+    def _set_back(self, journal: JournalFile) -> Iterator[Gap]:
+        """Tell of provisional rows that were delivered, and then taken by a power cut."""
+        run, end_seq = self._ends_at
+        if run == self.run and end_seq < self.seq:
+            start = self._last_ns if self._last_ns is not None else journal.start_ns
+            gap = missing(journal, end_seq, self.seq, start, journal.start_ns or start)
+            self.seq, self.ahead = end_seq, {}
+            yield self._at(replace(gap, run=run, reason="delivered, then lost in a power cut"))
 
     def _deliver(
         self,
@@ -325,10 +343,7 @@ def position_at(
     """Find where to begin: at the cursor, or ``lookback_s`` before it, or before the end."""
     if lookback_s <= 0:
         return cursor or WriterCursor()
-    files = [
-        journal_file(path, f"{path.parent.name}/{path.name}")
-        for path in store.journal_files(writer)
-    ]
+    files = files_of(store, writer)
     before = [
         f for f in files if cursor is None or (f.run, f.first_seq) <= (cursor.run, cursor.seq)
     ]
