@@ -96,6 +96,7 @@ class Pipeline:
         self._own_channels: dict[tuple[str, str], int] = {}
         self._channels: dict[tuple[str, Topic, str], int] = {}
         self._repeats: dict[tuple[str, str], int] = {}
+        self._latched: list[Stream] = []
         self._pending: dict[str, list[Any]] = {}
         self._floor_ns = self._last_tick_ns = 0
         self._clock_written_ns: int | None = None
@@ -128,6 +129,11 @@ class Pipeline:
                 if options.keep in ("ring", "incident") and "ring" not in self._writers:
                     self._writers["ring"] = self._writer("ring")
             return item
+
+    def latched(self, stream: Stream) -> None:
+        """Have the last message of a stream repeated in each file, also one of an earlier run."""
+        if stream.item.options.keep != "none":
+            self._latched.append(stream)
 
     def own(self, topic: str, values: Mapping[str, Any]) -> None:
         """Write a record of the box's own, stamped now."""
@@ -335,6 +341,9 @@ class Pipeline:
             (self._own_channel(writer, reserved.RUN), at_ns, at_ns, self._run_record(writer)),
             (self._own_channel(writer, reserved.CLOCK), at_ns, at_ns, self._clock_record()),
         ]
+        for stream in list(self._latched):
+            if stream.item.last_latched is not None:
+                self._channel(stream)
         for (item_name, of_writer), channel in self._repeats.items():
             data = self.items[item_name].last_latched
             if of_writer == writer and data is not None:

@@ -97,6 +97,8 @@ class BlockSink:
         known = [s for s in self._streams if s.item is item]
         if known and not stream.infers:
             self._tell_of_change(known[-1].topic, topic, item.name)
+        if topic.latched and not stream.infers:
+            self._pipeline.latched(stream)
         wrong = "" if stream.infers else stream.compile()
         if wrong:
             self.event(
