@@ -11,6 +11,7 @@ from amberbox.blackbox.follow import read
 from amberbox.blackbox.formats.open import open_recording
 from amberbox.blackbox.formats.recording import Recording
 from amberbox.blackbox.keeper import seal
+from amberbox.blackbox.recorder.messageclock import MessageClock
 from amberbox.blackbox.recorder.pipeline import Pipeline, PipelineOptions
 from amberbox.blackbox.recorder.sink import BlockSink
 from amberbox.blackbox.store import Store, create_store
@@ -22,25 +23,6 @@ SOURCE = "ros"
 """Source name of imported items: the same item names as if the robot had been recorded live."""
 
 Progress = Callable[[float], None]
-
-
-@dataclass
-class RecordedClock:
-    """Time inside a recording: that of the newest message read."""
-
-    at_ns: int = 0
-
-    def now_ns(self) -> int:
-        return self.at_ns
-
-    def offset_ns(self) -> int:
-        return 0
-
-    def new_epoch(self) -> None:
-        """Do nothing: time inside a recording does not step."""
-
-    def synchronised(self) -> bool | None:
-        return None
 
 
 @dataclass
@@ -114,7 +96,7 @@ def _copy_all(
     source: str,
     progress: Progress,
 ) -> ImportReport:
-    clock = RecordedClock(recording.report.start_ns or 0)
+    clock = MessageClock(recording.report.start_ns or 0)
     options = PipelineOptions(
         robot=path.stem, boot_id=digest[:8], input=digest, queue_bytes=1 << 40, counts_silence=False
     )
@@ -123,7 +105,7 @@ def _copy_all(
     sink = BlockSink(pipeline, source, topics, lossless=True)
     chosen = {option.name for option in topics}
     try:
-        _copy(recording, pipeline, sink, clock, chosen, progress)
+        _copy(recording, pipeline, sink, chosen, progress)
     finally:
         pipeline.close()
     items = {name: item.counters.kept for name, item in pipeline.items.items()}
@@ -137,7 +119,6 @@ def _copy(
     recording: Recording,
     pipeline: Pipeline,
     sink: BlockSink,
-    clock: RecordedClock,
     chosen: set[str],
     progress: Progress,
 ) -> None:
@@ -149,7 +130,6 @@ def _copy(
             streams[index] = sink.topic(topic) if not chosen or topic.name in chosen else -1
         if streams[index] < 0:
             continue
-        clock.at_ns = max(clock.at_ns, log_ns)
         sink.message(streams[index], data, log_ns)
         if pipeline.intake.size_bytes >= TICK_BYTES:
             _tick(pipeline)

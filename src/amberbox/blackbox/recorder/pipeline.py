@@ -24,6 +24,7 @@ from amberbox.blackbox.journal import reserved
 from amberbox.blackbox.journal.writer import JournalOptions, JournalWriter, SyncMark
 from amberbox.blackbox.recorder.gaplog import GapLog
 from amberbox.blackbox.recorder.intake import Intake
+from amberbox.blackbox.recorder.messageclock import MessageClock
 from amberbox.blackbox.recorder.names import ItemNames
 from amberbox.blackbox.recorder.streams import Item, Stream
 from amberbox.blackbox.store import Store, WriterLock
@@ -43,7 +44,7 @@ Message = tuple[Stream, bytes, int]
 
 
 class LogClock(Protocol):
-    """What stamps messages: a RunClock, or the time inside a recording being imported."""
+    """What stamps messages: a RunClock, or a MessageClock where messages bring their time."""
 
     def now_ns(self) -> int:
         """Log time."""
@@ -151,7 +152,7 @@ class Pipeline:
     def tick(self) -> None:
         """Write what has come since the last tick; when the disk refuses, keep it and say so."""
         taken = self.intake.take()
-        now_ns = self._advance()
+        now_ns = self._advance(taken)
         kept = self._change_filtered(self._rate_limited(taken, now_ns))
         self._note_drops()
         self._sort_into_journals(kept, now_ns)
@@ -162,8 +163,10 @@ class Pipeline:
             for writer in list(self._writers.values()):
                 writer.publish_head(now_ns if not self._disk_error else 0)
 
-    def _advance(self) -> int:
+    def _advance(self, taken: Sequence[Message]) -> int:
         """Return the time of this tick; never before the one of the last tick."""
+        if taken and isinstance(self.clock, MessageClock):
+            self.clock.heard(max(map(itemgetter(2), taken)))
         return max(self.clock.now_ns(), self._floor_ns)
 
     def _rate_limited(self, taken: Iterable[Message], now_ns: int) -> list[Message]:

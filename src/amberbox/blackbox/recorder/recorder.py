@@ -17,6 +17,7 @@ from amberbox.blackbox.folder.blocks import SourceBlock
 from amberbox.blackbox.folder.folder import RobotFolder
 from amberbox.blackbox.follow import read
 from amberbox.blackbox.journal.writer import SyncMark
+from amberbox.blackbox.recorder.messageclock import MessageClock
 from amberbox.blackbox.recorder.pipeline import Pipeline, PipelineOptions
 from amberbox.blackbox.recorder.sink import BlockSink
 from amberbox.blackbox.store import Store, create_store
@@ -66,16 +67,18 @@ class Recorder:
         self.folder = folder
         self.store = create_store(folder.store_path)
         self.stop = threading.Event()
-        self._clock = RunClock(clock or SystemClock())
+        clock = clock or SystemClock()
+        virtual_ns = virtual_start_ns(folder)
         self._keeper_wanted = keeper
         options = folder.robot.store
         self.pipeline = Pipeline(
             self.store,
-            self._clock,
+            RunClock(clock) if virtual_ns is None else MessageClock(virtual_ns),
             PipelineOptions(
                 robot=folder.robot.id,
                 config_hash=folder.config_hash,
-                boot_id=self._clock.clock.boot_id(),
+                boot_id=clock.boot_id(),
+                counts_silence=virtual_ns is None,
                 queue_bytes=options.queue,
                 rotate_bytes=int(options.rotate_mb * 1e6),
                 rotate_ns=int(options.rotate_s * NS),
@@ -262,6 +265,20 @@ class _Keeper:
             except subprocess.TimeoutExpired:
                 self._process.kill()
                 self._process.wait()
+
+
+def virtual_start_ns(folder: RobotFolder) -> int | None:
+    """Return when time begins if all sources of a folder bring their own, None if none does.
+
+    Raises UsageError when some do: one record has one time.
+    """
+    virtual = [block for block in folder.blocks if getattr(block.config, "is_virtual", False)]
+    if virtual and len(virtual) < len(folder.blocks):
+        raise UsageError(
+            f"{virtual[0].name} lives in virtual time, other sources of {folder.path} do not",
+            f"write 'times: now' at {virtual[0].name}, or give it a robot folder of its own",
+        )
+    return min((block.config.start_ns() for block in virtual), default=None)
 
 
 def _last_run(store: Store) -> list[read.JournalFile]:
