@@ -13,7 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.reader import NonSeekingReader, make_reader
 
-from amberbox.blackbox.journal.scan import FileScan, open_buffer, read_chunk, scan
+from amberbox.blackbox.journal.buffer import open_buffer
+from amberbox.blackbox.journal.scan import FileScan, read_chunk, scan
 from amberbox.blackbox.journal.writer import CHUNK_BYTES, JournalOptions, JournalWriter
 from amberbox.core.types import Schema, Topic
 

@@ -14,16 +14,11 @@ import numpy as np
 
 from amberbox.blackbox.follow.batching import Stream, make_batch, stream_of
 from amberbox.blackbox.journal import reserved
+from amberbox.blackbox.journal.buffer import open_buffer
 from amberbox.blackbox.journal.chunk import Chunk, sequences
 from amberbox.blackbox.journal.clocktable import ClockTable
-from amberbox.blackbox.journal.scan import (
-    ChunkPlace,
-    Damage,
-    FileScan,
-    open_buffer,
-    read_chunk,
-    scan,
-)
+from amberbox.blackbox.journal.scan import ChunkPlace, FileScan, read_chunk, scan
+from amberbox.blackbox.journal.walk import Damage
 from amberbox.blackbox.store import Store, open_store
 from amberbox.core.types import Batch, Gap, IntArray
 

@@ -20,11 +20,13 @@ from amberbox.blackbox.follow.read import (
     sound_chunks,
 )
 from amberbox.blackbox.journal import reserved
+from amberbox.blackbox.journal.buffer import open_buffer
 from amberbox.blackbox.journal.chunk import Chunk, sequences
 from amberbox.blackbox.journal.clocktable import ClockTable
 from amberbox.blackbox.journal.head import Head, read_head
-from amberbox.blackbox.journal.scan import ChunkPlace, Metadata, Walk, open_buffer, start_record
+from amberbox.blackbox.journal.scan import ChunkPlace, start_record
 from amberbox.blackbox.journal.summary import read_summary
+from amberbox.blackbox.journal.walk import Metadata, Walk
 from amberbox.blackbox.store import Store, is_locked, run_and_number
 from amberbox.core.clock import NS
 from amberbox.core.types import Batch, Cursor, Gap, IntArray, Schema, Watermark, WriterCursor

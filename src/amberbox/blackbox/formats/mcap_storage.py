@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -19,9 +20,10 @@ from amberbox.blackbox.formats.recording import (
 )
 from amberbox.blackbox.formats.ros2_qos import is_latched
 from amberbox.blackbox.journal import mcap
+from amberbox.blackbox.journal.buffer import open_buffer
 from amberbox.blackbox.journal.chunk import Chunk, open_chunk
 from amberbox.blackbox.journal.reserved import SOURCE
-from amberbox.blackbox.journal.scan import ChunkPlace, FileScan, open_buffer, read_chunk, scan
+from amberbox.blackbox.journal.scan import ChunkPlace, FileScan, read_chunk, scan
 from amberbox.core.errors import AmberboxError
 from amberbox.core.types import Topic
 
@@ -53,13 +55,13 @@ def open_mcap(path: Path, report: Report) -> McapFile:
         contents = scan(path)
         if not contents.walked and not _covers_everything(contents):
             contents = scan(path, walk=True)
-        mapping = open_buffer(path)
-        buffer = mapping.__enter__()
+        mapping = ExitStack()
+        buffer = mapping.enter_context(open_buffer(path))
     except OSError as error:
         raise AmberboxError(
             f"cannot open {path}: {error.strerror}", "check the path and its permissions"
         ) from None
-    file = McapFile(path, report, contents, buffer, mapping.__exit__)
+    file = McapFile(path, report, contents, buffer, mapping.close)
     _note_state(file)
     file.torn = _torn_chunk(file)
     return file

@@ -11,6 +11,8 @@ from amberbox.core.types import Schema
 
 MAGIC = b"\x89MCAP0\r\n"
 LIBRARY = "amberbox"
+START_METADATA = "amberbox/start"
+CHAIN_METADATA = "amberbox/chain"
 
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX = range(1, 9)
 STATISTICS, METADATA, METADATA_INDEX, SUMMARY_OFFSET, DATA_END = 0x0B, 0x0C, 0x0D, 0x0E, 0x0F

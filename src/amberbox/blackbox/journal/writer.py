@@ -10,7 +10,8 @@ import hashlib
 import os
 import zlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -19,8 +20,15 @@ from numpy.typing import NDArray
 
 from amberbox.blackbox.journal import mcap
 from amberbox.blackbox.journal.head import Head, HeadFile
-from amberbox.blackbox.journal.mcap import MESSAGE_HEAD, Channel
-from amberbox.blackbox.journal.summary import IndexedChunk, Summary
+from amberbox.blackbox.journal.mcap import (
+    CHAIN_METADATA,
+    MESSAGE_HEAD,
+    START_METADATA,
+    Channel,
+)
+from amberbox.blackbox.journal.openfile import OpenFile
+from amberbox.blackbox.journal.summary import IndexedChunk
+from amberbox.blackbox.store import sync_folder
 from amberbox.core.clock import NS
 from amberbox.core.types import IntArray, Schema, Topic
 
@@ -29,8 +37,6 @@ CHUNK_BYTES = 1 << 20
 SCHEMA_REPEAT_NS = (NS, 10 * NS)
 """Schemas are repeated after as long as the file is old, but within these limits."""
 COMPRESSION_LEVEL = 1
-START_METADATA = "amberbox/start"
-CHAIN_METADATA = "amberbox/chain"
 EMPTY_CHAIN = "0" * 64
 
 
@@ -67,24 +73,13 @@ class SyncMark:
 
     def wait(self) -> None:
         """Flush everything written before the mark; then ``seq`` is the durable end."""
-        for fd in self.fds:
-            os.fdatasync(fd)
-        for fd in self.close:
-            os.close(fd)
+        try:
+            for fd in self.fds:
+                os.fdatasync(fd)
+        finally:
+            for fd in self.close:
+                os.close(fd)
         self.done(self.seq)
-
-
-@dataclass(slots=True)
-class _OpenFile:
-    fd: int
-    path: Path
-    number: int
-    opened_ns: int
-    size: int = 0
-    summary: Summary = field(default_factory=Summary)
-    schemas_at_ns: dict[int, int] = field(default_factory=dict)
-    block: hashlib._Hash = field(default_factory=hashlib.sha256)
-    block_start: int = 0
 
 
 class JournalWriter:
@@ -100,7 +95,7 @@ class JournalWriter:
         self._schema_list: list[Schema] = []
         self._channels: list[Channel] = []
         self._records: list[bytes] = []
-        self._file: _OpenFile | None = None
+        self._file: OpenFile | None = None
         self._files = 0
         self._closing: list[int] = []
         self._zstd = zstandard.ZstdCompressor(level=COMPRESSION_LEVEL, write_content_size=True)
@@ -215,7 +210,7 @@ class JournalWriter:
         u8[starts + 23] = publish
         return body, starts
 
-    def _definitions(self, file: _OpenFile, used: Sequence[int], now_ns: int) -> bytes:
+    def _definitions(self, file: OpenFile, used: Sequence[int], now_ns: int) -> bytes:
         """Repeat the channels a chunk uses always, their schemas now and then."""
         parts = []
         for number in used:
@@ -233,7 +228,7 @@ class JournalWriter:
         return self._schema_list[schema_id - 1]
 
     def _note(
-        self, file: _OpenFile, used: Sequence[int], counts: Sequence[int], chunk: IndexedChunk
+        self, file: OpenFile, used: Sequence[int], counts: Sequence[int], chunk: IndexedChunk
     ) -> None:
         summary = file.summary
         for number, count in zip(used, counts, strict=True):
@@ -252,7 +247,8 @@ class JournalWriter:
         file, fds = self._file, list(self._closing)
         if file is not None:
             if file.size > file.block_start:
-                self._write_chain(file)
+                with suppress(OSError):  # a full disk: a later link covers what is synced now
+                    self._write_chain(file)
             fds.append(file.fd)
         mark = SyncMark(fds, self._closing, self.next_seq, self._set_durable)
         self._closing = []
@@ -261,23 +257,28 @@ class JournalWriter:
     def _set_durable(self, seq: int) -> None:
         self.durable_seq = max(self.durable_seq, seq)
 
-    def _write_chain(self, file: _OpenFile) -> None:
-        block = file.block.hexdigest()
-        self.chain = hashlib.sha256(bytes.fromhex(self.chain + block)).hexdigest()
+    def _write_chain(self, file: OpenFile) -> None:
+        block, start, digest = file.block, file.size, file.block.hexdigest()
+        chain = hashlib.sha256(bytes.fromhex(self.chain + digest)).hexdigest()
         values = {
             "from": str(file.block_start),
-            "to": str(file.size),
-            "block": block,
-            "chain": self.chain,
+            "to": str(start),
+            "block": digest,
+            "chain": chain,
             "next_seq": str(self.next_seq),
         }
-        file.block, file.block_start = hashlib.sha256(), file.size
-        self._append_metadata(file, CHAIN_METADATA, values)
+        file.block = hashlib.sha256()
+        try:
+            self._append_metadata(file, CHAIN_METADATA, values)
+        except OSError:
+            file.block = block
+            raise
+        self.chain, file.block_start = chain, start
 
-    def _append_metadata(self, file: _OpenFile, name: str, values: Mapping[str, str]) -> None:
+    def _append_metadata(self, file: OpenFile, name: str, values: Mapping[str, str]) -> None:
         data = mcap.metadata_record(name, values)
-        file.summary.metadata.append((file.size, len(data), name))
         self._append([data])
+        file.summary.metadata.append((file.size - len(data), len(data), name))
 
     def publish_head(self, watermark_ns: int) -> None:
         """Tell followers how far this journal reaches, without touching the journal itself."""
@@ -295,24 +296,31 @@ class JournalWriter:
         )
 
     def rotate(self) -> None:
-        """Finish the file; the next write begins a new one."""
+        """Finish the file; the next write begins a new one.
+
+        On a full disk the file stays without its end, and is read by walking it.
+        """
         file = self._file
         if file is None:
             return
-        try:
+        with suppress(OSError):
             self._write_chain(file)
             self._append([file.summary.encode(file.size)])
-        finally:  # without its end the file is read by walking it
-            self._closing.append(file.fd)
-            self._file = None
+        self._closing.append(file.fd)
+        self._file = None
 
     def close(self) -> None:
-        """Finish the file and make everything durable."""
-        self.rotate()
-        self.mark_sync().wait()
-        self._head.close()
+        """Finish the file and make everything durable.
 
-    def _opened(self) -> _OpenFile:
+        Raises OSError when the disk does not confirm it.
+        """
+        self.rotate()
+        try:
+            self.mark_sync().wait()
+        finally:
+            self._head.close()
+
+    def _opened(self) -> OpenFile:
         assert self._file is not None
         return self._file
 
@@ -320,19 +328,19 @@ class JournalWriter:
         folder = self.options.folder
         path = folder / self.options.file_name(self._files)
         fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND, 0o644)
-        self._files += 1
-        file = self._file = _OpenFile(fd, path, self._files - 1, now_ns)
+        file = self._file = OpenFile(fd, path, self._files, now_ns)
         try:
             self._append([mcap.MAGIC + mcap.header(self._profile())])
             self._append_metadata(file, START_METADATA, self._start_values(file))
-            _sync_folder(folder)
+            sync_folder(folder)
         except OSError:
             self._file = None
             os.close(fd)
             path.unlink()
             raise
+        self._files += 1
 
-    def _start_values(self, file: _OpenFile) -> dict[str, str]:
+    def _start_values(self, file: OpenFile) -> dict[str, str]:
         options = self.options
         return {
             "store_id": options.store_id,
@@ -357,6 +365,7 @@ class JournalWriter:
             _write_all(file.fd, data)
         except OSError:
             os.ftruncate(file.fd, file.size)  # our own torn tail, nothing acknowledged
+            file.schemas_at_ns.clear()  # it may have held schemas that count as written
             raise
         file.block.update(data)
         file.size += len(data)
@@ -403,11 +412,3 @@ def _write_all(fd: int, data: bytes) -> None:
     view = memoryview(data)
     while view:
         view = view[os.write(fd, view) :]
-
-
-def _sync_folder(folder: Path) -> None:
-    fd = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        os.fsync(fd)
-    finally:
-        os.close(fd)

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from amberbox.blackbox.segments.flat import TableSchema
+from amberbox.blackbox.store import sync_folder
 from amberbox.core.types import Gap
 
 NAME = "manifest"
@@ -336,12 +337,3 @@ def replace(store: Path, records: Sequence[Mapping[str, Any]]) -> None:
     _append_durably(temporary, _lines(records, _FIRST_HASH))
     temporary.rename(store / NAME)
     sync_folder(store)
-
-
-def sync_folder(folder: Path) -> None:
-    """Make a new name in a folder survive a power cut."""
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

@@ -21,8 +21,8 @@ from amberbox.blackbox.segments.manifest import (
     Part,
     Segment,
     part_from_json,
-    sync_folder,
 )
+from amberbox.blackbox.store import sync_folder
 from amberbox.core.types import IntArray
 
 if TYPE_CHECKING:
