@@ -25,7 +25,8 @@ TOPICS = (
 def record(folder: Path, seed: int, more: str = "") -> Path:
     folder.mkdir()
     (folder / "black_box.yaml").write_text(
-        f"- sim:\n    seed: {seed}\n    speed: max\n    duration_s: 20\n    topics: {TOPICS}\n{more}"
+        f"- sim:\n    seed: {seed}\n    speed: max\n    duration_s: 20\n"
+        f"    topics: {TOPICS}\n{more}"
     )
     Recorder(load_folder(folder), keeper=False).run()
     return folder / "store"

@@ -185,7 +185,9 @@ def _column(pieces: Sequence[Flat], name: str, kind: str) -> ColumnData:
 
 def _order(pieces: Sequence[Flat], times: IntArray, merged: Merged) -> IntArray | None:
     """Return the order of rows; None when they are in order as they are."""
-    if len({piece.writer for piece in pieces}) <= 1 and bool((np.diff(times) >= 0).all()):
+    steps, places = np.diff(times), np.diff(merged.seq)
+    in_order = bool(((steps > 0) | ((steps == 0) & (places >= 0))).all())
+    if in_order and len({piece.writer for piece in pieces}) <= 1:
         return None
     lengths = [len(piece) for piece in pieces]
     writers = sorted({piece.writer for piece in pieces})

@@ -31,6 +31,7 @@ from amberbox.blackbox.store import Store, WriterLock
 from amberbox.blackbox.unroll import UnrollError
 from amberbox.blackbox.unroll.infer import widen
 from amberbox.core.clock import NS
+from amberbox.core.errors import AmberboxError
 from amberbox.core.source import TopicOptions
 from amberbox.core.types import Topic
 
@@ -434,13 +435,31 @@ class Pipeline:
         return [writer.mark_sync() for writer in list(self._writers.values())]
 
     def close(self) -> None:
-        """Write the rest, finish the files, give the store free."""
+        """Write the rest, finish the files, give the store free.
+
+        Raises AmberboxError when the disk does not take the rest.
+        """
         self.gaps.close(self.clock.now_ns())
         self.tick()
+        lost, refused = self._unwritten(), self._disk_error
         for writer in self._writers.values():
-            writer.close()
+            try:
+                writer.close()
+            except OSError as error:  # without its end the file is read by walking it
+                refused = error.strerror or str(error)
         for lock in self._locks:
             lock.release()
+        if refused:
+            raise AmberboxError(
+                f"the disk does not take data: {refused}; {lost} messages are lost",
+                f"make room at {self.store.path}",
+            )
+
+    def _unwritten(self) -> int:
+        """Count the messages of sources that wait for the disk."""
+        own = {(writer, number) for (writer, _), number in self._own_channels.items()}
+        waiting = [(writer, row[0]) for writer, rows in self._pending.items() for row in rows]
+        return sum(channel not in own for channel in waiting)
 
     @property
     def bytes_written(self) -> int:

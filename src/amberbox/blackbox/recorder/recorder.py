@@ -126,9 +126,11 @@ class Recorder:
             thread.join(3.0)
         syncer.stop()
         self.pipeline.event("stopped", "recording stopped")
-        self.pipeline.close()
-        if keeper is not None:
-            keeper.stop()
+        try:
+            self.pipeline.close()
+        finally:
+            if keeper is not None:
+                keeper.stop()
 
     def _start(self, block: SourceBlock) -> None:
         thread = threading.Thread(target=self._supervise, args=(block,), name=block.name)

@@ -107,6 +107,8 @@ class BlockSink:
         return stream
 
     def _tell_of_change(self, old: Topic, new: Topic, item: str) -> None:
+        if (old.message_encoding, old.schema) == (new.message_encoding, new.schema):
+            return  # one publisher latches, another does not
         before = old.schema.name if old.schema else old.message_encoding
         after = new.schema.name if new.schema else new.message_encoding
         text = f"{item}: the definition changed from {before} to {after}"
