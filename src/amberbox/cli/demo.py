@@ -117,7 +117,7 @@ class Demo:
     def _blocks(self, endpoint: str) -> str:
         return (
             f"- zmq:\n    endpoint: {endpoint}\n    topics: []\n"
-            f"- recording:\n    path: {self.recording}\n    speed: 20\n"
+            f"- recording:\n    path: {self.recording.resolve()}\n    speed: 20\n"
         )
 
     def account(self) -> None:

@@ -20,8 +20,8 @@ software_version: ""       # version of the robot's own software
 
 store:
   path: store              # folder of the record, relative to this one
-  # quota: 50 GB           # most that the record may take; 80 % of the partition when absent
-  # min_free: 1 GB         # room that stays free on the partition
+  # quota: 50 GB           # most that the record may take (not acted on in this version)
+  # min_free: 1 GB         # room that stays free on the partition (not acted on in this version)
   # ring_s: 5 min          # how long topics with 'keep: ring' are kept
 
 # server:

@@ -2,7 +2,8 @@
 
 A source is a module whose file name is its name in ``black_box.yaml``. It defines
 
-- ``Config``: a frozen dataclass, built from the YAML block (see ``core.config``);
+- ``Config``: a frozen dataclass, built from the YAML block (see ``core.config``); one that names
+  files may have ``in_folder(folder)``, which returns it with paths seen from the robot folder;
 - ``Source``: a class that takes ``(config, name)`` and offers ``topics`` and ``run``;
 - ``SAMPLE``: a block of YAML as one would write it, shown by ``amberbox plugins`` and checked.
 
@@ -13,7 +14,7 @@ recorder's queue is full the message is dropped there and counted.
 from __future__ import annotations
 
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol
 
@@ -32,6 +33,15 @@ class ChangeOptions:
     variables: Sequence[str] = option((), "variables to look at; all when absent")
     bands: Mapping[str, float] = option({}, "absolute dead band per variable")
     heartbeat_s: float = option(5.0, "keep a message at least this often", unit="s")
+
+    def check(self) -> Iterator[tuple[str, str]]:
+        """Say which values cannot work."""
+        numbers = {"absolute": self.absolute, "relative": self.relative}
+        numbers |= {"heartbeat_s": self.heartbeat_s}
+        numbers |= {f"bands.{name}": width for name, width in self.bands.items()}
+        for key, value in numbers.items():
+            if not 0 <= value < float("inf"):
+                yield key, "must be 0 or more"
 
 
 @dataclass(frozen=True)

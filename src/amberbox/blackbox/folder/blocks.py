@@ -6,6 +6,7 @@ import dataclasses
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 from amberbox.blackbox.folder.legacy import legacy_note
@@ -171,7 +172,14 @@ def _build(
     if config is None:
         return None
     problems.extend(_topic_problems(config, node, block.plugin))
+    config = _in_folder(config, Path(block.node.file).parent)
     return SourceBlock(block.plugin, name, config, block.node.line, block.node.file)
+
+
+def _in_folder(config: Any, folder: Path) -> Any:
+    """Let a source that names files see them from the folder of ``black_box.yaml``."""
+    hook = getattr(config, "in_folder", None)
+    return config if hook is None else hook(folder)
 
 
 def _config_class(block: _Block, plugin: Plugin, problems: list[Problem]) -> type[Any] | None:

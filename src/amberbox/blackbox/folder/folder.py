@@ -9,10 +9,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from amberbox.blackbox.folder.blocks import Blocks, SourceBlock, read_blocks
-from amberbox.blackbox.folder.robot import RobotConfig
+from amberbox.blackbox.folder.robot import NOT_USED_YET, RobotConfig
 from amberbox.core.config import build, load_yaml, refuse
 from amberbox.core.errors import Problem, UsageError
 from amberbox.core.ids import derive_id
+from amberbox.core.nodes import Node
 
 SOURCES = "amberbox.blackbox.sources"
 ROBOT_FILE = "robot.yaml"
@@ -77,9 +78,12 @@ def hash_files(files: Mapping[str, Path]) -> str:
     """Return the SHA-256 over names and contents of files, sorted by name."""
     total = hashlib.sha256()
     for name, path in sorted(files.items()):
-        content = path.read_bytes()
-        total.update(f"{name}\0{len(content)}\0".encode("utf-8", "surrogateescape"))
-        total.update(content)
+        with path.open("rb") as file:
+            size = file.seek(0, 2)
+            total.update(f"{name}\0{size}\0".encode("utf-8", "surrogateescape"))
+            file.seek(0)
+            while block := file.read(1 << 20):
+                total.update(block)
     return total.hexdigest()
 
 
@@ -92,7 +96,18 @@ def _read_robot(place: Path, problems: list[Problem]) -> RobotConfig | None:
         return RobotConfig(id=derived)
     node = load_yaml(path, problems)
     robot = build(RobotConfig, node, problems) if node else None
+    problems.extend(_not_used_yet(node) if node else ())
     return dataclasses.replace(robot, id=robot.id or derived) if robot else None
+
+
+def _not_used_yet(root: Node) -> Iterator[Problem]:
+    """Note the keys that are set and that nobody acts on yet."""
+    for key, meaning in NOT_USED_YET.items():
+        node: Node | None = root
+        for part in key.split("."):
+            node = (node.mapping or {}).get(part) if node else None
+        if node is not None:
+            yield node.problem(key, f"has no effect in this version: {meaning}", is_error=False)
 
 
 def _read_black_box(path: Path, sources: str, problems: list[Problem]) -> Blocks:

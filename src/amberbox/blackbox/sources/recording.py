@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -43,6 +43,11 @@ class Config:
     def patterns(self) -> Sequence[str]:
         """The paths as a list."""
         return [self.path] if isinstance(self.path, str) else self.path
+
+    def in_folder(self, folder: Path) -> Config:
+        """Return the same with relative paths seen from a folder."""
+        paths = [str(folder / Path(pattern).expanduser()) for pattern in self.patterns]
+        return replace(self, path=paths)
 
     def check(self) -> Iterator[tuple[str, str]]:
         """Say which values cannot work; opens nothing."""
@@ -119,7 +124,8 @@ def find_paths(patterns: Sequence[str]) -> list[Path]:
         matches = _matches(Path(pattern).expanduser())
         if not matches:
             raise AmberboxError(
-                f"there is no recording at {pattern}", f"paths are seen from {Path.cwd()}"
+                f"there is no recording at {pattern}",
+                "relative paths in black_box.yaml are seen from its folder",
             )
         paths += matches
     return paths
