@@ -7,15 +7,21 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import msgspec
+import numpy as np
+
 from amberbox.blackbox.follow import read
+from amberbox.blackbox.follow.read import JournalFile
 from amberbox.blackbox.formats.open import open_recording
 from amberbox.blackbox.formats.recording import Recording
+from amberbox.blackbox.journal import reserved
 from amberbox.blackbox.keeper import seal
 from amberbox.blackbox.recorder.messageclock import MessageClock
 from amberbox.blackbox.recorder.pipeline import Pipeline, PipelineOptions
 from amberbox.blackbox.recorder.sink import BlockSink
-from amberbox.blackbox.store import Store, create_store
-from amberbox.core.errors import AmberboxError
+from amberbox.blackbox.segments import manifest
+from amberbox.blackbox.store import Store, WriterLock, create_store
+from amberbox.core.errors import AmberboxError, UsageError
 from amberbox.core.source import TopicOptions
 
 TICK_BYTES = 1 << 20
@@ -61,14 +67,16 @@ def import_recordings(
     an input cannot be read or the store not written.
     """
     store = create_store(store_path)
-    known = _inputs(store)
+    known, broken = _inputs(store)
     reports = []
     for path in paths:
         digest = digest_of(path)
         if digest in known:
             reports.append(ImportReport(path, known=True))
             continue
+        note = _discard(store, broken.pop(digest)) if digest in broken else ""
         reports.append(_import(path, store, digest, topics, source, progress))
+        reports[-1].notes += [note] if note else []
         known.add(digest)
     if segments:
         seal(store)
@@ -101,11 +109,11 @@ def _copy_all(
         robot=path.stem, boot_id=digest[:8], input=digest, queue_bytes=1 << 40, counts_silence=False
     )
     pipeline = Pipeline(store, clock, options)
-    pipeline.event("imported", f"import of {path.name}", source, sha256=digest)
     sink = BlockSink(pipeline, source, topics, lossless=True)
     chosen = {option.name for option in topics}
     try:
         _copy(recording, pipeline, sink, chosen, progress)
+        pipeline.event("imported", f"{path.name} is imported whole", source, sha256=digest)
     finally:
         pipeline.close()
     items = {name: item.counters.kept for name, item in pipeline.items.items()}
@@ -150,7 +158,7 @@ def _tick(pipeline: Pipeline) -> None:
 def digest_of(path: Path) -> str:
     """SHA-256 of a recording: of the file, or of all files of a folder with their names."""
     if not path.exists():
-        raise AmberboxError(f"there is no recording at {path}", "check the path")
+        raise UsageError(f"there is no recording at {path}", "check the path")
     files = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
     total = hashlib.sha256()
     for file in files:
@@ -161,7 +169,41 @@ def digest_of(path: Path) -> str:
     return total.hexdigest()
 
 
-def _inputs(store: Store) -> set[str]:
-    """Digests of what was imported before and finished."""
-    files = read.journals(store.path)
-    return {str(read.run_messages(f).get("input") or "") for f in files if f.finished} - {""}
+def _inputs(store: Store) -> tuple[set[str], dict[str, list[JournalFile]]]:
+    """Return digests of what was imported whole, and the files of imports that were broken off."""
+    runs: dict[int, list[JournalFile]] = {}
+    for journal in read.journals(store.path):
+        if journal.writer == "main" and journal.places:
+            runs.setdefault(journal.run, []).append(journal)
+    whole: set[str] = set()
+    broken: dict[str, list[JournalFile]] = {}
+    for files in runs.values():
+        digest = str(read.run_messages(files[0]).get("input") or "")
+        if digest and _ends_with_import(files[-1]):
+            whole.add(digest)
+        elif digest:
+            broken.setdefault(digest, []).extend(files)
+    return whole, broken
+
+
+def _ends_with_import(journal: JournalFile) -> bool:
+    """Tell whether the last records of a file say that its recording was imported whole."""
+    numbers = [n for n, stream in journal.streams.items() if stream.topic.name == reserved.EVENT]
+    for chunk in read.sound_chunks(journal, lambda place: place in journal.places[-2:]):
+        rows = np.flatnonzero(np.isin(chunk.channel, numbers))
+        kinds = [msgspec.json.decode(message)["kind"] for message in chunk.messages(rows)]
+        if "imported" in kinds:
+            return True
+    return False
+
+
+def _discard(store: Store, files: Sequence[JournalFile]) -> str:
+    """Remove what an import that was broken off has left; return what stays of it."""
+    lock = WriterLock(store, "main")  # it may just be under way
+    in_segments = manifest.read(store.path).journals.keys()
+    for journal in files:
+        if journal.name not in in_segments:
+            journal.path.unlink(missing_ok=True)
+    lock.release()
+    stays = sum(journal.rows for journal in files if journal.name in in_segments)
+    return f"an earlier import was broken off, {stays} of its messages are twice" if stays else ""

@@ -117,7 +117,7 @@ def test_a_topic_nobody_publishes_is_a_gap(tmp_path: Path) -> None:
 
 def _time(record: Record, kind: str) -> int:
     table = record.events()
-    return next(row["timestamp"] for row in table.rows() if row["kind"] == kind)
+    return next(int(row["timestamp"]) for row in table.rows() if row["kind"] == kind)
 
 
 def test_a_master_that_comes_late_is_waited_for(tmp_path: Path) -> None:

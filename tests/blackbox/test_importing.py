@@ -1,0 +1,216 @@
+"""Imports that are repeated, broken off, of damaged files, or of the box's own journals."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from rosbags.rosbag1 import Writer
+from rosbags.typesys import Stores, get_typestore
+
+import amberbox
+from amberbox.blackbox.formats.recording import Recording
+from amberbox.blackbox.importing import import_recordings
+from amberbox.core.errors import AmberboxError, UsageError
+from amberbox.core.source import TopicOptions
+from amberbox.testing.box import COUNT, ManualBox, events, last_counters, number, own_records
+
+TYPES = get_typestore(Stores.ROS1_NOETIC)
+COUNT_MESSAGES = 4000
+START_NS = 1_600_000_000 * 10**9
+
+
+@pytest.fixture
+def bag(tmp_path: Path) -> Path:
+    return write_bag(tmp_path / "count.bag", COUNT_MESSAGES)
+
+
+def write_bag(path: Path, count: int, size: int = 300) -> Path:
+    """Write numbered texts that do not compress, 10 ms apart."""
+    kind = "std_msgs/msg/String"
+    writer = Writer(path)
+    writer.chunk_threshold = 20_000
+    with writer:
+        connection = writer.add_connection("/text", kind, typestore=TYPES)
+        for n in range(count):
+            text = f"{n} {os.urandom(size // 2).hex()}"
+            data = TYPES.serialize_ros1(TYPES.types[kind](text), kind)
+            writer.write(connection, START_NS + n * 10**7, data)
+    return path
+
+
+def numbers(store: Path) -> list[int]:
+    texts = amberbox.open(store).query("ros_text").values("data")
+    return [int(text.split()[0]) for text in texts]
+
+
+def test_times_are_those_of_the_recording(bag: Path, tmp_path: Path) -> None:
+    import_recordings([bag], tmp_path / "store")
+    items = amberbox.open(tmp_path / "store").items()
+    (item,) = (item for item in items if item.name == "ros_text")
+    assert (item.first_ns, item.rows) == (START_NS, COUNT_MESSAGES)
+    assert item.last_ns == START_NS + (COUNT_MESSAGES - 1) * 10**7
+    assert all(START_NS <= i.first_ns <= i.last_ns <= item.last_ns for i in items)
+
+
+def test_what_is_there_is_not_imported_again(bag: Path, tmp_path: Path) -> None:
+    store, copy = tmp_path / "store", tmp_path / "another_name.bag"
+    copy.write_bytes(bag.read_bytes())
+    other = write_bag(tmp_path / "other.bag", 10)
+    reports = import_recordings([bag, copy, other], store)
+    assert [report.known for report in reports] == [False, True, False]
+    assert reports[1].lines() == [f"{copy}: is in the store already, nothing was done"]
+    assert len(numbers(store)) == COUNT_MESSAGES + 10
+    journals = sorted((store / "journal").iterdir())
+    assert [r.known for r in import_recordings([other, bag], store)] == [True, True]
+    assert sorted((store / "journal").iterdir()) == journals
+
+
+def test_an_import_that_is_interrupted_is_done_again_whole(
+    bag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store, original = tmp_path / "store", Recording.messages
+    with monkeypatch.context() as patch:
+
+        def interrupted(self: Recording) -> Iterator[Any]:
+            for place, message in enumerate(original(self)):
+                if place == 3000:
+                    raise KeyboardInterrupt
+                yield message
+
+        patch.setattr(Recording, "messages", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            import_recordings([bag], store)
+    assert 0 < len(numbers(store)) <= 3000
+    (report,) = import_recordings([bag], store)
+    assert (report.known, report.notes, report.messages) == (False, [], COUNT_MESSAGES)
+    assert numbers(store) == list(range(COUNT_MESSAGES))
+    assert import_recordings([bag], store)[0].known
+
+
+def killed(bag: Path, store: Path, after: int) -> None:
+    """Import with small files, in a process that dies on the way."""
+    from amberbox.blackbox import importing
+
+    original, patch = Recording.messages, pytest.MonkeyPatch()
+
+    def dying(self: Recording) -> Iterator[Any]:
+        for place, message in enumerate(original(self)):
+            if place == after:
+                os._exit(9)
+            yield message
+
+    patch.setattr(Recording, "messages", dying)
+    patch.setattr(importing, "PipelineOptions", small_files)
+    patch.setattr(importing, "TICK_BYTES", 10_000)
+    import_recordings([bag], store)
+
+
+def small_files(**options: Any) -> Any:
+    from amberbox.blackbox.recorder.pipeline import PipelineOptions
+
+    return PipelineOptions(**{**options, "rotate_bytes": 100_000})
+
+
+@pytest.mark.parametrize("after", [0, 500, 3999])
+def test_an_import_that_is_killed_is_done_again_whole(
+    bag: Path, tmp_path: Path, after: int
+) -> None:
+    store = tmp_path / "store"
+    process = multiprocessing.get_context("fork").Process(target=killed, args=(bag, store, after))
+    process.start()
+    process.join(30)
+    assert process.exitcode == 9
+    assert len(list((store / "journal").glob("*.mcap"))) > (2 if after == 3999 else -1)
+    (report,) = import_recordings([bag], store)
+    assert (report.known, report.messages) == (False, COUNT_MESSAGES)
+    assert numbers(store) == list(range(COUNT_MESSAGES))
+
+
+@pytest.mark.parametrize("share", [0.2, 0.6, 0.99])
+def test_a_truncated_bag_gives_what_can_be_read(bag: Path, tmp_path: Path, share: float) -> None:
+    torn = tmp_path / "torn.bag"
+    content = bag.read_bytes()
+    torn.write_bytes(content[: int(share * len(content))])
+    (report,) = import_recordings([torn], tmp_path / "store")
+    found = numbers(tmp_path / "store")
+    assert found == list(range(len(found)))
+    assert abs(len(found) / COUNT_MESSAGES - share) < 0.05
+    assert report.messages == len(found)
+    assert report.damage
+    assert "damaged" in "\n".join(report.lines())
+
+
+@pytest.mark.needs_data
+def test_the_truncated_recording_gives_what_can_be_read(shared_data: Path, tmp_path: Path) -> None:
+    path = shared_data / "recordings/test_truncated.bag"
+    (report,) = import_recordings([path], tmp_path / "store")
+    assert report.damage
+    items = {item.name: item.rows for item in amberbox.open(tmp_path / "store").items()}
+    assert {name: count for name, count in report.items.items() if count} == {
+        name: rows for name, rows in items.items() if name.startswith("ros_") and "__" not in name
+    }
+    assert report.messages > 0
+
+
+def test_a_journal_of_ours_is_imported_without_the_boxs_own_records(tmp_path: Path) -> None:
+    box = ManualBox(tmp_path / "robot")
+    for n in range(100):
+        box.hear(COUNT, number(n))
+        box.write()
+    box.close()
+    (journal,) = (box.store / "journal").glob("*.mcap")
+    store = tmp_path / "store"
+    (report,) = import_recordings([journal], store)
+    assert report.items == {"ros_count": 100}
+    assert amberbox.open(store).query("ros_count").values("data") == list(range(100))
+    assert [run["run"] for run in own_records(store, "amberbox/run")] == [1]
+    assert [event["kind"] for event in own_records(store, "amberbox/event")] == ["imported"]
+
+
+def test_options_thin_out_and_the_import_counts_it(bag: Path, tmp_path: Path) -> None:
+    options = [TopicOptions("/text", max_frequency=10.0)]
+    (report,) = import_recordings([bag], tmp_path / "store", topics=options)
+    counters = last_counters(tmp_path / "store")["ros_text"]
+    assert counters["received"] == COUNT_MESSAGES
+    assert report.messages == counters["kept"] == pytest.approx(400, abs=12)
+    assert import_recordings([bag], tmp_path / "none", topics=[TopicOptions("/x")])[0].items == {}
+
+
+def test_errors_name_what_is_wrong(tmp_path: Path, bag: Path) -> None:
+    with pytest.raises(UsageError, match="no recording at"):
+        import_recordings([tmp_path / "nothing.bag"], tmp_path / "store")
+    (tmp_path / "text.bag").write_text("not a bag at all, but long enough for its first line")
+    with pytest.raises(AmberboxError, match=r"text\.bag"):
+        import_recordings([tmp_path / "text.bag"], tmp_path / "store")
+    with pytest.raises(AmberboxError, match="cannot write to the store"):
+        import_recordings([bag], bag / "store")
+    box = ManualBox(tmp_path / "busy")
+    with pytest.raises(UsageError, match=f"written by process {os.getpid()}"):
+        import_recordings([bag], tmp_path / "busy")
+    box.close()
+
+
+def test_a_full_disk_ends_the_import_with_an_error(
+    bag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from amberbox.blackbox.journal import writer
+
+    write = writer._write_all
+
+    def refuse(fd: int, data: bytes) -> None:
+        if len(data) > 10_000:
+            raise OSError(28, "No space left on device")
+        write(fd, data)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(writer, "_write_all", refuse)
+        with pytest.raises(AmberboxError, match="No space left on device"):
+            import_recordings([bag], tmp_path / "store")
+    assert not import_recordings([bag], tmp_path / "store")[0].known
+    assert numbers(tmp_path / "store") == list(range(COUNT_MESSAGES))
+    assert len(events(tmp_path / "store", "imported")) == 1
