@@ -32,7 +32,8 @@ def draw_page(plot: Drawing) -> bytes:
     }
     text = json.dumps(data, allow_nan=False).replace("<", "\\u003c")
     template = files("amberbox.cli").joinpath("plot_page.html").read_text("utf-8")
-    return template.replace("{{title}}", html.escape(plot.title)).replace("{{data}}", text).encode()
+    page = template.replace("{{count}}", str(len(plot.units())))
+    return page.replace("{{title}}", html.escape(plot.title)).replace("{{data}}", text).encode()
 
 
 def _curve(curve: Curve, t0: int) -> dict[str, Any]:
