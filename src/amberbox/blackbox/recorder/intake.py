@@ -23,6 +23,7 @@ class Intake:
         self._queue: list[tuple[Stream, bytes, int]] = []
         self._bytes = 0
         self._waiting_bytes = 0
+        self._waits_no_more = False
 
     def put(self, stream: Stream, data: bytes, received_ns: int) -> None:
         """Take a message, or drop and count it when the queue is full. Never waits."""
@@ -37,16 +38,29 @@ class Intake:
             self._queue.append((stream, data, received_ns))
 
     def put_waiting(self, stream: Stream, data: bytes, received_ns: int) -> None:
-        """Take a message of a file: wait for room instead of dropping."""
+        """Take a message of a file: wait for room, until ``wait_no_more``, instead of dropping."""
         size = len(data) + _OVERHEAD
         with self._room:
-            while self._queue and self._bytes + self._waiting_bytes + size > self.limit_bytes:
+            while self._is_full_for(size):
+                if self._waits_no_more:
+                    return
                 self.wake.set()
                 self._room.wait(1.0)
             stream.counters.received += 1
             stream.counters.last_received_ns = received_ns
             self._bytes += size
             self._queue.append((stream, data, received_ns))
+
+    def _is_full_for(self, size: int) -> bool:
+        """Tell whether there is no room; there always is for one message, however large."""
+        used = self._bytes + self._waiting_bytes
+        return used > 0 and used + size > self.limit_bytes
+
+    def wait_no_more(self) -> None:
+        """Send those away who wait for room, for the recording ends."""
+        with self._room:
+            self._waits_no_more = True
+            self._room.notify_all()
 
     def take_drops(self, item: Item) -> Drops | None:
         """Return what was dropped of an item since the last call."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import threading
+from contextlib import suppress
 from pathlib import Path
 
 from amberbox.blackbox.store import replace_file
@@ -30,7 +31,8 @@ class ItemNames:
         with self._lock:
             if key not in self._names:
                 self._names = self._extended(key, item_name(source, topic))
-                replace_file(self._path, json.dumps(self._names, indent=0))
+                with suppress(OSError):  # a full disk: it is written with the next name
+                    replace_file(self._path, json.dumps(self._names, indent=0))
             return self._names[key]
 
     def _extended(self, key: str, plain: str) -> dict[str, str]:

@@ -3,30 +3,25 @@
 from __future__ import annotations
 
 import gc
-import os
 import shutil
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
-from amberbox.blackbox.folder.blocks import SourceBlock
 from amberbox.blackbox.folder.folder import RobotFolder
-from amberbox.blackbox.follow import read
-from amberbox.blackbox.journal.writer import SyncMark
+from amberbox.blackbox.recorder.keeperprocess import KeeperProcess
 from amberbox.blackbox.recorder.messageclock import MessageClock
 from amberbox.blackbox.recorder.pipeline import Pipeline, PipelineOptions
-from amberbox.blackbox.recorder.sink import BlockSink
-from amberbox.blackbox.store import Store, create_store
+from amberbox.blackbox.recorder.recovery import previous_end_ns, report_recovery
+from amberbox.blackbox.recorder.supervisor import Supervisor
+from amberbox.blackbox.recorder.syncer import Syncer
+from amberbox.blackbox.store import create_store
 from amberbox.core.clock import NS, Clock, RunClock, SystemClock
 from amberbox.core.errors import UsageError
-from amberbox.core.plugins import get
 
-SOURCES = "amberbox.blackbox.sources"
-_MAX_BACKOFF_S = 30.0
+_STOP_S = 3.0
+"""How long sources may take to end."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,8 +81,8 @@ class Recorder:
             ),
             start_gap_ns=previous_end_ns(self.store),
         )
-        self._report_recovery()
-        self._sources: list[threading.Thread] = []
+        report_recovery(self.pipeline)
+        self._sources = [Supervisor(self.pipeline, block, self.stop) for block in folder.blocks]
         self._rates: dict[str, tuple[int, float]] = {}
 
     def run(self) -> None:
@@ -95,92 +90,51 @@ class Recorder:
         gc.collect()
         gc.freeze()  # what exists now lives as long as the process: leave it out of collections
         self.pipeline.event("started", f"recording {self.folder.robot.id}")
-        for block in self.folder.blocks:
-            self._start(block)
-        keeper = (
-            _Keeper(self.store, self.folder.robot.store.ring_s) if self._keeper_wanted else None
-        )
-        syncer = _Syncer(self.pipeline, self.folder.robot.store.sync_s)
+        for source in self._sources:
+            source.thread.start()
+        options = self.folder.robot.store
+        keeper = KeeperProcess(self.pipeline, options.ring_s) if self._keeper_wanted else None
+        syncer = Syncer(self.pipeline, options.sync_s)
         try:
             self._tick_until_stopped(syncer, keeper)
         finally:
             self._finish(syncer, keeper)
 
-    def _tick_until_stopped(self, syncer: _Syncer, keeper: _Keeper | None) -> None:
+    def _tick_until_stopped(self, syncer: Syncer, keeper: KeeperProcess | None) -> None:
         write_s = self.folder.robot.store.write_s
         due = time.monotonic() + write_s
         while not self.stop.is_set():
             self.pipeline.intake.wake.wait(max(0.0, due - time.monotonic()))
             self.pipeline.intake.wake.clear()
+            due = time.monotonic() + write_s
             self.pipeline.tick()
             syncer.poke()
             if keeper is not None:
                 keeper.look_after()
-            if not any(thread.is_alive() for thread in self._sources):
+            if not any(source.thread.is_alive() for source in self._sources):
                 break
-            due = max(due + write_s, time.monotonic())
 
-    def _finish(self, syncer: _Syncer, keeper: _Keeper | None) -> None:
+    def _finish(self, syncer: Syncer, keeper: KeeperProcess | None) -> None:
         self.stop.set()
-        for thread in self._sources:
-            thread.join(3.0)
+        self.pipeline.intake.wait_no_more()
+        stuck = self._join_sources()
         syncer.stop()
-        self.pipeline.event("stopped", "recording stopped")
+        text = "recording stopped"
+        if stuck:
+            text += f"; still running: {', '.join(stuck)}"
+        self.pipeline.event("stopped", text, stuck=stuck)
         try:
             self.pipeline.close()
         finally:
             if keeper is not None:
                 keeper.stop()
 
-    def _start(self, block: SourceBlock) -> None:
-        thread = threading.Thread(target=self._supervise, args=(block,), name=block.name)
-        thread.daemon = True
-        self._sources.append(thread)
-        thread.start()
-
-    def _supervise(self, block: SourceBlock) -> None:
-        """Run a source until it ends; start it again when it fails."""
-        module = get(SOURCES, block.plugin).load()
-        backoff_s, sink = 1.0, None
-        while not self.stop.is_set():
-            try:
-                source = module.Source(block.config, block.name)
-                if sink is None:
-                    sink = self._sink(block, source)
-                source.run(sink, self.stop)
-            except Exception as error:
-                text = f"{block.name} failed and starts again in {backoff_s:.0f} s: {error}"
-                self.pipeline.event("source_failed", text, block.name, error=repr(error))
-                self.stop.wait(backoff_s)
-                backoff_s = min(2 * backoff_s, _MAX_BACKOFF_S)
-                continue
-            if not self.stop.is_set():
-                self.pipeline.event("source_ended", f"{block.name} has ended", block.name)
-            return
-
-    def _sink(self, block: SourceBlock, source: Any) -> BlockSink:
-        sink = BlockSink(self.pipeline, block.name, source.topics(), lossless=source.lossless)
-        if not source.lossless:
-            sink.expect_topics()
-        return sink
-
-    def _report_recovery(self) -> None:
-        """Say what an earlier run left unfinished or damaged."""
-        for journal in _last_run(self.store):
-            if journal.finished and not journal.damage:
-                continue
-            lost = read.holes(journal)
-            text = f"{journal.name} was not finished; {journal.rows} messages are there"
-            if journal.damage:
-                text += (
-                    f", {sum(d.to_offset - d.from_offset for d in journal.damage)} bytes are not"
-                )
-            self.pipeline.event(
-                "recovered", text, file=journal.name, rows=journal.rows,
-                damage=[(d.from_offset, d.to_offset, d.reason) for d in journal.damage],
-                missing=[(gap.from_seq, gap.to_seq) for gap in lost],
-                end_seq=journal.end_seq, end_ns=journal.end_ns,
-            )  # fmt: skip
+    def _join_sources(self) -> list[str]:
+        """Wait for the sources to end; return the names of those that do not."""
+        deadline = time.monotonic() + _STOP_S
+        for source in self._sources:
+            source.thread.join(max(0.0, deadline - time.monotonic()))
+        return [source.thread.name for source in self._sources if source.thread.is_alive()]
 
     def state(self) -> RecorderState:
         """Describe what is being recorded, for the live table."""
@@ -204,71 +158,6 @@ class Recorder:
                          counters.dropped, counters.bytes)  # fmt: skip
 
 
-class _Syncer:
-    """Makes the journals durable every ``sync_s`` in a thread of its own, so writing goes on."""
-
-    def __init__(self, pipeline: Pipeline, sync_s: float) -> None:
-        self._pipeline = pipeline
-        self._sync_s = sync_s
-        self._due = time.monotonic() + sync_s
-        self._thread: threading.Thread | None = None
-
-    def poke(self) -> None:
-        """Start a sync when one is due and none is under way."""
-        now = time.monotonic()
-        if now < self._due or (self._thread is not None and self._thread.is_alive()):
-            return
-        self._due = now + self._sync_s
-        try:
-            marks = self._pipeline.mark_sync()
-        except OSError:  # a full disk: the next write reports it
-            return
-        self._thread = threading.Thread(target=self._wait, args=(marks,), daemon=True)
-        self._thread.start()
-
-    def _wait(self, marks: Sequence[SyncMark]) -> None:
-        try:
-            for mark in marks:
-                mark.wait()
-        except OSError as error:
-            self._pipeline.event("disk", f"the disk does not sync: {error.strerror}")
-
-    def stop(self) -> None:
-        """Wait for the sync that is under way."""
-        if self._thread is not None:
-            self._thread.join()
-
-
-class _Keeper:
-    """Runs the keeper process beside the recorder and starts it again when it dies."""
-
-    def __init__(self, store: Store, ring_s: float) -> None:
-        module = ["-m", "amberbox.blackbox.keeper"]
-        self._command = [sys.executable, *module, str(store.path), "--ring-s", str(ring_s)]
-        self._process: subprocess.Popen[bytes] | None = None
-        self._not_before = 0.0
-
-    def look_after(self) -> None:
-        """Start the keeper if it is not running, at most every ten seconds."""
-        now = time.monotonic()
-        if now < self._not_before or (self._process and self._process.poll() is None):
-            return
-        self._not_before = now + 10.0
-        self._process = subprocess.Popen(
-            [*self._command, "--parent", str(os.getpid())], stdin=subprocess.DEVNULL
-        )
-
-    def stop(self) -> None:
-        """Let it finish what it is doing."""
-        if self._process is not None:
-            self._process.terminate()
-            try:
-                self._process.wait(10.0)
-            except subprocess.TimeoutExpired:
-                self._process.kill()
-                self._process.wait()
-
-
 def virtual_start_ns(folder: RobotFolder) -> int | None:
     """Return when time begins if all sources of a folder bring their own, None if none does.
 
@@ -281,20 +170,3 @@ def virtual_start_ns(folder: RobotFolder) -> int | None:
             f"write 'times: now' at {virtual[0].name}, or give it a robot folder of its own",
         )
     return min((block.config.start_ns() for block in virtual), default=None)
-
-
-def _last_run(store: Store) -> list[read.JournalFile]:
-    found = [
-        read.journal_file(path, f"{path.parent.name}/{path.name}")
-        for writer in ("main", "ring")
-        for path in store.journal_files(writer)[-1:]
-    ]
-    return [journal for journal in found if journal.rows or journal.damage]
-
-
-def previous_end_ns(store: Store) -> int | None:
-    """Corrected time up to which an earlier run recorded; None if there was none."""
-    ends = []
-    for journal in _last_run(store):
-        ends.append(journal.end_ns + (journal.clock[-1][1] if journal.clock else 0))
-    return max(ends, default=None)

@@ -30,6 +30,7 @@ class BlockSink:
         self._options = {options.name: options for options in topics}
         self._streams: list[Stream] = []
         self._numbers: dict[Topic, int] = {}
+        self._links: set[tuple[str, str]] = set()
         self._lock = threading.Lock()
         self._put = pipeline.intake.put_waiting if lossless else pipeline.intake.put
         self.now_ns = pipeline.clock.now_ns
@@ -51,10 +52,21 @@ class BlockSink:
     def message(self, stream: int, data: bytes, received_ns: int) -> None:
         self._put(self._streams[stream], data, received_ns)
 
+    def has_heard(self) -> bool:
+        """Tell whether any message has come so far."""
+        return any(stream.counters.received for stream in self._streams)
+
+    def lose_links(self, reason: str) -> None:
+        """Open the gaps of all peers: the source has failed without saying so."""
+        for topic, peer in list(self._links):
+            self.link_down(topic, peer, reason)
+
     def link_up(self, topic: str, peer: str, since_ns: int | None = None) -> None:
+        self._links.add((topic, peer))
         self._pipeline.gaps.up(self._item(topic), peer, self.now_ns(), since_ns)
 
     def link_down(self, topic: str, peer: str, reason: str, since_ns: int | None = None) -> None:
+        self._links.discard((topic, peer))
         at_ns = self.now_ns() if since_ns is None else since_ns
         self._pipeline.gaps.down(self._item(topic), peer, at_ns, reason)
 
@@ -78,8 +90,11 @@ class BlockSink:
 
     def save_state(self, state: Mapping[str, Any]) -> None:
         path = self._state_file()
-        path.parent.mkdir(exist_ok=True)
-        replace_file(path, json.dumps(state))
+        try:
+            path.parent.mkdir(exist_ok=True)
+            replace_file(path, json.dumps(state))
+        except OSError as error:  # the source shall go on listening
+            self.event("disk", f"the state of {self._name} is not kept: {error.strerror}")
 
     def _state_file(self) -> Path:
         return self._pipeline.store.path / "state" / f"{self._name}.json"

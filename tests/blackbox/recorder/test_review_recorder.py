@@ -1,0 +1,183 @@
+"""The recorder around its sources: how they fail, how they end, and what a stop costs."""
+
+from __future__ import annotations
+
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import amberbox
+from amberbox.blackbox.folder.folder import load_folder
+from amberbox.blackbox.recorder import keeperprocess, names, sink
+from amberbox.blackbox.recorder.intake import Intake
+from amberbox.blackbox.recorder.keeperprocess import KeeperProcess
+from amberbox.blackbox.recorder.recorder import Recorder
+from amberbox.blackbox.recorder.recovery import previous_end_ns
+from amberbox.blackbox.recorder.streams import Item, Stream
+from amberbox.blackbox.sources import recording as recording_source
+from amberbox.blackbox.sources import ros as ros_source
+from amberbox.blackbox.store import open_store
+from amberbox.core.source import Sink, TopicOptions
+from amberbox.testing.box import COUNT, ManualBox, events, number
+from amberbox.testing.realros import wait_until
+
+ROS = "- ros: {ros_master_uri: 'http://127.0.0.1:1', topics: [{name: /count}]}\n"
+FILE = "- recording: {path: absent.bag}\n"
+Run = Callable[[Any, Sink, threading.Event], None]
+
+
+@contextmanager
+def running(folder: Path, black_box: str) -> Iterator[tuple[Recorder, threading.Thread]]:
+    folder.mkdir()
+    (folder / "robot.yaml").write_text("id: r\n")
+    (folder / "black_box.yaml").write_text(black_box)
+    recorder = Recorder(load_folder(folder), keeper=False)
+    thread = threading.Thread(target=recorder.run)
+    thread.start()
+    try:
+        yield recorder, thread
+    finally:
+        recorder.stop.set()
+        thread.join(10)
+        assert not thread.is_alive()
+
+
+def test_events_do_not_put_off_the_next_write(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    heard_at: list[float] = []
+
+    def run(self: object, sink: Sink, stop: threading.Event) -> None:
+        for n in range(30):
+            sink.event("noise", f"event {n}")
+            stop.wait(0.005)
+        sink.message(sink.topic(COUNT), number(1), sink.now_ns())
+        heard_at.append(time.monotonic())
+        stop.wait()
+
+    monkeypatch.setattr(ros_source.Source, "run", run)
+    with running(tmp_path / "robot", ROS) as (recorder, _):
+        wait_until(
+            lambda: heard_at and recorder.pipeline.items["ros_count"].counters.kept, 5, "a write"
+        )
+        assert time.monotonic() - heard_at[0] < 0.5
+
+
+def test_the_gap_of_a_source_that_fails_lasts_until_it_hears_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    runs: list[int] = []
+
+    def run(self: object, sink: Sink, stop: threading.Event) -> None:
+        runs.append(sink.now_ns())
+        sink.link_up("/count", "robot")
+        sink.message(sink.topic(COUNT), number(len(runs)), sink.now_ns())
+        if len(runs) == 1:
+            raise OSError("no such device")
+        stop.wait()
+
+    monkeypatch.setattr(ros_source.Source, "run", run)
+    with running(tmp_path / "robot", ROS) as (recorder, _):
+        wait_until(lambda: len(runs) == 2, 5, "a second run")
+        wait_until(lambda: recorder.pipeline.items["ros_count"].counters.kept == 2, 5, "both")
+    gaps = amberbox.open(tmp_path / "robot").gaps("ros_count")
+    (gap,) = (gap for gap in gaps if gap.reason == "ros failed")
+    assert gap.from_ns >= runs[0]
+    assert 0.9e9 < gap.to_ns - gap.from_ns < 3e9
+
+
+def test_a_file_that_fails_halfway_is_not_played_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    runs = []
+
+    def run(self: object, sink: Sink, stop: threading.Event) -> None:
+        runs.append(1)
+        sink.message(sink.topic(COUNT), number(1), sink.now_ns())
+        raise OSError("Input/output error")
+
+    monkeypatch.setattr(recording_source.Source, "run", run)
+    with running(tmp_path / "robot", FILE) as (_, thread):
+        thread.join(5)  # all sources have ended
+        assert not thread.is_alive()
+    store = tmp_path / "robot" / "store"
+    (told,) = events(store, "source_failed")
+    assert "failed and has ended: Input/output error" in told["text"]
+    assert amberbox.open(store).query("recording_count").values("data") == [1]
+    assert len(runs) == 1
+
+
+def stream() -> Stream:
+    return Stream(Item("count", "ros", "/count", TopicOptions("/count")), COUNT)
+
+
+def test_a_file_waits_while_the_disk_has_what_was_taken() -> None:
+    intake, count = Intake(limit_bytes=300), stream()
+    intake.put_waiting(count, bytes(1000), 1)
+    assert len(intake.take()) == 1
+    intake.wait_no_more()
+    intake.put_waiting(count, bytes(10), 2)
+    assert intake.take() == []
+    intake.release()
+    intake.put_waiting(count, bytes(1000), 3)
+    assert len(intake.take()) == 1
+    assert count.counters.received == 2
+
+
+def test_a_stop_sends_those_away_who_wait_for_room() -> None:
+    intake, count = Intake(limit_bytes=300), stream()
+    intake.put_waiting(count, bytes(200), 1)
+    waiting = threading.Thread(target=intake.put_waiting, args=(count, bytes(200), 2))
+    waiting.start()
+    assert intake.wake.wait(5)
+    intake.wait_no_more()
+    waiting.join(5)
+    assert not waiting.is_alive()
+    assert (len(intake.take()), count.counters.received) == (1, 1)
+
+
+def test_the_last_run_is_known_behind_an_empty_file(tmp_path: Path) -> None:
+    box = ManualBox(tmp_path / "store")
+    box.hear(COUNT, number(1))
+    box.write()
+    box.close()
+    (box.store / "journal" / "000002-00000000-0000.mcap").touch()
+    assert previous_end_ns(open_store(box.store)) == box.clock.wall
+
+
+def test_a_full_disk_does_not_stop_a_source_from_listening(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(path: Path, text: str) -> None:
+        raise OSError(28, "No space left on device")
+
+    box = ManualBox(tmp_path / "store")
+    monkeypatch.setattr(sink, "replace_file", refuse)
+    monkeypatch.setattr(names, "replace_file", refuse)
+    box.sink.save_state({"port": 1})
+    box.hear(COUNT, number(1))
+    box.write()
+    box.close()
+    (told,) = events(box.store, "disk")
+    assert told["text"] == "the state of ros is not kept: No space left on device"
+    assert amberbox.open(box.store).query("ros_count").values("data") == [1]
+
+
+def test_a_keeper_that_cannot_run_is_told_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    box = ManualBox(tmp_path / "store")
+    monkeypatch.setattr(sys, "executable", "/absent/python")
+    monkeypatch.setattr(keeperprocess, "_PAUSE_S", 0.0)
+    keeper = KeeperProcess(box.pipeline, 300.0)
+    keeper.look_after()
+    keeper.look_after()
+    box.close()
+    (told,) = events(box.store, "keeper")
+    assert told["text"].startswith("the keeper cannot be started: No such file")
