@@ -143,6 +143,8 @@ def test_a_truncated_bag_gives_what_can_be_read(bag: Path, tmp_path: Path, share
     assert report.messages == len(found)
     assert report.damage
     assert "damaged" in "\n".join(report.lines())
+    told = events(tmp_path / "store", "recording_damaged")
+    assert [event["text"] for event in told] == report.damage
 
 
 @pytest.mark.needs_data

@@ -113,6 +113,8 @@ def _copy_all(
     chosen = {option.name for option in topics}
     try:
         _copy(recording, pipeline, sink, chosen, progress)
+        for damage in recording.report.damage:
+            pipeline.event("recording_damaged", str(damage), source, offset=damage.offset)
         pipeline.event("imported", f"{path.name} is imported whole", source, sha256=digest)
     finally:
         pipeline.close()

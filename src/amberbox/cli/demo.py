@@ -21,7 +21,7 @@ import numpy as np
 import amberbox
 from amberbox.blackbox.follow import read
 from amberbox.core.clock import NS
-from amberbox.core.errors import AmberboxError
+from amberbox.core.errors import AmberboxError, UsageError
 
 FAULT = "wheel_front_left_motor_weak"
 SHOWN = ("sensors_front_left_current_1_q", "sensors_front_right_current_1_q")
@@ -42,7 +42,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Run the demonstration; 0 only if every step worked."""
     if args.seconds < 8:
-        raise AmberboxError("the demonstration needs at least 8 seconds", "DEMO_SECONDS=20")
+        raise UsageError("the demonstration needs at least 8 seconds", "DEMO_SECONDS=20")
     place = args.keep or Path(tempfile.mkdtemp(prefix="amberbox-demo-"))
     place.mkdir(parents=True, exist_ok=True)
     demo = Demo(place, args.seconds)

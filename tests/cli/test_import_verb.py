@@ -1,0 +1,112 @@
+"""``amberbox import``: exit status, report, JSON, bar; and a recording in place of a store."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+from rosbags.rosbag1 import Writer
+from rosbags.typesys import Stores, get_typestore
+
+from amberbox.cli.main import main
+from amberbox.testing.box import COUNT, ManualBox, number
+
+TYPES = get_typestore(Stores.ROS1_NOETIC)
+Capture = pytest.CaptureFixture[str]
+
+
+@pytest.fixture
+def bag(tmp_path: Path) -> Path:
+    path, kind = tmp_path / "some.bag", "std_msgs/msg/Float64"
+    writer = Writer(path)
+    writer.chunk_threshold = 1000
+    with writer:
+        connection = writer.add_connection("/voltage", kind, typestore=TYPES)
+        for n in range(500):
+            data = TYPES.serialize_ros1(TYPES.types[kind](n / 2), kind)
+            writer.write(connection, 10**18 + n * 10**8, data)
+    return path
+
+
+@pytest.fixture
+def torn(bag: Path) -> Path:
+    path = bag.with_name("torn.bag")
+    path.write_bytes(bag.read_bytes()[:9000])
+    return path
+
+
+def test_the_report_for_people(bag: Path, tmp_path: Path, capsys: Capture) -> None:
+    store = str(tmp_path / "store")
+    assert main(["import", str(bag), "--store", store]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[:2] == [f"{bag}: 500 messages", "  ros_voltage: 500"]
+    assert lines[-1].startswith("500 messages in ") and lines[-1].endswith(f"now in {store}")
+    assert main(["import", str(bag), "--store", store]) == 0
+    assert "is in the store already, nothing was done" in capsys.readouterr().out
+    assert main(["items", store]) == 0
+    assert "ros_voltage" in capsys.readouterr().out
+
+
+def test_the_report_for_programs(bag: Path, torn: Path, tmp_path: Path, capsys: Capture) -> None:
+    arguments = ["--store", str(tmp_path / "store"), "--source", "robot", "--json"]
+    assert main(["import", str(bag), str(torn), *arguments]) == 1
+    whole, broken = json.loads(capsys.readouterr().out)
+    assert whole == {
+        "path": str(bag),
+        "messages": 500,
+        "items": {"robot_voltage": 500},
+        "notes": [],
+        "damage": [],
+        "already_imported": False,
+    }
+    assert 0 < broken["messages"] < 500
+    assert broken["damage"]
+
+
+def test_a_bar_shows_progress_on_a_terminal(
+    bag: Path, tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    assert main(["import", str(bag), "--store", str(tmp_path / "store")]) == 0
+    assert capsys.readouterr().err.endswith("[##############################] 100%\n")
+
+
+def test_wrong_usage(tmp_path: Path, capsys: Capture) -> None:
+    assert main(["import", str(tmp_path / "none.bag"), "--store", str(tmp_path / "store")]) == 2
+    assert "there is no recording at" in capsys.readouterr().err
+    assert main(["import", "x.bag"]) == 2
+    assert "--store" in capsys.readouterr().err
+
+
+def test_what_is_no_recording_is_a_problem(tmp_path: Path, capsys: Capture) -> None:
+    (tmp_path / "notes.bag").write_text("milk, bread, and a long line of something else")
+    store = str(tmp_path / "store")
+    assert main(["import", str(tmp_path / "notes.bag"), "--store", store]) == 1
+    printed = capsys.readouterr().err
+    assert "notes.bag" in printed
+    assert "Traceback" not in printed
+
+
+def test_a_bag_is_a_record_like_any_other(bag: Path, capsys: Capture) -> None:
+    assert main(["items", str(bag), "--json"]) == 0
+    items = {item["name"]: item for item in json.loads(capsys.readouterr().out)}
+    assert (items["ros_voltage"]["rows"], items["ros_voltage"]["rate_hz"]) == (500, 10.0)
+    assert main(["query", str(bag), "ros_voltage", "--from", "-1s", "--format", "json"]) == 0
+    rows = json.loads(capsys.readouterr().out)
+    assert [row["data"] for row in rows] == [n / 2 for n in range(489, 500)]
+    assert main(["sql", str(bag), "select max(data) as most from ros_voltage"]) == 0
+    assert "249.5" in capsys.readouterr().out
+    assert sorted(path.name for path in bag.parent.iterdir()) == ["some.bag"]
+
+
+def test_a_journal_file_is_a_record_like_any_other(tmp_path: Path, capsys: Capture) -> None:
+    box = ManualBox(tmp_path / "store")
+    for n in range(20):
+        box.hear(COUNT, number(n))
+        box.write()
+    box.close()
+    (journal,) = (box.store / "journal").glob("*.mcap")
+    assert main(["query", str(journal), "ros_count", "--format", "csv"]) == 0
+    assert len(capsys.readouterr().out.splitlines()) == 21

@@ -1,0 +1,149 @@
+"""``amberbox record``: how it ends, what it shows, and that a signal ends it cleanly."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+import amberbox
+from amberbox.blackbox.follow import read
+from amberbox.blackbox.recorder.recorder import ItemState, RecorderState
+from amberbox.cli.main import main
+from amberbox.cli.record import summary, table
+from amberbox.core.errors import UsageError
+from amberbox.testing.box import events
+from amberbox.testing.realros import wait_until
+
+SIM = "- sim:\n    seed: 1\n    topics: [{name: odom}, {name: wifi}]\n"
+STATE = RecorderState(
+    [
+        ItemState("ros_odom", 49.96, 500, 250, 250, 0, 176_000),
+        ItemState("ros_a_long_item_name", 0.0, 3, 1, 0, 2, 12),
+    ],
+    queue_bytes=1200,
+    written_bytes=98_765_432,
+    disk_free_bytes=45_600_000_000,
+    disk_error="",
+)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    made = tmp_path / "robot"
+    made.mkdir()
+    (made / "robot.yaml").write_text("id: r\n")
+    (made / "black_box.yaml").write_text(SIM)
+    return made
+
+
+def record(folder: Path, *options: str) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, "-m", "amberbox", "record", str(folder), *options],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+
+
+def test_the_table_lines_up() -> None:
+    assert table(STATE, 12.3) == [
+        "item                  rate Hz  kept  filtered  dropped     bytes",
+        "ros_odom                 50.0   250       250        0  176.0 kB",
+        "ros_a_long_item_name      0.0     1         0        2      12 B",
+        "12 s, written 98.8 MB, queue 1.2 kB, disk left 45.6 GB",
+    ]
+
+
+def test_the_table_names_a_disk_in_trouble() -> None:
+    broken = RecorderState([], 0, 0, 0, "No space left on device")
+    assert table(broken, 0)[-1] == "DISK: No space left on device"
+    assert summary(broken).endswith("; DISK: No space left on device")
+
+
+def test_the_summary_adds_up() -> None:
+    assert summary(STATE) == (
+        "2 items, 50 messages/s, 251 kept, 2 dropped, 98.8 MB written, 45.6 GB left"
+    )
+
+
+def test_it_ends_by_itself_and_prints_json_meanwhile(folder: Path) -> None:
+    began = time.monotonic()
+    process = record(folder, "--for", "2.6 s", "--json")
+    output, errors = process.communicate(timeout=40)
+    assert process.returncode == 0, errors
+    assert time.monotonic() - began >= 2.6
+    states = [json.loads(line) for line in output.splitlines()]
+    assert len(states) == 2
+    assert [item["name"] for item in states[1]["items"]] == ["sim_odom", "sim_wifi"]
+    odom = states[1]["items"][0]
+    assert odom["rate_hz"] == pytest.approx(50, abs=15)
+    assert states[1]["disk_free_bytes"] > 0
+    assert errors.startswith("recorded ")
+    assert all(journal.finished for journal in read.journals(folder / "store"))
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_ends_it_cleanly(folder: Path, number: int) -> None:
+    process = record(folder, "--quiet")
+    wait_until(lambda: rows(folder) > 20, 30, "rows")
+    process.send_signal(number)
+    output, errors = process.communicate(timeout=20)
+    assert (process.returncode, output, errors) == (0, "", "")
+    assert [event["kind"] for event in events(folder / "store", "stopped")] == ["stopped"]
+    files = read.journals(folder / "store")
+    assert files and all(journal.finished for journal in files)
+    (gap,) = (gap for gap in amberbox.open(folder).gaps("sim_odom") if gap.reason == "stopped")
+    assert gap.to_ns >= gap.from_ns
+
+
+def rows(folder: Path) -> int:
+    try:
+        return sum(journal.items.get("sim_odom", 0) for journal in read.journals(folder / "store"))
+    except UsageError:  # the store is about to be made
+        return 0
+
+
+def test_inputs_that_end_end_it(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    text = SIM.replace("seed: 1", "seed: 1\n    speed: max\n    duration_s: 5")
+    (folder / "black_box.yaml").write_text(text)
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        assert main(["record", str(folder)]) == 0
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+    assert f"recorded 255 messages of 2 items in {folder / 'store'}" in capsys.readouterr().err
+
+
+def test_wrong_usage(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["record", str(folder / "nowhere")]) == 2
+    assert "there is no folder or file" in capsys.readouterr().err
+    assert main(["record", str(folder), "--for", "a while"]) == 2
+    assert "a while" in capsys.readouterr().err
+
+
+def test_the_keeper_goes_with_the_recorder(folder: Path) -> None:
+    process = record(folder, "--quiet")
+    wait_until(lambda: keepers(folder), 30, "a keeper")
+    process.kill()
+    process.communicate(timeout=20)
+    wait_until(lambda: not keepers(folder), 20, "its end")
+
+
+def keepers(folder: Path) -> list[int]:
+    """Return processes that keep the store."""
+    found = []
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdigit() and int(entry.name) != os.getpid():
+            try:
+                command = (entry / "cmdline").read_bytes()
+            except OSError:  # it has just ended
+                continue
+            if b"amberbox.blackbox.keeper" in command and bytes(folder / "store") in command:
+                found.append(int(entry.name))
+    return found
