@@ -14,17 +14,27 @@ import pytest
 
 import amberbox
 from amberbox.blackbox.folder.folder import load_folder
+from amberbox.blackbox.journal import writer
 from amberbox.blackbox.recorder import keeperprocess, names, sink
 from amberbox.blackbox.recorder.intake import Intake
 from amberbox.blackbox.recorder.keeperprocess import KeeperProcess
+from amberbox.blackbox.recorder.pipeline import PipelineOptions
 from amberbox.blackbox.recorder.recorder import Recorder
 from amberbox.blackbox.recorder.recovery import previous_end_ns
 from amberbox.blackbox.recorder.streams import Item, Stream
 from amberbox.blackbox.sources import recording as recording_source
 from amberbox.blackbox.sources import ros as ros_source
 from amberbox.blackbox.store import open_store
-from amberbox.core.source import Sink, TopicOptions
-from amberbox.testing.box import COUNT, ManualBox, events, number
+from amberbox.core.source import ChangeOptions, Sink, TopicOptions
+from amberbox.core.types import Topic
+from amberbox.testing.box import (
+    COUNT,
+    ManualBox,
+    events,
+    last_counters,
+    number,
+    own_records,
+)
 from amberbox.testing.realros import wait_until
 
 ROS = "- ros: {ros_master_uri: 'http://127.0.0.1:1', topics: [{name: /count}]}\n"
@@ -181,3 +191,51 @@ def test_a_keeper_that_cannot_run_is_told_once(
     box.close()
     (told,) = events(box.store, "keeper")
     assert told["text"].startswith("the keeper cannot be started: No such file")
+
+
+def test_names_that_fit_no_variable_are_told(tmp_path: Path) -> None:
+    change = ChangeOptions(variables=("data", "dota"), bands={"speed": 0.1})
+    options = [TopicOptions("/count", variable_names=["data", "date"], change=change)]
+    box = ManualBox(tmp_path / "store", options)
+    box.hear(COUNT, number(1))
+    box.write()
+    box.close()
+    (told,) = events(box.store, "unused_names")
+    assert told["text"] == "ros_count has no date or dota or speed, as configured"
+
+
+def test_json_names_are_told_until_they_come(tmp_path: Path) -> None:
+    topic = Topic("/pose", "json")
+    box = ManualBox(tmp_path / "store", [TopicOptions("/pose", variable_names=["x", "y"])])
+    for message in (b'{"x": 1}', b'{"x": 2}', b'{"x": 1, "y": 2}'):
+        box.hear(topic, message)
+        box.write()
+    box.close()
+    (told,) = events(box.store, "unused_names")
+    assert told["details"]["names"] == ["y"]
+
+
+def test_accounts_of_a_long_trouble_do_not_pile_up(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    is_full = [False]
+    write_all = writer._write_all
+
+    def write(fd: int, data: bytes) -> None:
+        if is_full[0]:
+            raise OSError(28, "No space left on device")
+        write_all(fd, data)
+
+    monkeypatch.setattr(writer, "_write_all", write)
+    box = ManualBox(tmp_path / "store", options=PipelineOptions(queue_bytes=1000))
+    for n in range(200):
+        is_full[0] = 20 <= n < 190
+        box.hear(COUNT, number(n))
+        box.write()
+    box.close()
+    assert len(own_records(box.store, "amberbox/counters")) < 45
+    gaps = [gap for gap in amberbox.open(box.store).gaps("ros_count") if gap.count]
+    counters = last_counters(box.store)["ros_count"]
+    assert sum(gap.count or 0 for gap in gaps) == counters["dropped"] > 100
+    assert counters["kept"] + counters["dropped"] == counters["received"] == 200
+    assert len(gaps) <= 2

@@ -11,7 +11,7 @@ from typing import Any
 
 from amberbox.blackbox.follow import read
 from amberbox.blackbox.recorder.pipeline import Pipeline
-from amberbox.blackbox.recorder.streams import Stream
+from amberbox.blackbox.recorder.streams import Stream, tell_unused
 from amberbox.blackbox.store import replace_file
 from amberbox.core.source import TopicOptions
 from amberbox.core.types import Topic
@@ -119,6 +119,7 @@ class BlockSink:
             self.event(
                 "undecodable", f"{item.name}: {wrong}; raw messages are kept", item=item.name
             )
+        tell_unused(stream, self._pipeline.event)
         return stream
 
     def _tell_of_change(self, old: Topic, new: Topic, item: str) -> None:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field
-from typing import Any, TypeAlias
+from typing import Any, Protocol, TypeAlias
 
 import msgspec
 
 from amberbox.blackbox.filters.change import ChangeFilter
 from amberbox.blackbox.filters.rate import RateLimit
 from amberbox.blackbox.unroll import Unroller, unroller
+from amberbox.blackbox.unroll.select import select
 from amberbox.core.errors import AmberboxError
 from amberbox.core.source import TopicOptions
 from amberbox.core.types import Topic
@@ -31,6 +32,13 @@ Drops: TypeAlias = tuple[int, int, int]
 """First and last time and count of messages dropped since the last gap record."""
 
 
+class Tell(Protocol):
+    """How an event is written: kind, one line for a person, the source, details."""
+
+    def __call__(self, kind: str, text: str, source: str = "", **details: Any) -> None:
+        """Write the event."""
+
+
 @dataclass(slots=True)
 class Item:
     """A data item: what is configured for it, and what all its streams share."""
@@ -45,6 +53,8 @@ class Item:
     last_latched: bytes | None = None
     reported: Counters = field(default_factory=Counters)
     malformed: int = 0
+    unused: tuple[str, ...] = ()
+    """Names in the options that fit no variable, as told last."""
 
     def __post_init__(self) -> None:
         if self.options.max_frequency:
@@ -107,3 +117,16 @@ class Stream:
         except AmberboxError as error:
             return error.what
         return ""
+
+
+def tell_unused(stream: Stream, tell: Tell) -> None:
+    """Say which names in an item's options fit no variable, each time others do not."""
+    if stream.stamps is None:
+        return
+    item = stream.item
+    _, unmatched = select(stream.stamps.schema, item.options.variable_names)
+    unused = (*unmatched, *(stream.change.unused if stream.change else ()))
+    if unused and unused != item.unused:
+        text = f"{item.name} has no {' or '.join(dict.fromkeys(unused))}, as configured"
+        tell("unused_names", text, item.source, item=item.name, names=unused)
+    item.unused = unused

@@ -1,0 +1,185 @@
+"""The journals of a run: rows wait here until their disk has taken them, each exactly once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from operator import itemgetter
+from pathlib import Path
+from typing import TypeAlias
+
+from amberbox.blackbox.journal import reserved
+from amberbox.blackbox.journal.writer import JournalWriter, SyncMark
+from amberbox.blackbox.recorder.streams import Stream, Tell
+from amberbox.core.types import Topic
+
+Row: TypeAlias = tuple[int, int, int, bytes]
+"""Channel, log time, publish time, message."""
+
+Preamble: TypeAlias = Callable[[str], Sequence[tuple[str, bytes]]]
+
+
+class Journals:
+    """One journal per keeping class in use; all but ``use`` belongs to the writing thread."""
+
+    def __init__(self, make: Callable[[str], JournalWriter], preamble: Preamble, tell: Tell):
+        self._make = make
+        self._preamble_of = preamble
+        self._tell = tell
+        self._writers: dict[str, JournalWriter] = {"main": make("main")}
+        self._pending: dict[str, list[Row]] = {}
+        self._channels: dict[tuple[str, Topic, str], int] = {}
+        self._own_channels: dict[tuple[str, str], int] = {}
+        self._repeats: dict[tuple[str, int], Stream] = {}
+        self._latched: list[Stream] = []
+        self.disk_error = ""
+        """What the disk said when it last refused a write; empty when all is well."""
+
+    def use(self, writer: str) -> None:
+        """Begin a journal if there is none yet; from any thread."""
+        if writer not in self._writers:
+            self._writers[writer] = self._make(writer)
+
+    def repeat(self, stream: Stream) -> None:
+        """Repeat the last message of a latched stream in each file; from any thread."""
+        self._latched.append(stream)
+
+    def open_writers(self) -> list[str]:
+        """Name the journals that have a file open, and the main one."""
+        writers = list(self._writers.items())
+        return [name for name, writer in writers if name == "main" or writer.path]
+
+    def add(self, stream: Stream, received_ns: int, data: bytes) -> None:
+        """Take a message to be written."""
+        if stream.channel < 0:
+            stream.channel = self._channel(stream)
+        row = (stream.channel, received_ns, stream.stamp_ns(data, received_ns), data)
+        self._pending.setdefault(stream.item.writer, []).append(row)
+
+    def add_own(self, writer: str, name: str, at_ns: int, data: bytes) -> None:
+        """Take a record of the box's own to be written."""
+        row = (self._own_channel(writer, name), at_ns, at_ns, data)
+        self._pending.setdefault(writer, []).append(row)
+
+    def flush(self, now_ns: int) -> bool:
+        """Write all pending rows; False when a disk did not take them (they stay pending)."""
+        try:
+            for name, rows in self._pending.items():
+                rows.sort(key=itemgetter(1))
+                if rows:
+                    self._write(name, rows, now_ns)
+        except OSError as error:
+            self._note_disk_error(error)
+            return False
+        if self.disk_error:
+            self.disk_error = ""
+            self._tell("disk", "the disk takes data again")
+        return True
+
+    def _write(self, name: str, rows: list[Row], now_ns: int) -> None:
+        writer = self._writers[name]
+        if writer.rotation_due(now_ns):
+            writer.rotate()
+        preamble = self._preamble(name, rows[0][1]) if writer.path is None else []
+        rows[:0] = preamble
+        before = writer.next_seq
+        try:
+            channels, log_ns, publish_ns, messages = zip(*rows, strict=True)
+            writer.write(channels, log_ns, publish_ns, messages)
+        finally:  # what was written in whole chunks before an error is not written again
+            if writer.path is None:  # no file was made: the next attempt has its own preamble
+                del rows[: len(preamble)]
+            del rows[: writer.next_seq - before]
+
+    def _preamble(self, writer: str, at_ns: int) -> list[Row]:
+        """Return what each file begins with: the run, the clock, the last latched messages."""
+        rows: list[Row] = [
+            (self._own_channel(writer, name), at_ns, at_ns, data)
+            for name, data in self._preamble_of(writer)
+        ]
+        for stream in list(self._latched):
+            if stream.item.last_latched is not None:
+                self._channel(stream)
+        for (of_writer, channel), stream in self._repeats.items():
+            data = stream.item.last_latched
+            if of_writer == writer and data is not None:
+                rows.append((channel, at_ns, at_ns, data))
+        return rows
+
+    def _note_disk_error(self, error: OSError) -> None:
+        text = error.strerror or str(error)
+        if text != self.disk_error:
+            self.disk_error = text
+            self._tell("disk", f"the disk does not take data: {text}")
+
+    def _channel(self, stream: Stream) -> int:
+        """Register the channel of a stream, and the one that repeats its latched message."""
+        item, topic = stream.item, stream.topic
+        key = (item.writer, topic, item.name)
+        if key not in self._channels:
+            marks = {"item": item.name, "source": item.source}
+            if item.options.stamp is not None:
+                marks["stamp"] = item.options.stamp
+            if topic.latched:
+                marks["latched"] = "1"
+            writer = self._writers[item.writer]
+            self._channels[key] = writer.channel(topic, marks)
+            if topic.latched:
+                self._repeat_on(writer.channel(topic, {**marks, "repeated": "1"}), stream)
+        return self._channels[key]
+
+    def _repeat_on(self, channel: int, stream: Stream) -> None:
+        """Repeat an item's message on this channel, no longer on that of an older definition."""
+        for key, other in list(self._repeats.items()):
+            if other.item is stream.item:
+                del self._repeats[key]
+        self._repeats[stream.item.writer, channel] = stream
+
+    def _own_channel(self, writer: str, name: str) -> int:
+        key = (writer, name)
+        if key not in self._own_channels:
+            marks = {"item": name.replace("/", "_"), "source": reserved.SOURCE}
+            topic = reserved.topic_of(name)
+            self._own_channels[key] = self._writers[writer].channel(topic, marks)
+        return self._own_channels[key]
+
+    def publish_heads(self, watermark_ns: int) -> None:
+        """Tell followers how far the journals reach."""
+        with suppress(OSError):  # a hint for followers only, and the flush has told of the disk
+            for writer in list(self._writers.values()):
+                writer.publish_head(0 if self.disk_error else watermark_ns)
+
+    def rotate(self) -> None:
+        """Begin new files with the next write."""
+        for writer in list(self._writers.values()):
+            writer.rotate()
+
+    def mark_sync(self) -> list[SyncMark]:
+        """Return what makes everything written so far durable."""
+        return [writer.mark_sync() for writer in list(self._writers.values())]
+
+    def close(self) -> str:
+        """Finish the files; return what the disk said if it refused anything, else nothing."""
+        refused = self.disk_error
+        for writer in list(self._writers.values()):
+            try:
+                writer.close()
+            except OSError as error:  # without its end the file is read by walking it
+                refused = error.strerror or str(error)
+        return refused
+
+    def unwritten(self) -> int:
+        """Count the messages of sources that wait for the disk."""
+        own = {(writer, number) for (writer, _), number in self._own_channels.items()}
+        waiting = [(writer, row[0]) for writer, rows in self._pending.items() for row in rows]
+        return sum(channel not in own for channel in waiting)
+
+    @property
+    def bytes_written(self) -> int:
+        """Bytes this run has put into its journals."""
+        return sum(writer.bytes_written for writer in list(self._writers.values()))
+
+    @property
+    def paths(self) -> list[Path]:
+        """Files being written right now."""
+        return [writer.path for writer in list(self._writers.values()) if writer.path]
