@@ -12,14 +12,15 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 from amberbox.blackbox.follow.read import JournalFile, journal_file
 from amberbox.blackbox.segments.build import build_segments, can_build, merge_small
 from amberbox.blackbox.store import Store, WriterLock, is_locked, open_store
 from amberbox.core.clock import NS
-from amberbox.core.errors import AmberboxError, UsageError
+from amberbox.core.errors import UsageError
 
 PERIOD_S = 2.0
 PATIENCE_S = 10.0
@@ -46,29 +47,29 @@ class Keeper:
 
         done = manifest.read(self._store.path).journals
         built = 0
-        for journal in self.sealed("main"):
+        for journal in self.sealed("main", skip={*done, *self._refused}):
             if stop.is_set():
                 return
-            if journal.name not in done and journal.name not in self._refused:
-                built += self._build_one(journal)
+            built += self._build_one(journal)
         if built:
             merge_small(self._store.path)
 
     def _build_one(self, journal: JournalFile) -> int:
         try:
             build_segments(self._store.path, journal)
-        except (AmberboxError, OSError, ValueError) as error:
+        except Exception as error:  # whatever it is: the other journals go on
             self._refused.add(journal.name)  # its rows stay readable in the journal
             print(f"amberbox keeper: {journal.name}: no segments: {error}", file=sys.stderr)
             return 0
         return 1
 
-    def sealed(self, writer: str) -> list[JournalFile]:
-        """Return the journal files that nobody writes any more."""
+    def sealed(self, writer: str, skip: Container[str] = ()) -> list[JournalFile]:
+        """Return the journal files that nobody writes any more, but those named in ``skip``."""
         paths = self._store.journal_files(writer)
         if is_locked(self._store, writer):
             paths = paths[:-1]
-        files = [journal_file(path, f"{path.parent.name}/{path.name}") for path in paths]
+        names = {path: f"{path.parent.name}/{path.name}" for path in paths}
+        files = [journal_file(path, name) for path, name in names.items() if name not in skip]
         return [journal for journal in files if journal.rows]
 
     def _trim_ring(self) -> None:
@@ -135,7 +136,10 @@ def _lock(store: Store, patience_s: float, stop: threading.Event) -> WriterLock:
 def seal(store: Store) -> None:
     """Build what can be built once, as an import does at its end."""
     if can_build():
-        Keeper(store, ring_s=float("inf")).step(threading.Event())
+        with suppress(UsageError):  # another keeper is at work here: it builds them, too
+            lock = _lock(store, PATIENCE_S, threading.Event())
+            Keeper(store, ring_s=float("inf")).step(threading.Event())
+            lock.release()
 
 
 if __name__ == "__main__":
