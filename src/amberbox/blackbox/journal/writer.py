@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import os
 import zlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,6 +28,7 @@ from amberbox.blackbox.journal.mcap import (
 )
 from amberbox.blackbox.journal.openfile import OpenFile
 from amberbox.blackbox.journal.summary import IndexedChunk
+from amberbox.blackbox.journal.syncmark import SyncMark
 from amberbox.blackbox.store import sync_folder
 from amberbox.core.clock import NS
 from amberbox.core.types import IntArray, Schema, Topic
@@ -60,26 +61,6 @@ class JournalOptions:
     def file_name(self, number: int) -> str:
         """Name a file by run, boot and number, never by the wall clock."""
         return f"{self.run:06d}-{self.boot_id.replace('-', '')[:8]}-{number:04d}.mcap"
-
-
-@dataclass(slots=True)
-class SyncMark:
-    """What has to reach the disk; ``wait`` may run in another thread."""
-
-    fds: list[int]
-    close: list[int]
-    seq: int
-    done: Callable[[int], None]
-
-    def wait(self) -> None:
-        """Flush everything written before the mark; then ``seq`` is the durable end."""
-        try:
-            for fd in self.fds:
-                os.fdatasync(fd)
-        finally:
-            for fd in self.close:
-                os.close(fd)
-        self.done(self.seq)
 
 
 class JournalWriter:

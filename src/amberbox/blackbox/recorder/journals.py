@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import TypeAlias
 
 from amberbox.blackbox.journal import reserved
-from amberbox.blackbox.journal.writer import JournalWriter, SyncMark
+from amberbox.blackbox.journal.syncmark import SyncMark
+from amberbox.blackbox.journal.writer import JournalWriter
 from amberbox.blackbox.recorder.streams import Stream, Tell
 from amberbox.core.types import Topic
 

@@ -19,7 +19,8 @@ from msgspec import structs
 
 from amberbox import __version__
 from amberbox.blackbox.journal import reserved
-from amberbox.blackbox.journal.writer import JournalOptions, JournalWriter, SyncMark
+from amberbox.blackbox.journal.syncmark import SyncMark
+from amberbox.blackbox.journal.writer import JournalOptions, JournalWriter
 from amberbox.blackbox.recorder.filtering import Message, change_filtered, rate_limited
 from amberbox.blackbox.recorder.gaplog import GapLog
 from amberbox.blackbox.recorder.intake import Intake

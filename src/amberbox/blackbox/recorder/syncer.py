@@ -6,7 +6,7 @@ import threading
 import time
 from collections.abc import Sequence
 
-from amberbox.blackbox.journal.writer import SyncMark
+from amberbox.blackbox.journal.syncmark import SyncMark
 from amberbox.blackbox.recorder.pipeline import Pipeline
 
 
