@@ -192,6 +192,31 @@ def test_a_full_disk_is_told_and_recording_resumes_when_there_is_room(
     assert last_counters(box.store)["ros_count"]["kept"] == len(said)
 
 
+@pytest.mark.parametrize("fails_at", range(1, 8))
+def test_a_clock_that_is_set_when_a_write_fails_ends_nothing(
+    tmp_path: Path, disk: Disk, fails_at: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    writes, write = [], writer._write_all
+
+    def fail_once(fd: int, data: bytes) -> None:
+        writes.append(data)
+        if len(writes) == fails_at:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        write(fd, data)
+
+    box = ManualBox(tmp_path / "store")
+    box.hear(COUNT, number(0))
+    box.write()
+    monkeypatch.setattr(writer, "_write_all", fail_once)
+    box.clock.step(-3600)
+    for n in range(1, 9):
+        box.hear(COUNT, number(n))
+        box.write()
+    box.close()
+    assert numbers_of(box.store) == list(range(9))
+    assert len(events(box.store, "clock_step")) == 1
+
+
 def numbers_of(store: Path) -> list[int]:
     return [int.from_bytes(message, "little") for message in raw_messages(store, "/count")]
 
