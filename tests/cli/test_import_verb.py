@@ -101,6 +101,13 @@ def test_a_bag_is_a_record_like_any_other(bag: Path, capsys: Capture) -> None:
     assert sorted(path.name for path in bag.parent.iterdir()) == ["some.bag"]
 
 
+def test_damage_of_a_bag_is_told_beside_the_answer(torn: Path, capsys: Capture) -> None:
+    assert main(["items", str(torn), "--json"]) == 0
+    printed = capsys.readouterr()
+    assert json.loads(printed.out)[0]["name"] == "ros_voltage"
+    assert printed.err.startswith("note: damaged: ")
+
+
 def test_a_journal_file_is_a_record_like_any_other(tmp_path: Path, capsys: Capture) -> None:
     box = ManualBox(tmp_path / "store")
     for n in range(20):

@@ -10,10 +10,13 @@ import sys
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, TYPE_CHECKING, Any
 
 from amberbox.blackbox.query.tabletext import grid
 from amberbox.core.errors import UsageError
+
+if TYPE_CHECKING:
+    from amberbox.blackbox.query.record import Record
 
 
 def print_json(value: Any) -> None:
@@ -40,6 +43,16 @@ def tell(notes: Iterable[str]) -> None:
     """Say on stderr what could not be read."""
     for note in notes:
         print(f"note: {note}", file=sys.stderr)
+
+
+@contextmanager
+def opened(where: str) -> Iterator[Record]:
+    """Open a record and say what of it cannot be read."""
+    from amberbox.blackbox.query.record import open as open_record
+
+    with open_record(where) as record:
+        tell(record.notes)
+        yield record
 
 
 @contextmanager

@@ -5,8 +5,7 @@ from __future__ import annotations
 import argparse
 
 from amberbox.blackbox.query.overview import ItemInfo
-from amberbox.blackbox.query.record import open as open_record
-from amberbox.cli._output import print_grid, print_json, size
+from amberbox.cli._output import opened, print_grid, print_json, size
 from amberbox.core.clock import NS
 from amberbox.core.timetext import format_time
 
@@ -21,7 +20,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print the items of a record."""
-    with open_record(args.where) as record:
+    with opened(args.where) as record:
         items = record.items()
     if args.json:
         print_json([item.to_json() for item in items])

@@ -5,8 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable
 
-from amberbox.blackbox.query.record import open as open_record
-from amberbox.cli._output import add_range, tell, writable
+from amberbox.cli._output import add_range, opened, tell, writable
 from amberbox.cli._plot_curves import Drawing, drawing
 from amberbox.cli._plot_image import draw_image
 from amberbox.cli._plot_page import draw_page
@@ -42,7 +41,7 @@ def run(args: argparse.Namespace) -> int:
     if kind not in _DRAW:
         raise UsageError(f"cannot draw to {args.output}", "end the name in html, png, svg or pdf")
     target = writable(args.output)
-    with open_record(args.where) as record:
+    with opened(args.where) as record:
         plot = drawing(record, args)
     target.write_bytes(_DRAW[kind](plot))
     tell(plot.notes)

@@ -9,10 +9,9 @@ from typing import IO
 
 from amberbox.blackbox.query.livequery import follow_tables
 from amberbox.blackbox.query.record import Record
-from amberbox.blackbox.query.record import open as open_record
 from amberbox.blackbox.query.table import Table
 from amberbox.blackbox.query.tabletext import write_grid
-from amberbox.cli._output import add_range, tell, text_output, writable
+from amberbox.cli._output import add_range, opened, tell, text_output, writable
 from amberbox.core.errors import UsageError
 from amberbox.core.timetext import format_time
 
@@ -41,7 +40,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Print rows, and with ``--follow`` go on until stopped."""
     form = chosen_format(args.format, args.output)
-    with open_record(args.where) as record:
+    with opened(args.where) as record:
         if args.follow:
             return _follow(record, args, form)
         table = record.query(

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from amberbox.blackbox.query.record import open as open_record
-from amberbox.cli._output import tell
+from amberbox.cli._output import opened, tell
 from amberbox.cli.query import FORMATS, chosen_format, write
 
 
@@ -22,7 +21,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Print the answer to a SELECT."""
     form = chosen_format(args.format, args.output)
-    with open_record(args.where) as record:
+    with opened(args.where) as record:
         table = record.sql(args.statement)
     write(table, form, args.output)
     tell(table.notes)

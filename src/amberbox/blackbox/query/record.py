@@ -46,11 +46,12 @@ class Record:
     """A record opened for reading; a live one shows more each time it is asked.
 
     ``temporary`` holds the store that recording files were imported into; it goes with this
-    object, or with ``close``.
+    object, or with ``close``. ``notes`` say what of them could not be read.
     """
 
     path: Path
     temporary: tempfile.TemporaryDirectory[str] | None = None
+    notes: tuple[str, ...] = ()
 
     def __enter__(self) -> Record:
         return self
@@ -163,8 +164,8 @@ def _import(path: Path) -> Record:
 
     folder = tempfile.TemporaryDirectory(prefix="amberbox-")
     store = Path(folder.name) / "store"
-    import_recordings([path], store)
-    return Record(store, folder)
+    (report,) = import_recordings([path], store)
+    return Record(store, folder, (*(f"damaged: {text}" for text in report.damage), *report.notes))
 
 
 def _query(
