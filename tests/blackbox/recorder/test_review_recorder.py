@@ -15,7 +15,7 @@ import pytest
 import amberbox
 from amberbox.blackbox.folder.folder import load_folder
 from amberbox.blackbox.journal import writer
-from amberbox.blackbox.recorder import keeperprocess, names, sink
+from amberbox.blackbox.recorder import filtering, keeperprocess, names, sink
 from amberbox.blackbox.recorder.intake import Intake
 from amberbox.blackbox.recorder.keeperprocess import KeeperProcess
 from amberbox.blackbox.recorder.pipeline import PipelineOptions
@@ -34,6 +34,7 @@ from amberbox.testing.box import (
     last_counters,
     number,
     own_records,
+    raw_messages,
 )
 from amberbox.testing.realros import wait_until
 
@@ -239,3 +240,20 @@ def test_accounts_of_a_long_trouble_do_not_pile_up(
     assert sum(gap.count or 0 for gap in gaps) == counters["dropped"] > 100
     assert counters["kept"] + counters["dropped"] == counters["received"] == 200
     assert len(gaps) <= 2
+
+
+def test_keys_that_are_data_do_not_widen_a_schema_for_ever(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(filtering, "MOST_VERSIONS", 5)
+    box = ManualBox(tmp_path / "store")
+    for n in range(20):
+        box.hear(Topic("/tasks", "json"), b'{"task_%d": 1}' % n)
+        box.write()
+    box.close()
+    (told,) = events(box.store, "schema_unstable")
+    assert told["text"].startswith("ros_tasks had 5 schemas")
+    assert len(raw_messages(box.store, "/tasks")) == 20
+    (item,) = (i for i in amberbox.open(box.store).items() if i.name == "ros_tasks")
+    assert len(amberbox.open(box.store).variables("ros_tasks").columns) == 5
+    assert item.rows >= 5

@@ -13,6 +13,9 @@ from amberbox.blackbox.unroll import UnrollError
 from amberbox.blackbox.unroll.infer import widen
 from amberbox.core.types import Topic
 
+MOST_VERSIONS = 256
+"""A message whose keys are data (an id, a time) would widen its schema for ever."""
+
 Message: TypeAlias = tuple[Stream, bytes, int]
 
 
@@ -55,6 +58,8 @@ def change_filtered(kept: list[Message], tell: Tell) -> list[Message]:
 def _infer(stream: Stream, messages: Sequence[bytes], tell: Tell) -> None:
     """Widen a stream's schema so that it holds all these messages; a wider one is an event."""
     topic, item = stream.topic, stream.item
+    if item.versions >= MOST_VERSIONS:
+        return
     schema, bad = widen(topic.schema, messages, topic.message_encoding, item.name)
     if bad:
         _note_malformed(stream, len(bad), tell)
@@ -63,6 +68,10 @@ def _infer(stream: Stream, messages: Sequence[bytes], tell: Tell) -> None:
     if topic.schema is not None:
         text = f"{item.name} has new or wider variables"
         tell("schema_widened", text, item.source, item=item.name)
+    item.versions += 1
+    if item.versions == MOST_VERSIONS:
+        text = f"{item.name} had {MOST_VERSIONS} schemas; what does not fit the last one stays raw"
+        tell("schema_unstable", text, item.source, item=item.name)
     stream.topic = Topic(topic.name, topic.message_encoding, schema, topic.latched)
     stream.channel = -1
     stream.compile()

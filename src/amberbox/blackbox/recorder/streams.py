@@ -53,6 +53,8 @@ class Item:
     last_latched: bytes | None = None
     reported: Counters = field(default_factory=Counters)
     malformed: int = 0
+    versions: int = 0
+    """How many schemas have been inferred for its messages."""
     unused: tuple[str, ...] = ()
     """Names in the options that fit no variable, as told last."""
 
