@@ -59,16 +59,12 @@ def follow(
         for writer, tail in tails.items():
             for delivery in tail.step():
                 moved = True
-                here = dict(floor)
-                here |= {w: _not_before(t.position(), floor.get(w)) for w, t in tails.items()}
-                here[writer] = _not_before(_of(delivery, writer), floor.get(writer))
-                yield replace(delivery, cursor=Cursor(store.id, here))
+                at = {w: t.position() for w, t in tails.items()}
+                at[writer] = delivery.cursor.writers[writer]
+                here = {w: _not_before(position, floor.get(w)) for w, position in at.items()}
+                yield replace(delivery, cursor=Cursor(store.id, {**floor, **here}))
         if not moved and (not live or stop.wait(poll_s)):
             return
-
-
-def _of(delivery: Delivery, writer: str) -> WriterCursor:
-    return delivery.cursor.writers[writer]
 
 
 def _not_before(position: WriterCursor, floor: WriterCursor | None) -> WriterCursor:

@@ -238,15 +238,8 @@ def batches_of(
     if not wanted or not any(journal.items.get(s.item) for s in wanted.values()):
         return
     clock = ClockTable(journal.clock)
-    low, high = clock.bounds()
-
-    def in_range(place: ChunkPlace) -> bool:
-        too_late = to_ns is not None and place.start_ns + low >= to_ns
-        too_early = from_ns is not None and place.end_ns + high < from_ns
-        return not too_late and not too_early
-
     piles: dict[int, _Pile] = {}
-    for chunk in sound_chunks(journal, in_range):
+    for chunk in sound_chunks(journal, _overlapping(clock, from_ns, to_ns)):
         seq, received = sequences(chunk, journal.first_seq), clock.received(chunk.log_ns)
         inside = _inside(received, from_ns, to_ns)
         for number in np.unique(chunk.channel[inside]).tolist():
@@ -263,6 +256,20 @@ def batches_of(
                 yield from _unpile(journal, wanted[number], piles.pop(number), clock, on_gap)
     for number, pile in piles.items():
         yield from _unpile(journal, wanted[number], pile, clock, on_gap)
+
+
+def _overlapping(
+    clock: ClockTable, from_ns: int | None, to_ns: int | None
+) -> Callable[[ChunkPlace], bool]:
+    """Choose the chunks that may hold rows received in ``[from_ns, to_ns)``."""
+    low, high = clock.bounds()
+
+    def may_hold(place: ChunkPlace) -> bool:
+        too_late = to_ns is not None and place.start_ns + low >= to_ns
+        too_early = from_ns is not None and place.end_ns + high < from_ns
+        return not too_late and not too_early
+
+    return may_hold
 
 
 def _inside(received: IntArray, from_ns: int | None, to_ns: int | None) -> Any:
