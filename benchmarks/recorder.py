@@ -84,7 +84,7 @@ def _latency() -> list[Row]:
 
 def _send(socket: object, stop: threading.Event) -> None:
     while not stop.wait(0.01):
-        socket.send_multipart([b"t", b'{"t":%d}' % time.time_ns()])  # type: ignore[attr-defined]
+        socket.send_multipart([b"t", b'{"t":%d}' % time.time_ns()])  # type: ignore[attr-defined]  # zmq is imported late
 
 
 def _delays_ms(robot: Path, stop: threading.Event) -> list[float]:
