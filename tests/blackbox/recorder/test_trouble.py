@@ -251,3 +251,21 @@ def test_a_disk_that_is_full_at_the_end_is_no_silent_loss(
     assert raw_messages(tmp_path / "store", "/count") == [number(1)]
     again.crash()
     assert own_records(tmp_path / "store", "amberbox/run") != []
+
+
+def test_a_filter_that_fails_keeps_everything(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> None:
+        raise RuntimeError("out of order")
+
+    monkeypatch.setattr("amberbox.blackbox.recorder.pipeline.change_filtered", fail)
+    box = ManualBox(tmp_path / "store")
+    for n in range(3):
+        box.hear(COUNT, number(n))
+        box.write()
+    box.close()
+    assert raw_messages(tmp_path / "store", "/count") == [number(n) for n in range(3)]
+    found = events(tmp_path / "store", "filter_failed")
+    assert len(found) == 1
+    assert "out of order" in found[0]["text"]

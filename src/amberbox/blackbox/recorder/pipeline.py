@@ -95,6 +95,7 @@ class Pipeline:
         self._clock_written_ns: int | None = None
         self._clock_offset_ns = 0
         self._counted_ns = 0
+        self._filter_error = ""
         now_ns = self.clock.now_ns()  # the clock may have been set back since the last run
         start = now_ns if self.start_gap_ns is None else min(self.start_gap_ns, now_ns)
         self.gaps = GapLog(lambda values: self.own(reserved.GAP, values), start)
@@ -144,12 +145,24 @@ class Pipeline:
         """Write what has come since the last tick; when the disk refuses, keep it and say so."""
         taken = self.intake.take()
         now_ns = self._advance(taken)
-        kept = change_filtered(rate_limited(taken, self._last_tick_ns, now_ns), self.event)
+        kept = self._filtered(rate_limited(taken, self._last_tick_ns, now_ns))
         self._sort_into_journals(kept, now_ns)
         if self._journals.flush(now_ns):
             self.intake.release()
             self._follow_wall_clock()
         self._journals.publish_heads(now_ns)
+
+    def _filtered(self, messages: list[Message]) -> list[Message]:
+        """Drop what did not change; a filter that fails keeps everything rather than nothing."""
+        try:
+            return change_filtered(messages, self.event)
+        except Exception as error:  # whatever a message does to it, the recorder goes on
+            items = sorted({stream.item.name for stream, _, _ in messages})
+            text = f"a change filter or schema inference failed: {error!r}; kept unfiltered"
+            if text != self._filter_error:
+                self._filter_error = text
+                self.event("filter_failed", text, items=items)
+            return messages
 
     def _advance(self, taken: Sequence[Message]) -> int:
         """Return the time of this tick; never before the one of the last tick."""
