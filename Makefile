@@ -17,7 +17,7 @@ ROS := ros-core python3-rospy python3-roslaunch python3-rosbag \
 help:  ## say what there is
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /\1\t/' | expand -t 10
 
-demo: $(ALL)  ## record a simulated robot, break it, show that nothing is lost (DEMO_SECONDS=60)
+demo: $(ALL)  ## record a simulated robot, break it, show that nothing is lost (DEMO_SECONDS=20)
 	$(BIN)/amberbox demo
 
 test: $(TEST) debian  ## run all tests (PYTEST_ARGS="-k journal")

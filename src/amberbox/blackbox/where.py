@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from amberbox.blackbox.folder.folder import store_of
 from amberbox.blackbox.store import is_store
 from amberbox.core.errors import UsageError
 
@@ -16,10 +17,8 @@ def store_path(where: str | Path) -> Path:
     path = Path(where)
     if is_store(path):
         return path
-    if (path / "robot.yaml").is_file() or (path / "black_box.yaml").is_file():
-        from amberbox.blackbox.folder.folder import load_folder
-
-        store = load_folder(path).store_path
+    store = store_of(path)
+    if store is not None:
         if is_store(store):
             return store
         raise UsageError(

@@ -84,12 +84,17 @@ def accept_relative_times(parser: argparse.ArgumentParser) -> None:
     parser._negative_number_matcher = re.compile(r"-\d")
 
 
-def add_range(parser: argparse.ArgumentParser) -> None:
-    """Add ``--from``, ``--to`` and ``--by``."""
+def add_range_only(parser: argparse.ArgumentParser) -> None:
+    """Add ``--from`` and ``--to``."""
     accept_relative_times(parser)
     times = "ISO (UTC), epoch, -10m before the last record, now or now-10m"
     parser.add_argument("--from", dest="from_", metavar="T", help=f"first time: {times}")
     parser.add_argument("--to", metavar="T", help="end of the range, not included")
+
+
+def add_range(parser: argparse.ArgumentParser) -> None:
+    """Add ``--from``, ``--to`` and ``--by``."""
+    add_range_only(parser)
     parser.add_argument(
         "--by", choices=("received", "timestamp"), default="received",
         help="go by time of receipt (default) or by the item's own stamps",

@@ -70,7 +70,7 @@ def _plan(folder: RobotFolder, items: Sequence[PlannedItem]) -> list[str]:
         ("robot", " ".join(part for part in (folder.robot.id, folder.robot.model) if part)),
         ("store", str(folder.store_path)),
         ("configuration", folder.config_hash[:16]),
-        ("not built yet", ", ".join(folder.not_built) or "-"),
+        *([("not built yet", ", ".join(folder.not_built))] if folder.not_built else []),
     ]
     listening = {item.source for item in items}
     open_ended = [block.name for block in folder.blocks if block.name not in listening]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import atexit
 import json
 import os
 import signal
@@ -32,7 +33,7 @@ _LOST_AT_KILL_S = 0.15
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
     parser.add_argument(
-        "--seconds", type=float, default=float(os.environ.get("DEMO_SECONDS", "20")),
+        "--seconds", type=float, default=os.environ.get("DEMO_SECONDS", "20"),
         help="how long the robot runs (default: 20, or DEMO_SECONDS)",
     )  # fmt: skip
     parser.add_argument("--keep", type=Path, metavar="DIR",
@@ -45,6 +46,8 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError("the demonstration needs at least 8 seconds", "DEMO_SECONDS=20")
     place = args.keep or Path(tempfile.mkdtemp(prefix="amberbox-demo-"))
     place.mkdir(parents=True, exist_ok=True)
+    if any(place.iterdir()):
+        raise UsageError(f"{place} is not empty", "name a new folder, or none")
     demo = Demo(place, args.seconds)
     for step in (demo.prepare, demo.record, demo.account, demo.show):
         step()
@@ -189,7 +192,9 @@ def amberbox_verb(*arguments: str) -> None:
 def start_box(folder: Path) -> subprocess.Popen[bytes]:
     """Start recording and wait until the first journal is there."""
     before = journals(folder)
-    box = subprocess.Popen([sys.executable, "-m", "amberbox", "record", str(folder), "--quiet"])
+    command = [sys.executable, "-m", "amberbox", "record", str(folder), "--quiet"]
+    box = subprocess.Popen(command, start_new_session=True)
+    atexit.register(box.kill)  # whatever ends the demonstration ends the box
     wait_until(lambda: len(journals(folder)) > len(before) or box.poll() is not None)
     check(box.poll() is None, "the box records")
     return box
@@ -215,7 +220,7 @@ def robot(truth: Path) -> Iterator[tuple[subprocess.Popen[str], str]]:
     command = [sys.executable, "-m", "amberbox.sim", "--zmq", "tcp://127.0.0.1:*", "--wait"]
     process = subprocess.Popen(
         [*command, "--seed", "7", "--truth", str(truth)],
-        stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True,
     )  # fmt: skip
     assert process.stdout is not None
     try:

@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+from amberbox.blackbox.folder.folder import store_of
 from amberbox.blackbox.importing import ImportReport, import_recordings
 
 _BAR = 30
@@ -19,7 +20,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("inputs", nargs="+", type=Path, metavar="INPUT",
                         help="bag file, folder of a ROS 2 bag, or MCAP file")  # fmt: skip
     parser.add_argument("--store", required=True, type=Path, metavar="DIR",
-                        help="store to import into; made if it is not there")  # fmt: skip
+                        help="store or robot folder; made if it is not there")  # fmt: skip
     parser.add_argument("--source", default="ros", metavar="NAME",
                         help="first word of the item names (default: ros)")  # fmt: skip
     parser.add_argument("--json", action="store_true", help="print the report as JSON")
@@ -29,13 +30,14 @@ def run(args: argparse.Namespace) -> int:
     """Import and report; 1 if anything in the inputs was damaged."""
     started = time.monotonic()
     progress = _bar() if sys.stderr.isatty() and not args.json else lambda fraction: None
-    reports = import_recordings(args.inputs, args.store, source=args.source, progress=progress)
+    store = store_of(args.store) or args.store
+    reports = import_recordings(args.inputs, store, source=args.source, progress=progress)
     if args.json:
         print(json.dumps([_as_json(report) for report in reports], indent=2))
     else:
         print("\n".join(line for report in reports for line in report.lines()))
         total = sum(report.messages for report in reports)
-        print(f"{total} messages in {time.monotonic() - started:.1f} s, now in {args.store}")
+        print(f"{total} messages in {time.monotonic() - started:.1f} s, now in {store}")
     return 1 if any(report.damage for report in reports) else 0
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 
+from amberbox.blackbox.journal.reserved import PREFIX
 from amberbox.blackbox.query.overview import ItemInfo
 from amberbox.cli._output import opened, print_grid, print_json, size
 from amberbox.core.clock import NS
@@ -15,6 +16,7 @@ _HEADER = ("item", "type", "rows", "rate Hz", "first (UTC)", "last (UTC)", "stam
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
     parser.add_argument("where", metavar="WHERE", help="robot folder, store or recording file")
+    parser.add_argument("--all", action="store_true", help="the box's own items, too")
     parser.add_argument("--json", action="store_true", help="a list of objects")
 
 
@@ -24,9 +26,14 @@ def run(args: argparse.Namespace) -> int:
         items = record.items()
     if args.json:
         print_json([item.to_json() for item in items])
-    elif items:
-        print_grid(_HEADER, map(_row, items))
-    else:
+        return 0
+    own = [item for item in items if item.topic.startswith(PREFIX)]
+    shown = [item for item in items if args.all or item not in own]
+    if shown:
+        print_grid(_HEADER, map(_row, shown))
+    if own and not args.all:
+        print(f"and {len(own)} items of the box itself (--all shows them)")
+    if not items:
         print("nothing has been recorded yet")
     return 0
 

@@ -8,6 +8,7 @@ import signal
 import sys
 import threading
 import time
+from contextlib import suppress
 from dataclasses import asdict
 
 from amberbox.blackbox.folder.folder import load_folder
@@ -16,6 +17,7 @@ from amberbox.cli._output import size
 from amberbox.core.units import in_unit
 
 _TABLE_S = 1.0
+_NO_TROUBLE = {"started", "stopped", "source_ended", "imported"}
 _HEADINGS = ("item", "rate Hz", "kept", "filtered", "dropped", "bytes")
 
 
@@ -35,6 +37,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Record until stopped by a signal, by ``--for``, or by the end of all inputs."""
     recorder = Recorder(load_folder(args.folder))
+    recorder.pipeline.on_event = _tell
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: recorder.stop.set())
     if args.duration is not None:
@@ -44,11 +47,26 @@ def run(args: argparse.Namespace) -> int:
     view = threading.Thread(target=_watch, args=(recorder, args), daemon=True)
     if not args.quiet:
         view.start()
+    started = time.monotonic()
     recorder.run()
+    state = recorder.state()
     if not args.quiet:
         view.join(2 * _TABLE_S)
-        print(_last_line(recorder.state(), str(recorder.store.path)), file=sys.stderr)
-    return 0
+        if sys.stdout.isatty() and not args.json:
+            print("\n".join(table(state, time.monotonic() - started)), flush=True)
+        print(_last_line(state, str(recorder.store.path)), file=sys.stderr)
+    if any(item.received for item in state.items):
+        return 0
+    print("warning: nothing was heard; the events above and amberbox events say why",
+          file=sys.stderr)  # fmt: skip
+    return 1
+
+
+def _tell(kind: str, text: str) -> None:
+    """Say on stderr what goes wrong while recording; all of it is in the record, too."""
+    if kind not in _NO_TROUBLE:
+        with suppress(OSError):  # whoever reads stderr may be gone; recording goes on
+            print(f"{time.strftime('%H:%M:%S')} {kind}: {text}", file=sys.stderr, flush=True)
 
 
 def _seconds(text: str) -> float:
@@ -59,7 +77,12 @@ def _seconds(text: str) -> float:
 
 
 def _watch(recorder: Recorder, args: argparse.Namespace) -> None:
-    """Show what is being recorded, once a second."""
+    """Show what is being recorded for as long as somebody reads it."""
+    with suppress(BrokenPipeError):
+        _show(recorder, args)
+
+
+def _show(recorder: Recorder, args: argparse.Namespace) -> None:
     lines, started = 0, time.monotonic()
     while not recorder.stop.wait(_TABLE_S):
         state = recorder.state()

@@ -51,7 +51,9 @@ class TopicOptions:
     name: str = option(doc="topic as on the bus")
     type: str = option("", "message type; only checked where the bus tells it")
     variable_names: Sequence[str] = option((), "variables to show; all when absent")
-    max_frequency: float | None = option(None, "keep at most this many per second", unit="Hz")
+    max_frequency: float | None = option(
+        None, "keep at most this many per second, after a first burst of 11", unit="Hz"
+    )
     change: ChangeOptions | None = option(None, "keep only what changed")
     keep: Keep = option("all", "keeping class")
     stamp: str | None = option(None, "path of the own time stamp; '' for none")

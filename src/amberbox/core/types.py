@@ -152,7 +152,7 @@ class Rows:
     index: IntArray | None = None
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Batch:
     """Rows of one item, one schema, one writer's run, in ``seq`` order.
 
@@ -176,6 +176,11 @@ class Batch:
 
     def __len__(self) -> int:
         return len(self.seq)
+
+    def __repr__(self) -> str:
+        first = f"{self.seq[0]}" if len(self) else "-"
+        place = f"{self.writer} run {self.run} seq {first}"
+        return f"Batch({self.item}, {len(self)} rows, {len(self.columns)} columns, {place})"
 
 
 @dataclass(frozen=True, slots=True)

@@ -53,6 +53,20 @@ def load_folder(path: str | Path, sources: str = SOURCES) -> RobotFolder:
     return folder
 
 
+def store_of(path: Path) -> Path | None:
+    """Return where a robot folder keeps its record, by ``robot.yaml`` only; None if it is none.
+
+    What has been recorded can be read whatever happened to the rest of the folder since.
+    """
+    if not any((path / name).is_file() for name in (ROBOT_FILE, BLACK_BOX_FILE)):
+        return None
+    problems: list[Problem] = []
+    robot = _read_robot(path, problems)
+    refuse(problems)
+    assert robot is not None, "a robot.yaml without errors has been read"
+    return path / Path(robot.store.path).expanduser()
+
+
 def inspect_folder(
     path: str | Path, sources: str = SOURCES
 ) -> tuple[RobotFolder | None, list[Problem]]:

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
+from importlib.util import find_spec
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
 from amberbox.blackbox.query import tabletext
 from amberbox.blackbox.segments import columns as col
+from amberbox.core.errors import UsageError
 from amberbox.core.types import Column, ColumnData
 
 if TYPE_CHECKING:
@@ -69,27 +72,46 @@ class Table:
         return pa.Table.from_arrays(arrays, names=self.names)
 
     def to_pandas(self) -> pd.DataFrame:
-        """Return a pandas DataFrame."""
+        """Return a pandas DataFrame; raises UsageError without pandas."""
+        _need("pandas")
         return self.to_arrow().to_pandas()
 
     def to_polars(self) -> pl.DataFrame:
-        """Return a polars DataFrame."""
+        """Return a polars DataFrame; raises UsageError without polars."""
+        _need("polars")
         import polars as pl
 
         frame = pl.from_arrow(self.to_arrow())
         assert isinstance(frame, pl.DataFrame)
         return frame
 
-    def to_csv(self, file: IO[str], *, header: bool = True) -> None:
+    def to_csv(self, to: IO[str] | Path | str, *, header: bool = True) -> None:
         """Write comma-separated values: times as RFC 3339, nulls empty, lists as JSON."""
-        tabletext.write_csv(file, self.fields, self.columns, header=header)
+        with _opened(to) as file:
+            tabletext.write_csv(file, self.fields, self.columns, header=header)
 
-    def to_json(self, file: IO[str], *, lines: bool = False) -> None:
+    def to_json(self, to: IO[str] | Path | str, *, lines: bool = False) -> None:
         """Write a JSON array of objects, or one object per line; times as RFC 3339 strings."""
-        tabletext.write_json(file, self.fields, self.columns, lines=lines)
+        with _opened(to) as file:
+            tabletext.write_json(file, self.fields, self.columns, lines=lines)
 
     def to_parquet(self, path: Path | str) -> None:
         """Write a Parquet file (zstd)."""
         import pyarrow.parquet as pq
 
         pq.write_table(self.to_arrow(), str(path), compression="zstd")
+
+
+def _need(package: str) -> None:
+    if find_spec(package) is None:
+        raise UsageError(f"{package} is not installed here", f"pip install {package}")
+
+
+@contextmanager
+def _opened(to: IO[str] | Path | str) -> Iterator[IO[str]]:
+    """Open a path for writing; leave an open file as it is."""
+    if not isinstance(to, str | Path):
+        yield to
+        return
+    with Path(to).open("w", encoding="utf-8", newline="") as file:
+        yield file

@@ -10,6 +10,10 @@ from typing import Any
 Write = Callable[[dict[str, Any]], None]
 
 
+_PAUSED = "the box was not recording"
+_NOT_CONNECTED = "publisher not connected yet"
+
+
 @dataclass
 class GapLog:
     """Keeps the gaps that are open, per item and peer, and writes each as it opens and closes.
@@ -22,14 +26,24 @@ class GapLog:
     start_ns: int
     _open: dict[tuple[str, str], tuple[int, str]] = field(default_factory=dict)
     _known: set[tuple[str, str]] = field(default_factory=set)
+    _paused: bool = False
 
     def __post_init__(self) -> None:
         self._lock = threading.Lock()
 
-    def expect(self, item: str, reason: str) -> None:
+    def pause(self, now_ns: int) -> None:
+        """Write that nobody recorded since the end of the run before, whatever the item."""
+        self._paused = True
+        self._write("", "", self.start_ns, now_ns, _PAUSED)
+
+    def expect(self, item: str) -> None:
         """Open the gap that every configured item has until its first publisher is heard."""
         with self._lock:
-            self._begin(item, "", self.start_ns, reason)
+            self._begin(item, "", self.start_ns, self._not_connected)
+
+    @property
+    def _not_connected(self) -> str:
+        return f"{_PAUSED}, then {_NOT_CONNECTED}" if self._paused else _NOT_CONNECTED
 
     def up(self, item: str, peer: str, now_ns: int, since_ns: int | None) -> None:
         """Close what is open for a peer; for a new one write what it may have said before."""
@@ -40,7 +54,8 @@ class GapLog:
             self._known.add((item, peer))
             if new and not closed:
                 start = self.start_ns if since_ns is None else max(since_ns, self.start_ns)
-                self._write(item, peer, start, now_ns, "publisher not connected yet")
+                reason = self._not_connected if start == self.start_ns else _NOT_CONNECTED
+                self._write(item, peer, start, now_ns, reason)
 
     def down(self, item: str, peer: str, now_ns: int, reason: str) -> None:
         """Open a gap for a peer that was lost."""

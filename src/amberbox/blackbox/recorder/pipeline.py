@@ -7,7 +7,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, field
 from operator import itemgetter
@@ -96,9 +96,12 @@ class Pipeline:
         self._clock_offset_ns = 0
         self._counted_ns = 0
         self._filter_error = ""
+        self.on_event: Callable[[str, str], None] | None = None
         now_ns = self.clock.now_ns()  # the clock may have been set back since the last run
         start = now_ns if self.start_gap_ns is None else min(self.start_gap_ns, now_ns)
         self.gaps = GapLog(lambda values: self.own(reserved.GAP, values), start)
+        if start < now_ns:
+            self.gaps.pause(now_ns)
 
     def _writer(self, writer: str) -> JournalWriter:
         options = self.options
@@ -135,6 +138,8 @@ class Pipeline:
 
     def event(self, kind: str, text: str, source: str = "", **details: Any) -> None:
         """Write an event, at once."""
+        if self.on_event is not None:
+            self.on_event(kind, text)
         encoded = msgspec.json.encode(details, enc_hook=str).decode()
         self.own(reserved.EVENT, {"kind": kind, "text": text, "source": source, "details": encoded})
         self.intake.wake.set()

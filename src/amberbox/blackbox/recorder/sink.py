@@ -40,7 +40,7 @@ class BlockSink:
         for options in self._options.values():
             item = self._pipeline.item(self._name, options.name, options)
             if options.keep != "none":
-                self._pipeline.gaps.expect(item.name, "publisher not connected yet")
+                self._pipeline.gaps.expect(item.name)
 
     def topic(self, topic: Topic) -> int:
         with self._lock:

@@ -1,0 +1,35 @@
+"""List what happened to the box: starts, recoveries, sources in trouble, a full disk."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from typing import Any
+
+from amberbox.cli._output import add_range_only, opened
+from amberbox.core.timetext import format_time
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the verb's arguments."""
+    parser.add_argument("where", metavar="WHERE", help="robot folder, store or recording file")
+    add_range_only(parser)
+    parser.add_argument("--json", action="store_true", help="a list of objects")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print the events of a record, one line each."""
+    with opened(args.where) as record:
+        table = record.events(args.from_, args.to)
+    if args.json:
+        table.to_json(sys.stdout)
+        print()
+        return 0
+    for row in table.rows():
+        print(_line(row))
+    return 0
+
+
+def _line(row: dict[str, Any]) -> str:
+    source = f" [{row['source']}]" if row["source"] else ""
+    return f"{format_time(row['timestamp'])[:23]} {row['kind']}{source}: {row['text']}"

@@ -1,0 +1,56 @@
+"""List what is missing from a record: from when to when, and why."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+from amberbox.cli._output import add_range_only, opened, print_json
+from amberbox.cli._text import in_columns
+from amberbox.core.clock import NS
+from amberbox.core.timetext import format_time
+from amberbox.core.types import Gap
+
+_HEADER = ("from (UTC)", "to (UTC)", "seconds", "item", "messages", "reason")
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the verb's arguments."""
+    parser.add_argument("where", metavar="WHERE", help="robot folder, store or recording file")
+    parser.add_argument("item", nargs="?", metavar="ITEM", help="data item; all when absent")
+    add_range_only(parser)
+    parser.add_argument("--json", action="store_true", help="a list of objects")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print the gaps of a record."""
+    with opened(args.where) as record:
+        if args.item is not None:
+            record.variables(args.item)  # a name that is not there is an error, not an empty list
+        found = record.gaps(args.item, args.from_, args.to)
+    if args.json:
+        print_json([_as_json(gap) for gap in found])
+    elif found:
+        print("\n".join(in_columns([_HEADER, *map(_row, found)], "")))
+    else:
+        print("nothing is missing")
+    return 0
+
+
+def _row(gap: Gap) -> tuple[str, ...]:
+    seconds = f"{(gap.to_ns - gap.from_ns) / NS:.3f}"
+    start, end = (format_time(time_ns)[:23] for time_ns in (gap.from_ns, gap.to_ns))
+    count = "-" if gap.count is None else str(gap.count)
+    return start, end, seconds, gap.item or "all", count, gap.reason
+
+
+def _as_json(gap: Gap) -> dict[str, Any]:
+    return {
+        "item": gap.item or None,
+        "from": format_time(gap.from_ns),
+        "to": format_time(gap.to_ns),
+        "count": gap.count,
+        "reason": gap.reason,
+        "writer": gap.writer,
+        "run": gap.run,
+    }
