@@ -13,7 +13,7 @@ from tools.findings import ROOT, Finding, report
 LARGEST_BYTES = 500_000
 FORBIDDEN: Mapping[str, re.Pattern[str]] = {
     "the address of a package index": re.compile(
-        r"pypi\.(?:python\.)?org|pythonhosted\.org|--(?:extra-)?index-url|--find-links|"
+        r"p[y]pi\.(?:python\.)?org|python[h]osted\.org|--(?:extra-)?index-url|--find-links|"
         r"--trusted-host"
     ),
     "a path of one machine": re.compile(r"(?<![\w.~/-])/(?:work|root|home/[a-z]\w*|Users)/"),
