@@ -84,6 +84,7 @@ def publishing(sockets: int, rate_hz: float, size: int, burst: int = 1) -> Itera
         yield process.stdout.readline().strip()
     finally:
         process.stdin.close()
+        process.terminate()  # a flood may be waiting in a send that nobody reads any more
         process.wait(10)
 
 
