@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -10,8 +12,10 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from amberbox.blackbox.folder.folder import load_folder
 from amberbox.blackbox.follow import read
 from amberbox.blackbox.recorder.pipeline import Pipeline, PipelineOptions
+from amberbox.blackbox.recorder.recorder import Recorder
 from amberbox.blackbox.recorder.sink import BlockSink
 from amberbox.blackbox.store import create_store
 from amberbox.core.clock import RunClock
@@ -65,6 +69,20 @@ class ManualBox:
     def close(self) -> None:
         """End the run as a clean stop does."""
         self.pipeline.close()
+
+
+@contextmanager
+def recording(folder: Path) -> Iterator[Recorder]:
+    """Run the recorder of a robot folder in a thread until the block is left."""
+    recorder = Recorder(load_folder(folder), keeper=False)
+    thread = threading.Thread(target=recorder.run)
+    thread.start()
+    try:
+        yield recorder
+    finally:
+        recorder.stop.set()
+        thread.join(20)
+        assert not thread.is_alive()
 
 
 def raw_messages(store: Path, topic: str, *, repeated: bool = False) -> list[bytes]:

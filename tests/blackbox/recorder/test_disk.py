@@ -13,13 +13,20 @@ from pathlib import Path
 import pytest
 
 import amberbox
-from amberbox.blackbox.folder.folder import load_folder
 from amberbox.blackbox.follow import read
 from amberbox.blackbox.journal import writer
 from amberbox.blackbox.recorder.pipeline import PipelineOptions
 from amberbox.blackbox.recorder.recorder import Recorder
 from amberbox.core.clock import NS
-from amberbox.testing.box import COUNT, ManualBox, events, last_counters, number, raw_messages
+from amberbox.testing.box import (
+    COUNT,
+    ManualBox,
+    events,
+    last_counters,
+    number,
+    raw_messages,
+    recording,
+)
 from amberbox.testing.realros import wait_until
 from amberbox.testing.rosnet import RosMaster, RosPublisher, RosTopic
 
@@ -72,22 +79,15 @@ def publisher() -> Iterator[tuple[RosMaster, RosPublisher]]:
 
 
 @contextmanager
-def recording(folder: Path, master: RosMaster, queue: str) -> Iterator[Recorder]:
+def listening(folder: Path, master: RosMaster, queue: str) -> Iterator[Recorder]:
     folder.mkdir()
     (folder / "robot.yaml").write_text(f"id: r\nstore: {{queue: {queue}}}\n")
     (folder / "black_box.yaml").write_text(
         f"- ros:\n    ros_master_uri: {master.uri}\n    advertise: 127.0.0.1\n"
         f"    topics: [{{topic: {{name: {TOPIC}}}}}]\n"
     )
-    recorder = Recorder(load_folder(folder), keeper=False)
-    thread = threading.Thread(target=recorder.run)
-    thread.start()
-    try:
+    with recording(folder) as recorder:
         yield recorder
-    finally:
-        recorder.stop.set()
-        thread.join(20)
-        assert not thread.is_alive()
 
 
 def publish(node: RosPublisher, count: int, first: int) -> float:
@@ -113,7 +113,7 @@ def test_a_stalling_disk_neither_slows_the_robot_nor_hides_a_loss(
 ) -> None:
     master, node = publisher
     before, during, after = 300, round(STALL_S * RATE_HZ), 300
-    with recording(tmp_path / "robot", master, queue) as recorder:
+    with listening(tmp_path / "robot", master, queue) as recorder:
         node.wait_for_subscribers(TOPIC)
         slowest_s = publish(node, before, 0)
         disk.works.clear()
@@ -225,7 +225,7 @@ def test_the_recorder_lives_through_a_full_disk(
     tmp_path: Path, disk: Disk, publisher: tuple[RosMaster, RosPublisher]
 ) -> None:
     master, node = publisher
-    with recording(tmp_path / "robot", master, "64 MB") as recorder:
+    with listening(tmp_path / "robot", master, "64 MB") as recorder:
         node.wait_for_subscribers(TOPIC)
         disk.room = 50_000
         publish(node, 400, 0)

@@ -5,8 +5,6 @@ from __future__ import annotations
 import os
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +18,15 @@ from amberbox.blackbox.recorder.recorder import Recorder
 from amberbox.cli.main import main
 from amberbox.core.errors import AmberboxError, UsageError
 from amberbox.core.types import Gap, Schema, Topic
-from amberbox.testing.box import COUNT, ManualBox, events, number, own_records, raw_messages
+from amberbox.testing.box import (
+    COUNT,
+    ManualBox,
+    events,
+    number,
+    own_records,
+    raw_messages,
+    recording,
+)
 from amberbox.testing.realros import free_port, wait_until
 from amberbox.testing.rosnet import RosMaster, RosPublisher, RosTopic
 
@@ -44,19 +50,6 @@ def ros_block(uri: str, *topics: str) -> str:
         f"- ros:\n    ros_master_uri: {uri}\n    advertise: 127.0.0.1\n    poll_s: 0.1\n"
         f"    topics: [{listed}]\n"
     )
-
-
-@contextmanager
-def recording(folder: Path) -> Iterator[Recorder]:
-    recorder = Recorder(load_folder(folder), keeper=False)
-    thread = threading.Thread(target=recorder.run)
-    thread.start()
-    try:
-        yield recorder
-    finally:
-        recorder.stop.set()
-        thread.join(20)
-        assert not thread.is_alive()
 
 
 def test_wrong_yaml_is_named_by_file_and_line(

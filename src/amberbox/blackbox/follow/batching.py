@@ -15,7 +15,7 @@ from amberbox.blackbox.journal.mcap import Channel
 from amberbox.blackbox.unroll import Unroller, UnrollError, unroller
 from amberbox.core.errors import AmberboxError
 from amberbox.core.names import identifier, item_name
-from amberbox.core.types import Batch, Gap, IntArray, ItemSchema, Rows, Schema, Topic
+from amberbox.core.types import Batch, Gap, IntArray, Rows, Schema, Topic
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,6 +55,16 @@ def stream_of(channel: Channel, schemas: Mapping[int, Schema]) -> Stream:
 
 
 @dataclass(frozen=True, slots=True)
+class Origin:
+    """Where messages come from: whose run, which stream, and how its log time is corrected."""
+
+    writer: str
+    run: int
+    stream: Stream
+    clock: ClockTable
+
+
+@dataclass(frozen=True, slots=True)
 class Made:
     """A batch, if anything could be decoded, and what could not."""
 
@@ -62,77 +72,64 @@ class Made:
     gaps: Sequence[Gap] = ()
 
 
-def make_batch(
-    writer: str,
-    run: int,
-    stream: Stream,
-    seq: IntArray,
-    log_ns: IntArray,
-    messages: Sequence[bytes],
-    clock: ClockTable,
-) -> Made:
+def make_batch(origin: Origin, seq: IntArray, log_ns: IntArray, messages: Sequence[bytes]) -> Made:
     """Unroll messages of one stream; those that do not decode are left out and named."""
+    stream = origin.stream
     try:
         rows = stream.unroller().rows(messages)
     except UnrollError as error:
-        return _without_bad(writer, run, stream, seq, log_ns, messages, clock, error)
+        return _without_bad(origin, seq, log_ns, messages, error)
     except AmberboxError as error:  # no definition, or one that nobody can read: raw is kept
-        return Made(None, [_undecodable(writer, run, stream.item, seq, log_ns, error.what)])
-    received = clock.received(log_ns)
+        return Made(None, [_undecodable(origin, seq, log_ns, error.what)])
+    received = origin.clock.received(log_ns)
     stamp = received if rows.stamp_ns is None else np.where(rows.stamp_ns, rows.stamp_ns, received)
-    return Made(
-        Batch(
-            item=stream.item,
-            schema=stream.unroller().schema,
-            writer=writer,
-            run=run,
-            seq=seq,
-            log_time_ns=log_ns,
-            received_ns=received,
-            timestamp_ns=stamp,
-            columns=rows.columns,
-            children=_children(stream, rows, writer, run, seq, log_ns, received, stamp),
-            topic=stream.topic.name,
-            source=stream.source,
-        )
+    batch = Batch(
+        item=stream.item,
+        schema=stream.unroller().schema,
+        writer=origin.writer,
+        run=origin.run,
+        seq=seq,
+        log_time_ns=log_ns,
+        received_ns=received,
+        timestamp_ns=stamp,
+        columns=rows.columns,
+        topic=stream.topic.name,
+        source=stream.source,
     )
+    if not rows.children:
+        return Made(batch)
+    message = np.arange(rows.count)
+    return Made(replace(batch, children=_children(batch, batch, rows, message, None)))
 
 
 def _without_bad(
-    writer: str,
-    run: int,
-    stream: Stream,
+    origin: Origin,
     seq: IntArray,
     log_ns: IntArray,
     messages: Sequence[bytes],
-    clock: ClockTable,
     error: UnrollError,
 ) -> Made:
     bad = np.array(error.bad, np.int64)
     good = np.setdiff1d(np.arange(len(messages)), bad)
     gaps = [
-        _undecodable(
-            writer, run, stream.item, seq[row : row + 1], log_ns[row : row + 1], error.what
-        )
+        _undecodable(origin, seq[row : row + 1], log_ns[row : row + 1], error.what)
         for row in bad.tolist()
     ]
     if not len(good):
         return Made(None, gaps)
     rest = [messages[row] for row in good.tolist()]
-    made = make_batch(writer, run, stream, seq[good], log_ns[good], rest, clock)
+    made = make_batch(origin, seq[good], log_ns[good], rest)
     return Made(made.batch, [*gaps, *made.gaps])
 
 
-def _undecodable(
-    writer: str, run: int, item: str, seq: IntArray, log_ns: IntArray, why: str
-) -> Gap:
+def _undecodable(origin: Origin, seq: IntArray, log_ns: IntArray, why: str) -> Gap:
     return Gap(
-        writer,
-        run,
+        origin.writer,
+        origin.run,
         int(log_ns[0]),
         int(log_ns[-1]) + 1,
         f"undecodable: {why}",
-        item,
+        origin.stream.item,
         len(seq),
         int(seq[0]),
         int(seq[-1]) + 1,
@@ -140,65 +137,44 @@ def _undecodable(
 
 
 def _children(
-    stream: Stream,
-    rows: Rows,
-    writer: str,
-    run: int,
-    seq: IntArray,
-    log_ns: IntArray,
-    received: IntArray,
-    stamp: IntArray,
+    whole: Batch, parent: Batch, rows: Rows, message: IntArray, number: IntArray | None
 ) -> dict[str, Batch]:
-    schemas = stream.unroller().schema.children
-    message_row = np.arange(rows.count)
+    """Build the child tables of a table whose rows belong to these messages of the whole batch."""
     return {
-        path: _child(stream, f"{stream.item}__{identifier(path)}", schemas[path], child,
-                     message_row, None, writer, run, seq, log_ns, received, stamp)
+        path: _child(whole, parent, path, child, message, number)
         for path, child in rows.children.items()
-    }  # fmt: skip
+    }
 
 
 def _child(
-    stream: Stream,
-    item: str,
-    schema: ItemSchema,
+    whole: Batch,
+    parent: Batch,
+    path: str,
     rows: Rows,
     parent_message: IntArray,
     parent_number: IntArray | None,
-    writer: str,
-    run: int,
-    seq: IntArray,
-    log_ns: IntArray,
-    received: IntArray,
-    stamp: IntArray,
 ) -> Batch:
     """Build a child table: each row knows its message, its place, and the row above it."""
     assert rows.parent_row is not None
     assert rows.index is not None
     message = parent_message[rows.parent_row]
-    number = _number_within(message)
-    keys: dict[str, Any] = {"parent_seq": seq[message], "index": rows.index}
+    keys: dict[str, Any] = {"parent_seq": whole.seq[message], "index": rows.index}
     if parent_number is not None:
         keys["parent_index"] = parent_number[rows.parent_row]
-    children = {
-        path: _child(stream, f"{item}__{identifier(path)}", schema.children[path], child,
-                     message, number, writer, run, seq, log_ns, received, stamp)
-        for path, child in rows.children.items()
-    }  # fmt: skip
-    return Batch(
-        item=item,
-        schema=schema,
-        writer=writer,
-        run=run,
-        seq=seq[message],
-        log_time_ns=log_ns[message],
-        received_ns=received[message],
-        timestamp_ns=stamp[message],
+    child = replace(
+        whole,
+        item=f"{parent.item}__{identifier(path)}",
+        schema=parent.schema.children[path],
+        seq=whole.seq[message],
+        log_time_ns=whole.log_time_ns[message],
+        received_ns=whole.received_ns[message],
+        timestamp_ns=whole.timestamp_ns[message],
         columns={**keys, **rows.columns},
-        children=children,
-        topic=stream.topic.name,
-        source=stream.source,
     )
+    if not rows.children:
+        return child
+    number = _number_within(message)
+    return replace(child, children=_children(whole, child, rows, message, number))
 
 
 def _number_within(message: IntArray) -> IntArray:

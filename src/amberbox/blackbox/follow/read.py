@@ -12,7 +12,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from amberbox.blackbox.follow.batching import Stream, make_batch, stream_of
+from amberbox.blackbox.follow.batching import Origin, Stream, make_batch, stream_of
 from amberbox.blackbox.journal import reserved
 from amberbox.blackbox.journal.buffer import open_buffer
 from amberbox.blackbox.journal.chunk import Chunk, sequences
@@ -361,7 +361,8 @@ def _unpile(
     journal: JournalFile, stream: Stream, pile: _Pile, clock: ClockTable, on_gap: OnGap | None
 ) -> Iterator[Batch]:
     seq, log_ns = np.concatenate(pile.seq), np.concatenate(pile.log_ns)
-    made = make_batch(journal.writer, journal.run, stream, seq, log_ns, pile.messages, clock)
+    origin = Origin(journal.writer, journal.run, stream, clock)
+    made = make_batch(origin, seq, log_ns, pile.messages)
     if on_gap is not None:
         for gap in made.gaps:
             on_gap(gap)

@@ -11,7 +11,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from amberbox.blackbox.follow.batching import Made, Stream, make_batch, stream_of
+from amberbox.blackbox.follow.batching import Origin, Stream, make_batch, stream_of
 from amberbox.blackbox.follow.read import (
     JournalFile,
     files_of,
@@ -201,9 +201,8 @@ class WriterTail:
         for part in _runs_of_channel(rows, chunk):
             stream = streams[int(chunk.channel[part[0]])]
             messages = chunk.messages(part)
-            made: Made = make_batch(
-                self.writer, self.run, stream, seq[part], chunk.log_ns[part], messages, clock
-            )
+            origin = Origin(self.writer, self.run, stream, clock)
+            made = make_batch(origin, seq[part], chunk.log_ns[part], messages)
             for gap in made.gaps:
                 yield self._at(gap)
             self.ahead[item] = int(seq[part[-1]]) + 1
