@@ -21,7 +21,9 @@ from typing import Any, Literal, Protocol
 from amberbox.core.options import option
 from amberbox.core.types import Topic
 
-Keep = Literal["all", "ring", "incident", "none"]
+Keep = Literal["all", "bulk", "ring", "incident", "none"]
+Power = Literal["mains", "battery", "low"]
+"""How the box itself is powered: from outside, from its own battery, from what is left of it."""
 
 
 @dataclass(frozen=True)
@@ -86,6 +88,13 @@ class Sink(Protocol):
 
     def event(self, kind: str, text: str, **details: Any) -> None:
         """Record an event; ``kind`` is a short identifier, ``text`` one line for a person."""
+
+    def power(self, state: Power, text: str) -> None:
+        """Say how the box is powered now, ``text`` being one line for a person.
+
+        On ``battery`` the recorder makes everything durable at once and from then on more often,
+        and marks an incident; on ``low`` it ends the run cleanly while it still can.
+        """
 
     def last_latched(self, topic: str) -> bytes | None:
         """Return the last latched message of a topic in the store, also of an earlier run."""

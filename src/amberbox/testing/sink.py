@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from amberbox.core.source import Power
 from amberbox.core.types import Topic
 
 
@@ -22,6 +23,7 @@ class MemorySink:
     events: list[tuple[str, str, Mapping[str, Any]]] = field(default_factory=list)
     latched: dict[str, bytes] = field(default_factory=dict)
     saved: dict[str, Any] = field(default_factory=dict)
+    powers: list[tuple[Power, str]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         self._lock = threading.Condition(threading.RLock())
@@ -51,6 +53,11 @@ class MemorySink:
     def event(self, kind: str, text: str, **details: Any) -> None:
         with self._lock:
             self.events.append((kind, text, details))
+            self._lock.notify_all()
+
+    def power(self, state: Power, text: str) -> None:
+        with self._lock:
+            self.powers.append((state, text))
             self._lock.notify_all()
 
     def last_latched(self, topic: str) -> bytes | None:

@@ -31,7 +31,7 @@ from amberbox.blackbox.recorder.streams import Item, Stream
 from amberbox.blackbox.store import Store, WriterLock
 from amberbox.core.clock import NS
 from amberbox.core.errors import AmberboxError
-from amberbox.core.source import TopicOptions
+from amberbox.core.source import Power, TopicOptions
 
 CLOCK_PERIOD_NS = 10 * NS
 CLOCK_STEP_NS = 50_000_000
@@ -96,6 +96,8 @@ class Pipeline:
         self._clock_offset_ns = 0
         self._counted_ns = 0
         self._filter_error = ""
+        self.power: Power = "mains"
+        """How the box is powered, as a source has said last."""
         self.on_event: Callable[[str, str], None] | None = None
         now_ns = self.clock.now_ns()  # the clock may have been set back since the last run
         start = now_ns if self.start_gap_ns is None else min(self.start_gap_ns, now_ns)

@@ -13,7 +13,7 @@ from amberbox.blackbox.follow import read
 from amberbox.blackbox.recorder.pipeline import Pipeline
 from amberbox.blackbox.recorder.streams import Stream, tell_unused
 from amberbox.blackbox.store import replace_file
-from amberbox.core.source import TopicOptions
+from amberbox.core.source import Power, TopicOptions
 from amberbox.core.types import Topic
 
 INFERRED = ("json", "msgpack")
@@ -72,6 +72,10 @@ class BlockSink:
 
     def event(self, kind: str, text: str, **details: Any) -> None:
         self._pipeline.event(kind, text, self._name, **details)
+
+    def power(self, state: Power, text: str) -> None:
+        self._pipeline.event(f"power_{state}", text, self._name)
+        self._pipeline.power = state
 
     def last_latched(self, topic: str) -> bytes | None:
         item = self._pipeline.items.get(self._item(topic))
