@@ -16,6 +16,7 @@ from amberbox.blackbox.recorder.pipeline import Pipeline, PipelineOptions
 from amberbox.blackbox.recorder.recovery import previous_end_ns, report_recovery
 from amberbox.blackbox.recorder.supervisor import Supervisor
 from amberbox.blackbox.recorder.syncer import Syncer
+from amberbox.blackbox.service import Notifier
 from amberbox.blackbox.store import create_store
 from amberbox.core.clock import NS, Clock, RunClock, SystemClock
 from amberbox.core.errors import UsageError
@@ -62,6 +63,7 @@ class Recorder:
         self.folder = folder
         self.store = create_store(folder.store_path)
         self.stop = threading.Event()
+        self._notifier = Notifier()
         clock = clock or SystemClock()
         virtual_ns = virtual_start_ns(folder)
         self._keeper_wanted = keeper
@@ -108,6 +110,9 @@ class Recorder:
             self.pipeline.intake.wake.clear()
             due = time.monotonic() + write_s
             self.pipeline.tick()
+            if self.pipeline.bytes_written:
+                self._notifier.ready()
+            self._notifier.alive(self._status)
             syncer.poke()
             if keeper is not None:
                 keeper.look_after()
@@ -115,6 +120,7 @@ class Recorder:
                 break
 
     def _finish(self, syncer: Syncer, keeper: KeeperProcess | None) -> None:
+        self._notifier.stopping()
         self.stop.set()
         self.pipeline.intake.wait_no_more()
         stuck = self._join_sources()
@@ -135,6 +141,13 @@ class Recorder:
         for source in self._sources:
             source.thread.join(max(0.0, deadline - time.monotonic()))
         return [source.thread.name for source in self._sources if source.thread.is_alive()]
+
+    def _status(self) -> str:
+        """Say in one line what is being recorded, for systemctl status."""
+        items = list(self.pipeline.items.values())
+        kept = sum(item.counters.kept for item in items)
+        trouble = f"; DISK: {self.pipeline.disk_error}" if self.pipeline.disk_error else ""
+        return f"{len(items)} items, {kept} messages kept{trouble}"
 
     def state(self) -> RecorderState:
         """Describe what is being recorded, for the live table."""

@@ -1,0 +1,78 @@
+"""Tells systemd that the recorder writes: ready, alive, stopping (the protocol of sd_notify)."""
+
+from __future__ import annotations
+
+import os
+import socket
+import time
+from collections.abc import Callable, Mapping
+
+_STATUS_S = 5.0
+"""How often the status is told where no watchdog waits for it."""
+_START_PATIENCE_USEC = 30_000_000
+
+
+def notify(message: str, environ: Mapping[str, str] = os.environ) -> bool:
+    """Send one message such as ``READY=1`` to the service manager; False if nobody took it."""
+    address = environ.get("NOTIFY_SOCKET", "")
+    if address[:1] not in ("/", "@"):
+        return False
+    if address[0] == "@":  # Linux' abstract names begin with NUL
+        address = "\0" + address[1:]
+    try:
+        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as link:
+            link.setblocking(False)
+            link.sendto(message.encode(), address)
+    except OSError:  # a manager that is gone or busy: recording is what counts
+        return False
+    return True
+
+
+def watchdog_s(environ: Mapping[str, str] = os.environ) -> float | None:
+    """Return how long systemd waits for a sign of life before it kills; None if it does not."""
+    if environ.get("WATCHDOG_PID", str(os.getpid())) != str(os.getpid()):
+        return None
+    try:
+        interval_us = int(environ.get("WATCHDOG_USEC", ""))
+    except ValueError:
+        return None
+    return interval_us / 1e6 if interval_us > 0 else None
+
+
+class Notifier:
+    """Keeps systemd informed about one run; without systemd every call does nothing."""
+
+    def __init__(
+        self,
+        environ: Mapping[str, str] = os.environ,
+        monotonic: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._environ = environ
+        self._monotonic = monotonic
+        self._listens = bool(environ.get("NOTIFY_SOCKET"))
+        self._period_s = (watchdog_s(environ) or 2 * _STATUS_S) / 2
+        self._due = 0.0
+        self._is_ready = False
+
+    def ready(self) -> None:
+        """Say once that the first bytes are in the journal."""
+        if self._listens and not self._is_ready:
+            self._is_ready = notify("READY=1", self._environ)
+
+    def alive(self, status: Callable[[], str]) -> None:
+        """Say that the recorder goes on, and what it does; twice per watchdog interval.
+
+        Before ``ready`` it asks for more time instead: a recorder that waits for room on its
+        disk shall not be taken for one that failed to start.
+        """
+        now = self._monotonic()
+        if not self._listens or now < self._due:
+            return
+        sign = "WATCHDOG=1" if self._is_ready else f"EXTEND_TIMEOUT_USEC={_START_PATIENCE_USEC}"
+        if notify(f"{sign}\nSTATUS={status()}", self._environ):
+            self._due = now + self._period_s
+
+    def stopping(self) -> None:
+        """Say that the end of the run has begun."""
+        if self._listens:
+            notify("STOPPING=1\nSTATUS=writing the rest", self._environ)
