@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 from amberbox.blackbox.folder.folder import store_of
 from amberbox.blackbox.importing import ImportReport, import_recordings
-
-_BAR = 30
+from amberbox.cli._progress import progress_bar
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -29,7 +26,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Import and report; 1 if anything in the inputs was damaged."""
     started = time.monotonic()
-    progress = _bar() if sys.stderr.isatty() and not args.json else lambda fraction: None
+    progress = progress_bar(wanted=not args.json)
     store = store_of(args.store) or args.store
     reports = import_recordings(args.inputs, store, source=args.source, progress=progress)
     if args.json:
@@ -50,15 +47,3 @@ def _as_json(report: ImportReport) -> dict[str, object]:
         "damage": report.damage,
         "already_imported": report.known,
     }
-
-
-def _bar() -> Callable[[float], None]:
-    """Draw a progress bar on stderr."""
-
-    def draw(fraction: float) -> None:
-        full = round(min(max(fraction, 0.0), 1.0) * _BAR)
-        end = "\n" if fraction >= 1.0 else ""
-        print(f"\r[{'#' * full}{'.' * (_BAR - full)}] {fraction:4.0%}", end=end, file=sys.stderr,
-              flush=True)  # fmt: skip
-
-    return draw
