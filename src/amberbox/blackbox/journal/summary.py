@@ -53,6 +53,13 @@ class Summary:
     start_ns: int = 0
     end_ns: int = 0
 
+    def add_chunk(self, chunk: IndexedChunk) -> None:
+        """Take a chunk that has been written."""
+        first = not self.chunks
+        self.start_ns = chunk.start_ns if first else min(self.start_ns, chunk.start_ns)
+        self.end_ns = max(self.end_ns, chunk.end_ns)
+        self.chunks.append(chunk)
+
     def encode(self, start: int) -> bytes:
         """Encode data end, summary section, summary offsets and footer, to stand at ``start``."""
         data_end = mcap.record(mcap.DATA_END, struct.pack("<I", 0))

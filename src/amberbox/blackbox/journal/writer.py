@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import hashlib
 import os
-import zlib
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -19,22 +19,19 @@ import zstandard
 from numpy.typing import NDArray
 
 from amberbox.blackbox.journal import mcap
+from amberbox.blackbox.journal.frame import Packed, Rows, chunk_slices, pack
 from amberbox.blackbox.journal.head import Head, HeadFile
 from amberbox.blackbox.journal.mcap import (
     CHAIN_METADATA,
-    MESSAGE_HEAD,
     START_METADATA,
     Channel,
 )
 from amberbox.blackbox.journal.openfile import OpenFile
-from amberbox.blackbox.journal.summary import IndexedChunk
 from amberbox.blackbox.journal.syncmark import SyncMark
 from amberbox.blackbox.store import sync_folder
 from amberbox.core.clock import NS
 from amberbox.core.types import IntArray, Schema, Topic
 
-CHUNK_BYTES = 1 << 20
-"""Larger writes are split into chunks of about this size; a larger message has its own."""
 SCHEMA_REPEAT_NS = (NS, 10 * NS)
 """Schemas are repeated after as long as the file is old, but within these limits."""
 COMPRESSION_LEVEL = 1
@@ -124,72 +121,18 @@ class JournalWriter:
             self._open(int(log[0]))
         numbers = np.asarray(channels, np.uint16)
         publish = np.asarray(publish_ns, np.int64)
-        lengths = np.fromiter(map(len, messages), np.int64, len(messages))
-        for start, stop in _chunk_ranges(lengths):
-            part = slice(start, stop)
-            self._write_chunk(
-                numbers[part], log[part], publish[part], lengths[part], messages[start:stop]
-            )
+        sequence = np.arange(self.next_seq, self.next_seq + len(messages))
+        rows = Rows(numbers, sequence, log, publish, messages)
+        for part in chunk_slices(messages):
+            self._write_chunk(rows.take(part))
 
-    def _write_chunk(
-        self,
-        channels: NDArray[np.uint16],
-        log: IntArray,
-        publish: IntArray,
-        lengths: IntArray,
-        messages: Sequence[bytes],
-    ) -> None:
+    def _write_chunk(self, rows: Rows) -> None:
         file = self._opened()
-        order = np.argsort(channels, kind="stable")
-        grouped = channels[order]
-        firsts = np.flatnonzero(np.concatenate(([True], grouped[1:] != grouped[:-1])))
-        used = grouped[firsts].tolist()
-        start_ns, end_ns = int(log.min()), int(log.max())
-        prefix = self._definitions(file, used, end_ns)
-        body, starts = self._frame(prefix, channels, log, publish, lengths, messages)
-        compression = "zstd" if len(messages) > 1 or len(body) <= CHUNK_BYTES else ""
-        data = self._zstd.compress(body) if compression else bytes(body)
-        chunk = mcap.chunk_record(start_ns, end_ns, len(body), zlib.crc32(body), compression, data)
-        entries = np.empty((len(order), 2), np.int64)
-        entries[:, 0], entries[:, 1] = log[order], starts[order]
-        bounds = [*(firsts * 16).tolist(), len(order) * 16]
-        raw = entries.tobytes()
+        packed = pack(rows, partial(self._definitions, file), self._zstd)
         offset = file.size
-        self._append([chunk, *(
-            mcap.message_index_record(channel, raw[a:b])
-            for channel, a, b in zip(used, bounds[:-1], bounds[1:], strict=True)
-        )])  # fmt: skip
-        counts = (np.diff(bounds) // 16).tolist()
-        self._note(file, used, counts, IndexedChunk(
-            start_ns, end_ns, offset, len(chunk), _index_offsets(used, counts, offset + len(chunk)),
-            file.size - offset - len(chunk), compression, len(data), len(body),
-        ))  # fmt: skip
-        self.next_seq += len(messages)
-
-    def _frame(
-        self,
-        prefix: bytes,
-        channels: NDArray[np.uint16],
-        log: IntArray,
-        publish: IntArray,
-        lengths: IntArray,
-        messages: Sequence[bytes],
-    ) -> tuple[bytearray, IntArray]:
-        """Lay messages out behind the definitions, their 31-byte heads written column-wise."""
-        body = bytearray(MESSAGE_HEAD).join([prefix, *messages])
-        starts = np.empty(len(lengths), np.int64)
-        starts[0] = len(prefix)
-        np.cumsum(lengths[:-1] + MESSAGE_HEAD, out=starts[1:])
-        starts[1:] += len(prefix)
-        u1, u2, u4, u8 = _overlapping_views(body)
-        sequence = np.arange(self.next_seq, self.next_seq + len(lengths)) & 0xFFFFFFFF
-        u1[starts] = mcap.MESSAGE
-        u8[starts + 1] = lengths + (MESSAGE_HEAD - 9)
-        u2[starts + 9] = channels
-        u4[starts + 11] = sequence
-        u8[starts + 15] = log
-        u8[starts + 23] = publish
-        return body, starts
+        self._append([packed.chunk, *packed.indices])
+        self._note(file, packed, offset)
+        self.next_seq += len(rows.messages)
 
     def _definitions(self, file: OpenFile, used: Sequence[int], now_ns: int) -> bytes:
         """Repeat the channels a chunk uses always, their schemas now and then."""
@@ -208,20 +151,15 @@ class JournalWriter:
     def _schema(self, schema_id: int) -> Schema:
         return self._schema_list[schema_id - 1]
 
-    def _note(
-        self, file: OpenFile, used: Sequence[int], counts: Sequence[int], chunk: IndexedChunk
-    ) -> None:
+    def _note(self, file: OpenFile, packed: Packed, offset: int) -> None:
         summary = file.summary
-        for number, count in zip(used, counts, strict=True):
+        for number, count in zip(packed.channels, packed.counts, strict=True):
             channel = self._channels[number]
             summary.counts[number] += count
             summary.channels[number] = channel
             if channel.schema_id:
                 summary.schemas[channel.schema_id] = self._schema(channel.schema_id)
-        first = not summary.chunks
-        summary.start_ns = chunk.start_ns if first else min(summary.start_ns, chunk.start_ns)
-        summary.end_ns = max(summary.end_ns, chunk.end_ns)
-        summary.chunks.append(chunk)
+        summary.add_chunk(packed.indexed(offset))
 
     def mark_sync(self) -> SyncMark:
         """Close a link of the chain and return what makes everything so far durable."""
@@ -351,42 +289,6 @@ class JournalWriter:
         file.block.update(data)
         file.size += len(data)
         self.bytes_written += len(data)
-
-
-def _overlapping_views(
-    body: bytearray,
-) -> tuple[NDArray[np.uint8], NDArray[np.uint16], NDArray[np.uint32], NDArray[np.uint64]]:
-    """View bytes as numbers that begin at every byte, for column-wise writing."""
-    size = len(body)
-    return (
-        np.ndarray((size,), "<u1", body, 0, (1,)),
-        np.ndarray((size - 1,), "<u2", body, 0, (1,)),
-        np.ndarray((size - 3,), "<u4", body, 0, (1,)),
-        np.ndarray((size - 7,), "<u8", body, 0, (1,)),
-    )
-
-
-def _chunk_ranges(lengths: IntArray) -> list[tuple[int, int]]:
-    """Split a write into chunks of about CHUNK_BYTES; larger messages stand alone."""
-    total = int(lengths.sum())
-    if total <= CHUNK_BYTES:
-        return [(0, len(lengths))] if len(lengths) else []
-    ends = np.cumsum(lengths)
-    ranges, start = [], 0
-    while start < len(lengths):
-        base = int(ends[start] - lengths[start])
-        stop = max(start + 1, int(np.searchsorted(ends, base + CHUNK_BYTES, "right")))
-        ranges.append((start, stop))
-        start = stop
-    return ranges
-
-
-def _index_offsets(used: Sequence[int], counts: Sequence[int], start: int) -> list[tuple[int, int]]:
-    offsets = []
-    for channel, count in zip(used, counts, strict=True):
-        offsets.append((channel, start))
-        start += 15 + 16 * count
-    return offsets
 
 
 def _write_all(fd: int, data: bytes) -> None:
