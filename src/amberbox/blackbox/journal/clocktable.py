@@ -28,4 +28,4 @@ class ClockTable:
     def bounds(self) -> tuple[int, int]:
         """Smallest and largest offset: by so much log time may differ from received."""
         offsets = [offset for _, offset in self.points] or [0]
-        return min(*offsets, 0), max(*offsets, 0)
+        return min(offsets), max(offsets)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import TypeAlias
 
@@ -38,7 +39,9 @@ class Gathered:
     notes: list[str] = field(default_factory=list)
 
 
-class _DamagedSegmentError(Exception):
+class DamagedSegmentError(Exception):
+    """A segment that cannot be read: its journal, if there is one, has to do."""
+
     def __init__(self, segment: Segment, reason: str) -> None:
         super().__init__(reason)
         self.segment = segment
@@ -51,38 +54,48 @@ def gather(catalogue: Catalogue, request: Request) -> Gathered:
         try:
             found.pieces = list(_segment_rows(catalogue, request))
             break
-        except _DamagedSegmentError as damage:
-            _tell_damaged(found, catalogue, damage.segment, str(damage))
+        except DamagedSegmentError as damage:
+            tell_damaged(found, catalogue, damage.segment, str(damage))
             catalogue = catalogue.without(damage.segment)
     _add_journals(found, catalogue, request)
     if not catalogue.with_segments:
-        _tell_unreadable(found, catalogue, request)
-    pieces = (_cut(piece, request) for piece in found.pieces)
+        tell_unreadable(found, catalogue, request)
+    pieces = (within(piece, request) for piece in found.pieces)
     found.pieces = [piece for piece in pieces if len(piece)]
     return found
 
 
 def _segment_rows(catalogue: Catalogue, request: Request) -> Iterator[Flat]:
     for segment in catalogue.segments(request.table):
-        if not _may_hold(segment, request):
+        if not may_hold(segment, request):
             continue
         schema = catalogue.manifest.schemas[segment.schema]
-        try:
-            yield from read_segment(
+        with noticing_damage(segment):
+            flats = read_segment(
                 catalogue.store, segment, schema, request.names, request.span, request.by
             )
-        except FileNotFoundError:  # joined or deleted meanwhile: whoever asks looks again
-            raise
-        except (OSError, ValueError) as error:
-            raise _DamagedSegmentError(segment, str(error).splitlines()[0]) from error
+        yield from flats
 
 
-def _may_hold(segment: Segment, request: Request) -> bool:
+@contextmanager
+def noticing_damage(segment: Segment) -> Iterator[None]:
+    """Turn what goes wrong when a segment is read into ``DamagedSegmentError``."""
+    try:
+        yield
+    except FileNotFoundError:  # joined or deleted meanwhile: whoever asks looks again
+        raise
+    except (OSError, ValueError) as error:
+        raise DamagedSegmentError(segment, str(error).splitlines()[0]) from error
+
+
+def may_hold(segment: Segment, request: Request) -> bool:
+    """Tell whether a segment may hold rows of a request's range."""
     bounds = segment.received_range_ns if request.by == "received" else segment.stamp_range_ns
     return overlaps(*bounds, request.span)
 
 
-def _tell_damaged(found: Gathered, catalogue: Catalogue, segment: Segment, reason: str) -> None:
+def tell_damaged(found: Gathered, catalogue: Catalogue, segment: Segment, reason: str) -> None:
+    """Note what a damaged segment costs: nothing where its journals are still there."""
     lost = [part for part in segment.parts if part.journal not in catalogue.existing]
     if not lost:
         found.notes.append(f"{segment.path} is damaged, its journal was read instead ({reason})")
@@ -91,10 +104,10 @@ def _tell_damaged(found: Gathered, catalogue: Catalogue, segment: Segment, reaso
         found.gaps.append(_gap_of(segment, part, f"{segment.path} is damaged"))
 
 
-def _tell_unreadable(found: Gathered, catalogue: Catalogue, request: Request) -> None:
+def tell_unreadable(found: Gathered, catalogue: Catalogue, request: Request) -> None:
     """Without pyarrow, rows whose journal is gone are out of reach: say so."""
     for segment in catalogue.manifest.segments.get(request.table, ()):
-        for part in segment.parts if _may_hold(segment, request) else ():
+        for part in segment.parts if may_hold(segment, request) else ():
             if part.journal not in catalogue.existing:
                 found.notes.append(f"{segment.path}: {part.rows} rows need pyarrow to be read")
                 found.gaps.append(_gap_of(segment, part, "needs pyarrow to be read"))
@@ -132,7 +145,7 @@ def journal_rows(
                 yield flat.with_columns(kept)
 
 
-def _cut(piece: Flat, request: Request) -> Flat:
+def within(piece: Flat, request: Request) -> Flat:
     """Keep the rows of the range."""
     times = piece.received_ns if request.by == "received" else piece.timestamp_ns
     from_ns, to_ns = request.span

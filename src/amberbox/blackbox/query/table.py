@@ -85,10 +85,16 @@ class Table:
         assert isinstance(frame, pl.DataFrame)
         return frame
 
-    def to_csv(self, to: IO[str] | Path | str, *, header: bool = True) -> None:
-        """Write comma-separated values: times as RFC 3339, nulls empty, lists as JSON."""
+    def to_csv(
+        self, to: IO[str] | Path | str, *, header: bool = True, raw_text: bool = False
+    ) -> None:
+        """Write comma-separated values: times as RFC 3339, nulls empty, lists as JSON.
+
+        Text that a spreadsheet would take for a formula (it begins with ``= + - @``, a tab or a
+        carriage return) gets a ``'`` before it, unless ``raw_text``.
+        """
         with _opened(to) as file:
-            tabletext.write_csv(file, self.fields, self.columns, header=header)
+            tabletext.write_csv(file, self.fields, self.columns, header=header, raw_text=raw_text)
 
     def to_json(self, to: IO[str] | Path | str, *, lines: bool = False) -> None:
         """Write a JSON array of objects, or one object per line; times as RFC 3339 strings."""

@@ -16,6 +16,7 @@ from amberbox.core.timetext import format_times
 from amberbox.core.types import Column, ColumnData, Ragged
 
 _CHUNK = 10_000
+_FORMULA = "=+-@\t\r"
 _EDGE_ROWS = 5
 _CELL_WIDTH = 40
 _STEADY_WIDTH = 14
@@ -70,13 +71,25 @@ def _base64(value: Any) -> Any:
     return base64.b64encode(value).decode() if isinstance(value, bytes) else value
 
 
-def write_csv(file: IO[str], fields: Fields, columns: Columns, *, header: bool = True) -> None:
-    """Write CSV with a header line; a list stands as JSON in its cell."""
+def write_csv(
+    file: IO[str], fields: Fields, columns: Columns, *, header: bool = True, raw_text: bool = False
+) -> None:
+    """Write CSV with a header line; a list stands as JSON in its cell.
+
+    Text that a spreadsheet would take for a formula gets a ``'`` before it, but with ``raw_text``.
+    """
     writer = csv.writer(file, lineterminator="\n")
+    cells = [_cell if raw_text or field.type != "string" else _harmless for field in fields]
     if header:
         writer.writerow([column.name for column in fields])
     for chunk in _chunks(fields, columns):
-        writer.writerows(zip(*(map(_cell, column) for column in chunk), strict=True))
+        made = (map(cell, column) for cell, column in zip(cells, chunk, strict=True))
+        writer.writerows(zip(*made, strict=True))
+
+
+def _harmless(text: str | None) -> str | None:
+    """Keep a spreadsheet from calculating what a robot, or somebody on its network, has said."""
+    return f"'{text}" if text and text[0] in _FORMULA else text
 
 
 def _cell(value: Any) -> Any:

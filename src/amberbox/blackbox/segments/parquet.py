@@ -6,7 +6,7 @@ import hashlib
 import json
 import os
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -165,16 +165,52 @@ def read_segment(
     Row groups are chosen by their statistics: rows outside of the range may come along. Gives
     one ``Flat`` per part of the segment.
     """
+    with _opened(store / segment.path) as file:
+        found = _row_groups(file.metadata, schema, segment.clock, by)
+        chosen = [group for group in found if overlaps(group.low_ns, group.high_ns, span)]
+        return _read(file, segment, schema, names, [group.number for group in chosen])
+
+
+@dataclass(frozen=True, slots=True)
+class RowGroup:
+    """One row group of a segment and bounds of its times, both inclusive."""
+
+    number: int
+    low_ns: int
+    high_ns: int
+
+
+def row_groups(store: Path, segment: Segment, schema: TableSchema, by: str) -> list[RowGroup]:
+    """List the row groups of a segment with the bounds of ``received`` or of the stamps."""
+    with _opened(store / segment.path) as file:
+        return _row_groups(file.metadata, schema, segment.clock, by)
+
+
+def read_row_group(
+    store: Path, segment: Segment, schema: TableSchema, names: Collection[str], number: int
+) -> list[Flat]:
+    """Read the named columns of one row group; one ``Flat`` per part of the segment."""
+    with _opened(store / segment.path) as file:
+        return _read(file, segment, schema, names, [number])
+
+
+def _opened(path: Path) -> pq.ParquetFile:
     import pyarrow.parquet as pq
 
-    with pq.ParquetFile(
-        store / segment.path, memory_map=True, page_checksum_verification=True
-    ) as file:
-        groups = _groups_in_range(file.metadata, schema, segment.clock, span, by)
-        wanted = [column for column in schema.columns if column.name in names]
-        columns = [*key_names(schema), *(stored_name(column.name) for column in wanted)]
-        table = file.read_row_groups(groups, columns=columns, use_threads=len(columns) > 8)
-        first_rows = _first_rows(file.metadata)
+    return pq.ParquetFile(path, memory_map=True, page_checksum_verification=True)
+
+
+def _read(
+    file: pq.ParquetFile,
+    segment: Segment,
+    schema: TableSchema,
+    names: Collection[str],
+    groups: Sequence[int],
+) -> list[Flat]:
+    wanted = [column for column in schema.columns if column.name in names]
+    columns = [*key_names(schema), *(stored_name(column.name) for column in wanted)]
+    table = file.read_row_groups(groups, columns=columns, use_threads=len(columns) > 8)
+    first_rows = _first_rows(file.metadata)
     starts = np.concatenate(
         [np.arange(first_rows[g], first_rows[g + 1]) for g in groups] or [np.empty(0, np.int64)]
     )
@@ -187,23 +223,17 @@ def _first_rows(metadata: pq.FileMetaData) -> IntArray:
     return np.concatenate(([0], np.cumsum(counts, dtype=np.int64)))
 
 
-def _groups_in_range(
-    metadata: pq.FileMetaData,
-    schema: TableSchema,
-    clock: ClockPoints,
-    span: tuple[int | None, int | None],
-    by: str,
-) -> list[int]:
+def _row_groups(
+    metadata: pq.FileMetaData, schema: TableSchema, clock: ClockPoints, by: str
+) -> list[RowGroup]:
     offsets = [offset for _, offset in clock] if by == "received" else [0]
     column = list(key_names(schema)).index("log_time" if by == "received" else "timestamp")
-    chosen = []
-    for group in range(metadata.num_row_groups):
-        statistics = metadata.row_group(group).column(column).statistics
-        low = statistics.min_raw + min(offsets)
-        high = statistics.max_raw + max(offsets)
-        if overlaps(low, high, span):
-            chosen.append(group)
-    return chosen
+    found = []
+    for number in range(metadata.num_row_groups):
+        bounds = metadata.row_group(number).column(column).statistics
+        low, high = bounds.min_raw + min(offsets), bounds.max_raw + max(offsets)
+        found.append(RowGroup(number, low, high))
+    return found
 
 
 def overlaps(low: int, high: int, span: tuple[int | None, int | None]) -> bool:
