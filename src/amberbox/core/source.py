@@ -5,7 +5,9 @@ A source is a module whose file name is its name in ``black_box.yaml``. It defin
 - ``Config``: a frozen dataclass, built from the YAML block (see ``core.config``); one that names
   files may have ``in_folder(folder)``, which returns it with paths seen from the robot folder;
 - ``Source``: a class that takes ``(config, name)`` and offers ``topics`` and ``run``;
-- ``SAMPLE``: a block of YAML as one would write it, shown by ``amberbox plugins`` and checked.
+- ``SAMPLE``: a block of YAML as one would write it, shown by ``amberbox plugins`` and checked;
+- ``PASSIVE``: one line that says why it does not disturb, shown by ``amberbox doctor``; it may
+  name parts of the configuration, as in ``{config.caller_id}``.
 
 A source only listens. It always reads, stamps on receipt, and never waits for the disk: when the
 recorder's queue is full the message is dropped there and counted.

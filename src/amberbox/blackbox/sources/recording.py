@@ -22,6 +22,7 @@ SAMPLE = """\
     topics:
       - topic: {name: /odom, max_frequency: 10}
 """
+PASSIVE = "reads recordings only; the originals are never written to"
 _NOT_WORTH_WAITING_NS = 500_000
 
 

@@ -24,6 +24,7 @@ SAMPLE = """\
           max_frequency: 10
       - topic: {name: /scan}
 """
+PASSIVE = "subscribes only, {config.seen_as}; no publisher, no service, no parameter is written"
 
 
 @dataclass(frozen=True)
@@ -41,6 +42,13 @@ class Config:
     tcp_nodelay: bool = option(True, "ask publishers to send small messages without delay")
     max_message_mb: float = option(1024.0, "longer messages are taken for garbage", unit="MB")
     dead_after_s: float = option(40.0, "a silent peer is probed and given up after", unit="s")
+
+    @property
+    def seen_as(self) -> str:
+        """What the robot's ROS sees of the box."""
+        if self.invisible:
+            return "not registered at the master"
+        return f"registered at the master as node {global_name(self.caller_id)}"
 
     def check(self) -> Iterator[tuple[str, str]]:
         """Say which values cannot work; opens nothing."""

@@ -31,6 +31,7 @@ SAMPLE = """\
       - topic: {name: odom, max_frequency: 10}
       - topic: {name: wheels}
 """
+PASSIVE = "simulated in this process: there is no robot that could be disturbed"
 _NOT_WORTH_WAITING_NS = 500_000
 
 

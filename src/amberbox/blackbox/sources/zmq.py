@@ -19,6 +19,7 @@ SAMPLE = """\
       - topic: {name: events, type: json, max_frequency: 30}
       - topic: {name: pose, url: tcp://192.168.1.7, port: 5556, type: msgpack}
 """
+PASSIVE = "SUB sockets only: nothing is sent, no other subscriber misses a message"
 UNNAMED = "message"
 """Topic of messages in one frame that name none."""
 
