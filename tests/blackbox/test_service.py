@@ -152,3 +152,39 @@ def test_the_recorder_is_ready_once_bytes_are_there_and_says_when_it_stops(
 
 def journal_bytes(folder: Path) -> int:
     return sum(path.stat().st_size for path in folder.glob("store/journal/*.mcap"))
+
+
+def test_a_recorder_that_hangs_gives_no_sign_of_life(
+    tmp_path: Path, manager: Manager, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("NOTIFY_SOCKET", manager.address)
+    monkeypatch.setenv("WATCHDOG_USEC", "100000")
+    (tmp_path / "robot.yaml").write_text("id: r\n")
+    (tmp_path / "black_box.yaml").write_text(SIM)
+    recorder = Recorder(load_folder(tmp_path), keeper=False)
+    hangs, goes_on, tick = threading.Event(), threading.Event(), recorder.pipeline.tick
+    signs = 0
+
+    def tick_then_hang() -> None:
+        if signs >= 2:
+            hangs.set()
+            assert goes_on.wait(20)
+        tick()
+
+    monkeypatch.setattr(recorder.pipeline, "tick", tick_then_hang)
+    thread = threading.Thread(target=recorder.run)
+    thread.start()
+    manager.link.settimeout(10)
+    try:
+        while signs < 2:
+            signs += manager.link.recv(200).startswith(b"WATCHDOG=1")
+        assert hangs.wait(10)
+        manager.link.setblocking(False)
+        manager.heard()
+        manager.link.settimeout(0.3)  # three intervals
+        with pytest.raises(TimeoutError):
+            manager.link.recv(200)
+    finally:
+        goes_on.set()
+        recorder.stop.set()
+        thread.join(20)

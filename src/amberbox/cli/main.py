@@ -52,7 +52,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def verbs() -> Mapping[str, Plugin]:
     """Find the verbs, everyday ones first; none of them is imported."""
-    found = find("amberbox.cli", defines=("configure", "run"))
+    files = find("amberbox.cli", defines=("configure", "run"))
+    found = {name.replace("_", "-"): verb for name, verb in files.items()}
     everyday = [name for name in EVERYDAY if name in found]
     rest = [name for name in found if name not in everyday]
     return {name: found[name] for name in (*everyday, *rest)}

@@ -253,7 +253,7 @@ def test_a_line(tmp_path: Path, options: dict[str, Any], zero: str, one: str) ->
         value.write_text(text)
         assert reader.read().state == state
     value.write_text("high")
-    with pytest.raises(UnreadableError, match="says 'high', which is none of [01], [01]"):
+    with pytest.raises(UnreadableError, match=r"says 'high', which is none of [01], [01]"):
         reader.read()
     value.unlink()
     with pytest.raises(UnreadableError, match="No such file"):

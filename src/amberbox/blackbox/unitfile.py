@@ -1,0 +1,132 @@
+"""The systemd unit that makes a computer record a robot folder from its start on."""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from amberbox.blackbox.folder.folder import RobotFolder
+from amberbox.core.errors import UsageError
+from amberbox.core.ids import derive_id, is_id
+
+MARK = "# Written by amberbox install-service; run it again rather than changing this file."
+UNITS = Path("/etc/systemd/system")
+_HOMES = ("/home", "/root", "/run/user")
+_TEMPORARY = ("/tmp", "/var/tmp")  # here a service would see another folder
+_WATCHDOG_S = 10
+
+
+@dataclass(frozen=True, slots=True)
+class Service:
+    """What is to run: which folder, by whom, with which Python, under which name."""
+
+    name: str
+    user: str
+    robot: str
+    folder: Path
+    store: Path
+    write_s: float
+    python: Path = Path(sys.executable)
+
+    @property
+    def unit(self) -> str:
+        """Name of the unit."""
+        return f"{self.name}.service"
+
+    @property
+    def path(self) -> Path:
+        """Where the unit lies."""
+        return UNITS / self.unit
+
+
+def service_of(folder: RobotFolder, name: str, user: str) -> Service:
+    """Describe the service of a robot folder; raise UsageError for a name systemd cannot use."""
+    if not is_id(name):
+        raise UsageError(f"'{name}' is no name for a service", f"--name {derive_id(name)}")
+    path, store = folder.path.resolve(), folder.store_path.resolve()
+    return Service(name, user, folder.robot.id, path, store, folder.robot.store.write_s)
+
+
+def unit_text(service: Service) -> str:
+    """Write the unit."""
+    return "\n".join([MARK, *_unit(service), "", *_service(service), "", *_INSTALL, ""])
+
+
+_INSTALL = ("[Install]", "WantedBy=multi-user.target")
+
+
+def _unit(service: Service) -> Sequence[str]:
+    return (
+        "[Unit]",
+        f"Description=Amberbox flight recorder of {_plain(service.robot)}",
+        "# not after the network: the first seconds count, and sources wait for it themselves",
+        "After=local-fs.target",
+        f"RequiresMountsFor={argument(service.folder)} {argument(service.store)}",
+        "StartLimitIntervalSec=0",
+    )
+
+
+def _service(service: Service) -> Sequence[str]:
+    watchdog_s = max(_WATCHDOG_S, math.ceil(4 * service.write_s))
+    return (
+        "[Service]",
+        "Type=notify",
+        f"ExecStart={command_line(service)}",
+        f"User={_plain(service.user)}",
+        f"RuntimeDirectory={service.name}",
+        f"WatchdogSec={watchdog_s}",
+        "TimeoutStartSec=300",
+        "Restart=always",
+        "RestartSec=1",
+        "KillMode=mixed",
+        "TimeoutStopSec=15",
+        "# when memory or the processor get short, the recorder is the last to suffer",
+        "OOMScoreAdjust=-500",
+        "Nice=-5",
+        "IOSchedulingClass=best-effort",
+        "IOSchedulingPriority=1",
+        "NoNewPrivileges=yes",
+        *_protection(service),
+    )
+
+
+def _protection(service: Service) -> Sequence[str]:
+    """Let the recorder write its store and nothing else; see what lies in homes if it must."""
+    at_home = any(_lies_in(path, _HOMES) for path in _needed(service))
+    temporary = any(_lies_in(path, _TEMPORARY) for path in _needed(service))
+    return (
+        "ProtectSystem=strict",
+        f"ReadWritePaths={argument(service.store)}",
+        f"ProtectHome={'read-only' if at_home else 'yes'}",
+        f"PrivateTmp={'no' if temporary else 'yes'}",
+    )
+
+
+def _needed(service: Service) -> Sequence[Path]:
+    package = Path(__file__).resolve()
+    python = service.python
+    return service.folder, service.store, python, python.resolve(), Path(sys.prefix), package
+
+
+def _lies_in(path: Path, places: Sequence[str]) -> bool:
+    return any(path.is_relative_to(place) for place in places)
+
+
+def command_line(service: Service) -> str:
+    """Return the command that records, quoted for systemd."""
+    words = (service.python, "-m", "amberbox", "record", "--quiet", service.folder)
+    return " ".join(argument(word).replace("$", "$$") for word in words)
+
+
+def argument(text: str | Path) -> str:
+    """Quote a word for a unit file if it needs that; ``%`` would be a specifier."""
+    escaped = _plain(str(text)).replace("\\", "\\\\").replace('"', '\\"')
+    special = not escaped or any(c in escaped for c in " \t'\"\\;")
+    return f'"{escaped}"' if special else escaped
+
+
+def _plain(text: str) -> str:
+    return text.replace("%", "%%").replace("\n", " ")
