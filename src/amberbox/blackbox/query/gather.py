@@ -60,7 +60,7 @@ def gather(catalogue: Catalogue, request: Request) -> Gathered:
     _add_journals(found, catalogue, request)
     if not catalogue.with_segments:
         tell_unreadable(found, catalogue, request)
-    pieces = (within(piece, request) for piece in found.pieces)
+    pieces = (within(piece, request.span, request.by) for piece in found.pieces)
     found.pieces = [piece for piece in pieces if len(piece)]
     return found
 
@@ -145,10 +145,10 @@ def journal_rows(
                 yield flat.with_columns(kept)
 
 
-def within(piece: Flat, request: Request) -> Flat:
-    """Keep the rows of the range."""
-    times = piece.received_ns if request.by == "received" else piece.timestamp_ns
-    from_ns, to_ns = request.span
+def within(piece: Flat, span: Span, by: str) -> Flat:
+    """Keep the rows of a range."""
+    times = piece.received_ns if by == "received" else piece.timestamp_ns
+    from_ns, to_ns = span
     inside = np.ones(len(times), bool)
     if from_ns is not None:
         inside &= times >= from_ns

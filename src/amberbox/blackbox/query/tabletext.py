@@ -7,6 +7,7 @@ import csv
 import json
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import groupby
 from typing import IO, Any
 
 import numpy as np
@@ -42,7 +43,7 @@ def speakable(column: ColumnData, column_type: str) -> list[Any]:
         column = _times(column)
     values = plain(column)
     if "float" in column_type:
-        return [_finite(value) for value in values]
+        return values if _all_finite(column) else [_finite(value) for value in values]
     return [_base64(value) for value in values] if "binary" in column_type else values
 
 
@@ -54,6 +55,11 @@ def _times(column: ColumnData) -> ColumnData:
     texts = format_times(np.ma.getdata(column)).astype(object)
     texts[col.null_mask(column)] = None
     return texts
+
+
+def _all_finite(column: ColumnData) -> bool:
+    values = column.values if isinstance(column, Ragged) else column
+    return values.dtype != object and bool(np.isfinite(values).all())
 
 
 def _finite(value: Any) -> Any:
@@ -79,12 +85,23 @@ def write_csv(
     Text that a spreadsheet would take for a formula gets a ``'`` before it, but with ``raw_text``.
     """
     writer = csv.writer(file, lineterminator="\n")
+    quoting = csv.writer(file, lineterminator="\n", quoting=csv.QUOTE_ALL)
     cells = [_cell if raw_text or field.type != "string" else _harmless for field in fields]
     if header:
         writer.writerow([column.name for column in fields])
     for chunk in _chunks(fields, columns):
         made = (map(cell, column) for cell, column in zip(cells, chunk, strict=True))
-        writer.writerows(zip(*made, strict=True))
+        rows = zip(*made, strict=True)
+        if any(map(_has_carriage_return, chunk)):
+            for special, some in groupby(rows, _has_carriage_return):
+                (quoting if special else writer).writerows(some)
+        else:
+            writer.writerows(rows)
+
+
+def _has_carriage_return(cells: Sequence[Any]) -> bool:
+    """Tell cells that the csv module (up to Python 3.12) leaves unquoted, cutting a row in two."""
+    return any(type(cell) is str and "\r" in cell for cell in cells)
 
 
 def _harmless(text: str | None) -> str | None:

@@ -77,14 +77,15 @@ def parse_definition(schema: Schema) -> Definition:
     """
     from rosbags.typesys.msg import normalize_msgtype
 
-    types = _parse(schema)
+    types = parse_types(schema)
     root = normalize_msgtype(schema.name)
     structures: dict[str, Structure] = {}
     _collect(root, types, structures, schema, ())
     return Definition(root, structures)
 
 
-def _parse(schema: Schema) -> Typesdict:
+def parse_types(schema: Schema) -> Typesdict:
+    """Parse a definition into the types of ``rosbags``; raises as ``parse_definition``."""
     text = schema.data.decode("utf-8", "replace").replace("\r\n", "\n")
     parse = _parse_idl if schema.encoding in ("ros2idl", "omgidl") else _parse_msg
     try:
