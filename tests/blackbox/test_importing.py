@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,8 @@ from rosbags.typesys import Stores, get_typestore
 import amberbox
 from amberbox.blackbox.formats.recording import Recording
 from amberbox.blackbox.importing import import_recordings
+from amberbox.blackbox.keeper import seal
+from amberbox.blackbox.store import open_store
 from amberbox.core.errors import AmberboxError, UsageError
 from amberbox.core.source import TopicOptions
 from amberbox.testing.box import COUNT, ManualBox, events, last_counters, number, own_records
@@ -85,7 +87,7 @@ def test_an_import_that_is_interrupted_is_done_again_whole(
         patch.setattr(Recording, "messages", interrupted)
         with pytest.raises(KeyboardInterrupt):
             import_recordings([bag], store)
-    assert 0 < len(numbers(store)) <= 3000
+    assert not [*store.rglob("*.mcap"), *store.glob("importing")]
     (report,) = import_recordings([bag], store)
     assert (report.known, report.notes, report.messages) == (False, [], COUNT_MESSAGES)
     assert numbers(store) == list(range(COUNT_MESSAGES))
@@ -110,6 +112,13 @@ def killed(bag: Path, store: Path, after: int) -> None:
     import_recordings([bag], store)
 
 
+def run_until_killed(work: Callable[..., None], *arguments: Any) -> None:
+    process = multiprocessing.get_context("fork").Process(target=work, args=arguments)
+    process.start()
+    process.join(30)
+    assert process.exitcode == 9
+
+
 def small_files(**options: Any) -> Any:
     from amberbox.blackbox.recorder.pipeline import PipelineOptions
 
@@ -121,13 +130,57 @@ def test_an_import_that_is_killed_is_done_again_whole(
     bag: Path, tmp_path: Path, after: int
 ) -> None:
     store = tmp_path / "store"
-    process = multiprocessing.get_context("fork").Process(target=killed, args=(bag, store, after))
-    process.start()
-    process.join(30)
-    assert process.exitcode == 9
-    assert len(list((store / "journal").glob("*.mcap"))) > (2 if after == 3999 else -1)
+    run_until_killed(killed, bag, store, after)
+    assert len(list((store / "importing/journal").glob("*.mcap"))) > (2 if after == 3999 else -1)
+    seal(open_store(store))  # a keeper that comes by finds nothing to build
+    (report,) = import_recordings([bag], store)
+    assert (report.known, report.notes, report.messages) == (False, [], COUNT_MESSAGES)
+    assert numbers(store) == list(range(COUNT_MESSAGES))
+    assert not (store / "importing").exists()
+
+
+def killed_at_the_end(bag: Path, store: Path) -> None:
+    """Import with small files, in a process that dies when two of them are in the store."""
+    from amberbox.blackbox import importing
+
+    original, patch, moved = Path.rename, pytest.MonkeyPatch(), [0]
+
+    def dying(self: Path, target: Path) -> Path:
+        moved[0] += self.suffix == ".mcap"
+        if moved[0] > 2:
+            os._exit(9)
+        return original(self, target)
+
+    patch.setattr(Path, "rename", dying)
+    patch.setattr(importing, "PipelineOptions", small_files)
+    patch.setattr(importing, "TICK_BYTES", 10_000)
+    import_recordings([bag], store)
+
+
+@pytest.mark.parametrize("built", [False, True])
+def test_an_import_that_is_killed_as_its_files_move_is_done_again(
+    bag: Path, tmp_path: Path, built: bool
+) -> None:
+    store = tmp_path / "store"
+    run_until_killed(killed_at_the_end, bag, store)
+    there = len(numbers(store))
+    assert 0 < there < COUNT_MESSAGES
+    if built:  # in the millisecond between two files a keeper would have to come by
+        seal(open_store(store))
     (report,) = import_recordings([bag], store)
     assert (report.known, report.messages) == (False, COUNT_MESSAGES)
+    twice = there if built else 0
+    assert len(numbers(store)) == COUNT_MESSAGES + twice
+    assert bool(report.notes) == built
+    assert import_recordings([bag], store)[0].known
+
+
+def test_a_recording_stays_known_when_its_journals_are_gone(bag: Path, tmp_path: Path) -> None:
+    store = tmp_path / "store"
+    import_recordings([bag], store)
+    for journal in (store / "journal").iterdir():
+        journal.unlink()  # as keeping raw data for a shorter time does
+    assert import_recordings([bag], store)[0].known
     assert numbers(store) == list(range(COUNT_MESSAGES))
 
 

@@ -57,6 +57,8 @@ def test_the_report_for_programs(bag: Path, torn: Path, tmp_path: Path, capsys: 
         "path": str(bag),
         "messages": 500,
         "items": {"robot_voltage": 500},
+        "kinds": {},
+        "accounts": [],
         "notes": [],
         "damage": [],
         "already_imported": False,

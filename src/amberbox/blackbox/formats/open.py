@@ -4,28 +4,48 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from amberbox.blackbox.formats import mcap_storage, ros1_bag, ros2_bag, sqlite_storage
+from amberbox.blackbox.formats import (
+    csv_table,
+    mcap_storage,
+    mongodump,
+    ros1_bag,
+    ros2_bag,
+    sqlite_storage,
+    ulog,
+)
+from amberbox.blackbox.formats.options import ReadOptions
 from amberbox.blackbox.formats.recording import Recording
 from amberbox.core.errors import AmberboxError
 
-_KNOWN = "known are ROS 1 bags (.bag), folders of ROS 2 bags, .db3 and MCAP files"
+_KNOWN = (
+    "known are ROS 1 bags (.bag), folders of ROS 2 bags, .db3, MCAP, ULog and CSV files, "
+    "and folders of mongodump"
+)
 _STORAGES = (sqlite_storage.MAGIC, mcap_storage.MAGIC, ros2_bag.ZSTD_MAGIC)
+_NO_OPTIONS = ReadOptions()
 
 
-def open_recording(path: str | Path) -> Recording:
+def open_recording(path: str | Path, options: ReadOptions = _NO_OPTIONS) -> Recording:
     """Open a recording for reading; raises AmberboxError if it is none."""
     path = Path(path).expanduser()
     if path.is_dir():
-        return _open_folder(path)
+        return _open_folder(path, options)
     magic = _read_magic(path)
     if magic.startswith(ros1_bag.MAGIC):
         return ros1_bag.open_ros1_bag(path)
     if magic.startswith(_STORAGES):
         return ros2_bag.open_storage(path)
+    if magic.startswith(ulog.MAGIC):
+        return ulog.open_ulog(path, options)
+    if csv_table.is_csv(path, magic):
+        return csv_table.open_csv(path, options)
     raise _unknown(path, magic)
 
 
-def _open_folder(path: Path) -> Recording:
+def _open_folder(path: Path, options: ReadOptions) -> Recording:
+    dump = find_dump(path)
+    if dump is not None:
+        return mongodump.open_mongodump(dump, options)
     bags = sorted(p.name for p in path.iterdir() if p.suffix in (".bag", ".active"))
     if bags and not (path / ros2_bag.METADATA).exists():
         raise AmberboxError(
@@ -33,6 +53,18 @@ def _open_folder(path: Path) -> Recording:
             f"pass the files, such as {path / bags[0]}",
         )
     return ros2_bag.open_ros2_folder(path)
+
+
+def find_dump(path: Path) -> Path | None:
+    """Return the folder of a database: this one, or the only one below it."""
+    if mongodump.is_mongodump(path):
+        return path
+    below = [p for p in sorted(path.iterdir()) if p.is_dir() and mongodump.is_mongodump(p)]
+    if len(below) > 1:
+        raise AmberboxError(
+            f"{path} is a dump of {len(below)} databases", f"pass one of them, such as {below[0]}"
+        )
+    return below[0] if below else None
 
 
 def _read_magic(path: Path) -> bytes:

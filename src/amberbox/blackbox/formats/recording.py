@@ -39,6 +39,39 @@ class Damage:
         return f"{where}: {self.reason}"
 
 
+@dataclass(frozen=True, slots=True)
+class RecordedGap:
+    """A time in which the recording itself says that it heard nothing."""
+
+    from_ns: int
+    to_ns: int
+    reason: str
+
+
+@dataclass
+class Account:
+    """What became of the pieces of one file: each is a message of these topics, or refused."""
+
+    name: str
+    pieces: str
+    total: int = 0
+    topics: tuple[int, ...] = ()
+    refused: Counter[str] = field(default_factory=Counter)
+
+
+@dataclass(frozen=True, slots=True)
+class Origin:
+    """What a format knows of a topic beside its definition.
+
+    ``source`` is the first word of the item name, empty if the topic's name is all of it;
+    ``stamp`` as in the options of a topic; ``kind`` says where the columns come from.
+    """
+
+    source: str = "ros"
+    stamp: str | None = None
+    kind: str = ""
+
+
 @dataclass
 class Report:
     """What was found in a recording; the counts grow while its messages are read.
@@ -53,6 +86,8 @@ class Report:
     per_topic: list[int] = field(default_factory=list)
     damage: list[Damage] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
+    accounts: list[Account] = field(default_factory=list)
+    gaps: list[RecordedGap] = field(default_factory=list)
 
     def add_damage(self, damage: Damage) -> None:
         """Note a damaged range once, however often it is read."""
@@ -116,9 +151,11 @@ class Recording:
         parts: Sequence[Part],
         report: Report,
         close: Callable[[], None] = lambda: None,
+        origins: Sequence[Origin] = (),
     ) -> None:
         self.path = path
         self.topics = tuple(topics)
+        self.origins = tuple(origins) or (Origin(),) * len(self.topics)
         self.report = report
         self.progress = 0.0
         """Fraction of the recording that ``messages`` has given out."""
