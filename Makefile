@@ -11,6 +11,8 @@ ROS := ros-core python3-rospy python3-roslaunch python3-rosbag \
   python3-std-msgs python3-nav-msgs python3-sensor-msgs python3-geometry-msgs \
   python3-diagnostic-msgs python3-tf2-msgs
 
+SYSTEM := systemd
+
 .DEFAULT_GOAL := help
 .PHONY: help demo test check lint types rules bench venv debian clean
 
@@ -43,7 +45,8 @@ bench: $(TEST)  ## measure the numbers that the documentation quotes (BENCH_ARGS
 venv: $(TEST)  ## only install
 
 debian:
-	@tools/apt.sh $(ROS) || echo "tests against a real ROS 1 master will be skipped" >&2
+	@tools/apt.sh $(SYSTEM) $(ROS) || \
+	  echo "tests against a real ROS 1 master, or of systemd units, will be skipped" >&2
 
 clean:  ## remove what was installed and cached here
 	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .hypothesis build dist

@@ -96,15 +96,6 @@ def install_hint(name: str) -> str:
     return f"pip install 'amberbox[{name}]'" if name in extras else ""
 
 
-def summary_of(text: str) -> str:
-    """Return the first line of a module's docstring without running it; empty if it has none."""
-    try:
-        docstring = ast.get_docstring(ast.parse(text))
-    except (SyntaxError, ValueError):
-        return ""
-    return docstring.splitlines()[0] if docstring else ""
-
-
 def _candidates(
     package: str, extra_dirs: Sequence[Path], defines: Collection[str]
 ) -> Iterator[Plugin]:
@@ -129,19 +120,30 @@ def _in_folder(folder: Path, package: str, defines: Collection[str]) -> Iterator
         stem = path.parent.name if path.name == "__init__.py" else path.stem
         if path.parent == folder and path.name == "__init__.py":
             continue
-        text = path.read_text(encoding="utf-8", errors="replace")
-        if not stem.startswith("_") and _defines(text, defines):
+        if stem.startswith("_"):
+            continue
+        tree = _parsed(path.read_text(encoding="utf-8", errors="replace"))
+        if _defines(tree, defines):
             target = f"{package}.{stem}" if package else ""
-            yield Plugin(stem.rstrip("_"), summary_of(text), target, path)
+            yield Plugin(stem.rstrip("_"), _summary(tree), target, path)
 
 
-def _defines(text: str, names: Collection[str]) -> bool:
-    """Tell whether a module defines the names; a module with an error counts, to be reported."""
-    if not names:
-        return True
+def _parsed(text: str) -> ast.Module | None:
+    """Read a module without running it; None if it has an error."""
     try:
-        tree = ast.parse(text)
+        return ast.parse(text)
     except (SyntaxError, ValueError):
+        return None
+
+
+def _summary(tree: ast.Module | None) -> str:
+    docstring = ast.get_docstring(tree) if tree else None
+    return docstring.splitlines()[0] if docstring else ""
+
+
+def _defines(tree: ast.Module | None, names: Collection[str]) -> bool:
+    """Tell whether a module defines the names; a module with an error counts, to be reported."""
+    if tree is None or not names:
         return True
     return set(names) <= {name for statement in tree.body for name in _names(statement)}
 

@@ -97,18 +97,24 @@ def test_messages_come_regularly_and_at_once_on_a_change(hat: Hat) -> None:
     ]
 
 
-def test_a_start_on_battery_is_told_at_once_and_a_low_one_when_it_lasts(hat: Hat) -> None:
+def test_a_start_on_battery_is_told_at_once(hat: Hat) -> None:
     hat.says("battery", 50)
     box, sink = watch(hat)
     box.poll(0)
     assert [state for state, _ in sink.powers] == ["battery"]
+
+
+def test_a_run_that_begins_low_records_until_it_gets_low_again(hat: Hat) -> None:
     hat.says("battery", 3)
-    box, sink = watch(hat)
-    box.poll(0)
-    box.poll(0.9)
-    assert sink.powers == []
-    box.poll(1.0)
-    assert [state for state, _ in sink.powers] == ["low"]
+    box, sink = watch(hat, for_s=0, low_after_s=60)
+    for now_s in range(0, 200, 10):
+        box.poll(now_s)
+    assert sink.powers == [("battery", "external power is lost: 3 %")]
+    hat.says("mains", 15)
+    box.poll(200)
+    hat.says("battery", 9)
+    box.poll(201)
+    assert [state for state, _ in sink.powers[1:]] == ["mains", "low"]
 
 
 def test_a_long_time_on_battery_is_low_also_when_nothing_can_be_read(hat: Hat) -> None:

@@ -39,7 +39,8 @@ def judged_space(
     found += f" and may take {in_bytes(used + room)}"
     rate = traffic.kept_bytes if traffic else 0.0
     if rate:
-        found += f"; {in_bytes(rate)} per day of recording: full in {in_time(room / rate * DAY_S)}"
+        lasts = in_time(room / rate * DAY_S)
+        found += f"; {in_bytes(rate)} per day of recording: the oldest goes in {lasts}"
     if free < min(options.min_free, 2e6 * options.rotate_mb):
         hint = "make room, or record elsewhere (robot.yaml store.path)"
         return error("free space", found, hint)

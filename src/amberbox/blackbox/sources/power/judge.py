@@ -17,25 +17,30 @@ class Limits:
 
 @dataclass
 class Judge:
-    """Keeps the state that counts, on a monotonic clock."""
+    """Keeps the state that counts, on a monotonic clock.
+
+    A run that begins with ``low`` is on battery until it has been better: the run before has
+    ended because of it, and one that is started again shall record and not end at once.
+    """
 
     limits: Limits
     state: Power | None = None
     _candidate: Power | None = None
     _since_s: float = 0.0
     _on_battery_s: float | None = None
+    _was_better: bool = False
 
     def heard(self, state: Power, now_s: float) -> bool:
         """Take what the supplies say now; tell whether the state that counts has changed.
 
-        The first state counts at once, unless it is ``low``: one odd value right after the
-        start shall not end the recording.
+        The first state counts at once.
         """
-        state = self._after_long(state, now_s)
+        self._was_better = self._was_better or state != "low"
+        state = self._after_long(state, now_s) if self._was_better else "battery"
         if state != self._candidate:
             self._candidate, self._since_s = state, now_s
-        first = self.state is None and state != "low"
-        if state == self.state or not (first or now_s - self._since_s >= self.limits.for_s):
+        has_lasted = self.state is None or now_s - self._since_s >= self.limits.for_s
+        if state == self.state or not has_lasted:
             return False
         self.state = state
         return True
