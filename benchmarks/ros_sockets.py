@@ -19,6 +19,7 @@ from typing import Any
 from amberbox.blackbox.ros1.client import Client
 from amberbox.blackbox.ros1.framing import Framer
 from amberbox.blackbox.ros1.settings import Settings
+from amberbox.core.source import Power
 from amberbox.core.types import Topic
 from amberbox.testing.rosnet import RosMaster, RosPublisher, RosTopic
 from benchmarks.common import Row, cpu_s
@@ -53,6 +54,9 @@ class CountingSink:
         pass
 
     def event(self, kind: str, text: str, **details: Any) -> None:
+        pass
+
+    def power(self, state: Power, text: str) -> None:
         pass
 
     def last_latched(self, topic: str) -> bytes | None:

@@ -7,9 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from amberbox.blackbox import keeper as module
 from amberbox.blackbox.follow.read import JournalFile
 from amberbox.blackbox.keeper import Keeper, seal
+from amberbox.blackbox.keeper import keeper as module
+from amberbox.blackbox.keeper.options import KeeperOptions
 from amberbox.blackbox.recorder.pipeline import PipelineOptions
 from amberbox.blackbox.segments import manifest
 from amberbox.blackbox.segments.build import build_segments
@@ -42,7 +43,7 @@ def test_a_journal_that_cannot_be_built_does_not_stop_the_others(
         return build(store, journal)
 
     monkeypatch.setattr(module, "build_segments", fail)
-    keeper = Keeper(open_store(box.store), ring_s=300.0)
+    keeper = Keeper(open_store(box.store), KeeperOptions(ring_s=300.0))
     keeper.step(threading.Event())
     keeper.step(threading.Event())
     numbers = sorted(name.split("-")[-1] for name in manifest.read(box.store).journals)

@@ -13,8 +13,9 @@ from typing import IO
 
 from amberbox.core.errors import AmberboxError, UsageError
 
-FOLDERS = {"main": "journal", "ring": "ring", "watch": "watch"}
+FOLDERS = {"main": "journal", "bulk": "bulk", "ring": "ring", "watch": "watch", "keep": "keep"}
 """Folder of each writer's journal, inside the store."""
+INCIDENTS = "incidents"
 SEGMENTS = "segments"
 _IDENTITY = "store.json"
 _RUN = "run"
@@ -35,8 +36,23 @@ class Store:
         return self.path / FOLDERS[writer]
 
     def journal_files(self, writer: str) -> list[Path]:
-        """Journal files of a writer in the order they were written."""
-        return sorted(self.folder(writer).glob("*.mcap"), key=run_and_number)
+        """Journal files of a writer in the order they were written.
+
+        Those of the ring that only an incident still holds are among them.
+        """
+        found = {path.name: path for path in self.folder(writer).glob("*.mcap")}
+        if writer == "ring":
+            held = (self.path / INCIDENTS).glob(f"*/{self.folder(writer).name}/*.mcap")
+            found = {path.name: path for path in held} | found
+        return sorted(found.values(), key=run_and_number)
+
+    def journal_path(self, name: str) -> Path:
+        """Return where a journal called ``folder/file`` lies; an incident may hold it."""
+        path = self.path / name
+        if not path.exists():
+            held = sorted((self.path / INCIDENTS).glob(f"*/{name}"))
+            return held[0] if held else path
+        return path
 
     def writers(self) -> list[str]:
         """Writers that have a journal here."""

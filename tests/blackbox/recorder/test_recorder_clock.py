@@ -9,6 +9,7 @@ import pytest
 import amberbox
 from amberbox.blackbox.follow import read
 from amberbox.blackbox.keeper import Keeper
+from amberbox.blackbox.keeper.options import KeeperOptions
 from amberbox.blackbox.recorder.pipeline import PipelineOptions
 from amberbox.blackbox.store import open_store
 from amberbox.core.clock import NS
@@ -125,7 +126,7 @@ def test_the_ring_is_trimmed_to_its_length_whatever_the_clock_does(
     ring = [TopicOptions("/count", keep="ring"), TopicOptions("/main")]
     main = Topic("/main", COUNT.message_encoding, COUNT.schema)
     box = ManualBox(tmp_path / "store", ring, options=PipelineOptions(ring_rotate_ns=2 * NS))
-    keeper = Keeper(open_store(box.store), ring_s=10.0)
+    keeper = Keeper(open_store(box.store), KeeperOptions(ring_s=10.0))
     for n in range(600):
         if n == 300:
             box.clock.step(step_s)

@@ -15,6 +15,7 @@ import pytest
 import amberbox
 from amberbox.blackbox.folder.folder import load_folder
 from amberbox.blackbox.journal import writer
+from amberbox.blackbox.keeper.options import KeeperOptions
 from amberbox.blackbox.recorder import filtering, keeperprocess, names, sink
 from amberbox.blackbox.recorder.intake import Intake
 from amberbox.blackbox.recorder.keeperprocess import KeeperProcess
@@ -186,7 +187,7 @@ def test_a_keeper_that_cannot_run_is_told_once(
     box = ManualBox(tmp_path / "store")
     monkeypatch.setattr(sys, "executable", "/absent/python")
     monkeypatch.setattr(keeperprocess, "_PAUSE_S", 0.0)
-    keeper = KeeperProcess(box.pipeline, 300.0)
+    keeper = KeeperProcess(box.pipeline, KeeperOptions())
     keeper.look_after()
     keeper.look_after()
     box.close()

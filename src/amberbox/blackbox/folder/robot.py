@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Literal
 
 from amberbox.core.ids import derive_id, is_id
 from amberbox.core.options import option
@@ -15,6 +16,23 @@ NOT_USED_YET = {
     "server": "nothing leaves this computer yet",
 }
 """Keys that are checked, but that nobody acts on in this version, and what that means."""
+
+
+WhenFull = Literal["overwrite", "stop"]
+
+
+@dataclass(frozen=True)
+class LifetimeOptions:
+    """How long the parts of the record are kept at most; without a value until room is needed."""
+
+    raw: float | None = option(None, "journals, as the sources spoke", unit="s")
+    columns: float | None = option(None, "their columns", unit="s")
+
+    def check(self) -> Iterator[tuple[str, str]]:
+        """Say which values cannot work."""
+        for key in ("raw", "columns"):
+            if (getattr(self, key) or 1) <= 0:
+                yield key, "must be above 0"
 
 
 @dataclass(frozen=True)
@@ -29,6 +47,11 @@ class StoreOptions:
     sync_s: float = option(1.0, "a power cut loses at most this much more", unit="s")
     ring_s: float = option(300.0, "how long items of class ring are kept", unit="s")
     queue: int = option(64_000_000, "memory for messages that wait for the disk", unit="B")
+    keep_min: float = option(86_400.0, "the newest data are not deleted for room", unit="s")
+    when_full: WhenFull = option("overwrite", "delete the oldest data, or stop recording")
+    reserve: int = option(16_000_000, "room set aside for the last events", unit="B")
+    lifetime: LifetimeOptions = option(LifetimeOptions(), "when data go though there is room")
+    ring_path: str = option("", "folder for the ring, such as one in memory; else in the store")
     rotate_mb: float = option(64.0, "a journal file is closed at this size", unit="MB")
     rotate_s: float = option(600.0, "a journal file is closed at this age", unit="s")
 
@@ -38,8 +61,9 @@ class StoreOptions:
         for key in above_zero:
             if getattr(self, key) <= 0:
                 yield key, "must be above 0"
-        if self.min_free < 0:
-            yield "min_free", "must not be below 0"
+        for key in ("min_free", "keep_min", "reserve"):
+            if getattr(self, key) < 0:
+                yield key, "must not be below 0"
         if self.quota is not None and self.quota <= 0:
             yield "quota", "must be above 0"
         if not 0 < self.quota_percent <= 100:

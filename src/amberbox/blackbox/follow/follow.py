@@ -19,7 +19,7 @@ from amberbox.core.types import Batch, Cursor, Gap, Watermark, WriterCursor
 
 Delivery: TypeAlias = Batch | Gap | Watermark
 
-RECORDED = ("main", "ring")
+RECORDED = ("main", "bulk", "ring")
 """The writers that are followed unless others are named: what the recorder writes."""
 
 

@@ -15,6 +15,10 @@ CLOCK = "amberbox/clock"
 COUNTERS = "amberbox/counters"
 EVENT = "amberbox/event"
 GAP = "amberbox/gap"
+INCIDENT = "amberbox/incident"
+MISSION = "amberbox/mission"
+CURSOR = "amberbox/cursor"
+"""How far the writer of a journal had read others when it wrote what stands beside it."""
 
 _TEXT = {"type": "string"}
 _COUNT = {"type": "integer"}
@@ -58,6 +62,26 @@ _FIELDS: dict[str, dict[str, object]] = {
         "reason": _TEXT,
         "count": {"type": ["integer", "null"]},
     },
+    INCIDENT: {
+        "id": _TEXT,
+        "state": _TEXT,
+        "reason": _TEXT,
+        "who": _TEXT,
+        "trigger": _TEXT,
+        "from_ns": _COUNT,
+        "to_ns": _COUNT,
+    },
+    MISSION: {
+        "id": _TEXT,
+        "name": _TEXT,
+        "state": _TEXT,
+        "outcome": _TEXT,
+        "from_ns": _COUNT,
+        "to_ns": {"type": ["integer", "null"]},
+        "who": _TEXT,
+        "details": _TEXT,
+    },
+    CURSOR: {"cursor": _TEXT},
 }
 
 

@@ -37,7 +37,7 @@ class Catalogue:
         """Open the journal files that are not named in ``skip``, in the order of writing."""
         for name in self.existing:
             if name not in skip:
-                yield journal_file(self.store / name, name)
+                yield journal_file(open_store(self.store).journal_path(name), name)
 
     @property
     def done(self) -> Collection[str]:
@@ -95,7 +95,8 @@ class Catalogue:
     def still_holds(self) -> bool:
         """Tell whether no journal went while the segments for it came."""
         waiting = (name for name in self.existing if name not in self.manifest.journals)
-        return all((self.store / name).exists() for name in waiting)
+        store = open_store(self.store)
+        return all(store.journal_path(name).exists() for name in waiting)
 
     def without(self, segment: Segment) -> Catalogue:
         """Return the same without a segment that turned out to be damaged."""

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 
+from amberbox.blackbox.keeper.options import KeeperOptions
 from amberbox.blackbox.recorder.pipeline import Pipeline
 
 _PAUSE_S = 10.0
@@ -16,10 +17,10 @@ _STOP_S = 10.0
 class KeeperProcess:
     """Runs ``amberbox.blackbox.keeper`` on the recorder's store."""
 
-    def __init__(self, pipeline: Pipeline, ring_s: float) -> None:
+    def __init__(self, pipeline: Pipeline, options: KeeperOptions) -> None:
         module = ["-m", "amberbox.blackbox.keeper", str(pipeline.store.path)]
         parent = ["--parent", str(os.getpid())]
-        self._command = [sys.executable, *module, "--ring-s", str(ring_s), *parent]
+        self._command = [sys.executable, *module, "--options", options.to_json(), *parent]
         self._pipeline = pipeline
         self._process: subprocess.Popen[bytes] | None = None
         self._not_before = 0.0

@@ -18,6 +18,7 @@ import msgspec
 from msgspec import structs
 
 from amberbox import __version__
+from amberbox.blackbox.follow.follow import RECORDED
 from amberbox.blackbox.journal import reserved
 from amberbox.blackbox.journal.syncmark import SyncMark
 from amberbox.blackbox.journal.writer import JournalOptions, JournalWriter
@@ -83,7 +84,7 @@ class Pipeline:
     items: dict[str, Item] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        self._locks = [WriterLock(self.store, writer) for writer in ("main", "ring")]
+        self._locks = [WriterLock(self.store, writer) for writer in RECORDED]
         self.run = self.store.next_run()
         self.intake = Intake(self.options.queue_bytes)
         self.names = ItemNames(self.store.path)
@@ -107,7 +108,7 @@ class Pipeline:
 
     def _writer(self, writer: str) -> JournalWriter:
         options = self.options
-        age = options.rotate_ns if writer == "main" else options.ring_rotate_ns
+        age = options.ring_rotate_ns if writer == "ring" else options.rotate_ns
         return JournalWriter(
             JournalOptions(
                 self.store.folder(writer), self.store.id, writer, self.run, options.boot_id,

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from amberbox.blackbox.folder.folder import RobotFolder
+from amberbox.blackbox.folder.keeping import keeper_options
 from amberbox.blackbox.recorder.keeperprocess import KeeperProcess
 from amberbox.blackbox.recorder.messageclock import MessageClock
 from amberbox.blackbox.recorder.pipeline import Pipeline, PipelineOptions
@@ -95,7 +96,8 @@ class Recorder:
         for source in self._sources:
             source.thread.start()
         options = self.folder.robot.store
-        keeper = KeeperProcess(self.pipeline, options.ring_s) if self._keeper_wanted else None
+        kept = keeper_options(self.folder)
+        keeper = KeeperProcess(self.pipeline, kept) if self._keeper_wanted else None
         syncer = Syncer(self.pipeline, options.sync_s)
         try:
             self._tick_until_stopped(syncer, keeper)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from amberbox.blackbox.follow.follow import RECORDED
 from amberbox.blackbox.follow.read import JournalFile, files_of, holes
 from amberbox.blackbox.recorder.pipeline import Pipeline
 from amberbox.blackbox.store import Store
@@ -23,7 +24,7 @@ def report_recovery(pipeline: Pipeline) -> None:
 def _last_files(store: Store) -> list[JournalFile]:
     """Return each writer's last file with messages, and what came after it without any."""
     found: list[JournalFile] = []
-    for writer in ("main", "ring"):
+    for writer in RECORDED:
         for journal in reversed(files_of(store, writer)):
             found.append(journal)
             if journal.rows:

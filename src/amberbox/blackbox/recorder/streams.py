@@ -15,6 +15,8 @@ from amberbox.core.errors import AmberboxError
 from amberbox.core.source import TopicOptions
 from amberbox.core.types import Topic
 
+_WRITERS = {"all": "main", "bulk": "bulk"}
+
 
 class Counters(msgspec.Struct):
     """What happened to an item's messages since the start of the run."""
@@ -65,7 +67,7 @@ class Item:
     @property
     def writer(self) -> str:
         """Journal that this item's keeping class is written to."""
-        return "main" if self.options.keep == "all" else "ring"
+        return _WRITERS.get(self.options.keep, "ring")
 
     def describe(self) -> dict[str, Any]:
         """Say in the run record what is configured for the item."""

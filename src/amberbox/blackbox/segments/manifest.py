@@ -12,6 +12,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, TypeAlias
 
+from amberbox.blackbox.segments.entries import Sealed, Signature, Tombstone, from_record
 from amberbox.blackbox.segments.flat import TableSchema
 from amberbox.blackbox.store import sync_folder
 from amberbox.core.types import Gap
@@ -144,6 +145,10 @@ class Manifest:
     segments: Mapping[str, tuple[Segment, ...]] = field(default_factory=dict)
     journals: Mapping[str, Journal] = field(default_factory=dict)
     deletions: tuple[Deletion, ...] = ()
+    sealed: Mapping[str, Sealed] = field(default_factory=dict)
+    tombstones: tuple[Tombstone, ...] = ()
+    confirmed: frozenset[str] = frozenset()
+    signatures: tuple[Signature, ...] = ()
     damage: tuple[str, ...] = ()
     last_hash: str = _FIRST_HASH
 
@@ -222,11 +227,16 @@ def _manifest(records: list[dict[str, Any]], damage: list[str], last_hash: str) 
             deletions.append(Deletion(gone, record["reason"], record["at_ns"]))
     schemas = {r["id"]: TableSchema.from_json(r["schema"]) for r in _of_kind(records, "schema")}
     done = list(_of_kind(records, "journal"))
+    entries = [entry for entry in map(from_record, records) if entry is not None]
     return Manifest(
         schemas,
         _by_item(live.values()),
         {record["journal"]: _journal_from_json(record) for record in done},
         tuple(deletions),
+        {entry.journal: entry for entry in entries if isinstance(entry, Sealed)},
+        tuple(entry for entry in entries if isinstance(entry, Tombstone)),
+        frozenset(name for r in _of_kind(records, "confirmed") for name in r["journals"]),
+        tuple(entry for entry in entries if isinstance(entry, Signature)),
         tuple(damage),
         last_hash,
     )

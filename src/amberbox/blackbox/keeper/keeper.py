@@ -6,23 +6,19 @@ Only the keeper deletes.
 
 from __future__ import annotations
 
-import argparse
-import os
-import signal
 import sys
 import threading
 import time
 from collections.abc import Container, Sequence
 from contextlib import suppress
-from pathlib import Path
 
 from amberbox.blackbox.follow.read import JournalFile, journal_file
+from amberbox.blackbox.keeper.options import KeeperOptions
 from amberbox.blackbox.segments.build import build_segments, can_build, merge_small
-from amberbox.blackbox.store import Store, WriterLock, is_locked, open_store
+from amberbox.blackbox.store import Store, WriterLock, is_locked
 from amberbox.core.clock import NS
 from amberbox.core.errors import UsageError
 
-PERIOD_S = 2.0
 PATIENCE_S = 10.0
 """After the recorder was killed its keeper lives on for a moment; the next one waits for it."""
 
@@ -30,9 +26,9 @@ PATIENCE_S = 10.0
 class Keeper:
     """Keeps one store; ``step`` does what there is to do now."""
 
-    def __init__(self, store: Store, ring_s: float) -> None:
+    def __init__(self, store: Store, options: KeeperOptions | None = None) -> None:
         self._store = store
-        self._ring_s = ring_s
+        self._options = options or KeeperOptions()
         self._with_segments = can_build()
         self._refused: set[str] = set()
 
@@ -76,7 +72,7 @@ class Keeper:
         """Delete ring files that ended longer ago than the ring is long."""
         files = self.sealed("ring")
         for journal, age_ns in zip(files, ages(files), strict=True):
-            if age_ns > self._ring_s * NS:
+            if age_ns > self._options.ring_s * NS:
                 journal.path.unlink(missing_ok=True)
 
 
@@ -95,35 +91,8 @@ def ages(files: Sequence[JournalFile]) -> list[int]:
     return found[::-1]
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Keep a store until told to stop, or until the recorder that started this is gone."""
-    parser = argparse.ArgumentParser(prog="python -m amberbox.blackbox.keeper")
-    parser.add_argument("store", type=Path)
-    parser.add_argument("--ring-s", type=float, default=300.0)
-    parser.add_argument("--parent", type=int, default=0)
-    parser.add_argument("--once", action="store_true")
-    options = parser.parse_args(arguments)
-    stop = threading.Event()
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: stop.set())
-    os.nice(10)
-    try:
-        store = open_store(options.store)
-        lock = _lock(store, PATIENCE_S if options.parent else 0.0, stop)
-    except UsageError as error:
-        print(f"amberbox keeper: {error}", file=sys.stderr)
-        return error.exit_code
-    keeper = Keeper(store, options.ring_s)
-    while True:
-        keeper.step(stop)
-        gone = options.parent and os.getppid() != options.parent
-        if options.once or gone or stop.wait(PERIOD_S):
-            break
-    lock.release()
-    return 0
-
-
-def _lock(store: Store, patience_s: float, stop: threading.Event) -> WriterLock:
+def wait_for_lock(store: Store, patience_s: float, stop: threading.Event) -> WriterLock:
+    """Become the keeper of a store; raises UsageError when another one stays."""
     end = time.monotonic() + patience_s
     while True:
         try:
@@ -137,10 +106,6 @@ def seal(store: Store) -> None:
     """Build what can be built once, as an import does at its end."""
     if can_build():
         with suppress(UsageError):  # another keeper is at work here: it builds them, too
-            lock = _lock(store, PATIENCE_S, threading.Event())
-            Keeper(store, ring_s=float("inf")).step(threading.Event())
+            lock = wait_for_lock(store, PATIENCE_S, threading.Event())
+            Keeper(store, KeeperOptions(ring_s=float("inf"))).step(threading.Event())
             lock.release()
-
-
-if __name__ == "__main__":
-    sys.exit(main())

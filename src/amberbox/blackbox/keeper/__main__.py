@@ -1,0 +1,50 @@
+"""The keeper's process: keeps a store until told to stop, or until its recorder is gone."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import signal
+import sys
+import threading
+from collections.abc import Sequence
+from pathlib import Path
+
+from amberbox.blackbox.keeper.keeper import PATIENCE_S, Keeper, wait_for_lock
+from amberbox.blackbox.keeper.options import KeeperOptions
+from amberbox.blackbox.store import open_store
+from amberbox.core.errors import UsageError
+
+PERIOD_S = 2.0
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Keep a store until told to stop, or until the recorder that started this is gone."""
+    parser = argparse.ArgumentParser(prog="python -m amberbox.blackbox.keeper")
+    parser.add_argument("store", type=Path)
+    parser.add_argument("--options", default="{}", help="KeeperOptions as JSON")
+    parser.add_argument("--parent", type=int, default=0)
+    parser.add_argument("--once", action="store_true")
+    options = parser.parse_args(arguments)
+    stop = threading.Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: stop.set())
+    os.nice(10)
+    try:
+        store = open_store(options.store)
+        lock = wait_for_lock(store, PATIENCE_S if options.parent else 0.0, stop)
+    except UsageError as error:
+        print(f"amberbox keeper: {error}", file=sys.stderr)
+        return error.exit_code
+    keeper = Keeper(store, KeeperOptions.from_json(options.options))
+    while True:
+        keeper.step(stop)
+        gone = options.parent and os.getppid() != options.parent
+        if options.once or gone or stop.wait(PERIOD_S):
+            break
+    lock.release()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,132 @@
+"""A journal of conclusions: what the keeper (or the watcher) writes down, in the one format."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from amberbox import __version__
+from amberbox.blackbox.follow.read import files_of, sound_chunks
+from amberbox.blackbox.journal import reserved
+from amberbox.blackbox.journal.writer import JournalOptions, JournalWriter
+from amberbox.blackbox.store import Store
+from amberbox.core.clock import Clock, RunClock, SystemClock
+from amberbox.core.types import Cursor
+
+Record = tuple[str, Mapping[str, Any]]
+"""Reserved channel and values of one record."""
+
+
+class OwnJournal:
+    """Appends records of the box's own to a writer's journal, durable when ``write`` returns.
+
+    The first write begins a run and its file. Not thread-safe: one owner, who holds the lock.
+    """
+
+    def __init__(
+        self,
+        store: Store,
+        writer: str,
+        *,
+        robot: str = "",
+        config_hash: str = "",
+        clock: Clock | None = None,
+        chain: Callable[[], str] | None = None,
+    ) -> None:
+        self._store = store
+        self._writer_name = writer
+        self._about = {"robot": robot, "config_hash": config_hash}
+        self._clock = clock or SystemClock()
+        self._log = RunClock(self._clock)
+        self._chain = chain
+        self._writer: JournalWriter | None = None
+        self._channels: dict[str, int] = {}
+
+    def now_ns(self) -> int:
+        """Log time of a record that is written now."""
+        return self._log.now_ns()
+
+    def write(self, records: Sequence[Record], cursor: Cursor | None = None) -> None:
+        """Write records, and how far others had been read for them, as one chunk.
+
+        Raises OSError when the disk does not take them.
+        """
+        writer = self._opened()
+        rows = [(topic, msgspec.json.encode(values)) for topic, values in records]
+        if cursor is not None:
+            values = {"cursor": cursor.to_json()}
+            rows.append((reserved.CURSOR, msgspec.json.encode(values)))
+        if writer.rotation_due(self._log.now_ns()):
+            writer.rotate()
+        if writer.path is None:
+            rows[:0] = self._preamble(writer.options.run)
+        else:
+            rows.insert(0, (reserved.CLOCK, self._clock_record()))
+        at_ns = [self._log.now_ns()] * len(rows)
+        channels = [self._channel(writer, topic) for topic, _ in rows]
+        writer.write(channels, at_ns, at_ns, [data for _, data in rows])
+        writer.mark_sync().wait()
+        writer.publish_head(at_ns[0])
+
+    def close(self) -> None:
+        """Finish the file, if one was begun."""
+        if self._writer is not None:
+            self._writer.close()
+            self._writer = None
+
+    def _opened(self) -> JournalWriter:
+        if self._writer is None:
+            options = JournalOptions(
+                self._store.folder(self._writer_name), self._store.id, self._writer_name,
+                self._store.next_run(), self._clock.boot_id(),
+            )  # fmt: skip
+            chain = {} if self._chain is None else {"chain": self._chain()}
+            self._writer, self._channels = JournalWriter(options, **chain), {}
+        return self._writer
+
+    def _preamble(self, run: int) -> list[tuple[str, bytes]]:
+        about = {
+            "writer": self._writer_name,
+            "run": run,
+            "store_id": self._store.id,
+            "boot_id": self._clock.boot_id(),
+            "version": __version__,
+            "items": "{}",
+            "input": "",
+            **self._about,
+        }
+        run_record = (reserved.RUN, msgspec.json.encode(about))
+        return [run_record, (reserved.CLOCK, self._clock_record())]
+
+    def _clock_record(self) -> bytes:
+        offset_ns, synchronised = self._log.offset_ns(), self._log.synchronised()
+        return msgspec.json.encode({"offset_ns": offset_ns, "synchronised": synchronised})
+
+    def _channel(self, writer: JournalWriter, topic: str) -> int:
+        if topic not in self._channels:
+            marks = {"item": topic.replace("/", "_"), "source": reserved.SOURCE}
+            self._channels[topic] = writer.channel(reserved.topic_of(topic), marks)
+        return self._channels[topic]
+
+
+def event(kind: str, text: str, source: str = "", **details: Any) -> Record:
+    """Compose an event as the recorder writes them."""
+    encoded = msgspec.json.encode(details, enc_hook=str).decode()
+    return reserved.EVENT, {"kind": kind, "text": text, "source": source, "details": encoded}
+
+
+def last_cursor(store: Store, writer: str) -> Cursor | None:
+    """Return how far a writer had read others when it wrote last; None if it never said."""
+    for journal in reversed(files_of(store, writer)):
+        numbers = [n for n, s in journal.streams.items() if s.topic.name == reserved.CURSOR]
+        newest = None
+        for chunk in sound_chunks(journal) if numbers else ():
+            rows = np.flatnonzero(np.isin(chunk.channel, numbers))
+            if len(rows):
+                newest = chunk.messages(rows[-1:])[0]
+        if newest is not None:
+            return Cursor.from_json(msgspec.json.decode(newest)["cursor"])
+    return None
