@@ -17,7 +17,7 @@ from amberbox.cli._output import size
 from amberbox.core.units import in_unit
 
 _TABLE_S = 1.0
-_NO_TROUBLE = {"started", "stopped", "source_ended", "imported"}
+_NO_TROUBLE = {"started", "stopped", "source_ended", "imported", "power_mains"}
 _HEADINGS = ("item", "rate Hz", "kept", "filtered", "dropped", "bytes")
 
 
