@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 from rosbags.typesys import Stores, get_typestore
 
+from amberbox.blackbox.query.record import Record
+from amberbox.blackbox.recorder.pipeline import PipelineOptions
 from amberbox.core.types import Schema, Topic
 from amberbox.testing.box import ManualBox
 
@@ -47,9 +49,11 @@ class Kind:
         return self.types.types["std_msgs/msg/Header"](*sequence, time, frame)
 
 
-def record_robot(store: Path, *, cdr: bool = False, seconds: int = 3) -> ManualBox:
+def record_robot(
+    store: Path, *, cdr: bool = False, seconds: int = 3, rotate_s: float = 600
+) -> ManualBox:
     """Record text at 10 Hz, a range every third write, and a latched map name at the start."""
-    box = ManualBox(store)
+    box = ManualBox(store, options=PipelineOptions(rotate_ns=round(rotate_s * 1e9)))
     text, scan = Kind("std_msgs/msg/String", cdr), Kind("sensor_msgs/msg/Range", cdr)
     name = Kind("std_msgs/msg/String", cdr, latched=True)
     box.hear(name.topic("/map_name"), name.encode("hall"))
@@ -61,6 +65,12 @@ def record_robot(store: Path, *, cdr: bool = False, seconds: int = 3) -> ManualB
             box.hear(scan.topic("/range"), scan.encode(header, 1, *values))
         box.write()
     return box
+
+
+def item_like(record: Record, item: str) -> str:
+    """Find an item that was exported and imported again, whatever source it is of now."""
+    names = [info.name for info in record.items() if info.name.endswith(item)]
+    return min(names, key=len)
 
 
 @pytest.fixture

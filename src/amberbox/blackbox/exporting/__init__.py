@@ -48,6 +48,8 @@ def export(
     """
     if form not in FORMS:
         raise UsageError(f"there is no format {form!r}", f"choose {', '.join(FORMS)}")
+    if target is None and form != "csv":
+        raise UsageError(f"{form} needs a file", "add -o FILE")
     report = ExportReport(target, form)
     looking = Looking(record.path, report)
     FORMS[form](Job(looking, view, target, report, progress, options or ExportOptions()))

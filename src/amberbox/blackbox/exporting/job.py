@@ -40,9 +40,8 @@ class Job:
 
     @property
     def path(self) -> Path:
-        """The target; raises UsageError where the form cannot go to the terminal."""
-        if self.target is None:
-            raise UsageError(f"{self.report.form} needs a file", "add -o FILE")
+        """The target of a form that cannot go to the terminal."""
+        assert self.target is not None
         return self.target
 
 

@@ -158,36 +158,23 @@ def _as_it_is(schema: Schema) -> _Way:
 
 
 def _converted(job: Job, stream: Stream, schema: Schema) -> _Way:
-    from rosbags.typesys.msg import normalize_msgtype
-
-    name = normalize_msgtype(schema.name)
-    store = _ros1_types(schema)
-    try:
-        text, md5 = store.generate_msgdef(name, ros_version=1)
-        convert = partial(store.cdr_to_ros1, typename=name)
-        store.get_msgdef(name)
-    except Exception as error:  # rosbags raises many kinds on types that ROS 1 does not have
-        raise AmberboxError(f"{schema.name} has no form in ROS 1 ({error})") from error
-    _tell_other_type(job, stream, name, md5)
-    return _Way(name, text, md5, convert)
-
-
-def _ros1_types(schema: Schema) -> Any:
-    """Make a type store of a ROS 2 definition, with the header of ROS 1."""
     from rosbags.typesys import Stores, get_typestore
+    from rosbags.typesys.msg import normalize_msgtype
 
     from amberbox.blackbox.unroll.definition import HEADER, parse_types
 
-    types = dict(parse_types(schema))
-    noetic = get_typestore(Stores.ROS1_NOETIC)
-    if HEADER in types:
-        types[HEADER] = noetic.fielddefs[HEADER]
-    store = get_typestore(Stores.EMPTY)
+    name, types = normalize_msgtype(schema.name), dict(parse_types(schema))
+    ros1, ros2 = get_typestore(Stores.EMPTY), get_typestore(Stores.EMPTY)
+    header = get_typestore(Stores.ROS1_NOETIC).fielddefs[HEADER]
     try:
-        store.register(types)
-    except Exception as error:  # see above
+        ros1.register(types | ({HEADER: header} if HEADER in types else {}))
+        ros2.register(types)
+        text, md5 = ros1.generate_msgdef(name, ros_version=1)
+        ros2.get_msgdef(name)
+    except Exception as error:  # rosbags raises many kinds on types that ROS 1 does not have
         raise AmberboxError(f"{schema.name} has no form in ROS 1 ({error})") from error
-    return store
+    _tell_other_type(job, stream, name, md5)
+    return _Way(name, text, md5, partial(ros2.cdr_to_ros1, typename=name))
 
 
 def _tell_other_type(job: Job, stream: Stream, name: str, md5: str) -> None:
