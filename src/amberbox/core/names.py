@@ -17,8 +17,11 @@ def identifier(text: str) -> str:
 
 
 def item_name(source: str, topic: str) -> str:
-    """Name the data item of a topic: ``/ropod/odom`` on ``ros`` is ``ros_ropod_odom``."""
-    return identifier(f"{source}_{topic.strip('/')}" if topic.strip("/") else source)
+    """Name the data item of a topic: ``/ropod/odom`` on ``ros`` is ``ros_ropod_odom``.
+
+    Without a source the topic alone is the name.
+    """
+    return identifier("_".join(part for part in (source, topic.strip("/")) if part))
 
 
 def is_reserved(name: str) -> bool:

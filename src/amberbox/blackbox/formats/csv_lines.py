@@ -88,18 +88,17 @@ def find_dialect(file: FileBytes) -> Dialect:
     head = file.read(0, _BLOCK)
     if b"\0" in head:
         hint = "save it as CSV in UTF-8 and import that"
-        raise AmberboxError(f"{file.path} is no text in UTF-8 or Latin-1", hint)
+        raise AmberboxError("this is no text in UTF-8 or Latin-1", hint)
     encoding = _encoding(head)
     lines = Lines(file, len(_BOM) if head.startswith(_BOM) else 0, 1)
     lines.encoding = encoding
     header = next((line for line in lines if line.strip()), "")
     delimiter = max(DELIMITERS, key=lambda mark: _outside_quotes(header, mark))
-    if delimiter not in header:
+    if not header:
         raise AmberboxError(
-            f"{file.path} has no header line with at least two columns",
-            "the first line names the columns, separated by a comma, semicolon or tab",
+            "there is no header line", "the first line names the columns, separated by a comma"
         )
-    padded = header.count(delimiter + " ") == header.count(delimiter)
+    padded = 0 < header.count(delimiter) == header.count(delimiter + " ")
     dialect = Dialect(delimiter, encoding, padded, (), lines.at, lines.number)
     names = next(_reader(iter([header]), dialect))
     return Dialect(delimiter, encoding, padded, _names(names), lines.at, lines.number)

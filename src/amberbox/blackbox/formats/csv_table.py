@@ -25,7 +25,7 @@ from amberbox.blackbox.formats.recording import (
     Recording,
     Report,
 )
-from amberbox.core.errors import AmberboxError, UsageError
+from amberbox.core.errors import AmberboxError
 from amberbox.core.timetext import format_time
 from amberbox.core.types import Topic
 
@@ -61,9 +61,9 @@ def open_csv(path: Path, options: ReadOptions) -> Recording:
     file = FileBytes(path)
     try:
         return _open(path, file, options)
-    except UsageError as error:
+    except AmberboxError as error:
         file.close()
-        raise UsageError(f"{path}: {error.what}", error.hint) from None
+        raise type(error)(f"{path}: {error.what}", error.hint) from None
     except BaseException:
         file.close()
         raise
@@ -73,7 +73,7 @@ def _open(path: Path, file: FileBytes, options: ReadOptions) -> Recording:
     dialect = find_dialect(file)
     table = scan(file, dialect, options.time)
     if not table.batches or table.begin is None:
-        raise AmberboxError(f"{path} has a header, but no row with a time", "look at its lines")
+        raise AmberboxError("there is a header, but no row with a time", "look at its lines")
     plan = _decide(table, table.begin, options.start_ns)
     found = [batch for batch in (_possible(batch, table, plan) for batch in table.batches) if batch]
     report = Report("CSV file", accounts=[table.account])

@@ -23,7 +23,7 @@ _UNIT = re.compile(
 )
 _LIMITS = ((10**11, "s"), (10**14, "ms"), (10**17, "us"))
 """Seconds, milliseconds, microseconds by size: each covers the years 1973 to 5138."""
-_ISO_TEXT = re.compile(r"\d{4}-\d{2}-\d{2}\b.*")
+_ISO_TEXT = re.compile(r"\d{4}-\d{2}-\d{2}(?!\d).*")
 _LATEST_NS = 2**63 - 1
 _LONG_AGO = 10**8
 

@@ -11,8 +11,10 @@ from typing import Any
 
 from amberbox.blackbox.formats.compression import unpack
 from amberbox.blackbox.formats.definitions import Definitions
+from amberbox.blackbox.formats.flat_json import KIND, Rewrite, flat_columns, own_stamp, rewriter
 from amberbox.blackbox.formats.recording import (
     Damage,
+    Origin,
     Part,
     RecordedMessage,
     Report,
@@ -42,6 +44,7 @@ class McapFile:
     buffer: Any
     close: Callable[[], None]
     topic_of: dict[int, int] = field(default_factory=dict)
+    rewrite: dict[int, Rewrite] = field(default_factory=dict)
     torn: Chunk | None = None
 
     def damaged(self, offset: int, length: int, reason: str) -> None:
@@ -124,11 +127,28 @@ def add_topics(file: McapFile, table: TopicTable, definitions: Definitions) -> N
         schema = summary.schemas.get(channel.schema_id)
         if schema is not None and not schema.data and channel.message_encoding == "cdr":
             schema = definitions.schema(schema.name, partial(_sample, file, number))
-        latched = is_latched(channel.metadata.get("offered_qos_profiles", ""))
-        marks = (channel.metadata.get("latching"), channel.metadata.get("latched"))
-        latched = latched or bool({"1", "true"}.intersection(marks))
-        topic = Topic(channel.topic, channel.message_encoding, schema, latched)
-        file.topic_of[number] = table.add(topic)
+        columns = flat_columns(channel, schema)
+        if columns is None:
+            topic = Topic(channel.topic, channel.message_encoding, schema, _is_latched(channel))
+            file.topic_of[number] = table.add(topic, _origin(channel))
+        else:
+            file.rewrite[number] = rewriter(columns)
+            origin = Origin("", own_stamp(columns), KIND)
+            file.topic_of[number] = table.add(Topic(channel.topic, "msgpack"), origin)
+
+
+def _is_latched(channel: mcap.Channel) -> bool:
+    marks = (channel.metadata.get("latching"), channel.metadata.get("latched"))
+    by_qos = is_latched(channel.metadata.get("offered_qos_profiles", ""))
+    return by_qos or bool({"1", "true"}.intersection(marks))
+
+
+def _origin(channel: mcap.Channel) -> Origin:
+    """Items that a box has named keep the name of their source, and their stamp."""
+    marks = channel.metadata
+    if "item" not in marks or "source" not in marks:
+        return Origin()
+    return Origin(marks["source"], marks.get("stamp"))
 
 
 def _is_bookkeeping(channel: mcap.Channel) -> bool:
@@ -180,8 +200,18 @@ def _messages(file: McapFile, chunk: Chunk) -> list[RecordedMessage]:
         new(RecordedMessage, (topic_of.get(channel, _UNKNOWN), log, publish, body[start:end]))
         for channel, log, publish, start, end in rows
     ]
+    _rewrite(file, chunk, messages)
     known = [message for message in messages if message[0] >= 0]
     lost = sum(message[0] == _UNKNOWN for message in messages)
     if lost:
         file.damaged(chunk.offset, chunk.end - chunk.offset, f"{lost} messages of unknown channels")
     return known
+
+
+def _rewrite(file: McapFile, chunk: Chunk, messages: list[RecordedMessage]) -> None:
+    """Put back what an export had to write differently."""
+    for channel, rewrite in file.rewrite.items():
+        for place in chunk.rows_of(channel).tolist():
+            topic, log_ns, publish_ns, data = messages[place]
+            data = rewrite(data, log_ns, publish_ns or log_ns)
+            messages[place] = RecordedMessage(topic, log_ns, publish_ns, data)

@@ -72,6 +72,9 @@ class Origin:
     kind: str = ""
 
 
+_LIVE = Origin()
+
+
 @dataclass
 class Report:
     """What was found in a recording; the counts grow while its messages are read.
@@ -111,14 +114,16 @@ class TopicTable:
 
     def __init__(self) -> None:
         self.topics: list[Topic] = []
-        self._places: dict[tuple[str, str, Schema | None], int] = {}
+        self.origins: list[Origin] = []
+        self._places: dict[tuple[str, str, Schema | None, Origin], int] = {}
 
-    def add(self, topic: Topic) -> int:
+    def add(self, topic: Topic, origin: Origin = _LIVE) -> int:
         """Return the index of a topic; it is latched if any of its connections is."""
-        key = (topic.name, topic.message_encoding, topic.schema)
+        key = (topic.name, topic.message_encoding, topic.schema, origin)
         place = self._places.setdefault(key, len(self.topics))
         if place == len(self.topics):
             self.topics.append(topic)
+            self.origins.append(origin)
         elif topic.latched:
             self.topics[place] = topic
         return place
@@ -155,7 +160,7 @@ class Recording:
     ) -> None:
         self.path = path
         self.topics = tuple(topics)
-        self.origins = tuple(origins) or (Origin(),) * len(self.topics)
+        self.origins = tuple(origins) or (_LIVE,) * len(self.topics)
         self.report = report
         self.progress = 0.0
         """Fraction of the recording that ``messages`` has given out."""

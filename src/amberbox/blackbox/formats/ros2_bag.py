@@ -72,7 +72,8 @@ def _open_files(path: Path, files: Sequence[Path], bag: _Bag) -> Recording:
     except BaseException:
         bag.stack.close()
         raise
-    return Recording(path, bag.table.topics, bag.parts, bag.report, bag.stack.close)
+    table = bag.table
+    return Recording(path, table.topics, bag.parts, bag.report, bag.stack.close, table.origins)
 
 
 def _open_file(path: Path, bag: _Bag) -> None:
