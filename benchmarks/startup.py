@@ -17,6 +17,7 @@ from contextlib import contextmanager
 from os import environ
 from pathlib import Path
 
+from amberbox.blackbox.store import is_locked, open_store
 from benchmarks.common import Row
 from benchmarks.recorder import robot_folder
 
@@ -65,6 +66,8 @@ def _after_kill() -> tuple[list[float], list[float]]:
             first_s, ready_s = _again(robot)
             firsts.append(first_s)
             readies.append(ready_s)
+        while is_locked(open_store(robot / "store"), "keeper"):  # it ends when it is alone
+            time.sleep(0.1)
     return firsts, readies
 
 
