@@ -20,9 +20,11 @@ from amberbox.core.expression_eval import Instants, evaluate, rows_of, series_of
 from amberbox.core.expression_parse import parse_tree
 from amberbox.core.expression_tree import (
     Address,
+    Age,
     Fault,
     Kind,
     Tree,
+    delays_ns,
     history_ns,
     kind_of,
     needs_history,
@@ -80,6 +82,15 @@ class Expression:
     def history_ns(self) -> int:
         """How far it looks back: series must reach back this far, and one sample further."""
         return history_ns(self.tree)
+
+    @property
+    def reads_age(self) -> bool:
+        """Tell whether it reads an age, which grows between samples."""
+        return any(isinstance(part, Age) for part in walk(self.tree))
+
+    def delays_ns(self) -> tuple[int, ...]:
+        """Return how long after a sample its value may change: at once, and later by windows."""
+        return tuple(sorted(delays_ns(self.tree)))
 
     def resolve(self, known: Collection[str]) -> Expression:
         """Replace short forms by the full addresses they stand for.

@@ -172,6 +172,14 @@ def history_ns(tree: Tree) -> int:
     return own + max((history_ns(child) for child in children(tree)), default=0)
 
 
+def delays_ns(tree: Tree) -> frozenset[int]:
+    """Return how long after a sample the value of a tree may change."""
+    own = {tree.over_ns} if isinstance(tree, Window) else set()
+    own |= {tree.for_ns} if isinstance(tree, Held) else set()
+    inner = frozenset({0}).union(*(delays_ns(child) for child in children(tree)))
+    return frozenset(delay + more for delay in inner for more in (0, *own))
+
+
 def needs_history(tree: Tree) -> bool:
     """Tell whether a tree cannot be judged from the values of one instant."""
     return any(isinstance(part, Window | Held | Age) for part in walk(tree))

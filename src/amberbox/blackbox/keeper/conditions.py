@@ -1,0 +1,251 @@
+"""Conditions over a record as it grows: tell when each of them becomes true.
+
+Rows come in batches, edges go out in order of time. How the rows are split into batches does not
+matter, and neither does how often is asked: live and replay give the same edges.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from amberbox.core.clock import NS
+from amberbox.core.errors import AmberboxError, UsageError
+from amberbox.core.expression import Expression, Value
+from amberbox.core.expression_tree import Fault
+from amberbox.core.expression_values import element_of, values_of
+from amberbox.core.types import Batch, IntArray
+
+TICK_NS = NS // 10
+"""Conditions that depend on an age are looked at this often between samples, too."""
+
+_TICKED_NS = 3600 * NS
+_LONG_AGO = -(1 << 62)
+
+
+@dataclass(frozen=True, slots=True)
+class Condition:
+    """An expression to watch; ``asides`` are read at the instants at which it becomes true."""
+
+    when: Expression
+    asides: Mapping[str, Expression] = field(default_factory=dict)
+
+    def expressions(self) -> Iterator[Expression]:
+        """Give everything that has to be evaluated."""
+        yield self.when
+        yield from self.asides.values()
+
+
+@dataclass(frozen=True, slots=True)
+class Edge:
+    """A condition has become true; ``values`` are its asides at that instant."""
+
+    name: str
+    at_ns: int
+    values: Mapping[str, Value] = field(default_factory=dict)
+
+
+class Conditions:
+    """Watches named conditions over addresses ``item.variable``.
+
+    Times are those of the batches unless others are given; they must not decrease per item.
+    What a condition cannot be judged by (a text where a number was expected) is told in
+    ``problems``, once; it then never becomes true.
+    """
+
+    def __init__(self, conditions: Mapping[str, Condition]) -> None:
+        self._conditions = dict(conditions)
+        self._samples = {a: _Samples(a) for c in conditions.values() for a in addresses_of(c)}
+        self._was_true = dict.fromkeys(conditions, False)
+        self._until_ns = _LONG_AGO
+        self.problems: dict[str, str] = {}
+
+    @property
+    def items(self) -> frozenset[str]:
+        """Names of the items whose batches are wanted: those named, or parents of child tables."""
+        found = {address.partition(".")[0] for address in self._samples}
+        return frozenset(name for item in found for name in _with_parents(item))
+
+    @property
+    def history_ns(self) -> int:
+        """How far back rows matter to what is true now."""
+        depths = (e.history_ns for c in self._conditions.values() for e in c.expressions())
+        return max(depths, default=0)
+
+    def add(self, batch: Batch, times_ns: IntArray | None = None) -> None:
+        """Take the rows of a batch and of its child tables."""
+        times_ns = batch.received_ns if times_ns is None else times_ns
+        for samples in self._samples.values():
+            if samples.item == batch.item:
+                self._take(samples, batch, times_ns)
+        for child in batch.children.values():
+            place = np.searchsorted(batch.seq, child.seq)
+            self.add(child, times_ns[place])
+
+    def _take(self, samples: _Samples, batch: Batch, times_ns: IntArray) -> None:
+        try:
+            samples.add(batch, times_ns)
+        except (Fault, UsageError) as error:
+            self.problems.setdefault(samples.address, f"'{samples.address}' {error}")
+
+    def start_at(self, at_ns: int) -> None:
+        """Take what is true at an instant for known: no edge up to there is told."""
+        self.edges(at_ns)
+
+    def edges(self, until_ns: int) -> list[Edge]:
+        """Return what became true since the last call and up to ``until_ns``, in order of time.
+
+        All rows up to then must have been added.
+        """
+        if until_ns <= self._until_ns:
+            return []
+        series = {address: samples.series() for address, samples in self._samples.items()}
+        found = [e for name in self._conditions for e in self._edges_of(name, series, until_ns)]
+        self._until_ns = until_ns
+        keep_ns = until_ns - self.history_ns - TICK_NS
+        for samples in self._samples.values():
+            samples.forget_before(keep_ns)
+        return sorted(found, key=lambda edge: edge.at_ns)
+
+    def _edges_of(self, name: str, series: Any, until_ns: int) -> list[Edge]:
+        condition = self._conditions[name]
+        try:
+            at_ns = self._rising(name, condition.when, series, until_ns)
+        except AmberboxError as error:
+            self.problems.setdefault(name, error.what)
+            return []
+        return [Edge(name, t, self._asides(name, condition, series, t)) for t in at_ns]
+
+    def _rising(self, name: str, when: Expression, series: Any, until_ns: int) -> list[int]:
+        """Return when the expression became true after the last instant looked at."""
+        instants = instants_of(when, series, self._until_ns, until_ns)
+        if not len(instants):
+            return []
+        values = when.evaluate_series(series, instants)
+        if np.ma.getdata(values).dtype != bool and not _null(values).all():
+            raise UsageError("is no condition: compare it with something, such as: x > 0")
+        true = np.ma.filled(values, False).astype(bool)
+        before = np.concatenate([[self._was_true[name]], true[:-1]])
+        self._was_true[name] = bool(true[-1])
+        rising: list[int] = instants[true & ~before].tolist()
+        return rising
+
+    def _asides(self, name: str, condition: Condition, series: Any, at_ns: int) -> dict[str, Value]:
+        found: dict[str, Value] = {}
+        for aside, expression in condition.asides.items():
+            try:
+                found[aside] = expression.evaluate_series(series, at_ns)
+            except AmberboxError as error:
+                self.problems.setdefault(f"{name}: {aside}", error.what)
+                found[aside] = None
+        return found
+
+
+class _Samples:
+    """The samples of one address that still matter."""
+
+    def __init__(self, address: str) -> None:
+        self.address = address
+        self.item, _, variable = address.partition(".")
+        self._variable, _, index = variable.partition("[")
+        self._index = int(index.rstrip("]")) if index else None
+        self._times_ns: list[IntArray] = []
+        self._values: list[Any] = []
+
+    def add(self, batch: Batch, times_ns: IntArray) -> None:
+        """Take the values of a batch; a variable that it does not have is unknown there."""
+        column = batch.columns.get(self._variable, np.full(len(times_ns), None, object))
+        index = self._index
+        values = values_of(column, 0) if index is None else element_of(column, index, 0)
+        self._times_ns.append(times_ns)
+        self._values.append(values.column())
+
+    def series(self) -> tuple[IntArray, Any]:
+        """Return times and values so far."""
+        if not self._times_ns:
+            return np.empty(0, np.int64), np.empty(0, object)
+        if len(self._times_ns) > 1:
+            self._times_ns = [np.maximum.accumulate(np.concatenate(self._times_ns))]
+            self._values = [_joined(self._values)]
+        return self._times_ns[0], self._values[0]
+
+    def forget_before(self, at_ns: int) -> None:
+        """Drop what came before an instant, but for the last sample that had a value then."""
+        times_ns, values = self.series()
+        end = int(np.searchsorted(times_ns, at_ns, "right"))
+        known = np.flatnonzero(~_null(values[:end]))
+        first = int(known[-1]) if len(known) else max(end - 1, 0)
+        if first:
+            self._times_ns, self._values = [times_ns[first:]], [values[first:]]
+
+
+def addresses_of(condition: Condition) -> Iterator[str]:
+    """Name what a condition reads, each address once."""
+    yield from dict.fromkeys(a for e in condition.expressions() for a in e.addresses())
+
+
+def address_problem(expression: Expression) -> str:
+    """Say which address cannot be one of a recorded variable; empty if all can."""
+    for address in expression.addresses():
+        item, dot, variable = address.partition(".")
+        if not (dot and item and variable) or any(mark in address for mark in "/#:"):
+            return f"'{address}' is no recorded variable; write item.variable"
+    return ""
+
+
+def condition_problem(expression: Expression) -> str:
+    """Say why an expression cannot tell when something is the case; empty if it can."""
+    if expression.kind not in ("condition", "any"):
+        return "is no condition: compare it with something, such as: x > 0"
+    return address_problem(expression)
+
+
+def instants_of(expression: Expression, series: Any, since_ns: int, until_ns: int) -> IntArray:
+    """Return the instants in ``(since, until]`` at which the value may change, in order."""
+    delays = expression.delays_ns()
+    times = [series[address][0] for address in expression.addresses()]
+    found = [t + delay for t in times for delay in delays]
+    if expression.reads_age and any(len(t) for t in times):
+        found.append(_ticks(min(int(t[0]) for t in times if len(t)), since_ns, until_ns))
+    inside = [t[(t > since_ns) & (t <= until_ns)] for t in found]
+    instants: IntArray = np.unique(np.concatenate([np.zeros(0, np.int64), *inside]))
+    return instants
+
+
+def _ticks(first_ns: int, since_ns: int, until_ns: int) -> IntArray:
+    """Give regular instants, an hour of them at most: later ones add nothing to a silence."""
+    start = max(first_ns, since_ns)
+    end = min(until_ns, start + _TICKED_NS)
+    return np.arange(start // TICK_NS + 1, end // TICK_NS + 1, dtype=np.int64) * TICK_NS
+
+
+def _null(values: Any) -> Any:
+    if isinstance(values, np.ma.MaskedArray):
+        return np.ma.getmaskarray(values)
+    return np.array([value is None for value in values], bool)
+
+
+def _joined(columns: Sequence[Any]) -> Any:
+    if all(isinstance(column, np.ma.MaskedArray) for column in columns):
+        data = np.concatenate([np.ma.getdata(column) for column in columns])
+        return np.ma.MaskedArray(data, np.concatenate([_null(column) for column in columns]))
+    return np.concatenate([_as_objects(column) for column in columns])
+
+
+def _as_objects(column: Any) -> Any:
+    if not isinstance(column, np.ma.MaskedArray):
+        return column
+    objects = np.ma.getdata(column).astype(object)
+    objects[np.ma.getmaskarray(column)] = None
+    return objects
+
+
+def _with_parents(item: str) -> Iterator[str]:
+    """Name an item and the items that it may be a child table of."""
+    yield item
+    while "__" in item:
+        item = item.rpartition("__")[0]
+        yield item
