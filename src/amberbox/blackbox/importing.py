@@ -260,10 +260,11 @@ def digest_of(path: Path) -> str:
     """
     if not path.exists():
         raise UsageError(f"there is no recording at {path}", "check the path")
+    folder, files = _files(path)
     total = hashlib.sha256()
-    for file in _files(path):
-        if path.is_dir():
-            total.update(file.relative_to(path).as_posix().encode() + b"\0")
+    for file in files:
+        if folder is not None:
+            total.update(file.relative_to(folder).as_posix().encode() + b"\0")
         elif path.suffix.lower() in csv_table.SUFFIXES:
             total.update(path.name.encode() + b"\0")
         with file.open("rb") as opened:
@@ -271,11 +272,11 @@ def digest_of(path: Path) -> str:
     return total.hexdigest()
 
 
-def _files(path: Path) -> list[Path]:
-    """List the files that make up a recording."""
+def _files(path: Path) -> tuple[Path | None, list[Path]]:
+    """List the files that make up a recording, and the folder they are seen from."""
     if not path.is_dir():
-        return [path]
+        return None, [path]
     dump = find_dump(path)
     if dump is not None:
-        return sorted(mongodump.collections(dump).values())
-    return sorted(p for p in path.rglob("*") if p.is_file())
+        return dump, sorted(mongodump.collections(dump).values())
+    return path, sorted(p for p in path.rglob("*") if p.is_file())

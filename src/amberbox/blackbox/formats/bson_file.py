@@ -5,8 +5,6 @@ A file that is cut short or damaged gives the documents that are whole.
 
 from __future__ import annotations
 
-import gzip
-import shutil
 import zlib
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
@@ -24,6 +22,8 @@ from amberbox.core.errors import UsageError
 STRETCH_BYTES = 1 << 20
 _LARGEST = 48 << 20
 _SMALLEST = 5
+_GZIP = 31
+_PIECE = 1 << 14
 _OBJECT_ID = b"\x07_id\0"
 """How a document of a collection goes on behind its length."""
 
@@ -47,13 +47,20 @@ def open_bson(path: Path, report: Report, stack: ExitStack) -> FileBytes:
 
 
 def _unpacked(path: Path, report: Report, folder: Path) -> Path:
+    """Unpack a file as far as it goes."""
     target = folder / path.stem
-    with gzip.open(path) as packed, target.open("wb") as unpacked:
-        try:
-            shutil.copyfileobj(packed, unpacked)
-        except (OSError, EOFError, zlib.error) as error:
-            size = path.stat().st_size
-            report.add_damage(Damage(path.name, 0, size, f"unpacked in part only ({error})"))
+    unpacking, problem = zlib.decompressobj(wbits=_GZIP), ""
+    with path.open("rb") as packed, target.open("wb") as unpacked:
+        while not unpacking.eof and not problem:
+            piece = packed.read(_PIECE)
+            try:
+                unpacked.write(unpacking.decompress(piece))
+            except zlib.error as error:
+                problem = str(error)
+            problem = problem or ("" if piece else "it is cut short")
+    if problem:
+        damage = Damage(path.name, 0, path.stat().st_size, f"unpacked in part only ({problem})")
+        report.add_damage(damage)
     return target
 
 

@@ -140,7 +140,6 @@ class Reader:
         try:
             handle(self, payload)
         except (ValueError, IndexError, error) as problem:
-            self.refused[f"{chr(kind)} records that make no sense"] += 1
             self.notes.append(f"a record of kind {chr(kind)!r} makes no sense ({problem})")
 
     # -- the other kinds of records
@@ -240,6 +239,8 @@ def _begins_data(block: bytes, at: int, subscriptions: Mapping[int, Subscription
 def _key_value(payload: bytes) -> dict[str, Any]:
     """Read a key with its type, and the value; numbers and texts have columns of their own."""
     length = payload[0]
+    if length >= len(payload):
+        raise ValueError("its key is longer than the record")
     type_name, _, key = _text(payload[1 : 1 + length]).partition(" ")
     data = payload[1 + length :]
     if type_name in _VALUES:
