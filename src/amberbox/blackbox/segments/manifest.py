@@ -2,24 +2,23 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 import os
+import threading
 from collections import Counter
 from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, BinaryIO, TypeAlias
 
+from amberbox.blackbox.journal import reserved
+from amberbox.blackbox.segments import lines
 from amberbox.blackbox.segments.entries import Sealed, Signature, Tombstone, from_record
 from amberbox.blackbox.segments.flat import TableSchema
 from amberbox.blackbox.store import sync_folder
 from amberbox.core.types import Gap
 
 NAME = "manifest"
-_FIRST_HASH = "0" * 64
-_HASH_FIELD = 75  # {"hash":"<64 hex digits>",
 
 ClockPoints: TypeAlias = tuple[tuple[int, int], ...]
 
@@ -139,7 +138,11 @@ class Journal:
 
 @dataclass(frozen=True)
 class Manifest:
-    """What the manifest says now."""
+    """What the manifest says now.
+
+    ``columns_gone`` and ``raw_gone`` name the journals of which one or the other was deleted, as
+    far as the manifest has not been condensed since; ``gone_segments`` are files that went thus.
+    """
 
     schemas: Mapping[str, TableSchema] = field(default_factory=dict)
     segments: Mapping[str, tuple[Segment, ...]] = field(default_factory=dict)
@@ -150,7 +153,10 @@ class Manifest:
     confirmed: frozenset[str] = frozenset()
     signatures: tuple[Signature, ...] = ()
     damage: tuple[str, ...] = ()
-    last_hash: str = _FIRST_HASH
+    last_hash: str = lines.FIRST_HASH
+    columns_gone: frozenset[str] = frozenset()
+    raw_gone: frozenset[str] = frozenset()
+    gone_segments: frozenset[str] = frozenset()
 
     def complete(self, item: str, existing: Container[str] | None = None) -> frozenset[str]:
         """Return the journals whose rows of this item are all in segments.
@@ -169,88 +175,163 @@ class Manifest:
         )
 
 
-def read(store: Path) -> Manifest:
-    """Read a store's manifest; lines that do not hold are left out and named in ``damage``."""
-    path = store / NAME
-    try:
-        state = path.stat()
-    except FileNotFoundError:
-        return Manifest()
-    return _read_cached(path, state.st_mtime_ns, state.st_size, state.st_ino)
+def is_kept(schema: TableSchema) -> bool:
+    """Tell whether a table stays when the data around it go: events, gaps, runs, statuses."""
+    return schema.source == reserved.SOURCE and schema.topic != reserved.COUNTERS
+
+
+@dataclass(slots=True)
+class _State:
+    """What the lines read so far add up to."""
+
+    schemas: dict[str, TableSchema] = field(default_factory=dict)
+    live: dict[str, Segment] = field(default_factory=dict)
+    paths_of: dict[str, set[str]] = field(default_factory=dict)
+    deletions: list[Deletion] = field(default_factory=list)
+    journals: dict[str, Journal] = field(default_factory=dict)
+    sealed: dict[str, Sealed] = field(default_factory=dict)
+    tombstones: list[Tombstone] = field(default_factory=list)
+    confirmed: set[str] = field(default_factory=set)
+    signatures: list[Signature] = field(default_factory=list)
+    columns_gone: set[str] = field(default_factory=set)
+    raw_gone: set[str] = field(default_factory=set)
+    gone_segments: set[str] = field(default_factory=set)
+
+    def take(self, record: Mapping[str, Any]) -> None:
+        """Add one record."""
+        match record["kind"]:
+            case "segment":
+                self._take_segment(record)
+            case "deleted" if record["path"] in self.live:
+                gone = self.live.pop(record["path"])
+                self.deletions.append(Deletion(gone, record["reason"], record["at_ns"]))
+            case "schema":
+                self.schemas[record["id"]] = TableSchema.from_json(record["schema"])
+            case "journal":
+                self.journals[record["journal"]] = _journal_from_json(record)
+            case "confirmed":
+                self.confirmed.update(record["journals"])
+            case lines.CHECKPOINT:
+                self.columns_gone.update(record["columns_gone"])
+            case _:
+                self._take_entry(from_record(record))
+
+    def _take_segment(self, record: Mapping[str, Any]) -> None:
+        for path in record.get("replaces", ()):
+            self.live.pop(path, None)
+        segment = Segment.from_json(record["segment"])
+        self.live[segment.path] = segment
+        self.gone_segments.discard(segment.path)
+        for part in segment.parts:
+            self.paths_of.setdefault(part.journal, set()).add(segment.path)
+
+    def _take_entry(self, entry: Sealed | Tombstone | Signature | None) -> None:
+        if isinstance(entry, Sealed):
+            self.sealed[entry.journal] = entry
+        elif isinstance(entry, Signature):
+            self.signatures.append(entry)
+        elif isinstance(entry, Tombstone):
+            self.tombstones.append(entry)
+            if entry.what != "columns":
+                self.raw_gone.update(entry.journals)
+            if entry.what != "raw":
+                self._drop_columns(entry.journals)
+
+    def _drop_columns(self, journals: Sequence[str]) -> None:
+        """A segment goes with the last of its journals, unless its table is kept."""
+        self.columns_gone.update(journals)
+        for name in journals:
+            self.journals.pop(name, None)
+            for path in self.paths_of.pop(name, ()):
+                segment = self.live.get(path)
+                if segment is not None and self._is_over(segment):
+                    del self.live[path]
+                    self.gone_segments.add(path)
+
+    def _is_over(self, segment: Segment) -> bool:
+        gone = all(part.journal in self.columns_gone for part in segment.parts)
+        schema = self.schemas.get(segment.schema)
+        return gone and not (schema is not None and is_kept(schema))
+
+    def manifest(self, damage: Sequence[str], last_hash: str) -> Manifest:
+        """Return what it all says, not touched by records to come."""
+        return Manifest(
+            dict(self.schemas), _by_item(self.live.values()), dict(self.journals),
+            tuple(self.deletions), dict(self.sealed), tuple(self.tombstones),
+            frozenset(self.confirmed), tuple(self.signatures), tuple(damage), last_hash,
+            frozenset(self.columns_gone), frozenset(self.raw_gone), frozenset(self.gone_segments),
+        )  # fmt: skip
+
+
+class _Reader:
+    """Reads one manifest file, and later only what was appended since."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._lock = threading.Lock()
+        self._start_again()
+
+    def _start_again(self) -> None:
+        self._state, self._lines = _State(), lines.LineReader()
+        self._size, self._last_line = 0, b""
+        self._seen: tuple[int, int, int] | None = None
+        self._manifest = Manifest()
+
+    def read(self) -> Manifest:
+        """Return what the file says now; nothing when it is not there."""
+        with self._lock:
+            try:
+                with self._path.open("rb") as file:
+                    return self._read(file)
+            except FileNotFoundError:
+                return Manifest()
+
+    def _read(self, file: BinaryIO) -> Manifest:
+        status = os.fstat(file.fileno())
+        seen = (status.st_ino, status.st_mtime_ns, status.st_size)
+        if seen != self._seen:
+            if not self._goes_on(file, status):
+                self._start_again()
+            self._manifest = self._read_on(file)
+            self._seen = seen
+        return self._manifest
+
+    def _goes_on(self, file: BinaryIO, status: os.stat_result) -> bool:
+        """Tell whether the file is the one read before, with lines added."""
+        if self._seen is None or status.st_ino != self._seen[0] or status.st_size <= self._size:
+            return False
+        file.seek(self._size - len(self._last_line))
+        return file.read(len(self._last_line)) == self._last_line
+
+    def _read_on(self, file: BinaryIO) -> Manifest:
+        file.seek(self._size)
+        whole, newline, torn = file.read().rpartition(b"\n")
+        if newline:
+            for record in self._lines.take(whole):
+                self._state.take(record)
+            self._size += len(whole) + 1
+            self._last_line = whole[whole.rfind(b"\n") + 1 :] + newline
+        if torn:
+            return self._with_torn(file)
+        return self._state.manifest(self._lines.damage, self._lines.last_hash)
+
+    def _with_torn(self, file: BinaryIO) -> Manifest:
+        """Read all of it aside: what has no end yet may come differently next time."""
+        file.seek(0)
+        state, reader = _State(), lines.LineReader()
+        for record in reader.take(file.read(), ends=False):
+            state.take(record)
+        return state.manifest(reader.damage, reader.last_hash)
 
 
 @lru_cache(maxsize=8)
-def _read_cached(path: Path, _mtime_ns: int, size: int, _inode: int) -> Manifest:
-    with path.open("rb") as file:
-        content = file.read(size)
-    records, damage, last_hash = _verified(content)
-    return _manifest(records, damage, last_hash)
+def _reader(path: Path) -> _Reader:
+    return _Reader(path)
 
 
-def _verified(content: bytes) -> tuple[list[dict[str, Any]], list[str], str]:
-    """Return the records whose hash holds, what does not, and the hash of the last record."""
-    records: list[dict[str, Any]] = []
-    damage: list[str] = []
-    last_hash = _FIRST_HASH
-    lines = content.split(b"\n")
-    for number, line in enumerate(lines, 1):
-        if not line:
-            continue
-        record = _record(line)
-        if record is None:
-            torn = number == len(lines)
-            damage.append(f"line {number}: " + ("torn at the end" if torn else "damaged"))
-            continue
-        if record["prev"] != last_hash:
-            damage.append(f"line {number}: does not follow the line before")
-        last_hash = record["hash"]
-        records.append(record)
-    return records, damage, last_hash
-
-
-def _record(line: bytes) -> dict[str, Any] | None:
-    expected = b'{"hash":"%s",' % hashlib.sha256(line[_HASH_FIELD:]).hexdigest().encode()
-    if line[:_HASH_FIELD] != expected:
-        return None
-    record: dict[str, Any] = json.loads(line)
-    return record
-
-
-def _manifest(records: list[dict[str, Any]], damage: list[str], last_hash: str) -> Manifest:
-    live: dict[str, Segment] = {}
-    deletions: list[Deletion] = []
-    for record in records:
-        if record["kind"] == "segment":
-            _take_segment(live, record)
-        elif record["kind"] == "deleted" and record["path"] in live:
-            gone = live.pop(record["path"])
-            deletions.append(Deletion(gone, record["reason"], record["at_ns"]))
-    schemas = {r["id"]: TableSchema.from_json(r["schema"]) for r in _of_kind(records, "schema")}
-    done = list(_of_kind(records, "journal"))
-    entries = [entry for entry in map(from_record, records) if entry is not None]
-    return Manifest(
-        schemas,
-        _by_item(live.values()),
-        {record["journal"]: _journal_from_json(record) for record in done},
-        tuple(deletions),
-        {entry.journal: entry for entry in entries if isinstance(entry, Sealed)},
-        tuple(entry for entry in entries if isinstance(entry, Tombstone)),
-        frozenset(name for r in _of_kind(records, "confirmed") for name in r["journals"]),
-        tuple(entry for entry in entries if isinstance(entry, Signature)),
-        tuple(damage),
-        last_hash,
-    )
-
-
-def _of_kind(records: list[dict[str, Any]], kind: str) -> Iterable[dict[str, Any]]:
-    return (record for record in records if record["kind"] == kind)
-
-
-def _take_segment(live: dict[str, Segment], record: Mapping[str, Any]) -> None:
-    for path in record.get("replaces", ()):
-        live.pop(path, None)
-    segment = Segment.from_json(record["segment"])
-    live[segment.path] = segment
+def read(store: Path) -> Manifest:
+    """Read a store's manifest; lines that do not hold are left out and named in ``damage``."""
+    return _reader(store / NAME).read()
 
 
 def _by_item(segments: Iterable[Segment]) -> dict[str, tuple[Segment, ...]]:
@@ -301,49 +382,20 @@ def deleted_record(path: str, reason: str, at_ns: int) -> dict[str, Any]:
 
 
 def append(store: Path, records: Sequence[Mapping[str, Any]]) -> None:
-    """Append records in one write and make them durable. Only ``keep`` calls this."""
-    path = store / NAME
-    before = read(store)
-    content = _lines(records, before.last_hash)
-    if not _ends_with_newline(path):
-        content = b"\n" + content
-    _append_durably(path, content)
+    """Append records in one write and make them durable. Only ``keep`` calls this.
+
+    Raises OSError when the disk does not take them: the manifest is then as it was before.
+    """
+    content = lines.encode(records, read(store).last_hash)
+    lines.append_durably(store / NAME, content)
 
 
-def _lines(records: Sequence[Mapping[str, Any]], last_hash: str) -> bytes:
-    lines = []
-    for record in records:
-        rest = json.dumps({"prev": last_hash, **record}, separators=(",", ":"))[1:].encode()
-        last_hash = hashlib.sha256(rest).hexdigest()
-        lines.append(b'{"hash":"%s",%s\n' % (last_hash.encode(), rest))
-    return b"".join(lines)
-
-
-def _ends_with_newline(path: Path) -> bool:
-    if not path.exists() or path.stat().st_size == 0:
-        return True
-    with path.open("rb") as file:
-        file.seek(-1, os.SEEK_END)
-        return file.read(1) == b"\n"
-
-
-def _append_durably(path: Path, content: bytes) -> None:
-    is_new = not path.exists()
-    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
-    try:
-        while content:
-            content = content[os.write(descriptor, content) :]
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
-    if is_new:
-        sync_folder(path.parent)
-
-
-def replace(store: Path, records: Sequence[Mapping[str, Any]]) -> None:
-    """Write a manifest anew, for a rebuild from the segments."""
+def replace(
+    store: Path, records: Sequence[Mapping[str, Any]], last_hash: str = lines.FIRST_HASH
+) -> None:
+    """Write a manifest anew, for a rebuild from the segments or to condense it."""
     temporary = store / f".{NAME}.tmp"
     temporary.unlink(missing_ok=True)
-    _append_durably(temporary, _lines(records, _FIRST_HASH))
+    lines.append_durably(temporary, lines.encode(records, last_hash))
     temporary.rename(store / NAME)
     sync_folder(store)
