@@ -34,7 +34,11 @@ _FIELDS: dict[str, dict[str, object]] = {
         "items": _TEXT,
         "input": _TEXT,
     },
-    CLOCK: {"offset_ns": _COUNT, "synchronised": {"type": ["boolean", "null"]}},
+    CLOCK: {
+        "offset_ns": _COUNT,
+        "synchronised": {"type": ["boolean", "null"]},
+        "boot_ns": {"type": ["integer", "null"]},
+    },
     COUNTERS: {
         "items": {
             "type": "array",
@@ -81,7 +85,7 @@ _FIELDS: dict[str, dict[str, object]] = {
         "who": _TEXT,
         "details": _TEXT,
     },
-    CURSOR: {"cursor": _TEXT},
+    CURSOR: {"cursor": _TEXT, "reader": _TEXT, "state": _TEXT},
 }
 
 

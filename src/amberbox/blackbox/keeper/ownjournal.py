@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import msgspec
@@ -18,6 +19,15 @@ from amberbox.core.types import Cursor
 
 Record = tuple[str, Mapping[str, Any]]
 """Reserved channel and values of one record."""
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """How far a reader of other journals has come, and what it has to know when it goes on."""
+
+    cursor: Cursor
+    reader: str = ""
+    state: str = ""
 
 
 class OwnJournal:
@@ -49,15 +59,16 @@ class OwnJournal:
         """Log time of a record that is written now."""
         return self._log.now_ns()
 
-    def write(self, records: Sequence[Record], cursor: Cursor | None = None) -> None:
+    def write(self, records: Sequence[Record], progress: Progress | None = None) -> None:
         """Write records, and how far others had been read for them, as one chunk.
 
         Raises OSError when the disk does not take them.
         """
         writer = self._opened()
         rows = [(topic, msgspec.json.encode(values)) for topic, values in records]
-        if cursor is not None:
-            values = {"cursor": cursor.to_json()}
+        if progress is not None:
+            values = {"cursor": progress.cursor.to_json(), "reader": progress.reader}
+            values["state"] = progress.state
             rows.append((reserved.CURSOR, msgspec.json.encode(values)))
         if writer.rotation_due(self._log.now_ns()):
             writer.rotate()
@@ -118,15 +129,16 @@ def event(kind: str, text: str, source: str = "", **details: Any) -> Record:
     return reserved.EVENT, {"kind": kind, "text": text, "source": source, "details": encoded}
 
 
-def last_cursor(store: Store, writer: str) -> Cursor | None:
-    """Return how far a writer had read others when it wrote last; None if it never said."""
+def last_progress(store: Store, writer: str, reader: str = "") -> Progress | None:
+    """Return how far a reader had come when the writer wrote it down last; None if it never did."""
     for journal in reversed(files_of(store, writer)):
         numbers = [n for n, s in journal.streams.items() if s.topic.name == reserved.CURSOR]
         newest = None
         for chunk in sound_chunks(journal) if numbers else ():
-            rows = np.flatnonzero(np.isin(chunk.channel, numbers))
-            if len(rows):
-                newest = chunk.messages(rows[-1:])[0]
+            for message in chunk.messages(np.flatnonzero(np.isin(chunk.channel, numbers))):
+                values = msgspec.json.decode(message)
+                newest = values if values.get("reader", "") == reader else newest
         if newest is not None:
-            return Cursor.from_json(msgspec.json.decode(newest)["cursor"])
+            cursor = Cursor.from_json(newest["cursor"])
+            return Progress(cursor, reader, newest.get("state", ""))
     return None
