@@ -22,6 +22,7 @@ _PATTERNS = {
     for kind, cell in (("int", _INT), ("float", _FLOAT), ("bool", _BOOL), ("comma", _COMMA))
 }
 _INT64 = range(-(2**63), 2**63)
+_FORMULA = ("=", "+", "-", "@", "\t", "\r")
 WORDS = ("NaN", "Infinity", "-Infinity")
 """How numbers that JSON does not have stand in a list."""
 
@@ -113,6 +114,11 @@ def convert(kind: str, cells: Sequence[str]) -> Sequence[Any]:
     return [one(cell) if cell else None for cell in cells]
 
 
+def _text(cell: str) -> str:
+    """Take away the mark that kept a spreadsheet from calculating the text."""
+    return cell[1:] if cell[0] == "'" and cell[1:2] in _FORMULA else cell
+
+
 def _comma(cell: str) -> float:
     return float(cell.replace(",", "."))
 
@@ -131,7 +137,7 @@ _CONVERTERS: Mapping[str, Callable[[str], Any]] = {
     "float": float,
     "comma": _comma,
     "bool": _bool,
-    "text": str,
+    "text": _text,
     "list<int>": json.loads,
     "list<float>": _floats,
     "list<text>": json.loads,

@@ -100,7 +100,10 @@ def find_dialect(file: FileBytes) -> Dialect:
         )
     padded = 0 < header.count(delimiter) == header.count(delimiter + " ")
     dialect = Dialect(delimiter, encoding, padded, (), lines.at, lines.number)
-    names = next(_reader(iter([header]), dialect))
+    try:
+        names = next(_reader(iter([header]), dialect))
+    except csv.Error as error:
+        raise AmberboxError(f"the header line cannot be read ({error})", "mend it") from None
     return Dialect(delimiter, encoding, padded, _names(names), lines.at, lines.number)
 
 
@@ -128,7 +131,9 @@ def _names(cells: list[str]) -> tuple[str, ...]:
 
 def _reader(lines: Iterator[str], dialect: Dialect) -> Iterator[list[str]]:
     csv.field_size_limit(max(csv.field_size_limit(), LARGEST_CELL))
-    return csv.reader(lines, delimiter=dialect.delimiter, skipinitialspace=dialect.padded)
+    return csv.reader(
+        lines, delimiter=dialect.delimiter, skipinitialspace=dialect.padded, strict=True
+    )
 
 
 def read_rows(file: FileBytes, dialect: Dialect, start: int, stop: int, line: int) -> Iterator[Row]:
