@@ -1,0 +1,135 @@
+"""Export: rows, messages and bytes per second for each format, and what memory it takes."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from amberbox.blackbox.exporting import ExportReport, View, export
+from amberbox.blackbox.follow.read import journals
+from amberbox.blackbox.journal.writer import JournalOptions, JournalWriter
+from amberbox.blackbox.query.record import Record
+from amberbox.blackbox.segments.build import build_segments
+from amberbox.blackbox.store import create_store
+from benchmarks import mix
+from benchmarks.common import Row, cpu_s
+
+SECONDS = 60
+FILES = 4
+FORMS = {"csv": "", "parquet": "", "mcap": ".mcap", "mcap-json": ".mcap", "bag": ".bag"}
+
+
+def measure() -> list[Row]:
+    """Export four minutes of the mix in every format, then measure the peers."""
+    with tempfile.TemporaryDirectory() as folder:
+        made = mix.make(SECONDS)
+        _record(Path(folder) / "store", made)
+        rows = [row for form in FORMS for row in _form(Path(folder), form)]
+        return [*rows, *_peers(Path(folder), made), *_memory(Path(folder))]
+
+
+def _record(store: Path, made: mix.Mix) -> None:
+    """Write the mix file after file, as one robot would, and build segments."""
+    opened = create_store(store)
+    options = JournalOptions(opened.folder("main"), opened.id, "main", 1, "bench000")
+    writer = JournalWriter(options)
+    channels = [
+        writer.channel(topic, {"item": f"item{n}", "source": "bench"})
+        for n, topic in enumerate(made.topics)
+    ]
+    numbers, times = np.array([channels[n] for n in made.numbers]), np.array(made.times_ns)
+    for number in range(FILES):
+        shifted = times + number * SECONDS * 10**9
+        for start in range(0, len(times), 400):
+            part = slice(start, start + 400)
+            writer.write(numbers[part], shifted[part], shifted[part], made.messages[part])
+        writer.rotate()
+    writer.close()
+    for journal in journals(store):
+        build_segments(store, journal)
+
+
+def _form(folder: Path, form: str) -> Iterator[Row]:
+    targets = (folder / f"{form}{number}{FORMS[form]}" for number in range(100))
+    reports: list[ExportReport] = []
+
+    def work() -> None:
+        reports.append(export(Record(folder / "store"), View(), next(targets), form))
+
+    seconds = cpu_s(work, 3)
+    unit = "messages" if form in ("mcap", "bag") else "rows"
+    yield Row(f"export to {form}", reports[0].total / seconds, f"{unit}/s CPU")
+    yield Row(f"export to {form}: bytes written", reports[0].bytes / 1e6 / seconds, "MB/s CPU")
+
+
+def _peers(folder: Path, made: mix.Mix) -> Iterator[Row]:
+    """Write the same messages from memory, so that reading is not counted against us."""
+    targets = (folder / f"peer{number}" for number in range(100))
+    for name, work in (("mcap", _with_mcap), ("rosbags", _with_rosbags)):
+        seconds = cpu_s(partial(_next, work, targets, made), 3)
+        rate = len(made.messages) / seconds
+        yield Row(f"the writer of {name} alone, from memory", rate, "messages/s CPU")
+
+
+def _next(work: Callable[[Path, mix.Mix], None], targets: Iterator[Path], made: mix.Mix) -> None:
+    work(next(targets), made)
+
+
+def _with_mcap(path: Path, made: mix.Mix) -> None:
+    from mcap.writer import CompressionType, Writer
+
+    writer = Writer(str(path), compression=CompressionType.ZSTD)
+    writer.start("ros1")
+    channels = []
+    for topic in made.topics:
+        assert topic.schema is not None
+        schema = writer.register_schema(topic.schema.name, "ros1msg", topic.schema.data)
+        channels.append(writer.register_channel(topic.name, "ros1", schema))
+    for number, at_ns, data in zip(made.numbers, made.times_ns, made.messages, strict=True):
+        writer.add_message(channels[number], at_ns, data, at_ns)
+    writer.finish()  # type: ignore[no-untyped-call]  # mcap leaves it so
+
+
+def _with_rosbags(path: Path, made: mix.Mix) -> None:
+    from rosbags.rosbag1 import Writer
+
+    with Writer(path) as writer:
+        connections = [
+            writer.add_connection(topic.name, name, typestore=mix.store())
+            for topic, name in zip(made.topics, mix.RATES_HZ, strict=True)
+        ]
+        for number, at_ns, data in zip(made.numbers, made.times_ns, made.messages, strict=True):
+            writer.write(connections[number], at_ns, data)
+
+
+_CHILD = """
+import resource, sys
+from pathlib import Path
+from amberbox.blackbox.exporting import View, export
+from amberbox.blackbox.query.record import Record
+start = (1_700_000_000 * 10**9, 1_700_000_000 * 10**9 + int(sys.argv[4]) * 10**9)
+export(Record(Path(sys.argv[1])), View(windows=[start]), Path(sys.argv[2]), sys.argv[3])
+print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1000)
+"""
+
+
+def _memory(folder: Path) -> Iterator[Row]:
+    """Compare the peak memory of exporting one file and all of them."""
+    for form in ("mcap", "mcap-json", "csv"):
+        run = partial(_peak_mb, folder, form)
+        one, all_ = run(SECONDS), run(SECONDS * FILES)
+        name = f"memory to export {FILES} min to {form}"
+        yield Row(name, all_, "MB", "1 min", one / all_, "peak, Python and libraries included")
+
+
+def _peak_mb(folder: Path, form: str, seconds: int) -> float:
+    target = folder / f"memory-{form}-{seconds}{FORMS[form]}"
+    command = [sys.executable, "-c", _CHILD, str(folder / "store"), str(target), form, str(seconds)]
+    done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
+    return float(done.stdout)

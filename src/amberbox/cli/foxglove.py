@@ -1,0 +1,98 @@
+"""Serve a record, live or a time range, to Foxglove and other viewers."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import threading
+
+from amberbox.blackbox.foxglove.frames import ColumnFrames, MessageFrames, span_of
+from amberbox.blackbox.foxglove.live import LiveColumns, LiveMessages
+from amberbox.blackbox.foxglove.playback import Playback
+from amberbox.blackbox.foxglove.server import HOST, PORT, Listener, Server, is_loopback
+from amberbox.blackbox.where import store_path
+from amberbox.cli._output import add_range_only, opened, tell
+from amberbox.core.errors import UsageError
+from amberbox.core.timetext import format_time
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the verb's arguments."""
+    parser.add_argument("where", metavar="WHERE", help="robot folder, store or recording file")
+    add_range_only(parser)
+    parser.add_argument("--live", action="store_true", help="messages as they are recorded")
+    parser.add_argument(
+        "--item", action="append", default=[], metavar="NAME",
+        help="data item, again for more; all without",
+    )  # fmt: skip
+    parser.add_argument(
+        "--columns", action="store_true", help="flat columns as JSON, for tools without the types"
+    )
+    parser.add_argument(
+        "--speed", type=float, default=1.0, metavar="X", help="of the playback (default: 1)"
+    )
+    parser.add_argument("--port", type=int, default=PORT, help=f"default: {PORT}")
+    parser.add_argument("--host", default=HOST, help=f"address to listen on (default: {HOST})")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Serve until Ctrl-C."""
+    _check(args)
+    stop = threading.Event()
+    try:
+        if args.live:
+            _live(args, stop)
+        else:
+            _range(args, stop)
+    except KeyboardInterrupt:
+        stop.set()
+        print(file=sys.stderr)
+    return 0
+
+
+def _check(args: argparse.Namespace) -> None:
+    if args.live and (args.from_ is not None or args.to is not None):
+        raise UsageError("--live goes on from now", "leave out --from and --to, or --live")
+    if not 0 < args.speed <= 1000:
+        raise UsageError("--speed must be above 0, at most 1000", "1 is the original speed")
+    if not 0 <= args.port < 1 << 16:
+        raise UsageError(f"there is no port {args.port}", "choose one from 1024 to 65535")
+    if not is_loopback(args.host):
+        tell([f"everybody who reaches {args.host}:{args.port} can read this record: the protocol "
+              "has no login"])  # fmt: skip
+
+
+def _live(args: argparse.Namespace, stop: threading.Event) -> None:
+    path, server = store_path(args.where), Server(Listener())
+    source = (LiveColumns if args.columns else LiveMessages)(path, args.item)
+    source.prepare(server)
+    server.start(f"amberbox {path.name}", args.host, args.port)
+    try:
+        _greet(args, server, "live")
+        source.run(server, stop)
+    finally:
+        server.stop()
+
+
+def _range(args: argparse.Namespace, stop: threading.Event) -> None:
+    with opened(args.where) as record:
+        window = record.time_ns(args.from_), record.time_ns(args.to)
+        frames = (ColumnFrames if args.columns else MessageFrames)(record, args.item, window)
+        span = span_of(frames.looking.catalogue, window)
+        tell(frames.report.missing)
+        playback = Playback(frames, span, args.speed)
+        server = Server(Listener(playback.control))
+        for topic in frames.topics:
+            server.advertise(topic)
+        server.start(f"amberbox {record.path.name}", args.host, args.port, span)
+        try:
+            _greet(args, server, f"{format_time(span[0])} to {format_time(span[1])}")
+            playback.run(server, stop)
+        finally:
+            server.stop()
+
+
+def _greet(args: argparse.Namespace, server: Server, what: str) -> None:
+    host = f"[{args.host}]" if ":" in args.host else args.host
+    print(f"serving {args.where}, {what}, at ws://{host}:{server.websocket.port}")
+    print("open this address in Foxglove or Lichtblick; Ctrl-C ends", flush=True)
