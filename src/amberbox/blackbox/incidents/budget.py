@@ -1,0 +1,120 @@
+"""How much incidents hold of the record, and how much they may."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from amberbox.blackbox.follow.follow import RECORDED
+from amberbox.blackbox.incidents.extent import extent
+from amberbox.blackbox.incidents.incident import RING, Incident, folder_of, load_all
+from amberbox.blackbox.keeper.options import KeeperOptions
+from amberbox.blackbox.keeper.usage import bytes_of, total_bytes
+from amberbox.blackbox.segments import manifest
+from amberbox.blackbox.segments.manifest import Part
+from amberbox.blackbox.store import Store
+
+_RAW = ("main", "bulk")
+Held = dict[tuple[int, int], int]
+"""Bytes of each file, by device and inode: what several incidents hold counts once."""
+
+
+@dataclass(frozen=True, slots=True)
+class Refusal:
+    """Why a window was not pinned."""
+
+    reason: str
+
+
+def held_files(store: Store, incidents: Iterable[Incident]) -> Held:
+    """Return the files that incidents hold: journals, segments, copies of the ring."""
+    pinned = [incident for incident in incidents if incident.is_pinned]
+    return _sizes([
+        *_copies(store, pinned),
+        *_journals(store, pinned),
+        *(path for path, _ in _segments(store, pinned)),
+    ])  # fmt: skip
+
+
+def held_bytes(store: Store, incidents: Iterable[Incident]) -> int:
+    """Return how much incidents hold, each file once."""
+    return sum(held_files(store, incidents).values())
+
+
+def allowed_bytes(store: Store, options: KeeperOptions) -> int:
+    """Return how much incidents may hold."""
+    share = total_bytes(store.path) * options.quota_percent / 100
+    limit = share if options.quota is None else min(share, options.quota)
+    return int(options.incident_share * limit)
+
+
+def pinned_journals(store: Store) -> frozenset[str]:
+    """Name the journals (``folder/file``) whose rows, raw or as columns, are pinned."""
+    pinned = [incident for incident in load_all(store) if incident.is_pinned]
+    raw = {f"{path.parent.name}/{path.name}" for path in _journals(store, pinned, RECORDED)}
+    columns = {p.journal for _, parts in _segments(store, pinned) for p in parts}
+    return frozenset(raw | columns)
+
+
+def refused_by_budget(
+    store: Store, incident: Incident, known: Sequence[Incident], options: KeeperOptions
+) -> Refusal | None:
+    """Say why there is no room for one more incident, or for one that grows; None if there is."""
+    others = [other for other in known if other.id != incident.id]
+    allowed = allowed_bytes(store, options)
+    held = held_bytes(store, [*others, incident]) + _still_in_ring(store, incident)
+    if held <= allowed:
+        return None
+    return Refusal(f"incidents would hold {held} bytes, {allowed} are allowed; release some")
+
+
+def _still_in_ring(store: Store, incident: Incident) -> int:
+    """Bytes of the ring's journals that are about to be held."""
+    here = {path.name for path in (folder_of(store, incident.id) / RING).glob("*.mcap")}
+    files = (path for path in store.folder("ring").glob("*.mcap") if path.name not in here)
+    return sum(_sizes(path for path in files if _is_held(path, [incident])).values())
+
+
+def _copies(store: Store, incidents: Sequence[Incident]) -> Iterator[Path]:
+    for incident in incidents:
+        yield from (folder_of(store, incident.id) / RING).glob("*")
+
+
+def _journals(
+    store: Store, incidents: Sequence[Incident], writers: Sequence[str] = _RAW
+) -> Iterator[Path]:
+    for writer in writers:
+        for path in store.folder(writer).glob("*.mcap"):
+            if _is_held(path, incidents):
+                yield path
+
+
+def _is_held(path: Path, incidents: Sequence[Incident]) -> bool:
+    found = extent(path) if incidents else None
+    return found is not None and any(
+        incident.holds(found.run, found.start_ns, found.end_ns) for incident in incidents
+    )
+
+
+def _segments(store: Store, incidents: Sequence[Incident]) -> Iterator[tuple[Path, Sequence[Part]]]:
+    """Give the segments that are held, and their parts that lie in a window."""
+    for segments in manifest.read(store.path).segments.values() if incidents else ():
+        for segment in segments:
+            inside = [part for part in segment.parts if _meets(part, incidents)]
+            if inside:
+                yield store.path / segment.path, inside
+
+
+def _meets(part: Part, incidents: Sequence[Incident]) -> bool:
+    return any(incident.holds(part.run, part.from_ns, part.to_ns) for incident in incidents)
+
+
+def _sizes(paths: Iterable[Path]) -> Held:
+    found: Held = {}
+    for path in paths:
+        with suppress(FileNotFoundError):
+            status = path.stat()
+            found[status.st_dev, status.st_ino] = bytes_of(status)
+    return found

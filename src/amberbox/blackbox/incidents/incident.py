@@ -1,0 +1,221 @@
+"""An incident: a window of the record that is kept, why, and who wanted it."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Collection
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import msgspec
+
+from amberbox.blackbox.store import INCIDENTS, Store, replace_file
+from amberbox.core.clock import NS
+from amberbox.core.config import did_you_mean
+from amberbox.core.errors import UsageError
+from amberbox.core.timetext import format_time
+
+FILE = "incident.json"
+RING = "ring"
+State = Literal["open", "complete", "released"]
+_SLEW_NS = 2 * NS
+"""Corrected times may differ from log time plus offset by smaller steps of the wall clock."""
+
+
+class At(NamedTuple):
+    """A moment of the record: log time within a run."""
+
+    run: int
+    log_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class Span:
+    """A stretch of a run without a step of the clock, in log time, both ends inclusive.
+
+    ``offset_ns`` leads from log time to the time of receipt, as far as was known when it was made.
+    """
+
+    run: int
+    from_ns: int
+    to_ns: int
+    offset_ns: int = 0
+
+    def meets(self, run: int, from_ns: int, to_ns: int) -> bool:
+        """Tell whether rows of ``[from_ns, to_ns]`` (log time) may lie in it."""
+        return run == self.run and from_ns <= self.to_ns and to_ns >= self.from_ns
+
+    def received(self) -> tuple[int, int]:
+        """Return the range in times of receipt, ``[from, to)``."""
+        return self.from_ns + self.offset_ns, self.to_ns + self.offset_ns + 1
+
+
+@dataclass(frozen=True, slots=True)
+class Reason:
+    """Why a window is kept; ``at_ns`` is the time of receipt that it is about.
+
+    ``key`` tells a trigger's firing from every other, so that none counts twice.
+    """
+
+    at_ns: int
+    text: str
+    who: str = ""
+    trigger: str = ""
+    key: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Incident:
+    """A window of all items that is not deleted before it is confirmed or released.
+
+    ``spans`` are what is pinned; while it is ``open``, so is everything from ``since`` on, and the
+    window ends ``after_ns`` later. ``told`` is the state that the keeper's journal knows of.
+    """
+
+    id: str
+    reasons: tuple[Reason, ...]
+    from_ns: int
+    to_ns: int
+    made_ns: int
+    versions: dict[str, str]
+    spans: tuple[Span, ...]
+    since: At
+    after_ns: int
+    state: State = "open"
+    confirmed: bool = False
+    told: str = ""
+    bytes: int = 0
+
+    @property
+    def is_pinned(self) -> bool:
+        """Tell whether it holds anything."""
+        return self.state != "released"
+
+    @property
+    def text(self) -> str:
+        """Its reasons in one line."""
+        return "; ".join(dict.fromkeys(reason.text for reason in self.reasons if reason.text))
+
+    @property
+    def who(self) -> str:
+        """Who marked it, people and triggers."""
+        return ", ".join(dict.fromkeys(r.who or r.trigger for r in self.reasons))
+
+    @property
+    def trigger(self) -> str:
+        """The trigger that made it; empty for a person."""
+        return self.reasons[0].trigger
+
+    def holds(self, run: int, from_log_ns: int, to_log_ns: int) -> bool:
+        """Tell whether rows that a recorder wrote in ``[from, to]`` of log time are pinned."""
+        if not self.is_pinned:
+            return False
+        if self.state == "open" and (run, to_log_ns) >= self.since:
+            return True
+        return any(span.meets(run, from_log_ns, to_log_ns) for span in self.spans)
+
+    def holds_received(self, run: int, from_ns: int, to_ns: int) -> bool:
+        """Tell the same by times of receipt, rather once too often."""
+        if not self.is_pinned:
+            return False
+        if self.state == "open" and run > self.since.run:
+            return True
+        low_ns, high_ns = from_ns - _SLEW_NS, to_ns + _SLEW_NS
+        spans = [replace(s, to_ns=1 << 62) if self._grows(s) else s for s in self.spans]
+        return any(s.meets(run, low_ns - s.offset_ns, high_ns - s.offset_ns) for s in spans)
+
+    def _grows(self, span: Span) -> bool:
+        return self.state == "open" and span is self.spans[-1]
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the incident for programs: times are RFC 3339 strings."""
+        reasons = [
+            {"at": format_time(r.at_ns), "text": r.text, "who": r.who, "trigger": r.trigger}
+            for r in self.reasons
+        ]
+        return {
+            "id": self.id,
+            "state": self.state,
+            "confirmed": self.confirmed,
+            "from": format_time(self.from_ns),
+            "to": format_time(self.to_ns),
+            "made": format_time(self.made_ns),
+            "reasons": reasons,
+            "who": self.who,
+            "trigger": self.trigger,
+            "versions": self.versions,
+        }
+
+
+def folder_of(store: Store, incident_id: str) -> Path:
+    """Return the folder of an incident."""
+    return store.path / INCIDENTS / incident_id
+
+
+def load_all(store: Store) -> list[Incident]:
+    """Return the incidents of a store, released ones included, in order of their windows.
+
+    A file that cannot be read holds no window, but what was copied for it stays.
+    """
+    read = (_read(path) for path in _files(store))
+    found = [incident for incident in read if incident is not None]
+    return sorted(found, key=lambda incident: (incident.from_ns, incident.id))
+
+
+def unreadable(store: Store) -> list[Path]:
+    """Return the files of incidents that cannot be read."""
+    return [path for path in _files(store) if path.exists() and _read(path) is None]
+
+
+def _files(store: Store) -> list[Path]:
+    return sorted((store.path / INCIDENTS).glob(f"[!.]*/{FILE}"))
+
+
+def _read(path: Path) -> Incident | None:
+    with suppress(FileNotFoundError):
+        status = path.stat()
+        return _decoded(path, status.st_mtime_ns, status.st_ino)
+    return None
+
+
+@lru_cache(maxsize=4096)
+def _decoded(path: Path, _mtime_ns: int, _inode: int) -> Incident | None:
+    with suppress(msgspec.MsgspecError):
+        return msgspec.json.decode(path.read_bytes(), type=Incident)
+    return None
+
+
+def load(store: Store, incident_id: str) -> Incident:
+    """Return one incident; raises UsageError when there is none of this id."""
+    known = {incident.id: incident for incident in load_all(store)}
+    if incident_id in known:
+        return known[incident_id]
+    raise UsageError(
+        f"there is no incident '{incident_id}'{did_you_mean(incident_id, known)}",
+        f"amberbox incident list {store.path}",
+    )
+
+
+def encoded(incident: Incident) -> str:
+    """Write an incident as its file has it."""
+    return msgspec.json.format(msgspec.json.encode(incident), indent=2).decode()
+
+
+def save(store: Store, incident: Incident) -> Incident:
+    """Replace the file of an incident that is there; whoever calls holds the pin lock."""
+    replace_file(folder_of(store, incident.id) / FILE, encoded(incident))
+    return incident
+
+
+def remove_leftovers(store: Store) -> None:
+    """Remove what a process that died while pinning has left; whoever calls holds the pin lock."""
+    for path in (store.path / INCIDENTS).glob(".*"):
+        shutil.rmtree(path, ignore_errors=True)
+
+
+def triggered(incidents: Collection[Incident], key: str) -> Incident | None:
+    """Return the incident that a firing has been taken into, if it has."""
+    return next((i for i in incidents if any(r.key == key for r in i.reasons)), None)
