@@ -12,6 +12,8 @@ from rosbags.typesys import Stores, get_typestore
 
 from amberbox.cli.main import main
 from amberbox.testing.box import COUNT, ManualBox, number
+from tests.blackbox.formats.test_mongodump import write_dump
+from tests.blackbox.formats.ulog_file import flight
 
 TYPES = get_typestore(Stores.ROS1_NOETIC)
 Capture = pytest.CaptureFixture[str]
@@ -119,3 +121,55 @@ def test_a_journal_file_is_a_record_like_any_other(tmp_path: Path, capsys: Captu
     (journal,) = (box.store / "journal").glob("*.mcap")
     assert main(["query", str(journal), "ros_count", "--format", "csv"]) == 0
     assert len(capsys.readouterr().out.splitlines()) == 21
+
+
+def test_inputs_of_many_kinds_in_one_call(bag: Path, tmp_path: Path, capsys: Capture) -> None:
+    dump = write_dump(tmp_path / "dump", 5)
+    log = flight(20, with_gps=False).write(tmp_path / "flight.ulg")
+    (tmp_path / "weather.csv").write_text("when_s,wind,time\n3,2.5,x\n4,3.5,y\n")
+    inputs = [str(path) for path in (bag, dump, log, tmp_path / "weather.csv")]
+    store = str(tmp_path / "store")
+    options = ["--time", "when_s", "--start", "2018-12-10T12:00:00Z", "--store", store]
+    assert main(["import", *inputs, *options]) == 0
+    printed = capsys.readouterr().out
+    assert "  ros_joy: 5, typed (sensor_msgs/Joy, built in)" in printed
+    assert "  ros_joy.bson: 5 documents = 5 messages + 0 refused" in printed
+    assert "  weather: 2, from a table: 1 float, 1 text" in printed
+    assert main(["items", store, "--json"]) == 0
+    items = {item["name"]: item for item in json.loads(capsys.readouterr().out)}
+    assert items["weather"]["first"] == "2018-12-10T12:00:00.000000000Z"
+    assert items["ulog_sensor_accel"]["first"] == "2018-12-10T12:00:00.000000000Z"
+    assert items["ros_ropod_odom"]["stamp_offset_s"] == pytest.approx(-84.4)
+
+
+def test_definitions_and_topics_are_chosen(tmp_path: Path, capsys: Capture) -> None:
+    dump = write_dump(tmp_path / "dump", 5)
+    arguments = ["import", str(dump), "--store", str(tmp_path / "store")]
+    assert main([*arguments, "--msg", str(tmp_path / "none")]) == 2
+    assert "there is no folder" in capsys.readouterr().err
+    assert main([*arguments, "--start", "soon"]) == 2
+    assert "not a time" in capsys.readouterr().err
+    assert main([*arguments, "--topics", "/joy", "/marker", "--json"]) == 0
+    (report,) = json.loads(capsys.readouterr().out)
+    assert report["items"] == {"ros_joy": 5, "ros_marker": 5}
+    assert report["kinds"]["ros_joy"] == "typed (sensor_msgs/Joy, built in)"
+    assert len(report["accounts"]) == 4
+
+
+def test_a_dump_is_a_record_like_any_other(tmp_path: Path, capsys: Capture) -> None:
+    dump = write_dump(tmp_path / "dump", 5)
+    assert main(["items", str(dump)]) == 0
+    assert "ros_ropod_odom" in capsys.readouterr().out
+
+
+@pytest.mark.needs_data
+def test_the_84_seconds_of_the_nominal_dump_are_told(
+    shared_data: Path, tmp_path: Path, capsys: Capture
+) -> None:
+    store = str(tmp_path / "store")
+    assert main(["import", str(shared_data / "ropod/nominal"), "--store", store]) == 0
+    capsys.readouterr()
+    assert main(["items", store]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    (odom,) = (line.split() for line in lines if line.startswith("ros_ropod_odom"))
+    assert odom[2] == "838" and "-84.4238" in odom

@@ -14,6 +14,7 @@ from amberbox.core.clock import NS
 from amberbox.core.types import Schema
 
 KIND = "flat columns of an export"
+MALFORMED = "malformed"
 _TIMESTAMP, _RECEIVED, _STAMP = "timestamp", "received", "stamp"
 _PARENT = "parent_seq"
 _STAMPS = ("header_stamp", _STAMP)
@@ -45,7 +46,8 @@ def own_stamp(columns: Mapping[str, Any]) -> str:
 def rewriter(columns: Mapping[str, Any]) -> Rewrite:
     """Make a function that turns the rows of a table into documents.
 
-    What JSON does not have is put back: null is NaN among numbers, Base64 is binary.
+    What JSON does not have is put back: null is NaN among numbers, Base64 is binary. The function
+    raises ValueError for what is no such row.
     """
     repairs = {name: repair for name, kind in columns.items() if (repair := _repair(kind))}
     return partial(_rewritten, repairs, own_stamp(columns) not in columns)
@@ -82,5 +84,10 @@ def _rewritten(
         if adds_stamp and stamp_ns != log_ns:
             row[_STAMP] = at["sec"] * NS + at["nsec"]
         return msgspec.msgpack.encode(row)
-    except (msgspec.DecodeError, KeyError, TypeError, ValueError, AttributeError):
-        return message  # it is kept as it came and told as malformed
+    except (msgspec.DecodeError, KeyError, TypeError, AttributeError) as error:
+        raise ValueError(f"no row of an export: {error}") from None
+
+
+def malformed(message: bytes) -> bytes:
+    """Keep what is no row as the only variable of a document."""
+    return msgspec.msgpack.encode({MALFORMED: message})

@@ -9,9 +9,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from amberbox.blackbox.formats import flat_json
 from amberbox.blackbox.formats.compression import unpack
 from amberbox.blackbox.formats.definitions import Definitions
-from amberbox.blackbox.formats.flat_json import KIND, Rewrite, flat_columns, own_stamp, rewriter
 from amberbox.blackbox.formats.recording import (
     Damage,
     Origin,
@@ -44,7 +44,7 @@ class McapFile:
     buffer: Any
     close: Callable[[], None]
     topic_of: dict[int, int] = field(default_factory=dict)
-    rewrite: dict[int, Rewrite] = field(default_factory=dict)
+    rewrite: dict[int, flat_json.Rewrite] = field(default_factory=dict)
     torn: Chunk | None = None
 
     def damaged(self, offset: int, length: int, reason: str) -> None:
@@ -127,13 +127,13 @@ def add_topics(file: McapFile, table: TopicTable, definitions: Definitions) -> N
         schema = summary.schemas.get(channel.schema_id)
         if schema is not None and not schema.data and channel.message_encoding == "cdr":
             schema = definitions.schema(schema.name, partial(_sample, file, number))
-        columns = flat_columns(channel, schema)
+        columns = flat_json.flat_columns(channel, schema)
         if columns is None:
             topic = Topic(channel.topic, channel.message_encoding, schema, _is_latched(channel))
             file.topic_of[number] = table.add(topic, _origin(channel))
         else:
-            file.rewrite[number] = rewriter(columns)
-            origin = Origin("", own_stamp(columns), KIND)
+            file.rewrite[number] = flat_json.rewriter(columns)
+            origin = Origin("", flat_json.own_stamp(columns), flat_json.KIND)
             file.topic_of[number] = table.add(Topic(channel.topic, "msgpack"), origin)
 
 
@@ -210,8 +210,16 @@ def _messages(file: McapFile, chunk: Chunk) -> list[RecordedMessage]:
 
 def _rewrite(file: McapFile, chunk: Chunk, messages: list[RecordedMessage]) -> None:
     """Put back what an export had to write differently."""
+    broken = 0
     for channel, rewrite in file.rewrite.items():
         for place in chunk.rows_of(channel).tolist():
             topic, log_ns, publish_ns, data = messages[place]
-            data = rewrite(data, log_ns, publish_ns or log_ns)
+            try:
+                data = rewrite(data, log_ns, publish_ns or log_ns)
+            except ValueError:
+                broken += 1
+                data = flat_json.malformed(data)
             messages[place] = RecordedMessage(topic, log_ns, publish_ns, data)
+    if broken:
+        reason = f"{broken} rows are damaged and kept as {flat_json.MALFORMED!r}"
+        file.damaged(chunk.offset, chunk.end - chunk.offset, reason)

@@ -143,7 +143,7 @@ class Record:
 
 
 def open(where: str | Path) -> Record:
-    """Open a robot folder, a store, or recording files (bag, MCAP), for reading.
+    """Open a robot folder, a store, or a recording (bag, MCAP, ULog, CSV, mongodump), for reading.
 
     Raises UsageError when there is none of these at ``where``.
     """
@@ -156,7 +156,8 @@ def open(where: str | Path) -> Record:
 def _is_recording(path: Path) -> bool:
     if is_store(path) or (path / "robot.yaml").exists() or (path / "black_box.yaml").exists():
         return False
-    return path.is_file() or (path / "metadata.yaml").is_file()
+    bag, dump = path / "metadata.yaml", path.glob("*.bson*")
+    return path.is_file() or bag.is_file() or next(dump, None) is not None
 
 
 def _import(path: Path) -> Record:
