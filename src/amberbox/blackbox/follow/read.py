@@ -16,7 +16,7 @@ from amberbox.blackbox.follow.batching import Origin, Stream, make_batch, stream
 from amberbox.blackbox.journal import reserved
 from amberbox.blackbox.journal.buffer import open_buffer
 from amberbox.blackbox.journal.chunk import Chunk, sequences
-from amberbox.blackbox.journal.clocktable import ClockTable
+from amberbox.blackbox.journal.clocktable import ClockReading, ClockTable, simplified
 from amberbox.blackbox.journal.scan import ChunkPlace, FileScan, read_chunk, scan
 from amberbox.blackbox.journal.walk import Damage
 from amberbox.blackbox.store import Store, open_store
@@ -51,6 +51,7 @@ class JournalFile:
     damage: Sequence[Damage] = ()
     store_id: str = ""
     walked: bool = False
+    readings: tuple[ClockReading, ...] = ()
 
     @property
     def rows(self) -> int:
@@ -115,7 +116,9 @@ def describe(found: FileScan, name: str) -> JournalFile:
         store_id=start.get("store_id", ""),
         walked=found.walked,
     )
-    return replace(journal, clock=_clock_points(journal, _places_of_clock(found)))
+    readings = tuple(_clock_readings(journal, _places_of_clock(found)))
+    points = [(reading.log_ns, reading.offset_ns) for reading in readings]
+    return replace(journal, clock=simplified(points), readings=readings)
 
 
 def _end_seq(found: FileScan, first_seq: int) -> int:
@@ -140,15 +143,11 @@ def _places_of_clock(found: FileScan) -> list[ChunkPlace]:
     return [p for p, c in indexed if any(n in numbers for n, _ in c.index_offsets)]
 
 
-def _clock_points(
-    journal: JournalFile, places: Sequence[ChunkPlace]
-) -> tuple[tuple[int, int], ...]:
-    points: list[tuple[int, int]] = []
+def _clock_readings(journal: JournalFile, places: Sequence[ChunkPlace]) -> Iterator[ClockReading]:
     for log_ns, values in _own_messages(journal, reserved.CLOCK, places):
-        offset = int(values["offset_ns"])
-        if not points or points[-1][1] != offset:
-            points.append((log_ns, offset))
-    return tuple(points)
+        yield ClockReading(
+            log_ns, int(values["offset_ns"]), values.get("synchronised"), values.get("boot_ns")
+        )
 
 
 def _own_messages(

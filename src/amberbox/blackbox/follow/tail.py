@@ -22,7 +22,7 @@ from amberbox.blackbox.follow.read import (
 from amberbox.blackbox.journal import reserved
 from amberbox.blackbox.journal.buffer import open_buffer
 from amberbox.blackbox.journal.chunk import Chunk, sequences
-from amberbox.blackbox.journal.clocktable import ClockTable
+from amberbox.blackbox.journal.clocktable import ClockTable, held_points
 from amberbox.blackbox.journal.head import Head, read_head
 from amberbox.blackbox.journal.scan import ChunkPlace, start_record
 from amberbox.blackbox.journal.summary import read_summary
@@ -89,7 +89,7 @@ class WriterTail:
         self._live = None
         if journal.places:
             yield from self._enter(journal.run, journal.first_seq, journal)
-        clock = ClockTable(journal.clock)
+        clock = ClockTable(held_points(journal.readings), held=True)
         skip_before = _skipper(journal, self.run, self.seq)
         for chunk in sound_chunks(journal, skip_before):
             yield from self._deliver(chunk, journal, clock, journal.streams)
@@ -136,7 +136,9 @@ class WriterTail:
         journal = _outline(live, self.writer, run, number)
         if len(chunk):
             yield from self._enter(run, live.first_seq, journal)
-            yield from self._deliver(chunk, journal, ClockTable(live.clock), live.streams)
+            yield from self._deliver(
+                chunk, journal, ClockTable(live.clock, held=True), live.streams
+            )
 
     def _enter(self, run: int, first_seq: int, journal: JournalFile) -> Iterator[Gap]:
         """Go over to another run, or to a later file after some were deleted."""
@@ -221,7 +223,7 @@ class WriterTail:
         if (head.run, head.next_seq) != (self.run, self.seq):
             return
         points = self._live.clock if self._live else []
-        received = int(ClockTable(points).received(np.array([head.watermark_ns]))[0])
+        received = int(ClockTable(points, held=True).received(np.array([head.watermark_ns]))[0])
         yield from self._mark(received, head.durable_seq)
 
     def _mark(self, received_ns: int, durable_seq: int) -> Iterator[Watermark]:

@@ -4,18 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Collection, Container, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 
 from amberbox.blackbox.follow.read import JournalFile, journal_file
+from amberbox.blackbox.journal.clocktable import ClockReading
+from amberbox.blackbox.query.clockbook import UNKNOWN_BOOT, ClockBook, JournalClock, book_of
 from amberbox.blackbox.query.variables import closest
 from amberbox.blackbox.segments import manifest as mf
 from amberbox.blackbox.segments.build import selection_of
 from amberbox.blackbox.segments.columns import wider
+from amberbox.blackbox.segments.entries import Sealed
 from amberbox.blackbox.segments.flat import TableSchema, tables_of
 from amberbox.blackbox.segments.manifest import Manifest, Segment
-from amberbox.blackbox.store import open_store
+from amberbox.blackbox.store import Store, open_store
 from amberbox.core.errors import AmberboxError, UsageError
 from amberbox.core.types import Column
 
@@ -32,12 +35,18 @@ class Catalogue:
     manifest: Manifest
     with_segments: bool = True
     existing: tuple[str, ...] = ()
+    book: ClockBook = field(default_factory=ClockBook)
 
     def journals(self, skip: Container[str]) -> Iterator[JournalFile]:
-        """Open the journal files that are not named in ``skip``, in the order of writing."""
+        """Open the journal files that are not named in ``skip``, in the order of writing.
+
+        Their clocks are corrected by what has become known since.
+        """
         for name in self.existing:
             if name not in skip:
-                yield journal_file(open_store(self.store).journal_path(name), name)
+                journal = journal_file(open_store(self.store).journal_path(name), name)
+                points = self.book.points(name)
+                yield journal if points is None else replace(journal, clock=points)
 
     @property
     def done(self) -> Collection[str]:
@@ -116,7 +125,56 @@ def look(store: Path, *, with_segments: bool = True) -> Catalogue:
         for writer in opened.writers()
         for path in opened.journal_files(writer)
     )
-    return Catalogue(store, mf.read(store), with_segments, existing)
+    manifest = mf.read(store)
+    book = book_of(_clocks(opened, manifest, existing))
+    return Catalogue(store, corrected(manifest, book), with_segments, existing, book)
+
+
+def _clocks(store: Store, manifest: Manifest, existing: Sequence[str]) -> Iterator[JournalClock]:
+    """Give what journals say about clocks: by the manifest if they are sealed, else by the file."""
+    for sealed in manifest.sealed.values():
+        yield _sealed_clock(sealed)
+    for name in existing:
+        if name not in manifest.sealed:
+            with suppress(FileNotFoundError):  # deleted meanwhile
+                journal = journal_file(store.journal_path(name), name)
+                yield JournalClock(name, boot_in(name), journal.run, journal.readings)
+
+
+def _sealed_clock(sealed: Sealed) -> JournalClock:
+    base_ns, last = sealed.boot_base_ns, len(sealed.clock) - 1
+    readings = tuple(
+        ClockReading(
+            log_ns, offset_ns, sealed.synchronised if number == last else None,
+            None if base_ns is None else log_ns - base_ns,
+        )
+        for number, (log_ns, offset_ns) in enumerate(sealed.clock)
+    )  # fmt: skip
+    return JournalClock(sealed.journal, boot_in(sealed.journal), sealed.run, readings)
+
+
+def boot_in(journal: str) -> str:
+    """Read from a journal's file name in which boot it was written."""
+    parts = journal.rpartition("/")[2].split("-")
+    return parts[1] if len(parts) == 3 else UNKNOWN_BOOT
+
+
+def corrected(manifest: Manifest, book: ClockBook) -> Manifest:
+    """Return the manifest with the clocks of its segments as they are known now."""
+    segments = {
+        table: tuple(_corrected(segment, book) for segment in found)
+        for table, found in manifest.segments.items()
+    }
+    return replace(manifest, segments=segments)
+
+
+def _corrected(segment: Segment, book: ClockBook) -> Segment:
+    if not any(part.journal in book.journals for part in segment.parts):
+        return segment
+    parts = tuple(
+        replace(part, clock=book.points(part.journal) or part.clock) for part in segment.parts
+    )
+    return replace(segment, parts=parts)
 
 
 def journal_tables(journal: JournalFile) -> Iterator[TableSchema]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,7 @@ import numpy as np
 
 from amberbox.blackbox.follow.read import JournalFile, batches_of, journal_file
 from amberbox.blackbox.journal import reserved
-from amberbox.blackbox.journal.clocktable import ClockTable
+from amberbox.blackbox.journal.clocktable import ClockPoints, ClockTable
 from amberbox.blackbox.query.catalogue import Catalogue, item_of, union
 from amberbox.blackbox.segments.build import median
 from amberbox.blackbox.segments.flat import Flat, flatten
@@ -129,13 +129,15 @@ def _share_of_part(part: Part) -> _Share:
 
 def _journal_shares(journal: JournalFile) -> dict[str, _Share]:
     status = journal.path.stat()
-    return _counted(journal.path, journal.name, status.st_mtime_ns, status.st_size)
+    return _counted(journal.path, journal.name, journal.clock, status.st_mtime_ns, status.st_size)
 
 
 @lru_cache(maxsize=256)
-def _counted(path: Path, name: str, _mtime_ns: int, _size: int) -> dict[str, _Share]:
-    """Count a journal's rows by unrolling it; remembered until the file changes."""
-    journal = journal_file(path, name)
+def _counted(
+    path: Path, name: str, clock: ClockPoints, _mtime_ns: int, _size: int
+) -> dict[str, _Share]:
+    """Count a journal's rows by unrolling it; remembered until the file or its clock changes."""
+    journal = replace(journal_file(path, name), clock=clock)
     pieces: dict[str, list[Flat]] = {}
     sizes: dict[str, int] = {}
     for batch in batches_of(journal, sizes=sizes):

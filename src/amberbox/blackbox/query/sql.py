@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
+from amberbox.blackbox.journal.clocktable import ClockTable, Piece
 from amberbox.blackbox.query.catalogue import Catalogue
 from amberbox.blackbox.query.gather import Request, from_journals, gather, merge
 from amberbox.blackbox.query.table import Table
 from amberbox.blackbox.segments.columns import NUMPY_TYPES, element_type
 from amberbox.blackbox.segments.columns_io import arrow_type, from_arrow
 from amberbox.blackbox.segments.flat import TableSchema
-from amberbox.blackbox.segments.manifest import ClockPoints
+from amberbox.blackbox.segments.manifest import Segment, part_clock
 from amberbox.blackbox.segments.parquet import seq_name, stored_name
 from amberbox.core.errors import AmberboxError, UsageError
 from amberbox.core.types import Column, ColumnData
@@ -19,6 +20,8 @@ from amberbox.core.types import Column, ColumnData
 if TYPE_CHECKING:
     import duckdb
     import pyarrow as pa
+
+Pieces: TypeAlias = tuple[tuple[int, Piece], ...]
 
 _TYPES = {
     "bool": "BOOLEAN",
@@ -97,7 +100,9 @@ def _create_view(
 ) -> None:
     schema = catalogue.schema(table)
     groups = {} if _needs_text(catalogue, schema) else _groups(catalogue, table)
-    selects = [_select(schema, version, steps, paths) for (version, steps), paths in groups.items()]
+    selects = [
+        _select(schema, version, pieces, paths) for (version, pieces), paths in groups.items()
+    ]
     files += (path for paths in groups.values() for path in paths)
     rest = _journal_rows(catalogue, schema, also_segments=not groups)
     if rest is not None:
@@ -106,20 +111,18 @@ def _create_view(
     connection.execute(f"CREATE VIEW {_name(table)} AS {' UNION ALL '.join(selects)}")
 
 
-def _groups(catalogue: Catalogue, table: str) -> dict[tuple[TableSchema, ClockPoints], list[str]]:
+def _groups(catalogue: Catalogue, table: str) -> dict[tuple[TableSchema, Pieces], list[str]]:
     """Group a table's segments by schema version and clock: each group is one SELECT."""
-    groups: dict[tuple[TableSchema, ClockPoints], list[str]] = {}
+    groups: dict[tuple[TableSchema, Pieces], list[str]] = {}
     for segment in catalogue.segments(table):
         version = catalogue.manifest.schemas[segment.schema]
         path = str((catalogue.store / segment.path).resolve())
-        groups.setdefault((version, _steps(segment.clock)), []).append(path)
+        groups.setdefault((version, _pieces(segment)), []).append(path)
     return groups
 
 
-def _select(
-    schema: TableSchema, version: TableSchema, steps: ClockPoints, paths: Sequence[str]
-) -> str:
-    columns = ", ".join(_columns(schema, version, steps))
+def _select(schema: TableSchema, version: TableSchema, pieces: Pieces, paths: Sequence[str]) -> str:
+    columns = ", ".join(_columns(schema, version, pieces))
     return f"SELECT {columns} FROM read_parquet([{', '.join(map(_quoted, paths))}])"
 
 
@@ -133,17 +136,20 @@ def _needs_text(catalogue: Catalogue, schema: TableSchema) -> bool:
     )
 
 
-def _steps(clock: ClockPoints) -> ClockPoints:
-    """Leave out points that change nothing: most files have one offset from end to end."""
-    kept = clock[:1]
-    for point in clock[1:]:
-        if point[1] != kept[-1][1]:
-            kept = (*kept, point)
-    return kept if len(kept) > 1 else ((0, kept[0][1]),)
+def _pieces(segment: Segment) -> Pieces:
+    """Say how the offset goes, each entry from a log time on; most files have a single one."""
+    found: list[tuple[int, Piece]] = []
+    for part in segment.parts:
+        for piece in ClockTable(part_clock(part)).pieces():
+            if not found or piece.rate or found[-1][1][1:] != piece[1:]:
+                found.append((max(piece.log_ns, part.from_ns), piece))
+    if len(found) == 1 and not found[0][1].rate:
+        return ((0, Piece(0, found[0][1].offset_ns, 0.0)),)
+    return tuple(found)
 
 
-def _columns(schema: TableSchema, version: TableSchema, steps: ClockPoints) -> list[str]:
-    received = f"make_timestamp_ns(log_time + {_offset(steps)})"
+def _columns(schema: TableSchema, version: TableSchema, pieces: Pieces) -> list[str]:
+    received = f"make_timestamp_ns(log_time + {_offset(pieces)})"
     stamp = '"timestamp"::TIMESTAMP_NS' if schema.stamp else received
     return [
         f'{stamp} AS "timestamp"',
@@ -153,11 +159,20 @@ def _columns(schema: TableSchema, version: TableSchema, steps: ClockPoints) -> l
     ]
 
 
-def _offset(steps: ClockPoints) -> str:
-    if len(steps) == 1:
-        return str(steps[0][1])
-    cases = " ".join(f"WHEN log_time >= {at} THEN {offset}" for at, offset in reversed(steps[1:]))
-    return f"CASE {cases} ELSE {steps[0][1]} END"
+def _offset(pieces: Pieces) -> str:
+    *later, (_, first) = reversed(pieces)
+    if not later:
+        return _offset_of(first)
+    cases = " ".join(f"WHEN log_time >= {at} THEN {_offset_of(piece)}" for at, piece in later)
+    return f"CASE {cases} ELSE {_offset_of(first)} END"
+
+
+def _offset_of(piece: Piece) -> str:
+    """Compute as ``ClockTable`` does, to the nanosecond."""
+    if not piece.rate:
+        return str(piece.offset_ns)
+    since = f"greatest(log_time - {piece.log_ns}, 0)::DOUBLE"
+    return f"({piece.offset_ns} + round_even({since} * {piece.rate!r}::DOUBLE, 0)::BIGINT)"
 
 
 def _column(column: Column, version: TableSchema) -> str:

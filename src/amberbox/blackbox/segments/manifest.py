@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import os
 import threading
+from bisect import bisect_left, bisect_right
 from collections import Counter
 from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, BinaryIO, TypeAlias
+from typing import Any, BinaryIO
 
 from amberbox.blackbox.journal import reserved
+from amberbox.blackbox.journal.clocktable import ClockPoints, ClockTable
 from amberbox.blackbox.segments import lines
 from amberbox.blackbox.segments.entries import Sealed, Signature, Tombstone, from_record
 from amberbox.blackbox.segments.flat import TableSchema
@@ -19,8 +21,6 @@ from amberbox.blackbox.store import sync_folder
 from amberbox.core.types import Gap
 
 NAME = "manifest"
-
-ClockPoints: TypeAlias = tuple[tuple[int, int], ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,9 +63,10 @@ class Segment:
     parts: tuple[Part, ...]
 
     @property
-    def clock(self) -> ClockPoints:
-        """The offsets of all parts; log time only grows from part to part."""
-        return sum((part_clock(part) for part in self.parts), ())
+    def offsets_ns(self) -> tuple[int, int]:
+        """By how much log time may differ from the time of receipt: least and most."""
+        bounds = [ClockTable(part_clock(part)).bounds() for part in self.parts]
+        return min(low for low, _ in bounds), max(high for _, high in bounds)
 
     @property
     def received_range_ns(self) -> tuple[int, int]:
@@ -98,13 +99,13 @@ def part_from_json(data: Mapping[str, Any]) -> Part:
 
 
 def part_clock(part: Part) -> ClockPoints:
-    """Return the offsets of one part, the first of them moved to the part's first row."""
+    """Return the points that the offsets of a part's rows depend on, from before to after them."""
     if not part.clock:
         return ((part.from_ns, 0),)
-    valid = [offset for log_ns, offset in part.clock if log_ns <= part.from_ns]
-    first = valid[-1] if valid else part.clock[0][1]
-    later = [entry for entry in part.clock if part.from_ns < entry[0] <= part.to_ns]
-    return ((part.from_ns, first), *later)
+    times = [log_ns for log_ns, _ in part.clock]
+    first = max(bisect_right(times, part.from_ns) - 1, 0)
+    end = bisect_left(times, part.to_ns) + 1
+    return part.clock[first : max(end, first + 1)]
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,9 +17,9 @@ from amberbox.blackbox.segments import encoding
 from amberbox.blackbox.segments.columns_io import from_arrow, to_arrow
 from amberbox.blackbox.segments.flat import Flat, TableSchema
 from amberbox.blackbox.segments.manifest import (
-    ClockPoints,
     Part,
     Segment,
+    part_clock,
     part_from_json,
 )
 from amberbox.blackbox.store import sync_folder
@@ -166,7 +166,7 @@ def read_segment(
     one ``Flat`` per part of the segment.
     """
     with _opened(store / segment.path) as file:
-        found = _row_groups(file.metadata, schema, segment.clock, by)
+        found = _row_groups(file.metadata, schema, segment, by)
         chosen = [group for group in found if overlaps(group.low_ns, group.high_ns, span)]
         return _read(file, segment, schema, names, [group.number for group in chosen])
 
@@ -183,7 +183,7 @@ class RowGroup:
 def row_groups(store: Path, segment: Segment, schema: TableSchema, by: str) -> list[RowGroup]:
     """List the row groups of a segment with the bounds of ``received`` or of the stamps."""
     with _opened(store / segment.path) as file:
-        return _row_groups(file.metadata, schema, segment.clock, by)
+        return _row_groups(file.metadata, schema, segment, by)
 
 
 def read_row_group(
@@ -224,14 +224,14 @@ def _first_rows(metadata: pq.FileMetaData) -> IntArray:
 
 
 def _row_groups(
-    metadata: pq.FileMetaData, schema: TableSchema, clock: ClockPoints, by: str
+    metadata: pq.FileMetaData, schema: TableSchema, segment: Segment, by: str
 ) -> list[RowGroup]:
-    offsets = [offset for _, offset in clock] if by == "received" else [0]
+    least, most = segment.offsets_ns if by == "received" else (0, 0)
     column = list(key_names(schema)).index("log_time" if by == "received" else "timestamp")
     found = []
     for number in range(metadata.num_row_groups):
         bounds = metadata.row_group(number).column(column).statistics
-        low, high = bounds.min_raw + min(offsets), bounds.max_raw + max(offsets)
+        low, high = bounds.min_raw + least, bounds.max_raw + most
         found.append(RowGroup(number, low, high))
     return found
 
@@ -245,12 +245,11 @@ def overlaps(low: int, high: int, span: tuple[int | None, int | None]) -> bool:
 def _to_flat(table: pa.Table, segment: Segment, schema: TableSchema, names: list[str]) -> Flat:
     types = {column.name: column.type for column in schema.columns}
     log_time = _integers(table[_KEYS[0]])
-    received = ClockTable(segment.clock).received(log_time)
-    stamps = _integers(table.column("timestamp")) if schema.stamp else received
+    stamps = _integers(table.column("timestamp")) if schema.stamp else log_time
     part = segment.parts[0]
     columns = {name: from_arrow(table[stored_name(name)], types[name]) for name in names}
     seq = _integers(table[seq_name(schema)])
-    return Flat(schema, part.writer, part.run, seq, log_time, received, stamps, columns)
+    return Flat(schema, part.writer, part.run, seq, log_time, log_time, stamps, columns)
 
 
 def _integers(array: pa.ChunkedArray) -> IntArray:
@@ -260,13 +259,21 @@ def _integers(array: pa.ChunkedArray) -> IntArray:
 
 
 def _split_parts(whole: Flat, parts: Sequence[Part], rows: IntArray) -> list[Flat]:
+    """Give the rows of each part, with the times of its own clock."""
     if len(parts) == 1:
-        return [whole] if len(whole) else []
+        return [_received(whole, parts[0])] if len(whole) else []
     ends = np.cumsum([part.rows for part in parts])
     cuts = np.searchsorted(rows, np.concatenate(([0], ends)))
     flats = []
     for part, start, stop in zip(parts, cuts[:-1], cuts[1:], strict=True):
         if stop > start:
             piece = whole.take(slice(int(start), int(stop)))
-            flats.append(replace(piece, writer=part.writer, run=part.run))
+            flats.append(_received(replace(piece, writer=part.writer, run=part.run), part))
     return flats
+
+
+def _received(piece: Flat, part: Part) -> Flat:
+    """Correct the time of receipt, which is the stamp of rows that have none of their own."""
+    received = ClockTable(part_clock(part)).received(piece.log_time_ns)
+    stamps = piece.timestamp_ns if piece.schema.stamp else received
+    return replace(piece, received_ns=received, timestamp_ns=stamps)
