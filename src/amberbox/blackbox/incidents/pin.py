@@ -35,7 +35,14 @@ from amberbox.blackbox.incidents.incident import (
 from amberbox.blackbox.incidents.timeline import Timeline, look_back
 from amberbox.blackbox.keeper.options import KeeperOptions
 from amberbox.blackbox.keeper.pinlock import pin_lock
-from amberbox.blackbox.store import INCIDENTS, Store, is_locked, replace_file, sync_folder
+from amberbox.blackbox.store import (
+    INCIDENTS,
+    Store,
+    is_locked,
+    replace_file,
+    run_and_number,
+    sync_folder,
+)
 from amberbox.core.clock import NS
 from amberbox.core.errors import UsageError
 
@@ -118,9 +125,9 @@ def _to_join(made: Incident, known: Iterable[Incident]) -> Incident | None:
     """Find the incident that a new window belongs to: an open one, or one of the same trigger."""
     for other in known:
         same = bool(made.trigger) and made.trigger == other.trigger
-        if other.is_pinned and not other.confirmed and (other.state == "open" or same):
-            if any(other.holds(s.run, s.from_ns, s.to_ns) for s in made.spans):
-                return other
+        takes = other.is_pinned and not other.confirmed and (other.state == "open" or same)
+        if takes and any(other.holds(s.run, s.from_ns, s.to_ns) for s in made.spans):
+            return other
     return None
 
 
@@ -183,45 +190,39 @@ def _extend(store: Store, incident: Incident) -> Incident:
     return save(store, replace(incident, told=""))
 
 
-def hold_ring(store: Store, incident: Incident, folder: Path) -> int:
-    """Link the ring's journals that meet a window into a folder; returns how many are new.
+def hold_ring(store: Store, incident: Incident, folder: Path, *, is_over: bool = True) -> None:
+    """Link the ring's journals that meet a window into a folder.
 
-    Where the ring lies on another file system they are copied, a growing one again each time.
+    Where the ring lies on another file system they are copied, a growing one when all ``is_over``.
     """
-    made = 0
-    for path in store.folder("ring").glob("*.mcap"):
+    paths = sorted(store.folder("ring").glob("*.mcap"), key=run_and_number)
+    for path in paths:
         found = extent(path)
         if found is not None and incident.holds(found.run, found.start_ns, found.end_ns):
             (folder / RING).mkdir(exist_ok=True)
-            made += _hold(path, folder / RING / path.name)
-    if made:
+            _hold(path, folder / RING / path.name, grows=path == paths[-1] and not is_over)
+    if (folder / RING).exists():
         sync_folder(folder / RING)
-    return made
 
 
-def _hold(path: Path, target: Path) -> bool:
+def _hold(path: Path, target: Path, *, grows: bool) -> None:
     try:
-        status = path.stat()
-        if target.exists():
-            same = target.stat()
-            if same.st_ino == status.st_ino or same.st_size == status.st_size:
-                return False
-            return _copied(path, target)
-        os.link(path, target)
+        if not target.exists():
+            os.link(path, target)
+        elif target.stat().st_size != path.stat().st_size and not grows:  # never so for a link
+            _copy(path, target)
     except FileNotFoundError:  # the ring has moved on just now
-        return False
+        return
     except OSError:  # another file system, or one without links
-        return _copied(path, target)
-    return True
+        _copy(path, target)
 
 
-def _copied(path: Path, target: Path) -> bool:
+def _copy(path: Path, target: Path) -> None:
     part = target.with_suffix(".part")
     shutil.copyfile(path, part)
     with part.open("rb") as file:
         os.fsync(file.fileno())
     part.replace(target)
-    return True
 
 
 def advance(store: Store, incident: Incident) -> Incident:
@@ -241,8 +242,9 @@ def advance(store: Store, incident: Incident) -> Incident:
         end_age_ns = (timeline.pieces[-1].start_age_ns if age_ns is None else age_ns) - (
             current.after_ns
         )
-        hold_ring(store, current, folder_of(store, current.id))
-        if end_age_ns < 0 and alive:
+        is_over = end_age_ns >= 0 or not alive
+        hold_ring(store, current, folder_of(store, current.id), is_over=is_over)
+        if not is_over:
             return current
         return _complete(store, current, timeline, max(end_age_ns, 0))
 
