@@ -114,8 +114,7 @@ def table(state: RecorderState, elapsed_s: float) -> list[str]:
     ]
     foot = f"{elapsed_s:.0f} s, written {size(state.written_bytes)}, "
     foot += f"queue {size(state.queue_bytes)}, disk left {size(state.disk_free_bytes)}"
-    trouble = [f"DISK: {state.disk_error}"] if state.disk_error else []
-    return [*lines, foot, *trouble]
+    return [*lines, foot, *_trouble(state)]
 
 
 def summary(state: RecorderState) -> str:
@@ -125,7 +124,13 @@ def summary(state: RecorderState) -> str:
     rate = sum(item.rate_hz for item in state.items)
     text = f"{len(state.items)} items, {rate:.0f} messages/s, {kept} kept, {dropped} dropped, "
     text += f"{size(state.written_bytes)} written, {size(state.disk_free_bytes)} left"
-    return f"{text}; DISK: {state.disk_error}" if state.disk_error else text
+    return "; ".join([text, *_trouble(state)])
+
+
+def _trouble(state: RecorderState) -> list[str]:
+    """Say what is wrong with the disk, if anything is."""
+    full = [f"{state.full.upper()}: only events are recorded"] if state.full else []
+    return [*full, f"DISK: {state.disk_error}"] if state.disk_error else full
 
 
 def _last_line(state: RecorderState, store: str) -> str:

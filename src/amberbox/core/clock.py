@@ -66,6 +66,10 @@ class RunClock:
         """Log time now, nanoseconds."""
         return self._base_ns + self.clock.boot_ns()
 
+    def boot_ns(self, log_ns: int) -> int:
+        """Nanoseconds since boot at a log time of this epoch."""
+        return log_ns - self._base_ns
+
     def offset_ns(self) -> int:
         """Wall minus log time: 0 until the wall clock is stepped or slewed."""
         return self.clock.wall_ns() - self.now_ns()

@@ -6,6 +6,7 @@ from ``kill -9``. ``mark_sync`` closes a link of the hash chain and returns what
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import os
 from collections.abc import Mapping, Sequence
@@ -281,6 +282,7 @@ class JournalWriter:
         file = self._opened()
         data = b"".join(parts)
         try:
+            _expect_room(file.fd, len(data))
             _write_all(file.fd, data)
         except OSError:
             os.ftruncate(file.fd, file.size)  # our own torn tail, nothing acknowledged
@@ -289,6 +291,16 @@ class JournalWriter:
         file.block.update(data)
         file.size += len(data)
         self.bytes_written += len(data)
+
+
+def _expect_room(fd: int, size: int) -> None:
+    """Refuse what would not fit whole: to cut off a torn end is deadly for whoever has it mapped.
+
+    It is cut off all the same when others take the room in that very moment.
+    """
+    status = os.fstatvfs(fd)
+    if status.f_blocks and status.f_bavail * status.f_frsize < size:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
 def _write_all(fd: int, data: bytes) -> None:

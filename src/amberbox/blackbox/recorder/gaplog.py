@@ -7,6 +7,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
+from amberbox.blackbox.recorder.streams import Drops
+
 Write = Callable[[dict[str, Any]], None]
 
 
@@ -63,9 +65,14 @@ class GapLog:
             self._known.add((item, peer))
             self._begin(item, peer, now_ns, reason)
 
-    def dropped(self, item: str, from_ns: int, to_ns: int, count: int) -> None:
+    def dropping(self, item: str, from_ns: int, reason: str) -> None:
+        """Write that the box itself drops an item from now on; ``dropped`` tells the end."""
+        self._write(item, "", from_ns, None, f"dropped: {reason}")
+
+    def dropped(self, item: str, drops: Drops, reason: str) -> None:
         """Write what the box itself had to drop."""
-        self._write(item, "", from_ns, to_ns, "dropped: queue full", count)
+        first_ns, last_ns, count = drops
+        self._write(item, "", first_ns, last_ns + 1, f"dropped: {reason}", count)
 
     def shift(self, step_ns: int) -> None:
         """Move the beginnings of what is open: log time has begun anew."""

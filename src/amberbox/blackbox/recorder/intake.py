@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 from amberbox.blackbox.recorder.streams import Drops, Item, Stream
@@ -62,11 +63,24 @@ class Intake:
             self._waits_no_more = True
             self._room.notify_all()
 
-    def take_drops(self, item: Item) -> Drops | None:
-        """Return what was dropped of an item since the last call."""
+    def refuse(self, messages: Iterable[tuple[Item, int]], reason: str) -> None:
+        """Count messages that were taken, and then found no room on the disk."""
         with self._room:
-            drops, item.drops = item.drops, None
+            for item, received_ns in messages:
+                item.drop(received_ns, reason)
+
+    def take_drops(self, item: Item) -> dict[str, Drops]:
+        """Return what was dropped of an item since the last call, by reason."""
+        with self._room:
+            drops, item.drops = item.drops, {}
         return drops
+
+    def shift_drops(self, items: Iterable[Item], step_ns: int) -> None:
+        """Move the times of what was dropped: log time has begun anew."""
+        with self._room:
+            for item in items:
+                for reason, (first_ns, last_ns, count) in item.drops.items():
+                    item.drops[reason] = (first_ns + step_ns, last_ns + step_ns, count)
 
     @property
     def size_bytes(self) -> int:
@@ -80,6 +94,12 @@ class Intake:
             self._waiting_bytes += self._bytes
             self._bytes = 0
         return taken
+
+    def give_back(self, messages: Sequence[tuple[Stream, bytes, int]]) -> None:
+        """Put messages back to the front of the queue, as if they had not been taken."""
+        with self._room:
+            self._queue[:0] = messages
+            self._bytes += sum(len(data) + _OVERHEAD for _, data, _ in messages)
 
     def release(self) -> None:
         """Say that what was taken has been written."""

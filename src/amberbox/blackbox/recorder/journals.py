@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from operator import itemgetter
@@ -11,25 +12,39 @@ from typing import TypeAlias
 from amberbox.blackbox.journal import reserved
 from amberbox.blackbox.journal.syncmark import SyncMark
 from amberbox.blackbox.journal.writer import JournalWriter
-from amberbox.blackbox.recorder.streams import Stream, Tell
+from amberbox.blackbox.recorder.streams import Item, Stream, Tell
 from amberbox.core.types import Topic
 
 Row: TypeAlias = tuple[int, int, int, bytes]
 """Channel, log time, publish time, message."""
 
-Preamble: TypeAlias = Callable[[str], Sequence[tuple[str, bytes]]]
+Preamble: TypeAlias = Callable[[str, int], Sequence[tuple[str, bytes]]]
+"""What a writer's file begins with at a log time."""
+
+MakeRoom: TypeAlias = Callable[[str], bool]
+"""Asked when a writer's disk is full; False if nothing can be done about it."""
+
+_FULL = (errno.ENOSPC, errno.EDQUOT)
 
 
 class Journals:
     """One journal per keeping class in use; all but ``use`` belongs to the writing thread."""
 
-    def __init__(self, make: Callable[[str], JournalWriter], preamble: Preamble, tell: Tell):
+    def __init__(
+        self,
+        make: Callable[[str], JournalWriter],
+        preamble: Preamble,
+        tell: Tell,
+        make_room: MakeRoom,
+    ) -> None:
         self._make = make
         self._preamble_of = preamble
         self._tell = tell
+        self._make_room = make_room
         self._writers: dict[str, JournalWriter] = {"main": make("main")}
         self._pending: dict[str, list[Row]] = {}
         self._channels: dict[tuple[str, Topic, str], int] = {}
+        self._items: dict[tuple[str, int], Item] = {}
         self._own_channels: dict[tuple[str, str], int] = {}
         self._repeats: dict[tuple[str, int], Stream] = {}
         self._latched: list[Stream] = []
@@ -64,18 +79,54 @@ class Journals:
 
     def flush(self, now_ns: int) -> bool:
         """Write all pending rows; False when a disk did not take them (they stay pending)."""
-        try:
-            for name, rows in self._pending.items():
-                rows.sort(key=itemgetter(1))
-                if rows:
-                    self._write(name, rows, now_ns)
-        except OSError as error:
+        errors = self._write_pending(now_ns)
+        full = [name for name, error in errors.items() if error.errno in _FULL]
+        made = [self._make_room(name) for name in full]
+        if any(made):
+            errors = self._write_pending(now_ns)
+        for error in errors.values():
             self._note_disk_error(error)
             return False
         if self.disk_error:
             self.disk_error = ""
             self._tell("disk", "the disk takes data again")
         return True
+
+    def _write_pending(self, now_ns: int) -> dict[str, OSError]:
+        """Write what can be written; return what went wrong, by writer."""
+        errors = {}
+        for name, rows in self._pending.items():
+            rows.sort(key=itemgetter(1))
+            try:
+                if rows:
+                    self._write(name, rows, now_ns)
+            except OSError as error:
+                errors[name] = error
+        return errors
+
+    def take_back(self, writer: str, spared_bytes: int = 0) -> list[tuple[Item, int]]:
+        """Take the newest messages of sources back that wait for a disk; return item and time.
+
+        The oldest ones, up to ``spared_bytes``, the box's own records, and what files hold that
+        are read without loss, go on waiting.
+        """
+        rows = sorted(self._pending.get(writer, ()), key=itemgetter(1))
+        stays, taken = [], []
+        for row in rows:
+            item = self._items.get((writer, row[0]))
+            spared_bytes -= len(row[3]) if item else 0
+            if item is None or item.waits or spared_bytes >= 0:
+                stays.append(row)
+                continue
+            item.counters.kept -= 1
+            item.counters.bytes -= len(row[3])
+            taken.append((item, row[1]))
+        self._pending[writer] = stays
+        return taken
+
+    def forget_own(self, writer: str) -> None:
+        """Drop what waits of the box's own: it stands in another journal as well."""
+        self._pending[writer] = []
 
     def _write(self, name: str, rows: list[Row], now_ns: int) -> None:
         writer = self._writers[name]
@@ -96,7 +147,7 @@ class Journals:
         """Return what each file begins with: the run, the clock, the last latched messages."""
         rows: list[Row] = [
             (self._own_channel(writer, name), at_ns, at_ns, data)
-            for name, data in self._preamble_of(writer)
+            for name, data in self._preamble_of(writer, at_ns)
         ]
         for stream in list(self._latched):
             if stream.item.last_latched is not None:
@@ -124,7 +175,8 @@ class Journals:
             if topic.latched:
                 marks["latched"] = "1"
             writer = self._writers[item.writer]
-            self._channels[key] = writer.channel(topic, marks)
+            number = self._channels[key] = writer.channel(topic, marks)
+            self._items[item.writer, number] = item
             if topic.latched:
                 self._repeat_on(writer.channel(topic, {**marks, "repeated": "1"}), stream)
         return self._channels[key]

@@ -18,6 +18,9 @@ class MessageClock:
     def now_ns(self) -> int:
         return self.at_ns
 
+    def boot_ns(self, log_ns: int) -> None:
+        """Return None: this time is not counted from the start of a computer."""
+
     def offset_ns(self) -> int:
         return 0
 

@@ -7,7 +7,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, field
 from operator import itemgetter
@@ -18,16 +18,19 @@ import msgspec
 from msgspec import structs
 
 from amberbox import __version__
+from amberbox.blackbox.follow.chain import previous_chain
 from amberbox.blackbox.follow.follow import RECORDED
 from amberbox.blackbox.journal import reserved
 from amberbox.blackbox.journal.syncmark import SyncMark
 from amberbox.blackbox.journal.writer import JournalOptions, JournalWriter
+from amberbox.blackbox.recorder.admission import Admission
 from amberbox.blackbox.recorder.filtering import Message, change_filtered, rate_limited
 from amberbox.blackbox.recorder.gaplog import GapLog
 from amberbox.blackbox.recorder.intake import Intake
 from amberbox.blackbox.recorder.journals import Journals
 from amberbox.blackbox.recorder.messageclock import MessageClock
 from amberbox.blackbox.recorder.names import ItemNames
+from amberbox.blackbox.recorder.room import DISK_FULL, Room
 from amberbox.blackbox.recorder.streams import Item, Stream
 from amberbox.blackbox.store import Store, WriterLock
 from amberbox.core.clock import NS
@@ -46,6 +49,9 @@ class LogClock(Protocol):
 
     def now_ns(self) -> int:
         """Log time."""
+
+    def boot_ns(self, log_ns: int) -> int | None:
+        """Time since the computer's start at a log time; None if it does not count from there."""
 
     def offset_ns(self) -> int:
         """Wall minus log time."""
@@ -81,6 +87,8 @@ class Pipeline:
     options: PipelineOptions
     start_gap_ns: int | None = None
     """Received time up to which an earlier run reaches; gaps of this run begin there."""
+    room: Room | None = None
+    """Room set aside for the last events of a full disk; an import has none."""
     items: dict[str, Item] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -91,30 +99,36 @@ class Pipeline:
         self._own: list[tuple[str, bytes, int]] = []
         self._own_lock = threading.Lock()
         self._items_lock = threading.Lock()
-        self._journals = Journals(self._writer, self._preamble, self.event)
+        self._journals = Journals(self._writer, self._preamble, self.event, self._make_room)
         self._last_tick_ns = 0
         self._clock_written_ns: int | None = None
         self._clock_offset_ns = 0
+        self._clock_seen_ns = 0
+        self._rotates = False
         self._counted_ns = 0
         self._filter_error = ""
-        self.power: Power = "mains"
-        """How the box is powered, as a source has said last."""
+        self.power: Power | None = None
+        """How the box is powered, as a source has said last; None if none has."""
         self.on_event: Callable[[str, str], None] | None = None
         now_ns = self.clock.now_ns()  # the clock may have been set back since the last run
         start = now_ns if self.start_gap_ns is None else min(self.start_gap_ns, now_ns)
         self.gaps = GapLog(lambda values: self.own(reserved.GAP, values), start)
         if start < now_ns:
             self.gaps.pause(now_ns)
+        self._admission = None
+        if self.room is not None:
+            self._admission = Admission(self.room, self.intake, self.gaps, self.event)
 
     def _writer(self, writer: str) -> JournalWriter:
         options = self.options
         age = options.ring_rotate_ns if writer == "ring" else options.rotate_ns
-        return JournalWriter(
-            JournalOptions(
-                self.store.folder(writer), self.store.id, writer, self.run, options.boot_id,
-                options.rotate_bytes, age,
-            )
+        journal = JournalOptions(
+            self.store.folder(writer), self.store.id, writer, self.run, options.boot_id,
+            options.rotate_bytes, age,
         )  # fmt: skip
+        # an import is staged elsewhere, but follows what the store has
+        chain = previous_chain(Store(self.store.path, self.store.id), writer)
+        return JournalWriter(journal, chain=chain)
 
     # -- what sources and the recorder put in
 
@@ -152,12 +166,20 @@ class Pipeline:
     def tick(self) -> None:
         """Write what has come since the last tick; when the disk refuses, keep it and say so."""
         taken = self.intake.take()
+        if self._admission is not None:
+            taken = self._admission.put_off(taken)
         now_ns = self._advance(taken)
-        kept = self._filtered(rate_limited(taken, self._last_tick_ns, now_ns))
-        self._sort_into_journals(kept, now_ns)
+        self._watch_clock(now_ns)
+        kept = rate_limited(taken, self._last_tick_ns, now_ns)
+        if self._admission is not None:
+            kept = self._admission.admit(kept, now_ns)
+        self._sort_into_journals(self._filtered(kept), now_ns)
+        if self._rotates:
+            self._rotates = False
+            self._journals.rotate()
         if self._journals.flush(now_ns):
             self.intake.release()
-            self._follow_wall_clock()
+            self._follow_steps()
         self._journals.publish_heads(now_ns)
 
     def _filtered(self, messages: list[Message]) -> list[Message]:
@@ -178,11 +200,37 @@ class Pipeline:
             self.clock.heard(max(map(itemgetter(2), taken)))
         return max(self.clock.now_ns(), self._last_tick_ns)
 
+    def _make_room(self, writer: str) -> bool:
+        """Give up what there is to give, so that a full disk takes the rest; False if nothing."""
+        if self._admission is None or self.room is None:
+            return False
+        if writer in self._admission.elsewhere:
+            self._admission.refuse(self._journals.take_back(writer), f"no room for the {writer}")
+            self._journals.forget_own(writer)
+            return True
+        if not self.room.release():
+            return False
+        self._admission.say()
+        for other in RECORDED:
+            if other not in self._admission.elsewhere:
+                late = self._journals.take_back(other, self.room.spared_bytes)
+                self._admission.refuse(late, DISK_FULL)
+        return True
+
+    def keep_elsewhere(self, writers: Collection[str]) -> None:
+        """Say which journals lie on another disk than the store."""
+        if self._admission is not None:
+            self._admission.elsewhere = writers
+
+    def _account_due(self, now_ns: int) -> bool:
+        if self.disk_error:  # accounts of a long trouble would fill the memory
+            return False
+        return self._admission is None or self._admission.account_due(now_ns)
+
     def _note_drops(self) -> None:
         for item in list(self.items.values()):
-            drops = self.intake.take_drops(item)
-            if drops is not None:
-                self.gaps.dropped(item.name, drops[0], drops[1] + 1, drops[2])
+            for reason, drops in self.intake.take_drops(item).items():
+                self.gaps.dropped(item.name, drops, reason)
 
     # -- into the journals
 
@@ -194,7 +242,7 @@ class Pipeline:
             if stream.topic.latched:
                 item.last_latched = data
             self._journals.add(stream, received_ns, data)
-        if not self.disk_error:  # accounts of a long trouble would fill the memory
+        if self._account_due(now_ns):
             self._note_drops()
             self._count(now_ns)
         for name, data, at_ns in self._take_own():
@@ -226,9 +274,10 @@ class Pipeline:
                 encoded = msgspec.json.encode({"items": changed})
                 self._own.append((reserved.COUNTERS, encoded, now_ns))
 
-    def _preamble(self, writer: str) -> list[tuple[str, bytes]]:
+    def _preamble(self, writer: str, at_ns: int) -> list[tuple[str, bytes]]:
         """Return the own records that each file begins with: the run and the clock."""
-        return [(reserved.RUN, self._run_record(writer)), (reserved.CLOCK, self._clock_record())]
+        clock = self._clock_record(at_ns, self._clock_offset_ns)
+        return [(reserved.RUN, self._run_record(writer)), (reserved.CLOCK, clock)]
 
     def _run_record(self, writer: str) -> bytes:
         items = {name: item.describe() for name, item in list(self.items.items())}
@@ -246,27 +295,38 @@ class Pipeline:
             }
         )
 
-    def _clock_record(self) -> bytes:
+    def _clock_record(self, at_ns: int, offset_ns: int) -> bytes:
         values = {
-            "offset_ns": self._clock_offset_ns,
+            "offset_ns": offset_ns,
             "synchronised": self.clock.synchronised(),
+            "boot_ns": self.clock.boot_ns(at_ns),
         }
         return msgspec.json.encode(values)
 
     # -- clock, sync, end
 
-    def _follow_wall_clock(self) -> None:
-        """Record wall minus log time; after a large step begin a new epoch in new files."""
-        now_ns, offset = self.clock.now_ns(), self.clock.offset_ns()
+    def _watch_clock(self, now_ns: int) -> None:
+        """Record wall minus log time now and then; at a step, what it was before as well."""
+        offset, written_ns = self.clock.offset_ns(), self._clock_written_ns
         step = abs(offset - self._clock_offset_ns)
+        if self.disk_error or step > EPOCH_STEP_NS:
+            return
+        if written_ns is not None and step > CLOCK_STEP_NS:
+            self._own_clock(self._last_tick_ns, self._clock_seen_ns)
+        if written_ns is None or step > CLOCK_STEP_NS or now_ns - written_ns >= CLOCK_PERIOD_NS:
+            self._own_clock(now_ns, offset)
+            self._clock_offset_ns, self._clock_written_ns = offset, now_ns
+        self._clock_seen_ns = offset
+
+    def _own_clock(self, at_ns: int, offset_ns: int) -> None:
+        with self._own_lock:
+            self._own.append((reserved.CLOCK, self._clock_record(at_ns, offset_ns), at_ns))
+
+    def _follow_steps(self) -> None:
+        """After a large step of the wall clock begin a new epoch in new files."""
+        step = abs(self.clock.offset_ns() - self._clock_offset_ns)
         if step > EPOCH_STEP_NS:
             self._new_epoch(step)
-            return
-        due = self._clock_written_ns is None or now_ns - self._clock_written_ns >= CLOCK_PERIOD_NS
-        if due or step > CLOCK_STEP_NS:
-            self._clock_offset_ns, self._clock_written_ns = offset, now_ns
-            values = {"offset_ns": offset, "synchronised": self.clock.synchronised()}
-            self.own(reserved.CLOCK, values)
 
     def _new_epoch(self, step_ns: int) -> None:
         self._journals.rotate()
@@ -274,9 +334,15 @@ class Pipeline:
         self.clock.new_epoch()
         now_ns = self.clock.now_ns()
         self.gaps.shift(now_ns - before_ns)
+        self.intake.shift_drops(list(self.items.values()), now_ns - before_ns)
         self._clock_offset_ns, self._clock_written_ns = 0, now_ns
+        self._clock_seen_ns = 0
         self._last_tick_ns = self._counted_ns = now_ns
         self.event("clock_step", f"the wall clock stepped by {step_ns / NS:.3f} s: new epoch")
+
+    def rotate(self) -> None:
+        """Begin new files with the next write; from any thread."""
+        self._rotates = True
 
     def mark_sync(self) -> list[SyncMark]:
         """Return what makes everything written so far durable."""
@@ -288,10 +354,14 @@ class Pipeline:
         Raises AmberboxError when the disk does not take the rest.
         """
         self.gaps.close(self.clock.now_ns())
+        if self._admission is not None:
+            self._admission.end()
         had_trouble = self.disk_error
         self.tick()
         if had_trouble:  # what was not accounted for meanwhile
             self.tick()
+        if self.room is not None:
+            self.room.relieve()
         lost, refused = self._journals.unwritten(), self._journals.close()
         for lock in self._locks:
             lock.release()
@@ -305,6 +375,11 @@ class Pipeline:
     def disk_error(self) -> str:
         """What the disk said when it last refused a write; empty when all is well."""
         return self._journals.disk_error
+
+    @property
+    def full(self) -> str:
+        """Why only events are recorded; empty while everything is."""
+        return self.room.reason if self.room is not None else ""
 
     @property
     def bytes_written(self) -> int:

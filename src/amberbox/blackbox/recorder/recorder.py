@@ -14,13 +14,16 @@ from amberbox.blackbox.folder.keeping import keeper_options
 from amberbox.blackbox.recorder.keeperprocess import KeeperProcess
 from amberbox.blackbox.recorder.messageclock import MessageClock
 from amberbox.blackbox.recorder.pipeline import Pipeline, PipelineOptions
+from amberbox.blackbox.recorder.power import PowerWatch
 from amberbox.blackbox.recorder.recovery import previous_end_ns, report_recovery
+from amberbox.blackbox.recorder.ringfolder import place_ring, writers_elsewhere
+from amberbox.blackbox.recorder.room import Room
 from amberbox.blackbox.recorder.supervisor import Supervisor
 from amberbox.blackbox.recorder.syncer import Syncer
 from amberbox.blackbox.service import Notifier
-from amberbox.blackbox.store import create_store
+from amberbox.blackbox.store import Store, create_store, is_locked
 from amberbox.core.clock import NS, Clock, RunClock, SystemClock
-from amberbox.core.errors import UsageError
+from amberbox.core.errors import AmberboxError, UsageError
 
 _STOP_S = 3.0
 """How long sources may take to end."""
@@ -48,6 +51,8 @@ class RecorderState:
     written_bytes: int
     disk_free_bytes: int
     disk_error: str
+    full: str = ""
+    """Why only events are recorded; empty while everything is."""
 
 
 class Recorder:
@@ -65,25 +70,12 @@ class Recorder:
         self.store = create_store(folder.store_path)
         self.stop = threading.Event()
         self._notifier = Notifier()
-        clock = clock or SystemClock()
-        virtual_ns = virtual_start_ns(folder)
         self._keeper_wanted = keeper
-        options = folder.robot.store
-        self.pipeline = Pipeline(
-            self.store,
-            RunClock(clock) if virtual_ns is None else MessageClock(virtual_ns),
-            PipelineOptions(
-                robot=folder.robot.id,
-                config_hash=folder.config_hash,
-                boot_id=clock.boot_id(),
-                counts_silence=virtual_ns is None,
-                queue_bytes=options.queue,
-                rotate_bytes=int(options.rotate_mb * 1e6),
-                rotate_ns=int(options.rotate_s * NS),
-                ring_rotate_ns=int(min(options.ring_s / 5, options.rotate_s) * NS),
-            ),
-            start_gap_ns=previous_end_ns(self.store),
-        )
+        self._ended_by = ""
+        self.pipeline = _pipeline(folder, self.store, clock or SystemClock())
+        ring_path = folder.robot.store.ring_path
+        place_ring(self.store, folder.path / ring_path if ring_path else None)
+        self.pipeline.keep_elsewhere(writers_elsewhere(self.store))
         report_recovery(self.pipeline)
         self._sources = [Supervisor(self.pipeline, block, self.stop) for block in folder.blocks]
         self._rates: dict[str, tuple[int, float]] = {}
@@ -99,12 +91,16 @@ class Recorder:
         kept = keeper_options(self.folder)
         keeper = KeeperProcess(self.pipeline, kept) if self._keeper_wanted else None
         syncer = Syncer(self.pipeline, options.sync_s)
+        power = PowerWatch(self.pipeline, syncer, options.sync_s)
         try:
-            self._tick_until_stopped(syncer, keeper)
+            self._tick_until_stopped(syncer, power, keeper)
         finally:
+            power.stop()
             self._finish(syncer, keeper)
 
-    def _tick_until_stopped(self, syncer: Syncer, keeper: KeeperProcess | None) -> None:
+    def _tick_until_stopped(
+        self, syncer: Syncer, power: PowerWatch, keeper: KeeperProcess | None
+    ) -> None:
         write_s = self.folder.robot.store.write_s
         due = time.monotonic() + write_s
         while not self.stop.is_set():
@@ -115,6 +111,9 @@ class Recorder:
             if self.pipeline.bytes_written:
                 self._notifier.ready()
             self._notifier.alive(self._status)
+            if power.ends_run():
+                self._ended_by = "the battery is low"
+                break
             syncer.poke()
             if keeper is not None:
                 keeper.look_after()
@@ -128,6 +127,8 @@ class Recorder:
         stuck = self._join_sources()
         syncer.stop()
         text = "recording stopped"
+        if self._ended_by:
+            text += f": {self._ended_by}"
         if stuck:
             text += f"; still running: {', '.join(stuck)}"
         self.pipeline.event("stopped", text, stuck=stuck)
@@ -149,6 +150,8 @@ class Recorder:
         items = list(self.pipeline.items.values())
         kept = sum(item.counters.kept for item in items)
         trouble = f"; DISK: {self.pipeline.disk_error}" if self.pipeline.disk_error else ""
+        if self.pipeline.full:
+            trouble = f"; {self.pipeline.full.upper()}: only events are recorded{trouble}"
         return f"{len(items)} items, {kept} messages kept{trouble}"
 
     def state(self) -> RecorderState:
@@ -161,6 +164,7 @@ class Recorder:
             self.pipeline.bytes_written,
             shutil.disk_usage(self.store.path).free,
             self.pipeline.disk_error,
+            self.pipeline.full,
         )
 
     def _item_state(self, name: str, now: float) -> ItemState:
@@ -171,6 +175,39 @@ class Recorder:
         filtered = counters.rate_limited + counters.unchanged
         return ItemState(name, rate, counters.received, counters.kept, filtered,
                          counters.dropped, counters.bytes)  # fmt: skip
+
+
+def _pipeline(folder: RobotFolder, store: Store, clock: Clock) -> Pipeline:
+    """Begin a run on a store, with what its folder says and the room that there is.
+
+    Raises AmberboxError when not even a run's first bytes can be written.
+    """
+    options, virtual_ns = folder.robot.store, virtual_start_ns(folder)
+    room = Room(store.path, options.reserve)
+    try:
+        if not is_locked(store, "main"):
+            room.begin()
+        return Pipeline(
+            store,
+            RunClock(clock) if virtual_ns is None else MessageClock(virtual_ns),
+            PipelineOptions(
+                robot=folder.robot.id,
+                config_hash=folder.config_hash,
+                boot_id=clock.boot_id(),
+                counts_silence=virtual_ns is None,
+                queue_bytes=options.queue,
+                rotate_bytes=int(options.rotate_mb * 1e6),
+                rotate_ns=int(options.rotate_s * NS),
+                ring_rotate_ns=int(min(options.ring_s / 5, options.rotate_s) * NS),
+            ),
+            start_gap_ns=previous_end_ns(store),
+            room=room,
+        )
+    except OSError as error:
+        raise AmberboxError(
+            f"cannot write to the store {store.path}: {error.strerror}",
+            "make room on its disk, or choose another one in robot.yaml store.path",
+        ) from error
 
 
 def virtual_start_ns(folder: RobotFolder) -> int | None:

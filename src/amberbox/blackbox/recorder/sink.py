@@ -32,6 +32,7 @@ class BlockSink:
         self._numbers: dict[Topic, int] = {}
         self._links: set[tuple[str, str]] = set()
         self._lock = threading.Lock()
+        self._waits = lossless
         self._put = pipeline.intake.put_waiting if lossless else pipeline.intake.put
         self.now_ns = pipeline.clock.now_ns
 
@@ -74,8 +75,8 @@ class BlockSink:
         self._pipeline.event(kind, text, self._name, **details)
 
     def power(self, state: Power, text: str) -> None:
+        self._pipeline.power = state  # before the event, which wakes those who act on it
         self._pipeline.event(f"power_{state}", text, self._name)
-        self._pipeline.power = state
 
     def last_latched(self, topic: str) -> bytes | None:
         item = self._pipeline.items.get(self._item(topic))
@@ -109,6 +110,7 @@ class BlockSink:
 
     def _new_stream(self, topic: Topic) -> Stream:
         item = self._pipeline.items[self._item(topic.name)]
+        item.waits = self._waits
         infers = topic.message_encoding in INFERRED
         if infers:  # what is really sent counts, not what was declared
             topic = replace(topic, schema=None)

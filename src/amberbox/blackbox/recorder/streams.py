@@ -33,6 +33,8 @@ class Counters(msgspec.Struct):
 Drops: TypeAlias = tuple[int, int, int]
 """First and last time and count of messages dropped since the last gap record."""
 
+QUEUE_FULL = "queue full"
+
 
 class Tell(Protocol):
     """How an event is written: kind, one line for a person, the source, details."""
@@ -51,9 +53,12 @@ class Item:
     options: TopicOptions
     counters: Counters = field(default_factory=Counters)
     rate: RateLimit | None = None
-    drops: Drops | None = None
+    drops: dict[str, Drops] = field(default_factory=dict)
+    """What the box had to drop since it was last written down, by reason."""
     last_latched: bytes | None = None
     reported: Counters = field(default_factory=Counters)
+    waits: bool = False
+    """Whether its source waits for room, as a file does, instead of being lost."""
     malformed: int = 0
     versions: int = 0
     """How many schemas have been inferred for its messages."""
@@ -63,6 +68,12 @@ class Item:
     def __post_init__(self) -> None:
         if self.options.max_frequency:
             self.rate = RateLimit(self.options.max_frequency)
+
+    def drop(self, received_ns: int, reason: str) -> None:
+        """Count a message that is not kept though it should be."""
+        self.counters.dropped += 1
+        first, last, count = self.drops.get(reason, (received_ns, received_ns, 0))
+        self.drops[reason] = (min(first, received_ns), max(last, received_ns), count + 1)
 
     @property
     def writer(self) -> str:
@@ -99,11 +110,9 @@ class Stream:
         """Counters of the item."""
         return self.item.counters
 
-    def drop(self, received_ns: int) -> None:
+    def drop(self, received_ns: int, reason: str = QUEUE_FULL) -> None:
         """Count a message that found no room."""
-        self.item.counters.dropped += 1
-        first, _, count = self.item.drops or (received_ns, received_ns, 0)
-        self.item.drops = (first, received_ns, count + 1)
+        self.item.drop(received_ns, reason)
 
     def stamp_ns(self, data: bytes, received_ns: int) -> int:
         """Return the message's own time stamp, else the time of receipt."""

@@ -18,6 +18,16 @@ class Syncer:
         self._sync_s = sync_s
         self._due = time.monotonic() + sync_s
         self._thread: threading.Thread | None = None
+        self._trouble = ""
+
+    def every(self, sync_s: float) -> None:
+        """Sync in this interval from now on."""
+        self._due += sync_s - self._sync_s
+        self._sync_s = sync_s
+
+    def at_once(self, sync_s: float) -> None:
+        """Sync as soon as possible, and then in this interval."""
+        self._sync_s, self._due = sync_s, 0.0
 
     def poke(self) -> None:
         """Start a sync when one is due and none is under way."""
@@ -30,14 +40,26 @@ class Syncer:
         self._thread.start()
 
     def _wait(self, marks: Sequence[SyncMark]) -> None:
-        for mark in marks:
-            try:
-                mark.wait()
-            except OSError as error:
-                text = f"the disk does not sync: {error.strerror}"
-                self._pipeline.event("disk", text)
+        troubles = [trouble for trouble in map(_wait_for, marks) if trouble]
+        trouble, before = troubles[0] if troubles else "", self._trouble
+        self._trouble = trouble
+        if trouble and not before:
+            self._pipeline.rotate()  # the kernel reports a page once, then takes it for written
+            text = f"the disk does not sync: {trouble}; what came since the last sync may be lost"
+            self._pipeline.event("disk", f"{text}, new files begin")
+        elif before and not trouble:
+            self._pipeline.event("disk", "the disk syncs again")
 
     def stop(self) -> None:
         """Wait for the sync that is under way."""
         if self._thread is not None:
             self._thread.join()
+
+
+def _wait_for(mark: SyncMark) -> str:
+    """Make a journal durable; return what the disk says against it."""
+    try:
+        mark.wait()
+    except OSError as error:
+        return error.strerror or str(error)
+    return ""
