@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from amberbox.blackbox.journal.clocktable import simplified
 from amberbox.blackbox.segments import manifest as mf
 from amberbox.blackbox.segments.entries import Tombstone, confirmed_record, to_record
 from amberbox.blackbox.segments.lines import CHECKPOINT, encode
@@ -134,8 +135,7 @@ def _may_join(first: Part, second: Part, known: Manifest, exists: Callable[[str]
 
 
 def _joined_part(first: Part, second: Part) -> Part:
-    points = [*mf.part_clock(first), *mf.part_clock(second)]
-    clock = [p for n, p in enumerate(points) if n == 0 or points[n - 1][1] != p[1]]
+    points = sorted({*mf.part_clock(first), *mf.part_clock(second)})
     return replace(
         second,
         first_seq=first.first_seq,
@@ -145,7 +145,7 @@ def _joined_part(first: Part, second: Part) -> Part:
         stamp_to_ns=max(first.stamp_to_ns, second.stamp_to_ns),
         files=1,
         bytes=first.bytes + second.bytes,
-        clock=tuple(clock),
+        clock=simplified(points),
     )
 
 
