@@ -14,6 +14,7 @@ import numpy as np
 from amberbox.blackbox.journal import reserved
 from amberbox.blackbox.query import gaps as gap_list
 from amberbox.blackbox.query.catalogue import Catalogue, look
+from amberbox.blackbox.query.clockbook import ClockBook
 from amberbox.blackbox.query.downsample import downsample
 from amberbox.blackbox.query.gather import Merged, Request, gather, merge
 from amberbox.blackbox.query.overview import ItemInfo, overview
@@ -111,6 +112,10 @@ class Record:
         """Return what is missing in ``[from_, to)`` and why, of one item or of all."""
         span = self.time_ns(from_), self.time_ns(to)
         return self._ask(lambda catalogue: gap_list.gaps(catalogue, item, span))
+
+    def clock(self) -> ClockBook:
+        """Return what is known by now of the clocks of each boot, and what cannot be put right."""
+        return self._ask(lambda catalogue: catalogue.book)
 
     def sql(self, statement: str) -> Table:
         """Answer a SELECT: each item and child table is a view (see ``blackbox.sql``)."""
