@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -37,7 +38,7 @@ def test_a_journal_that_cannot_be_built_does_not_stop_the_others(
     box = recorded(tmp_path / "store")
     build = build_segments
 
-    def fail(store: Path, journal: JournalFile) -> list[Segment]:
+    def fail(store: Path, journal: JournalFile, breathe: Callable[[], None]) -> list[Segment]:
         if journal.number == 1:
             raise NotImplementedError("no such type in Arrow")
         return build(store, journal)

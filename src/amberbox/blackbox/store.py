@@ -13,7 +13,14 @@ from typing import IO
 
 from amberbox.core.errors import AmberboxError, UsageError
 
-FOLDERS = {"main": "journal", "bulk": "bulk", "ring": "ring", "watch": "watch", "keep": "keep"}
+FOLDERS = {
+    "main": "journal",
+    "bulk": "bulk",
+    "ring": "ring",
+    "watch": "watch",
+    "keep": "keep",
+    "kept": "kept",
+}
 """Folder of each writer's journal, inside the store."""
 INCIDENTS = "incidents"
 SEGMENTS = "segments"

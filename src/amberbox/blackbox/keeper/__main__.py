@@ -7,6 +7,7 @@ import os
 import signal
 import sys
 import threading
+import time
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from amberbox.blackbox.store import open_store
 from amberbox.core.errors import UsageError
 
 PERIOD_S = 2.0
+BREATH_S = 0.1
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -37,13 +39,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"amberbox keeper: {error}", file=sys.stderr)
         return error.exit_code
     keeper = Keeper(store, KeeperOptions.from_json(options.options))
-    while True:
+    keeper.step(stop)
+    while not options.once and _pause(keeper, stop, options.parent):
         keeper.step(stop)
-        gone = options.parent and os.getppid() != options.parent
-        if options.once or gone or stop.wait(PERIOD_S):
-            break
+    keeper.close()
     lock.release()
     return 0
+
+
+def _pause(keeper: Keeper, stop: threading.Event, parent: int) -> bool:
+    """Wait for the next step, minding the room that is left; False when it is time to go."""
+    end_s = time.monotonic() + PERIOD_S
+    while time.monotonic() < end_s:
+        if stop.wait(BREATH_S) or (parent and os.getppid() != parent):
+            return False
+        keeper.breathe()
+    return True
 
 
 if __name__ == "__main__":

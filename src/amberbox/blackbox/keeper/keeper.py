@@ -1,4 +1,4 @@
-"""The keeper: turns finished journals into segments and trims the ring, beside the recorder.
+"""The keeper: turns finished journals into segments and bounds the disk, beside the recorder.
 
 It runs as a process of its own at low priority, so that nothing it does can hold up recording.
 Only the keeper deletes.
@@ -9,86 +9,118 @@ from __future__ import annotations
 import sys
 import threading
 import time
-from collections.abc import Container, Sequence
 from contextlib import suppress
 
-from amberbox.blackbox.follow.read import JournalFile, journal_file
+from amberbox.blackbox.follow.read import journal_file
+from amberbox.blackbox.keeper import confirm
+from amberbox.blackbox.keeper.deleter import Deleter
 from amberbox.blackbox.keeper.options import KeeperOptions
-from amberbox.blackbox.segments.build import build_segments, can_build, merge_small
-from amberbox.blackbox.store import Store, WriterLock, is_locked
-from amberbox.core.clock import NS
+from amberbox.blackbox.keeper.ownjournal import OwnJournal
+from amberbox.blackbox.segments import manifest
+from amberbox.blackbox.segments.build import (
+    build_segments,
+    can_build,
+    merge_small,
+    remove_leftovers,
+)
+from amberbox.blackbox.segments.condense import no_signature
+from amberbox.blackbox.store import Store, WriterLock
+from amberbox.core.clock import Clock
 from amberbox.core.errors import UsageError
 
 PATIENCE_S = 10.0
 """After the recorder was killed its keeper lives on for a moment; the next one waits for it."""
+_BUILT = ("main", "bulk")
+"""Writers whose journals become segments."""
 
 
 class Keeper:
-    """Keeps one store; ``step`` does what there is to do now."""
+    """Keeps one store; ``step`` does what there is to do now, ``breathe`` what cannot wait."""
 
-    def __init__(self, store: Store, options: KeeperOptions | None = None) -> None:
+    def __init__(
+        self, store: Store, options: KeeperOptions | None = None, clock: Clock | None = None
+    ) -> None:
         self._store = store
         self._options = options or KeeperOptions()
+        self.journal = OwnJournal(
+            store, "keep", robot=self._options.robot, config_hash=self._options.config_hash,
+            clock=clock,
+        )  # fmt: skip
         self._with_segments = can_build()
         self._refused: set[str] = set()
+        self._deleter = Deleter(store, self._options, self.journal, self._is_pending)
+        self._recovered = False
 
     def step(self, stop: threading.Event) -> None:
-        """Build the segments of sealed journals, then trim the ring."""
-        if self._with_segments:
-            self._build(stop)
-        self._trim_ring()
+        """Do everything once: what others ask for, segments, deletion, accounts."""
+        self._recover()
+        self._deleter.make_room()
+        confirm.take_requests(self._store)
+        self.build(stop)
+        self._deleter.trim_ring()
+        self._deleter.expire()
+        self._deleter.make_room()
+        self._deleter.condense(no_signature)
+        self._deleter.report()
 
-    def _build(self, stop: threading.Event) -> None:
-        from amberbox.blackbox.segments import manifest
+    def breathe(self) -> None:
+        """See to the room that is left; to be called often during long work."""
+        self._deleter.breathe()
 
-        done = manifest.read(self._store.path).journals
+    def close(self) -> None:
+        """Write down what is left to say, finish the keeper's own journals."""
+        self._deleter.close()
+        with suppress(OSError):
+            self.journal.close()
+
+    def _recover(self) -> None:
+        """Finish what a keeper before this one was killed over."""
+        if not self._recovered:
+            self._recovered = True
+            self._deleter.recover()
+            if self._with_segments:
+                remove_leftovers(self._store.path)
+
+    def build(self, stop: threading.Event) -> None:
+        """Build the segments of sealed journals."""
+        if not self._with_segments:
+            return
+        self._deleter.measure()
         built = 0
-        for journal in self.sealed("main", skip={*done, *self._refused}):
+        for name in self._to_build():
             if stop.is_set():
                 return
-            built += self._build_one(journal)
+            built += self._build_one(name)
         if built:
-            merge_small(self._store.path)
+            merge_small(self._store.path, self.breathe)
 
-    def _build_one(self, journal: JournalFile) -> int:
+    def _to_build(self) -> list[str]:
+        done = manifest.read(self._store.path).journals
+        names = [name for writer in _BUILT for name in self._deleter.stock.sealed(writer)]
+        return [name for name in names if name not in done and self._is_pending(name)]
+
+    def _is_pending(self, name: str) -> bool:
+        """Tell whether a journal that has no columns will have some."""
+        columns_gone = manifest.read(self._store.path).columns_gone
+        return self._with_segments and name not in self._refused and name not in columns_gone
+
+    def _build_one(self, name: str) -> int:
+        self._deleter.busy = name
         try:
-            build_segments(self._store.path, journal)
-        except Exception as error:  # whatever it is: the other journals go on
-            self._refused.add(journal.name)  # its rows stay readable in the journal
-            print(f"amberbox keeper: {journal.name}: no segments: {error}", file=sys.stderr)
+            journal = journal_file(self._store.path / name, name)
+            if not journal.rows:
+                self._refused.add(name)
+                return 0
+            build_segments(self._store.path, journal, self.breathe)
+        except FileNotFoundError:  # deleted for room meanwhile
             return 0
+        except Exception as error:  # whatever it is: the other journals go on
+            self._refused.add(name)  # its rows stay readable in the journal
+            print(f"amberbox keeper: {name}: no segments: {error}", file=sys.stderr)
+            return 0
+        finally:
+            self._deleter.busy = ""
         return 1
-
-    def sealed(self, writer: str, skip: Container[str] = ()) -> list[JournalFile]:
-        """Return the journal files that nobody writes any more, but those named in ``skip``."""
-        paths = self._store.journal_files(writer)
-        if is_locked(self._store, writer):
-            paths = paths[:-1]
-        names = {path: f"{path.parent.name}/{path.name}" for path in paths}
-        files = [journal_file(path, name) for path, name in names.items() if name not in skip]
-        return [journal for journal in files if journal.rows]
-
-    def _trim_ring(self) -> None:
-        """Delete ring files that ended longer ago than the ring is long."""
-        files = self.sealed("ring")
-        for journal, age_ns in zip(files, ages(files), strict=True):
-            if age_ns > self._options.ring_s * NS:
-                journal.path.unlink(missing_ok=True)
-
-
-def ages(files: Sequence[JournalFile]) -> list[int]:
-    """Tell how long before the end of the last file each one ended, in ns.
-
-    Files of a run follow each other without a pause: where their times do not, the clock was set.
-    """
-    found: list[int] = []
-    age_ns = 0
-    for journal, after in zip(reversed(files), [None, *reversed(files)], strict=False):
-        if after is not None:
-            pause_ns = after.start_ns - journal.end_ns if after.run != journal.run else 0
-            age_ns += max(0, pause_ns) + max(0, after.end_ns - after.start_ns)
-        found.append(age_ns)
-    return found[::-1]
 
 
 def wait_for_lock(store: Store, patience_s: float, stop: threading.Event) -> WriterLock:
@@ -103,9 +135,10 @@ def wait_for_lock(store: Store, patience_s: float, stop: threading.Event) -> Wri
 
 
 def seal(store: Store) -> None:
-    """Build what can be built once, as an import does at its end."""
+    """Build what can be built once, as an import does at its end; nothing is deleted."""
     if can_build():
         with suppress(UsageError):  # another keeper is at work here: it builds them, too
             lock = wait_for_lock(store, PATIENCE_S, threading.Event())
-            Keeper(store, KeeperOptions(ring_s=float("inf"))).step(threading.Event())
+            options = KeeperOptions(quota_percent=100.0, min_free=0)
+            Keeper(store, options).build(threading.Event())
             lock.release()

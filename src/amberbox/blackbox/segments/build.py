@@ -5,17 +5,20 @@ from __future__ import annotations
 import importlib.util
 import json
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from amberbox.blackbox.follow.read import JournalFile, batches_of, run_messages
 from amberbox.blackbox.journal.clocktable import ClockTable
 from amberbox.blackbox.segments import manifest as mf
+from amberbox.blackbox.segments.condense import kept_records
 from amberbox.blackbox.segments.flat import Flat, TableSchema, flatten, join
+from amberbox.blackbox.segments.lines import CHECKPOINT
 from amberbox.blackbox.segments.manifest import Part, Segment
 from amberbox.blackbox.segments.parquet import TableFile, describe, read_segment
 from amberbox.core.errors import AmberboxError
@@ -93,8 +96,16 @@ def _size(column: ColumnData) -> int:
     return len(column) * (64 + sum(known) // max(len(sample), 1))
 
 
-def build_segments(store: Path, journal: JournalFile) -> list[Segment]:
+def _no_pause() -> None:
+    """Nothing else has to be done on the way."""
+
+
+def build_segments(
+    store: Path, journal: JournalFile, breathe: Callable[[], None] = _no_pause
+) -> list[Segment]:
     """Write a sealed journal's rows as one Parquet file per table and enter them in the manifest.
+
+    ``breathe`` is called again and again on the way.
 
     A journal that is in the manifest already is left alone. A crash on the way leaves files that
     the next call overwrites; readers use the journal until its entries are durable. What cannot
@@ -109,6 +120,7 @@ def build_segments(store: Path, journal: JournalFile) -> list[Segment]:
     try:
         for flat in _flats(known, journal, gaps, sizes):
             _builder(builders, store, journal, flat.schema).add(flat)
+            breathe()
         segments = _finish(builders, journal, sizes)
     finally:
         for builder in builders.values():
@@ -193,18 +205,26 @@ def _path(item: str, journal: str, version: int) -> str:
     return f"{FOLDER}/{item}/{writer}{Path(name).stem}{number}.parquet"
 
 
-def merge_small(store: Path) -> list[Segment]:
+def merge_small(store: Path, breathe: Callable[[], None] = _no_pause) -> list[Segment]:
     """Join neighbouring small segments, so that slow items do not fill the disk with files.
 
     Whenever 6 segments of one table (one hour at 10 minutes each) of fewer than 6,000 rows
     stand side by side, they become one. What was joined is deleted once the manifest says so.
     """
-    known = mf.read(store)
     merged = []
-    for item in known.segments:
-        for group in _small_groups(known.segments[item]):
+    for item in mf.read(store).segments:
+        breathe()  # which may delete segments
+        known = mf.read(store)
+        whole = [s for s in known.segments.get(item, ()) if not _is_partly_gone(s, known)]
+        for group in _small_groups(whole):
             merged.append(_merge(store, known.schemas[group[0].schema], group))
     return merged
+
+
+def _is_partly_gone(segment: Segment, known: mf.Manifest) -> bool:
+    """Tell whether a segment only waits for the last of its journals to go; kept ones never do."""
+    kept = mf.is_kept(known.schemas[segment.schema])
+    return not kept and any(part.journal in known.columns_gone for part in segment.parts)
 
 
 def _small_groups(segments: Sequence[Segment]) -> Iterator[list[Segment]]:
@@ -283,14 +303,19 @@ def rebuild(store: Path) -> list[str]:
             continue
         schemas[schema.id] = schema
         segments.append(segment)
+    before = mf.read(store)
     kept = _without_replaced(segments)
-    records = [mf.schema_record(schema) for schema in schemas.values()]
+    records: list[Mapping[str, Any]] = [
+        {"kind": CHECKPOINT, "columns_gone": sorted(before.columns_gone), "damage": []},
+        *(mf.schema_record(schema) for schema in schemas.values()),
+    ]
     records += [mf.segment_record(segment) for segment in kept]
     records += [
         mf.journal_record(journal)
         for journal in _journals_of(kept)
-        if not (store / journal.name).exists()
+        if not (store / journal.name).exists() and journal.name not in before.columns_gone
     ]
+    records += kept_records(replace(before, journals={}), lambda name: True)
     mf.replace(store, records)
     return bad
 

@@ -1,0 +1,173 @@
+"""Keeps a store within its limits: deletes by the one rule, says when there is no room left."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+
+from amberbox.blackbox.keeper.deletion import Removal, Unit, Window, for_room, too_old, unpinned
+from amberbox.blackbox.keeper.deletionlog import DeletionLog
+from amberbox.blackbox.keeper.holding import is_needed, pinning, release_confirmed
+from amberbox.blackbox.keeper.kept import KeptJournal
+from amberbox.blackbox.keeper.limit import FullMark, Room, room, with_reserve
+from amberbox.blackbox.keeper.options import KeeperOptions
+from amberbox.blackbox.keeper.ownjournal import OwnJournal, event
+from amberbox.blackbox.keeper.pinlock import pin_lock
+from amberbox.blackbox.keeper.removal import Remover
+from amberbox.blackbox.keeper.stock import Stock
+from amberbox.blackbox.keeper.usage import DiskUse
+from amberbox.blackbox.segments import manifest as mf
+from amberbox.blackbox.segments.condense import LARGE_BYTES, SignHead, condense
+from amberbox.blackbox.store import Store
+
+BREATH_S = 0.1
+"""Between two looks at the room that is left, while something else is being done."""
+_PATIENCE_S = 1.0
+"""Between two searches for what may be deleted when there was nothing."""
+_BATCH = 64
+_MANIFEST_SHARE = 20
+
+
+class Deleter:
+    """Deletes in one store; ``pending`` tells which journals will still have columns.
+
+    ``busy`` is the journal that is being read just now and stays for so long.
+    """
+
+    def __init__(
+        self,
+        store: Store,
+        options: KeeperOptions,
+        journal: OwnJournal,
+        pending: Callable[[str], bool],
+    ) -> None:
+        self.use = DiskUse(store.path)
+        self.stock = Stock(store, self.use)
+        self.busy = ""
+        self._store = store
+        self._options = options
+        self._journal = journal
+        self._pending = pending
+        self._kept = KeptJournal(store)
+        self._remover = Remover(store, self._kept, lambda: pinning(store))
+        self._full = FullMark(store)
+        self._log = DeletionLog()
+        self._looked_s = 0.0
+        self._in_vain_s = 0.0
+        self._trouble = ""
+
+    def recover(self) -> None:
+        """Finish what a keeper before has begun to delete."""
+        self._remover.finish()
+
+    def measure(self) -> Room:
+        """Return how much the store takes and may take now."""
+        return room(self._store, self._options, self.use.measure())
+
+    def breathe(self) -> None:
+        """See to the room that is left, but not more often than needed."""
+        now_s = time.monotonic()
+        if now_s - self._looked_s >= BREATH_S:
+            self._looked_s = now_s
+            self.make_room(patient=now_s < self._in_vain_s)
+
+    def make_room(self, *, patient: bool = False) -> None:
+        """Delete until there is room again; where nothing may go, say that the store is full."""
+        try:
+            left = self.measure()
+            if left.needed > 0 and not patient:
+                left = self._delete_for(left)
+            self._mark(left)
+        except OSError as error:  # a disk in trouble: the next look may find it better
+            self._complain(f"cannot delete: {error.strerror or error}")
+
+    def _delete_for(self, left: Room) -> Room:
+        while left.needed > 0:
+            if not self._delete_some(left.needed):
+                released = release_confirmed(self._store)
+                if released is None:
+                    self._in_vain_s = time.monotonic() + _PATIENCE_S
+                    break
+                text = f"incident {released}, which a server holds, is let go for room"
+                self._tell("incident_released", text, incident=released)
+            left = self.measure()
+        return left
+
+    def _delete_some(self, needed_bytes: int) -> int:
+        known = mf.read(self._store.path)
+        windows = self.stock.windows(known)
+        units = self._free(self.stock.units(known, windows, self._pending))
+        return self._remove(for_room(units, needed_bytes, self._options)[:_BATCH], windows)
+
+    def _free(self, units: Sequence[Unit]) -> list[Unit]:
+        return unpinned((u for u in units if u.name != self.busy), pinning(self._store))
+
+    def expire(self) -> None:
+        """Delete what has outlived its lifetime."""
+        lifetime = self._options.lifetime
+        if lifetime.raw_s is None and lifetime.columns_s is None:
+            return
+        known = mf.read(self._store.path)
+        windows = self.stock.windows(known)
+        units = self.stock.units(known, windows, self._pending)
+        chosen = too_old(self._free(units), self._options)
+        for start in range(0, len(chosen), _BATCH):
+            self._remove(chosen[start : start + _BATCH], windows)
+            self.breathe()
+
+    def _remove(self, chosen: Sequence[Removal], windows: Mapping[str, Window]) -> int:
+        gone = self._remover.remove(chosen, windows)
+        for removal, tombstone in gone:
+            self._log.add(removal, tombstone)
+        return len(gone)
+
+    def trim_ring(self) -> None:
+        """Delete ring files that ended longer ago than the ring is long."""
+        for window, age_s in self.stock.ring():
+            path = self._store.path / window.name
+            if age_s > self._options.ring_s and path.exists():
+                with pin_lock(self._store):
+                    if not is_needed(self._store, window, path):
+                        path.unlink(missing_ok=True)
+
+    def condense(self, sign: SignHead) -> None:
+        """Write the manifest anew when most of it is about what is long gone."""
+        large = min(LARGE_BYTES, self.measure().limit // _MANIFEST_SHARE)
+        condense(self._store.path, lambda name: (self._store.path / name).exists(), sign, large)
+
+    def report(self, *, now: bool = False) -> None:
+        """Write down what was deleted since the last time."""
+        records = self._log.due(now=now)
+        if records:
+            with suppress(OSError):  # it stays due
+                with_reserve(self._store, lambda: self._journal.write(records))
+                self._log.forget()
+
+    def close(self) -> None:
+        """Write down the rest."""
+        self.report(now=True)
+        with suppress(OSError):
+            self._kept.close()
+
+    def _mark(self, left: Room) -> None:
+        if left.needed > 0 and left.is_full:
+            reason = "nothing that is left may be deleted"
+            if self._options.when_full == "stop":
+                reason = "nothing is deleted for room (when_full: stop)"
+            if with_reserve(self._store, lambda: self._full.set(reason)):
+                text = f"the store is full: {reason}; only events are recorded"
+                self._tell("store_full", text, used=left.used, limit=left.limit)
+        elif left.needed <= 0 and self._full.clear():
+            self._tell("store_room", "there is room in the store again")
+
+    def _tell(self, kind: str, text: str, **details: object) -> None:
+        with suppress(OSError):
+            record = event(kind, text, "keeper", **details)
+            with_reserve(self._store, lambda: self._journal.write([record]))
+
+    def _complain(self, text: str) -> None:
+        if text != self._trouble:
+            self._trouble = text
+            print(f"amberbox keeper: {text}", file=sys.stderr)

@@ -1,0 +1,203 @@
+"""What is deleted, by the one rule: a pure function from what there is to what goes.
+
+For room: (1) what a server has confirmed, oldest first; (2) unconfirmed data of the ring; (3) of
+class bulk; (4) all other unconfirmed data, oldest first, but never the newest ``keep_min_s``;
+(5) confirmed incidents. Never what is pinned, and never events and statuses: their tables are no
+part of a unit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from math import inf
+from typing import Protocol
+
+from amberbox.blackbox.keeper.options import KeeperOptions
+from amberbox.blackbox.segments.entries import What
+from amberbox.core.clock import NS
+
+ROOM = "for room"
+TOO_OLD = "older than its lifetime"
+
+
+class Pin(Protocol):
+    """A stretch of the record that stays: an incident."""
+
+    def holds_received(self, run: int, from_ns: int, to_ns: int) -> bool:
+        """Tell whether it meets rows of a run that were received in ``[from, to]``."""
+
+
+@dataclass(frozen=True, slots=True)
+class Unit:
+    """What is deleted at once: a journal file that nobody writes, and its columns.
+
+    Bytes are 0 for what is not there (any more). ``age_s`` is how much record there is after its
+    end; ``pending`` says that its columns are still to be built.
+    """
+
+    name: str
+    writer: str
+    run: int
+    start_ns: int
+    end_ns: int
+    age_s: float
+    raw_bytes: int
+    column_bytes: int = 0
+    confirmed: bool = False
+    pending: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Removal:
+    """One unit or a part of it that goes, and why."""
+
+    unit: Unit
+    what: What
+    reason: str
+
+    @property
+    def freed_bytes(self) -> int:
+        """About what is gained; segments shared with other units stay for a while."""
+        raw = self.unit.raw_bytes if self.what != "columns" else 0
+        return raw + (self.unit.column_bytes if self.what != "raw" else 0)
+
+
+def unpinned(units: Iterable[Unit], pins: Collection[Pin]) -> list[Unit]:
+    """Leave out the units that a pin holds."""
+    return [
+        unit
+        for unit in units
+        if not any(pin.holds_received(unit.run, unit.start_ns, unit.end_ns) for pin in pins)
+    ]
+
+
+def too_old(units: Iterable[Unit], options: KeeperOptions) -> list[Removal]:
+    """Return what has outlived its lifetime, oldest first; the ring has its own length."""
+    raw_s, columns_s = _lifetimes(options)
+    found = []
+    for unit in by_age(u for u in units if u.writer != "ring"):
+        old_raw = unit.age_s > raw_s and unit.raw_bytes > 0
+        old_raw &= not (unit.pending and columns_s > raw_s)  # their columns come first
+        old_columns = unit.age_s > columns_s and unit.column_bytes > 0
+        if old_raw and (old_columns or not unit.column_bytes):
+            found.append(Removal(unit, "both", TOO_OLD))
+        elif old_raw or old_columns:
+            found.append(Removal(unit, "raw" if old_raw else "columns", TOO_OLD))
+    return found
+
+
+def for_room(units: Sequence[Unit], needed_bytes: int, options: KeeperOptions) -> list[Removal]:
+    """Return what has to go so that ``needed_bytes`` become free, in the order of the rule.
+
+    Where raw and columns have different lifetimes, the part with the shorter one goes first,
+    of the whole store. Gives less than is needed when there is no more that may go.
+    """
+    found, freed = [], 0
+    for removal in _in_order(units, options):
+        if freed >= needed_bytes:
+            break
+        found.append(removal)
+        freed += removal.freed_bytes
+    return found
+
+
+def _in_order(units: Sequence[Unit], options: KeeperOptions) -> Iterator[Removal]:
+    candidates = list(_by_the_rule(units, options))
+    raw_s, columns_s = _lifetimes(options)
+    first: What = "raw" if raw_s < columns_s else "columns" if columns_s < raw_s else "both"
+    if first == "both":
+        yield from (Removal(unit, "both", ROOM) for unit in candidates)
+        return
+    parted = [unit for unit in candidates if unit.raw_bytes and unit.column_bytes]
+    halved = {unit.name for unit in parted}
+    yield from (Removal(unit, first, ROOM) for unit in parted)
+    for unit in candidates:
+        yield Removal(_rest(unit, first) if unit.name in halved else unit, "both", ROOM)
+
+
+def _rest(unit: Unit, gone: What) -> Unit:
+    return replace(unit, raw_bytes=0) if gone == "raw" else replace(unit, column_bytes=0)
+
+
+def _by_the_rule(units: Sequence[Unit], options: KeeperOptions) -> Iterator[Unit]:
+    open_units = [unit for unit in units if not unit.confirmed]
+    yield from by_age(unit for unit in units if unit.confirmed)
+    yield from by_age(unit for unit in open_units if unit.writer == "ring")
+    if options.when_full == "stop":
+        return
+    yield from by_age(unit for unit in open_units if unit.writer == "bulk")
+    others = (unit for unit in open_units if unit.writer not in ("ring", "bulk"))
+    yield from by_age(unit for unit in others if unit.age_s >= options.keep_min_s)
+
+
+def by_age(units: Iterable[Unit]) -> list[Unit]:
+    """Sort units, the oldest first."""
+    return sorted(units, key=lambda unit: (-unit.age_s, unit.name))
+
+
+def _lifetimes(options: KeeperOptions) -> tuple[float, float]:
+    raw_s, columns_s = options.lifetime.raw_s, options.lifetime.columns_s
+    return inf if raw_s is None else raw_s, inf if columns_s is None else columns_s
+
+
+@dataclass(frozen=True, slots=True)
+class Window:
+    """Where a journal file lies in its writer's run, and when it was received."""
+
+    name: str
+    writer: str
+    run: int
+    number: int
+    first_seq: int
+    end_seq: int
+    start_ns: int
+    end_ns: int
+    chain: str
+
+
+def ages_s(windows: Sequence[Window]) -> dict[str, float]:
+    """Tell how much record there is after the end of each journal, whatever clocks did.
+
+    Files of a run follow each other without a pause: where their times do not, the clock was
+    set. What other writers wrote is placed among the main journals of its run.
+    """
+    main = _in_turn(w for w in windows if w.writer == "main")
+    ages = _chained(main)
+    for writer in {w.writer for w in windows} - {"main"}:
+        others = _in_turn(w for w in windows if w.writer == writer)
+        own = _chained(others) if not main else {}
+        for window in others:
+            ages[window.name] = own.get(window.name, 0) or _placed(window, main, ages)
+    return {name: age_ns / NS for name, age_ns in ages.items()}
+
+
+def _in_turn(windows: Iterable[Window]) -> list[Window]:
+    return sorted((w for w in windows if w.end_ns), key=lambda w: (w.run, w.number))
+
+
+def _chained(windows: Sequence[Window]) -> dict[str, int]:
+    ages: dict[str, int] = {}
+    age_ns, after = 0, None
+    for window in reversed(windows):
+        if after is not None:
+            pause_ns = after.start_ns - window.end_ns if after.run != window.run else 0
+            age_ns += max(0, pause_ns) + max(0, after.end_ns - after.start_ns)
+        ages[window.name] = age_ns
+        after = window
+    return ages
+
+
+def _placed(window: Window, main: Sequence[Window], ages: dict[str, int]) -> int:
+    """Age of a journal by the youngest main journal of its run that was written when it ended."""
+    same = [m for m in main if m.run == window.run]
+    for beside in reversed(same):
+        if beside.start_ns <= window.end_ns <= beside.end_ns:
+            return ages[beside.name] + beside.end_ns - window.end_ns
+    if same and window.end_ns > same[-1].end_ns:
+        return ages[same[-1].name]
+    before = [m for m in main if m.run < window.run]
+    oldest = same[0] if same else None
+    if oldest is not None:
+        return ages[oldest.name] + oldest.end_ns - oldest.start_ns
+    return ages[before[-1].name] if before else max(ages.values(), default=0)

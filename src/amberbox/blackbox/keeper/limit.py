@@ -1,0 +1,98 @@
+"""How much room a record may take, and the mark that says when it has none left."""
+
+from __future__ import annotations
+
+import errno
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar
+
+from amberbox.blackbox.keeper.options import KeeperOptions
+from amberbox.blackbox.keeper.usage import free_bytes, total_bytes
+from amberbox.blackbox.store import Store, replace_file
+
+FULL = "full"
+RESERVE = "reserve"
+_RESERVE_STEP = 1_000_000
+_SHARE = 4
+"""At most this part of the limit is held free for files that grow."""
+_NO_ROOM = (errno.ENOSPC, errno.EDQUOT)
+
+Result = TypeVar("Result")
+
+
+@dataclass(frozen=True, slots=True)
+class Room:
+    """What a record takes, what it may take, and how much of that is held free."""
+
+    used: int
+    limit: int
+    headroom: int
+
+    @property
+    def needed(self) -> int:
+        """Bytes that have to go now; 0 or less when there is room."""
+        return self.used + self.headroom - self.limit
+
+    @property
+    def is_full(self) -> bool:
+        """Tell whether even half of what is held free is in use."""
+        return self.used + self.headroom // 2 > self.limit
+
+
+def room(store: Store, options: KeeperOptions, used: int) -> Room:
+    """Compare what a store takes with its quota and with what must stay free beside it."""
+    partition = total_bytes(store.path)
+    quota = options.quota
+    if quota is None:
+        quota = int(partition * options.quota_percent / 100)
+    limit = max(0, min(quota, used + free_bytes(store.path) - options.min_free))
+    return Room(used, limit, min(options.headroom, limit // _SHARE))
+
+
+class FullMark:
+    """The file ``full`` in a store: while it is there, nothing but events is recorded."""
+
+    def __init__(self, store: Store) -> None:
+        self._path = store.path / FULL
+        self.is_set = self._path.exists()
+
+    def set(self, reason: str) -> bool:
+        """Leave the mark; False if it was there already."""
+        if self.is_set:
+            return False
+        replace_file(self._path, f"{reason}\n")
+        self.is_set = True
+        return True
+
+    def clear(self) -> bool:
+        """Remove the mark; False if there was none."""
+        if not self.is_set:
+            return False
+        self._path.unlink(missing_ok=True)
+        self.is_set = False
+        return True
+
+
+def with_reserve(store: Store, action: Callable[[], Result]) -> Result:
+    """Do what must be written down; on a full disk give up the reserve for it, bit by bit."""
+    while True:
+        try:
+            return action()
+        except OSError as error:
+            if error.errno not in _NO_ROOM or not shrink(store.path / RESERVE):
+                raise
+
+
+def shrink(reserve: Path) -> bool:
+    """Give a part of the reserve back to the disk; False when there is none left."""
+    try:
+        size = reserve.stat().st_size
+        if size == 0:
+            return False
+        os.truncate(reserve, max(0, size - _RESERVE_STEP))
+    except FileNotFoundError:
+        return False
+    return True
