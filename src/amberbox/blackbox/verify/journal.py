@@ -39,27 +39,44 @@ class Checked:
     """What was found in a file: how far its chain goes, and what does not hold.
 
     ``loose_from`` is the first byte that no link speaks for, ``torn`` how many bytes at the end are
-    no whole record.
+    no whole record, ``tail`` the SHA-256 of what follows the ``last`` link, itself included.
+    ``noted`` are the links that somebody has asked for.
     """
 
-    name: str
+    target: Target
     size: int = 0
     start_chain: str = ""
-    links: Sequence[Link] = ()
+    last: Link | None = None
+    noted: Sequence[Link] = ()
     loose_from: int = 0
     torn: int = 0
+    tail: str = ""
+    finished: bool = False
     findings: list[Finding] = field(default_factory=list)
+
+    @property
+    def places(self) -> Places:
+        """Where the file's chunks lie and when they were received."""
+        return Places(self.target.path, self.target.name)
+
+    @property
+    def tail_from(self) -> int:
+        """Where the last link stands: what follows is for a seal to vouch for."""
+        return self.last.to if self.last is not None else 0
 
     @property
     def chain(self) -> str:
         """The last link; where there is none, the one that the file began with."""
-        return self.links[-1].chain if self.links else self.start_chain
+        return self.last.chain if self.last is not None else self.start_chain
 
 
-def check_journal(target: Target) -> Checked:
-    """Hash a journal file and compare with its chain, and with what was sealed."""
+def check_journal(target: Target, noted: tuple[str, ...] = ()) -> Checked:
+    """Hash a journal file and compare with its chain, and with what was sealed.
+
+    ``noted`` are beginnings of links that somebody wants to find again.
+    """
     with open_buffer(target.path) as data:
-        checking = _Checking(target, data)
+        checking = _Checking(target, data, noted)
         checking.run()
         return checking.checked
 
@@ -67,13 +84,14 @@ def check_journal(target: Target) -> Checked:
 class _Checking:
     """One pass over a file: ``chain`` and ``at`` say how far it has been proven."""
 
-    def __init__(self, target: Target, data: Buffer) -> None:
+    def __init__(self, target: Target, data: Buffer, noted: tuple[str, ...]) -> None:
         self.target = target
+        self.noted = noted
         self.data = data
         self.places = Places(target.path, target.name)
         self.start = dict(start_record(target.path))
         self.chain = self.start.get("chain", "")
-        self.checked = Checked(target.name, len(data), self.chain)
+        self.checked = Checked(target, len(data), self.chain)
         self.at = 0
         self.before: Link | None = None
 
@@ -86,8 +104,10 @@ class _Checking:
                 self._link(link, found[number + 1] if number + 1 < len(found) else None)
             if number == 0 and not self.checked.findings and self._is_another():
                 return
-        self.checked.links, self.checked.loose_from = found, self.at
-        self._end(found)
+        self.checked.last, self.checked.loose_from = found[-1] if found else None, self.at
+        self.checked.noted = [link for link in found if link.chain.startswith(self.noted)]
+        self.checked.tail = digest(self.data, self.checked.tail_from, len(self.data))
+        self._end()
 
     def _tell(self, finding: Finding) -> None:
         self.checked.findings.append(finding)
@@ -183,7 +203,7 @@ class _Checking:
             return False
         return True
 
-    def _end(self, found: Sequence[Link]) -> None:
+    def _end(self) -> None:
         """Check what follows the last link."""
         sealed, moved = self.target.sealed, displaced(self.data, self.at)
         if moved is not None:
@@ -194,7 +214,7 @@ class _Checking:
             self._cut(sealed)
         elif sealed.chain and self.checked.chain != sealed.chain:
             self._rewritten(sealed)
-        elif digest(self.data, sealed.tail_from, sealed.bytes) != sealed.tail:
+        elif self.checked.tail != sealed.tail:
             self._judge(Block(sealed.tail_from, sealed.bytes, sealed.tail, self.before, tail=True))
 
     def _moved(self, offset: int, said: int) -> Finding:
@@ -225,7 +245,8 @@ class _Checking:
 
     def _open_end(self) -> None:
         """Look at the end of a file that is not sealed: only checksums speak for it."""
-        if self.before is not None and self._is_finished():
+        self.checked.finished = self.before is not None and self._is_finished()
+        if self.checked.finished:
             return
         walk = Walk(self.data, at=self.at, tag=self.target.identity.tag, trusted=self.at)
         for found in walk:

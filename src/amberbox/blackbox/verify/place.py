@@ -50,6 +50,11 @@ class Places:
         ends = [p.end_ns for p in self.chunks() if to_byte is None or p.offset < to_byte]
         return self._received(ends[-1] if ends else None, None)[0]
 
+    def start_ns(self) -> int | None:
+        """Return when the first chunk was received."""
+        starts = [place.start_ns for place in self.chunks()]
+        return self._received(starts[0] if starts else None, None)[0]
+
     def chunks(self) -> Sequence[ChunkPlace]:
         """Return where the chunks are, in the order in which they stand."""
         if self._chunks is None:

@@ -1,0 +1,197 @@
+"""Check the manifest: each line's own hash, the chain from line to line, and the signatures."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from amberbox.blackbox.keeper.keys import holds
+from amberbox.blackbox.keeper.signing import signature_message
+from amberbox.blackbox.segments import lines
+from amberbox.blackbox.segments import manifest as mf
+from amberbox.blackbox.segments.entries import Sealed, Signature, from_record
+from amberbox.blackbox.verify.findings import Finding, State
+from amberbox.blackbox.verify.mended import without_one_bit
+from amberbox.blackbox.verify.place import TROUBLE
+
+_MOST_BYTES = 16_000
+"""Longer lines are not searched for a flipped bit: it would take minutes."""
+_BEGIN = b'\n{"hash":"'
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """A line that holds, or held before a bit of it was flipped."""
+
+    number: int
+    offset: int
+    record: dict[str, Any]
+
+
+@dataclass(slots=True)
+class CheckedManifest:
+    """What the lines say and how far they can be believed.
+
+    ``hashes`` are the numbers of the lines with each hash, ``sealed`` those that seal each journal;
+    ``signatures`` are those that hold, with the line they stand in.
+    """
+
+    hashes: dict[str, int] = field(default_factory=dict)
+    sealed: dict[str, tuple[int, Sealed]] = field(default_factory=dict)
+    signatures: list[tuple[int, Signature]] = field(default_factory=list)
+    checkpoint: str = ""
+    last_hash: str = lines.FIRST_HASH
+    findings: list[Finding] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+    size: int = 0
+
+    def signed(self, key: str) -> tuple[int, Signature] | None:
+        """Return the last line that a key has signed, and its signature."""
+        covered = [
+            (self.hashes[s.head], s)
+            for _, s in self.signatures
+            if s.key == key and s.head in self.hashes
+        ]
+        return max(covered, key=lambda pair: pair[0], default=None)
+
+
+def check_manifest(store: Path, store_id: str, *, can_check: bool) -> CheckedManifest:
+    """Read a manifest line by line and check it; signatures where they can be checked."""
+    checked = CheckedManifest()
+    try:
+        content = (store / mf.NAME).read_bytes()
+    except FileNotFoundError:
+        return checked
+    checked.size = len(content)
+    found = list(_lines(content, checked))
+    _check_order(found, checked)
+    for line in found:
+        _take(line, store_id, checked, can_check=can_check)
+    return checked
+
+
+def _lines(content: bytes, checked: CheckedManifest) -> Iterator[Line]:
+    """Give the lines whose hash holds; say of the others what is wrong with them."""
+    pieces = content.split(b"\n")
+    number, offset, last_hash = 0, 0, lines.FIRST_HASH
+    while number < len(pieces):
+        piece, taken = pieces[number], 1
+        found = [record] if (record := _decoded(piece)) else []
+        if piece and not found:
+            found, taken = _mended(pieces, number)
+            after = _next_record(pieces, number + taken)
+            checked.findings += _bad_line(piece, number + 1, offset, found, after, last_hash)
+        for record in found:
+            yield Line(number + 1, offset, record)
+            last_hash = record["hash"]
+        offset += sum(len(p) + 1 for p in pieces[number : number + taken])
+        number += taken
+
+
+def _decoded(line: bytes) -> dict[str, Any] | None:
+    try:
+        record = lines.decode(line)
+    except ValueError:
+        return None
+    return record if record is not None and {"kind", "prev"} <= record.keys() else None
+
+
+def _next_record(pieces: Sequence[bytes], start: int) -> dict[str, Any] | None:
+    return next((r for p in pieces[start:] if (r := _decoded(p)) is not None), None)
+
+
+def _mended(pieces: Sequence[bytes], number: int) -> tuple[list[dict[str, Any]], int]:
+    """Undo one flipped bit: in the line, in the line's end, or where it became a line's end."""
+    piece = pieces[number]
+    if len(piece) > _MOST_BYTES:
+        return [], 1
+    cut = piece.find(_BEGIN[1:], 1)
+    if cut > 0:
+        parts = [_decoded(piece[: cut - 1]), _decoded(piece[cut:])]
+        if None not in parts:
+            return [part for part in parts if part is not None], 1
+    candidates = [(piece, 1)]
+    if number + 1 < len(pieces) and pieces[number + 1]:
+        candidates.append((piece + b"\n" + pieces[number + 1], 2))
+    for content, taken in candidates:
+        whole = without_one_bit(content, lambda c: _decoded(c) is not None)
+        record = _decoded(whole) if whole is not None else None
+        if record is not None:
+            return [record], taken
+    return [], 1
+
+
+def _bad_line(
+    line: bytes,
+    number: int,
+    offset: int,
+    found: Sequence[dict[str, Any]],
+    after: dict[str, Any] | None,
+    last_hash: str,
+) -> Iterator[Finding]:
+    """Say what became of a line whose hash does not hold; nothing of one torn by a crash."""
+    if found:
+        yield _finding("damaged", f"line {number}: one bit is flipped", offset, len(line))
+    elif after is not None and after["prev"] != last_hash:
+        yield _finding("altered", f"line {number} was changed", offset, len(line))
+    elif _is_json(line):
+        yield _finding("altered", f"line {number} was added or changed", offset, len(line))
+    elif after is None:
+        text = f"line {number} is torn: it was being written at a crash or power cut"
+        yield _finding("unsigned", text, offset, len(line))
+
+
+def _is_json(line: bytes) -> bool:
+    try:
+        json.loads(line)
+    except ValueError:
+        return False
+    return True
+
+
+def _finding(state: State, text: str, offset: int, size: int) -> Finding:
+    return Finding(state, mf.NAME, text, None, offset, offset + size)
+
+
+def _check_order(found: Sequence[Line], checked: CheckedManifest) -> None:
+    """Check that each line names the one before it."""
+    all_hashes = {line.record["hash"] for line in found}
+    expected = lines.FIRST_HASH
+    for place, line in enumerate(found):
+        prev = line.record["prev"]
+        if place == 0 and line.record["kind"] == lines.CHECKPOINT:
+            checked.checkpoint = prev
+        elif prev != expected:
+            checked.findings.append(_break(line, moved=prev in all_hashes))
+        checked.hashes[line.record["hash"]] = line.number
+        expected = line.record["hash"]
+    checked.last_hash = expected
+
+
+def _break(line: Line, *, moved: bool) -> Finding:
+    if moved:
+        text = f"line {line.number} is not where it was written: lines were moved"
+        return _finding("altered", text, line.offset, 0)
+    text = f"lines before line {line.number} are gone"
+    return _finding("missing", text, line.offset, 0)
+
+
+def _take(line: Line, store_id: str, checked: CheckedManifest, *, can_check: bool) -> None:
+    try:
+        entry = from_record(line.record)
+    except TROUBLE:
+        text = f"line {line.number} cannot be understood"
+        checked.findings.append(_finding("altered", text, line.offset, 0))
+        return
+    if isinstance(entry, Sealed):
+        checked.sealed[entry.journal] = (line.number, entry)
+    elif isinstance(entry, Signature) and can_check:
+        message = signature_message(store_id, entry.head, entry.at_ns)
+        if holds(entry.key, entry.signature, message):
+            checked.signatures.append((line.number, entry))
+        else:
+            text = f"the signature in line {line.number} does not hold"
+            checked.findings.append(_finding("altered", text, line.offset, 0))

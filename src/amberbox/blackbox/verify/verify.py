@@ -1,0 +1,217 @@
+"""Verify a store: the manifest, every journal, every segment, and the heads noted earlier."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+from amberbox.blackbox.journal.scan import start_record
+from amberbox.blackbox.keeper.keys import PUBLIC, can_sign, public_key
+from amberbox.blackbox.keeper.signing import LOCKS, SignedHeads
+from amberbox.blackbox.segments import manifest as mf
+from amberbox.blackbox.segments.manifest import Manifest, Segment
+from amberbox.blackbox.store import is_locked, open_store
+from amberbox.blackbox.verify.continuity import Graves, check_continuity
+from amberbox.blackbox.verify.findings import Collected, Finding, HeadLine, Report
+from amberbox.blackbox.verify.heads import (
+    Known,
+    Noted,
+    check_noted,
+    check_own_heads,
+    links_of,
+    read_noted,
+    read_own,
+)
+from amberbox.blackbox.verify.journal import Checked, Target, check_journal
+from amberbox.blackbox.verify.manifest import CheckedManifest, check_manifest
+from amberbox.blackbox.verify.place import TROUBLE
+from amberbox.blackbox.verify.segments import check_segment
+from amberbox.blackbox.verify.signed import Trust, check_trust, unsigned_ends
+from amberbox.blackbox.verify.targets import target_of
+
+THREADS = 2
+"""Hashing runs beside Python; more threads would take the robot's other processors."""
+_ATTEMPTS = 3
+
+
+def verify(path: Path, *, key: str = "", noted: Sequence[str] = ()) -> Report:
+    """Check everything in a store.
+
+    ``key`` is the public key (hex) as noted at the first start, else the store's own is believed.
+    ``noted`` are heads: hashes, or signed statements as text or files. A keeper that works on the
+    store meanwhile is no trouble. Raises UsageError for a head that is none, AmberboxError for one
+    that is not this robot's.
+    """
+    heads = [read_noted(text) for text in noted]
+    for _ in range(_ATTEMPTS):
+        before = mf.read(path).last_hash
+        report = _Verification(path, key, heads).run()
+        missing = any(finding.state == "missing" for finding in report.findings)
+        if not missing or mf.read(path).last_hash == before:
+            break
+    return report
+
+
+@dataclass(frozen=True, slots=True)
+class _Journals:
+    """The journal files of a store as they were checked, writer by writer."""
+
+    by_writer: Mapping[str, Sequence[Checked]]
+
+    @property
+    def by_name(self) -> dict[str, Checked]:
+        return {c.target.name: c for found in self.by_writer.values() for c in found}
+
+
+class _Verification:
+    """One pass over a store."""
+
+    def __init__(self, path: Path, key: str, noted: Sequence[Noted]) -> None:
+        self.store = open_store(path)
+        self.key = key
+        self.noted = noted
+        self.own = read_own(path)
+        self.collected = Collected()
+        self.notes: list[str] = []
+        self.bytes = 0
+
+    def run(self) -> Report:
+        """Check all parts; what is known from one goes into the next."""
+        path = self.store.path
+        store_id = self._store_id()
+        lines = check_manifest(path, store_id, can_check=can_sign())
+        trust = self._trust(lines)
+        manifest = self._read_manifest()
+        self.collected.take(mf.NAME, lines.findings)
+        self.bytes += lines.size
+        journals = self._journals(lines, store_id)
+        graves = Graves(manifest.tombstones)
+        self._continuity(lines, journals, graves)
+        self._segments(manifest, lines)
+        sealed = {name: entry for name, (_, entry) in lines.sealed.items()}
+        known = Known(store_id, lines, journals.by_name, sealed, graves)
+        heads = self._heads(known, trust.key)
+        ends = unsigned_ends(trust, lines, journals.by_writer, heads)
+        for finding in ends:
+            self.collected.take(finding.file, [finding])
+        return Report(
+            self.collected.findings, self.collected.files,
+            [*_head_lines(lines, journals.by_writer, trust)], self.notes, self.bytes,
+            trust.is_signed,
+        )  # fmt: skip
+
+    def _store_id(self) -> str:
+        """Return the store's identity; where all files name another one, that is it."""
+        paths = [
+            path for writer in self.store.writers() for path in self.store.journal_files(writer)
+        ]
+        stated = {start_record(path).get("store_id", self.store.id) for path in paths}
+        if len(stated) == 1 and self.store.id not in stated and len(paths) > 1:
+            other = stated.pop()
+            text = f"names another store than all of its {len(paths)} journals ({other})"
+            self.collected.take("store.json", [Finding("altered", "store.json", text)])
+            return other
+        return self.store.id
+
+    def _trust(self, lines: CheckedManifest) -> Trust:
+        trust = check_trust(self.key, public_key(self.store.path), lines)
+        for finding in trust.findings:
+            self.collected.take(finding.file, [finding])
+        self.notes += trust.notes
+        return trust
+
+    def _read_manifest(self) -> Manifest:
+        try:
+            return mf.read(self.store.path)
+        except TROUBLE:
+            text = "a line cannot be understood: nothing of what it lists is checked"
+            self.collected.take(mf.NAME, [Finding("altered", mf.NAME, text)])
+            return Manifest()
+
+    def _journals(self, lines: CheckedManifest, store_id: str) -> _Journals:
+        """Check all journal files, two at a time."""
+        targets = list(self._targets(lines, store_id))
+        noted = links_of(self.noted, self.own)
+        with ThreadPoolExecutor(THREADS) as pool:
+            results = pool.map(lambda target: _checked(target, noted), targets)
+            found = [checked for checked in results if checked is not None]
+        by_writer: dict[str, list[Checked]] = {}
+        for checked in found:
+            by_writer.setdefault(checked.target.identity.writer, []).append(checked)
+            self.collected.take(checked.target.name, checked.findings)
+            self.bytes += checked.size
+        return _Journals(by_writer)
+
+    def _targets(self, lines: CheckedManifest, store_id: str) -> Iterator[Target]:
+        for writer in self.store.writers():
+            paths = self.store.journal_files(writer)
+            locked = is_locked(self.store, LOCKS.get(writer, writer))
+            before = ""
+            for place, path in enumerate(paths, 1):
+                entry = lines.sealed.get(f"{path.parent.name}/{path.name}")
+                sealed = entry[1] if entry is not None else None
+                live = locked and place == len(paths)
+                yield target_of(self.store, path, sealed=sealed, before=before, live=live,
+                                store_id=store_id)  # fmt: skip
+                before = sealed.chain if sealed is not None else ""
+
+    def _continuity(self, lines: CheckedManifest, journals: _Journals, graves: Graves) -> None:
+        sealed = {name: entry for name, (_, entry) in lines.sealed.items()}
+        writers = {*journals.by_writer, *(entry.writer for entry in sealed.values())}
+        for writer in sorted(writers - {"ring"}):
+            files = journals.by_writer.get(writer, ())
+            for finding in check_continuity(writer, files, sealed, graves):
+                self.collected.take(finding.file, [finding])
+
+    def _segments(self, manifest: Manifest, lines: CheckedManifest) -> None:
+        """Check all segments, two at a time."""
+        segments = [s for found in manifest.segments.values() for s in found]
+        sealed = {name: entry for name, (_, entry) in lines.sealed.items()}
+        by_hash = {segment.sha256: segment.path for segment in segments}
+
+        def check(segment: Segment) -> tuple[list[Finding], int]:
+            return check_segment(self.store.path, segment, sealed, by_hash)
+
+        with ThreadPoolExecutor(THREADS) as pool:
+            for segment, (findings, size) in zip(segments, pool.map(check, segments), strict=True):
+                self.collected.take(segment.path, findings)
+                self.bytes += size
+
+    def _heads(self, known: Known, key: str) -> SignedHeads | None:
+        findings, heads = check_own_heads(self.own, known, key)
+        for finding in findings:
+            self.collected.take(finding.file, [finding])
+        for noted in self.noted:
+            missing, text = check_noted(noted, known, key)
+            for finding in missing:
+                self.collected.take(finding.file, [finding])
+            self.notes += [text] if text else []
+        return heads
+
+
+def _checked(target: Target, noted: tuple[str, ...]) -> Checked | None:
+    """Check a file; None when it was deleted meanwhile."""
+    try:
+        return check_journal(target, noted)
+    except FileNotFoundError:
+        return None
+    except TROUBLE as error:
+        text = f"cannot be read: {error}"
+        size = target.path.stat().st_size
+        return Checked(target, size, findings=[Finding("damaged", target.name, text)])
+
+
+def _head_lines(
+    lines: CheckedManifest, by_writer: Mapping[str, Sequence[Checked]], trust: Trust
+) -> Iterator[HeadLine]:
+    """Give the hashes that are worth noting down."""
+    if lines.hashes:
+        yield HeadLine("manifest", lines.last_hash, mf.NAME, trust.signed_ns)
+    for writer, files in by_writer.items():
+        if writer != "ring" and files and files[-1].last is not None:
+            last = files[-1]
+            yield HeadLine(writer, last.chain, last.target.name, last.places.end_ns(last.tail_from))
+    if trust.key:
+        yield HeadLine("key", trust.key, PUBLIC)
