@@ -55,7 +55,7 @@ def _structure(definition: Definition, name: str) -> Write:
             steps += [_field(field, _value(definition, kind)) for field, kind in group]
 
     def write(value: Any, pieces: list[bytes]) -> None:
-        if not isinstance(value, Mapping):
+        if not isinstance(value, dict):
             raise MisfitError(f"is no structure but {_named(value)}")
         if value.keys() != names:
             raise MisfitError(_difference(names, value))
@@ -185,7 +185,7 @@ def _write_text(value: Any, pieces: list[bytes]) -> None:
 
 def _write_time(value: Any, pieces: list[bytes]) -> None:
     try:
-        if isinstance(value, Mapping):
+        if isinstance(value, dict):
             pieces.append(pack("<II", *_pair(value)))
         else:
             pieces.append(pack("<II", *divmod(_epoch_ns(value), _NS)))
@@ -204,7 +204,7 @@ def _epoch_ns(value: Any) -> int:
 
 def _write_duration(value: Any, pieces: list[bytes]) -> None:
     try:
-        if not isinstance(value, Mapping):
+        if not isinstance(value, dict):
             raise TypeError
         pieces.append(pack("<ii", *_pair(value)))
     except _REFUSED:
