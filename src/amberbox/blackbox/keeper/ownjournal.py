@@ -72,11 +72,10 @@ class OwnJournal:
             rows.append((reserved.CURSOR, msgspec.json.encode(values)))
         if writer.rotation_due(self._log.now_ns()):
             writer.rotate()
-        if writer.path is None:
-            rows[:0] = self._preamble(writer.options.run)
-        else:
-            rows.insert(0, (reserved.CLOCK, self._clock_record()))
-        at_ns = [self._log.now_ns()] * len(rows)
+        now_ns = self._log.now_ns()
+        clock = (reserved.CLOCK, self._clock_record(now_ns))
+        rows[:0] = [clock] if writer.path is not None else [self._about_run(writer), clock]
+        at_ns = [now_ns] * len(rows)
         channels = [self._channel(writer, topic) for topic, _ in rows]
         writer.write(channels, at_ns, at_ns, [data for _, data in rows])
         writer.mark_sync().wait()
@@ -98,10 +97,10 @@ class OwnJournal:
             self._writer, self._channels = JournalWriter(options, **chain), {}
         return self._writer
 
-    def _preamble(self, run: int) -> list[tuple[str, bytes]]:
+    def _about_run(self, writer: JournalWriter) -> tuple[str, bytes]:
         about = {
             "writer": self._writer_name,
-            "run": run,
+            "run": writer.options.run,
             "store_id": self._store.id,
             "boot_id": self._clock.boot_id(),
             "version": __version__,
@@ -109,12 +108,14 @@ class OwnJournal:
             "input": "",
             **self._about,
         }
-        run_record = (reserved.RUN, msgspec.json.encode(about))
-        return [run_record, (reserved.CLOCK, self._clock_record())]
+        return reserved.RUN, msgspec.json.encode(about)
 
-    def _clock_record(self) -> bytes:
-        offset_ns, synchronised = self._log.offset_ns(), self._log.synchronised()
-        return msgspec.json.encode({"offset_ns": offset_ns, "synchronised": synchronised})
+    def _clock_record(self, at_ns: int) -> bytes:
+        return msgspec.json.encode({
+            "offset_ns": self._log.offset_ns(),
+            "synchronised": self._log.synchronised(),
+            "boot_ns": self._log.boot_ns(at_ns),
+        })  # fmt: skip
 
     def _channel(self, writer: JournalWriter, topic: str) -> int:
         if topic not in self._channels:

@@ -276,7 +276,7 @@ class Pipeline:
 
     def _preamble(self, writer: str, at_ns: int) -> list[tuple[str, bytes]]:
         """Return the own records that each file begins with: the run and the clock."""
-        clock = self._clock_record(at_ns, self._clock_offset_ns)
+        clock = self._clock_record(at_ns, self._clock_seen_ns)
         return [(reserved.RUN, self._run_record(writer)), (reserved.CLOCK, clock)]
 
     def _run_record(self, writer: str) -> bytes:
