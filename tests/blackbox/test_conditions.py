@@ -128,6 +128,25 @@ def test_an_age_survives_that_old_samples_are_forgotten() -> None:
     assert 6.0 < at_s <= 6.1
 
 
+def test_unknown_is_not_false() -> None:
+    watched = watch(low="b.v < 20")
+    watched.add(batch("b", [1, 2, 3, 4], v=np.array([10.0, None, 10.0, None], object)))
+    assert edges(watched, 5) == [("low", 1.0)]
+
+
+def test_a_new_run_knows_what_was_true_before() -> None:
+    watched = watch(low="b.v < 20", high="b.v > 20")
+    watched.add(batch("b", [5], v=np.array([10.0])))
+    assert edges(watched, 6) == [("low", 5.0)]
+    watched.begin_anew()
+    watched.add(batch("b", [1, 2], v=np.array([10.0, 30.0])))
+    assert edges(watched, 6) == [("high", 2.0)]
+    after = watch(low="b.v < 20", high="b.v > 20")
+    after.resume(watched.true, 6 * NS)
+    after.add(batch("b", [5, 7, 8], v=np.array([10.0, 30.0, 10.0])))
+    assert edges(after, 9) == [("low", 8.0)]
+
+
 TEXTS = ("a.v > 2", "a.v > 1 for 2s", "mean(a.v over 3s) > 2", "a.v > b.v", "age(a.v) > 2")
 
 

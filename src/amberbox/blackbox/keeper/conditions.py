@@ -6,7 +6,7 @@ matter, and neither does how often is asked: live and replay give the same edges
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -52,6 +52,7 @@ class Conditions:
     """Watches named conditions over addresses ``item.variable``.
 
     Times are those of the batches unless others are given; they must not decrease per item.
+    While it is unknown whether a condition is true, it counts as it was known last.
     What a condition cannot be judged by (a text where a number was expected) is told in
     ``problems``, once; it then never becomes true.
     """
@@ -91,6 +92,21 @@ class Conditions:
         except (Fault, UsageError) as error:
             self.problems.setdefault(samples.address, f"'{samples.address}' {error}")
 
+    @property
+    def true(self) -> list[str]:
+        """Name the conditions that were true when they were last known."""
+        return [name for name, is_true in self._was_true.items() if is_true]
+
+    def resume(self, true: Iterable[str], at_ns: int = _LONG_AGO) -> None:
+        """Go on where somebody else stopped: these were true, edges up to ``at_ns`` are told."""
+        self._was_true |= dict.fromkeys(set(true) & self._was_true.keys(), True)
+        self._until_ns = at_ns
+
+    def begin_anew(self) -> None:
+        """Forget all rows, as at the start of a run, but not what was true."""
+        self._samples = {address: _Samples(address) for address in self._samples}
+        self._until_ns = _LONG_AGO
+
     def start_at(self, at_ns: int) -> None:
         """Take what is true at an instant for known: no edge up to there is told."""
         self.edges(at_ns)
@@ -127,7 +143,7 @@ class Conditions:
         values = when.evaluate_series(series, instants)
         if np.ma.getdata(values).dtype != bool and not _null(values).all():
             raise UsageError("is no condition: compare it with something, such as: x > 0")
-        true = np.ma.filled(values, False).astype(bool)
+        true = _known_last(values, self._was_true[name])
         before = np.concatenate([[self._was_true[name]], true[:-1]])
         self._was_true[name] = bool(true[-1])
         rising: list[int] = instants[true & ~before].tolist()
@@ -220,6 +236,15 @@ def _ticks(first_ns: int, since_ns: int, until_ns: int) -> IntArray:
     start = max(first_ns, since_ns)
     end = min(until_ns, start + _TICKED_NS)
     return np.arange(start // TICK_NS + 1, end // TICK_NS + 1, dtype=np.int64) * TICK_NS
+
+
+def _known_last(values: Any, before: bool) -> Any:
+    """Say what was last known to be the case: unknown is not false."""
+    null = _null(values)
+    data = np.zeros(len(null), bool)
+    data[~null] = np.ma.getdata(values)[~null]
+    last = np.maximum.accumulate(np.where(null, -1, np.arange(len(null))))
+    return np.where(last < 0, before, data[last])
 
 
 def _null(values: Any) -> Any:
