@@ -14,7 +14,6 @@ import numpy as np
 from amberbox.blackbox.follow.batching import Origin, Stream, make_batch, stream_of
 from amberbox.blackbox.follow.read import (
     JournalFile,
-    files_of,
     journal_file,
     missing,
     sound_chunks,
@@ -28,7 +27,6 @@ from amberbox.blackbox.journal.scan import ChunkPlace, start_record
 from amberbox.blackbox.journal.summary import read_summary
 from amberbox.blackbox.journal.walk import Metadata, Walk
 from amberbox.blackbox.store import Store, is_locked, run_and_number
-from amberbox.core.clock import NS
 from amberbox.core.types import Batch, Cursor, Gap, IntArray, Schema, Watermark, WriterCursor
 
 Delivery = Batch | Gap | Watermark
@@ -61,12 +59,17 @@ class WriterTail:
         self._done: tuple[int, int] = (-1, -1)
         self._ends_at: tuple[int, int] = (-1, 0)
         self._live: _Live | None = None
-        self._last_ns: int | None = None
+        self.last_ns: int | None = None
         self._watermark: tuple[int, int, int] = (0, 0, 0)
 
     def position(self) -> WriterCursor:
         """Where this tail stands."""
         return WriterCursor(self.run, self.seq, dict(self.ahead))
+
+    @property
+    def last_ns(self) -> int | None:
+        """Log time up to which rows have been looked at, chosen items or not."""
+        return self.last_ns
 
     def step(self) -> Iterator[Delivery]:
         """Yield what has come since the last step."""
@@ -99,7 +102,7 @@ class WriterTail:
 
     def _missing_end(self, journal: JournalFile) -> Iterator[Gap]:
         """Tell of rows at a file's end: by number if its index counts them, else that some were."""
-        last_ns = journal.end_ns if self._last_ns is None else self._last_ns
+        last_ns = journal.end_ns if self.last_ns is None else self.last_ns
         if self.run == journal.run and self.seq < journal.end_seq:
             gap = missing(journal, self.seq, journal.end_seq, last_ns, journal.end_ns)
             self.seq, self.ahead = journal.end_seq, {}
@@ -146,7 +149,7 @@ class WriterTail:
             yield from self._set_back(journal)
             self.run, self.seq, self.ahead = run, 0, {}
         if first_seq > self.seq:
-            start = self._last_ns if self._last_ns is not None else journal.start_ns
+            start = self.last_ns if self.last_ns is not None else journal.start_ns
             gap = missing(journal, self.seq, first_seq, start, journal.start_ns or start)
             self.seq, self.ahead = first_seq, {}
             yield self._at(Gap(
@@ -158,7 +161,7 @@ class WriterTail:
         """Tell of provisional rows that were delivered, and then taken by a power cut."""
         run, end_seq = self._ends_at
         if run == self.run and end_seq < self.seq:
-            start = self._last_ns if self._last_ns is not None else journal.start_ns
+            start = self.last_ns if self.last_ns is not None else journal.start_ns
             gap = missing(journal, end_seq, self.seq, start, journal.start_ns or start)
             self.seq, self.ahead = end_seq, {}
             yield self._at(replace(gap, run=run, reason="delivered, then lost in a power cut"))
@@ -175,7 +178,7 @@ class WriterTail:
         if end <= self.seq:
             return
         if first > self.seq:
-            start = self._last_ns if self._last_ns is not None else int(chunk.log_ns[0])
+            start = self.last_ns if self.last_ns is not None else int(chunk.log_ns[0])
             gap = missing(journal, self.seq, first, start, int(chunk.log_ns[0]))
             self.seq, self.ahead = first, {}
             yield self._at(gap)
@@ -183,9 +186,9 @@ class WriterTail:
             yield from self._item_rows(item, rows[seq[rows] >= self._read_to(item)],
                                        chunk, seq, clock, streams)  # fmt: skip
         self.seq, self.ahead = end, {}
-        self._last_ns = int(chunk.log_ns.max())
+        self.last_ns = int(chunk.log_ns.max())
         yield from map(self._at, _gap_records(chunk, streams, self.writer, self.run, clock))
-        yield from self._advance_watermark(clock, self._last_ns)
+        yield from self._advance_watermark(clock, self.last_ns)
 
     def _read_to(self, item: str) -> int:
         return max(self.seq, self.ahead.get(item, 0))
@@ -338,42 +341,3 @@ def _gap_records(
                 writer, run, times[0], times[1], values["reason"], values["item"],
                 values.get("count"),
             )  # fmt: skip
-
-
-def position_at(
-    store: Store, writer: str, cursor: WriterCursor | None, lookback_s: float
-) -> WriterCursor:
-    """Find where to begin: at the cursor, or ``lookback_s`` before it, or before the end."""
-    if lookback_s <= 0:
-        return cursor or WriterCursor()
-    files = files_of(store, writer)
-    before = [
-        f for f in files if cursor is None or (f.run, f.first_seq) <= (cursor.run, cursor.seq)
-    ]
-    if not before:
-        return cursor or WriterCursor()
-    end_ns = _time_of(before[-1], cursor)
-    start = cursor or WriterCursor(before[-1].run, before[-1].end_seq)
-    for journal in reversed(before):
-        seq = journal.first_seq
-        for place in journal.places:
-            if place.end_ns >= end_ns - lookback_s * NS:
-                start = min(start, WriterCursor(journal.run, seq), key=lambda c: (c.run, c.seq))
-                break
-            seq += place.count
-        if journal.start_ns < end_ns - lookback_s * NS:
-            break
-    return start
-
-
-def _time_of(journal: JournalFile, cursor: WriterCursor | None) -> int:
-    """Log time at a cursor, or at the end of the file."""
-    if cursor is None or cursor.run != journal.run:
-        return journal.end_ns
-    seq, time_ns = journal.first_seq, journal.start_ns
-    for place in journal.places:
-        if seq >= cursor.seq:
-            break
-        time_ns = place.end_ns
-        seq += place.count
-    return time_ns

@@ -21,12 +21,20 @@ class Lifetime:
 
 @dataclass(frozen=True, slots=True)
 class Trigger:
-    """A condition that makes an incident when it becomes true."""
+    """What makes an incident: a condition that becomes true, an event, or the silence of an item.
+
+    ``when`` is an expression, ``event`` the kind of an event (``*`` stands for anything); nothing
+    was received of item ``silence`` for ``silence_s``. One of the three is given.
+    """
 
     name: str
-    when: str
+    when: str = ""
+    event: str = ""
+    silence: str = ""
+    silence_s: float = 0.0
     before_s: float = 60.0
     after_s: float = 20.0
+    hold_off_s: float = 60.0
     reason: str = ""
 
 

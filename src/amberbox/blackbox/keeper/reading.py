@@ -1,0 +1,167 @@
+"""Read a record as it grows, run by run, on one axis of time for all its journals.
+
+The axis is log time; where the clock was set within a run, it goes on as if nothing had happened,
+so that durations stay right.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass, field
+
+from amberbox.blackbox.follow.follow import RECORDED
+from amberbox.blackbox.follow.tail import WriterTail, position_at
+from amberbox.blackbox.incidents.incident import At
+from amberbox.blackbox.journal import reserved
+from amberbox.blackbox.journal.head import read_head
+from amberbox.blackbox.store import Store
+from amberbox.core.clock import NS
+from amberbox.core.names import identifier
+from amberbox.core.types import Batch, Cursor, IntArray
+
+WATCH = "watch"
+_RUN = identifier(reserved.RUN)
+_BACK_NS = NS // 20
+_ON_NS = 2 * NS
+"""A recorder writes once a second at least: a file that begins later than this after the one
+before has another clock, and so has one that begins before its end."""
+_MARGIN_NS = NS
+
+
+@dataclass(slots=True)
+class Axis:
+    """Log times of one run as times that never step."""
+
+    starts: list[int] = field(default_factory=list)
+    shifts: list[int] = field(default_factory=list)
+    _at: dict[str, tuple[int, int]] = field(default_factory=dict)
+
+    def begin(self, log_ns: int, last_ns: int | None) -> None:
+        """Take a file's first log time, and the last one before it."""
+        if not self.starts:
+            self.starts, self.shifts = [log_ns], [0]
+        elif last_ns is not None and not -_BACK_NS <= log_ns - last_ns <= _ON_NS:
+            self.starts.append(log_ns)
+            self.shifts.append(last_ns + self.shifts[-1] - log_ns)
+
+    def times(self, writer: str, log_ns: IntArray) -> IntArray:
+        """Return the times of a writer's rows; its log time goes back at a step only."""
+        first = int(log_ns[0])
+        place, last = self._at.get(writer, (0, first))
+        if first < last - _MARGIN_NS:
+            place += 1
+        while place + 1 < len(self.starts) and not self._fits(place, first):
+            place += 1
+        place = min(place, len(self.starts) - 1)
+        self._at[writer] = (place, int(log_ns[-1]))
+        times: IntArray = log_ns + self.shifts[place]
+        return times
+
+    def _fits(self, place: int, log_ns: int) -> bool:
+        end_ns = self.starts[place + 1] + self.shifts[place + 1] - self.shifts[place]
+        return self.starts[place] - _MARGIN_NS <= log_ns <= end_ns + _MARGIN_NS
+
+    def time_of(self, log_ns: int) -> int:
+        """Return the time of a log time of the newest stretch that it can be of."""
+        for start_ns, shift_ns in zip(reversed(self.starts), reversed(self.shifts), strict=True):
+            if log_ns >= start_ns - _MARGIN_NS:
+                return log_ns + shift_ns
+        return log_ns
+
+    def log_of(self, time_ns: int) -> int:
+        """Return the log time of a time."""
+        for start_ns, shift_ns in zip(reversed(self.starts), reversed(self.shifts), strict=True):
+            if time_ns >= start_ns + shift_ns:
+                return time_ns - shift_ns
+        return time_ns
+
+
+@dataclass(slots=True)
+class RunPart:
+    """What has come of one run: batches with their times, and up to when all of it has."""
+
+    run: int
+    axis: Axis
+    batches: list[tuple[Batch, IntArray]] = field(default_factory=list)
+    until_ns: int = 0
+
+    def moment(self, time_ns: int) -> At:
+        """Return the moment of the record at a time of the axis."""
+        return At(self.run, self.axis.log_of(time_ns))
+
+
+class Reading:
+    """Reads some items of a store from a cursor on; ``step`` gives what is new, run by run.
+
+    Only recorders count runs here; what was written by others (``watch``) comes with the run that
+    was under way.
+    """
+
+    def __init__(
+        self, store: Store, items: Collection[str], cursor: Cursor | None, lookback_s: float
+    ) -> None:
+        self._store = store
+        self._items = {*items, _RUN}
+        self._from = cursor.writers if cursor and cursor.store_id == store.id else {}
+        self._lookback_s = lookback_s
+        self._tails: dict[str, WriterTail] = {}
+        self._part: RunPart | None = None
+
+    def step(self) -> list[RunPart]:
+        """Read on; the last part is of the run that goes on."""
+        for writer in (*RECORDED, WATCH):
+            if writer not in self._tails and self._store.folder(writer).is_dir():
+                start = position_at(self._store, writer, self._from.get(writer), self._lookback_s)
+                self._tails[writer] = WriterTail(self._store, writer, self._items, start)
+        if "main" not in self._tails:
+            return []
+        parts = list(self._main(self._tails["main"]))
+        for writer, tail in self._tails.items():
+            if writer != "main":
+                _sort_in(parts, writer, tail)
+        return parts
+
+    def cursor(self) -> Cursor:
+        """Where the reading stands."""
+        return Cursor(self._store.id, {w: tail.position() for w, tail in self._tails.items()})
+
+    def _main(self, tail: WriterTail) -> Iterator[RunPart]:
+        """Read the main journal, which says when runs and stretches of log time begin."""
+        head = read_head(self._store.folder("main"))
+        part = self._part
+        if part is not None:
+            part.batches = []
+        for delivery in tail.step():
+            if not isinstance(delivery, Batch):
+                continue
+            if part is None or part.run != delivery.run:
+                if part is not None:
+                    yield part
+                part = self._part = RunPart(delivery.run, Axis())
+            self._take(part, delivery, tail.last_ns)
+        if part is not None:
+            told = head is not None and (head.run, head.next_seq) == (part.run, tail.seq)
+            last_ns = tail.last_ns or 0
+            end_ns = max(head.watermark_ns, last_ns) if head is not None and told else last_ns
+            part.until_ns = max(part.until_ns, part.axis.time_of(end_ns))
+            yield part
+
+    def _take(self, part: RunPart, batch: Batch, last_ns: int | None) -> None:
+        first_ns = int(batch.log_time_ns[0])
+        if batch.item == _RUN or not part.axis.starts:
+            part.axis.begin(first_ns, last_ns)
+        times_ns = part.axis.times("main", batch.log_time_ns)
+        part.until_ns = max(part.until_ns, int(times_ns[-1]))
+        if batch.item != _RUN:
+            part.batches.append((batch, times_ns))
+
+
+def _sort_in(parts: list[RunPart], writer: str, tail: WriterTail) -> None:
+    """Add the batches of another journal to the runs that they belong to."""
+    by_run = {part.run: part for part in parts}
+    for delivery in tail.step():
+        if not isinstance(delivery, Batch) or delivery.item == _RUN or not parts:
+            continue
+        part = parts[-1] if writer == WATCH else by_run.get(delivery.run)
+        if part is not None and part.axis.starts:
+            part.batches.append((delivery, part.axis.times(writer, delivery.log_time_ns)))
