@@ -78,6 +78,14 @@ def test_the_time_is_found_with_its_unit(
     assert f", in {unit}" in report.notes[0]
 
 
+def test_times_that_no_journal_holds_are_refused(tmp_path: Path) -> None:
+    cells = ["2018-12-10T12:00:00Z", "2300-01-01T00:00:00Z", "2018-12-10T12:00:00+5Z", ""]
+    report, table = imported("time,n\n" + "".join(f"{c},1\n" for c in cells), tmp_path)
+    assert table.values("timestamp") == [NOON * NS]
+    (account,) = report.accounts
+    assert "1 messages + 3 refused (2 no time, 1 a time before 1970 or after 2262)" in account
+
+
 def test_relative_times_begin_when_one_says(tmp_path: Path) -> None:
     content = "t_ms,x\n-500,1\n0,2\n250.5,3\n"
     report, table = imported(content, tmp_path, start_ns=NOON * NS)
