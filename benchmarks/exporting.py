@@ -109,13 +109,14 @@ def _with_rosbags(path: Path, made: mix.Mix) -> None:
 
 
 _CHILD = """
-import resource, sys
+import sys
 from pathlib import Path
 from amberbox.blackbox.exporting import View, export
 from amberbox.blackbox.query.record import Record
 start = (1_700_000_000 * 10**9, 1_700_000_000 * 10**9 + int(sys.argv[4]) * 10**9)
 export(Record(Path(sys.argv[1])), View(windows=[start]), Path(sys.argv[2]), sys.argv[3])
-print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1000)
+peak = next(l for l in Path("/proc/self/status").read_text().splitlines() if "VmHWM" in l)
+print(int(peak.split()[1]) / 1000)
 """
 
 

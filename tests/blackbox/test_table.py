@@ -30,7 +30,7 @@ def test_csv(table: Any) -> None:
     lines = file.getvalue().splitlines()
     assert lines[0] == "timestamp,pose_x,ranges[1],ranges,mode"
     assert lines[1] == "2026-09-21T14:13:19.997000000Z,0.0,,[],A"
-    assert lines[4] == '2026-09-21T14:13:20.027000000Z,3.0,1.0,"[0.0, 1.0, 2.0]",B'
+    assert lines[4] == '2026-09-21T14:13:20.027000000Z,3.0,1.0,"[0.0,1.0,2.0]",B'
 
 
 def test_json(table: Any) -> None:

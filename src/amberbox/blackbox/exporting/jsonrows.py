@@ -10,13 +10,13 @@ import numpy as np
 
 from amberbox.blackbox.exporting.tables import TableStream
 from amberbox.blackbox.query.table import Table
-from amberbox.blackbox.query.tabletext import plain
+from amberbox.blackbox.query.tabletext import plain, rows_at_once
 from amberbox.blackbox.segments.columns import element_type, null_mask
 from amberbox.core.clock import NS
 from amberbox.core.types import Column, ColumnData, Schema, Topic
 
 ROWS = 2000
-"""Rows that are turned into text together."""
+"""At most so many rows are turned into text together."""
 
 _TIME = {
     "type": "object",
@@ -58,8 +58,9 @@ def json_rows(table: Table) -> Iterator[list[bytes]]:
     value that is missing is left out of its row. NaN and infinities, which JSON does not have,
     are null.
     """
-    for start in range(0, len(table), ROWS):
-        part = table.take(slice(start, start + ROWS))
+    step = rows_at_once(list(table.columns.values()), ROWS)
+    for start in range(0, len(table), step):
+        part = table.take(slice(start, start + step))
         names = part.names
         columns = [_values(name, part.columns[name]) for name in names]
         rows = [dict(zip(names, row, strict=True)) for row in zip(*columns, strict=True)]

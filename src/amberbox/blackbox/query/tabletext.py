@@ -10,6 +10,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import groupby
 from typing import IO, Any
 
+import msgspec
 import numpy as np
 
 from amberbox.blackbox.segments import columns as col
@@ -17,6 +18,8 @@ from amberbox.core.timetext import format_times
 from amberbox.core.types import Column, ColumnData, Ragged
 
 _CHUNK = 10_000
+_VALUES = 500_000
+_NUMBERS = {*col.NUMPY_TYPES} - {"bool", "time"}
 _FORMULA = "=+-@\t\r"
 _EDGE_ROWS = 5
 _CELL_WIDTH = 40
@@ -86,17 +89,27 @@ def write_csv(
     """
     writer = csv.writer(file, lineterminator="\n")
     quoting = csv.writer(file, lineterminator="\n", quoting=csv.QUOTE_ALL)
-    cells = [_cell if raw_text or field.type != "string" else _harmless for field in fields]
     if header:
         writer.writerow([column.name for column in fields])
-    for chunk in _chunks(fields, columns):
-        made = (map(cell, column) for cell, column in zip(cells, chunk, strict=True))
-        rows = zip(*made, strict=True)
-        if any(map(_has_carriage_return, chunk)):
+    for part in _slices(fields, columns):
+        cells = [_cells(f, col.take(columns[f.name], part), raw_text) for f in fields]
+        rows = zip(*cells, strict=True)
+        texts = (c for f, c in zip(fields, cells, strict=True) if f.type == "string")
+        if any(map(_has_carriage_return, texts)):
             for special, some in groupby(rows, _has_carriage_return):
                 (quoting if special else writer).writerows(some)
         else:
             writer.writerows(rows)
+
+
+def _cells(field: Column, column: ColumnData, raw_text: bool) -> list[Any]:
+    """Return the cells of a column, as text or as numbers that ``csv`` writes the same way."""
+    if field.type in _NUMBERS and not np.ma.isMaskedArray(column) and _all_finite(column):
+        return msgspec.json.encode(plain(column))[1:-1].decode().split(",") if len(column) else []
+    values = speakable(column, field.type)
+    if field.type == "string":
+        return values if raw_text else [_harmless(value) for value in values]
+    return [_cell(value) for value in values] if field.type not in _NUMBERS else values
 
 
 def _has_carriage_return(cells: Sequence[Any]) -> bool:
@@ -111,16 +124,28 @@ def _harmless(text: str | None) -> str | None:
 
 def _cell(value: Any) -> Any:
     if isinstance(value, list):
-        return json.dumps(value)
+        return msgspec.json.encode(value).decode()
     if isinstance(value, bool):
         return "true" if value else "false"
     return value
 
 
-def _chunks(fields: Fields, columns: Columns) -> Iterator[list[list[Any]]]:
+def _slices(fields: Fields, columns: Columns) -> Iterator[slice]:
     count = len(columns[fields[0].name]) if fields else 0
-    for start in range(0, count, _CHUNK):
-        rows = slice(start, start + _CHUNK)
+    step = rows_at_once([columns[field.name] for field in fields], _CHUNK)
+    for start in range(0, count, step):
+        yield slice(start, start + step)
+
+
+def rows_at_once(columns: Sequence[ColumnData], most: int) -> int:
+    """Return how many rows to turn into Python values together: fewer where lists are long."""
+    lists = [column for column in columns if isinstance(column, Ragged)]
+    values = sum(len(column.values) // max(len(column), 1) for column in lists)
+    return max(min(most, _VALUES // (values + 1)), 1)
+
+
+def _chunks(fields: Fields, columns: Columns) -> Iterator[list[list[Any]]]:
+    for rows in _slices(fields, columns):
         yield [speakable(col.take(columns[f.name], rows), f.type) for f in fields]
 
 
@@ -167,7 +192,8 @@ def _line(cells: Sequence[str], widths: Sequence[int], right: Sequence[bool]) ->
 def _shown(value: Any) -> str:
     if value is None:
         return "-"
-    text = f"{value:.9g}" if isinstance(value, float) else str(_cell(value))
+    listed = json.dumps(value) if isinstance(value, list) else str(_cell(value))
+    text = f"{value:.9g}" if isinstance(value, float) else listed
     text = text.replace("\n", "\\n")
     return text if len(text) <= _CELL_WIDTH else text[: _CELL_WIDTH - 3] + "..."
 
