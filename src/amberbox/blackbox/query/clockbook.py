@@ -27,6 +27,9 @@ from amberbox.core.types import IntArray
 UNKNOWN_BOOT = "00000000"
 """The name of a boot in files of writers that do not know it."""
 
+MARGIN_NS = 15_000_000_000
+"""A file may go on for this long after its last reading of the clock."""
+
 _SLEW = 500e-6
 """The kernel turns the wall clock faster or slower by at most this while it follows a reference."""
 
@@ -69,12 +72,24 @@ class BootClock:
 
 
 @dataclass(frozen=True, slots=True)
+class Epoch:
+    """A stretch of log time within a run that has one base."""
+
+    boot: str
+    run: int
+    base_ns: int
+    from_ns: int
+    to_ns: int
+
+
+@dataclass(frozen=True, slots=True)
 class ClockBook:
     """The clocks of all boots in a store, and which journal was written in which."""
 
     boots: Mapping[str, BootClock] = field(default_factory=dict)
     journals: Mapping[str, tuple[str, int]] = field(default_factory=dict)
     """Boot of a journal, and its log time minus time since boot."""
+    epochs: tuple[Epoch, ...] = ()
 
     def points(self, journal: str) -> ClockPoints | None:
         """Return the corrected points of a journal; None where nothing is known better."""
@@ -82,6 +97,17 @@ class ClockBook:
             return None
         boot, base_ns = self.journals[journal]
         return tuple((b + base_ns, d - base_ns) for b, d in self.boots[boot].points)
+
+    def received_ns(self, run: int, log_ns: int) -> int | None:
+        """Return when a log time of a run was; None where nothing is known better.
+
+        Where the clock was set back in between, the newest that fits.
+        """
+        fitting = [e for e in self.epochs if e.run == run and e.from_ns <= log_ns <= e.to_ns]
+        if not fitting:
+            return None
+        newest = max(fitting, key=lambda epoch: epoch.from_ns - epoch.base_ns)
+        return self.boots[newest.boot].wall_ns(log_ns - newest.base_ns)
 
     def boot_of(self, run: int) -> BootClock | None:
         """Return the boot in which a run took place, if that is known."""
@@ -115,7 +141,14 @@ def book_of(clocks: Iterable[JournalClock]) -> ClockBook:
     journals = {
         clock.name: (boot, clock.base_ns or 0) for boot, found in by_boot.items() for clock in found
     }
-    return ClockBook(boots, journals)
+    epochs = tuple(_epoch(clock) for found in by_boot.values() for clock in found)
+    return ClockBook(boots, journals, epochs)
+
+
+def _epoch(clock: JournalClock) -> Epoch:
+    times = [reading.log_ns for reading in clock.readings]
+    base_ns = clock.base_ns or 0
+    return Epoch(clock.boot, clock.run, base_ns, min(times) - MARGIN_NS, max(times) + MARGIN_NS)
 
 
 @lru_cache(maxsize=64)
