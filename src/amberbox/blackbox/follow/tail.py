@@ -8,17 +8,23 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 
 from amberbox.blackbox.follow.batching import Origin, Stream, make_batch, stream_of
+from amberbox.blackbox.follow.chunkrows import (
+    by_item,
+    clock_points,
+    gap_records,
+    runs_of_channel,
+)
+from amberbox.blackbox.follow.deleted import GoneJournal, GoneList, outline_of, rows_of_gone
 from amberbox.blackbox.follow.read import (
     JournalFile,
+    files_of,
     journal_file,
     missing,
     sound_chunks,
 )
-from amberbox.blackbox.journal import reserved
 from amberbox.blackbox.journal.buffer import open_buffer
 from amberbox.blackbox.journal.chunk import Chunk, sequences
 from amberbox.blackbox.journal.clocktable import ClockTable, held_points
@@ -27,6 +33,7 @@ from amberbox.blackbox.journal.scan import ChunkPlace, start_record
 from amberbox.blackbox.journal.summary import read_summary
 from amberbox.blackbox.journal.walk import Metadata, Walk
 from amberbox.blackbox.store import Store, is_locked, run_and_number
+from amberbox.core.clock import NS
 from amberbox.core.types import Batch, Cursor, Gap, IntArray, Schema, Watermark, WriterCursor
 
 Delivery = Batch | Gap | Watermark
@@ -59,6 +66,7 @@ class WriterTail:
         self._done: tuple[int, int] = (-1, -1)
         self._ends_at: tuple[int, int] = (-1, 0)
         self._live: _Live | None = None
+        self._gone = GoneList(store, writer)
         self.last_ns: int | None = None
         self._watermark: tuple[int, int, int] = (0, 0, 0)
 
@@ -66,23 +74,21 @@ class WriterTail:
         """Where this tail stands."""
         return WriterCursor(self.run, self.seq, dict(self.ahead))
 
-    @property
-    def last_ns(self) -> int | None:
-        """Log time up to which rows have been looked at, chosen items or not."""
-        return self.last_ns
-
     def step(self) -> Iterator[Delivery]:
         """Yield what has come since the last step."""
         head = read_head(self.store.folder(self.writer))  # before the files: never too much
         files = [p for p in self.store.journal_files(self.writer) if run_and_number(p) > self._done]
         alive = is_locked(self.store, self.writer)  # after the files: nobody writes these any more
+        gone = self._gone.since(self._done, files)
         with suppress(FileNotFoundError):  # deleted meanwhile: the next step says what is missing
             files = files[_first_of_interest(files, self.run, self.seq) :]
             for path in files:
+                yield from self._deleted_before(gone, run_and_number(path))
                 if path is files[-1] and alive and not _is_finished(path):
                     yield from self._grow(path)
                 else:
                     yield from self._static(path)
+            yield from self._deleted_before(gone, None)
         if head is not None:
             yield from self._watermark_of_head(head)
 
@@ -99,6 +105,31 @@ class WriterTail:
         yield from self._missing_end(journal)
         self._ends_at = (journal.run, journal.end_seq)
         self._done = run_and_number(path)
+
+    def _deleted_before(
+        self, gone: list[GoneJournal], place: tuple[int, int] | None
+    ) -> Iterator[Delivery]:
+        """Deliver what is left of journals that are gone: columns, or why there are none."""
+        while gone and (place is None or gone[0].place < place):
+            journal = gone.pop(0)
+            stretch = journal.stretch
+            if (stretch.run, stretch.end_seq) > (self.run, self.seq):
+                yield from self._of_gone(journal)
+
+    def _of_gone(self, journal: GoneJournal) -> Iterator[Delivery]:
+        stretch = journal.stretch
+        self._live = None
+        yield from self._enter(stretch.run, stretch.first_seq, outline_of(journal))
+        rows = rows_of_gone(self.store.path, journal, self.items, self.seq, self._read_to)
+        for end_seq, deliveries in rows:
+            for delivery in deliveries:
+                if isinstance(delivery, Batch):
+                    self.ahead[delivery.item] = int(delivery.seq[-1]) + 1
+                yield self._at(delivery)
+            self.seq, self.ahead = end_seq, {}
+        self.last_ns = journal.end_ns
+        self._ends_at = (stretch.run, stretch.end_seq)
+        self._done = max(self._done, journal.place)
 
     def _missing_end(self, journal: JournalFile) -> Iterator[Gap]:
         """Tell of rows at a file's end: by number if its index counts them, else that some were."""
@@ -134,7 +165,7 @@ class WriterTail:
             known = live.streams.get(number)
             if known is None or (known.topic.schema is None and channel.schema_id in chunk.schemas):
                 live.streams[number] = stream_of(channel, live.schemas)
-        live.clock.extend(_clock_points(chunk, live.streams))
+        live.clock.extend(clock_points(chunk, live.streams))
         run, number = run_and_number(live.path)
         journal = _outline(live, self.writer, run, number)
         if len(chunk):
@@ -182,12 +213,12 @@ class WriterTail:
             gap = missing(journal, self.seq, first, start, int(chunk.log_ns[0]))
             self.seq, self.ahead = first, {}
             yield self._at(gap)
-        for item, rows in _by_item(chunk, streams, self.items):
+        for item, rows in by_item(chunk, streams, self.items):
             yield from self._item_rows(item, rows[seq[rows] >= self._read_to(item)],
                                        chunk, seq, clock, streams)  # fmt: skip
         self.seq, self.ahead = end, {}
         self.last_ns = int(chunk.log_ns.max())
-        yield from map(self._at, _gap_records(chunk, streams, self.writer, self.run, clock))
+        yield from map(self._at, gap_records(chunk, streams, self.writer, self.run, clock))
         yield from self._advance_watermark(clock, self.last_ns)
 
     def _read_to(self, item: str) -> int:
@@ -203,7 +234,7 @@ class WriterTail:
         streams: Any,
     ) -> Iterator[Delivery]:
         """Yield an item's rows of a chunk: one batch, or more where its type changes."""
-        for part in _runs_of_channel(rows, chunk):
+        for part in runs_of_channel(rows, chunk):
             stream = streams[int(chunk.channel[part[0]])]
             messages = chunk.messages(part)
             origin = Origin(self.writer, self.run, stream, clock)
@@ -295,49 +326,40 @@ def _skipper(journal: JournalFile, run: int, seq: int) -> Any:
     return wanted
 
 
-def _by_item(
-    chunk: Chunk, streams: Any, items: Collection[str] | None
-) -> list[tuple[str, IntArray]]:
-    """Group rows by item, in the order of their first row."""
-    rows: dict[str, list[IntArray]] = {}
-    numbers, firsts = np.unique(chunk.channel, return_index=True)
-    for number in numbers[np.argsort(firsts)].tolist():
-        stream = streams[number]
-        if not stream.repeated and (items is None or stream.item in items):
-            rows.setdefault(stream.item, []).append(chunk.rows_of(number))
-    return [(item, np.sort(np.concatenate(parts))) for item, parts in rows.items()]
+def position_at(
+    store: Store, writer: str, cursor: WriterCursor | None, lookback_s: float
+) -> WriterCursor:
+    """Find where to begin: at the cursor, or ``lookback_s`` before it, or before the end."""
+    if lookback_s <= 0:
+        return cursor or WriterCursor()
+    files = files_of(store, writer)
+    before = [
+        f for f in files if cursor is None or (f.run, f.first_seq) <= (cursor.run, cursor.seq)
+    ]
+    if not before:
+        return cursor or WriterCursor()
+    end_ns = _time_of(before[-1], cursor)
+    start = cursor or WriterCursor(before[-1].run, before[-1].end_seq)
+    for journal in reversed(before):
+        seq = journal.first_seq
+        for place in journal.places:
+            if place.end_ns >= end_ns - lookback_s * NS:
+                start = min(start, WriterCursor(journal.run, seq), key=lambda c: (c.run, c.seq))
+                break
+            seq += place.count
+        if journal.start_ns < end_ns - lookback_s * NS:
+            break
+    return start
 
 
-def _runs_of_channel(rows: IntArray, chunk: Chunk) -> list[IntArray]:
-    if not len(rows):
-        return []
-    channel = chunk.channel[rows]
-    return np.split(rows, np.flatnonzero(channel[1:] != channel[:-1]) + 1)
-
-
-def _own_messages(chunk: Chunk, streams: Any, topic: str) -> Iterator[tuple[int, dict[str, Any]]]:
-    for number in np.unique(chunk.channel).tolist():
-        if streams[number].topic.name == topic:
-            rows = chunk.rows_of(number)
-            for log_ns, message in zip(
-                chunk.log_ns[rows].tolist(), chunk.messages(rows), strict=True
-            ):
-                yield log_ns, msgspec.json.decode(message)
-
-
-def _clock_points(chunk: Chunk, streams: Any) -> list[tuple[int, int]]:
-    found = _own_messages(chunk, streams, reserved.CLOCK)
-    return [(log_ns, int(values["offset_ns"])) for log_ns, values in found]
-
-
-def _gap_records(
-    chunk: Chunk, streams: Any, writer: str, run: int, clock: ClockTable
-) -> Iterator[Gap]:
-    """Turn closed gap records of the recorder into gaps."""
-    for _, values in _own_messages(chunk, streams, reserved.GAP):
-        if values.get("to_ns") is not None:
-            times = clock.received(np.array([values["from_ns"], values["to_ns"]])).tolist()
-            yield Gap(
-                writer, run, times[0], times[1], values["reason"], values["item"],
-                values.get("count"),
-            )  # fmt: skip
+def _time_of(journal: JournalFile, cursor: WriterCursor | None) -> int:
+    """Log time at a cursor, or at the end of the file."""
+    if cursor is None or cursor.run != journal.run:
+        return journal.end_ns
+    seq, time_ns = journal.first_seq, journal.start_ns
+    for place in journal.places:
+        if seq >= cursor.seq:
+            break
+        time_ns = place.end_ns
+        seq += place.count
+    return time_ns

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -18,14 +18,39 @@ from amberbox.blackbox.segments.manifest import Journal
 from amberbox.blackbox.segments.parquet import overlaps
 from amberbox.core.types import Gap
 
+_SAME = ("writer", "run", "item", "reason")
 _FIELDS = ("item", "peer", "from_ns", "to_ns", "reason", "count")
 
 
 def gaps(catalogue: Catalogue, item: str | None, span: Span) -> list[Gap]:
     """List gaps that meet ``[from, to)``, in order of time, of one item or of all."""
     known = [*_recorded(catalogue), *_holes(catalogue), *_deleted(catalogue)]
-    chosen = [gap for gap in known if _concerns(gap, item, span)]
+    chosen = [gap for gap in _joined(known) if _concerns(gap, item, span)]
     return sorted(chosen, key=lambda gap: (gap.from_ns, gap.to_ns, gap.item))
+
+
+def _joined(known: Sequence[Gap]) -> Iterator[Gap]:
+    """Join gaps of one reason where one ends at the row that the next begins with."""
+    last: Gap | None = None
+    for gap in known:
+        if last is not None and _goes_on(last, gap):
+            count = _sum(last.count, gap.count)
+            last = replace(last, to_ns=gap.to_ns, to_seq=gap.to_seq, count=count)
+            continue
+        if last is not None:
+            yield last
+        last = gap
+    if last is not None:
+        yield last
+
+
+def _goes_on(first: Gap, second: Gap) -> bool:
+    same = all(getattr(first, name) == getattr(second, name) for name in _SAME)
+    return same and first.to_seq is not None and first.to_seq == second.from_seq
+
+
+def _sum(first: int | None, second: int | None) -> int | None:
+    return None if first is None or second is None else first + second
 
 
 def _concerns(gap: Gap, item: str | None, span: Span) -> bool:
@@ -87,9 +112,10 @@ def last_received_ns(catalogue: Catalogue) -> int | None:
 
 
 def _holes(catalogue: Catalogue) -> Iterator[Gap]:
-    """Walk the journals for rows that are not there; what lives on in segments is no gap."""
-    if not catalogue.existing:
-        return
+    """Walk the journals for rows that are not there; what lives on in segments is no gap.
+
+    What was deleted comes with its reason, from the tombstones.
+    """
     for delivery in follow(catalogue.store, items=(), live=False):
         if isinstance(delivery, Gap) and delivery.from_seq is not None:
             yield from _outside_segments(delivery, catalogue)
@@ -128,12 +154,14 @@ def _piece(gap: Gap, from_seq: int, to_seq: int, from_ns: int, to_ns: int) -> Ga
 
 
 def _deleted(catalogue: Catalogue) -> Iterator[Gap]:
+    existing, sealed = set(catalogue.existing), catalogue.manifest.sealed
     for journal in catalogue.manifest.journals.values():
-        if journal.name not in catalogue.existing:
+        if journal.name not in existing:
             yield from journal.gaps
+            yield from sealed[journal.name].gaps() if journal.name in sealed else ()
     for deletion in catalogue.manifest.deletions:
         for part in deletion.segment.parts:
-            if part.journal not in catalogue.existing:
+            if part.journal not in existing:
                 yield Gap(
                     part.writer, part.run, part.from_ns, part.to_ns + 1,
                     f"deleted: {deletion.reason}", deletion.segment.item, part.rows,
