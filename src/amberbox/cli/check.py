@@ -7,9 +7,11 @@ import json
 from collections.abc import Sequence
 from typing import Any
 
-from amberbox.blackbox.folder.folder import RobotFolder, inspect_folder
+from amberbox.blackbox.folder.folder import ROBOT_FILE, RobotFolder, inspect_folder
 from amberbox.blackbox.folder.plan import PlannedItem, planned_items
+from amberbox.blackbox.folder.triggers import trigger_problems
 from amberbox.cli._text import in_columns
+from amberbox.core.config import load_yaml
 from amberbox.core.errors import ConfigurationError, Problem
 from amberbox.core.redaction import as_plain
 
@@ -24,12 +26,24 @@ def run(args: argparse.Namespace) -> int:
     """Print all problems and notes, and the plan if there is no error; return 0 or 2."""
     folder, problems = inspect_folder(args.folder)
     items = planned_items(folder, problems) if folder else []
+    problems += _triggers(folder, items) if folder else []
     ok = not any(problem.is_error for problem in problems)
     if args.json:
         print(json.dumps(_report(folder, items, problems, ok), indent=2))
     else:
         print("\n".join(_lines(args.folder, folder, items, problems)))
     return 0 if ok else ConfigurationError.exit_code
+
+
+def _triggers(folder: RobotFolder, items: Sequence[PlannedItem]) -> list[Problem]:
+    """Judge the items that triggers name by the plan."""
+    path, unread = folder.path / ROBOT_FILE, list[Problem]()
+    node = load_yaml(path, unread) if folder.robot.triggers else None
+    if node is None:
+        return []
+    sources = [block.name for block in folder.blocks]
+    names = [item.item for item in items]
+    return list(trigger_problems(node, folder.robot.triggers, sources, names))
 
 
 def _report(

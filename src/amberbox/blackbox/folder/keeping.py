@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from amberbox.blackbox.folder.folder import RobotFolder
-from amberbox.blackbox.keeper.options import KeeperOptions, Lifetime
+from amberbox.blackbox.folder.triggers import TriggerOptions, silence_of
+from amberbox.blackbox.keeper.options import KeeperOptions, Lifetime, Trigger
 
 
 def keeper_options(folder: RobotFolder) -> KeeperOptions:
@@ -21,4 +22,22 @@ def keeper_options(folder: RobotFolder) -> KeeperOptions:
         when_full=store.when_full,
         lifetime=Lifetime(store.lifetime.raw, store.lifetime.columns),
         headroom=int(store.rotate_mb * 1e6),
+        incident_share=robot.incidents.share / 100,
+        incidents_per_hour=robot.incidents.per_hour,
+        triggers=tuple(map(_trigger, robot.triggers)),
+    )
+
+
+def _trigger(options: TriggerOptions) -> Trigger:
+    item, silence_s = silence_of(options.silence) if options.silence else ("", 0.0)
+    return Trigger(
+        name=options.name,
+        when=options.when,
+        event=options.event,
+        silence=item,
+        silence_s=silence_s,
+        before_s=options.before,
+        after_s=options.after,
+        hold_off_s=options.hold_off,
+        reason=options.reason,
     )

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+from amberbox.blackbox.folder.triggers import IncidentOptions, TriggerOptions, repeated
 from amberbox.core.ids import derive_id, is_id
 from amberbox.core.options import option
 
@@ -94,8 +95,12 @@ class RobotConfig:
     software_version: str = option("", "version of the robot's own software")
     store: StoreOptions = option(StoreOptions(), "where and how the record is kept")
     server: ServerOptions | None = option(None, "the fleet server this robot reports to")
+    triggers: Sequence[TriggerOptions] = option((), "what makes an incident")
+    incidents: IncidentOptions = option(IncidentOptions(), "limits of incidents")
 
     def check(self) -> Iterator[tuple[str, str]]:
-        """Say what is wrong with the id."""
+        """Say what is wrong with the id, and which names are there twice."""
+        for name in repeated(self.triggers):
+            yield "triggers", f"there are several called '{name}'"
         if self.id and not is_id(self.id):
             yield "id", f"'{self.id}' is no id (a-z 0-9 _ . -); '{derive_id(self.id)}' would be one"

@@ -97,7 +97,7 @@ def _new(store: Store, wish: Wish, timeline: Timeline, options: KeeperOptions) -
     return Incident(
         id=_id(at_ns, wish.key),
         reasons=(Reason(at_ns, wish.reason, wish.who, wish.trigger, wish.key),),
-        from_ns=spans[0].received()[0],
+        from_ns=timeline.received_ns(timeline.at(age_ns + before_ns)),
         to_ns=end_ns if is_over else at_ns + after_ns,
         made_ns=time.time_ns(),
         versions={

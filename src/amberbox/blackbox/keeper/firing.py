@@ -67,19 +67,19 @@ class SilenceWatcher:
 
     def __init__(self, item: str, silence_s: float) -> None:
         self._item = item
-        self._received = -1
+        self._last_ns = 0
         self._silent = WhenWatcher(f"age({_HEARD}.at) >= {silence_s!r}")
 
     def add(self, batch: Batch, times_ns: IntArray) -> None:
         """Take counters of the recorder."""
         counts = batch.children.get("items")
-        if batch.item != COUNTERS or counts is None:
+        if batch.item != COUNTERS or counts is None or "last_received_ns" not in counts.columns:
             return
         rows = np.flatnonzero(np.asarray(counts.columns["item"], object) == self._item)
-        received = np.asarray(counts.columns["received"])[rows]
-        more = np.diff(received, prepend=self._received) > 0
+        last_ns = np.asarray(counts.columns["last_received_ns"], np.int64)[rows]
+        more = np.diff(last_ns, prepend=self._last_ns) != 0
         if more.any():
-            self._received = int(received[-1])
+            self._last_ns = int(last_ns[-1])
             times_ns = times_ns[np.searchsorted(batch.seq, counts.seq[rows[more]])]
             self._silent.add(_heard(batch, times_ns), times_ns)
 

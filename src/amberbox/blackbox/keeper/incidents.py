@@ -1,4 +1,4 @@
-"""The keeper's work on incidents in one step: what was asked for, what triggers say, what is due."""
+"""The keeper's work on incidents: what was asked for, what triggers say, what is due."""
 
 from __future__ import annotations
 

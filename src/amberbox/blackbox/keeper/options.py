@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Literal
 
 import msgspec
@@ -40,13 +41,19 @@ class Trigger:
 
 @dataclass(frozen=True, slots=True)
 class MissionRule:
-    """Conditions that begin and end a mission; ``failed`` and ``outcome`` are read at its end."""
+    """Expressions that begin and end a mission of a name.
+
+    ``failed``, ``outcome`` are read at its end, ``parameters`` at its start. After ``max_s`` it
+    ends by itself.
+    """
 
     name: str
     start: str
     end: str
     failed: str = ""
     outcome: str = ""
+    parameters: Mapping[str, str] = field(default_factory=dict)
+    max_s: float | None = None
 
 
 @dataclass(frozen=True, slots=True)

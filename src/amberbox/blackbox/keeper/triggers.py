@@ -151,7 +151,7 @@ class Triggers:
             name = watch.trigger.name
             for problem in watch.watcher.problems():
                 if self._is_new(f"{name}: {problem}"):
-                    yield event("trigger_failed", f"the trigger {name}: {problem}", name)
+                    yield event("trigger_failed", _about(name, problem), name)
             lasted_ns = part.until_ns - min(part.axis.starts, default=part.until_ns)
             if watch.missing and lasted_ns >= _MISSING_NS and self._is_new(name):
                 yield from self._missing(watch)
@@ -185,9 +185,18 @@ class Triggers:
             self._journal.write([], Progress(cursor, READER, state))
 
 
+def _about(name: str, problem: str) -> str:
+    return f"the trigger {name}: {_first_line(problem)}"
+
+
 def _off(trigger: Trigger, why: str) -> Record:
-    text = f"the trigger {trigger.name} is off: {why}"
+    text = f"the trigger {trigger.name} is off: {_first_line(why)}"
     return event("trigger_failed", text, trigger.name, why=why)
+
+
+def _first_line(text: str) -> str:
+    """Leave out the picture of an expression, which has lines of its own."""
+    return text.partition("\n")[0]
 
 
 def _wish(trigger: Trigger, firing: Firing, part: RunPart) -> Wish:
