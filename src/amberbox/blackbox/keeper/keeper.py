@@ -10,10 +10,13 @@ import sys
 import threading
 import time
 from contextlib import suppress
+from typing import TYPE_CHECKING
 
+from amberbox.blackbox.follow.chain import previous_chain
 from amberbox.blackbox.follow.read import journal_file
 from amberbox.blackbox.keeper import confirm
 from amberbox.blackbox.keeper.deleter import Deleter
+from amberbox.blackbox.keeper.notary import Notary
 from amberbox.blackbox.keeper.options import KeeperOptions
 from amberbox.blackbox.keeper.ownjournal import OwnJournal
 from amberbox.blackbox.segments import manifest
@@ -23,10 +26,12 @@ from amberbox.blackbox.segments.build import (
     merge_small,
     remove_leftovers,
 )
-from amberbox.blackbox.segments.condense import no_signature
 from amberbox.blackbox.store import Store, WriterLock
 from amberbox.core.clock import Clock
 from amberbox.core.errors import UsageError
+
+if TYPE_CHECKING:
+    from amberbox.blackbox.keeper.incidents import IncidentKeeping
 
 PATIENCE_S = 10.0
 """After the recorder was killed its keeper lives on for a moment; the next one waits for it."""
@@ -44,24 +49,28 @@ class Keeper:
         self._options = options or KeeperOptions()
         self.journal = OwnJournal(
             store, "keep", robot=self._options.robot, config_hash=self._options.config_hash,
-            clock=clock,
+            clock=clock, chain=lambda: previous_chain(store, "keep"),
         )  # fmt: skip
         self._with_segments = can_build()
         self._refused: set[str] = set()
+        self._notary = Notary(store, self.journal)
         self._deleter = Deleter(store, self._options, self.journal, self._is_pending)
+        self._incidents = _incidents(store, self._options, self.journal)
         self._recovered = False
 
     def step(self, stop: threading.Event) -> None:
         """Do everything once: what others ask for, segments, deletion, accounts."""
         self._recover()
+        self._incidents.step()  # what is pinned now is not deleted below
         self._deleter.make_room()
         confirm.take_requests(self._store)
         self.build(stop)
         self._deleter.trim_ring()
         self._deleter.expire()
         self._deleter.make_room()
-        self._deleter.condense(no_signature)
+        self._deleter.condense(self._notary.signature_of)
         self._deleter.report()
+        self._notary.sign()
 
     def breathe(self) -> None:
         """See to the room that is left; to be called often during long work."""
@@ -69,9 +78,11 @@ class Keeper:
 
     def close(self) -> None:
         """Write down what is left to say, finish the keeper's own journals."""
+        self._incidents.close()
         self._deleter.close()
         with suppress(OSError):
             self.journal.close()
+        self._notary.close()
 
     def _recover(self) -> None:
         """Finish what a keeper before this one was killed over."""
@@ -82,10 +93,11 @@ class Keeper:
                 remove_leftovers(self._store.path)
 
     def build(self, stop: threading.Event) -> None:
-        """Build the segments of sealed journals."""
+        """Seal the journals that nobody writes any more, and build their segments."""
+        self._deleter.measure()
+        self._notary.seal(lambda: self._interrupted(stop))
         if not self._with_segments:
             return
-        self._deleter.measure()
         built = 0
         for name in self._to_build():
             if stop.is_set():
@@ -93,6 +105,11 @@ class Keeper:
             built += self._build_one(name)
         if built:
             merge_small(self._store.path, self.breathe)
+
+    def _interrupted(self, stop: threading.Event) -> bool:
+        """See to the room that is left amid long work, and tell whether it is time to go."""
+        self.breathe()
+        return stop.is_set()
 
     def _to_build(self) -> list[str]:
         done = manifest.read(self._store.path).journals
@@ -123,6 +140,12 @@ class Keeper:
         return 1
 
 
+def _incidents(store: Store, options: KeeperOptions, journal: OwnJournal) -> IncidentKeeping:
+    from amberbox.blackbox.keeper.incidents import IncidentKeeping  # it imports our options
+
+    return IncidentKeeping(store, options, journal)
+
+
 def wait_for_lock(store: Store, patience_s: float, stop: threading.Event) -> WriterLock:
     """Become the keeper of a store; raises UsageError when another one stays."""
     end = time.monotonic() + patience_s
@@ -135,10 +158,10 @@ def wait_for_lock(store: Store, patience_s: float, stop: threading.Event) -> Wri
 
 
 def seal(store: Store) -> None:
-    """Build what can be built once, as an import does at its end; nothing is deleted."""
-    if can_build():
-        with suppress(UsageError):  # another keeper is at work here: it builds them, too
-            lock = wait_for_lock(store, PATIENCE_S, threading.Event())
-            options = KeeperOptions(quota_percent=100.0, min_free=0)
-            Keeper(store, options).build(threading.Event())
-            lock.release()
+    """Seal and build once, as an import does at its end; nothing is deleted."""
+    with suppress(UsageError):  # another keeper is at work here: it does so, too
+        lock = wait_for_lock(store, PATIENCE_S, threading.Event())
+        keeper = Keeper(store, KeeperOptions(quota_percent=100.0, min_free=0))
+        keeper.build(threading.Event())
+        keeper.close()
+        lock.release()

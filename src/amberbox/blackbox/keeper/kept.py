@@ -10,6 +10,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from amberbox.blackbox.follow.chain import previous_chain
 from amberbox.blackbox.follow.read import JournalFile, files_of, sound_chunks
 from amberbox.blackbox.journal import reserved
 from amberbox.blackbox.journal.chunk import Chunk
@@ -82,7 +83,8 @@ class KeptJournal:
             options = JournalOptions(
                 store.folder(WRITER), store.id, WRITER, store.next_run(), boot, rotate_ns=1 << 62
             )
-            self._writer, self._channels = JournalWriter(options), {}
+            self._channels = {}
+            self._writer = JournalWriter(options, chain=previous_chain(store, WRITER))
         return self._writer
 
     def _channel(self, writer: JournalWriter, topic: str) -> int:

@@ -34,10 +34,14 @@ class SigningKey:
 
 @dataclass(frozen=True, slots=True)
 class Keys:
-    """The key to sign with, if there is one, and what somebody should be told about it."""
+    """The key to sign with, if there is one, and what somebody should be told about it.
+
+    ``is_new`` says that what was published before was another key, or none.
+    """
 
     key: SigningKey | None
     warnings: tuple[str, ...] = ()
+    is_new: bool = False
 
 
 def can_sign() -> bool:
@@ -57,11 +61,11 @@ def open_keys(store: Store) -> Keys:
         made = not path.exists()
         if made:
             _create(path)
-        key = _load(path)
+        key, known = _load(path), public_key(store.path)
         warnings = [*_width(path), *_publish(store, key.public, made=made)]
     except (OSError, ValueError, TypeError) as error:
         return Keys(None, (f"nothing is signed: {path} cannot be used: {error}",))
-    return Keys(key, tuple(warnings))
+    return Keys(key, tuple(warnings), is_new=known != key.public)
 
 
 def _create(path: Path) -> None:
@@ -140,6 +144,14 @@ def _from_pem(content: bytes) -> str:
     if not isinstance(key, Ed25519PublicKey):
         raise ValueError("it is no Ed25519 key")
     return key.public_bytes_raw().hex()
+
+
+def is_key(public: str, content: bytes) -> bool:
+    """Tell whether the bytes of a file hold this public key (hex)."""
+    try:
+        return _from_pem(content) == public
+    except (ValueError, TypeError):
+        return False
 
 
 def parse_public(text: str) -> str:

@@ -28,15 +28,18 @@ def seal_journals(
     key: SigningKey | None,
     warn: Warn = lambda kind, text: None,
     stop: Callable[[], bool] = lambda: False,
+    *,
+    own: bool = False,
 ) -> list[Sealed]:
     """Seal every journal file that nobody writes any more, and sign; return what was sealed.
 
-    Each is hashed once and made durable first. ``warn`` is told of what does not hold. Only the
-    keeper calls this. Raises OSError when the disk does not take the entries.
+    Each is hashed once and made durable first. ``warn`` is told of what does not hold. With
+    ``own`` the keeper has finished its own journals, too. Only the keeper calls this.
+    Raises OSError when the disk does not take the entries.
     """
     known = mf.read(store.path).sealed
     done: list[Sealed] = []
-    for path in finished_files(store, known):
+    for path in finished_files(store, known, own=own):
         if stop():
             break
         sealed = _seal(store, path, warn)
@@ -48,11 +51,14 @@ def seal_journals(
     return done
 
 
-def finished_files(store: Store, sealed: Mapping[str, Sealed]) -> Iterator[Path]:
+def finished_files(
+    store: Store, sealed: Mapping[str, Sealed], *, own: bool = False
+) -> Iterator[Path]:
     """List the files that are to be sealed, oldest first; not those of the ring."""
     for writer in STATED:
         paths = store.journal_files(writer)
-        if is_locked(store, LOCKS.get(writer, writer)):
+        is_own = writer in LOCKS
+        if (is_own and not own) or (not is_own and is_locked(store, writer)):
             paths = paths[:-1]
         yield from (path for path in paths if f"{path.parent.name}/{path.name}" not in sealed)
 

@@ -21,9 +21,9 @@ from amberbox.blackbox.store import Store, is_locked, replace_file, run_and_numb
 from amberbox.blackbox.verify.links import Link, links
 
 HEADS = "heads.json"
-STATED = ("main", "bulk", "keep", "watch")
+STATED = ("main", "bulk", "keep", "kept", "watch")
 """Writers whose journals are vouched for; those of the ring go by themselves."""
-LOCKS = {"keep": "keeper"}
+LOCKS = {"keep": "keeper", "kept": "keeper"}
 """Lock that is held while a writer is at work, where it has another name."""
 _LINE_BYTES = 1024
 """More than a line with a signature has."""
@@ -104,9 +104,15 @@ def signature_record(store: Store, key: SigningKey | None, head: str) -> dict[st
     return to_record(signature_of(store, key, head, time.time_ns()))
 
 
-def sign_manifest(store: Store, key: SigningKey | None, now_ns: int | None = None) -> bool:
-    """Sign what was appended since the last signature; tell whether there was anything."""
-    if key is None or not _has_unsigned_end(store.path / mf.NAME):
+def sign_manifest(
+    store: Store, key: SigningKey | None, now_ns: int | None = None, *, again: bool = False
+) -> bool:
+    """Sign what was appended since the last signature; tell whether there was anything.
+
+    With ``again`` what is signed already is signed once more, as by a new key.
+    """
+    last = _last_line(store.path / mf.NAME)
+    if key is None or not last or (b',"kind":"signed",' in last and not again):
         return False
     at_ns = time.time_ns() if now_ns is None else now_ns
     signature = signature_of(store, key, mf.read(store.path).last_hash, at_ns)
@@ -114,15 +120,14 @@ def sign_manifest(store: Store, key: SigningKey | None, now_ns: int | None = Non
     return True
 
 
-def _has_unsigned_end(path: Path) -> bool:
-    """Tell whether the last whole line of the manifest is something else than a signature."""
+def _last_line(path: Path) -> bytes:
+    """Return the end of the manifest's last line; empty when there is none."""
     try:
         with path.open("rb") as file:
             file.seek(-min(file.seek(0, os.SEEK_END), _LINE_BYTES), os.SEEK_END)
-            last = file.read().rstrip(b"\n").rpartition(b"\n")[2]
+            return file.read().rstrip(b"\n").rpartition(b"\n")[2]
     except FileNotFoundError:
-        return False
-    return bool(last) and b',"kind":"signed",' not in last
+        return b""
 
 
 def write_heads(store: Store, key: SigningKey | None, now_ns: int | None = None) -> SignedHeads:

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from amberbox.blackbox.keeper.signing import HEADS, Reach, SignedHeads, parse_heads
+from amberbox.blackbox.keeper.signing import HEADS, STATED, Reach, SignedHeads, parse_heads
 from amberbox.blackbox.segments import manifest as mf
 from amberbox.blackbox.segments.entries import Sealed
 from amberbox.blackbox.verify.continuity import Graves, place_of
@@ -66,9 +66,7 @@ class Known:
             if entry.chain.startswith(digits):
                 return f"{entry.journal}, as it was sealed"
         gone = any(
-            chain.startswith(digits)
-            for writer in ("main", "bulk", "keep", "watch")
-            for chain in self.graves.chains(writer)
+            chain.startswith(digits) for writer in STATED for chain in self.graves.chains(writer)
         )
         return "a journal that was deleted on purpose since" if gone else ""
 
@@ -175,7 +173,8 @@ def check_own_heads(
 
 
 def _bad_heads(content: bytes, text: str) -> Finding:
-    if len(content) <= _MOST_BYTES and without_one_bit(content, _is_signed) is not None:
+    may_mend = len(content) <= _MOST_BYTES and not _is_signed(content)
+    if may_mend and without_one_bit(content, _is_signed) is not None:
         return Finding("damaged", HEADS, "one bit is flipped")
     return Finding("altered", HEADS, text)
 

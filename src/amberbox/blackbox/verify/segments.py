@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
 from amberbox.blackbox.segments.build import can_build
@@ -12,8 +12,9 @@ from amberbox.blackbox.segments.manifest import Segment
 from amberbox.blackbox.verify.findings import Finding, State
 from amberbox.blackbox.verify.mended import without_one_bit
 
-_FOOTER_BYTES = 24_000
-"""A larger end of a Parquet file is not searched for a flipped bit: it would take minutes."""
+_MOST_HASHED_BYTES = 3_000_000_000
+"""How much may be hashed in search of a flipped bit: some ten seconds."""
+_PAGE_HEAD_BYTES = 100
 
 
 def check_segment(
@@ -50,8 +51,8 @@ def _changed(path: Path, segment: Segment, size: int, other: str | None) -> Find
         return _finding("altered", segment, f"{size - segment.bytes} bytes were added")
     if not _readable(path):
         return _finding("damaged", segment, "a page does not match its checksum")
-    if _one_bit(path, segment.sha256):
-        return _finding("damaged", segment, "one bit of its footer is flipped")
+    if can_build() and _one_bit(path, segment.sha256):
+        return _finding("damaged", segment, "one bit around its pages is flipped")
     return _finding("altered", segment, "its checksums hold, but it is not the file it was")
 
 
@@ -72,20 +73,46 @@ def _readable(path: Path) -> bool:
 
 
 def _one_bit(path: Path, sha256: str) -> bool:
-    """Tell whether one bit of the end of the file, which has no checksum, makes the difference."""
+    """Tell whether one bit outside the checksums (footer, heads of pages) makes the difference."""
     content = path.read_bytes()
+    left = _MOST_HASHED_BYTES
+    for start, end in _unchecked(path, content):
+        left -= 8 * (end - start) * (len(content) - start)
+        if left < 0:
+            break
+        rest = content[end:]
+        holds = _ends_in(hashlib.sha256(content[:start]), rest, sha256)
+        if without_one_bit(content[start:end], holds) is not None:
+            return True
+    return False
+
+
+def _unchecked(path: Path, content: bytes) -> Iterator[tuple[int, int]]:
+    """Give the parts of a Parquet file that have no checksum, from its end on."""
     length = int.from_bytes(content[-8:-4], "little") + 8
-    start = len(content) - min(length, len(content))
-    if length > _FOOTER_BYTES:
-        return False
-    before = hashlib.sha256(content[:start])
-    return without_one_bit(content[start:], _ends_in(before, sha256)) is not None
+    footer = max(len(content) - length, 0)
+    yield footer, len(content)
+    for start in sorted(_page_starts(path), reverse=True):
+        yield start, min(start + _PAGE_HEAD_BYTES, len(content))
 
 
-def _ends_in(before: hashlib._Hash, sha256: str) -> Callable[[bytes], bool]:
-    def holds(end: bytes) -> bool:
+def _page_starts(path: Path) -> Iterator[int]:
+    """Give where the first pages of each column begin."""
+    import pyarrow.parquet as pq
+
+    metadata = pq.read_metadata(path)
+    for group in range(metadata.num_row_groups):
+        for number in range(metadata.num_columns):
+            column = metadata.row_group(group).column(number)
+            yield column.data_page_offset
+            if column.dictionary_page_offset is not None:
+                yield column.dictionary_page_offset
+
+
+def _ends_in(before: hashlib._Hash, rest: bytes, sha256: str) -> Callable[[bytes], bool]:
+    def holds(part: bytes) -> bool:
         whole = before.copy()
-        whole.update(end)
+        whole.update(part + rest)
         return whole.hexdigest() == sha256
 
     return holds

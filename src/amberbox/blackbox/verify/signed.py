@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
 
-from amberbox.blackbox.keeper.keys import PUBLIC, can_sign
+from amberbox.blackbox.keeper.keys import PUBLIC, can_sign, is_key, public_key
 from amberbox.blackbox.keeper.signing import STATED, SignedHeads
 from amberbox.blackbox.segments import manifest as mf
 from amberbox.blackbox.segments.entries import Signature
 from amberbox.blackbox.verify.findings import BAD, Finding, as_text
 from amberbox.blackbox.verify.journal import Checked
 from amberbox.blackbox.verify.manifest import CheckedManifest
+from amberbox.blackbox.verify.mended import without_one_bit
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,13 +33,13 @@ class Trust:
         return self.signed_line > 0
 
 
-def check_trust(given: str, published: str | None, lines: CheckedManifest) -> Trust:
+def check_trust(given: str, store: Path, lines: CheckedManifest) -> Trust:
     """Choose the key to believe and look at what it has signed."""
     if not can_sign():
         note = "signatures are not checked: the package cryptography is not installed"
         return Trust(notes=(note,))
     last = lines.signatures[-1][1] if lines.signatures else None
-    key, notes, findings = _choose(given, published, last)
+    key, notes, findings = _choose(given, store, last)
     covered = lines.signed(key)
     if last is not None and last.key != key:
         text = f"the last signature is not by {key[:16]}..., but by {last.key}"
@@ -50,24 +53,25 @@ def check_trust(given: str, published: str | None, lines: CheckedManifest) -> Tr
 
 
 def _choose(
-    given: str, published: str | None, last: Signature | None
+    given: str, store: Path, last: Signature | None
 ) -> tuple[str, list[str], list[Finding]]:
     """Return the key to believe; one that differs from ``key.pub`` by a bit shows damage there."""
-    if given:
+    published = public_key(store)
+    if given or (last is None and published is None):
         return given, [], []
+    if last is not None and published != last.key and _was(store / PUBLIC, last.key):
+        return last.key, [], [Finding("damaged", PUBLIC, "one bit is flipped")]
     if published is not None:
-        if last is not None and _differ_by_a_bit(published, last.key):
-            return last.key, [], [Finding("damaged", PUBLIC, "one bit is flipped")]
         note = "the store's own key.pub is believed: give --key as noted at the first start"
         return published, [note], []
-    if last is None:
-        return "", [], []
     text = "is gone or cannot be read; the key that the signatures state is believed"
-    return last.key, [], [Finding("damaged", PUBLIC, text)]
+    return "" if last is None else last.key, [], [Finding("damaged", PUBLIC, text)]
 
 
-def _differ_by_a_bit(one: str, other: str) -> bool:
-    return (int(one, 16) ^ int(other, 16)).bit_count() == 1
+def _was(path: Path, key: str) -> bool:
+    """Tell whether a file held a public key before one bit of it was flipped."""
+    content = path.read_bytes() if path.exists() else b""
+    return without_one_bit(content, partial(is_key, key)) is not None
 
 
 def unsigned_ends(

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from amberbox.blackbox.journal.scan import start_record
-from amberbox.blackbox.keeper.keys import PUBLIC, can_sign, public_key
+from amberbox.blackbox.keeper.keys import PUBLIC, can_sign
 from amberbox.blackbox.keeper.signing import LOCKS, SignedHeads
 from amberbox.blackbox.segments import manifest as mf
 from amberbox.blackbox.segments.manifest import Manifest, Segment
@@ -116,7 +116,7 @@ class _Verification:
         return self.store.id
 
     def _trust(self, lines: CheckedManifest) -> Trust:
-        trust = check_trust(self.key, public_key(self.store.path), lines)
+        trust = check_trust(self.key, self.store.path, lines)
         for finding in trust.findings:
             self.collected.take(finding.file, [finding])
         self.notes += trust.notes
