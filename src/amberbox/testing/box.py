@@ -16,6 +16,7 @@ from amberbox.blackbox.folder.folder import load_folder
 from amberbox.blackbox.follow import read
 from amberbox.blackbox.recorder.pipeline import Pipeline, PipelineOptions
 from amberbox.blackbox.recorder.recorder import Recorder
+from amberbox.blackbox.recorder.room import Room
 from amberbox.blackbox.recorder.sink import BlockSink
 from amberbox.blackbox.store import create_store
 from amberbox.core.clock import RunClock
@@ -44,10 +45,11 @@ class ManualBox:
     options: PipelineOptions = field(default_factory=PipelineOptions)
     source: str = "ros"
     start_gap_ns: int | None = None
+    room: Room | None = None
 
     def __post_init__(self) -> None:
         store, clock = create_store(self.store), RunClock(self.clock)
-        self.pipeline = Pipeline(store, clock, self.options, self.start_gap_ns)
+        self.pipeline = Pipeline(store, clock, self.options, self.start_gap_ns, self.room)
         self.sink = BlockSink(self.pipeline, self.source, self.topics, lossless=False)
 
     def hear(self, topic: Topic, *messages: bytes) -> None:

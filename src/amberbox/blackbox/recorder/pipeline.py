@@ -38,6 +38,8 @@ from amberbox.core.errors import AmberboxError
 from amberbox.core.source import Power, TopicOptions
 
 CLOCK_PERIOD_NS = 10 * NS
+SPARING_CLOCK_PERIOD_NS = 60 * NS
+"""The same while only events are recorded, so that their room lasts."""
 CLOCK_STEP_NS = 50_000_000
 EPOCH_STEP_NS = NS
 HEARTBEAT_NS = NS
@@ -115,7 +117,7 @@ class Pipeline:
         self.gaps = GapLog(lambda values: self.own(reserved.GAP, values), start)
         if start < now_ns:
             self.gaps.pause(now_ns)
-        self._admission = None
+        self._admission: Admission | None = None
         if self.room is not None:
             self._admission = Admission(self.room, self.intake, self.gaps, self.event)
 
@@ -313,7 +315,8 @@ class Pipeline:
             return
         if written_ns is not None and step > CLOCK_STEP_NS:
             self._own_clock(self._last_tick_ns, self._clock_seen_ns)
-        if written_ns is None or step > CLOCK_STEP_NS or now_ns - written_ns >= CLOCK_PERIOD_NS:
+        period_ns = SPARING_CLOCK_PERIOD_NS if self.full else CLOCK_PERIOD_NS
+        if written_ns is None or step > CLOCK_STEP_NS or now_ns - written_ns >= period_ns:
             self._own_clock(now_ns, offset)
             self._clock_offset_ns, self._clock_written_ns = offset, now_ns
         self._clock_seen_ns = offset
