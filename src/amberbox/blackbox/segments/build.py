@@ -256,7 +256,7 @@ def _may_follow(group: Sequence[Segment], segment: Segment) -> bool:
 def _merge(store: Path, schema: TableSchema, group: Sequence[Segment]) -> Segment:
     first = Path(group[0].path)
     stem = first.stem.partition("+")[0]
-    count = sum(len(segment.parts) for segment in group)
+    count = sum(map(_journal_count, group))
     file = TableFile(store, str(first.with_name(f"{stem}+{count}.parquet")), schema)
     names = {column.name for column in schema.columns}
     flats = [flat for s in group for flat in read_segment(store, s, schema, names)]
@@ -271,6 +271,11 @@ def _merge(store: Path, schema: TableSchema, group: Sequence[Segment]) -> Segmen
     for path in replaced:
         (store / path).unlink(missing_ok=True)
     return segment
+
+
+def _journal_count(segment: Segment) -> int:
+    """Count the journals of a segment by its name: of old ones the manifest joins the parts."""
+    return int(Path(segment.path).stem.partition("+")[2] or 1)
 
 
 def _group_starts(flats: Sequence[Flat]) -> Iterator[Flat]:
