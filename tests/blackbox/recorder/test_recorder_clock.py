@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from pathlib import Path
 
 import pytest
@@ -10,6 +11,7 @@ import amberbox
 from amberbox.blackbox.follow import read
 from amberbox.blackbox.keeper import Keeper
 from amberbox.blackbox.keeper.options import KeeperOptions
+from amberbox.blackbox.recorder.messageclock import MessageClock
 from amberbox.blackbox.recorder.pipeline import PipelineOptions
 from amberbox.blackbox.store import open_store
 from amberbox.core.clock import NS
@@ -126,7 +128,7 @@ def test_the_ring_is_trimmed_to_its_length_whatever_the_clock_does(
     ring = [TopicOptions("/count", keep="ring"), TopicOptions("/main")]
     main = Topic("/main", COUNT.message_encoding, COUNT.schema)
     box = ManualBox(tmp_path / "store", ring, options=PipelineOptions(ring_rotate_ns=2 * NS))
-    keeper = Keeper(open_store(box.store), KeeperOptions(ring_s=10.0))
+    keeper = Keeper(open_store(box.store), KeeperOptions(ring_s=10.0, min_free=0))
     for n in range(600):
         if n == 300:
             box.clock.step(step_s)
@@ -134,11 +136,57 @@ def test_the_ring_is_trimmed_to_its_length_whatever_the_clock_does(
         box.hear(main, number(n))
         box.write()
         if n % 20 == 0:
-            keeper._trim_ring()
+            keeper.step(threading.Event())
     box.close()
-    keeper._trim_ring()
+    keeper.step(threading.Event())
     kept = amberbox.open(box.store).query("ros_count").values("data")
     assert kept[-1] == 599 or step_s < 0
     assert 100 <= len(kept) <= 140
     assert sorted(kept) == list(range(600 - len(kept), 600))
     assert len(amberbox.open(box.store).query("ros_main")) == 600
+
+
+@pytest.mark.parametrize("keep", KEEPS)
+def test_a_step_is_noted_with_what_the_clock_was_before(tmp_path: Path, keep: Keep) -> None:
+    box = ManualBox(tmp_path / "store", [TopicOptions("/count", keep=keep)])
+    stepped_ns = 0
+    for n in range(30):
+        if n == 10:
+            before_ns = box.sink.now_ns()
+            box.clock.step(0.4)
+            stepped_ns = round(0.4 * NS)
+        box.hear(COUNT, number(n))
+        box.write()
+    box.close()
+    journal = next(j for j in read.journals(box.store) if j.items.get("ros_count"))
+    found = read._own_messages(journal, "amberbox/clock", journal.places)
+    points = [(log_ns, values["offset_ns"]) for log_ns, values in found]
+    after = next(place for place, point in enumerate(points) if point[1] == stepped_ns)
+    assert points[after - 1] == (before_ns, 0)
+    assert points[after] == (before_ns + round(0.1 * NS), stepped_ns)
+
+
+def test_each_point_says_how_long_the_computer_runs(tmp_path: Path) -> None:
+    box = ManualBox(tmp_path / "store", options=PipelineOptions(rotate_ns=15 * NS))
+    base_ns = box.clock.wall - box.clock.boot
+    for n in range(300):
+        if n == 120:
+            box.clock.step(0.3)
+        box.hear(COUNT, number(n))
+        box.write()
+    box.close()
+    count = 0
+    for journal in read.journals(box.store):
+        for log_ns, values in read._own_messages(journal, "amberbox/clock", journal.places):
+            assert log_ns - values["boot_ns"] == base_ns
+            count += 1
+    assert count >= 6
+
+
+def test_a_recording_does_not_count_from_a_start(tmp_path: Path) -> None:
+    box = ManualBox(tmp_path / "store")
+    box.pipeline.clock = MessageClock(box.clock.wall)
+    box.hear(COUNT, number(1))
+    box.write()
+    box.close()
+    assert {r["boot_ns"] for r in own_records(box.store, "amberbox/clock")} == {None}

@@ -166,9 +166,11 @@ def ages_s(windows: Sequence[Window]) -> dict[str, float]:
     ages = _chained(main)
     for writer in {w.writer for w in windows} - {"main"}:
         others = _in_turn(w for w in windows if w.writer == writer)
-        own = _chained(others) if not main else {}
+        if not main:
+            ages |= _chained(others)
+            continue
         for window in others:
-            ages[window.name] = own.get(window.name, 0) or _placed(window, main, ages)
+            ages[window.name] = _placed(window, main, ages)
     return {name: age_ns / NS for name, age_ns in ages.items()}
 
 
