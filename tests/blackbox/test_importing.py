@@ -15,7 +15,7 @@ from rosbags.typesys import Stores, get_typestore
 import amberbox
 from amberbox.blackbox.formats.recording import Recording
 from amberbox.blackbox.importing import import_recordings
-from amberbox.blackbox.keeper import seal
+from amberbox.blackbox.keeper.keeper import seal
 from amberbox.blackbox.store import open_store
 from amberbox.core.errors import AmberboxError, UsageError
 from amberbox.core.source import TopicOptions

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from amberbox.blackbox.follow.read import JournalFile
-from amberbox.blackbox.keeper import Keeper, seal
 from amberbox.blackbox.keeper import keeper as module
+from amberbox.blackbox.keeper.keeper import Keeper, seal
 from amberbox.blackbox.keeper.options import KeeperOptions
 from amberbox.blackbox.recorder.pipeline import PipelineOptions
 from amberbox.blackbox.segments import manifest

@@ -12,7 +12,7 @@ from amberbox.blackbox.formats.open import find_dump, open_recording
 from amberbox.blackbox.formats.options import ReadOptions
 from amberbox.blackbox.formats.recording import Account, Origin, Recording, Report
 from amberbox.blackbox.journal import reserved
-from amberbox.blackbox.keeper import seal
+from amberbox.blackbox.keeper.keeper import seal
 from amberbox.blackbox.recorder.messageclock import MessageClock
 from amberbox.blackbox.recorder.pipeline import Pipeline, PipelineOptions
 from amberbox.blackbox.recorder.sink import BlockSink
