@@ -13,6 +13,7 @@ from amberbox.blackbox.query.record import Record
 from amberbox.blackbox.query.variables import closest
 from amberbox.cli._output import add_range, opened, print_json, size, writable
 from amberbox.cli._progress import progress_bar
+from amberbox.cli._window import add_window, windows
 from amberbox.core.errors import UsageError
 
 _ENDINGS = {".csv": "csv", ".parquet": "parquet", ".mcap": "mcap", ".bag": "bag"}
@@ -54,6 +55,7 @@ def _add_choice(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument("--received", action="store_true", help="add the columns received and seq")
     add_range(parser)
+    add_window(parser)
     parser.add_argument(
         "--with-box", action="store_true",
         help="add what the box wrote about itself: events, gaps, clock",
@@ -102,7 +104,7 @@ def _view(record: Record, args: argparse.Namespace) -> View:
     return View(
         items=args.item,
         variables=_variables(record, args.variable),
-        windows=[(record.time_ns(args.from_), record.time_ns(args.to))],
+        windows=windows(args, record),
         by=args.by,
         all_variables=args.all_variables,
         received=args.received,

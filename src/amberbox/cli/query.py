@@ -11,7 +11,9 @@ from amberbox.blackbox.query.livequery import follow_tables
 from amberbox.blackbox.query.record import Record
 from amberbox.blackbox.query.table import Table
 from amberbox.blackbox.query.tabletext import write_grid
+from amberbox.cli._missions import missions_of
 from amberbox.cli._output import add_range, opened, tell, text_output, writable
+from amberbox.cli._window import add_window, window_of
 from amberbox.core.errors import UsageError
 from amberbox.core.timetext import format_time
 
@@ -27,6 +29,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="column, path or end of a path, ranges[17], received, seq",
     )  # fmt: skip
     add_range(parser)
+    add_window(parser)
     parser.add_argument(
         "--points", type=int, metavar="N", help="thin out to N rows, keeping extremes"
     )
@@ -43,8 +46,10 @@ def run(args: argparse.Namespace) -> int:
     with opened(args.where) as record:
         if args.follow:
             return _follow(record, args, form)
+        missions = missions_of(args, record)
+        span = (None, None) if missions else window_of(args, record)
         table = record.query(
-            args.item, args.variables or None, args.from_, args.to, args.by, args.points
+            args.item, args.variables or None, *span, args.by, args.points, missions=missions
         )
         notes = [*table.notes, *([] if len(table) else [_nothing(record, table.item)])]
     write(table, form, args.output)
@@ -90,10 +95,12 @@ _WRITERS: dict[str, Callable[[Table, IO[str]], None]] = {
 
 def _follow(record: Record, args: argparse.Namespace, form: str) -> int:
     """Stream rows; JSON comes as one object per line."""
-    if form == "parquet" or args.points is not None or args.to is not None:
-        raise UsageError("--follow prints rows as they come", "leave out parquet, --points, --to")
-    if args.by != "received":
-        raise UsageError("--follow goes by time of receipt", "leave out --by")
+    ended = args.points is not None or args.to is not None or args.incident is not None
+    if form == "parquet" or ended:
+        hint = "leave out parquet, --points, --to, --incident"
+        raise UsageError("--follow prints rows as they come", hint)
+    if args.by != "received" or args.mission is not None:
+        raise UsageError("--follow goes by time of receipt", "leave out --by and --mission")
     with text_output(args.output) as file:
         first = True
         try:

@@ -28,19 +28,16 @@ class Refusal:
     reason: str
 
 
-def held_files(store: Store, incidents: Iterable[Incident]) -> Held:
+def held_files(store: Store, incidents: Iterable[Incident]) -> list[Path]:
     """Return the files that incidents hold: journals, segments, copies of the ring."""
     pinned = [incident for incident in incidents if incident.is_pinned]
-    return _sizes([
-        *_copies(store, pinned),
-        *_journals(store, pinned),
-        *(path for path, _ in _segments(store, pinned)),
-    ])  # fmt: skip
+    segments = (path for path, _ in _segments(store, pinned))
+    return [*_copies(store, pinned), *_journals(store, pinned), *segments]
 
 
 def held_bytes(store: Store, incidents: Iterable[Incident]) -> int:
     """Return how much incidents hold, each file once."""
-    return sum(held_files(store, incidents).values())
+    return sum(_sizes(held_files(store, incidents)).values())
 
 
 def allowed_bytes(store: Store, options: KeeperOptions) -> int:

@@ -31,8 +31,11 @@ class IncidentKeeping:
             self._trouble = ""
 
     def close(self) -> None:
-        """Tell what is left to tell."""
+        """Take what the end of the record brings, and tell what is left to tell."""
+        self.step()
         try:
+            if self._triggers is not None:
+                self._triggers.close()
             self._pins.close()
         except OSError as error:
             self._say(error.strerror or str(error))

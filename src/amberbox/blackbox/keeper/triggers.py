@@ -67,6 +67,7 @@ class Triggers:
         self._triggers = [trigger for trigger in options.triggers if self._is_sound(trigger)]
         self._watches: list[_Watch] = []
         self._run = -1
+        self._last: RunPart | None = None
         self._since_ns = 0
         self._noted_s = time.monotonic()
         self._noted = Cursor()
@@ -91,7 +92,13 @@ class Triggers:
             self._pins.fire(*self._pending[0])
             self._pending.pop(0)
         if parts:
+            self._last = parts[-1]
             self._note(parts[-1], at_once=fired_any)
+
+    def close(self) -> None:
+        """Write down how far was read."""
+        if self._last is not None and self._reading.cursor() != self._noted:
+            self._note(self._last, at_once=True)
 
     def _is_sound(self, trigger: Trigger) -> bool:
         try:
