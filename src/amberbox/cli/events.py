@@ -7,6 +7,7 @@ import sys
 from typing import Any
 
 from amberbox.cli._output import add_range_only, opened
+from amberbox.cli._window import add_window, window_of
 from amberbox.core.timetext import format_time
 
 
@@ -14,13 +15,14 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
     parser.add_argument("where", metavar="WHERE", help="robot folder, store or recording file")
     add_range_only(parser)
+    add_window(parser)
     parser.add_argument("--json", action="store_true", help="a list of objects")
 
 
 def run(args: argparse.Namespace) -> int:
     """Print the events of a record, one line each."""
     with opened(args.where) as record:
-        table = record.events(args.from_, args.to)
+        table = record.events(*window_of(args, record))
     if args.json:
         table.to_json(sys.stdout)
         print()

@@ -5,8 +5,10 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
+from amberbox.blackbox.segments.parquet import overlaps
 from amberbox.cli._output import add_range_only, opened, print_json
 from amberbox.cli._text import in_columns
+from amberbox.cli._window import Window, add_window, windows
 from amberbox.core.clock import NS
 from amberbox.core.timetext import format_time
 from amberbox.core.types import Gap
@@ -19,6 +21,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("where", metavar="WHERE", help="robot folder, store or recording file")
     parser.add_argument("item", nargs="?", metavar="ITEM", help="data item; all when absent")
     add_range_only(parser)
+    add_window(parser)
     parser.add_argument("--json", action="store_true", help="a list of objects")
 
 
@@ -27,7 +30,8 @@ def run(args: argparse.Namespace) -> int:
     with opened(args.where) as record:
         if args.item is not None:
             record.variables(args.item)  # a name that is not there is an error, not an empty list
-        found = record.gaps(args.item, args.from_, args.to)
+        spans = windows(args, record)
+        found = [g for g in record.gaps(args.item) if any(_meets(g, span) for span in spans)]
     if args.json:
         print_json([_as_json(gap) for gap in found])
     elif found:
@@ -35,6 +39,10 @@ def run(args: argparse.Namespace) -> int:
     else:
         print("nothing is missing")
     return 0
+
+
+def _meets(gap: Gap, window: Window) -> bool:
+    return overlaps(gap.from_ns, max(gap.to_ns - 1, gap.from_ns), window)
 
 
 def _row(gap: Gap) -> tuple[str, ...]:

@@ -25,6 +25,7 @@ def keeper_options(folder: RobotFolder) -> KeeperOptions:
         incident_share=robot.incidents.share / 100,
         incidents_per_hour=robot.incidents.per_hour,
         triggers=tuple(map(_trigger, robot.triggers)),
+        missions=tuple(mission.rule() for mission in robot.missions),
     )
 
 

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+from amberbox.blackbox.folder.missions import MissionOptions
 from amberbox.blackbox.folder.triggers import IncidentOptions, TriggerOptions, repeated
 from amberbox.core.ids import derive_id, is_id
 from amberbox.core.options import option
@@ -96,11 +97,14 @@ class RobotConfig:
     store: StoreOptions = option(StoreOptions(), "where and how the record is kept")
     server: ServerOptions | None = option(None, "the fleet server this robot reports to")
     triggers: Sequence[TriggerOptions] = option((), "what makes an incident")
+    missions: Sequence[MissionOptions] = option((), "what begins and ends missions")
     incidents: IncidentOptions = option(IncidentOptions(), "limits of incidents")
 
     def check(self) -> Iterator[tuple[str, str]]:
         """Say what is wrong with the id, and which names are there twice."""
         for name in repeated(self.triggers):
             yield "triggers", f"there are several called '{name}'"
+        for name in repeated(self.missions):
+            yield "missions", f"there are several called '{name}'"
         if self.id and not is_id(self.id):
             yield "id", f"'{self.id}' is no id (a-z 0-9 _ . -); '{derive_id(self.id)}' would be one"

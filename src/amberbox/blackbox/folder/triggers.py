@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 from amberbox.core.config import Node, did_you_mean
 from amberbox.core.errors import AmberboxError, Problem, UsageError
@@ -15,6 +16,14 @@ from amberbox.core.units import parse_duration_s
 OWN = ("amberbox_", "probe_")
 """Items that no block of ``black_box.yaml`` names begin like this."""
 _KINDS = ("when", "event", "silence")
+
+
+class Named(Protocol):
+    """What has a name."""
+
+    @property
+    def name(self) -> str:
+        """Its name."""
 
 
 @dataclass(frozen=True)
@@ -98,9 +107,9 @@ def _silence_problem(text: str) -> str:
     return ""
 
 
-def repeated(triggers: Sequence[TriggerOptions]) -> Iterator[str]:
-    """Name the triggers whose name another one has, too."""
-    names = [trigger.name for trigger in triggers]
+def repeated(named: Sequence[Named]) -> Iterator[str]:
+    """Give the names that several have."""
+    names = [entry.name for entry in named]
     yield from (name for name in dict.fromkeys(names) if names.count(name) > 1)
 
 

@@ -71,6 +71,16 @@ class Conditions:
         return frozenset(name for item in found for name in _with_parents(item))
 
     @property
+    def tables(self) -> frozenset[str]:
+        """Names of the items and child tables that are read."""
+        return frozenset(samples.item for samples in self._samples.values())
+
+    def variables(self, table: str) -> list[str]:
+        """Name the variables of a table that are read."""
+        found = (s.variable for s in self._samples.values() if s.item == table)
+        return list(dict.fromkeys(found))
+
+    @property
     def history_ns(self) -> int:
         """How far back rows matter to what is true now."""
         depths = (e.history_ns for c in self._conditions.values() for e in c.expressions())
@@ -166,14 +176,14 @@ class _Samples:
     def __init__(self, address: str) -> None:
         self.address = address
         self.item, _, variable = address.partition(".")
-        self._variable, _, index = variable.partition("[")
+        self.variable, _, index = variable.partition("[")
         self._index = int(index.rstrip("]")) if index else None
         self._times_ns: list[IntArray] = []
         self._values: list[Any] = []
 
     def add(self, batch: Batch, times_ns: IntArray) -> None:
         """Take the values of a batch; a variable that it does not have is unknown there."""
-        column = batch.columns.get(self._variable, np.full(len(times_ns), None, object))
+        column = batch.columns.get(self.variable, np.full(len(times_ns), None, object))
         index = self._index
         values = values_of(column, 0) if index is None else element_of(column, index, 0)
         self._times_ns.append(times_ns)

@@ -120,6 +120,11 @@ class Mission:
         }
 
 
+def book_of_store(store: Path) -> ClockBook:
+    """Return what is known now of a store's clocks."""
+    return look(store, with_segments=can_build()).book
+
+
 def load(store: Path) -> list[Mission]:
     """Return all missions of a store in order of their start, with corrected times."""
     catalogue = look(store, with_segments=can_build())

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import numpy as np
 
@@ -28,6 +28,9 @@ from amberbox.blackbox.where import store_path
 from amberbox.core.errors import AmberboxError, UsageError
 from amberbox.core.timetext import parse_time
 from amberbox.core.types import Column, ColumnData, Gap, ItemSchema
+
+if TYPE_CHECKING:
+    from amberbox.blackbox.missions import Mission
 
 By = Literal["received", "timestamp"]
 Time = int | str | None
@@ -85,6 +88,8 @@ class Record:
         to: Time = None,
         by: By = "received",
         points: int | None = None,
+        *,
+        missions: Sequence[Mission] | None = None,
     ) -> Table:
         """Return ``timestamp`` and variables of an item for ``[from_, to)``, in order of time.
 
@@ -92,9 +97,16 @@ class Record:
         Without ``variables`` the table has the ones chosen in ``black_box.yaml``, else all;
         ``received`` and ``seq`` come when named. ``points`` thins out, keeping extremes. Without
         pyarrow the journals are read instead of the segments: slower, with the same result.
+        With ``missions`` the ranges are theirs; of several, a column ``mission`` tells which.
 
         Raises UsageError for unknown or ambiguous names and for times that cannot be read.
         """
+        if missions is not None:
+            from amberbox.blackbox.missions.windows import query_missions
+
+            return query_missions(
+                missions, lambda start, end: self.query(item, variables, start, end, by, points)
+            )
         span = self.time_ns(from_), self.time_ns(to)
         return self._ask(lambda c: _query(c, item, variables, span, by, points))
 
@@ -112,6 +124,14 @@ class Record:
         """Return what is missing in ``[from_, to)`` and why, of one item or of all."""
         span = self.time_ns(from_), self.time_ns(to)
         return self._ask(lambda catalogue: gap_list.gaps(catalogue, item, span))
+
+    def missions(
+        self, name: str | None = None, *, failed: bool = False, last: int | None = None
+    ) -> list[Mission]:
+        """Return missions in order of their start: of a name, failed ones, the last few."""
+        from amberbox.blackbox.missions import choose, load
+
+        return choose(load(self.path), name, failed=failed, last=last)
 
     def clock(self) -> ClockBook:
         """Return what is known by now of the clocks of each boot, and what cannot be put right."""

@@ -1,0 +1,70 @@
+"""Find missions in what was recorded already, such as imported recordings."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from amberbox.blackbox.keeper.conditions import Conditions
+from amberbox.blackbox.keeper.missiontracker import RULE, Tracker, conditions_of
+from amberbox.blackbox.keeper.options import MissionRule
+from amberbox.blackbox.missions.ask import write
+from amberbox.blackbox.missions.mission import Mission, Moment, load
+from amberbox.blackbox.query.record import Record
+from amberbox.blackbox.store import open_store
+from amberbox.core.clock import NS
+from amberbox.core.errors import UsageError
+from amberbox.core.types import Batch, IntArray, ItemSchema
+
+_SAME_NS = NS
+
+
+def detect(store: Path, rules: Sequence[MissionRule]) -> tuple[list[Mission], list[str]]:
+    """Evaluate rules over a whole record and write down the missions that were not known.
+
+    Returns them, and notes on what could not be evaluated. Doing it again finds nothing new.
+    """
+    found, notes = find(Record(store), rules)
+    known = load(store)
+    new = [mission for mission in found if not any(_same(mission, other) for other in known)]
+    write(open_store(store), new)
+    return new, notes
+
+
+def find(record: Record, rules: Sequence[MissionRule]) -> tuple[list[Mission], list[str]]:
+    """Return the missions that rules find in a record, and notes."""
+    conditions = conditions_of(rules)
+    notes = [note for item in sorted(conditions.tables) for note in _add(conditions, record, item)]
+    last_ns = record.last_ns()
+    if last_ns is None:
+        return [], notes
+    changed = Tracker(rules).take(conditions.edges(last_ns), Moment)
+    missions = {mission.id: mission for mission in changed}
+    return list(missions.values()), [*notes, *conditions.problems.values()]
+
+
+def _add(conditions: Conditions, record: Record, item: str) -> list[str]:
+    """Give all rows of an item to the conditions."""
+    try:
+        table = record.query(item, ["received", *conditions.variables(item)])
+    except UsageError as error:
+        return [error.what]
+    times = table.columns["received"]
+    assert isinstance(times, np.ndarray)
+    received: IntArray = np.maximum.accumulate(times)
+    rows = np.arange(len(received))
+    columns = {name: table.columns[name] for name in conditions.variables(item)}
+    schema = ItemSchema("", ())
+    batch = Batch(item, schema, "main", 0, rows, received, received, received, columns)
+    conditions.add(batch)
+    return []
+
+
+def _same(found: Mission, known: Mission) -> bool:
+    """Two missions of one name that rules found are one if they began together."""
+    began_together = abs(found.from_ns - known.from_ns) <= _SAME_NS
+    return found.id == known.id or (
+        known.who == RULE and found.name == known.name and began_together
+    )
