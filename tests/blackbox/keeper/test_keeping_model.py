@@ -7,7 +7,7 @@ import tempfile
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from unittest import mock
 
@@ -51,7 +51,7 @@ TOPICS = [TopicOptions("/bulky", keep="bulk"), TopicOptions("/ring", keep="ring"
 ITEMS = {"ros_count": COUNT, "ros_bulky": BULKY, "ros_ring": RING}
 RING_S = 120.0
 ROOMY = 50_000_000
-TIGHT = 250_000
+TIGHT = 200_000
 
 
 class KilledError(BaseException):
@@ -81,7 +81,7 @@ class World:
         self.model = Model()
         self.next = 0
         self.options = KeeperOptions(
-            quota=ROOMY, min_free=0, keep_min_s=0.0, headroom=8_000, ring_s=RING_S
+            quota=2 * TIGHT, min_free=0, keep_min_s=0.0, headroom=8_000, ring_s=RING_S
         )
         self.start()
         self.keeper: Keeper | None = None
@@ -212,15 +212,19 @@ class BoxMachine(RuleBasedStateMachine):
     def begin(self) -> None:
         self.world = World()
         self.pinned: dict[str, dict[str, set[int]]] = {}
+        self.world.mark()
+        self.world.record(60, 0.5)
 
     def teardown(self) -> None:
         if hasattr(self, "world"):
             self.world.check(self.pinned)
             self.world.end()
 
-    @rule(writes=st.integers(5, 60), pause_s=st.sampled_from([0.1, 1.0]))
-    def record(self, writes: int, pause_s: float) -> None:
+    @rule(writes=st.integers(5, 60), pause_s=st.sampled_from([0.1, 1.0]), keeps=st.booleans())
+    def record(self, writes: int, pause_s: float, keeps: bool) -> None:
         self.world.record(writes, pause_s)
+        if keeps:
+            self.world.keep()
 
     @rule()
     def mark(self) -> None:
@@ -247,8 +251,6 @@ class BoxMachine(RuleBasedStateMachine):
 
     @rule(quota=st.sampled_from([TIGHT, 2 * TIGHT, ROOMY]))
     def change_quota(self, quota: int) -> None:
-        from dataclasses import replace
-
         self.world.options = replace(self.world.options, quota=quota)
         if self.world.keeper is not None:
             self.world.keeper.close()
@@ -256,8 +258,6 @@ class BoxMachine(RuleBasedStateMachine):
 
     @rule(keep_min_s=st.sampled_from([0.0, 30.0]), stop=st.booleans())
     def change_rule(self, keep_min_s: float, stop: bool) -> None:
-        from dataclasses import replace
-
         full = "stop" if stop else "overwrite"
         self.world.options = replace(self.world.options, keep_min_s=keep_min_s, when_full=full)
         self.world.forget_keeper()
@@ -294,8 +294,8 @@ class BoxMachine(RuleBasedStateMachine):
 
 TestBox = BoxMachine.TestCase
 TestBox.settings = settings(
-    max_examples=8,
-    stateful_step_count=20,
+    max_examples=5,
+    stateful_step_count=15,
     deadline=None,
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.filter_too_much],
 )

@@ -13,7 +13,7 @@ import numpy as np
 from amberbox.blackbox.segments import columns as col
 from amberbox.blackbox.segments import manifest as mf
 from amberbox.blackbox.segments.flat import Flat, TableSchema, join
-from amberbox.blackbox.segments.manifest import Manifest, Segment
+from amberbox.blackbox.segments.manifest import Manifest, Part, Segment
 from amberbox.core.types import Batch, ColumnData, Gap, ItemSchema, Ragged
 
 WINDOW_ROWS = 4096
@@ -27,13 +27,18 @@ def can_read() -> bool:
 
 @dataclass(frozen=True, slots=True)
 class Stretch:
-    """The rows of one journal: ``[first_seq, end_seq)`` of a writer's run."""
+    """Rows of a journal, or of several: ``[first_seq, end_seq)`` of a writer's run."""
 
     journal: str
     writer: str
     run: int
     first_seq: int
     end_seq: int
+
+    def meets(self, part: Part) -> bool:
+        """Tell whether a part of a segment may have rows of it."""
+        same = (part.writer, part.run) == (self.writer, self.run)
+        return same and part.last_seq >= self.first_seq and part.first_seq < self.end_seq
 
 
 class TableRows:
@@ -103,17 +108,28 @@ def tables_of(
         for segment in segments:
             schema = known.schemas[segment.schema]
             wanted = items is None or (schema.parent or schema.item) in items
-            if wanted and any(part.journal == of.journal for part in segment.parts):
+            if wanted and any(of.meets(part) for part in segment.parts):
                 found.append(TableRows(store, segment, schema, of))
     return found
 
 
-def windows(tables: Sequence[TableRows], of: Stretch, from_seq: int) -> Iterator[tuple[int, int]]:
-    """Cut a stretch so that no table has rows of two versions of its schema in one piece."""
-    starts = {table.next_seq for table in tables if table.next_seq is not None}
-    cuts = sorted({*starts, *range(from_seq, of.end_seq, WINDOW_ROWS), of.end_seq})
-    inside = [cut for cut in cuts if cut > from_seq]
-    yield from zip([from_seq, *inside], inside, strict=False)
+def windows(tables: Sequence[TableRows], of: Stretch) -> Iterator[int]:
+    """Give positions up to which rows may be taken together, each once those before are taken.
+
+    No table has rows of two versions of its schema in one piece.
+    """
+    begins = sorted({table.next_seq for table in tables if table.next_seq is not None})
+    while True:
+        waiting = [table.next_seq for table in tables if table.next_seq is not None]
+        if not waiting:
+            break
+        first = min(waiting)
+        later = (begin for begin in begins if begin > first)
+        end_seq = min(first + WINDOW_ROWS, next(later, of.end_seq))
+        if end_seq >= of.end_seq:
+            break
+        yield end_seq
+    yield of.end_seq
 
 
 def batches(tables: Sequence[TableRows], end_seq: int) -> list[Batch]:

@@ -115,7 +115,7 @@ def rows_of_gone(
     stretch, known = gone.stretch, mf.read(store)
     from_seq = max(from_seq, stretch.first_seq)
     missing: list[Batch | Gap] = [_gap(gone, from_seq, gone.reason)] if gone.reason else []
-    if stretch.journal and not col.can_read():
+    if not col.can_read():
         why = missing or [_gap(gone, from_seq, "needs pyarrow to be read")]
         yield stretch.end_seq, why
         return
@@ -123,8 +123,8 @@ def rows_of_gone(
         yield stretch.end_seq, missing
         return
     wanted = None if items is None else {*items, _GAP_ITEM}
-    tables = col.tables_of(store, known, stretch, wanted) if stretch.journal else []
-    for _, end_seq in col.windows(tables, stretch, from_seq):
+    tables = col.tables_of(store, known, stretch, wanted)
+    for end_seq in col.windows(tables, stretch):
         found = list(_window(tables, end_seq, items, read_to))
         found += [_gap(gone, from_seq, why, item) for item, why in col.damage(tables)]
         if end_seq == stretch.end_seq:
