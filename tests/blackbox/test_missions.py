@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import Any
 import msgspec
 import pytest
 
+from amberbox.blackbox.keeper import Keeper
 from amberbox.blackbox.keeper.missions import MissionKeeper
 from amberbox.blackbox.keeper.missiontracker import id_of
 from amberbox.blackbox.keeper.options import KeeperOptions, MissionRule
@@ -167,6 +169,20 @@ def test_a_rule_that_cannot_be_judged_is_told_once(tmp_path: Path) -> None:
     robot.close()
     kinds = Record(robot.store).events().values("kind")
     assert kinds.count("mission_rule") == 1
+
+
+def test_the_keeper_looks_after_missions(tmp_path: Path) -> None:
+    robot = Robot(tmp_path / "store", rules=())
+    robot.tell("STARTED", 2)
+    options = KeeperOptions(missions=(RULE,), quota_percent=100.0, min_free=0)
+    keeper = Keeper(open_store(robot.store), options, clock=robot.clock)
+    keeper.step(threading.Event())
+    assert [m.outcome for m in robot.missions] == [""]
+    robot.tell("DONE", 2)
+    keeper.step(threading.Event())
+    assert [m.outcome for m in robot.missions] == ["DONE"]
+    keeper.close()
+    robot.box.close()
 
 
 # -- by hand

@@ -6,7 +6,7 @@ import argparse
 
 from amberbox.blackbox.journal.reserved import PREFIX
 from amberbox.blackbox.query.overview import ItemInfo
-from amberbox.cli._output import opened, print_grid, print_json, size
+from amberbox.cli._output import opened, print_grid, print_json, size, tell
 from amberbox.core.clock import NS
 from amberbox.core.timetext import format_time
 
@@ -24,6 +24,7 @@ def run(args: argparse.Namespace) -> int:
     """Print the items of a record."""
     with opened(args.where) as record:
         items = record.items()
+        notes = record.clock().notes if items else []
     if args.json:
         print_json([item.to_json() for item in items])
         return 0
@@ -31,6 +32,7 @@ def run(args: argparse.Namespace) -> int:
     shown = [item for item in items if args.all or item not in own]
     if shown:
         print_grid(_HEADER, map(_row, shown))
+    tell(notes)
     if own and not args.all:
         print(f"and {len(own)} items of the box itself (--all shows them)")
     if not items:

@@ -32,6 +32,7 @@ from amberbox.core.errors import UsageError
 
 if TYPE_CHECKING:
     from amberbox.blackbox.keeper.incidents import IncidentKeeping
+    from amberbox.blackbox.keeper.missions import MissionKeeper
 
 PATIENCE_S = 10.0
 """After the recorder was killed its keeper lives on for a moment; the next one waits for it."""
@@ -56,12 +57,14 @@ class Keeper:
         self._notary = Notary(store, self.journal)
         self._deleter = Deleter(store, self._options, self.journal, self._is_pending)
         self._incidents = _incidents(store, self._options, self.journal)
+        self._missions = _missions(store, self._options, self.journal)
         self._recovered = False
 
     def step(self, stop: threading.Event) -> None:
         """Do everything once: what others ask for, segments, deletion, accounts."""
         self._recover()
         self._incidents.step()  # what is pinned now is not deleted below
+        self._missions.step()
         self._deleter.make_room()
         confirm.take_requests(self._store)
         self.build(stop)
@@ -79,6 +82,7 @@ class Keeper:
     def close(self) -> None:
         """Write down what is left to say, finish the keeper's own journals."""
         self._incidents.close()
+        self._missions.close()
         self._deleter.close()
         with suppress(OSError):
             self.journal.close()
@@ -138,6 +142,12 @@ class Keeper:
         finally:
             self._deleter.busy = ""
         return 1
+
+
+def _missions(store: Store, options: KeeperOptions, journal: OwnJournal) -> MissionKeeper:
+    from amberbox.blackbox.keeper.missions import MissionKeeper  # see above
+
+    return MissionKeeper(store, options.missions, journal)
 
 
 def _incidents(store: Store, options: KeeperOptions, journal: OwnJournal) -> IncidentKeeping:

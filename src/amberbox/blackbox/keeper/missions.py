@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import bisect
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -45,10 +47,11 @@ class MissionKeeper:
         self._follower: _Follower | None = None
         self._told: set[str] = set()
         self._unwritten: list[Record] = []
+        self._answers: dict[Path, list[Record]] = {}
         self._saved_ns = self._journal.now_ns()
 
     def step(self) -> None:
-        """See to requests, then go on along the record. Raises OSError on a full disk."""
+        """See to requests, then go on along the record; what a full disk refuses waits."""
         self._take_requests()
         if self._rules:
             self._follow()
@@ -56,9 +59,7 @@ class MissionKeeper:
     def close(self) -> None:
         """Write down how far the record was read."""
         if self._follower is not None and self._follower.has_read:
-            self._journal.write(self._unwritten, self._follower.progress())
-            self._unwritten = []
-            self._follower.has_read = False
+            self._write_progress(self._follower)
 
     def note(self, missions: Sequence[Mission]) -> None:
         """Write missions down as they are."""
@@ -66,10 +67,15 @@ class MissionKeeper:
 
     def _take_requests(self) -> None:
         for request in pending(self._store):
-            if request.kind == KIND:
+            if request.kind != KIND:
+                continue
+            if request.path not in self._answers:
                 records: list[Record] = [m.record() for m in self._asked(request)]
-                self._journal.write(records or [_refusal(request)])
+                self._answers[request.path] = records or [_refusal(request)]
+            with suppress(OSError):  # then it is done at the next step
+                self._journal.write(self._answers[request.path])
                 finish(request)
+                del self._answers[request.path]
 
     def _asked(self, request: Request) -> list[Mission]:
         values, moment = request.values, _moment_of(request)
@@ -103,9 +109,17 @@ class MissionKeeper:
                 )
         now_ns = self._journal.now_ns()
         due = self._unwritten or now_ns - self._saved_ns > _SAVE_NS
-        if due and self._follower.has_read:
-            self._journal.write(self._unwritten, self._follower.progress())
-            self._unwritten, self._saved_ns = [], now_ns
+        if due and self._follower.has_read and self._write_progress(self._follower):
+            self._saved_ns = now_ns
+
+    def _write_progress(self, follower: _Follower) -> bool:
+        """Write down what was found and how far this has come; False if the disk is full."""
+        try:
+            self._journal.write(self._unwritten, follower.progress())
+        except OSError:
+            return False
+        self._unwritten = []
+        return True
 
 
 class _Follower:

@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from amberbox.blackbox.follow.chain import previous_chain
 from amberbox.blackbox.keeper.missions import KIND, MissionKeeper
 from amberbox.blackbox.keeper.missiontracker import id_of
 from amberbox.blackbox.keeper.ownjournal import OwnJournal
@@ -105,7 +106,7 @@ def as_keeper(store: Store, work: Callable[[MissionKeeper], object]) -> bool:
         lock = WriterLock(store, "keeper")
     except UsageError:
         return False
-    journal = OwnJournal(store, "keep")
+    journal = OwnJournal(store, "keep", chain=lambda: previous_chain(store, "keep"))
     try:
         work(MissionKeeper(store, (), journal))
     finally:
