@@ -11,7 +11,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from amberbox.blackbox.keeper import Keeper
+from amberbox.blackbox.keeper.keeper import Keeper
 from amberbox.blackbox.keeper.missions import MissionKeeper
 from amberbox.blackbox.keeper.missiontracker import id_of
 from amberbox.blackbox.keeper.options import KeeperOptions, MissionRule

@@ -99,6 +99,18 @@ def test_other_verbs_take_missions(
     printed(capsys, *verb, str(detected), "--mission", "last")
 
 
+def test_export_takes_several_missions_and_plot_takes_one(
+    detected: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    where, target = str(detected), str(detected.parent / "x.csv")
+    printed(capsys, "export", where, "--item", "task", "--mission", "failed:2", "-o", target)
+    assert len(Path(target).read_text().splitlines()) == 5
+    plot = ["plot", where, "task", "speed", "-o", str(detected.parent / "x.html"), "--mission"]
+    assert "3 rows" in printed(capsys, *plot, "last")
+    assert main([*plot, "last:2"]) == 2
+    assert "name one" in capsys.readouterr().err
+
+
 def test_a_mission_is_begun_and_ended(store: Path, capsys: pytest.CaptureFixture[str]) -> None:
     begin = ("mission", "start", str(store), "drive", "--id", "d1", "--parameter", "load=2 kg")
     assert printed(capsys, *begin) == "d1\n"
@@ -118,6 +130,7 @@ def test_a_mission_is_begun_and_ended(store: Path, capsys: pytest.CaptureFixture
         (["mission", "list", "STORE", "--last", "0"], "--last"),
         (["mission", "detect", "STORE"], "no rules"),
         (["query", "STORE", "task", "--mission", "last"], "no mission 'last'"),
+        (["plot", "STORE", "task", "speed", "--mission", "x", "-o", "x.svg"], "no mission 'x'"),
         (["query", "STORE", "task", "--mission", "last", "--from", "-1s"], "its own window"),
         (["query", "STORE", "task", "--mission", "last", "--follow"], "--follow"),
     ],

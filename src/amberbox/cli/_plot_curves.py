@@ -12,6 +12,7 @@ from amberbox.blackbox.query.downsample import downsample
 from amberbox.blackbox.query.record import Record
 from amberbox.blackbox.query.table import Table
 from amberbox.blackbox.segments.columns import null_mask
+from amberbox.cli._window import window_of
 from amberbox.core.clock import NS
 from amberbox.core.errors import AmberboxError, UsageError
 from amberbox.core.types import Column, ColumnData, Gap, IntArray, Ragged
@@ -54,7 +55,8 @@ def drawing(record: Record, args: argparse.Namespace) -> Drawing:
     """
     if args.points < 1:
         raise UsageError("--points must be 1 or more")
-    table = record.query(args.item, [*args.variables, "received"], args.from_, args.to, args.by)
+    span = window_of(args, record)
+    table = record.query(args.item, [*args.variables, "received"], *span, args.by)
     if not len(table):
         raise AmberboxError(
             f"{table.item} has no rows in this range", "amberbox items shows its times"

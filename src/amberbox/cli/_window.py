@@ -37,6 +37,8 @@ def windows(args: argparse.Namespace, record: Record) -> list[Window]:
 def window_of(args: argparse.Namespace, record: Record) -> Window:
     """Return one window that holds all that is meant; says so when it holds more."""
     found = windows(args, record)
+    if args.mission and len(found) > 1:
+        raise UsageError(f"'{args.mission}' are {len(found)} missions", "name one of them")
     if len(found) > 1:
         tell([f"the clock was set in between: the window is in {len(found)} parts, "
               "rows between them are shown, too"])  # fmt: skip

@@ -9,6 +9,7 @@ from amberbox.cli._output import add_range, opened, tell, writable
 from amberbox.cli._plot_curves import Drawing, drawing
 from amberbox.cli._plot_image import draw_image
 from amberbox.cli._plot_page import draw_page
+from amberbox.cli._window import add_window
 from amberbox.core.errors import UsageError
 
 _DRAW: dict[str, Callable[[Drawing], bytes]] = {
@@ -25,6 +26,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("item", metavar="ITEM", help="data item; 'amberbox items' lists them")
     parser.add_argument("variables", metavar="VAR", nargs="+", help="as for 'amberbox query'")
     add_range(parser)
+    add_window(parser)
     parser.add_argument(
         "--points", type=int, default=4000, metavar="N",
         help="draw at most N rows, keeping extremes (default: 4000)",
