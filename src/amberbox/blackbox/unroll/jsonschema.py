@@ -8,11 +8,17 @@ from typing import Any
 import msgspec
 
 from amberbox.blackbox.unroll.shapes import Shape, nullable, places
+from amberbox.blackbox.unroll.viewerform import ALSO_TEXT, viewer_form
 from amberbox.core.types import Schema
 
 NAMES = "x-columns"
 """Keyword for the paths of a table's columns in the order they were first seen, where the
 properties alone do not tell: names are given in that order and never change."""
+
+SHAPE = "x-shape"
+"""Keyword for all kinds of value that were seen, where the plain types do not tell. What viewers
+take has no way to say "number or text"; whether a value may be missing or null goes unsaid,
+because the root and every property may."""
 
 _DRAFT = "https://json-schema.org/draft/2020-12/schema"
 OURS = "every message fits: amberbox"
@@ -21,10 +27,18 @@ _ORDER = ("array", "boolean", "integer", "number", "object", "string", "null")
 
 
 def to_schema(shape: Shape, name: str) -> Schema:
-    """Write a shape as a JSON Schema document."""
-    head = {"$schema": _DRAFT, "$comment": OURS, "title": name}
-    document = head | _to_json(shape, table=True)
-    return Schema(name, "jsonschema", msgspec.json.encode(document))
+    """Write a shape as a JSON Schema document that viewers take."""
+    document = {"$schema": _DRAFT, "$comment": OURS, "title": name}
+    return Schema(name, "jsonschema", msgspec.json.encode(document | _for_viewers(shape)))
+
+
+def _for_viewers(shape: Shape) -> dict[str, Any]:
+    full = _to_json(shape, table=True)
+    plain = viewer_form(full)
+    if plain is None or plain["type"] != "object":  # they ask for an object, whatever comes
+        plain = {"type": "object", "properties": {}}
+    tells_all = _to_json(_nullable(plain, table=True), table=True) == full
+    return plain if tells_all else plain | {SHAPE: full}
 
 
 def _to_json(shape: Shape, table: bool = False) -> dict[str, Any]:
@@ -33,7 +47,7 @@ def _to_json(shape: Shape, table: bool = False) -> dict[str, Any]:
     if "binary" in shape.kinds:
         document["contentEncoding"] = "base64"
         if "string" in shape.kinds:
-            document["x-also-text"] = True
+            document[ALSO_TEXT] = True
     if shape.open:
         return document | {"additionalProperties": True}
     if "object" in shape.kinds:
@@ -59,8 +73,14 @@ def from_schema(schema: Schema) -> Shape:
         document = msgspec.json.decode(schema.data)
     except msgspec.DecodeError:
         return nullable()
-    ours = isinstance(document, dict) and document.get("$comment") == OURS
-    return _from_json(document, table=True) if ours else nullable()
+    if not is_ours(document):
+        return nullable()
+    return _nullable(document.get(SHAPE, document), table=True)
+
+
+def is_ours(document: Any) -> bool:
+    """Tell the documents that ``to_schema`` wrote, and those of the box's own channels."""
+    return isinstance(document, dict) and document.get("$comment") == OURS
 
 
 def _from_json(document: Mapping[str, Any], table: bool = False) -> Shape:
@@ -68,12 +88,18 @@ def _from_json(document: Mapping[str, Any], table: bool = False) -> Shape:
     shape = Shape({types} if isinstance(types, str) else set(types))
     if "contentEncoding" in document:
         shape.kinds.add("binary")
-        if not document.get("x-also-text"):
+        if not document.get(ALSO_TEXT):
             shape.kinds.discard("string")
     shape.open = document.get("additionalProperties") is True
-    shape.properties = {k: _from_json(v) for k, v in document.get("properties", {}).items()}
+    shape.properties = {k: _nullable(v) for k, v in document.get("properties", {}).items()}
     if "items" in document:
         shape.items = _from_json(document["items"] or {}, table=True)
     if table:
         shape.names = list(document.get(NAMES) or _natural_names(shape))
+    return shape
+
+
+def _nullable(document: Mapping[str, Any], table: bool = False) -> Shape:
+    shape = _from_json(document, table)
+    shape.kinds.add("null")
     return shape
