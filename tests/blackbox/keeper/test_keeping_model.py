@@ -26,8 +26,8 @@ from hypothesis.stateful import (
 
 from amberbox.blackbox.follow.follow import follow
 from amberbox.blackbox.incidents import Incident, Wish, advance, load, pin, release
-from amberbox.blackbox.keeper.keeper import Keeper
 from amberbox.blackbox.keeper.confirm import confirm
+from amberbox.blackbox.keeper.keeper import Keeper
 from amberbox.blackbox.keeper.options import KeeperOptions
 from amberbox.blackbox.keeper.removal import Remover
 from amberbox.blackbox.query.catalogue import look

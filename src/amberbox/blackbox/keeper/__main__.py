@@ -13,6 +13,7 @@ from pathlib import Path
 
 from amberbox.blackbox.keeper.keeper import PATIENCE_S, Keeper, wait_for_lock
 from amberbox.blackbox.keeper.options import KeeperOptions
+from amberbox.blackbox.segments.build import can_build
 from amberbox.blackbox.store import open_store
 from amberbox.core.errors import UsageError
 
@@ -32,6 +33,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: stop.set())
     os.nice(10)
+    _load_ahead()
     try:
         store = open_store(options.store)
         lock = wait_for_lock(store, PATIENCE_S if options.parent else 0.0, stop)
@@ -45,6 +47,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     keeper.close()
     lock.release()
     return 0
+
+
+def _load_ahead() -> None:
+    """Load what takes a second before there is a store to mind, not amid it."""
+    if can_build():
+        import pyarrow.parquet  # noqa: F401  # only to have it loaded
 
 
 def _pause(keeper: Keeper, stop: threading.Event, parent: int) -> bool:

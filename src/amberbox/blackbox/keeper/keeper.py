@@ -23,6 +23,7 @@ from amberbox.blackbox.segments import manifest
 from amberbox.blackbox.segments.build import (
     build_segments,
     can_build,
+    drop_gone,
     merge_small,
     remove_leftovers,
 )
@@ -70,10 +71,17 @@ class Keeper:
         self.build(stop)
         self._deleter.trim_ring()
         self._deleter.expire()
+        self._drop_gone()
         self._deleter.make_room()
         self._deleter.condense(self._notary.signature_of)
         self._deleter.report()
         self._notary.sign()
+
+    def _drop_gone(self) -> None:
+        """Take the rows of deleted journals out of segments that hold others, too."""
+        if self._with_segments:
+            with suppress(OSError):  # no room for it just now
+                drop_gone(self._store.path, self.breathe)
 
     def breathe(self) -> None:
         """See to the room that is left; to be called often during long work."""

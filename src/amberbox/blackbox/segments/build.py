@@ -221,6 +221,49 @@ def merge_small(store: Path, breathe: Callable[[], None] = _no_pause) -> list[Se
     return merged
 
 
+def drop_gone(store: Path, breathe: Callable[[], None] = _no_pause) -> int:
+    """Write segments that were joined anew without the journals whose columns were deleted."""
+    count = 0
+    for item in mf.read(store).segments:
+        breathe()  # which may delete segments
+        known = mf.read(store)
+        for segment in known.segments.get(item, ()):
+            if _is_partly_gone(segment, known):
+                _rewrite(store, known, segment)
+                count += 1
+    return count
+
+
+def _rewrite(store: Path, known: mf.Manifest, segment: Segment) -> None:
+    """Replace a segment by its rows of the journals that still have columns."""
+    schema = known.schemas[segment.schema]
+    parts = [part for part in segment.parts if part.journal not in known.columns_gone]
+    names = {column.name for column in schema.columns}
+    flats = [f for f in read_segment(store, segment, schema, names) if _is_of(f, parts)]
+    file = TableFile(store, _path_without(segment, parts), schema)
+    try:
+        for rows in _group_starts(flats):
+            file.write(rows)
+        rest = file.finish(parts)
+    finally:
+        file.discard()
+    mf.append(store, [mf.segment_record(rest, [segment.path])])
+    (store / segment.path).unlink(missing_ok=True)
+
+
+def _is_of(flat: Flat, parts: Sequence[Part]) -> bool:
+    first = int(flat.seq[0])
+    return any(p.run == flat.run and p.first_seq <= first <= p.last_seq for p in parts)
+
+
+def _path_without(segment: Segment, parts: Sequence[Part]) -> str:
+    """Name what is left of a segment by its first journal, schema version and number of parts."""
+    stem = Path(segment.path).stem.partition("+")[0]
+    version = stem.partition(".")[2]
+    first = Path(_path(segment.item, parts[0].journal, int(version or 1)))
+    return str(first.with_name(f"{first.stem}+{len(parts)}.parquet"))
+
+
 def _is_partly_gone(segment: Segment, known: mf.Manifest) -> bool:
     """Tell whether a segment only waits for the last of its journals to go; kept ones never do."""
     kept = mf.is_kept(known.schemas[segment.schema])

@@ -1,0 +1,225 @@
+"""A bounded disk in practice: weeks offline, a fast recorder beside the keeper, a full store."""
+
+from __future__ import annotations
+
+import random
+import subprocess
+import sys
+import threading
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import amberbox
+from amberbox.blackbox import requests
+from amberbox.blackbox.follow.follow import follow
+from amberbox.blackbox.incidents import Incident, Wish, advance, pin
+from amberbox.blackbox.incidents.incident import load, save
+from amberbox.blackbox.keeper import confirm
+from amberbox.blackbox.keeper import keeper as module
+from amberbox.blackbox.keeper.keeper import Keeper
+from amberbox.blackbox.keeper.options import KeeperOptions, Lifetime
+from amberbox.blackbox.keeper.usage import DiskUse
+from amberbox.blackbox.query import record
+from amberbox.blackbox.recorder.pipeline import PipelineOptions
+from amberbox.blackbox.segments import manifest as mf
+from amberbox.blackbox.store import WriterLock, is_locked, open_store
+from amberbox.core.clock import NS
+from amberbox.core.types import Batch, Schema, Topic
+from amberbox.testing import ManualClock
+from amberbox.testing.box import COUNT, ManualBox, events, number
+
+BLOB = Topic("/blob", "ros1", Schema("test/Blob", "ros1msg", b"uint8[] data\n"))
+DAY_S = 86_400.0
+OPTIONS = KeeperOptions(quota=2_000_000, min_free=0, headroom=50_000)
+needs_pyarrow = pytest.mark.skipif(not module.can_build(), reason="segments are Parquet files")
+
+
+def blob(size: int, source: random.Random = random.Random(7)) -> bytes:  # noqa: B008  # one stream
+    return size.to_bytes(4, "little") + source.randbytes(size)
+
+
+def box_at(path: Path, rotate_bytes: int = 15_000) -> ManualBox:
+    return ManualBox(path, options=PipelineOptions(rotate_bytes=rotate_bytes, rotate_ns=600 * NS))
+
+
+def keep(box: ManualBox, options: KeeperOptions = OPTIONS) -> None:
+    keeper = Keeper(open_store(box.store), options, clock=box.clock)
+    keeper.step(threading.Event())
+    keeper.close()
+
+
+def rows(path: Path) -> list[int]:
+    values = amberbox.open(path).query("ros_count", ["data"]).columns["data"]
+    return list(np.asarray(values).tolist())
+
+
+@needs_pyarrow
+def test_weeks_offline_leave_the_newest_day_all_incidents_and_all_events(tmp_path: Path) -> None:
+    path, clock = tmp_path / "store", ManualClock()
+    box = ManualBox(path, clock=clock)
+    store, keeper = open_store(path), Keeper(open_store(path), OPTIONS, clock=clock)
+    written: dict[int, int] = {}
+    pinned: set[int] = set()
+    for step in range(21 * 4):  # every six hours the robot is on for a while
+        box.hear(COUNT, number(step))
+        box.hear(BLOB, blob(16_000))
+        written[step] = clock.wall_ns()
+        if step % 4 == 0:
+            box.pipeline.event("mark", f"day {step // 4}")
+        box.write()
+        if step == 10:
+            found = pin(store, Wish(1.0, 0.0, "looked odd"), OPTIONS)
+            assert isinstance(found, Incident)
+            pinned = {v for v, at_ns in written.items() if found.from_ns <= at_ns < found.to_ns}
+        box.close()
+        keeper.step(threading.Event())
+        assert DiskUse(path).measure() <= 2_000_000
+        clock.advance(DAY_S / 4)
+        box = ManualBox(path, clock=clock)
+    keeper.close()
+    box.close()
+    answer = set(rows(path))
+    assert pinned == {10}
+    assert pinned <= answer
+    assert {v for v, at_ns in written.items() if written[83] - at_ns < DAY_S * NS} <= answer
+    assert len(answer) < len(written), "the quota is too small for all of it"
+    marks = [e["text"] for e in amberbox.open(path).events().rows() if e["kind"] == "mark"]
+    assert marks == [f"day {day}" for day in range(21)]
+    assert events(path, "deleted")
+
+
+def test_a_fast_recorder_never_takes_more_than_the_quota_and_a_segment(tmp_path: Path) -> None:
+    rotate_bytes, quota = 300_000, 5_000_000
+    options = KeeperOptions(quota=quota, min_free=0, keep_min_s=0.0, headroom=rotate_bytes)
+    box = box_at(tmp_path / "store", rotate_bytes)
+    command = [sys.executable, "-m", "amberbox.blackbox.keeper", str(box.store)]
+    keeper = subprocess.Popen([*command, "--options", options.to_json()])
+    over = threading.Event()
+    try:
+        while not is_locked(open_store(box.store), "keeper"):
+            assert keeper.poll() is None
+            time.sleep(0.01)
+        writer = threading.Thread(target=record_fast, args=(box, 12_000_000, over))
+        writer.start()
+        most, use = 0, DiskUse(box.store)
+        while not over.wait(0.01):
+            most = max(most, use.measure())
+        writer.join()
+    finally:
+        over.set()
+        keeper.terminate()
+        keeper.wait(20)
+    box.close()
+    assert quota / 2 < most <= quota + rotate_bytes
+    assert mf.read(box.store).tombstones
+    assert len(amberbox.open(box.store).query("ros_count")) > 0
+
+
+def record_fast(box: ManualBox, size: int, over: threading.Event) -> None:
+    """Write some MB a second, as messages that do not compress."""
+    written, value = 0, 0
+    while written < size and not over.is_set():
+        for _ in range(3):
+            box.hear(BLOB, blob(20_000))
+        box.hear(COUNT, number(value))
+        value, written = value + 1, written + 60_000
+        box.write(0.02)
+        time.sleep(0.015)
+    over.set()
+
+
+def full_box(path: Path, journals: int) -> ManualBox:
+    box = box_at(path)
+    for value in range(journals):
+        box.hear(COUNT, number(value))
+        box.hear(BLOB, blob(16_000))
+        box.write(60.0)
+    return box
+
+
+@needs_pyarrow
+@pytest.mark.parametrize("with_columns", [True, False])
+def test_raw_and_columns_live_as_long_as_they_may(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, with_columns: bool
+) -> None:
+    if not with_columns:
+        monkeypatch.setattr(module, "can_build", lambda: False)
+    box = full_box(tmp_path / "store", 30)
+    lifetime = Lifetime(raw_s=300.0, columns_s=900.0)
+    keep(box, replace(OPTIONS, quota=50_000_000, lifetime=lifetime))
+    left = open_store(box.store).journal_files("main")
+    assert 5 <= len(left) <= 8
+    assert (12 <= len(rows(box.store)) <= 18) is with_columns
+    followed = [
+        value
+        for delivery in follow(box.store, ["ros_count"], live=False)
+        if isinstance(delivery, Batch)
+        for value in np.asarray(delivery.columns["data"]).tolist()
+    ]
+    assert followed == rows(box.store)
+    box.close()
+
+
+def test_events_outlive_their_journal_without_columns(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "can_build", lambda: False)
+    monkeypatch.setattr(record, "can_build", lambda: False)
+    box = box_at(tmp_path / "store")
+    for value in range(30):
+        box.pipeline.event("mark", f"{value}")
+        box.hear(BLOB, blob(16_000))
+        box.write(60.0)
+    before = [e for e in amberbox.open(box.store).events().rows() if e["kind"] == "mark"]
+    keep(box, replace(OPTIONS, quota=300_000, keep_min_s=0.0))
+    assert len(open_store(box.store).journal_files("main")) < 15
+    after = [e for e in amberbox.open(box.store).events().rows() if e["kind"] == "mark"]
+    assert [(e["timestamp"], e["text"]) for e in after] == [
+        (e["timestamp"], e["text"]) for e in before
+    ]
+    (gap,) = [g for g in amberbox.open(box.store).gaps() if g.reason.startswith("deleted")]
+    assert gap.reason == "deleted: for room"
+    box.close()
+
+
+def test_a_store_that_may_not_delete_says_that_it_is_full_until_a_server_has_it(
+    tmp_path: Path,
+) -> None:
+    box = full_box(tmp_path / "store", 30)
+    store = open_store(box.store)
+    stops = replace(OPTIONS, quota=300_000, when_full="stop")
+    keep(box, stops)
+    assert "when_full" in (box.store / "full").read_text()
+    assert events(box.store, "store_full")
+    assert not mf.read(box.store).tombstones
+    journals = [f"journal/{path.name}" for path in store.journal_files("main")[:-1]]
+    lock = WriterLock(store, "keeper")
+    confirm.confirm(store, journals, "https://server")
+    assert requests.pending(store), "the keeper that is at work is asked"
+    lock.release()
+    keep(box, stops)
+    assert not requests.pending(store)
+    assert mf.read(box.store).tombstones
+    assert all(stone.confirmed for stone in mf.read(box.store).tombstones)
+    box.close()
+
+
+def test_confirmed_incidents_go_last(tmp_path: Path) -> None:
+    box = full_box(tmp_path / "store", 20)
+    store = open_store(box.store)
+    found = pin(store, Wish(3600.0, 0.0, "all of it"), replace(OPTIONS, quota=None))
+    assert isinstance(found, Incident)
+    done = advance(store, found)
+    tight = replace(OPTIONS, quota=300_000, keep_min_s=0.0)
+    keep(box, tight)
+    assert not mf.read(box.store).tombstones
+    save(store, replace(load(store, done.id), confirmed=True))
+    keep(box, tight)
+    assert mf.read(box.store).tombstones
+    assert load(store, done.id).state == "released"
+    assert events(box.store, "incident_released")
+    box.close()
