@@ -15,6 +15,7 @@ import pytest
 import amberbox
 from amberbox.blackbox.follow import read
 from amberbox.blackbox.recorder.recorder import ItemState, RecorderState
+from amberbox.blackbox.store import Store
 from amberbox.cli.main import main
 from amberbox.cli.record import summary, table
 from amberbox.core.errors import UsageError
@@ -147,3 +148,22 @@ def keepers(folder: Path) -> list[int]:
             if b"amberbox.blackbox.keeper" in command and bytes(folder / "store") in command:
                 found.append(int(entry.name))
     return found
+
+
+def test_a_full_disk_is_shown_beside_the_table() -> None:
+    full = RecorderState([], 0, 0, 0, "", "disk full")
+    assert table(full, 0)[-1] == "DISK FULL: only events are recorded"
+    assert summary(full).endswith("; DISK FULL: only events are recorded")
+
+
+def test_a_disk_without_a_byte_is_an_error_with_a_hint(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def refuse(store: Store) -> int:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Store, "next_run", refuse)
+    assert main(["record", str(folder)]) == 1
+    printed = capsys.readouterr().err
+    assert "cannot write to the store" in printed
+    assert "hint: make room on its disk" in printed
