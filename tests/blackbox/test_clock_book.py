@@ -314,6 +314,8 @@ def test_segments_and_journals_say_the_same_also_when_these_are_gone(
     for journal in files:
         build_segments(store, journal)
     assert (received_in(store) == before).all()
+    late = Record(store).query("tick", ["received"], int(before[20]), by="timestamp")
+    assert len(late) == len(before) - 20
     rows = Record(store).sql("SELECT received AS a FROM tick ORDER BY received").columns["a"]
     assert (np.asarray(rows) == before).all()
     assert Record(store).items()[0].first_ns == first_ns

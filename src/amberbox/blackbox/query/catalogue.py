@@ -8,8 +8,10 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 
+import numpy as np
+
 from amberbox.blackbox.follow.read import JournalFile, journal_file
-from amberbox.blackbox.journal.clocktable import ClockReading
+from amberbox.blackbox.journal.clocktable import ClockReading, ClockTable
 from amberbox.blackbox.query.clockbook import UNKNOWN_BOOT, ClockBook, JournalClock, book_of
 from amberbox.blackbox.query.variables import closest
 from amberbox.blackbox.segments import manifest as mf
@@ -17,7 +19,7 @@ from amberbox.blackbox.segments.build import selection_of
 from amberbox.blackbox.segments.columns import wider
 from amberbox.blackbox.segments.entries import Sealed
 from amberbox.blackbox.segments.flat import TableSchema, tables_of
-from amberbox.blackbox.segments.manifest import Manifest, Segment
+from amberbox.blackbox.segments.manifest import Manifest, Part, Segment
 from amberbox.blackbox.store import Store, open_store
 from amberbox.core.errors import AmberboxError, UsageError
 from amberbox.core.types import Column
@@ -162,19 +164,31 @@ def boot_in(journal: str) -> str:
 def corrected(manifest: Manifest, book: ClockBook) -> Manifest:
     """Return the manifest with the clocks of its segments as they are known now."""
     segments = {
-        table: tuple(_corrected(segment, book) for segment in found)
+        table: tuple(
+            _corrected(segment, book, stamped=bool(manifest.schemas[segment.schema].stamp))
+            for segment in found
+        )
         for table, found in manifest.segments.items()
     }
     return replace(manifest, segments=segments)
 
 
-def _corrected(segment: Segment, book: ClockBook) -> Segment:
+def _corrected(segment: Segment, book: ClockBook, *, stamped: bool) -> Segment:
     if not any(part.journal in book.journals for part in segment.parts):
         return segment
-    parts = tuple(
-        replace(part, clock=book.points(part.journal) or part.clock) for part in segment.parts
-    )
+    parts = tuple(_corrected_part(part, book, stamped=stamped) for part in segment.parts)
     return replace(segment, parts=parts)
+
+
+def _corrected_part(part: Part, book: ClockBook, *, stamped: bool) -> Part:
+    """Replace the clock of a part; rows without a stamp of their own are stamped by it."""
+    points = book.points(part.journal)
+    if points is None:
+        return part
+    if stamped:
+        return replace(part, clock=points)
+    edges = ClockTable(points).received(np.array([part.from_ns, part.to_ns], np.int64)).tolist()
+    return replace(part, clock=points, stamp_from_ns=edges[0], stamp_to_ns=edges[1])
 
 
 def journal_tables(journal: JournalFile) -> Iterator[TableSchema]:

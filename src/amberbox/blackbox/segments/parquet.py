@@ -226,8 +226,9 @@ def _first_rows(metadata: pq.FileMetaData) -> IntArray:
 def _row_groups(
     metadata: pq.FileMetaData, schema: TableSchema, segment: Segment, by: str
 ) -> list[RowGroup]:
-    least, most = segment.offsets_ns if by == "received" else (0, 0)
-    column = list(key_names(schema)).index("log_time" if by == "received" else "timestamp")
+    by_clock = by == "received" or not schema.stamp
+    least, most = segment.offsets_ns if by_clock else (0, 0)
+    column = list(key_names(schema)).index("log_time" if by_clock else "timestamp")
     found = []
     for number in range(metadata.num_row_groups):
         bounds = metadata.row_group(number).column(column).statistics
