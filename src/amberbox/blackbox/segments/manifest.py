@@ -335,6 +335,15 @@ def read(store: Path) -> Manifest:
     return _reader(store / NAME).read()
 
 
+def of_records(records: Iterable[Mapping[str, Any]]) -> Manifest:
+    """Return what records add up to, as one has them who mended a damaged manifest."""
+    state, last_hash = _State(), lines.FIRST_HASH
+    for record in records:
+        state.take(record)
+        last_hash = record["hash"]
+    return state.manifest((), last_hash)
+
+
 def _by_item(segments: Iterable[Segment]) -> dict[str, tuple[Segment, ...]]:
     grouped: dict[str, list[Segment]] = {}
     for segment in segments:

@@ -180,6 +180,12 @@ def _altered(places: Places, block: Block, seen: _Seen) -> Finding:
     return places.finding("altered", text, block.start, block.end, first)
 
 
+def count_messages(data: Buffer, identity: Identity, start: int, end: int) -> int:
+    """Count the messages of the sound chunks in a stretch of a file."""
+    walk = Walk(data[:end], at=start, tag=identity.tag, trusted=start)
+    return sum(len(found) for found in walk if isinstance(found, Chunk))
+
+
 def _chunk_of(seen: _Seen, at: int) -> int | None:
     """Return the chunk that a byte belongs to, its indices included."""
     before = [chunk.offset for chunk in seen.chunks if chunk.offset <= at]

@@ -10,9 +10,9 @@ from amberbox.blackbox.journal import mcap
 from amberbox.blackbox.journal.buffer import Buffer, open_buffer
 from amberbox.blackbox.journal.scan import start_record
 from amberbox.blackbox.journal.summary import read_summary
-from amberbox.blackbox.journal.walk import Damage, Walk
+from amberbox.blackbox.journal.walk import Damage, Walk, metadata_at
 from amberbox.blackbox.segments.entries import Sealed
-from amberbox.blackbox.verify.block import Block, Identity, digest, judge
+from amberbox.blackbox.verify.block import Block, Identity, count_messages, digest, judge
 from amberbox.blackbox.verify.findings import Finding
 from amberbox.blackbox.verify.links import Link, displaced, joined, links
 from amberbox.blackbox.verify.place import Places
@@ -98,12 +98,15 @@ class _Checking:
     def run(self) -> None:
         """Check the file from its start to its end."""
         self._size()
-        found = self._links()
+        found, known = self._links(), len(self.checked.findings)
         for number, link in enumerate(found):
             if link.start >= self.at:
                 self._link(link, found[number + 1] if number + 1 < len(found) else None)
-            if number == 0 and not self.checked.findings and self._is_another():
-                return
+            if number == 0 and len(self.checked.findings) == known:
+                other = self._other()
+                if other is not None:
+                    self.checked.findings = [other]
+                    return
         self.checked.last, self.checked.loose_from = found[-1] if found else None, self.at
         self.checked.noted = [link for link in found if link.chain.startswith(self.noted)]
         self.checked.tail = digest(self.data, self.checked.tail_from, len(self.data))
@@ -186,22 +189,19 @@ class _Checking:
         found = judge(self.data, self.places, self.target.identity, block)
         self._tell(found)
 
-    def _is_another(self) -> bool:
-        """Tell whether a sound file is another than its name says, and say so."""
+    def _other(self) -> Finding | None:
+        """Tell whether a sound file is another than its name says."""
         wanted, start = self.target.identity, self.start
-        if not start or (start.get("store_id"), start.get("writer")) == ("", ""):
-            return False
         stated = (start.get("run"), start.get("file"), start.get("writer"))
-        if start.get("store_id") != wanted.store_id:
-            text = f"belongs to another store ({start.get('store_id')})"
-            self._tell(self.places.finding("altered", text, 0, len(self.data)))
-        elif stated != (str(wanted.run), str(wanted.number), wanted.writer):
+        if not start or "store_id" not in start:
+            return None
+        if start["store_id"] != wanted.store_id:
+            text = f"belongs to another store ({start['store_id']})"
+            return self.places.finding("altered", text, 0, len(self.data))
+        if stated != (str(wanted.run), str(wanted.number), wanted.writer):
             text = f"is not there: under its name lies file {stated[1]} of run {stated[0]}"
-            text += f" of {stated[2]}"
-            self._tell(self.places.finding("missing", text, 0, len(self.data)))
-        else:
-            return False
-        return True
+            return self.places.finding("missing", f"{text} of {stated[2]}", 0, len(self.data))
+        return None
 
     def _end(self) -> None:
         """Check what follows the last link."""
@@ -218,11 +218,20 @@ class _Checking:
             self._judge(Block(sealed.tail_from, sealed.bytes, sealed.tail, self.before, tail=True))
 
     def _moved(self, offset: int, said: int) -> Finding:
-        if said > offset:
-            text = f"{said - offset} bytes are gone before byte {offset}"
+        """Say what happened before a link that does not stand where it should."""
+        first = self.before.next_seq if self.before is not None else self._first_seq()
+        link = metadata_at(self.data, offset)
+        next_seq = int(link.values.get("next_seq", 0)) if link is not None else 0
+        if next_seq - first > count_messages(self.data, self.target.identity, self.at, offset):
+            text = f"messages between positions {first} and {next_seq} were taken out"
             return self.places.finding("missing", text, self.at, offset)
-        text = f"{offset - said} bytes were added or moved before byte {offset}"
+        text = f"the content was changed: it is {abs(offset - said)} bytes "
+        text += "longer" if offset > said else "shorter"
         return self.places.finding("altered", text, self.at, offset)
+
+    def _first_seq(self) -> int:
+        first = self.start.get("first_seq", "0")
+        return int(first) if first.isdecimal() else 0
 
     def _cut(self, sealed: Sealed) -> None:
         size = len(self.data)
@@ -271,7 +280,7 @@ class _Checking:
         if summary is None or link is None:
             return False
         end = link.end
-        first = int(self.start.get("first_seq", 0) or 0)
+        first = self._first_seq()
         if bytes(data[end : end + len(_DATA_END)]) != _DATA_END:
             text = "the mark at the end of the data is damaged; the messages are proven"
             self._tell(self.places.finding("damaged", text, end, end + len(_DATA_END), end))

@@ -13,6 +13,7 @@ from amberbox.blackbox.keeper.signing import signature_message
 from amberbox.blackbox.segments import lines
 from amberbox.blackbox.segments import manifest as mf
 from amberbox.blackbox.segments.entries import Sealed, Signature, from_record
+from amberbox.blackbox.segments.manifest import Manifest
 from amberbox.blackbox.verify.findings import Finding, State
 from amberbox.blackbox.verify.mended import without_one_bit
 from amberbox.blackbox.verify.place import TROUBLE
@@ -36,7 +37,7 @@ class CheckedManifest:
     """What the lines say and how far they can be believed.
 
     ``hashes`` are the numbers of the lines with each hash, ``sealed`` those that seal each journal;
-    ``signatures`` are those that hold, with the line they stand in.
+    ``signatures`` are those that hold, with the line they stand in; ``known`` is what it all says.
     """
 
     hashes: dict[str, int] = field(default_factory=dict)
@@ -47,6 +48,7 @@ class CheckedManifest:
     findings: list[Finding] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     size: int = 0
+    known: Manifest = field(default_factory=Manifest)
 
     def signed(self, key: str) -> tuple[int, Signature] | None:
         """Return the last line that a key has signed, and its signature."""
@@ -70,6 +72,11 @@ def check_manifest(store: Path, store_id: str, *, can_check: bool) -> CheckedMan
     _check_order(found, checked)
     for line in found:
         _take(line, store_id, checked, can_check=can_check)
+    try:
+        checked.known = mf.of_records(line.record for line in found)
+    except TROUBLE:
+        text = "a line cannot be understood: nothing of what it lists is checked"
+        checked.findings.append(_finding("altered", text, 0, len(content)))
     return checked
 
 

@@ -83,7 +83,7 @@ class _Verification:
         store_id = self._store_id()
         lines = check_manifest(path, store_id, can_check=can_sign())
         trust = self._trust(lines)
-        manifest = self._read_manifest()
+        manifest = lines.known
         self.collected.take(mf.NAME, lines.findings)
         self.bytes += lines.size
         journals = self._journals(lines, store_id)
@@ -121,14 +121,6 @@ class _Verification:
             self.collected.take(finding.file, [finding])
         self.notes += trust.notes
         return trust
-
-    def _read_manifest(self) -> Manifest:
-        try:
-            return mf.read(self.store.path)
-        except TROUBLE:
-            text = "a line cannot be understood: nothing of what it lists is checked"
-            self.collected.take(mf.NAME, [Finding("altered", mf.NAME, text)])
-            return Manifest()
 
     def _journals(self, lines: CheckedManifest, store_id: str) -> _Journals:
         """Check all journal files, two at a time."""
