@@ -15,12 +15,15 @@ from amberbox.blackbox.follow.follow import follow
 from amberbox.blackbox.follow.read import journals
 from amberbox.blackbox.journal import reserved
 from amberbox.blackbox.journal.clocktable import ClockReading, ClockTable, simplified
+from amberbox.blackbox.keeper.sealing import seal_journals
+from amberbox.blackbox.query.catalogue import look
 from amberbox.blackbox.query.clockbook import ClockBook, JournalClock, book_of
+from amberbox.blackbox.query.gaps import _as_known_now
 from amberbox.blackbox.query.record import Record
 from amberbox.blackbox.segments.build import build_segments
-from amberbox.blackbox.store import create_store
+from amberbox.blackbox.store import create_store, open_store
 from amberbox.core.clock import NS
-from amberbox.core.types import Batch, IntArray
+from amberbox.core.types import Batch, Gap, IntArray
 from amberbox.testing.records import FakeItem, FakeRun
 
 MS = 1_000_000
@@ -319,6 +322,33 @@ def test_segments_and_journals_say_the_same_also_when_these_are_gone(
     rows = Record(store).sql("SELECT received AS a FROM tick ORDER BY received").columns["a"]
     assert (np.asarray(rows) == before).all()
     assert Record(store).items()[0].first_ns == first_ns
+
+
+def test_what_is_known_outlives_the_journals(started_in_1970: tuple[Path, Computer]) -> None:
+    store, _ = started_in_1970
+    before, files = received_in(store), journals(store)
+    sealed = seal_journals(open_store(store), None)
+    assert [entry.boot_base_ns is None for entry in sealed] == [False, False]
+    for journal in files:
+        build_segments(store, journal)
+    (store / files[1].name).unlink()
+    assert (received_in(store) == before).all()
+    (store / files[0].name).unlink()
+    assert (received_in(store) == before).all()
+
+
+def test_gaps_found_earlier_are_moved_with_the_rows(
+    started_in_1970: tuple[Path, Computer],
+) -> None:
+    store, computer = started_in_1970
+    book = Record(store).clock()
+    then, now = computer.rows[0][20], received_in(store)[20]
+    assert book.known_now_ns(1, then) == now
+    assert book.known_now_ns(2, then) == then
+    gap = Gap("main", 1, then, then + NS, "deleted: test")
+    moved = _as_known_now(gap, look(store))
+    assert moved.from_ns == now
+    assert moved.to_ns - moved.from_ns == pytest.approx(NS, abs=MS)
 
 
 def test_follow_goes_by_what_was_known_then(started_in_1970: tuple[Path, Computer]) -> None:

@@ -80,6 +80,7 @@ class Epoch:
     base_ns: int
     from_ns: int
     to_ns: int
+    points: ClockPoints
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,6 +109,16 @@ class ClockBook:
             return None
         newest = max(fitting, key=lambda epoch: epoch.from_ns - epoch.base_ns)
         return self.boots[newest.boot].wall_ns(log_ns - newest.base_ns)
+
+    def known_now_ns(self, run: int, received_ns: int) -> int:
+        """Return when something was that was received then, as far as was known at that time."""
+        for epoch in (epoch for epoch in self.epochs if epoch.run == run):
+            table = ClockTable(epoch.points)
+            near_ns = received_ns - epoch.points[0][1]
+            log_ns = received_ns - (table.at(near_ns) - near_ns)
+            if epoch.from_ns <= log_ns <= epoch.to_ns:
+                return self.boots[epoch.boot].wall_ns(log_ns - epoch.base_ns)
+        return received_ns
 
     def boot_of(self, run: int) -> BootClock | None:
         """Return the boot in which a run took place, if that is known."""
@@ -148,7 +159,9 @@ def book_of(clocks: Iterable[JournalClock]) -> ClockBook:
 def _epoch(clock: JournalClock) -> Epoch:
     times = [reading.log_ns for reading in clock.readings]
     base_ns = clock.base_ns or 0
-    return Epoch(clock.boot, clock.run, base_ns, min(times) - MARGIN_NS, max(times) + MARGIN_NS)
+    first_ns, last_ns = min(times) - MARGIN_NS, max(times) + MARGIN_NS
+    points = tuple((reading.log_ns, reading.offset_ns) for reading in clock.readings)
+    return Epoch(clock.boot, clock.run, base_ns, first_ns, last_ns, points)
 
 
 @lru_cache(maxsize=64)

@@ -24,9 +24,18 @@ _FIELDS = ("item", "peer", "from_ns", "to_ns", "reason", "count")
 
 def gaps(catalogue: Catalogue, item: str | None, span: Span) -> list[Gap]:
     """List gaps that meet ``[from, to)``, in order of time, of one item or of all."""
-    known = [*_recorded(catalogue), *_holes(catalogue), *_deleted(catalogue)]
+    then = [*_holes(catalogue), *_deleted(catalogue)]
+    known = [*_recorded(catalogue), *(_as_known_now(gap, catalogue) for gap in then)]
     chosen = [gap for gap in _joined(known) if _concerns(gap, item, span)]
     return sorted(chosen, key=lambda gap: (gap.from_ns, gap.to_ns, gap.item))
+
+
+def _as_known_now(gap: Gap, catalogue: Catalogue) -> Gap:
+    """Correct a gap whose times are as they were known when it was found."""
+    from_ns, to_ns = (
+        catalogue.book.known_now_ns(gap.run, time_ns) for time_ns in (gap.from_ns, gap.to_ns)
+    )
+    return replace(gap, from_ns=from_ns, to_ns=max(from_ns, to_ns))
 
 
 def _joined(known: Sequence[Gap]) -> Iterator[Gap]:
