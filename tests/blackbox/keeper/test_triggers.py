@@ -217,9 +217,9 @@ def test_the_rate_is_limited_and_told_once(tmp_path: Path) -> None:
     kept = Kept(box, Trigger("flap", event="flap", before_s=0, after_s=0, hold_off_s=5), per_hour=6)
     for _ in range(10):
         box.pipeline.event("flap", "again")
-        hear(box, 4, 1)
+        box.write(4.0)
         box.pipeline.event("flap", "too soon")
-        hear(box, 2, 1)
+        box.write(2.0)
         kept.step()
     assert len(kept.fired()) == 3
     assert len(kept.events("incident_refused")) == 1
@@ -240,7 +240,9 @@ def test_what_keeps_a_trigger_from_working_is_told_and_others_go_on(tmp_path: Pa
         Trigger("never", when="ros_cuont.data > 3"),
         HIGH,
     )
-    hear(box, 70, 50)
+    for _ in range(70):
+        box.hear(COUNT, number(50))
+        box.write(1.0)
     hear(box, 3, 150)
     kept.step()
     kept.step()
