@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Container, Iterator, Sequence
+from collections.abc import Collection, Container, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -163,14 +163,30 @@ def boot_in(journal: str) -> str:
 
 def corrected(manifest: Manifest, book: ClockBook) -> Manifest:
     """Return the manifest with the clocks of its segments as they are known now."""
-    segments = {
-        table: tuple(
-            _corrected(segment, book, stamped=bool(manifest.schemas[segment.schema].stamp))
-            for segment in found
-        )
-        for table, found in manifest.segments.items()
-    }
-    return replace(manifest, segments=segments)
+    return replace(manifest, segments=_Corrected(manifest, book))
+
+
+class _Corrected(Mapping[str, tuple[Segment, ...]]):
+    """Segments by table with clocks as known now; worked out for the tables that are asked for."""
+
+    def __init__(self, manifest: Manifest, book: ClockBook) -> None:
+        self._manifest, self._book = manifest, book
+        self._done: dict[str, tuple[Segment, ...]] = {}
+
+    def __getitem__(self, table: str) -> tuple[Segment, ...]:
+        if table not in self._done:
+            schemas, found = self._manifest.schemas, self._manifest.segments[table]
+            self._done[table] = tuple(
+                _corrected(segment, self._book, stamped=bool(schemas[segment.schema].stamp))
+                for segment in found
+            )
+        return self._done[table]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._manifest.segments)
+
+    def __len__(self) -> int:
+        return len(self._manifest.segments)
 
 
 def _corrected(segment: Segment, book: ClockBook, *, stamped: bool) -> Segment:

@@ -8,10 +8,12 @@ that there is no step. Nothing is rewritten: whoever reads asks the book. The re
 
 from __future__ import annotations
 
+from bisect import bisect_left, bisect_right
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from itertools import pairwise
+from operator import itemgetter
 
 import numpy as np
 
@@ -88,23 +90,26 @@ class ClockBook:
     """The clocks of all boots in a store, and which journal was written in which."""
 
     boots: Mapping[str, BootClock] = field(default_factory=dict)
-    journals: Mapping[str, tuple[str, int]] = field(default_factory=dict)
-    """Boot of a journal, and its log time minus time since boot."""
-    epochs: tuple[Epoch, ...] = ()
+    journals: Mapping[str, Epoch] = field(default_factory=dict)
 
     def points(self, journal: str) -> ClockPoints | None:
         """Return the corrected points of a journal; None where nothing is known better."""
         if journal not in self.journals:
             return None
-        boot, base_ns = self.journals[journal]
-        return tuple((b + base_ns, d - base_ns) for b, d in self.boots[boot].points)
+        epoch = self.journals[journal]
+        points, base_ns = self.boots[epoch.boot].points, epoch.base_ns
+        first = bisect_right(points, epoch.from_ns - base_ns, key=itemgetter(0)) - 1
+        end = bisect_left(points, epoch.to_ns - base_ns, key=itemgetter(0)) + 1
+        return tuple((b + base_ns, d - base_ns) for b, d in points[max(first, 0) : end])
 
     def received_ns(self, run: int, log_ns: int) -> int | None:
         """Return when a log time of a run was; None where nothing is known better.
 
         Where the clock was set back in between, the newest that fits.
         """
-        fitting = [e for e in self.epochs if e.run == run and e.from_ns <= log_ns <= e.to_ns]
+        fitting = [
+            e for e in self.journals.values() if e.run == run and e.from_ns <= log_ns <= e.to_ns
+        ]
         if not fitting:
             return None
         newest = max(fitting, key=lambda epoch: epoch.from_ns - epoch.base_ns)
@@ -112,7 +117,7 @@ class ClockBook:
 
     def known_now_ns(self, run: int, received_ns: int) -> int:
         """Return when something was that was received then, as far as was known at that time."""
-        for epoch in (epoch for epoch in self.epochs if epoch.run == run):
+        for epoch in (epoch for epoch in self.journals.values() if epoch.run == run):
             table = ClockTable(epoch.points)
             near_ns = received_ns - epoch.points[0][1]
             log_ns = received_ns - (table.at(near_ns) - near_ns)
@@ -149,11 +154,8 @@ def book_of(clocks: Iterable[JournalClock]) -> ClockBook:
         if clock.base_ns is not None:
             by_boot.setdefault(clock.boot, []).append(clock)
     boots = {boot: _boot_clock(boot, tuple(found)) for boot, found in by_boot.items()}
-    journals = {
-        clock.name: (boot, clock.base_ns or 0) for boot, found in by_boot.items() for clock in found
-    }
-    epochs = tuple(_epoch(clock) for found in by_boot.values() for clock in found)
-    return ClockBook(boots, journals, epochs)
+    journals = {clock.name: _epoch(clock) for found in by_boot.values() for clock in found}
+    return ClockBook(boots, journals)
 
 
 def _epoch(clock: JournalClock) -> Epoch:
