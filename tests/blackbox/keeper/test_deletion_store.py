@@ -93,7 +93,7 @@ def test_weeks_offline_leave_the_newest_day_all_incidents_and_all_events(tmp_pat
 
 
 def test_a_fast_recorder_never_takes_more_than_the_quota_and_a_segment(tmp_path: Path) -> None:
-    rotate_bytes, quota = 300_000, 5_000_000
+    rotate_bytes, quota = 1_000_000, 6_000_000
     options = KeeperOptions(quota=quota, min_free=0, keep_min_s=0.0, headroom=rotate_bytes)
     box = box_at(tmp_path / "store", rotate_bytes)
     command = [sys.executable, "-m", "amberbox.blackbox.keeper", str(box.store)]

@@ -16,7 +16,7 @@ from amberbox.blackbox.keeper.deletion import Unit, Window, ages_s
 from amberbox.blackbox.keeper.usage import DiskUse
 from amberbox.blackbox.segments import manifest as mf
 from amberbox.blackbox.segments.manifest import Manifest
-from amberbox.blackbox.store import FOLDERS, Store, is_locked, run_and_number
+from amberbox.blackbox.store import FOLDERS, Store, is_locked
 
 
 class Stock:
@@ -35,7 +35,7 @@ class Stock:
             names = [path.name for path in self._store.folder(writer).glob("*.mcap")]
         else:
             names = [name for name in self._use.sizes(folder) if name.endswith(".mcap")]
-        names.sort(key=lambda name: run_and_number(self._store.path / name))
+        names.sort(key=_place)
         if is_locked(self._store, writer):
             names = names[:-1]
         return [f"{folder}/{name}" for name in names]
@@ -60,7 +60,7 @@ class Stock:
 
     def _of_writer(self, known: Manifest, names: Collection[str]) -> Iterator[Window]:
         before: Window | None = None
-        for name in sorted(names, key=lambda name: run_and_number(self._store.path / name)):
+        for name in sorted(names, key=_place):
             window = self._window(known, name)
             if window is None or not (window.end_ns or before):
                 continue  # gone meanwhile, or nothing in it that has a time
@@ -77,7 +77,7 @@ class Stock:
                 sealed.start_ns, sealed.end_ns, sealed.chain,
             )  # fmt: skip
         if done is not None:
-            _, number = run_and_number(self._store.path / name)
+            _, number = _place(name)
             return Window(name, done.writer, done.run, number, done.first_seq, done.end_seq,
                           done.start_ns, done.end_ns, done.head)  # fmt: skip
         if name not in self._looked:
@@ -118,6 +118,13 @@ class Stock:
                             shares[part.journal] += max(share, 1)
             self._shares = known, shares
         return self._shares[1]
+
+
+def _place(name: str) -> tuple[int, int]:
+    """Read run and file number from a journal's name; there may be very many of them."""
+    run, _, rest = name.rpartition("/")[2].removesuffix(".mcap").partition("-")
+    number = rest.rpartition("-")[2]
+    return (int(run), int(number)) if run.isdigit() and number.isdigit() else (0, 0)
 
 
 def window_of(journal: JournalFile) -> Window:

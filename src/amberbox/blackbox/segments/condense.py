@@ -34,11 +34,19 @@ def condense(
     if size <= large_bytes:
         return False
     known = mf.read(store)
+    if known.lines < _WORTH * _live_lines(known):
+        return False
     records = [*_beginning(known, exists, sign), *live_records(known, exists)]
     if _WORTH * len(encode(records, known.last_hash)) > size:
         return False
     mf.replace(store, records, known.last_hash)
     return True
+
+
+def _live_lines(known: Manifest) -> int:
+    """Count about how many lines would be left; cheap, for it is asked often."""
+    segments = sum(map(len, known.segments.values()))
+    return segments + len(known.journals) + len(known.sealed) + len(known.schemas)
 
 
 def _beginning(known: Manifest, exists: Callable[[str], bool], sign: SignHead) -> Iterator[Record]:

@@ -14,7 +14,7 @@ from typing import Any, BinaryIO
 
 from amberbox.blackbox.journal import reserved
 from amberbox.blackbox.journal.clocktable import ClockPoints, ClockTable
-from amberbox.blackbox.segments import lines
+from amberbox.blackbox.segments import lines as text
 from amberbox.blackbox.segments.entries import Sealed, Signature, Tombstone, from_record
 from amberbox.blackbox.segments.flat import TableSchema
 from amberbox.blackbox.store import sync_folder
@@ -143,6 +143,7 @@ class Manifest:
 
     ``columns_gone`` and ``raw_gone`` name the journals of which one or the other was deleted, as
     far as the manifest has not been condensed since; ``gone_segments`` are files that went thus.
+    ``lines`` is how many there are.
     """
 
     schemas: Mapping[str, TableSchema] = field(default_factory=dict)
@@ -154,10 +155,11 @@ class Manifest:
     confirmed: frozenset[str] = frozenset()
     signatures: tuple[Signature, ...] = ()
     damage: tuple[str, ...] = ()
-    last_hash: str = lines.FIRST_HASH
+    last_hash: str = text.FIRST_HASH
     columns_gone: frozenset[str] = frozenset()
     raw_gone: frozenset[str] = frozenset()
     gone_segments: frozenset[str] = frozenset()
+    lines: int = 0
 
     def complete(self, item: str, existing: Container[str] | None = None) -> frozenset[str]:
         """Return the journals whose rows of this item are all in segments.
@@ -212,7 +214,7 @@ class _State:
                 self.journals[record["journal"]] = _journal_from_json(record)
             case "confirmed":
                 self.confirmed.update(record["journals"])
-            case lines.CHECKPOINT:
+            case text.CHECKPOINT:
                 self.columns_gone.update(record["columns_gone"])
             case _:
                 self._take_entry(from_record(record))
@@ -254,13 +256,14 @@ class _State:
         schema = self.schemas.get(segment.schema)
         return gone and not (schema is not None and is_kept(schema))
 
-    def manifest(self, damage: Sequence[str], last_hash: str) -> Manifest:
+    def manifest(self, read: text.LineReader) -> Manifest:
         """Return what it all says, not touched by records to come."""
         return Manifest(
             dict(self.schemas), _by_item(self.live.values()), dict(self.journals),
             tuple(self.deletions), dict(self.sealed), tuple(self.tombstones),
-            frozenset(self.confirmed), tuple(self.signatures), tuple(damage), last_hash,
+            frozenset(self.confirmed), tuple(self.signatures), tuple(read.damage), read.last_hash,
             frozenset(self.columns_gone), frozenset(self.raw_gone), frozenset(self.gone_segments),
+            read.number,
         )  # fmt: skip
 
 
@@ -273,7 +276,7 @@ class _Reader:
         self._start_again()
 
     def _start_again(self) -> None:
-        self._state, self._lines = _State(), lines.LineReader()
+        self._state, self._lines = _State(), text.LineReader()
         self._size, self._last_line = 0, b""
         self._seen: tuple[int, int, int] | None = None
         self._manifest = Manifest()
@@ -314,15 +317,15 @@ class _Reader:
             self._last_line = whole[whole.rfind(b"\n") + 1 :] + newline
         if torn:
             return self._with_torn(file)
-        return self._state.manifest(self._lines.damage, self._lines.last_hash)
+        return self._state.manifest(self._lines)
 
     def _with_torn(self, file: BinaryIO) -> Manifest:
         """Read all of it aside: what has no end yet may come differently next time."""
         file.seek(0)
-        state, reader = _State(), lines.LineReader()
+        state, reader = _State(), text.LineReader()
         for record in reader.take(file.read(), ends=False):
             state.take(record)
-        return state.manifest(reader.damage, reader.last_hash)
+        return state.manifest(reader)
 
 
 @lru_cache(maxsize=8)
@@ -337,11 +340,11 @@ def read(store: Path) -> Manifest:
 
 def of_records(records: Iterable[Mapping[str, Any]]) -> Manifest:
     """Return what records add up to, as one has them who mended a damaged manifest."""
-    state, last_hash = _State(), lines.FIRST_HASH
+    state, reader = _State(), text.LineReader()
     for record in records:
         state.take(record)
-        last_hash = record["hash"]
-    return state.manifest((), last_hash)
+        reader.last_hash, reader.number = record["hash"], reader.number + 1
+    return state.manifest(reader)
 
 
 def _by_item(segments: Iterable[Segment]) -> dict[str, tuple[Segment, ...]]:
@@ -396,16 +399,16 @@ def append(store: Path, records: Sequence[Mapping[str, Any]]) -> None:
 
     Raises OSError when the disk does not take them: the manifest is then as it was before.
     """
-    content = lines.encode(records, read(store).last_hash)
-    lines.append_durably(store / NAME, content)
+    content = text.encode(records, read(store).last_hash)
+    text.append_durably(store / NAME, content)
 
 
 def replace(
-    store: Path, records: Sequence[Mapping[str, Any]], last_hash: str = lines.FIRST_HASH
+    store: Path, records: Sequence[Mapping[str, Any]], last_hash: str = text.FIRST_HASH
 ) -> None:
     """Write a manifest anew, for a rebuild from the segments or to condense it."""
     temporary = store / f".{NAME}.tmp"
     temporary.unlink(missing_ok=True)
-    lines.append_durably(temporary, lines.encode(records, last_hash))
+    text.append_durably(temporary, text.encode(records, last_hash))
     temporary.rename(store / NAME)
     sync_folder(store)
