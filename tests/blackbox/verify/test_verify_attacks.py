@@ -18,6 +18,9 @@ from amberbox.blackbox.segments import lines
 from amberbox.blackbox.segments import manifest as mf
 from amberbox.blackbox.segments.entries import Tombstone, to_record
 from amberbox.blackbox.store import open_store
+from amberbox.blackbox.verify import heads as heads_module
+from amberbox.blackbox.verify import signed as signed_module
+from amberbox.blackbox.verify import verify as verify_module
 from amberbox.core.errors import AmberboxError, UsageError
 from amberbox.testing.clock import ManualClock
 from tests.blackbox.verify.conftest import Robot, keep, record
@@ -362,6 +365,20 @@ def test_whoever_signs_with_another_key_is_found_out_by_the_key_noted(robot: Rob
     assert robot.verify().is_good()
     states = {(f.state, f.file) for f in robot.verify(key=noted).findings}
     assert ("altered", mf.NAME) in states
+
+
+def test_without_the_library_hashes_are_checked_and_signatures_are_not(
+    robot: Robot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for module in (heads_module, signed_module, verify_module):
+        monkeypatch.setattr(module, "can_sign", lambda: False)
+    noted = (robot.path / HEADS).read_text()
+    report = robot.verify(noted)
+    assert report.is_good() and not report.signed
+    assert any("signatures are not checked" in note for note in report.notes)
+    name = robot.journals(1)[0]
+    robot.forge(name, robot.chunks(name)[3])
+    assert robot.states() == [("altered", name)]
 
 
 def test_a_flipped_bit_of_key_pub_is_damage(robot: Robot) -> None:

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from amberbox.blackbox.keeper.keys import can_sign
 from amberbox.blackbox.keeper.signing import HEADS, STATED, Reach, SignedHeads, parse_heads
 from amberbox.blackbox.segments import manifest as mf
 from amberbox.blackbox.segments.entries import Sealed
@@ -95,7 +96,7 @@ def refuse_forged(heads: SignedHeads, store_id: str, key: str) -> None:
         raise AmberboxError(f"the head is that of another store ({heads.store_id})", hint)
     if key and not heads.signature:
         raise AmberboxError("the head is not signed", hint)
-    if heads.signature and not heads.holds():
+    if heads.signature and can_sign() and not heads.holds():
         raise AmberboxError("the signature of the head does not hold", hint)
     if key and heads.key != key:
         raise AmberboxError(f"the head is signed with another key ({heads.key})", hint)
@@ -184,7 +185,7 @@ def _is_signed(content: bytes) -> bool:
         heads = parse_heads(content)
     except ValueError:
         return False
-    return bool(heads.signature) and heads.holds()
+    return can_sign() and bool(heads.signature) and heads.holds()
 
 
 def links_of(noted: Sequence[Noted], own: OwnHeads) -> tuple[str, ...]:
