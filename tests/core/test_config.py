@@ -281,3 +281,55 @@ def test_what_json_says_is_read_as_it_is(value: Any) -> None:
     assert node is not None
     assert node.plain() == value
     assert not problems
+
+
+@dataclass(frozen=True)
+class Rates:
+    """Values that are judged together."""
+
+    write_s: float = option(0.1, "")
+    sync_s: float = option(1.0, "")
+    mode: Literal["fast", "slow"] = option("fast", "")
+    names: Sequence[str] = option((), "")
+    nested: Wheel | None = option(None, "")
+
+    def check(self) -> Iterator[str | tuple[str, str]]:
+        if self.sync_s < self.write_s:
+            yield "sync_s", "is below write_s"
+        if self.write_s <= 0:
+            yield "write_s", "must be above 0"
+        if self.mode == "slow":
+            yield "mode", "is too slow"
+        for name in self.names:
+            if not name.islower():
+                yield "names", f"{name} is not small"
+        if self.nested is not None and self.nested.radius_m > 7:
+            yield "nested.radius_m is too wide"
+        if self.sync_s > 100:
+            yield "sync_s", "is too long"
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("write_s: x\nsync_s: 101", ["expected a number", "is too long"]),
+        ("write_s: x\nsync_s: 0.01", ["expected a number"]),
+        ("write_s: 0\nsync_s: x", ["must be above 0", "expected a number"]),
+        ("mode: slow\nwrite_s: x", ["is too slow", "expected a number"]),
+        ("names: [A, {}, b]\nmode: fats", ["expected text", "A is not small", "expected one of"]),
+        ("nested: 3\nsync_s: 101", ["expected a mapping"]),
+        ("nested: 3\nmode: slow", ["expected a mapping", "is too slow"]),
+        ("writes: 5\nsync_s: 0.01", ["unknown key 'writes'"]),
+        ("zebra: 5\nsync_s: 0.01", ["unknown key 'zebra'", "is below write_s"]),
+    ],
+)
+def test_what_is_wrong_whatever_the_unread_values_are_is_said_with_them(
+    text: str, expected: list[str]
+) -> None:
+    problems: list[Problem] = []
+    node = parse_yaml(text, "a.yaml", problems)
+    assert node is not None and build(Rates, node, problems) is None
+    problems.sort(key=lambda problem: problem.line)
+    assert len(problems) == len(expected), problems
+    for problem, words in zip(problems, expected, strict=True):
+        assert words in problem.what

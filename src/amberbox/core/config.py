@@ -20,6 +20,7 @@ from typing import Any, Literal, TypeVar, Union, get_args, get_origin
 
 from amberbox.core.errors import AmberboxError, ConfigurationError, Problem
 from amberbox.core.nodes import Node, load_yaml, parse_yaml, scalar
+from amberbox.core.standins import Finding, Unread, certain_findings, findings, stand_ins
 from amberbox.core.units import in_unit, known_units
 
 __all__ = ["Node", "build", "did_you_mean", "field_keys", "load_yaml", "parse_yaml", "refuse"]
@@ -32,7 +33,7 @@ Legacy = Callable[[str], "str | None"]
 WRAPPERS = frozenset({"topic", "element", "listener", "interface_specification"})
 """Single keys that the paper's format wraps around the entries of a list."""
 
-_FAILED: Any = object()
+_FAILED: Any = Unread()
 _YES_NO = {"yes": True, "on": True, "true": True, "no": False, "off": False, "false": False}
 
 
@@ -49,7 +50,7 @@ def build(
     ``legacy`` become notes.
     """
     built = _dataclass(_Context(problems, legacy), cls, node, where)
-    return None if built is _FAILED else typing.cast(T, built)
+    return None if _failed(built) else typing.cast(T, built)
 
 
 def refuse(problems: Sequence[Problem]) -> None:
@@ -60,14 +61,23 @@ def refuse(problems: Sequence[Problem]) -> None:
 
 def did_you_mean(word: str, known: Collection[str]) -> str:
     """Return ``; did you mean 'x'?`` for the nearest known word, or nothing."""
+    near = _nearest(word, known)
+    return f"; did you mean '{near}'?" if near is not None else ""
+
+
+def _nearest(word: str, known: Collection[str]) -> str | None:
     lower = {name.lower(): name for name in known}
     near = difflib.get_close_matches(word.lower(), lower, n=1, cutoff=0.6)
-    return f"; did you mean '{lower[near[0]]}'?" if near else ""
+    return lower[near[0]] if near else None
 
 
 def field_keys(field: dataclasses.Field[Any]) -> tuple[str, ...]:
     """Return the spellings of a key: its name, then its aliases."""
     return (field.name, *field.metadata.get("aliases", ()))
+
+
+def _failed(value: Any) -> bool:
+    return isinstance(value, Unread)
 
 
 @dataclass(frozen=True)
@@ -102,22 +112,42 @@ def _dataclass(ctx: _Context, cls: type[Any], node: Node, where: str) -> Any:
         return ctx.fail(node, where, f"expected a mapping (key: value), got {node.kind}")
     fields = [field for field in dataclasses.fields(cls) if field.init]
     kinds = typing.get_type_hints(cls)
-    ok = _known_keys(ctx, fields, entries, where)
+    known = [key for field in fields for key in field_keys(field)]
+    unknown = _unknown_keys(ctx, known, entries, where)
     values: dict[str, Any] = {}
     for field in fields:
         value = _field(ctx, field, kinds[field.name], (node, entries), where)
         values |= {} if value is dataclasses.MISSING else {field.name: value}
-    if not ok or any(value is _FAILED for value in values.values()):
-        return _FAILED
-    return _instance(ctx, cls, values, node, where)
+    if not unknown and not any(map(_failed, values.values())):
+        return _instance(ctx, cls, values, node, where)
+    misspelt = {_nearest(key, known) for key in unknown}
+    _tell(ctx, _certain(cls, values, kinds, misspelt), node, where)
+    return _FAILED
 
 
-def _known_keys(
-    ctx: _Context, fields: Sequence[dataclasses.Field[Any]], entries: Mapping[str, Node], where: str
-) -> bool:
-    known = [key for field in fields for key in field_keys(field)]
-    verdicts = [_known_key(ctx, key, value, known, where) for key, value in entries.items()]
-    return all(verdicts)
+def _certain(
+    cls: type[Any],
+    values: Mapping[str, Any],
+    kinds: Mapping[str, Any],
+    misspelt: Collection[str | None],
+) -> Sequence[Finding]:
+    """Judge what could be read; a value under a misspelt key is there, but not known."""
+    read = {name: value for name, value in values.items() if not _failed(value)}
+    read |= {name: v.good for name, v in values.items() if _failed(v) and v.good}
+    unread = {
+        field.name: stand_ins(field, kinds[field.name])
+        for field in dataclasses.fields(cls)
+        if field.name not in read
+        and (field.name in values or not {*field_keys(field)}.isdisjoint(misspelt))
+    }
+    return certain_findings(cls, read, unread)
+
+
+def _unknown_keys(
+    ctx: _Context, known: Sequence[str], entries: Mapping[str, Node], where: str
+) -> list[str]:
+    """Return the keys that nobody knows, each of which is an error."""
+    return [k for k, value in entries.items() if not _known_key(ctx, k, value, known, where)]
 
 
 def _known_key(ctx: _Context, key: str, value: Node, known: Sequence[str], where: str) -> bool:
@@ -171,13 +201,16 @@ def _instance(ctx: _Context, cls: type[Any], values: dict[str, Any], node: Node,
         return ctx.fail(node, where, error.what, error.hint)
     except ValueError as error:
         return ctx.fail(node, where, str(error))
-    ok = True
-    for finding in getattr(built, "check", tuple)():
+    found = list(findings(built))
+    _tell(ctx, found, node, where)
+    return built if not found else _FAILED
+
+
+def _tell(ctx: _Context, found: Sequence[Finding], node: Node, where: str) -> None:
+    for finding in found:
         key, what = ("", finding) if isinstance(finding, str) else finding
         place = (node.mapping or {}).get(key, node)
         ctx.fail(place, _join(where, key) if key else where, what)
-        ok = False
-    return built if ok else _FAILED
 
 
 def _value(ctx: _Context, kind: Any, node: Node, where: str, marks: _Marks) -> Any:
@@ -207,7 +240,7 @@ def _union(ctx: _Context, kind: Any, node: Node, where: str, marks: _Marks) -> A
     for member in sorted(members, key=lambda member: not _is_exactly(member, node)):
         attempt = _Context([], ctx.legacy)
         value = _value(attempt, member, node, where, marks)
-        if value is not _FAILED:
+        if not _failed(value):
             ctx.problems.extend(attempt.problems)
             return value
     names = " or ".join(type_text(member) for member in members)
@@ -243,7 +276,8 @@ def _sequence(ctx: _Context, kind: Any, node: Node, where: str, marks: _Marks) -
         _value(ctx, kind, _unwrapped(entry, kind), f"{where}[{index}]", marks)
         for index, entry in enumerate(node.items)
     )
-    return _FAILED if any(value is _FAILED for value in values) else values
+    good = tuple(value for value in values if not _failed(value))
+    return values if len(good) == len(values) else Unread(good)
 
 
 def _unwrapped(node: Node, kind: Any) -> Node:
@@ -262,7 +296,7 @@ def _mapping(ctx: _Context, kind: Any, node: Node, where: str, marks: _Marks) ->
         key: _value(ctx, kind, value, _join(where, key), marks)
         for key, value in node.mapping.items()
     }
-    return _FAILED if any(value is _FAILED for value in values.values()) else values
+    return _FAILED if any(map(_failed, values.values())) else values
 
 
 def _scalar(ctx: _Context, kind: Any, node: Node, where: str, marks: _Marks) -> Any:

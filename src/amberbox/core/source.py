@@ -62,6 +62,11 @@ class TopicOptions:
     keep: Keep = option("all", "keeping class")
     stamp: str | None = option(None, "path of the own time stamp; '' for none")
 
+    def check(self) -> Iterator[tuple[str, str]]:
+        """Say which values cannot work."""
+        if self.max_frequency is not None and self.max_frequency <= 0:
+            yield "max_frequency", "must be above 0"
+
 
 class Sink(Protocol):
     """Where a source puts what it hears. All calls may come from any thread."""

@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args, get_type_hints
 
 from amberbox.blackbox.folder.legacy import legacy_note
 from amberbox.core.config import build, did_you_mean
@@ -169,9 +169,9 @@ def _build(
         return None
     node = _with_defaults(_without_name(block, name, cls, problems), defaults)
     config = build(cls, node, problems, block.plugin, legacy_note)
+    problems.extend(_repeated_topics(cls, node, block.plugin))
     if config is None:
         return None
-    problems.extend(_topic_problems(config, node, block.plugin))
     config = _in_folder(config, Path(block.node.file).parent)
     return SourceBlock(block.plugin, name, config, block.node.line, block.node.file)
 
@@ -221,17 +221,18 @@ def _with_frequency(entry: Node, max_frequency: Node) -> Node:
     return replace(entry, value={"max_frequency": max_frequency} | keys)
 
 
-def _topic_problems(config: Any, node: Node, where: str) -> Iterator[Problem]:
-    """Yield topics given twice and limits that cannot be."""
-    topics = getattr(config, "topics", ())
-    nodes = (node.mapping or {}).get("topics", node).items or ()
+def _repeated_topics(cls: type[Any], node: Node, where: str) -> Iterator[Problem]:
+    """Yield the topics that are given twice, whether or not the rest of them is right."""
+    kind = next(iter(get_args(get_type_hints(cls).get("topics"))), None)
+    if not (isinstance(kind, type) and issubclass(kind, TopicOptions)):
+        return
     seen: dict[str, int] = {}
-    for topic, place in zip(topics, nodes, strict=False):
-        if not isinstance(topic, TopicOptions):
+    for place in (node.mapping or {}).get("topics", node).items or ():
+        keys = place.mapping or {}
+        name = (keys.get("topic", place).mapping or keys).get("name")
+        if name is None or not name.text:
             continue
-        if topic.name in seen:
-            what = f"topic '{topic.name}' is given twice, first in line {seen[topic.name]}"
+        if name.text in seen:
+            what = f"topic '{name.text}' is given twice, first in line {seen[name.text]}"
             yield place.problem(where, what)
-        if topic.max_frequency is not None and topic.max_frequency <= 0:
-            yield place.problem(where, f"topic '{topic.name}': max_frequency must be above 0")
-        seen.setdefault(topic.name, place.line)
+        seen.setdefault(name.text, place.line)
