@@ -49,6 +49,14 @@ def test_one_flipped_bit_of_a_journal_is_damage_wherever_it_is(robot: Robot, run
     assert robot.bad() == []
 
 
+def test_a_start_record_that_cannot_be_read_is_damage(robot: Robot) -> None:
+    for name in (robot.journals(1)[0], robot.journals(3)[1]):
+        robot.flip(name, 67 * 8 + 7)  # no text any more
+        assert robot.states() == [("damaged", name)]
+        assert "the messages themselves are proven" in robot.bad()[0].text
+        robot.flip(name, 67 * 8 + 7)
+
+
 def test_damage_names_chunk_and_time(robot: Robot) -> None:
     name = robot.journals(1)[1]
     chunk = robot.chunks(name)[5]

@@ -72,7 +72,7 @@ def judge(data: Buffer, places: Places, identity: Identity, block: Block) -> Fin
         at = first_difference(data, block.start, whole)
         text = "bytes around the messages are damaged; the messages themselves are proven"
         return places.finding("damaged", text, at, at + 1, _chunk_of(seen, at))
-    if seen.damage and (block.tail or _lost(seen)):
+    if seen.damage and (block.tail or block.before is None or _lost(seen)):
         return _damaged(places, seen)
     return _altered(places, block, seen)
 

@@ -7,6 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
+from amberbox.blackbox.journal.buffer import open_buffer
 from amberbox.blackbox.journal.scan import start_record
 from amberbox.blackbox.keeper.keys import PUBLIC, can_sign
 from amberbox.blackbox.keeper.signing import LOCKS, SignedHeads
@@ -25,6 +26,7 @@ from amberbox.blackbox.verify.heads import (
     read_own,
 )
 from amberbox.blackbox.verify.journal import Checked, Target, check_journal
+from amberbox.blackbox.verify.links import links
 from amberbox.blackbox.verify.manifest import CheckedManifest, check_manifest
 from amberbox.blackbox.verify.place import TROUBLE
 from amberbox.blackbox.verify.segments import check_segment
@@ -147,7 +149,7 @@ class _Verification:
                 live = locked and place == len(paths)
                 yield target_of(self.store, path, sealed=sealed, before=before, live=live,
                                 store_id=store_id)  # fmt: skip
-                before = sealed.chain if sealed is not None else ""
+                before = sealed.chain if sealed is not None else _last_link(path)
 
     def _continuity(self, lines: CheckedManifest, journals: _Journals, graves: Graves) -> None:
         sealed = {name: entry for name, (_, entry) in lines.sealed.items()}
@@ -181,6 +183,16 @@ class _Verification:
                 self.collected.take(finding.file, [finding])
             self.notes += [text] if text else []
         return heads
+
+
+def _last_link(path: Path) -> str:
+    """Read the last link of a file; nothing where there is none."""
+    try:
+        with open_buffer(path) as data:
+            found = links(data)
+    except OSError:
+        return ""
+    return found[-1].chain if found else ""
 
 
 def _checked(target: Target, noted: tuple[str, ...]) -> Checked | None:
