@@ -23,10 +23,10 @@ from amberbox.blackbox.segments import manifest
 from amberbox.blackbox.segments.build import (
     build_segments,
     can_build,
-    drop_gone,
     merge_small,
     remove_leftovers,
 )
+from amberbox.blackbox.segments.dropping import drop_gone
 from amberbox.blackbox.store import Store, WriterLock
 from amberbox.core.clock import Clock
 from amberbox.core.errors import UsageError

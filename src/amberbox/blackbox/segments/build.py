@@ -193,12 +193,13 @@ def _builder(
 ) -> _TableBuilder:
     if schema not in builders:
         version = 1 + sum(other.item == schema.item for other in builders)
-        path = _path(schema.item, journal.name, version)
+        path = segment_path(schema.item, journal.name, version)
         builders[schema] = _TableBuilder(TableFile(store, path, schema))
     return builders[schema]
 
 
-def _path(item: str, journal: str, version: int) -> str:
+def segment_path(item: str, journal: str, version: int) -> str:
+    """Name the file of a table's rows of one journal."""
     folder, _, name = journal.rpartition("/")
     writer = "" if folder in ("", "journal") else f"{folder}-"
     number = f".{version}" if version > 1 else ""
@@ -215,56 +216,13 @@ def merge_small(store: Path, breathe: Callable[[], None] = _no_pause) -> list[Se
     for item in mf.read(store).segments:
         breathe()  # which may delete segments
         known = mf.read(store)
-        whole = [s for s in known.segments.get(item, ()) if not _is_partly_gone(s, known)]
+        whole = [s for s in known.segments.get(item, ()) if not is_partly_gone(s, known)]
         for group in _small_groups(whole):
             merged.append(_merge(store, known.schemas[group[0].schema], group))
     return merged
 
 
-def drop_gone(store: Path, breathe: Callable[[], None] = _no_pause) -> int:
-    """Write segments that were joined anew without the journals whose columns were deleted."""
-    count = 0
-    for item in mf.read(store).segments:
-        breathe()  # which may delete segments
-        known = mf.read(store)
-        for segment in known.segments.get(item, ()):
-            if _is_partly_gone(segment, known):
-                _rewrite(store, known, segment)
-                count += 1
-    return count
-
-
-def _rewrite(store: Path, known: mf.Manifest, segment: Segment) -> None:
-    """Replace a segment by its rows of the journals that still have columns."""
-    schema = known.schemas[segment.schema]
-    parts = [part for part in segment.parts if part.journal not in known.columns_gone]
-    names = {column.name for column in schema.columns}
-    flats = [f for f in read_segment(store, segment, schema, names) if _is_of(f, parts)]
-    file = TableFile(store, _path_without(segment, parts), schema)
-    try:
-        for rows in _group_starts(flats):
-            file.write(rows)
-        rest = file.finish(parts)
-    finally:
-        file.discard()
-    mf.append(store, [mf.segment_record(rest, [segment.path])])
-    (store / segment.path).unlink(missing_ok=True)
-
-
-def _is_of(flat: Flat, parts: Sequence[Part]) -> bool:
-    first = int(flat.seq[0])
-    return any(p.run == flat.run and p.first_seq <= first <= p.last_seq for p in parts)
-
-
-def _path_without(segment: Segment, parts: Sequence[Part]) -> str:
-    """Name what is left of a segment by its first journal, schema version and number of parts."""
-    stem = Path(segment.path).stem.partition("+")[0]
-    version = stem.partition(".")[2]
-    first = Path(_path(segment.item, parts[0].journal, int(version or 1)))
-    return str(first.with_name(f"{first.stem}+{len(parts)}.parquet"))
-
-
-def _is_partly_gone(segment: Segment, known: mf.Manifest) -> bool:
+def is_partly_gone(segment: Segment, known: mf.Manifest) -> bool:
     """Tell whether a segment only waits for the last of its journals to go; kept ones never do."""
     kept = mf.is_kept(known.schemas[segment.schema])
     return not kept and any(part.journal in known.columns_gone for part in segment.parts)
@@ -304,7 +262,7 @@ def _merge(store: Path, schema: TableSchema, group: Sequence[Segment]) -> Segmen
     names = {column.name for column in schema.columns}
     flats = [flat for s in group for flat in read_segment(store, s, schema, names)]
     try:
-        for start in _group_starts(flats):
+        for start in group_starts(flats):
             file.write(start)
         segment = file.finish([part for member in group for part in member.parts])
     finally:
@@ -321,7 +279,7 @@ def _journal_count(segment: Segment) -> int:
     return int(Path(segment.path).stem.partition("+")[2] or 1)
 
 
-def _group_starts(flats: Sequence[Flat]) -> Iterator[Flat]:
+def group_starts(flats: Sequence[Flat]) -> Iterator[Flat]:
     """Join rows up to the size of a row group."""
     waiting: list[Flat] = []
     for flat in flats:

@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-import os
-import threading
 from bisect import bisect_left, bisect_right
 from collections import Counter
 from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 from amberbox.blackbox.journal import reserved
 from amberbox.blackbox.journal.clocktable import ClockPoints, ClockTable
 from amberbox.blackbox.segments import lines as text
 from amberbox.blackbox.segments.entries import Sealed, Signature, Tombstone, from_record
 from amberbox.blackbox.segments.flat import TableSchema
+from amberbox.blackbox.segments.growing import GrowingLines
 from amberbox.blackbox.store import sync_folder
 from amberbox.core.types import Gap
 
@@ -256,7 +255,7 @@ class _State:
         schema = self.schemas.get(segment.schema)
         return gone and not (schema is not None and is_kept(schema))
 
-    def manifest(self, read: text.LineReader) -> Manifest:
+    def result(self, read: text.LineReader) -> Manifest:
         """Return what it all says, not touched by records to come."""
         return Manifest(
             dict(self.schemas), _by_item(self.live.values()), dict(self.journals),
@@ -267,70 +266,9 @@ class _State:
         )  # fmt: skip
 
 
-class _Reader:
-    """Reads one manifest file, and later only what was appended since."""
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self._lock = threading.Lock()
-        self._start_again()
-
-    def _start_again(self) -> None:
-        self._state, self._lines = _State(), text.LineReader()
-        self._size, self._last_line = 0, b""
-        self._seen: tuple[int, int, int] | None = None
-        self._manifest = Manifest()
-
-    def read(self) -> Manifest:
-        """Return what the file says now; nothing when it is not there."""
-        with self._lock:
-            try:
-                with self._path.open("rb") as file:
-                    return self._read(file)
-            except FileNotFoundError:
-                return Manifest()
-
-    def _read(self, file: BinaryIO) -> Manifest:
-        status = os.fstat(file.fileno())
-        seen = (status.st_ino, status.st_mtime_ns, status.st_size)
-        if seen != self._seen:
-            if not self._goes_on(file, status):
-                self._start_again()
-            self._manifest = self._read_on(file)
-            self._seen = seen
-        return self._manifest
-
-    def _goes_on(self, file: BinaryIO, status: os.stat_result) -> bool:
-        """Tell whether the file is the one read before, with lines added."""
-        if self._seen is None or status.st_ino != self._seen[0] or status.st_size <= self._size:
-            return False
-        file.seek(self._size - len(self._last_line))
-        return file.read(len(self._last_line)) == self._last_line
-
-    def _read_on(self, file: BinaryIO) -> Manifest:
-        file.seek(self._size)
-        whole, newline, torn = file.read().rpartition(b"\n")
-        if newline:
-            for record in self._lines.take(whole):
-                self._state.take(record)
-            self._size += len(whole) + 1
-            self._last_line = whole[whole.rfind(b"\n") + 1 :] + newline
-        if torn:
-            return self._with_torn(file)
-        return self._state.manifest(self._lines)
-
-    def _with_torn(self, file: BinaryIO) -> Manifest:
-        """Read all of it aside: what has no end yet may come differently next time."""
-        file.seek(0)
-        state, reader = _State(), text.LineReader()
-        for record in reader.take(file.read(), ends=False):
-            state.take(record)
-        return state.manifest(reader)
-
-
 @lru_cache(maxsize=8)
-def _reader(path: Path) -> _Reader:
-    return _Reader(path)
+def _reader(path: Path) -> GrowingLines[Manifest]:
+    return GrowingLines(path, _State)
 
 
 def read(store: Path) -> Manifest:
@@ -344,7 +282,7 @@ def of_records(records: Iterable[Mapping[str, Any]]) -> Manifest:
     for record in records:
         state.take(record)
         reader.last_hash, reader.number = record["hash"], reader.number + 1
-    return state.manifest(reader)
+    return state.result(reader)
 
 
 def _by_item(segments: Iterable[Segment]) -> dict[str, tuple[Segment, ...]]:
