@@ -26,6 +26,7 @@ from amberbox.blackbox.keeper.usage import DiskUse
 from amberbox.blackbox.query import record
 from amberbox.blackbox.recorder.pipeline import PipelineOptions
 from amberbox.blackbox.segments import manifest as mf
+from amberbox.blackbox.segments.build import can_build
 from amberbox.blackbox.store import WriterLock, is_locked, open_store
 from amberbox.core.clock import NS
 from amberbox.core.types import Batch, Schema, Topic
@@ -34,8 +35,8 @@ from amberbox.testing.box import COUNT, ManualBox, events, number
 
 BLOB = Topic("/blob", "ros1", Schema("test/Blob", "ros1msg", b"uint8[] data\n"))
 DAY_S = 86_400.0
-OPTIONS = KeeperOptions(quota=2_000_000, min_free=0, headroom=50_000)
-needs_pyarrow = pytest.mark.skipif(not module.can_build(), reason="segments are Parquet files")
+OPTIONS = KeeperOptions(quota=1_500_000, min_free=0, headroom=50_000)
+needs_pyarrow = pytest.mark.skipif(not can_build(), reason="segments are Parquet files")
 
 
 def blob(size: int, source: random.Random = random.Random(7)) -> bytes:  # noqa: B008  # one stream
@@ -64,7 +65,7 @@ def test_weeks_offline_leave_the_newest_day_all_incidents_and_all_events(tmp_pat
     store, keeper = open_store(path), Keeper(open_store(path), OPTIONS, clock=clock)
     written: dict[int, int] = {}
     pinned: set[int] = set()
-    for step in range(21 * 4):  # every six hours the robot is on for a while
+    for step in range(14 * 4):  # every six hours the robot is on for a while
         box.hear(COUNT, number(step))
         box.hear(BLOB, blob(16_000))
         written[step] = clock.wall_ns()
@@ -77,7 +78,7 @@ def test_weeks_offline_leave_the_newest_day_all_incidents_and_all_events(tmp_pat
             pinned = {v for v, at_ns in written.items() if found.from_ns <= at_ns < found.to_ns}
         box.close()
         keeper.step(threading.Event())
-        assert DiskUse(path).measure() <= 2_000_000
+        assert DiskUse(path).measure() <= 1_500_000
         clock.advance(DAY_S / 4)
         box = ManualBox(path, clock=clock)
     keeper.close()
@@ -85,15 +86,15 @@ def test_weeks_offline_leave_the_newest_day_all_incidents_and_all_events(tmp_pat
     answer = set(rows(path))
     assert pinned == {10}
     assert pinned <= answer
-    assert {v for v, at_ns in written.items() if written[83] - at_ns < DAY_S * NS} <= answer
+    assert {v for v, at_ns in written.items() if written[55] - at_ns < DAY_S * NS} <= answer
     assert len(answer) < len(written), "the quota is too small for all of it"
     marks = [e["text"] for e in amberbox.open(path).events().rows() if e["kind"] == "mark"]
-    assert marks == [f"day {day}" for day in range(21)]
+    assert marks == [f"day {day}" for day in range(14)]
     assert events(path, "deleted")
 
 
 def test_a_fast_recorder_never_takes_more_than_the_quota_and_a_segment(tmp_path: Path) -> None:
-    rotate_bytes, quota = 1_000_000, 6_000_000
+    rotate_bytes, quota = 1_000_000, 8_000_000
     options = KeeperOptions(quota=quota, min_free=0, keep_min_s=0.0, headroom=rotate_bytes)
     box = box_at(tmp_path / "store", rotate_bytes)
     command = [sys.executable, "-m", "amberbox.blackbox.keeper", str(box.store)]

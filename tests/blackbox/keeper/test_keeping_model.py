@@ -258,8 +258,11 @@ class BoxMachine(RuleBasedStateMachine):
 
     @rule(keep_min_s=st.sampled_from([0.0, 30.0]), stop=st.booleans())
     def change_rule(self, keep_min_s: float, stop: bool) -> None:
-        full = "stop" if stop else "overwrite"
-        self.world.options = replace(self.world.options, keep_min_s=keep_min_s, when_full=full)
+        self.world.options = replace(
+            self.world.options,
+            keep_min_s=keep_min_s,
+            when_full="stop" if stop else "overwrite",
+        )
         self.world.forget_keeper()
 
     @rule(share=st.floats(0.0, 1.0))
@@ -284,7 +287,8 @@ class BoxMachine(RuleBasedStateMachine):
 
     @rule(incident=consumes(incidents))
     def release(self, incident: str) -> None:
-        if incident and self.pinned.pop(incident, None):
+        if incident in self.pinned:
+            del self.pinned[incident]
             release(self.world.store, load(self.world.store, incident))
 
     @rule()

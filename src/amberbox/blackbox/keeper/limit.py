@@ -16,6 +16,8 @@ from amberbox.blackbox.store import Store, replace_file
 FULL = "full"
 RESERVE = "reserve"
 _RESERVE_STEP = 1_000_000
+_GROWING = 2
+"""Journals that may grow by a file's size before the next look: those of main and bulk."""
 _SHARE = 4
 """At most this part of the limit is held free for files that grow."""
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT)
@@ -49,7 +51,7 @@ def room(store: Store, options: KeeperOptions, used: int) -> Room:
     if quota is None:
         quota = int(partition * options.quota_percent / 100)
     limit = max(0, min(quota, used + free_bytes(store.path) - options.min_free))
-    return Room(used, limit, min(options.headroom, limit // _SHARE))
+    return Room(used, limit, min(_GROWING * options.headroom, limit // _SHARE))
 
 
 class FullMark:
