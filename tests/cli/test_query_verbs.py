@@ -246,3 +246,28 @@ def test_sql_prints_what_is_asked(store: str, capsys: pytest.CaptureFixture[str]
         {"mode": "A", "n": 150, "s": 22350.0},
         {"mode": "B", "n": 150, "s": 22500.0},
     ]
+
+
+class Terminal(io.StringIO):
+    """Text as somebody sees it in a terminal."""
+
+    def isatty(self) -> bool:
+        return True
+
+
+@pytest.mark.parametrize("verb", ["query", "sql", "items"])
+def test_tables_fit_a_terminal(
+    store: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], verb: str
+) -> None:
+    ask = {"query": ["odom"], "sql": ["select * from odom"], "items": ["--all"]}[verb]
+    assert main([verb, store, *ask]) == 0
+    piped = capsys.readouterr().out.splitlines()
+    assert max(map(len, piped)) > 60 and "columns;" not in piped[-1]
+    terminal = Terminal()
+    monkeypatch.setattr("sys.stdout", terminal)
+    monkeypatch.setenv("COLUMNS", "60")
+    assert main([verb, store, *ask]) == 0
+    shown = terminal.getvalue().splitlines()
+    assert max(map(len, shown)) <= 60 and len(shown) == len(piped) + 1
+    assert shown[0].split()[0] == piped[0].split()[0] and "..." in shown[2]
+    assert " columns; " in shown[-1]

@@ -6,12 +6,14 @@ import argparse
 import json
 import os
 import re
+import shutil
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
+from amberbox.blackbox.query.fitting import Room
 from amberbox.blackbox.query.tabletext import grid
 from amberbox.core.errors import UsageError
 
@@ -25,8 +27,16 @@ def print_json(value: Any) -> None:
 
 
 def print_grid(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
-    """Print a table for the eye."""
-    print(grid(header, list(rows)))
+    """Print a table for the eye; in a terminal it gets no wider than that."""
+    print(grid(header, list(rows), room=room(sys.stdout, "--json has all")))
+
+
+def room(file: IO[str], more: str) -> Room | None:
+    """Return how wide a table may be: what fits a terminal, anything in a file or a pipe.
+
+    ``more`` says how to get the columns that there is no room for.
+    """
+    return Room(shutil.get_terminal_size().columns, more) if file.isatty() else None
 
 
 def size(count: int) -> str:

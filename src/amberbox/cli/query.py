@@ -12,12 +12,13 @@ from amberbox.blackbox.query.record import Record
 from amberbox.blackbox.query.table import Table
 from amberbox.blackbox.query.tabletext import write_grid
 from amberbox.cli._missions import missions_of
-from amberbox.cli._output import add_range, opened, tell, text_output, writable
+from amberbox.cli._output import add_range, opened, room, tell, text_output, writable
 from amberbox.cli._window import add_window, window_of
 from amberbox.core.errors import UsageError
 from amberbox.core.timetext import format_time
 
 FORMATS = ("table", "csv", "json", "parquet")
+_MORE = "name some, or --format csv"
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -83,7 +84,7 @@ def write(table: Table, form: str, output: str | None) -> None:
 
 
 def _write_grid(table: Table, file: IO[str]) -> None:
-    write_grid(file, table.fields, table.columns)
+    write_grid(file, table.fields, table.columns, room=room(file, _MORE))
 
 
 _WRITERS: dict[str, Callable[[Table, IO[str]], None]] = {
@@ -118,5 +119,6 @@ def _stream(table: Table, form: str, file: IO[str], *, header: bool) -> None:
     elif form == "csv":
         table.to_csv(file, header=header)
     else:
-        write_grid(file, table.fields, table.columns, header=header, steady=True)
+        space = room(file, _MORE)
+        write_grid(file, table.fields, table.columns, header=header, steady=True, room=space)
     file.flush()

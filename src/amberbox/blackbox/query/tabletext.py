@@ -13,6 +13,7 @@ from typing import IO, Any
 import msgspec
 import numpy as np
 
+from amberbox.blackbox.query.fitting import DOTS, GAP, Fit, Room, cut, fit
 from amberbox.blackbox.segments import columns as col
 from amberbox.core.timetext import format_times
 from amberbox.core.types import Column, ColumnData, Ragged
@@ -168,16 +169,63 @@ def grid(
     *,
     with_header: bool = True,
     least_widths: Sequence[int] = (),
+    room: Room | None = None,
 ) -> str:
-    """Lay out cells in columns; numbers to the right, the rest to the left."""
+    """Lay out cells in columns; numbers to the right, the rest to the left.
+
+    Without ``room`` lines are as long as they are. ``least_widths`` decide which columns there is
+    room for, if given: the same ones for every call.
+    """
     table = [[_shown(value) for value in row] for row in rows]
     numeric = [_is_number(cells) for cells in zip(*table, strict=True)] or [False] * len(header)
     widths = [max(map(len, cells)) for cells in zip(header, *table, strict=True)]
+    if room is not None:
+        texts = [not number and not least_widths for number in numeric]
+        fitted = fit(least_widths or widths, texts, room.width)
+        text = _fitted(header, table, numeric, fitted, with_header=with_header)
+        is_told = with_header and fitted.hides
+        return f"{text}\n{room.note(len(fitted.columns), len(header))}" if is_told else text
     if least_widths:
         widths = [max(pair) for pair in zip(widths, least_widths, strict=True)]
+    return _laid_out(header, table, numeric, widths, with_header=with_header)
+
+
+def _fitted(
+    header: Sequence[str],
+    table: Sequence[Sequence[str]],
+    numeric: Sequence[bool],
+    fitted: Fit,
+    *,
+    with_header: bool,
+) -> str:
+    """Lay out the columns that there is room for."""
+    top, *rows = (
+        [
+            cell if number else cut(cell, width)
+            for cell, number, width in zip(row, numeric, fitted.widths, strict=True)
+        ]
+        for row in (header, *table)
+    )
+    return _laid_out(
+        fitted.pick(top, DOTS),
+        [fitted.pick(row, DOTS) for row in rows],
+        fitted.pick(numeric, False),
+        fitted.pick(fitted.widths, len(DOTS)),
+        with_header=with_header,
+    )
+
+
+def _laid_out(
+    header: Sequence[str],
+    table: Sequence[Sequence[str]],
+    numeric: Sequence[bool],
+    widths: Sequence[int],
+    *,
+    with_header: bool,
+) -> str:
     lines = [_line(row, widths, numeric) for row in table]
     if with_header:
-        lines = [_line(header, widths, numeric), "  ".join("-" * w for w in widths), *lines]
+        lines = [_line(header, widths, numeric), GAP.join("-" * w for w in widths), *lines]
     return "\n".join(lines)
 
 
@@ -186,7 +234,7 @@ def _line(cells: Sequence[str], widths: Sequence[int], right: Sequence[bool]) ->
         cell.rjust(width) if number else cell.ljust(width)
         for cell, width, number in zip(cells, widths, right, strict=True)
     ]
-    return "  ".join(aligned).rstrip()
+    return GAP.join(aligned).rstrip()
 
 
 def _shown(value: Any) -> str:
@@ -194,8 +242,7 @@ def _shown(value: Any) -> str:
         return "-"
     listed = json.dumps(value) if isinstance(value, list) else str(_cell(value))
     text = f"{value:.9g}" if isinstance(value, float) else listed
-    text = text.replace("\n", "\\n")
-    return text if len(text) <= _CELL_WIDTH else text[: _CELL_WIDTH - 3] + "..."
+    return cut(text.replace("\n", "\\n"), _CELL_WIDTH)
 
 
 def _is_number(cells: Sequence[str]) -> bool:
@@ -203,13 +250,24 @@ def _is_number(cells: Sequence[str]) -> bool:
 
 
 def write_grid(
-    file: IO[str], fields: Fields, columns: Columns, *, header: bool = True, steady: bool = False
+    file: IO[str],
+    fields: Fields,
+    columns: Columns,
+    *,
+    header: bool = True,
+    steady: bool = False,
+    room: Room | None = None,
 ) -> None:
     """Write all rows as a table for the eye; ``steady`` keeps widths alike from call to call."""
     titles = [f"{c.name} [{c.unit}]" if c.unit else c.name for c in fields]
     rows = (row for chunk in _chunks(fields, columns) for row in zip(*chunk, strict=True))
-    widths = [_STEADY_WIDTHS.get(c.type, _STEADY_WIDTH) for c in fields] if steady else ()
-    file.write(grid(titles, rows, with_header=header, least_widths=widths) + "\n")
+    widths = list(map(_steady_width, fields, titles)) if steady else ()
+    text = grid(titles, rows, with_header=header, least_widths=widths, room=room)
+    file.write(text + "\n")
+
+
+def _steady_width(field: Column, title: str) -> int:
+    return max(_STEADY_WIDTHS.get(field.type, _STEADY_WIDTH), len(title))
 
 
 def preview(item: str, fields: Fields, columns: Columns, count: int) -> str:
