@@ -121,7 +121,7 @@ def build_segments(
         for flat in _flats(known, journal, gaps, sizes):
             _builder(builders, store, journal, flat.schema).add(flat)
             breathe()
-        segments = _finish(builders, journal, sizes)
+        segments = _finish(builders, journal, sizes, breathe)
     finally:
         for builder in builders.values():
             builder.file.discard()
@@ -143,13 +143,17 @@ def _done(journal: JournalFile, gaps: Sequence[Gap]) -> mf.Journal:
 
 
 def _finish(
-    builders: Mapping[TableSchema, _TableBuilder], journal: JournalFile, sizes: dict[str, int]
+    builders: Mapping[TableSchema, _TableBuilder],
+    journal: JournalFile,
+    sizes: dict[str, int],
+    breathe: Callable[[], None],
 ) -> list[Segment]:
     files = Counter(schema.item for schema in builders)
     segments = []
     for schema, builder in builders.items():
         size = sizes.pop(schema.item, 0)  # once, should there be several versions
         segments.append(builder.finish(journal, files[schema.item], size))
+        breathe()  # each file is synced
     return segments
 
 
