@@ -78,6 +78,8 @@ def test_query_and_export_know_the_window(robot: Path, capsys: pytest.CaptureFix
         capsys, "query", where, "ros_count", "data", "--incident", made["id"], "--format", "json"
     )
     assert [row["data"] for row in rows] == list(range(70, 100))
+    last = ["query", where, "ros_count", "data", "--incident", "last", "--format", "json"]
+    assert answer(capsys, *last) == rows
     target = robot / "rows.csv"
     arguments = ["--item", "ros_count", "--incident", made["id"], "-o", str(target)]
     assert main(["export", where, *arguments]) == 0

@@ -14,7 +14,7 @@ Window = tuple[int | None, int | None]
 
 def add_window(parser: argparse.ArgumentParser) -> None:
     """Add the options that name a window."""
-    parser.add_argument("--incident", metavar="ID", help="the window of an incident")
+    parser.add_argument("--incident", metavar="ID", help="the window of an incident; 'last' is one")
     add_mission(parser)
 
 
@@ -46,8 +46,14 @@ def window_of(args: argparse.Namespace, record: Record) -> Window:
 
 
 def _of_incident(incident_id: str, record: Record) -> list[tuple[int, int]]:
-    from amberbox.blackbox.incidents.incident import load
+    from amberbox.blackbox.incidents.incident import load, load_all
     from amberbox.blackbox.incidents.window import windows_of
     from amberbox.blackbox.store import open_store
 
-    return windows_of(record, load(open_store(record.path), incident_id))
+    store = open_store(record.path)
+    if incident_id != "last":
+        return windows_of(record, load(store, incident_id))
+    known = load_all(store)
+    if not known:
+        raise UsageError(f"{record.path} has no incident", "amberbox incident list shows them")
+    return windows_of(record, max(known, key=lambda incident: incident.made_ns))

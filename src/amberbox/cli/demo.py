@@ -6,6 +6,7 @@ import argparse
 import atexit
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -21,11 +22,21 @@ import numpy as np
 
 import amberbox
 from amberbox.blackbox.follow import read
+from amberbox.blackbox.incidents.incident import load_all
+from amberbox.blackbox.store import open_store
 from amberbox.core.clock import NS
 from amberbox.core.errors import AmberboxError, UsageError
 
 FAULT = "wheel_front_left_motor_weak"
 SHOWN = ("sensors_front_left_current_1_q", "sensors_front_right_current_1_q")
+WEAK = " - ".join(f"abs(zmq_wheels.{name})" for name in SHOWN)
+TRIGGER = f"""triggers:
+- name: uneven_wheels
+  when: {WEAK} > 0.4 for 500ms
+  before: 2s
+  after: 2s
+  reason: a wheel draws more current than its neighbour
+"""
 PASSENGER = "recording_odom"
 _LOST_AT_KILL_S = 0.15
 
@@ -49,13 +60,14 @@ def run(args: argparse.Namespace) -> int:
     if any(place.iterdir()):
         raise UsageError(f"{place} is not empty", "name a new folder, or none")
     demo = Demo(place, args.seconds)
-    for step in (demo.prepare, demo.record, demo.account, demo.show):
+    for step in (demo.prepare, demo.record, demo.account, demo.show, demo.defend):
         step()
     print(f"\nEverything is in {place}. Go on with:")
     for verb in (
         "items {}",
         "query {} zmq_odom --points 5",
         "sql {} 'select count(*) from zmq_imu'",
+        "query {} zmq_wheels --incident last --points 5",
     ):
         print("  amberbox " + verb.format(demo.folder))
     return 0
@@ -101,7 +113,7 @@ class Demo:
             "A simulated robot speaks ZMQ; the black box listens, and replays the recording beside."
         )
         with robot(self.truth) as (process, endpoint):
-            write_folder(self.folder, "demo_robot", self._blocks(endpoint))
+            write_folder(self.folder, "demo_robot", self._blocks(endpoint), TRIGGER)
             box = start_box(self.folder)
             time.sleep(self.seconds * 0.3)
             tell_robot(process, f"fault {FAULT}")
@@ -161,6 +173,22 @@ class Demo:
         rows = sum(item.rows for item in record.items() if item.name == PASSENGER)
         check(rows > 0, f"{rows} messages of the recording went the same way")
 
+    def defend(self) -> None:
+        """Show what the box has kept for good, and that nobody changes the record unseen."""
+        say("The fault was noticed: the seconds around it stay whatever else has to go.")
+        amberbox_verb("incident", "list", str(self.folder))
+        held = load_all(open_store(self.folder / "store"))
+        check(any(reason.trigger == "uneven_wheels" for i in held for reason in i.reasons),
+              "an incident was made by its trigger")  # fmt: skip
+        say("Is the record as the robot left it? One bit of a copy is changed as well.")
+        amberbox_verb("verify", str(self.folder))
+        forged = self.place / "forged"
+        shutil.copytree(self.folder / "store", forged)
+        flip_a_bit(max((forged / "journal").glob("*.mcap"), key=lambda path: path.stat().st_size))
+        amberbox_verb("verify", str(forged), expected=1)
+        shutil.rmtree(forged)
+        check(True, "the record is intact, and the bit was found in its copy")
+
 
 def say(text: str) -> None:
     """Announce a step."""
@@ -174,18 +202,27 @@ def check(fine: bool, text: str) -> None:
     print(f"  ok: {text}", flush=True)
 
 
-def write_folder(folder: Path, name: str, blocks: str) -> None:
-    """Write a robot folder."""
+def write_folder(folder: Path, name: str, blocks: str, more: str = "") -> None:
+    """Write a robot folder; ``more`` goes into its ``robot.yaml``."""
     folder.mkdir(exist_ok=True)
-    (folder / "robot.yaml").write_text(f"id: {name}\n")
+    (folder / "robot.yaml").write_text(f"id: {name}\n{more}")
     (folder / "black_box.yaml").write_text(blocks)
 
 
-def amberbox_verb(*arguments: str) -> None:
+def flip_a_bit(path: Path) -> None:
+    """Change one bit in the middle of a file."""
+    with path.open("r+b") as file:
+        file.seek(path.stat().st_size // 2)
+        byte = file.read(1)[0]
+        file.seek(-1, os.SEEK_CUR)
+        file.write(bytes([byte ^ 1]))
+
+
+def amberbox_verb(*arguments: str, expected: int = 0) -> None:
     """Run a verb as a user would."""
     print("  $ amberbox " + " ".join(arguments), flush=True)
     done = subprocess.run([sys.executable, "-m", "amberbox", *arguments], check=False)
-    if done.returncode:
+    if done.returncode != expected:
         raise AmberboxError(f"amberbox {arguments[0]} ended with {done.returncode}", "see above")
 
 

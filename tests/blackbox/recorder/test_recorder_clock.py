@@ -9,7 +9,7 @@ import pytest
 
 import amberbox
 from amberbox.blackbox.follow import read
-from amberbox.blackbox.keeper import Keeper
+from amberbox.blackbox.keeper.keeper import Keeper
 from amberbox.blackbox.keeper.options import KeeperOptions
 from amberbox.blackbox.recorder.messageclock import MessageClock
 from amberbox.blackbox.recorder.pipeline import PipelineOptions
