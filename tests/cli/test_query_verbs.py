@@ -271,3 +271,16 @@ def test_tables_fit_a_terminal(
     assert max(map(len, shown)) <= 60 and len(shown) == len(piped) + 1
     assert shown[0].split()[0] == piped[0].split()[0] and "..." in shown[2]
     assert " columns; " in shown[-1]
+
+
+@pytest.mark.parametrize("ask", [["query", "odom"], ["sql", "select * from odom"]])
+def test_json_by_its_short_name(
+    store: str, ask: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    verb, what = ask
+    assert main([verb, store, what, "--format", "json"]) == 0
+    expected = json.loads(capsys.readouterr().out)
+    assert main([verb, store, what, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out) == expected and len(expected) == 300
+    assert main([verb, store, what, "--json", "--format", "csv"]) == 2
+    assert "not allowed with" in capsys.readouterr().err

@@ -35,8 +35,15 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--points", type=int, metavar="N", help="thin out to N rows, keeping extremes"
     )
     parser.add_argument("--follow", action="store_true", help="go on with rows as they come")
-    parser.add_argument(
-        "--format", choices=FORMATS, help="default: by the ending of -o, else table"
+    add_format(parser)
+
+
+def add_format(parser: argparse.ArgumentParser) -> None:
+    """Add ``--format``, ``--json`` and ``-o``."""
+    group = parser.add_mutually_exclusive_group()
+    group.add_argument("--format", choices=FORMATS, help="default: by the ending of -o, else table")
+    group.add_argument(
+        "--json", dest="format", action="store_const", const="json", help="--format json"
     )
     parser.add_argument("-o", "--output", metavar="FILE", help="write to a file")
 

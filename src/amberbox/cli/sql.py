@@ -5,17 +5,14 @@ from __future__ import annotations
 import argparse
 
 from amberbox.cli._output import opened, tell
-from amberbox.cli.query import FORMATS, chosen_format, write
+from amberbox.cli.query import add_format, chosen_format, write
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
     parser.add_argument("where", metavar="WHERE", help="robot folder, store or recording file")
     parser.add_argument("statement", metavar="SQL", help='such as "select ... from ros_odom"')
-    parser.add_argument(
-        "--format", choices=FORMATS, help="default: by the ending of -o, else table"
-    )
-    parser.add_argument("-o", "--output", metavar="FILE", help="write to a file")
+    add_format(parser)
 
 
 def run(args: argparse.Namespace) -> int:
