@@ -161,3 +161,26 @@ def test_without_duckdb_it_says_what_to_install(
     monkeypatch.setitem(sys.modules, "duckdb", None)
     with pytest.raises(UsageError, match="needs DuckDB"):
         amberbox.open(tmp_path).sql("select 1")
+
+
+@pytest.mark.parametrize("built", [0, 1, 2])
+def test_tables_are_the_items(tmp_path: Path, built: int) -> None:
+    fill_store(tmp_path)
+    build_segments_of(tmp_path, built)
+    record = amberbox.open(tmp_path)
+    names = sorted(item.name for item in record.items())
+    for question in ("show tables", "select view_name as name from duckdb_views()"
+                     " where not internal and schema_name = current_schema()"):  # fmt: skip
+        assert sorted(record.sql(question).values("name")) == names
+    described = record.sql("describe odom").values("column_name")
+    assert described[0] == "timestamp" and described[-1] == "seq"
+
+
+def test_items_may_have_the_names_of_our_schema(tmp_path: Path) -> None:
+    run = FakeRun(tmp_path)
+    for name in ("journals", "main", "temp"):
+        run.write([(T0_NS, FakeItem(name, [{"x": 1}]), {"x": 1})])
+    run.close()
+    record = amberbox.open(tmp_path)
+    for name in ("journals", "main", "temp"):
+        assert record.sql(f'select x from "{name}"').values("x") == [1]

@@ -23,6 +23,9 @@ if TYPE_CHECKING:
 
 Pieces: TypeAlias = tuple[tuple[int, Piece], ...]
 
+_JOURNALS = "journals"
+"""Schema of the rows that no segment serves."""
+
 _TYPES = {
     "bool": "BOOLEAN",
     "int8": "TINYINT",
@@ -106,9 +109,16 @@ def _create_view(
     files += (path for paths in groups.values() for path in paths)
     rest = _journal_rows(catalogue, schema, also_segments=not groups)
     if rest is not None:
-        connection.register(f"{table}:journal", rest)
-        selects.append(f"SELECT * FROM {_name(f'{table}:journal')}")
+        selects.append(f"SELECT * FROM {_beside(connection, table, rest)}")
     connection.execute(f"CREATE VIEW {_name(table)} AS {' UNION ALL '.join(selects)}")
+
+
+def _beside(connection: duckdb.DuckDBPyConnection, table: str, rows: pa.Table) -> str:
+    """Make a view of rows in memory where SHOW TABLES does not look, and return its full name."""
+    connection.execute(f"CREATE SCHEMA IF NOT EXISTS {_JOURNALS}; USE {_JOURNALS}")
+    connection.from_arrow(rows).create_view(table)
+    connection.execute("USE main")
+    return f"{_JOURNALS}.{_name(table)}"
 
 
 def _groups(catalogue: Catalogue, table: str) -> dict[tuple[TableSchema, Pieces], list[str]]:
