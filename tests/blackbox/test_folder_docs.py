@@ -18,7 +18,8 @@ PAGE = Path(__file__).resolve().parents[2] / "docs" / "configuration.md"
 def test_every_key_is_documented() -> None:
     page = PAGE.read_text(encoding="utf-8")
     general = [row.key for row in describe(DefaultParameters, "default_parameters.")]
-    robot = [row.key for row in describe(RobotConfig) if row.key not in ("store", "server")]
+    groups = ("store", "store.lifetime", "server", "incidents")
+    robot = [row.key for row in describe(RobotConfig) if row.key not in groups]
     topic = [row.key for row in describe(TopicOptions)]
     for key in (*general, *robot, *topic):
         assert f"| `{key}` |" in page, key
@@ -32,6 +33,6 @@ def test_examples_load(tmp_path: Path) -> None:
     (tmp_path / "robot.yaml").write_text(robot)
     (tmp_path / "black_box.yaml").write_text(black_box)
     built = load_folder(tmp_path)
-    assert {note.where for note in built.notes} == {"store.quota", "server"}
+    assert {note.where for note in built.notes} == {"server"}
     assert all(NOT_USED_YET[note.where] in note.what for note in built.notes)
     assert [topic.max_frequency for topic in built.blocks[0].config.topics] == [5, 10]

@@ -20,8 +20,9 @@ software_version: ""       # version of the robot's own software
 
 store:
   path: store              # folder of the record, relative to this one
-  # quota: 50 GB           # most that the record may take (not acted on in this version)
-  # min_free: 1 GB         # room that stays free on the partition (not acted on in this version)
+  # quota: 50 GB           # most that the record may take; the oldest data go first
+  # min_free: 1 GB         # room that stays free on the partition
+  # keep_min: 24 h         # the newest data are not deleted for room
   # ring_s: 5 min          # how long topics with 'keep: ring' are kept
 
 # server:

@@ -12,9 +12,6 @@ from amberbox.core.ids import derive_id, is_id
 from amberbox.core.options import option
 
 NOT_USED_YET = {
-    "store.quota": "nothing is deleted yet but old files of the ring",
-    "store.quota_percent": "nothing is deleted yet but old files of the ring",
-    "store.min_free": "nothing is deleted yet but old files of the ring",
     "server": "nothing leaves this computer yet",
 }
 """Keys that are checked, but that nobody acts on in this version, and what that means."""
