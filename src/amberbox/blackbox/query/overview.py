@@ -14,6 +14,7 @@ from amberbox.blackbox.follow.read import JournalFile, batches_of, journal_file
 from amberbox.blackbox.journal import reserved
 from amberbox.blackbox.journal.clocktable import ClockPoints, ClockTable
 from amberbox.blackbox.query.catalogue import Catalogue, item_of, union
+from amberbox.blackbox.query.rates import Place, Share, deleted_places, rate_hz
 from amberbox.blackbox.segments.build import median
 from amberbox.blackbox.segments.flat import Flat, flatten
 from amberbox.blackbox.segments.manifest import Part, part_clock
@@ -25,8 +26,10 @@ from amberbox.core.timetext import format_time
 class ItemInfo:
     """One data item or child table of a record.
 
-    ``stamp_offset_s`` is how far stamps lie behind receipt (median over the record), None
-    without stamps; ``bytes`` counts the messages as received (0 for child tables).
+    ``rate_hz`` is over the time of recording: pauses between runs, and what was deleted whole, do
+    not count; None where no two rows came in one run. ``stamp_offset_s`` is how far stamps lie
+    behind receipt (median over the record), None without stamps; ``bytes`` counts the messages as
+    received (0 for child tables).
     """
 
     name: str
@@ -56,50 +59,35 @@ class ItemInfo:
         }
 
 
-@dataclass(frozen=True, slots=True)
-class _Share:
-    """What one journal adds to an item."""
-
-    rows: int
-    first_ns: int
-    last_ns: int
-    bytes: int
-    stamp_offset_ns: int | None
-
-
 def overview(catalogue: Catalogue) -> list[ItemInfo]:
     """Describe each table that has rows, by name; the box's own channels come last."""
-    infos = [_info(catalogue, table) for table in sorted(catalogue.schemas)]
+    holes = list(deleted_places(catalogue))
+    infos = [_info(catalogue, table, holes) for table in sorted(catalogue.schemas)]
     known = [info for info in infos if info is not None]
     return sorted(known, key=lambda info: info.source == reserved.SOURCE)
 
 
-def _info(catalogue: Catalogue, table: str) -> ItemInfo | None:
+def _info(catalogue: Catalogue, table: str, holes: Sequence[Place]) -> ItemInfo | None:
     shares = list(_shares(catalogue, table))
     rows = sum(share.rows for share in shares)
     if not rows:
         return None
     schema = union(catalogue.schemas[table])
-    first, last = min(s.first_ns for s in shares), max(s.last_ns for s in shares)
     return ItemInfo(
         table,
         schema.source,
         schema.topic,
         schema.type,
         rows,
-        first,
-        last,
-        _rate(rows, first, last),
+        min(share.first_ns for share in shares),
+        max(share.last_ns for share in shares),
+        rate_hz(shares, holes),
         _stamp_offset_s(shares),
         sum(share.bytes for share in shares),
     )
 
 
-def _rate(rows: int, first_ns: int, last_ns: int) -> float | None:
-    return round((rows - 1) * NS / (last_ns - first_ns), 3) if last_ns > first_ns else None
-
-
-def _stamp_offset_s(shares: Sequence[_Share]) -> float | None:
+def _stamp_offset_s(shares: Sequence[Share]) -> float | None:
     """Median over the journals' medians, each counting by its rows."""
     known = sorted(
         (share.stamp_offset_ns, share.rows) for share in shares if share.stamp_offset_ns is not None
@@ -111,7 +99,7 @@ def _stamp_offset_s(shares: Sequence[_Share]) -> float | None:
     return known[middle][0] / NS
 
 
-def _shares(catalogue: Catalogue, table: str) -> Iterator[_Share]:
+def _shares(catalogue: Catalogue, table: str) -> Iterator[Share]:
     for segment in catalogue.segments(table):
         for part in segment.parts:
             yield _share_of_part(part)
@@ -121,13 +109,14 @@ def _shares(catalogue: Catalogue, table: str) -> Iterator[_Share]:
             yield share
 
 
-def _share_of_part(part: Part) -> _Share:
+def _share_of_part(part: Part) -> Share:
     edges = np.array([part.from_ns, part.to_ns])
     first, last = ClockTable(part_clock(part)).received(edges).tolist()
-    return _Share(part.rows, first, last, part.bytes, part.stamp_offset_ns)
+    place = part.writer, part.run, part.first_seq
+    return Share(place, part.rows, first, last, part.bytes, part.stamp_offset_ns)
 
 
-def _journal_shares(journal: JournalFile) -> dict[str, _Share]:
+def _journal_shares(journal: JournalFile) -> dict[str, Share]:
     status = journal.path.stat()
     return _counted(journal.path, journal.name, journal.clock, status.st_mtime_ns, status.st_size)
 
@@ -135,7 +124,7 @@ def _journal_shares(journal: JournalFile) -> dict[str, _Share]:
 @lru_cache(maxsize=256)
 def _counted(
     path: Path, name: str, clock: ClockPoints, _mtime_ns: int, _size: int
-) -> dict[str, _Share]:
+) -> dict[str, Share]:
     """Count a journal's rows by unrolling it; remembered until the file or its clock changes."""
     journal = replace(journal_file(path, name), clock=clock)
     pieces: dict[str, list[Flat]] = {}
@@ -144,11 +133,12 @@ def _counted(
         for flat in flatten(batch):
             if len(flat):
                 pieces.setdefault(flat.schema.item, []).append(flat.with_columns({}))
-    return {table: _share(found, sizes.get(table, 0)) for table, found in pieces.items()}
+    place = journal.writer, journal.run, journal.first_seq
+    return {table: _share(place, found, sizes.get(table, 0)) for table, found in pieces.items()}
 
 
-def _share(pieces: Sequence[Flat], size: int) -> _Share:
+def _share(place: Place, pieces: Sequence[Flat], size: int) -> Share:
     first = min(int(piece.received_ns.min()) for piece in pieces)
     last = max(int(piece.received_ns.max()) for piece in pieces)
     ages = [p.received_ns - p.timestamp_ns for p in pieces if p.schema.stamp]
-    return _Share(sum(map(len, pieces)), first, last, size, median(ages))
+    return Share(place, sum(map(len, pieces)), first, last, size, median(ages))
