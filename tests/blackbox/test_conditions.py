@@ -15,6 +15,7 @@ from amberbox.blackbox.keeper.conditions import (
     Conditions,
     address_problem,
     condition_problem,
+    instants_of,
 )
 from amberbox.core.clock import NS
 from amberbox.core.expression import parse
@@ -66,6 +67,27 @@ def test_an_age_is_noticed_in_silence() -> None:
     ((name, at_s),) = edges(watched, 5)
     assert name == "silent"
     assert 2.0 < at_s <= 2.1
+
+
+def test_silences_late_in_a_long_record_are_noticed_however_it_is_read() -> None:
+    seconds = [*range(1, 5000, 5), *range(5030, 9000, 5), 50_000]
+    whole, parts = watch(silent="age(b.v) > 20"), watch(silent="age(b.v) > 20")
+    whole.add(batch("b", seconds, v=np.ones(len(seconds))))
+    found = []
+    for until in (*range(100, 9100, 100), seconds[-1] + 60):
+        new = [s for s in seconds if until - 100 < s <= until or s == seconds[-1] < until]
+        if new:
+            parts.add(batch("b", new, v=np.ones(len(new))))
+        found += edges(parts, until)
+    assert [round(at_s, 1) for _, at_s in found] == [5016.1, 9015.1, seconds[-1] + 20.1]
+    assert edges(whole, seconds[-1] + 60) == found
+
+
+def test_a_leap_of_the_clock_is_no_endless_silence() -> None:
+    times = np.array([1, 60 * 365 * 86_400], np.int64) * NS
+    series = {"b.v": (times, np.ones(2))}
+    found = instants_of(parse("age(b.v) > 20"), series, 0, int(times[-1]) + NS)
+    assert sum(map(len, found)) == 7 * 86_400 * 10 + 12
 
 
 def test_asides_are_read_at_the_edge() -> None:

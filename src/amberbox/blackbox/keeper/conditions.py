@@ -22,7 +22,10 @@ from amberbox.core.types import Batch, IntArray
 TICK_NS = NS // 10
 """Conditions that depend on an age are looked at this often between samples, too."""
 
-_TICKED_NS = 3600 * NS
+_TICKS = 36_000
+"""So many of these instants are looked at together."""
+_SILENCE_NS = 7 * 86_400 * NS
+"""A longer silence has no more of them: by then it is a leap of the clock."""
 _LONG_AGO = -(1 << 62)
 
 
@@ -147,7 +150,12 @@ class Conditions:
 
     def _rising(self, name: str, when: Expression, series: Any, until_ns: int) -> list[int]:
         """Return when the expression became true after the last instant looked at."""
-        instants = instants_of(when, series, self._until_ns, until_ns)
+        rising: list[int] = []
+        for instants in instants_of(when, series, self._until_ns, until_ns):
+            rising += self._rising_at(name, when, series, instants)
+        return rising
+
+    def _rising_at(self, name: str, when: Expression, series: Any, instants: IntArray) -> list[int]:
         if not len(instants):
             return []
         values = when.evaluate_series(series, instants)
@@ -229,23 +237,31 @@ def condition_problem(expression: Expression) -> str:
     return address_problem(expression)
 
 
-def instants_of(expression: Expression, series: Any, since_ns: int, until_ns: int) -> IntArray:
-    """Return the instants in ``(since, until]`` at which the value may change, in order."""
-    delays = expression.delays_ns()
+def instants_of(
+    expression: Expression, series: Any, since_ns: int, until_ns: int
+) -> Iterator[IntArray]:
+    """Give the instants in ``(since, until]`` at which the value may change, in order."""
     times = [series[address][0] for address in expression.addresses()]
-    found = [t + delay for t in times for delay in delays]
-    if expression.reads_age and any(len(t) for t in times):
-        found.append(_ticks(min(int(t[0]) for t in times if len(t)), since_ns, until_ns))
+    found = [t + delay for t in times for delay in expression.delays_ns()]
     inside = [t[(t > since_ns) & (t <= until_ns)] for t in found]
-    instants: IntArray = np.unique(np.concatenate([np.zeros(0, np.int64), *inside]))
-    return instants
+    changes: IntArray = np.unique(np.concatenate([np.zeros(0, np.int64), *inside]))
+    reached_ns = since_ns
+    for ticks in _ticks(times, since_ns, until_ns) if expression.reads_age else ():
+        between = changes[(changes > reached_ns) & (changes <= ticks[-1])]
+        yield np.union1d(between, ticks)
+        reached_ns = int(ticks[-1])
+    yield changes[changes > reached_ns]
 
 
-def _ticks(first_ns: int, since_ns: int, until_ns: int) -> IntArray:
-    """Give regular instants, an hour of them at most: later ones add nothing to a silence."""
-    start = max(first_ns, since_ns)
-    end = min(until_ns, start + _TICKED_NS)
-    return np.arange(start // TICK_NS + 1, end // TICK_NS + 1, dtype=np.int64) * TICK_NS
+def _ticks(times: Sequence[IntArray], since_ns: int, until_ns: int) -> Iterator[IntArray]:
+    """Give regular instants from the first sample on, an hour of them at a time."""
+    heard = np.unique(np.concatenate(times))
+    groups = np.split(heard, np.flatnonzero(np.diff(heard) > _SILENCE_NS) + 1)
+    for group in groups if len(heard) else ():
+        first = max(int(group[0]), since_ns) // TICK_NS + 1
+        end = min(int(group[-1]) + _SILENCE_NS, until_ns) // TICK_NS + 1
+        for start in range(first, end, _TICKS):
+            yield np.arange(start, min(start + _TICKS, end), dtype=np.int64) * TICK_NS
 
 
 def _known_last(values: Any, before: bool) -> Any:
