@@ -72,5 +72,5 @@ def test_unknown(capsys: pytest.CaptureFixture[str]) -> None:
 def test_describe_reaches_nested_keys() -> None:
     rows = {row.key: row for row in describe(TopicOptions)}
     assert rows["change.heartbeat_s"].default == "5"
-    assert rows["keep"].type == "one of all, ring, incident, none"
+    assert rows["keep"].type == "one of all, bulk, ring, incident, none"
     assert rows["change.bands"].type == "a mapping to a number"

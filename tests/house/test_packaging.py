@@ -135,7 +135,8 @@ def _distribution(module: str) -> str | None:
     top = module.partition(".")[0]
     if top in sys.stdlib_module_names or top == "amberbox":
         return None
-    return {"yaml": "pyyaml", "zmq": "pyzmq"}.get(top, canonicalize_name(top))
+    brought = {"yaml": "pyyaml", "zmq": "pyzmq", "bson": "pymongo", "foxglove": "foxglove-sdk"}
+    return brought.get(top, canonicalize_name(top))
 
 
 def _extras(name: str) -> list[str]:
