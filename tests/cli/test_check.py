@@ -29,7 +29,7 @@ def no_sockets(monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*arguments: Any, **more: Any) -> None:
         raise AssertionError("check opened a socket")
 
-    monkeypatch.setattr(socket, "socket", refuse)
+    monkeypatch.setattr(socket.socket, "__init__", refuse)
 
 
 @pytest.fixture
@@ -98,3 +98,23 @@ def test_single_file_and_nothing(robot: Path, capsys: pytest.CaptureFixture[str]
     assert main(["check", str(robot / "black_box.yaml")]) == 0
     assert main(["check", str(robot / "absent")]) == 2
     assert "there is no folder or file" in capsys.readouterr().err
+
+
+def test_a_recording_that_is_not_there_yet_is_a_note(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "here.mcap").touch()
+    text = "- recording:\n    speed: 2\n    paths: [here.mcap, '*.bag', a**b, gone.mcap]\n"
+    (tmp_path / "black_box.yaml").write_text(text)
+    assert main(["check", str(tmp_path), "--json"]) == 0
+    problems = json.loads(capsys.readouterr().out)["problems"]
+    found = [(p["line"], p["what"]) for p in problems if p["where"] == "recording.paths"]
+    assert found == [
+        (3, f"there is no recording at {tmp_path / name} yet")
+        for name in ("*.bag", "a**b", "gone.mcap")
+    ]
+    assert not any(problem["is_error"] for problem in problems)
+    (tmp_path / "x.bag").touch()
+    (tmp_path / "black_box.yaml").write_text("- recording: {path: '*.bag'}\n")
+    assert main(["check", str(tmp_path)]) == 0
+    assert "there is no recording" not in capsys.readouterr().out

@@ -3,7 +3,8 @@
 A source is a module whose file name is its name in ``black_box.yaml``. It defines
 
 - ``Config``: a frozen dataclass, built from the YAML block (see ``core.config``); one that names
-  files may have ``in_folder(folder)``, which returns it with paths seen from the robot folder;
+  files may have ``in_folder(folder)``, which returns it with paths seen from the robot folder,
+  and ``notes()``, which yields key and sentence for what is odd but no error, as ``check`` does;
 - ``Source``: a class that takes ``(config, name)`` and offers ``topics`` and ``run``;
 - ``SAMPLE``: a block of YAML as one would write it, shown by ``amberbox plugins`` and checked;
 - ``PASSIVE``: one line that says why it does not disturb, shown by ``amberbox doctor``; it may

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
 from amberbox.blackbox.folder.legacy import legacy_note
-from amberbox.core.config import build, did_you_mean
+from amberbox.core.config import build, did_you_mean, field_keys
 from amberbox.core.errors import AmberboxError, Problem
 from amberbox.core.ids import derive_id, is_id
 from amberbox.core.nodes import Node
@@ -173,6 +173,7 @@ def _build(
     if config is None:
         return None
     config = _in_folder(config, Path(block.node.file).parent)
+    problems.extend(_notes(config, block))
     return SourceBlock(block.plugin, name, config, block.node.line, block.node.file)
 
 
@@ -180,6 +181,15 @@ def _in_folder(config: Any, folder: Path) -> Any:
     """Let a source that names files see them from the folder of ``black_box.yaml``."""
     hook = getattr(config, "in_folder", None)
     return config if hook is None else hook(folder)
+
+
+def _notes(config: Any, block: _Block) -> Iterator[Problem]:
+    """Yield what a source has to say that is no error, such as a file that may come later."""
+    keys = block.node.mapping or {}
+    spellings = {field.name: field_keys(field) for field in dataclasses.fields(config)}
+    for name, what in getattr(config, "notes", tuple)():
+        key = next(key for key in spellings[name] if key in keys)
+        yield keys[key].problem(f"{block.plugin}.{key}", what, is_error=False)
 
 
 def _config_class(block: _Block, plugin: Plugin, problems: list[Problem]) -> type[Any] | None:

@@ -61,6 +61,12 @@ class Config:
         if self.duration_s is not None and self.duration_s <= 0:
             yield "duration_s", "must be above 0"
 
+    def notes(self) -> Iterator[tuple[str, str]]:
+        """Say which paths lead nowhere so far; what is not there when it is to play is an error."""
+        for pattern in self.patterns:
+            if not _matches(Path(pattern).expanduser()):
+                yield "path", f"there is no recording at {pattern} yet"
+
 
 class Source:
     """Replays recordings; messages are stamped on receipt like those of a robot."""
@@ -136,7 +142,10 @@ def _matches(pattern: Path) -> list[Path]:
     if pattern.exists():  # also when its name has brackets in it
         return [pattern]
     parts = pattern.relative_to(pattern.anchor)
-    return sorted(Path(pattern.anchor).glob(str(parts)))
+    try:
+        return sorted(Path(pattern.anchor).glob(str(parts)))
+    except ValueError:  # a**b, up to Python 3.12
+        return []
 
 
 def _chosen(recording: Recording, config: Config) -> Iterator[tuple[int, int, int | None, bytes]]:
