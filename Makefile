@@ -14,7 +14,7 @@ ROS := ros-core python3-rospy python3-roslaunch python3-rosbag \
 SYSTEM := systemd
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test check lint types rules bench venv debian clean
+.PHONY: help demo test check lint types rules bench soak venv debian clean
 
 help:  ## say what there is
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /\1\t/' | expand -t 10
@@ -41,6 +41,10 @@ rules: $(TEST)
 
 bench: $(TEST)  ## measure the numbers that the documentation quotes (BENCH_ARGS="unroll query")
 	$(BIN)/python -m benchmarks.run $(BENCH_ARGS)
+
+soak: $(TEST)  ## what takes long: random lives of stores, verified and kept (about half an hour)
+	$(BIN)/python -m benchmarks.soak_verify
+	HYPOTHESIS_PROFILE=soak $(BIN)/python -m pytest --timeout=0 tests/blackbox/keeper/test_keeping_model.py
 
 venv: $(TEST)  ## only install
 

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from amberbox.blackbox.journal.clocktable import ClockTable
+from amberbox.blackbox.journal.clocktable import ClockPoints, ClockTable
 from amberbox.blackbox.segments import manifest as mf
 from amberbox.blackbox.segments.flat import TableSchema
 from amberbox.core.types import Column, Gap
@@ -125,7 +125,7 @@ def test_unknown_kinds_of_records_are_chained_and_passed_over(tmp_path: Path) ->
 
 
 @pytest.mark.parametrize("points", [(), ((-50, 7),), ((-50, 7), (20, -3), (95, 4), (200, 9))])
-def test_a_part_s_clock_says_the_same_as_the_journal_s(points: mf.ClockPoints) -> None:
+def test_a_part_s_clock_says_the_same_as_the_journal_s(points: ClockPoints) -> None:
     times = np.arange(0, 91)
     part = mf.Part("j", "", "main", 1, 0, 9, 10, 0, 90, 0, 90, clock=points)
     assert (
