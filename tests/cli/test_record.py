@@ -121,6 +121,29 @@ def test_inputs_that_end_end_it(folder: Path, capsys: pytest.CaptureFixture[str]
     assert f"recorded 255 messages of 2 items in {folder / 'store'}" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(("service", "status"), [(False, 1), (True, 0)])
+def test_a_robot_that_was_off_is_no_failure_of_a_service(
+    folder: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    service: bool,
+    status: int,
+) -> None:
+    monkeypatch.delenv("NOTIFY_SOCKET", raising=False)
+    if service:
+        monkeypatch.setenv("NOTIFY_SOCKET", str(folder / "gone"))
+    (folder / "black_box.yaml").write_text("- zmq: {endpoint: tcp://127.0.0.1:1}\n")
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        assert main(["record", str(folder), "--for", "0.3", "--quiet"]) == status
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+    assert "warning: nothing was heard" in capsys.readouterr().err
+    assert main(["record", "--help"]) == 0
+    assert "1 nothing was heard" in " ".join(capsys.readouterr().out.split())
+
+
 def test_wrong_usage(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["record", str(folder / "nowhere")]) == 2
     assert "there is no folder or file" in capsys.readouterr().err

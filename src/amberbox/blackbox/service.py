@@ -28,6 +28,11 @@ def notify(message: str, environ: Mapping[str, str] = os.environ) -> bool:
     return True
 
 
+def is_service(environ: Mapping[str, str] = os.environ) -> bool:
+    """Tell whether a service manager started this process and listens to it."""
+    return bool(environ.get("NOTIFY_SOCKET"))
+
+
 def watchdog_s(environ: Mapping[str, str] = os.environ) -> float | None:
     """Return how long systemd waits for a sign of life before it kills; None if it does not."""
     if environ.get("WATCHDOG_PID", str(os.getpid())) != str(os.getpid()):
@@ -49,7 +54,7 @@ class Notifier:
     ) -> None:
         self._environ = environ
         self._monotonic = monotonic
-        self._listens = bool(environ.get("NOTIFY_SOCKET"))
+        self._listens = is_service(environ)
         self._period_s = (watchdog_s(environ) or 2 * _STATUS_S) / 2
         self._due = 0.0
         self._is_ready = False
