@@ -14,7 +14,10 @@ from rosbags.typesys import Stores, get_typestore
 
 import amberbox
 from amberbox.blackbox.exporting import ExportOptions, ExportReport, View, export
+from amberbox.blackbox.exporting.messages import MessageStream
 from amberbox.blackbox.exporting.ros1md5 import md5sum
+from amberbox.blackbox.follow.batching import Stream
+from amberbox.blackbox.query.catalogue import Catalogue
 from amberbox.core.errors import AmberboxError
 from amberbox.core.types import Schema, Topic
 from amberbox.testing.box import raw_messages
@@ -94,6 +97,40 @@ def test_what_cannot_be_in_a_bag_is_named(ros1_store: Path, tmp_path: Path) -> N
         run(tmp_path / "json", tmp_path / "json.bag")
     assert "its messages are json, not of ROS" in error.value.hint
     assert not list(tmp_path.glob("*.part")) and not (tmp_path / "json.bag").exists()
+
+
+@pytest.mark.parametrize("form", ["bag", "mcap"])
+def test_latched_messages_outlive_the_file_they_came_in(tmp_path: Path, form: str) -> None:
+    record_robot(tmp_path / "store", seconds=3, rotate_s=1).close()
+    first, second, *_ = sorted((tmp_path / "store" / "journal").glob("*.mcap"))
+    first.unlink()
+    record = amberbox.open(tmp_path / "store")
+    times = record.query("ros_text", ["received"]).values("received")
+    for window, count in ((None, None), 1), ((times[5], None), 0):
+        target = tmp_path / f"{count}.{form}"
+        report = export(record, View(windows=[window]), target, form)
+        assert report.counts.get("ros_map_name", 0) == count
+        found = amberbox.open(target).query("ros_map_name")
+        assert found.values("data") == ["hall"]
+
+
+def test_a_topic_that_begins_during_the_export_is_in_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    box = record_robot(tmp_path / "store", seconds=1)
+    late = Kind("std_msgs/msg/String")
+
+    def streams_and_one_more(self: MessageStream, catalogue: Catalogue) -> list[Stream]:
+        found = listed(self, catalogue)
+        box.hear(late.topic("/late"), late.encode("late"))
+        box.write()
+        return found
+
+    listed = MessageStream.streams
+    monkeypatch.setattr(MessageStream, "streams", streams_and_one_more)
+    report = run(tmp_path / "store", tmp_path / "out.bag")
+    box.close()
+    assert report.counts["ros_late"] == 1
 
 
 def test_both_versions_of_a_topic_are_one_connection(ros1_store: Path, tmp_path: Path) -> None:

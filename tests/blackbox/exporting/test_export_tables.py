@@ -262,6 +262,17 @@ def test_targets_that_cannot_be(filled: Path, tmp_path: Path) -> None:
     assert run(filled, tmp_path / "empty", "csv", items=["battery"]).total == 30
 
 
+def test_what_lies_beside_the_target_stays(filled: Path, tmp_path: Path) -> None:
+    (tmp_path / "out.part").mkdir()
+    (tmp_path / "out.part" / "mine.txt").write_text("mine")
+    (tmp_path / "one.csv.part").write_text("mine")
+    run(filled, tmp_path / "out", "csv")
+    run(filled, tmp_path / "one.csv", "csv", items=["battery"])
+    assert (tmp_path / "out.part" / "mine.txt").read_text() == "mine"
+    assert (tmp_path / "one.csv.part").read_text() == "mine"
+    assert len(list(tmp_path.glob("*.part"))) == 2
+
+
 @pytest.mark.parametrize("built", [True, False])
 def test_memory_does_not_grow_with_the_range(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, built: bool

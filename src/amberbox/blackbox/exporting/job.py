@@ -48,8 +48,7 @@ class Job:
 @contextmanager
 def new_file(target: Path) -> Iterator[Path]:
     """Give a path beside the target to write to; it becomes the target when all went well."""
-    part = target.with_name(f"{target.name}.part")
-    part.unlink(missing_ok=True)
+    part = _part_of(target)
     try:
         yield part
         with part.open("rb") as file:
@@ -68,8 +67,7 @@ def new_folder(target: Path) -> Iterator[Path]:
     """
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
         raise UsageError(f"{target} is there already", "choose a folder that does not exist yet")
-    part = target.with_name(f"{target.name}.part")
-    shutil.rmtree(part, ignore_errors=True)
+    part = _part_of(target)
     part.mkdir()
     try:
         yield part
@@ -79,6 +77,11 @@ def new_folder(target: Path) -> Iterator[Path]:
     except BaseException:
         shutil.rmtree(part, ignore_errors=True)
         raise
+
+
+def _part_of(target: Path) -> Path:
+    """Name what is written first; no other export and no file of the user has this name."""
+    return target.with_name(f"{target.name}.{os.getpid()}.part")
 
 
 def size_of(target: Path) -> int:

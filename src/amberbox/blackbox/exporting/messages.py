@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Container, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -73,11 +73,24 @@ class MessageStream:
     def streams(self, catalogue: Catalogue) -> list[Stream]:
         """List the streams that have messages, in the order they were first seen."""
         found: dict[Stream, None] = {}
+        existing = frozenset(catalogue.existing)
         for journal in catalogue.journals(skip=()):
-            for stream in journal.streams.values():
-                if self.wants(stream) and journal.items.get(stream.item):
-                    found[stream] = None
+            found |= dict.fromkeys(self.of(journal, existing).values())
         return list(found)
+
+    def of(self, journal: JournalFile, existing: Container[str]) -> dict[int, Stream]:
+        """Return the wanted streams of a file that have messages in it, by channel.
+
+        What latched topics had said is repeated at the start of each file; where the file before
+        is gone, this is all that is left of it.
+        """
+        stands_in = _is_first_left(journal, existing)
+        found = {
+            number: replace(stream, repeated=False) if stands_in else stream
+            for number, stream in journal.streams.items()
+            if journal.items.get(stream.item) or (stands_in and stream.repeated)
+        }
+        return {number: stream for number, stream in found.items() if self.wants(stream)}
 
     def read(self, looking: Looking, window: Window) -> Iterator[tuple[Messages, float]]:
         """Read the messages received in a window, in order; files that go meanwhile are named."""
@@ -113,9 +126,10 @@ class MessageStream:
     def _parts(
         self, looking: Looking, window: Window, places: dict[Stream, int]
     ) -> Iterator[Part[Messages]]:
+        existing = frozenset(looking.catalogue.existing)
         for journal in looking.catalogue.journals(skip=()):
-            numbers = {n: s for n, s in journal.streams.items() if self.wants(s)}
-            if not any(journal.items.get(stream.item) for stream in numbers.values()):
+            numbers = self.of(journal, existing)
+            if not numbers:
                 continue
             looking.tell_damage(journal)
             order = journal.run << 2 | _WRITERS.get(journal.writer, 3)
@@ -125,6 +139,12 @@ class MessageStream:
             for span in slices(journal, window):
                 load = partial(_load, looking, journal, table, places, order, span)
                 yield Part(span[0], load)
+
+
+def _is_first_left(journal: JournalFile, existing: Container[str]) -> bool:
+    """Tell whether the file before this one in the same run is gone."""
+    head, _, _ = journal.name.rpartition("-")
+    return journal.number > 0 and f"{head}-{journal.number - 1:04d}.mcap" not in existing
 
 
 _WRITERS = {"main": 0, "ring": 1, "watch": 2}

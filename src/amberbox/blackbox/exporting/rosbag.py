@@ -81,9 +81,9 @@ class _BagFile:
         self._connections: dict[Stream, Connection] = {}
 
     def write(self, messages: Messages) -> None:
-        ways = [self._ways.get(stream) for stream in messages.streams]
         used = [messages.streams[place] for place in np.unique(messages.stream).tolist()]
-        connections = {stream: self._connection(stream) for stream in used if self._ways[stream]}
+        connections = {stream: self._connection(stream) for stream in used if self._way(stream)}
+        ways = [self._ways.get(stream) for stream in messages.streams]
         targets = [connections.get(stream) for stream in messages.streams]
         rows = zip(
             messages.stream.tolist(), messages.received_ns.tolist(), messages.data, strict=True
@@ -96,6 +96,12 @@ class _BagFile:
                 self._writer.write(connection, received_ns, way.convert(data))
             except _conversion_errors() as error:
                 self._lost(messages.streams[place], error)
+
+    def _way(self, stream: Stream) -> _Way | None:
+        """Return how a stream gets into the bag, also one that began after the export."""
+        if stream not in self._ways:
+            self._ways[stream] = _way(self._job, stream)
+        return self._ways[stream]
 
     def _connection(self, stream: Stream) -> Connection:
         if stream not in self._connections:
