@@ -260,6 +260,7 @@ def test_the_unit_that_records_this_folder(folder: Path, host: Host) -> None:
     write(host, {
         "/etc/systemd/system/a.service": "[Service]\nExecStart=/usr/bin/true\n",
         "/etc/systemd/system/b.service": text.replace(str(folder), f"{folder}2"),
+        "/etc/systemd/system/c.service": text.replace(str(folder), f"/srv{folder}"),
     })  # fmt: skip
     assert find_unit(folder, host) is None
     write(host, {"/etc/systemd/system/box.service": text})

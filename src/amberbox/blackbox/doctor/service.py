@@ -78,8 +78,8 @@ def find_unit(folder: Path, host: Host) -> Unit | None:
     wanted = argument(folder.resolve()).replace("$", "$$")
     for path in sorted(units.glob("*.service")):
         text = host.text(f"{UNITS}/{path.name}")
-        command = re.search(r"^ExecStart=.*amberbox.* record (.*)$", text, re.M)
-        if command and command[1].endswith(wanted):
+        command = re.search(r"^ExecStart=.*amberbox.* record(.*)$", text, re.M)
+        if command and command[1].endswith(f" {wanted}"):
             watchdog = re.search(r"^WatchdogSec=(\S+)", text, re.M)
             enabled = any(units.glob(f"*.wants/{path.name}"))
             return Unit(path.name, enabled, watchdog[1] if watchdog else "")
