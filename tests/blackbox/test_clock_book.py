@@ -187,7 +187,7 @@ def test_boots_do_not_correct_each_other_but_a_wrong_order_is_told() -> None:
     clocks = [*good.clocks("0000000a", 1), *bad.clocks("0000000b", 2)]
     book = book_of(clocks)
     assert [book.boots[b].synchronised for b in ("0000000a", "0000000b")] == [True, False]
-    assert any("runs 2 came after runs 1" in note for note in book.notes)
+    assert any("run 2 came after run 1" in note for note in book.notes)
     assert book.boot_of(2) is book.boots["0000000b"]
 
 

@@ -133,7 +133,7 @@ class ClockBook:
     def notes(self) -> list[str]:
         """Say which times cannot be put right, and why."""
         found = [
-            f"runs {_listed(boot.runs)}: the clock was never synchronised; times are as it said"
+            f"{_listed(boot.runs)}: the clock was never synchronised; times are as it said"
             for boot in self.boots.values()
             if boot.synchronised is False
         ]
@@ -141,7 +141,7 @@ class ClockBook:
         for before, after in pairwise(ordered):
             if _end_ns(before) > _start_ns(after) and False in _flags(before, after):
                 found.append(
-                    f"runs {_listed(after.runs)} came after runs {_listed(before.runs)}, "
+                    f"{_listed(after.runs)} came after {_listed(before.runs)}, "
                     "but by their clocks they began before these ended"
                 )
         return found
@@ -257,4 +257,12 @@ def _end_ns(boot: BootClock) -> int:
 
 
 def _listed(runs: Sequence[int]) -> str:
-    return ", ".join(map(str, runs))
+    """Name runs in words; of many in a row only the first and the last."""
+    parts: list[list[int]] = []
+    for run in sorted(runs):
+        if parts and run == parts[-1][-1] + 1:
+            parts[-1].append(run)
+        else:
+            parts.append([run])
+    texts = [f"{p[0]} to {p[-1]}" if len(p) > 1 else f"{p[0]}" for p in parts]
+    return f"run{'s' * (len(runs) > 1)} {', '.join(texts)}"
