@@ -53,6 +53,16 @@ def test_the_first_value_heard_is_an_edge_if_it_is_true() -> None:
     assert edges(watched, 3) == [("started", 2.0)]
 
 
+def test_a_path_names_its_column_and_an_unknown_one_is_told_after_a_while() -> None:
+    watched = watch(fast="odom.twist.linear.x > 1", typo="odom.twits_linear_x > 1")
+    for start in (0, 40):
+        watched.add(batch("odom", [start, start + 20], twist_linear_x=np.array([0.0, 2.0])))
+        assert edges(watched, start + 20) == [("fast", start + 20.0)]
+        assert len(watched.problems) == (start > 0)
+    (told,) = watched.problems.values()
+    assert "has not come in 60 s of odom; did you mean 'twist_linear_x'?" in told
+
+
 def test_for_fires_between_samples() -> None:
     watched = watch(low="b.v < 20 for 2s")
     watched.add(batch("b", [1, 6], v=np.array([10.0, 10.0])))

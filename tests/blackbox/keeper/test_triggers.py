@@ -238,6 +238,7 @@ def test_what_keeps_a_trigger_from_working_is_told_and_others_go_on(tmp_path: Pa
         Trigger("torn", when="ros_count.data >"),
         Trigger("text", when="ros_count.data == 'x'"),
         Trigger("never", when="ros_cuont.data > 3"),
+        Trigger("strange", when="ros_count.dtaa > 3"),
         HIGH,
     )
     for _ in range(70):
@@ -250,8 +251,10 @@ def test_what_keeps_a_trigger_from_working_is_told_and_others_go_on(tmp_path: Pa
     assert [name for name, _ in kept.fired()] == ["high"]
     failed = sorted(kept.events("trigger_failed"))
     assert [text.split(":")[0] for text in failed] == [
-        "the trigger text", "the trigger torn is off",
+        "the trigger strange", "the trigger text", "the trigger torn is off",
     ]  # fmt: skip
+    assert "'ros_count.dtaa' has not come" in failed[0]
+    assert "did you mean 'data'?" in failed[0]
     (waits,) = kept.events("trigger_waits")
     assert "ros_cuont" in waits
     assert "did you mean 'ros_count'" in waits

@@ -13,10 +13,12 @@ from typing import Any
 import numpy as np
 
 from amberbox.core.clock import NS
+from amberbox.core.config import did_you_mean
 from amberbox.core.errors import AmberboxError, UsageError
 from amberbox.core.expression import Expression, Value
 from amberbox.core.expression_tree import Fault
 from amberbox.core.expression_values import element_of, values_of
+from amberbox.core.names import identifier
 from amberbox.core.types import Batch, IntArray
 
 TICK_NS = NS // 10
@@ -26,6 +28,8 @@ _TICKS = 36_000
 """So many of these instants are looked at together."""
 _SILENCE_NS = 7 * 86_400 * NS
 """A longer silence has no more of them: by then it is a leap of the clock."""
+_MISSING_NS = 60 * NS
+"""Fields of JSON may come later; a variable that has not come by then is told."""
 _LONG_AGO = -(1 << 62)
 
 
@@ -184,8 +188,11 @@ class _Samples:
     def __init__(self, address: str) -> None:
         self.address = address
         self.item, _, variable = address.partition(".")
-        self.variable, _, index = variable.partition("[")
+        path, _, index = variable.partition("[")
+        self.variable = identifier(path)
         self._index = int(index.rstrip("]")) if index else None
+        self._has_come = False
+        self._missing_since_ns: int | None = None
         self._times_ns: list[IntArray] = []
         self._values: list[Any] = []
 
@@ -196,6 +203,19 @@ class _Samples:
         values = values_of(column, 0) if index is None else element_of(column, index, 0)
         self._times_ns.append(times_ns)
         self._values.append(values.column())
+        self._miss(batch, times_ns)
+
+    def _miss(self, batch: Batch, times_ns: IntArray) -> None:
+        """Raise UsageError if the item has come for a while, and never with this variable."""
+        self._has_come = self._has_come or self.variable in batch.columns
+        if self._has_come or not len(times_ns):
+            return
+        if self._missing_since_ns is None:
+            self._missing_since_ns = int(times_ns[0])
+        lasted_ns = int(times_ns[-1]) - self._missing_since_ns
+        if lasted_ns >= _MISSING_NS:
+            hint = did_you_mean(self.variable, batch.columns)
+            raise UsageError(f"has not come in {lasted_ns / NS:.0f} s of {self.item}{hint}")
 
     def series(self) -> tuple[IntArray, Any]:
         """Return times and values so far."""
