@@ -41,6 +41,19 @@ def test_the_middle_is_left_out() -> None:
     assert max(map(len, lines)) <= 60
 
 
+def test_what_has_room_beside_a_wide_column_is_shown() -> None:
+    header, row = ["item", "rate", "first", "last", "size"], ["odom", 10.5, 10**25, 10**25, 7]
+    lines = grid(header, [row], room=Room(40)).splitlines()
+    assert lines[0].split() == ["item", "rate", "...", "size"]
+    assert lines[-1] == "3 of 5 columns"
+
+
+def test_texts_are_cut_no_more_than_needed_when_columns_go() -> None:
+    rows = [["a", *(10**20 for _ in range(4)), "the words of a warning"]]
+    lines = grid(["x", "b", "c", "d", "e", "text"], rows, room=Room(60)).splitlines()
+    assert lines[2].endswith("the words of a warning") and "..." in lines[2]
+
+
 def test_long_texts_are_cut_before_columns_go() -> None:
     rows = [["a long name that is needed", "x" * 40, 1.25, "y" * 15]]
     lines = grid(["item", "text", "number", "short"], rows, room=Room(70)).splitlines()

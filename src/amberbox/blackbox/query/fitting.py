@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -55,6 +55,16 @@ def fit(widths: Sequence[int], may_cut: Sequence[bool], room: int) -> Fit:
 
     Numbers and times are whole or absent: half of one would be another.
     """
+    shown, left = _outer(_narrowed(widths, may_cut, room), room)
+    if len(shown) < len(widths):
+        room -= len(GAP) + len(DOTS)
+    kept = _narrowed([widths[n] for n in shown], [may_cut[n] for n in shown], room)
+    narrower = dict(zip(shown, kept, strict=True))
+    return Fit([narrower.get(n, width) for n, width in enumerate(widths)], shown, left)
+
+
+def _narrowed(widths: Sequence[int], may_cut: Sequence[bool], room: int) -> list[int]:
+    """Take from the longest texts until a line has room, or they are as short as they may be."""
     narrower = list(widths)
     texts = [number for number, text in enumerate(may_cut) if text and number > 0]
     while total(narrower) > room:
@@ -62,7 +72,7 @@ def fit(widths: Sequence[int], may_cut: Sequence[bool], room: int) -> Fit:
         if not texts or narrower[widest] <= _NARROWEST:
             break
         narrower[widest] -= 1
-    return Fit(narrower, *_outer(narrower, room))
+    return narrower
 
 
 def total(widths: Sequence[int]) -> int:
@@ -74,19 +84,16 @@ def _outer(widths: Sequence[int], room: int) -> tuple[Sequence[int], int]:
     """Return the columns from both ends that have room, and how many of them are on the left."""
     if total(widths) <= room:
         return range(len(widths)), len(widths)
-    left: list[int] = []
-    right: list[int] = []
-    used = len(DOTS)
-    for number, is_left in _from_both_ends(len(widths)):
-        used += widths[number] + len(GAP)
-        if used > room and left:
-            break
-        (left if is_left else right).append(number)
-    return [*left, *reversed(right)], len(left)
-
-
-def _from_both_ends(count: int) -> Iterator[tuple[int, bool]]:
-    """Give 0, the last, 1, the one before the last, and so on."""
-    for number in range(count):
-        half, is_right = divmod(number, 2)
-        yield (count - 1 - half if is_right else half), not is_right
+    low, high = 1, len(widths)  # what lies between is left out
+    used = len(DOTS) + len(GAP) + widths[0]
+    sides = ["right", "left"]
+    while sides and low < high:
+        number = high - 1 if sides[0] == "right" else low
+        wanted = len(GAP) + widths[number]
+        if used + wanted > room:
+            sides.pop(0)  # the other side may have one that is narrower
+            continue
+        used += wanted
+        low, high = (low, number) if sides[0] == "right" else (number + 1, high)
+        sides.reverse()
+    return [*range(low), *range(high, len(widths))], low
