@@ -30,7 +30,7 @@ def test_keys_that_nobody_acts_on_yet_are_noted(tmp_path: Path) -> None:
     robot = "id: r1\nstore:\n  quota: 5 GB\n  write_s: 0.1\nserver: {url: https://fleet.example}\n"
     built = load_folder(folder(tmp_path, "- ros: {topics: [{name: /odom}]}\n", robot))
     notes = [(note.line, note.where) for note in built.notes]
-    assert notes == [(3, "store.quota"), (5, "server")]
+    assert notes == [(5, "server")]
     assert all("no effect in this version" in note.what for note in built.notes)
 
 
