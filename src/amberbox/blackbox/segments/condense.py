@@ -46,7 +46,8 @@ def condense(
 def _live_lines(known: Manifest) -> int:
     """Count about how many lines would be left; cheap, for it is asked often."""
     segments = sum(map(len, known.segments.values()))
-    return segments + len(known.journals) + len(known.sealed) + len(known.schemas)
+    others = (known.journals, known.sealed, known.schemas, known.incidents)
+    return segments + sum(map(len, others))
 
 
 def _beginning(known: Manifest, exists: Callable[[str], bool], sign: SignHead) -> Iterator[Record]:
@@ -72,7 +73,7 @@ def live_records(known: Manifest, exists: Callable[[str], bool]) -> Iterator[Rec
 
 
 def kept_records(known: Manifest, exists: Callable[[str], bool]) -> Iterator[Record]:
-    """Give what is said of journals: done, sealed, deleted, confirmed, signed."""
+    """Give what is said of journals and incidents: done, sealed, deleted, confirmed, signed."""
     alive = {name for name in known.sealed if exists(name) or name not in known.columns_gone}
     for sealed in known.sealed.values():
         if sealed.journal in alive:
@@ -81,6 +82,7 @@ def kept_records(known: Manifest, exists: Callable[[str], bool]) -> Iterator[Rec
         yield mf.journal_record(journal)
     for tombstone in joined(known.tombstones):
         yield to_record(tombstone)
+    yield from known.incidents.values()
     confirmed = tuple(sorted(n for n in known.confirmed if exists(n) or n in known.journals))
     if confirmed:
         yield confirmed_record(confirmed, "", 0)

@@ -142,7 +142,7 @@ class Manifest:
 
     ``columns_gone`` and ``raw_gone`` name the journals of which one or the other was deleted, as
     far as the manifest has not been condensed since; ``gone_segments`` are files that went thus.
-    ``lines`` is how many there are.
+    ``incidents`` is what was said last of each; ``lines`` is how many there are.
     """
 
     schemas: Mapping[str, TableSchema] = field(default_factory=dict)
@@ -159,6 +159,7 @@ class Manifest:
     raw_gone: frozenset[str] = frozenset()
     gone_segments: frozenset[str] = frozenset()
     lines: int = 0
+    incidents: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
     def complete(self, item: str, existing: Container[str] | None = None) -> frozenset[str]:
         """Return the journals whose rows of this item are all in segments.
@@ -198,6 +199,7 @@ class _State:
     columns_gone: set[str] = field(default_factory=set)
     raw_gone: set[str] = field(default_factory=set)
     gone_segments: set[str] = field(default_factory=set)
+    incidents: dict[str, Mapping[str, Any]] = field(default_factory=dict)
 
     def take(self, record: Mapping[str, Any]) -> None:
         """Add one record."""
@@ -213,6 +215,9 @@ class _State:
                 self.journals[record["journal"]] = _journal_from_json(record)
             case "confirmed":
                 self.confirmed.update(record["journals"])
+            case "incident":
+                said = {k: v for k, v in record.items() if k not in ("hash", "prev")}
+                self.incidents[record["incident"]["id"]] = said
             case text.CHECKPOINT:
                 self.columns_gone.update(record["columns_gone"])
             case _:
@@ -262,7 +267,7 @@ class _State:
             tuple(self.deletions), dict(self.sealed), tuple(self.tombstones),
             frozenset(self.confirmed), tuple(self.signatures), tuple(read.damage), read.last_hash,
             frozenset(self.columns_gone), frozenset(self.raw_gone), frozenset(self.gone_segments),
-            read.number,
+            read.number, dict(self.incidents),
         )  # fmt: skip
 
 
