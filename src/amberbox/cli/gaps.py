@@ -49,7 +49,12 @@ def _row(gap: Gap) -> tuple[str, ...]:
     seconds = f"{(gap.to_ns - gap.from_ns) / NS:.3f}"
     start, end = (format_time(time_ns)[:23] for time_ns in (gap.from_ns, gap.to_ns))
     count = "-" if gap.count is None else str(gap.count)
-    return start, end, seconds, gap.item or "all", count, gap.reason
+    return start, end, seconds, gap.item or _all(gap), count, gap.reason
+
+
+def _all(gap: Gap) -> str:
+    """Name the items of a journal: those of the keeping classes bulk and ring have their own."""
+    return f"all of {gap.writer}" if gap.writer in ("bulk", "ring") else "all"
 
 
 def _as_json(gap: Gap) -> dict[str, Any]:

@@ -17,7 +17,14 @@ from amberbox.blackbox.follow.chunkrows import (
     gap_records,
     runs_of_channel,
 )
-from amberbox.blackbox.follow.deleted import GoneJournal, GoneList, outline_of, rows_of_gone
+from amberbox.blackbox.follow.deleted import (
+    FORGOTTEN,
+    LOST,
+    GoneJournal,
+    GoneList,
+    outline_of,
+    rows_of_gone,
+)
 from amberbox.blackbox.follow.read import (
     JournalFile,
     files_of,
@@ -183,8 +190,9 @@ class WriterTail:
             start = self.last_ns if self.last_ns is not None else journal.start_ns
             gap = missing(journal, self.seq, first_seq, start, journal.start_ns or start)
             self.seq, self.ahead = first_seq, {}
+            reason = FORGOTTEN if self.writer == "ring" else LOST
             yield self._at(Gap(
-                gap.writer, run, gap.from_ns, gap.to_ns, "deleted or lost with its file",
+                gap.writer, run, gap.from_ns, gap.to_ns, reason,
                 count=gap.count, from_seq=gap.from_seq, to_seq=gap.to_seq,
             ))  # fmt: skip
 

@@ -10,7 +10,7 @@ from typing import Any
 import msgspec
 
 from amberbox.blackbox.journal import reserved
-from amberbox.blackbox.query.catalogue import look
+from amberbox.blackbox.query.catalogue import Catalogue, ask, look
 from amberbox.blackbox.query.clockbook import ClockBook
 from amberbox.blackbox.query.gather import Request, gather
 from amberbox.blackbox.query.tabletext import plain
@@ -127,7 +127,10 @@ def book_of_store(store: Path) -> ClockBook:
 
 def load(store: Path) -> list[Mission]:
     """Return all missions of a store in order of their start, with corrected times."""
-    catalogue = look(store, with_segments=can_build())
+    return ask(store, _load, with_segments=can_build())
+
+
+def _load(catalogue: Catalogue) -> list[Mission]:
     table = next((n for n, v in catalogue.schemas.items() if v[-1].topic == reserved.MISSION), None)
     if table is None:
         return []

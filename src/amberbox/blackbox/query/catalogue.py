@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Container, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Container, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
@@ -23,6 +24,9 @@ from amberbox.blackbox.segments.manifest import Manifest, Part, Segment
 from amberbox.blackbox.store import Store, open_store
 from amberbox.core.errors import AmberboxError, UsageError
 from amberbox.core.types import Column
+
+_ATTEMPTS = 5
+Answer = TypeVar("Answer")
 
 
 @dataclass(frozen=True)
@@ -104,8 +108,12 @@ class Catalogue:
         return chosen
 
     def still_holds(self) -> bool:
-        """Tell whether no journal went while the segments for it came."""
-        waiting = (name for name in self.existing if name not in self.manifest.journals)
+        """Tell whether no journal went while the segments for it came; the ring has none."""
+        waiting = (
+            name
+            for name in self.existing
+            if name not in self.manifest.journals and not name.startswith("ring/")
+        )
         store = open_store(self.store)
         return all(store.journal_path(name).exists() for name in waiting)
 
@@ -130,6 +138,24 @@ def look(store: Path, *, with_segments: bool = True) -> Catalogue:
     manifest = mf.read(store)
     book = book_of(_clocks(opened, manifest, existing))
     return Catalogue(store, corrected(manifest, book), with_segments, existing, book)
+
+
+def ask(
+    store: Path, question: Callable[[Catalogue], Answer], *, with_segments: bool = True
+) -> Answer:
+    """Answer from one look at a store; look again when files moved on meanwhile."""
+    for _ in range(_ATTEMPTS):
+        catalogue = look(store, with_segments=with_segments)
+        try:
+            answer = question(catalogue)
+        except FileNotFoundError:
+            continue
+        if catalogue.still_holds():
+            return answer
+    raise AmberboxError(
+        f"the files of {store} changed while they were being read",
+        "ask again, for a shorter range if it is a long one",
+    )
 
 
 def _clocks(store: Store, manifest: Manifest, existing: Sequence[str]) -> Iterator[JournalClock]:

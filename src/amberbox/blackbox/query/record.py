@@ -7,13 +7,13 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from amberbox.blackbox.journal import reserved
 from amberbox.blackbox.query import gaps as gap_list
-from amberbox.blackbox.query.catalogue import Catalogue, look
+from amberbox.blackbox.query.catalogue import Answer, Catalogue, ask
 from amberbox.blackbox.query.clockbook import ClockBook
 from amberbox.blackbox.query.downsample import downsample
 from amberbox.blackbox.query.gather import Merged, Request, gather, merge
@@ -25,7 +25,7 @@ from amberbox.blackbox.segments.build import can_build
 from amberbox.blackbox.segments.flat import TableSchema
 from amberbox.blackbox.store import is_store
 from amberbox.blackbox.where import store_path
-from amberbox.core.errors import AmberboxError, UsageError
+from amberbox.core.errors import UsageError
 from amberbox.core.timetext import parse_time
 from amberbox.core.types import Column, ColumnData, Gap, ItemSchema
 
@@ -34,7 +34,6 @@ if TYPE_CHECKING:
 
 By = Literal["received", "timestamp"]
 Time = int | str | None
-Answer = TypeVar("Answer")
 
 _KEYS = {
     "timestamp": "time",
@@ -42,7 +41,6 @@ _KEYS = {
     "seq": "int64",
     "parent_seq": "int64",
 }
-_ATTEMPTS = 3
 
 
 @dataclass(frozen=True)
@@ -152,19 +150,7 @@ class Record:
         return self.query(topics[reserved.EVENT], None, from_, to)
 
     def _ask(self, question: Callable[[Catalogue], Answer]) -> Answer:
-        """Answer from one look at the store; look again when files moved on meanwhile."""
-        for _ in range(_ATTEMPTS):
-            catalogue = look(self.path, with_segments=can_build())
-            try:
-                answer = question(catalogue)
-            except FileNotFoundError:
-                continue
-            if catalogue.still_holds():
-                return answer
-        raise AmberboxError(
-            f"the files of {self.path} changed while they were being read",
-            "ask again, for a shorter range if it is a long one",
-        )
+        return ask(self.path, question, with_segments=can_build())
 
 
 def open(where: str | Path) -> Record:
