@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import random
+import signal
 import subprocess
 import sys
 import threading
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,16 +21,17 @@ from amberbox.blackbox import requests
 from amberbox.blackbox.follow.follow import follow
 from amberbox.blackbox.incidents import Incident, Wish, advance, pin
 from amberbox.blackbox.incidents.incident import load, save
-from amberbox.blackbox.keeper import confirm
+from amberbox.blackbox.keeper import allowance, confirm
 from amberbox.blackbox.keeper import keeper as module
 from amberbox.blackbox.keeper.keeper import Keeper
 from amberbox.blackbox.keeper.options import KeeperOptions, Lifetime
 from amberbox.blackbox.keeper.usage import DiskUse
 from amberbox.blackbox.query import record
 from amberbox.blackbox.recorder.pipeline import PipelineOptions
+from amberbox.blackbox.recorder.room import Room
 from amberbox.blackbox.segments import manifest as mf
 from amberbox.blackbox.segments.build import can_build
-from amberbox.blackbox.store import WriterLock, is_locked, open_store
+from amberbox.blackbox.store import WriterLock, open_store
 from amberbox.core.clock import NS
 from amberbox.core.types import Batch, Schema, Topic
 from amberbox.testing import ManualClock
@@ -43,8 +47,9 @@ def blob(size: int, source: random.Random = random.Random(7)) -> bytes:  # noqa:
     return size.to_bytes(4, "little") + source.randbytes(size)
 
 
-def box_at(path: Path, rotate_bytes: int = 15_000) -> ManualBox:
-    return ManualBox(path, options=PipelineOptions(rotate_bytes=rotate_bytes, rotate_ns=600 * NS))
+def box_at(path: Path, rotate_bytes: int = 15_000, room: Room | None = None) -> ManualBox:
+    options = PipelineOptions(rotate_bytes=rotate_bytes, rotate_ns=600 * NS)
+    return ManualBox(path, options=options, room=room)
 
 
 def keep(box: ManualBox, options: KeeperOptions = OPTIONS) -> None:
@@ -93,31 +98,44 @@ def test_weeks_offline_leave_the_newest_day_all_incidents_and_all_events(tmp_pat
     assert events(path, "deleted")
 
 
-def test_a_fast_recorder_never_takes_more_than_the_quota_and_a_segment(tmp_path: Path) -> None:
+@pytest.mark.parametrize("stopped", [False, True], ids=["keeper runs", "keeper is stopped"])
+def test_a_fast_recorder_never_takes_more_than_the_quota_and_a_segment(
+    tmp_path: Path, stopped: bool
+) -> None:
     rotate_bytes, quota = 1_000_000, 8_000_000
     options = KeeperOptions(quota=quota, min_free=0, keep_min_s=0.0, headroom=rotate_bytes)
-    box = box_at(tmp_path / "store", rotate_bytes)
-    command = [sys.executable, "-m", "amberbox.blackbox.keeper", str(box.store)]
-    keeper = subprocess.Popen([*command, "--options", options.to_json()])
+    box = box_at(tmp_path / "store", rotate_bytes, Room(tmp_path / "store", 0))
     over = threading.Event()
-    try:
-        while not is_locked(open_store(box.store), "keeper"):
-            assert keeper.poll() is None
-            time.sleep(0.01)
-        writer = threading.Thread(target=record_fast, args=(box, 12_000_000, over))
+    with keeper_process(box.store, options) as keeper:
+        if stopped:
+            keeper.send_signal(signal.SIGSTOP)
+        writer = threading.Thread(target=record_fast, args=(box, 11_000_000, over))
         writer.start()
         most, use = 0, DiskUse(box.store)
         while not over.wait(0.01):
             most = max(most, use.measure())
         writer.join()
-    finally:
-        over.set()
-        keeper.terminate()
-        keeper.wait(20)
+        keeper.send_signal(signal.SIGCONT)
     box.close()
     assert quota / 2 < most <= quota + rotate_bytes
-    assert mf.read(box.store).tombstones
+    assert events(box.store, "events_only") if stopped else mf.read(box.store).tombstones
     assert len(amberbox.open(box.store).query("ros_count")) > 0
+
+
+@contextmanager
+def keeper_process(path: Path, options: KeeperOptions) -> Iterator[subprocess.Popen[bytes]]:
+    """Run a real keeper on a store, from its first statement of the room that is left."""
+    command = [sys.executable, "-m", "amberbox.blackbox.keeper", str(path)]
+    keeper = subprocess.Popen([*command, "--options", options.to_json()])
+    try:
+        while allowance.read(path / allowance.NAME) is None:
+            assert keeper.poll() is None
+            time.sleep(0.01)
+        yield keeper
+    finally:
+        keeper.send_signal(signal.SIGCONT)
+        keeper.terminate()
+        keeper.wait(20)
 
 
 def record_fast(box: ManualBox, size: int, over: threading.Event) -> None:

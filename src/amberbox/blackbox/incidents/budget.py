@@ -10,8 +10,9 @@ from pathlib import Path
 from amberbox.blackbox.follow.follow import RECORDED
 from amberbox.blackbox.incidents.extent import extent
 from amberbox.blackbox.incidents.incident import RING, Incident, folder_of, load_all
+from amberbox.blackbox.keeper.limit import quota_bytes
 from amberbox.blackbox.keeper.options import KeeperOptions
-from amberbox.blackbox.keeper.usage import bytes_of, total_bytes
+from amberbox.blackbox.keeper.usage import bytes_of
 from amberbox.blackbox.segments import manifest
 from amberbox.blackbox.segments.manifest import Part
 from amberbox.blackbox.store import Store
@@ -42,9 +43,7 @@ def held_bytes(store: Store, incidents: Iterable[Incident]) -> int:
 
 def allowed_bytes(store: Store, options: KeeperOptions) -> int:
     """Return how much incidents may hold."""
-    share = total_bytes(store.path) * options.quota_percent / 100
-    limit = share if options.quota is None else min(share, options.quota)
-    return int(options.incident_share * limit)
+    return int(options.incident_share * quota_bytes(store, options))
 
 
 def pinned_journals(store: Store) -> frozenset[str]:

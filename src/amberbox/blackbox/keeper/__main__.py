@@ -18,7 +18,7 @@ from amberbox.blackbox.store import open_store
 from amberbox.core.errors import UsageError
 
 PERIOD_S = 2.0
-BREATH_S = 0.1
+_PAUSE_S = 0.2
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -32,8 +32,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     stop = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: stop.set())
-    os.nice(10)
-    _load_ahead()
     try:
         store = open_store(options.store)
         lock = wait_for_lock(store, PATIENCE_S if options.parent else 0.0, stop)
@@ -41,8 +39,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"amberbox keeper: {error}", file=sys.stderr)
         return error.exit_code
     keeper = Keeper(store, KeeperOptions.from_json(options.options))
+    keeper.mind_room()  # at normal priority: what follows is about this thread only
+    os.nice(10)
+    _load_ahead()
     keeper.step(stop)
-    while not options.once and _pause(keeper, stop, options.parent):
+    while not options.once and _pause(stop, options.parent):
         keeper.step(stop)
     keeper.close()
     lock.release()
@@ -50,18 +51,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _load_ahead() -> None:
-    """Load what takes a second before there is a store to mind, not amid it."""
+    """Load what takes a second before anything is to be built, not amid it."""
     if can_build():
         import pyarrow.parquet  # noqa: F401  # only to have it loaded
 
 
-def _pause(keeper: Keeper, stop: threading.Event, parent: int) -> bool:
-    """Wait for the next step, minding the room that is left; False when it is time to go."""
+def _pause(stop: threading.Event, parent: int) -> bool:
+    """Wait for the next step; False when it is time to go."""
     end_s = time.monotonic() + PERIOD_S
     while time.monotonic() < end_s:
-        if stop.wait(BREATH_S) or (parent and os.getppid() != parent):
+        if stop.wait(_PAUSE_S) or (parent and os.getppid() != parent):
             return False
-        keeper.breathe()
     return True
 
 

@@ -32,7 +32,8 @@ def confirm(store: Store, journals: Sequence[str], by: str) -> None:
 
 def enter(store: Store, journals: Sequence[str], by: str) -> None:
     """Append the confirmation to the manifest; only who holds the keeper's lock may."""
-    new = tuple(name for name in journals if name not in mf.read(store.path).confirmed)
+    known = mf.read(store.path).confirmed
+    new = tuple(name for name in journals if name not in known)
     if new:
         mf.append(store.path, [confirmed_record(new, by, time.time_ns())])
 

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 
+from amberbox.blackbox.keeper import allowance
+from amberbox.blackbox.keeper.allowance import Statement
 from amberbox.blackbox.keeper.deletion import Removal, Unit, Window, for_room, too_old, unpinned
 from amberbox.blackbox.keeper.deletionlog import DeletionLog
 from amberbox.blackbox.keeper.holding import is_needed, pinning, release_confirmed
@@ -33,7 +35,7 @@ _MANIFEST_SHARE = 20
 class Deleter:
     """Deletes in one store; ``pending`` tells which journals will still have columns.
 
-    ``busy`` is the journal that is being read just now and stays for so long.
+    Any thread may make room; whoever deletes, or looks at what there is, holds ``mf.CHANGING``.
     """
 
     def __init__(
@@ -45,7 +47,6 @@ class Deleter:
     ) -> None:
         self.use = DiskUse(store.path)
         self.stock = Stock(store, self.use)
-        self.busy = ""
         self._store = store
         self._options = options
         self._journal = journal
@@ -56,15 +57,54 @@ class Deleter:
         self._log = DeletionLog()
         self._looked_s = 0.0
         self._in_vain_s = 0.0
+        self._busy = ""
+        self._expected = 0
+        self._stated: tuple[int, int] | None = None
         self._trouble = ""
 
     def recover(self) -> None:
         """Finish what a keeper before has begun to delete."""
-        self._remover.finish()
+        with mf.CHANGING:
+            self._remover.finish()
 
     def measure(self) -> Room:
-        """Return how much the store takes and may take now."""
-        return room(self._store, self._options, self.use.measure())
+        """Return how much the store takes and may take now, and tell the recorder."""
+        with mf.CHANGING:
+            looked_ns = time.monotonic_ns()
+            now = room(self._store, self._options, self.use.measure(), self._expected)
+            self._state(now, looked_ns)
+            return now
+
+    def _state(self, now: Room, looked_ns: int) -> None:
+        stated = now.left, now.headroom // 2
+        if stated != self._stated:
+            with suppress(OSError):  # then the recorder goes by the statement before
+                allowance.state(self._store.path, Statement(*stated, looked_ns))
+                self._stated = stated
+
+    @contextmanager
+    def expecting(self, size: int, busy: str = "") -> Iterator[bool]:
+        """Hold room free for what is about to be written; tells whether there is any.
+
+        Journal ``busy`` is being read meanwhile and stays.
+        """
+        with mf.CHANGING:
+            self._expected, self._busy = size, busy
+            self.make_room()
+        try:
+            yield not self.is_full
+        finally:
+            self._expected, self._busy = 0, ""
+
+    @property
+    def is_full(self) -> bool:
+        """Tell whether nothing but events is recorded for want of room."""
+        return self._full.is_set
+
+    def sealed(self, writer: str) -> list[str]:
+        """Name a writer's journal files that nobody writes, in order."""
+        with mf.CHANGING:
+            return self.stock.sealed(writer)
 
     def breathe(self) -> None:
         """See to the room that is left, but not more often than needed."""
@@ -76,10 +116,11 @@ class Deleter:
     def make_room(self, *, patient: bool = False) -> None:
         """Delete until there is room again; where nothing may go, say that the store is full."""
         try:
-            left = self.measure()
-            if left.needed > 0 and not patient:
-                left = self._delete_for(left)
-            self._mark(left)
+            with mf.CHANGING:
+                left = self.measure()
+                if left.needed > 0 and not patient:
+                    left = self._delete_for(left)
+                self._mark(left)
         except OSError as error:  # a disk in trouble: the next look may find it better
             self._complain(f"cannot delete: {error.strerror or error}")
 
@@ -102,20 +143,23 @@ class Deleter:
         return self._remove(for_room(units, needed_bytes, self._options)[:_BATCH], windows)
 
     def _free(self, units: Sequence[Unit]) -> list[Unit]:
-        return unpinned((u for u in units if u.name != self.busy), pinning(self._store))
+        return unpinned((u for u in units if u.name != self._busy), pinning(self._store))
 
     def expire(self) -> None:
         """Delete what has outlived its lifetime."""
         lifetime = self._options.lifetime
         if lifetime.raw_s is None and lifetime.columns_s is None:
             return
-        known = mf.read(self._store.path)
-        windows = self.stock.windows(known)
-        units = self.stock.units(known, windows, self._pending)
-        chosen = too_old(self._free(units), self._options)
-        for start in range(0, len(chosen), _BATCH):
-            self._remove(chosen[start : start + _BATCH], windows)
+        while self._expire_some() == _BATCH:
             self.breathe()
+
+    def _expire_some(self) -> int:
+        with mf.CHANGING:
+            known = mf.read(self._store.path)
+            windows = self.stock.windows(known)
+            units = self.stock.units(known, windows, self._pending)
+            chosen = too_old(self._free(units), self._options)[:_BATCH]
+            return self._remove(chosen, windows)
 
     def _remove(self, chosen: Sequence[Removal], windows: Mapping[str, Window]) -> int:
         gone = self._remover.remove(chosen, windows)
@@ -125,23 +169,29 @@ class Deleter:
 
     def trim_ring(self) -> None:
         """Delete ring files that ended longer ago than the ring is long."""
-        for window, age_s in self.stock.ring():
+        with mf.CHANGING:
+            ring = self.stock.ring()
+        for window, age_s in ring:
             path = self._store.path / window.name
             if age_s > self._options.ring_s and path.exists():
-                with pin_lock(self._store):
+                with mf.CHANGING, pin_lock(self._store):
                     if not is_needed(self._store, window, path):
                         path.unlink(missing_ok=True)
 
     def condense(self, sign: SignHead) -> None:
         """Write the manifest anew when most of it is about what is long gone."""
+        with mf.CHANGING:
+            self._condense(sign)
+
+    def _condense(self, sign: SignHead) -> None:
         large = min(LARGE_BYTES, self.measure().limit // _MANIFEST_SHARE)
         condense(self._store.path, lambda name: (self._store.path / name).exists(), sign, large)
 
     def report(self, *, now: bool = False) -> None:
         """Write down what was deleted since the last time."""
-        records = self._log.due(now=now)
-        if records:
-            with suppress(OSError):  # it stays due
+        with mf.CHANGING, suppress(OSError):  # it stays due
+            records = self._log.due(now=now)
+            if records:
                 with_reserve(self._store, lambda: self._journal.write(records))
                 self._log.forget()
 

@@ -19,6 +19,7 @@ from amberbox.blackbox.keeper.deleter import Deleter
 from amberbox.blackbox.keeper.notary import Notary
 from amberbox.blackbox.keeper.options import KeeperOptions
 from amberbox.blackbox.keeper.ownjournal import OwnJournal
+from amberbox.blackbox.keeper.roomthread import RoomThread
 from amberbox.blackbox.segments import manifest
 from amberbox.blackbox.segments.build import (
     build_segments,
@@ -60,19 +61,24 @@ class Keeper:
         self._incidents = _incidents(store, self._options, self.journal)
         self._missions = _missions(store, self._options, self.journal)
         self._recovered = False
+        self._room: RoomThread | None = None
+
+    def mind_room(self) -> None:
+        """Make room in a thread of its own from now on, whatever else there is to do."""
+        self._room = RoomThread(self._deleter.breathe)
 
     def step(self, stop: threading.Event) -> None:
         """Do everything once: what others ask for, segments, deletion, accounts."""
         self._recover()
         self._incidents.step()  # what is pinned now is not deleted below
         self._missions.step()
-        self._deleter.make_room()
+        self._make_room()
         confirm.take_requests(self._store)
         self.build(stop)
         self._deleter.trim_ring()
         self._deleter.expire()
         self._drop_gone()
-        self._deleter.make_room()
+        self._make_room()
         self._deleter.condense(self._notary.signature_of)
         self._deleter.report()
         self._notary.sign()
@@ -83,12 +89,19 @@ class Keeper:
             with suppress(OSError):  # no room for it just now
                 drop_gone(self._store.path, self.breathe)
 
+    def _make_room(self) -> None:
+        if self._room is None:
+            self._deleter.make_room()
+
     def breathe(self) -> None:
-        """See to the room that is left; to be called often during long work."""
-        self._deleter.breathe()
+        """See to the room that is left, where no thread does; to be called often in long work."""
+        if self._room is None:
+            self._deleter.breathe()
 
     def close(self) -> None:
         """Write down what is left to say, finish the keeper's own journals."""
+        if self._room is not None:
+            self._room.stop()
         self._incidents.close()
         self._missions.close()
         self._deleter.close()
@@ -112,7 +125,7 @@ class Keeper:
             return
         built = 0
         for name in self._to_build():
-            if stop.is_set():
+            if stop.is_set() or self._deleter.is_full:
                 return
             built += self._build_one(name)
         if built:
@@ -125,7 +138,7 @@ class Keeper:
 
     def _to_build(self) -> list[str]:
         done = manifest.read(self._store.path).journals
-        names = [name for writer in _BUILT for name in self._deleter.stock.sealed(writer)]
+        names = [name for writer in _BUILT for name in self._deleter.sealed(writer)]
         return [name for name in names if name not in done and self._is_pending(name)]
 
     def _is_pending(self, name: str) -> bool:
@@ -134,21 +147,23 @@ class Keeper:
         return self._with_segments and name not in self._refused and name not in columns_gone
 
     def _build_one(self, name: str) -> int:
-        self._deleter.busy = name
+        size = self._deleter.stock.bytes_of(name)
         try:
-            journal = journal_file(self._store.path / name, name)
-            if not journal.rows:
-                self._refused.add(name)
-                return 0
-            build_segments(self._store.path, journal, self.breathe)
+            with self._deleter.expecting(size, busy=name) as has_room:
+                return has_room and self._build_from(name)
         except FileNotFoundError:  # deleted for room meanwhile
             return 0
         except Exception as error:  # whatever it is: the other journals go on
             self._refused.add(name)  # its rows stay readable in the journal
             print(f"amberbox keeper: {name}: no segments: {error}", file=sys.stderr)
             return 0
-        finally:
-            self._deleter.busy = ""
+
+    def _build_from(self, name: str) -> int:
+        journal = journal_file(self._store.path / name, name)
+        if not journal.rows:
+            self._refused.add(name)
+            return 0
+        build_segments(self._store.path, journal, self.breathe)
         return 1
 
 

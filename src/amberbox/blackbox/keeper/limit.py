@@ -39,19 +39,32 @@ class Room:
         return self.used + self.headroom - self.limit
 
     @property
+    def left(self) -> int:
+        """Bytes that may still be written."""
+        return self.limit - self.used
+
+    @property
     def is_full(self) -> bool:
         """Tell whether even half of what is held free is in use."""
         return self.used + self.headroom // 2 > self.limit
 
 
-def room(store: Store, options: KeeperOptions, used: int) -> Room:
-    """Compare what a store takes with its quota and with what must stay free beside it."""
-    partition = total_bytes(store.path)
-    quota = options.quota
-    if quota is None:
-        quota = int(partition * options.quota_percent / 100)
-    limit = max(0, min(quota, used + free_bytes(store.path) - options.min_free))
-    return Room(used, limit, min(_GROWING * options.headroom, limit // _SHARE))
+def quota_bytes(store: Store, options: KeeperOptions) -> int:
+    """Return the most that a store may take: its quota, or a share of the partition without one."""
+    if options.quota is not None:
+        return options.quota
+    return int(total_bytes(store.path) * options.quota_percent / 100)
+
+
+def room(store: Store, options: KeeperOptions, used: int, expected: int = 0) -> Room:
+    """Compare what a store takes with its quota and with what must stay free beside it.
+
+    ``expected`` are bytes that the keeper is about to write itself.
+    """
+    free = free_bytes(store.path) - options.min_free
+    limit = max(0, min(quota_bytes(store, options), used + free))
+    headroom = min(_GROWING * options.headroom + expected, limit // _SHARE)
+    return Room(used, limit, headroom)
 
 
 class FullMark:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -33,7 +34,7 @@ class Progress:
 class OwnJournal:
     """Appends records of the box's own to a writer's journal, durable when ``write`` returns.
 
-    The first write begins a run and its file. Not thread-safe: one owner, who holds the lock.
+    The first write begins a run and its file. One owner, who holds the store's lock; any thread.
     """
 
     def __init__(
@@ -54,6 +55,7 @@ class OwnJournal:
         self._chain = chain
         self._writer: JournalWriter | None = None
         self._channels: dict[str, int] = {}
+        self._lock = threading.Lock()
 
     def now_ns(self) -> int:
         """Log time of a record that is written now."""
@@ -64,6 +66,10 @@ class OwnJournal:
 
         Raises OSError when the disk does not take them.
         """
+        with self._lock:
+            self._write(records, progress)
+
+    def _write(self, records: Sequence[Record], progress: Progress | None) -> None:
         writer = self._opened()
         rows = [(topic, msgspec.json.encode(values)) for topic, values in records]
         if progress is not None:
@@ -83,9 +89,10 @@ class OwnJournal:
 
     def close(self) -> None:
         """Finish the file, if one was begun."""
-        if self._writer is not None:
-            self._writer.close()
-            self._writer = None
+        with self._lock:
+            if self._writer is not None:
+                self._writer.close()
+                self._writer = None
 
     def _opened(self) -> JournalWriter:
         if self._writer is None:

@@ -43,9 +43,10 @@ def seal_journals(
         if stop():
             break
         sealed = _seal(store, path, warn)
-        if sealed is not None:
-            mf.append(store.path, [to_record(sealed)])
-            done.append(sealed)
+        with mf.CHANGING:
+            if sealed is not None and path.exists():  # else it was deleted meanwhile
+                mf.append(store.path, [to_record(sealed)])
+                done.append(sealed)
     if done:
         sign_manifest(store, key)
     return done

@@ -111,13 +111,14 @@ def sign_manifest(
 
     With ``again`` what is signed already is signed once more, as by a new key.
     """
-    last = _last_line(store.path / mf.NAME)
-    if key is None or not last or (b',"kind":"signed",' in last and not again):
-        return False
-    at_ns = time.time_ns() if now_ns is None else now_ns
-    signature = signature_of(store, key, mf.read(store.path).last_hash, at_ns)
-    mf.append(store.path, [to_record(signature)])
-    return True
+    with mf.CHANGING:
+        last = _last_line(store.path / mf.NAME)
+        if key is None or not last or (b',"kind":"signed",' in last and not again):
+            return False
+        at_ns = time.time_ns() if now_ns is None else now_ns
+        signature = signature_of(store, key, mf.read(store.path).last_hash, at_ns)
+        mf.append(store.path, [to_record(signature)])
+        return True
 
 
 def _last_line(path: Path) -> bytes:

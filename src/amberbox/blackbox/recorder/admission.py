@@ -39,9 +39,9 @@ class Admission:
     _account_pause_ns: int = ACCOUNT_NS[0]
     _ends: bool = False
 
-    def put_off(self, taken: list[Message]) -> list[Message]:
+    def put_off(self, taken: list[Message], written_bytes: int) -> list[Message]:
         """Look for room; without any, let messages of files wait, and return the others."""
-        self.room.look()
+        self.room.look(written_bytes, self.intake.size_bytes)
         self.say()
         if not self.room.reason or self._ends:
             return taken

@@ -169,7 +169,7 @@ class Pipeline:
         """Write what has come since the last tick; when the disk refuses, keep it and say so."""
         taken = self.intake.take()
         if self._admission is not None:
-            taken = self._admission.put_off(taken)
+            taken = self._admission.put_off(taken, self.bytes_written)
         now_ns = self._advance(taken)
         self._watch_clock(now_ns)
         kept = rate_limited(taken, self._last_tick_ns, now_ns)

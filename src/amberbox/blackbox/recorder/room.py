@@ -7,11 +7,14 @@ import time
 from contextlib import suppress
 from pathlib import Path
 
+from amberbox.blackbox.keeper.allowance import Allowance
+
 RESERVE = "reserve"
 """File in the store that holds room free for the last events."""
 FULL = "full"
 """File in the store by which the keeper says, and why, that nothing more may be recorded."""
 DISK_FULL = "disk full"
+USED_UP = "the room is used up that the keeper had stated"
 SPARE_BYTES = 4_000_000
 """Room beside the reserve without which recording would stop again at once."""
 _PAUSE_S = 10.0
@@ -35,6 +38,7 @@ class Room:
         self._path = store / RESERVE
         self._wanted_bytes = reserve_bytes
         self._not_before_s = 0.0
+        self._allowance = Allowance(store)
 
     @property
     def spared_bytes(self) -> int:
@@ -52,12 +56,23 @@ class Room:
         if short > 0 and not self.reason and not self.trouble:
             self.trouble = "too little room is free"
 
-    def look(self) -> None:
-        """See whether there is room again, or none any more."""
+    def look(self, written_bytes: int = 0, coming_bytes: int = 0) -> None:
+        """See whether there is room again, or none any more, for what comes next.
+
+        ``written_bytes`` is what this run has written so far.
+        """
+        left = self._allowance.left_bytes(written_bytes)
         if self._wanted_bytes:
-            self._refill()
+            self._refill(left)
         given_up = self._wanted_bytes > 0 and self._size() == 0
-        self.reason = DISK_FULL if given_up else self._forbidden()
+        is_used_up = left is not None and left < self._least_bytes(coming_bytes)
+        self.reason = DISK_FULL if given_up else self._forbidden() or USED_UP * is_used_up
+
+    def _least_bytes(self, coming_bytes: int) -> int:
+        """How much must be left by the keeper's word; more than that to begin again."""
+        if self.reason != USED_UP:
+            return coming_bytes
+        return max(coming_bytes, self._allowance.enough_bytes)
 
     def release(self) -> bool:
         """Give the reserve up for the last events; False if there is none left to give."""
@@ -76,9 +91,11 @@ class Room:
         if free is not None and free < _TIGHT_BYTES:
             self.release()
 
-    def _refill(self) -> None:
+    def _refill(self, left_bytes: int | None) -> None:
         """Make the reserve whole as soon as there is room for it and some more."""
         size = self._size() or 0
+        if left_bytes is not None and left_bytes < self._wanted_bytes - size:
+            return
         if size >= self._wanted_bytes or time.monotonic() < self._not_before_s:
             return
         free = free_bytes(self._store)

@@ -222,14 +222,15 @@ def merge_small(store: Path, breathe: Callable[[], None] = _no_pause) -> list[Se
         known = mf.read(store)
         whole = [s for s in known.segments.get(item, ()) if not is_partly_gone(s, known)]
         for group in _small_groups(whole):
-            merged.append(_merge(store, known.schemas[group[0].schema], group))
+            with suppress(FileNotFoundError):  # deleted for room meanwhile
+                merged += _merge(store, known.schemas[group[0].schema], group)
     return merged
 
 
 def is_partly_gone(segment: Segment, known: mf.Manifest) -> bool:
     """Tell whether a segment only waits for the last of its journals to go; kept ones never do."""
-    kept = mf.is_kept(known.schemas[segment.schema])
-    return not kept and any(part.journal in known.columns_gone for part in segment.parts)
+    gone = any(part.journal in known.columns_gone for part in segment.parts)
+    return gone and not is_kept_segment(segment, known)
 
 
 def _small_groups(segments: Sequence[Segment]) -> Iterator[list[Segment]]:
@@ -258,7 +259,7 @@ def _may_follow(group: Sequence[Segment], segment: Segment) -> bool:
     return same and last.to_ns < first.from_ns and size < _MERGED_BYTES
 
 
-def _merge(store: Path, schema: TableSchema, group: Sequence[Segment]) -> Segment:
+def _merge(store: Path, schema: TableSchema, group: Sequence[Segment]) -> list[Segment]:
     first = Path(group[0].path)
     stem = first.stem.partition("+")[0]
     count = sum(map(_journal_count, group))
@@ -271,11 +272,28 @@ def _merge(store: Path, schema: TableSchema, group: Sequence[Segment]) -> Segmen
         segment = file.finish([part for member in group for part in member.parts])
     finally:
         file.discard()
-    replaced = [member.path for member in group]
-    mf.append(store, [mf.segment_record(segment, replaced)])
-    for path in replaced:
-        (store / path).unlink(missing_ok=True)
-    return segment
+    return [segment] if put_in_place_of(store, segment, group) else []
+
+
+def put_in_place_of(store: Path, segment: Segment, before: Sequence[Segment]) -> bool:
+    """Enter a segment for others and delete these; not if one of them was deleted meanwhile."""
+    paths = [one.path for one in before]
+    with mf.CHANGING:
+        known = mf.read(store)
+        named = {part.journal for part in segment.parts}
+        is_late = not known.gone_segments.isdisjoint(paths)
+        if is_late or not (known.columns_gone.isdisjoint(named) or is_kept_segment(segment, known)):
+            (store / segment.path).unlink(missing_ok=True)
+            return False
+        mf.append(store, [mf.segment_record(segment, paths)])
+        for path in paths:
+            (store / path).unlink(missing_ok=True)
+    return True
+
+
+def is_kept_segment(segment: Segment, known: mf.Manifest) -> bool:
+    """Tell whether a segment stays when the data around it go."""
+    return mf.is_kept(known.schemas[segment.schema])
 
 
 def _journal_count(segment: Segment) -> int:

@@ -33,6 +33,11 @@ def condense(
     size = path.stat().st_size if path.exists() else 0
     if size <= large_bytes:
         return False
+    with mf.CHANGING:
+        return _condense(store, exists, sign, size)
+
+
+def _condense(store: Path, exists: Callable[[str], bool], sign: SignHead, size: int) -> bool:
     known = mf.read(store)
     if known.lines < _WORTH * _live_lines(known):
         return False

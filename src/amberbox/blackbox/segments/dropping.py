@@ -3,10 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 from amberbox.blackbox.segments import manifest as mf
-from amberbox.blackbox.segments.build import group_starts, is_partly_gone, segment_path
+from amberbox.blackbox.segments.build import (
+    group_starts,
+    is_partly_gone,
+    put_in_place_of,
+    segment_path,
+)
 from amberbox.blackbox.segments.flat import Flat
 from amberbox.blackbox.segments.manifest import Part, Segment
 from amberbox.blackbox.segments.parquet import TableFile, read_segment
@@ -20,12 +26,12 @@ def drop_gone(store: Path, breathe: Callable[[], None]) -> int:
         known = mf.read(store)
         for segment in known.segments.get(item, ()):
             if is_partly_gone(segment, known):
-                _rewrite(store, known, segment)
-                count += 1
+                with suppress(FileNotFoundError):  # deleted for room meanwhile
+                    count += _rewrite(store, known, segment)
     return count
 
 
-def _rewrite(store: Path, known: mf.Manifest, segment: Segment) -> None:
+def _rewrite(store: Path, known: mf.Manifest, segment: Segment) -> bool:
     """Replace a segment by its rows of the journals that still have columns."""
     schema = known.schemas[segment.schema]
     parts = [part for part in segment.parts if part.journal not in known.columns_gone]
@@ -38,8 +44,7 @@ def _rewrite(store: Path, known: mf.Manifest, segment: Segment) -> None:
         rest = file.finish(parts)
     finally:
         file.discard()
-    mf.append(store, [mf.segment_record(rest, [segment.path])])
-    (store / segment.path).unlink(missing_ok=True)
+    return put_in_place_of(store, rest, [segment])
 
 
 def _is_of(flat: Flat, parts: Sequence[Part]) -> bool:

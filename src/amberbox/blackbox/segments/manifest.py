@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from bisect import bisect_left, bisect_right
 from collections import Counter
 from collections.abc import Container, Iterable, Mapping, Sequence
@@ -20,6 +21,8 @@ from amberbox.blackbox.store import sync_folder
 from amberbox.core.types import Gap
 
 NAME = "manifest"
+CHANGING = threading.RLock()
+"""Held by the thread of the keeper that appends to the manifest or deletes what it names."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -342,8 +345,9 @@ def append(store: Path, records: Sequence[Mapping[str, Any]]) -> None:
 
     Raises OSError when the disk does not take them: the manifest is then as it was before.
     """
-    content = text.encode(records, read(store).last_hash)
-    text.append_durably(store / NAME, content)
+    with CHANGING:
+        content = text.encode(records, read(store).last_hash)
+        text.append_durably(store / NAME, content)
 
 
 def replace(
