@@ -16,6 +16,7 @@ from amberbox.blackbox.incidents import (
     Refusal,
     Wish,
     advance,
+    budget,
     held_bytes,
     load,
     load_all,
@@ -24,9 +25,12 @@ from amberbox.blackbox.incidents import (
     release,
 )
 from amberbox.blackbox.incidents import incident as incident_file
+from amberbox.blackbox.incidents.budget import held_files
+from amberbox.blackbox.incidents.extent import Extent, extent
 from amberbox.blackbox.incidents.timeline import look_back
 from amberbox.blackbox.incidents.window import windows_of
 from amberbox.blackbox.keeper.incidents import IncidentKeeping
+from amberbox.blackbox.keeper.notary import Notary
 from amberbox.blackbox.keeper.options import KeeperOptions
 from amberbox.blackbox.keeper.ownjournal import OwnJournal
 from amberbox.blackbox.recorder.pipeline import PipelineOptions
@@ -359,3 +363,62 @@ def test_a_file_that_cannot_be_read_is_told_of_and_stops_nothing(tmp_path: Path)
     kinds = [record["kind"] for record in own_records(box.store, "amberbox/event")]
     assert kinds.count("incident_unreadable") == 1
     box.close()
+
+
+def test_a_damaged_file_holds_what_the_manifest_says_of_it(tmp_path: Path) -> None:
+    box = box_at(tmp_path / "store")
+    store = open_store(box.store)
+    pass_time(box, 5)
+    made = pinned(store, Wish(2, 3, "bump", "me", key="k"))
+    keeper, journal = keeping(box)
+    keeper.step()
+    (store.path / "incidents" / made.id / incident_file.FILE).write_text("{")
+    (known,) = load_all(store)
+    assert known.state == "open" and known.reasons == made.reasons
+    assert (known.spans, known.since, known.after_ns) == (made.spans, made.since, made.after_ns)
+    pass_time(box, 5, 50)
+    keeper.step()
+    journal.close()
+    assert [incident.state for incident in load_all(store)] == ["complete"]
+    assert not incident_file.unreadable(store)
+    box.close()
+
+
+@pytest.mark.parametrize("before", [float("inf"), float("nan"), -1.0])
+def test_a_request_for_no_window_is_refused_and_stops_nothing(
+    tmp_path: Path, before: float
+) -> None:
+    box = box_at(tmp_path / "store")
+    store = open_store(box.store)
+    pass_time(box, 2)
+    requests.submit(store, "incident", {"before_s": before, "reason": "odd"})
+    keeper, journal = keeping(box)
+    keeper.step()
+    journal.close()
+    kinds = [record["kind"] for record in own_records(box.store, "amberbox/event")]
+    assert kinds.count("incident_refused") == 1
+    assert requests.pending(store) == [] and load_all(store) == []
+    with pytest.raises(UsageError, match="shorter than nothing"):
+        amberbox.mark(store.path, before_s=before)
+    box.close()
+
+
+def test_few_of_many_journals_are_opened_to_pin(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    box = box_at(tmp_path / "store")
+    pass_time(box, 60)
+    box.close()
+    store = open_store(box.store)
+    Notary(store).close()
+    looked: list[Path] = []
+
+    def look(path: Path) -> Extent | None:
+        looked.append(path)
+        return extent(path)
+
+    monkeypatch.setattr(budget, "extent", look)
+    made = pinned(store, Wish(5, 0))
+    held = {path for path in held_files(store, [made]) if path.parent.name == "journal"}
+    journals = {path for path in looked if path.parent.name == "journal"}
+    assert held and held <= journals and len(journals) <= len(held) + 1 < 5

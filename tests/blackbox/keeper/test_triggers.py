@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 from pathlib import Path
 
 import pytest
@@ -11,9 +12,11 @@ from amberbox.blackbox.keeper import firing
 from amberbox.blackbox.keeper.incidents import IncidentKeeping
 from amberbox.blackbox.keeper.options import KeeperOptions, Trigger
 from amberbox.blackbox.keeper.ownjournal import OwnJournal, last_progress
+from amberbox.blackbox.keeper.pins import Pins
 from amberbox.blackbox.recorder.pipeline import PipelineOptions
 from amberbox.blackbox.store import open_store
 from amberbox.core.clock import NS
+from amberbox.core.errors import UsageError
 from amberbox.core.source import TopicOptions
 from amberbox.core.types import Batch, IntArray
 from amberbox.testing.box import COUNT, ManualBox, number, own_records
@@ -289,4 +292,45 @@ def test_without_triggers_nothing_is_read(tmp_path: Path, monkeypatch: pytest.Mo
     kept.step()
     kept.work.close()
     assert not (box.store / "keep").exists()
+    box.close()
+
+
+def test_a_firing_that_a_disk_refused_is_not_forgotten_at_the_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    box = box_at(tmp_path / "store")
+    kept = Kept(box, HIGH)
+    hear(box, 2, 1)
+    kept.step()
+    hear(box, 5, 200)
+    with monkeypatch.context() as patched:
+        patched.setattr(Pins, "fire", _full)
+        kept.step()
+        kept.work.close()
+    kept.killed()
+    kept.step()
+    assert kept.fired() == [("high", 4.0)]
+    box.close()
+
+
+def _full(*_: object) -> None:
+    raise OSError(errno.ENOSPC, "No space left on device")
+
+
+def test_a_window_that_is_gone_stops_no_trigger(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    box = box_at(tmp_path / "store")
+    kept = Kept(box, HIGH)
+    hear(box, 5, 200)
+
+    def gone(*_: object) -> None:
+        raise UsageError("nothing has been recorded")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Pins, "fire", gone)
+        kept.step()
+    kept.step()
+    assert kept.fired() == []
+    assert "nothing has been recorded" in kept.events("incident_refused")[0]
     box.close()

@@ -14,6 +14,7 @@ from amberbox.blackbox.keeper.limit import quota_bytes
 from amberbox.blackbox.keeper.options import KeeperOptions
 from amberbox.blackbox.keeper.usage import bytes_of
 from amberbox.blackbox.segments import manifest
+from amberbox.blackbox.segments.entries import Sealed
 from amberbox.blackbox.segments.manifest import Part
 from amberbox.blackbox.store import Store
 
@@ -81,10 +82,18 @@ def _copies(store: Store, incidents: Sequence[Incident]) -> Iterator[Path]:
 def _journals(
     store: Store, incidents: Sequence[Incident], writers: Sequence[str] = _RAW
 ) -> Iterator[Path]:
-    for writer in writers:
+    sealed = manifest.read(store.path).sealed if incidents else {}
+    for writer in writers if incidents else ():
         for path in store.folder(writer).glob("*.mcap"):
-            if _is_held(path, incidents):
+            entry = sealed.get(f"{path.parent.name}/{path.name}")
+            if (entry is None or _may_be_held(entry, incidents)) and _is_held(path, incidents):
                 yield path
+
+
+def _may_be_held(entry: Sealed, incidents: Sequence[Incident]) -> bool:
+    """Judge a journal by what the manifest says, so that few of thousands have to be opened."""
+    run, start_ns, end_ns = entry.run, entry.start_ns, entry.end_ns
+    return any(incident.holds_received(run, start_ns, end_ns) for incident in incidents)
 
 
 def _is_held(path: Path, incidents: Sequence[Incident]) -> bool:

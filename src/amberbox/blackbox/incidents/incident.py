@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -12,6 +12,7 @@ from typing import Any, Literal, NamedTuple
 
 import msgspec
 
+from amberbox.blackbox.segments import manifest
 from amberbox.blackbox.store import INCIDENTS, Store, replace_file
 from amberbox.core.clock import NS
 from amberbox.core.config import did_you_mean
@@ -123,9 +124,12 @@ class Incident:
             return False
         if self.state == "open" and run > self.since.run:
             return True
-        low_ns, high_ns = from_ns - _SLEW_NS, to_ns + _SLEW_NS
-        spans = [replace(s, to_ns=1 << 62) if self._grows(s) else s for s in self.spans]
-        return any(s.meets(run, low_ns - s.offset_ns, high_ns - s.offset_ns) for s in spans)
+        return any(
+            span.run == run
+            and span.from_ns + span.offset_ns <= to_ns + _SLEW_NS
+            and (span.to_ns + span.offset_ns >= from_ns - _SLEW_NS or self._grows(span))
+            for span in self.spans
+        )
 
     def _grows(self, span: Span) -> bool:
         return self.state == "open" and span is self.spans[-1]
@@ -158,9 +162,9 @@ def folder_of(store: Store, incident_id: str) -> Path:
 def load_all(store: Store) -> list[Incident]:
     """Return the incidents of a store, released ones included, in order of their windows.
 
-    A file that cannot be read holds no window, but what was copied for it stays.
+    Where a file cannot be read, what the manifest says of its incident holds.
     """
-    read = (_read(path) for path in _files(store))
+    read = (_read(path) or _registered(store, path.parent.name) for path in _files(store))
     found = [incident for incident in read if incident is not None]
     return sorted(found, key=lambda incident: (incident.from_ns, incident.id))
 
@@ -186,6 +190,56 @@ def _decoded(path: Path, _mtime_ns: int, _inode: int) -> Incident | None:
     with suppress(msgspec.MsgspecError):
         return msgspec.json.decode(path.read_bytes(), type=Incident)
     return None
+
+
+def _registered(store: Store, incident_id: str) -> Incident | None:
+    """Read what the keeper has written down of an incident; None if it has not yet."""
+    line = manifest.read(store.path).incidents.get(incident_id)
+    with suppress(KeyError, TypeError, IndexError):
+        return None if line is None else from_line(line)
+    return None
+
+
+def to_line(incident: Incident, at_ns: int) -> dict[str, Any]:
+    """Return what the manifest says of an incident."""
+    about = {
+        "id": incident.id,
+        "state": incident.state,
+        "reason": incident.text,
+        "who": incident.who,
+        "trigger": incident.trigger,
+        "from_ns": incident.from_ns,
+        "to_ns": incident.to_ns,
+    }
+    return {
+        "kind": "incident",
+        "incident": about,
+        "spans": [[s.run, s.from_ns, s.to_ns, s.offset_ns] for s in incident.spans],
+        "reasons": [[r.at_ns, r.text, r.who, r.trigger, r.key] for r in incident.reasons],
+        "since": list(incident.since),
+        "after_ns": incident.after_ns,
+        "versions": incident.versions,
+        "made_ns": incident.made_ns,
+        "at_ns": at_ns,
+    }
+
+
+def from_line(line: Mapping[str, Any]) -> Incident:
+    """Read what ``to_line`` returned."""
+    about = line["incident"]
+    return Incident(
+        id=about["id"],
+        reasons=tuple(Reason(*reason) for reason in line["reasons"]),
+        from_ns=about["from_ns"],
+        to_ns=about["to_ns"],
+        made_ns=line["made_ns"],
+        versions=dict(line["versions"]),
+        spans=tuple(Span(*span) for span in line["spans"]),
+        since=At(*line["since"]),
+        after_ns=line["after_ns"],
+        state=about["state"],
+        told=about["state"],
+    )
 
 
 def load(store: Store, incident_id: str) -> Incident:

@@ -14,7 +14,7 @@ from amberbox.blackbox.keeper.options import KeeperOptions
 from amberbox.blackbox.requests import submit
 from amberbox.blackbox.store import is_store, open_store
 from amberbox.blackbox.where import store_path
-from amberbox.core.errors import AmberboxError, ConfigurationError, UsageError
+from amberbox.core.errors import AmberboxError, ConfigurationError
 
 
 def mark(
@@ -31,8 +31,6 @@ def mark(
     It is pinned when this returns, also while neither recorder nor keeper run. Raises UsageError
     if there is no record at ``where``, AmberboxError if incidents hold as much as they may.
     """
-    if before_s < 0 or after_s < 0:
-        raise UsageError("a window cannot be shorter than nothing", "before 60s, after 20s")
     store = open_store(store_path(where))
     wish = Wish(before_s, after_s, reason, who or user(), trigger)
     done = pin(store, wish, options_of(where))

@@ -6,6 +6,7 @@ Any process may do it at any time, also while recorder or keeper are dead.
 from __future__ import annotations
 
 import hashlib
+import math
 import os
 import shutil
 import time
@@ -49,7 +50,10 @@ from amberbox.core.errors import UsageError
 
 @dataclass(frozen=True, slots=True)
 class Wish:
-    """A window somebody wants: around a moment of the record, its end where none is given."""
+    """A window somebody wants: around a moment of the record, its end where none is given.
+
+    Raises UsageError for one that has no length.
+    """
 
     before_s: float
     after_s: float
@@ -58,6 +62,10 @@ class Wish:
     trigger: str = ""
     at: At | None = None
     key: str = ""
+
+    def __post_init__(self) -> None:
+        if not (0 <= self.before_s < math.inf and 0 <= self.after_s < math.inf):
+            raise UsageError("a window cannot be shorter than nothing", "before 60s, after 20s")
 
 
 def pin(store: Store, wish: Wish, options: KeeperOptions) -> Incident | Refusal:

@@ -17,6 +17,7 @@ from amberbox.blackbox.incidents.incident import (
     folder_of,
     load_all,
     save,
+    to_line,
     triggered,
     unreadable,
 )
@@ -97,7 +98,7 @@ class Pins:
             after_s = float(values.get("after_s", 20.0))
             trigger, at = str(values.get("trigger", "")), self._moment(request)
             self.fire(Wish(before_s, after_s, reason, who, trigger, at, request.path.stem))
-        except (TypeError, ValueError, UsageError) as error:
+        except (TypeError, ValueError, OverflowError, UsageError) as error:
             text = f"an incident was asked for that cannot be made: {error}"
             self._write([event("incident_refused", text, reason=reason)])
 
@@ -124,8 +125,8 @@ class Pins:
         """Write an incident's state down for good, then note that this was done."""
         if incident.told == incident.state:
             return
-        self._write([(reserved.INCIDENT, _record(incident)), _event(incident)])
-        line = _line(incident, self._journal.now_ns())
+        line = to_line(incident, self._journal.now_ns())
+        self._write([(reserved.INCIDENT, line["incident"]), _event(incident)])
         with_reserve(self._store, lambda: manifest.append(self._store.path, [line]))
         with pin_lock(self._store):
             now = {other.id: other for other in load_all(self._store)}.get(incident.id)
@@ -146,18 +147,6 @@ class Pins:
             with_reserve(self._store, lambda: self._journal.write(records))
 
 
-def _record(incident: Incident) -> dict[str, object]:
-    return {
-        "id": incident.id,
-        "state": incident.state,
-        "reason": incident.text,
-        "who": incident.who,
-        "trigger": incident.trigger,
-        "from_ns": incident.from_ns,
-        "to_ns": incident.to_ns,
-    }
-
-
 _KINDS = {"open": "incident", "complete": "incident_complete", "released": "incident_released"}
 
 
@@ -168,11 +157,3 @@ def _event(incident: Incident) -> Record:
         trigger=incident.trigger, from_ns=incident.from_ns, to_ns=incident.to_ns,
         versions=incident.versions,
     )  # fmt: skip
-
-
-def _line(incident: Incident, at_ns: int) -> dict[str, object]:
-    """Return what the manifest says of an incident."""
-    spans = [[span.run, span.from_ns, span.to_ns] for span in incident.spans]
-    reasons = [[r.at_ns, r.text, r.who, r.trigger] for r in incident.reasons]
-    return {"kind": KIND, "incident": _record(incident), "spans": spans, "reasons": reasons,
-            "versions": incident.versions, "at_ns": at_ns}  # fmt: skip

@@ -6,7 +6,7 @@ Where the keeper died it goes on where it was; a firing that has been taken coun
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 
@@ -31,7 +31,7 @@ from amberbox.blackbox.query.catalogue import look
 from amberbox.blackbox.store import Store
 from amberbox.core.clock import NS
 from amberbox.core.config import did_you_mean
-from amberbox.core.errors import AmberboxError
+from amberbox.core.errors import AmberboxError, UsageError
 from amberbox.core.types import Cursor
 
 READER = "triggers"
@@ -64,6 +64,7 @@ class Triggers:
         self._pins = pins
         self._told: set[str] = set()
         self._pending: list[tuple[Wish, float]] = []
+        self._untold: list[Record] = []
         self._triggers = [trigger for trigger in options.triggers if self._is_sound(trigger)]
         self._watches: list[_Watch] = []
         self._run = -1
@@ -86,25 +87,36 @@ class Triggers:
                 self._begin(part, is_last=part is parts[-1])
             fired = self._firings(part)
             self._pending += [(_wish(t, firing, part), t.hold_off_s) for t, firing in fired]
-            self._tell(self._troubles(part))
+            self._untold += self._troubles(part)
         fired_any = bool(self._pending)
-        while self._pending:  # what a full disk did not take is tried again at the next step
-            self._pins.fire(*self._pending[0])
-            self._pending.pop(0)
+        self._settle()
         if parts:
             self._last = parts[-1]
             self._note(parts[-1], at_once=fired_any)
 
     def close(self) -> None:
-        """Write down how far was read."""
-        if self._last is not None and self._reading.cursor() != self._noted:
-            self._note(self._last, at_once=True)
+        """Write down how far was read, unless a firing waits that shall be found again then."""
+        if self._last is None or self._pending or self._reading.cursor() == self._noted:
+            return
+        self._note(self._last, at_once=True)
+
+    def _settle(self) -> None:
+        """Pin and tell; what a full disk does not take is tried again at the next step."""
+        while self._pending:
+            try:
+                self._pins.fire(*self._pending[0])
+            except UsageError as error:  # what it is about is gone already
+                self._untold.append(_refused(self._pending[0][0], error))
+            self._pending.pop(0)
+        if self._untold:
+            self._journal.write(self._untold)
+            self._untold = []
 
     def _is_sound(self, trigger: Trigger) -> bool:
         try:
             watcher_of(trigger)
         except AmberboxError as error:
-            self._tell([_off(trigger, error.what)])
+            self._untold.append(_off(trigger, error.what))
             return False
         return True
 
@@ -124,7 +136,7 @@ class Triggers:
         if self._resume is None:
             return part.until_ns - _FIRST_NS if is_last else part.until_ns
         if part.run == self._resume.run:
-            return part.axis.time_of(self._resume.log_ns)
+            return part.left_ns(self._resume.log_ns)
         return 0 if part.run > self._resume.run else part.until_ns
 
     def _firings(self, part: RunPart) -> list[tuple[Trigger, Firing]]:
@@ -150,7 +162,7 @@ class Triggers:
     def _disable(self, watch: _Watch, why: str) -> None:
         self._watches.remove(watch)
         self._triggers.remove(watch.trigger)
-        self._tell([_off(watch.trigger, why)])
+        self._untold.append(_off(watch.trigger, why))
 
     def _troubles(self, part: RunPart) -> Iterator[Record]:
         """Tell once what keeps a trigger from firing: a wrong type, an item that does not come."""
@@ -176,11 +188,6 @@ class Triggers:
             text += did_you_mean(item, known)
             yield event("trigger_waits", text, name, item=item)
 
-    def _tell(self, records: Sequence[Record] | Iterator[Record]) -> None:
-        records = list(records)
-        if records:
-            self._journal.write(records)
-
     def _note(self, part: RunPart, *, at_once: bool) -> None:
         """Write down how far was read: with each firing, and now and then."""
         cursor = self._reading.cursor()
@@ -194,6 +201,11 @@ class Triggers:
 
 def _about(name: str, problem: str) -> str:
     return f"the trigger {name}: {_first_line(problem)}"
+
+
+def _refused(wish: Wish, error: UsageError) -> Record:
+    text = f"{wish.trigger} fired and nothing was pinned: {error.what}"
+    return event("incident_refused", text, wish.trigger, trigger=wish.trigger, why=error.what)
 
 
 def _off(trigger: Trigger, why: str) -> Record:
