@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import random
 import threading
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import zip_longest
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import msgspec
 import pytest
@@ -26,6 +28,7 @@ from amberbox.blackbox.requests import submit
 from amberbox.blackbox.store import WriterLock, create_store, open_store
 from amberbox.core.clock import NS
 from amberbox.core.errors import AmberboxError, UsageError
+from amberbox.core.source import TopicOptions
 from amberbox.core.types import Topic
 from amberbox.testing.box import ManualBox
 from amberbox.testing.clock import ManualClock
@@ -183,6 +186,96 @@ def test_the_keeper_looks_after_missions(tmp_path: Path) -> None:
     assert [m.outcome for m in robot.missions] == ["DONE"]
     keeper.close()
     robot.box.close()
+
+
+# -- whatever dies and begins again
+
+
+@dataclass
+class MortalRobot(Robot):
+    """A robot whose recorder and keeper die at any moment; ``told`` is what the truth is."""
+
+    keep: Literal["all", "ring"] = "all"
+    rotate_ns: int = 600 * NS
+    told: list[tuple[int, str]] = field(default_factory=list)
+
+    def _new_box(self) -> ManualBox:
+        options = PipelineOptions(boot_id=BOOT[:8], rotate_ns=self.rotate_ns)
+        topics = [TopicOptions("/task", keep=self.keep)]
+        return ManualBox(self.store, topics, clock=self.clock, options=options)
+
+    def live(self, rnd: random.Random) -> None:
+        keeper: MissionKeeper | None = None
+        for _ in range(rnd.randint(3, 25)):
+            match rnd.choice([*"hhhhhhsssdd", "restart", "crash", "quiet"]):
+                case "h":
+                    self.hear(rnd.choice(["STARTED", "STARTED", "DONE", "IDLE"]))
+                    self.box.write(rnd.choice([0.1, 1.0]))
+                case "s":
+                    keeper = keeper or self._new_keeper()
+                    keeper.step()
+                case "d":
+                    keeper = _die(keeper, clean=rnd.random() < 0.3)
+                case "quiet":
+                    for _ in range(rnd.randint(1, 8)):
+                        self.box.write(1.0)
+                case end:
+                    self.box.close() if end == "restart" else self.box.crash()
+                    self.clock.advance(rnd.choice([0.5, 30]))
+                    self.box = self._new_box()
+        self.box.close()
+        for _ in range(2):
+            keeper = keeper or self._new_keeper()
+            keeper.step()
+            keeper = _die(keeper, clean=rnd.random() < 0.5)
+
+    def hear(self, state: str) -> None:
+        self.told.append((self.clock.wall, state))
+        self.box.hear(TASK, msgspec.json.encode({"state": state, "goal": ""}))
+
+    @property
+    def truth(self) -> list[tuple[int, int | None]]:
+        edges, before = [], "IDLE"
+        for at_ns, state in self.told:
+            if (state == "STARTED") != (before == "STARTED"):
+                edges.append(at_ns)
+            before = state
+        return list(zip_longest(edges[::2], edges[1::2]))
+
+
+def _die(keeper: MissionKeeper | None, *, clean: bool) -> MissionKeeper | None:
+    if keeper is not None and clean:
+        keeper.close()
+    return None
+
+
+@pytest.mark.parametrize("keep", ["all", "ring"])
+@pytest.mark.parametrize("seed", range(2))
+def test_missions_are_told_once_whatever_dies(
+    tmp_path: Path, seed: int, keep: Literal["all", "ring"]
+) -> None:
+    for number in range(5 * seed, 5 * seed + 5):
+        rnd = random.Random(number)
+        rotate_ns = rnd.choice([2 * NS, 600 * NS])
+        robot = MortalRobot(tmp_path / f"store{number}", keep=keep, rotate_ns=rotate_ns)
+        robot.live(rnd)
+        found = robot.missions
+        assert [(m.from_ns, m.to_ns) for m in found] == robot.truth, number
+        told = len(found) + sum(m.to_ns is not None for m in found)
+        assert not told or len(Record(robot.store).query("amberbox_mission")) == told, number
+
+
+def test_a_keeper_that_begins_amid_steps_of_the_clock_goes_on_where_it_was(robot: Robot) -> None:
+    robot.tell("STARTED", 2)
+    robot.clock.step(-3.0)
+    robot.tell("STARTED", 1)
+    robot.keeper.close()
+    robot.keeper = robot._new_keeper()
+    robot.clock.step(3.0)
+    robot.tell("DONE")
+    robot.tell("STARTED")
+    robot.tell("DONE")
+    assert [mission.outcome for mission in robot.missions] == ["DONE", "DONE"]
 
 
 # -- by hand

@@ -128,8 +128,9 @@ class _Follower:
     def __init__(self, store: Store, rules: Sequence[MissionRule]) -> None:
         self._conditions = conditions_of(rules)
         self.problems = self._conditions.problems
-        self._before = last_progress(store, "keep", READER)
-        cursor = self._before.cursor if self._before else None
+        before = last_progress(store, "keep", READER)
+        self._left = msgspec.json.decode(before.state or "{}") if before else {}
+        cursor = before.cursor if before else None
         look_back_s = (self._conditions.history_ns + _LOOK_BACK_NS) / NS if cursor else 0.0
         self._reading = Reading(store, self._conditions.items, cursor, look_back_s)
         self._run: int | None = None
@@ -142,6 +143,8 @@ class _Follower:
         changed: list[Mission] = []
         parts = self._reading.step()
         for part in parts:
+            if self._is_done(part):
+                continue
             until_ns = part.until_ns - (part is parts[-1])  # more may come of the very instant
             self._enter(part)
             for batch, times_ns in part.batches:
@@ -161,17 +164,19 @@ class _Follower:
         state = {"run": run, "log_ns": log_ns, "true": self._conditions.true}
         return Progress(self._reading.cursor(), READER, msgspec.json.encode(state).decode())
 
+    def _is_done(self, part: RunPart) -> bool:
+        """Tell whether a run came before the one in which this was left: it is read again."""
+        return self._run is None and part.run < self._left.get("run", 0)
+
     def _enter(self, part: RunPart) -> None:
         if part.run == self._run:
             return
         if self._run is not None:
             self._conditions.begin_anew()
-        elif self._before is not None:
-            state = msgspec.json.decode(self._before.state or "{}")
-            if state.get("run") == part.run:
-                self._conditions.resume(state["true"], part.axis.time_of(state["log_ns"]))
-            else:
-                self._conditions.resume(state.get("true", ()))
+        elif self._left.get("run") == part.run:
+            self._conditions.resume(self._left["true"], part.left_ns(self._left["log_ns"]))
+        else:
+            self._conditions.resume(self._left.get("true", ()))
         self._run = part.run
 
 

@@ -13,7 +13,7 @@ from amberbox.blackbox.follow.follow import RECORDED
 from amberbox.blackbox.follow.tail import WriterTail, position_at
 from amberbox.blackbox.incidents.incident import At
 from amberbox.blackbox.journal import reserved
-from amberbox.blackbox.journal.head import read_head
+from amberbox.blackbox.journal.head import Head, read_head
 from amberbox.blackbox.store import Store
 from amberbox.core.clock import NS
 from amberbox.core.names import identifier
@@ -84,10 +84,21 @@ class RunPart:
     axis: Axis
     batches: list[tuple[Batch, IntArray]] = field(default_factory=list)
     until_ns: int = 0
+    known: int = 1
+    """So many stretches of log time had begun where the reading goes on."""
+
+    def left_ns(self, log_ns: int) -> int:
+        """Return the time of the log time at which the reading was left."""
+        return log_ns + (self.axis.shifts[self.known - 1] if self.axis.shifts else 0)
 
     def moment(self, time_ns: int) -> At:
         """Return the moment of the record at a time of the axis."""
         return At(self.run, self.axis.log_of(time_ns))
+
+    def reach(self, log_ns: int | None) -> None:
+        """Take note that everything has come up to a log time, the newest of the run."""
+        if log_ns is not None:
+            self.until_ns = max(self.until_ns, self.axis.time_of(log_ns))
 
 
 class Reading:
@@ -117,8 +128,10 @@ class Reading:
             return []
         parts = list(self._main(self._tails["main"]))
         for writer, tail in self._tails.items():
-            if writer != "main":
+            if writer != "main" and parts:
                 _sort_in(parts, writer, tail)
+        for part in parts[:-1]:  # what other journals have to the end of a run counts, too
+            part.until_ns = max([part.until_ns, *(int(times[-1]) for _, times in part.batches)])
         return parts
 
     def cursor(self) -> Cursor:
@@ -129,6 +142,8 @@ class Reading:
         """Read the main journal, which says when runs and stretches of log time begin."""
         head = read_head(self._store.folder("main"))
         part = self._part
+        if part is None and tail.run:  # read on amid a run, which need have nothing of ours here
+            part = self._part = RunPart(tail.run, Axis())
         if part is not None:
             part.batches = []
         for delivery in tail.step():
@@ -136,24 +151,35 @@ class Reading:
                 continue
             if part is None or part.run != delivery.run:
                 if part is not None:
+                    part.reach(tail.last_ns)
                     yield part
                 part = self._part = RunPart(delivery.run, Axis())
             self._take(part, delivery, tail.last_ns)
         if part is not None:
-            told = head is not None and (head.run, head.next_seq) == (part.run, tail.seq)
-            last_ns = tail.last_ns or 0
-            end_ns = max(head.watermark_ns, last_ns) if head is not None and told else last_ns
-            part.until_ns = max(part.until_ns, part.axis.time_of(end_ns))
+            part.reach(_complete_ns(part, head, tail))
             yield part
 
     def _take(self, part: RunPart, batch: Batch, last_ns: int | None) -> None:
         first_ns = int(batch.log_time_ns[0])
-        if batch.item == _RUN or not part.axis.starts:
-            part.axis.begin(first_ns, last_ns)
+        part.axis.begin(first_ns, last_ns if batch.item == _RUN else None)
+        left = self._from.get("main")
+        if left is not None and (batch.run, int(batch.seq[0])) < (left.run, left.seq):
+            part.known = len(part.axis.starts)
         times_ns = part.axis.times("main", batch.log_time_ns)
-        part.until_ns = max(part.until_ns, int(times_ns[-1]))
         if batch.item != _RUN:
             part.batches.append((batch, times_ns))
+
+
+def _complete_ns(part: RunPart, head: Head | None, tail: WriterTail) -> int | None:
+    """Return the log time up to which all journals of a run are written and read.
+
+    None where the recorder is just writing: what belongs to the newest rows may be on its way.
+    """
+    if head is None or head.run != part.run or head.next_seq > tail.seq:
+        return tail.last_ns
+    if head.next_seq < tail.seq:
+        return None if part.until_ns else head.watermark_ns
+    return max(head.watermark_ns, tail.last_ns or 0)
 
 
 def _sort_in(parts: list[RunPart], writer: str, tail: WriterTail) -> None:
@@ -163,5 +189,6 @@ def _sort_in(parts: list[RunPart], writer: str, tail: WriterTail) -> None:
         if not isinstance(delivery, Batch) or delivery.item == _RUN or not parts:
             continue
         part = parts[-1] if writer == WATCH else by_run.get(delivery.run)
-        if part is not None and part.axis.starts:
+        if part is not None:
+            part.axis.begin(int(delivery.log_time_ns[0]), None)
             part.batches.append((delivery, part.axis.times(writer, delivery.log_time_ns)))
