@@ -315,3 +315,24 @@ def test_a_source_that_refuses_becomes_a_problem_of_the_plan(
     problems: list[Problem] = []
     assert planned_items(built, problems, fake_sources) == []
     assert str(problems[0]).startswith(f"{tmp_path / 'black_box.yaml'}:2: fake: no such bus")
+
+
+def test_journals_and_reserve_fit_into_a_small_quota(tmp_path: Path) -> None:
+    path = folder(tmp_path, "- ros: {topics: [{name: /a}]}")
+    (path / "robot.yaml").write_text("id: small\nstore: {quota: 80 MB}\n")
+    store = load_folder(path).robot.store
+    assert (store.rotate_bytes, store.reserve_bytes) == (10_000_000, 10_000_000)
+    (path / "robot.yaml").write_text("id: small\nstore: {quota: 80 MB, rotate_mb: 4, reserve: 0}\n")
+    store = load_folder(path).robot.store
+    assert (store.rotate_bytes, store.reserve_bytes) == (4_000_000, 0)
+
+
+def test_what_was_set_to_more_than_its_share_of_the_quota_is_refused(tmp_path: Path) -> None:
+    path = folder(tmp_path, "- ros: {topics: [{name: /a}]}")
+    (path / "robot.yaml").write_text(
+        "id: small\nstore: {quota: 80 MB, rotate_mb: 11, reserve: 12 MB}\n"
+    )
+    with pytest.raises(ConfigurationError) as raised:
+        load_folder(path)
+    assert "rotate_mb: must be at most 10, an eighth of the quota" in str(raised.value)
+    assert "reserve: must be at most 10 MB, an eighth of the quota" in str(raised.value)

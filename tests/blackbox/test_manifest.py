@@ -70,14 +70,6 @@ def test_a_segment_takes_the_place_of_those_it_replaces(tmp_path: Path) -> None:
     assert known.complete("odom") == {f"journal/{n}.mcap" for n in range(3)}
 
 
-def test_a_deletion_stays_known_with_its_reason(tmp_path: Path) -> None:
-    mf.append(tmp_path, [mf.segment_record(segment(n)) for n in range(2)])
-    mf.append(tmp_path, [mf.deleted_record(segment(0).path, "quota", 77)])
-    known = mf.read(tmp_path)
-    assert known.segments == {"odom": (segment(1),)}
-    assert known.deletions == (mf.Deletion(segment(0), "quota", 77),)
-
-
 def test_a_journal_counts_when_all_files_of_its_schema_versions_are_there(tmp_path: Path) -> None:
     mf.append(tmp_path, [mf.segment_record(segment(0, files=2))])
     known = mf.read(tmp_path)

@@ -18,6 +18,8 @@ from amberbox.blackbox.exporting import looking as looking_module
 from amberbox.blackbox.exporting.view import ordered_windows
 from amberbox.blackbox.follow.read import journals
 from amberbox.blackbox.segments import build as segments
+from amberbox.blackbox.segments import manifest as mf
+from amberbox.blackbox.segments.entries import Tombstone, to_record
 from amberbox.core.clock import NS
 from amberbox.core.errors import AmberboxError, UsageError
 from amberbox.testing.records import (
@@ -223,6 +225,33 @@ def test_a_journal_deleted_meanwhile_is_named(
     )
     assert report.counts == {"odom": 200}
     assert report.missing == [f"{last.name} was deleted while it was being exported"]
+
+
+def test_columns_deleted_meanwhile_are_named(
+    filled: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    build_segments_of(filled)
+    monkeypatch.setattr(slices, "SLICE_ROWS", 40)
+    known, held = mf.read(filled), journals(filled)
+    last = max(known.journals.values(), key=lambda journal: journal.first_seq)
+    for journal in held:
+        if journal.name in known.journals:
+            journal.path.unlink()
+    stone = Tombstone(
+        (last.name,), "columns", last.writer, last.run, last.first_seq, last.end_seq,
+        last.start_ns, last.end_ns, last.head, "for room", False, 0,
+    )  # fmt: skip
+
+    def delete(fraction: float) -> None:
+        if last.name in mf.read(filled).journals:
+            mf.append(filled, [to_record(stone)])
+            for path in mf.read(filled).gone_segments:
+                (filled / path).unlink()
+
+    report = export(
+        amberbox.open(filled), View(items=["odom"]), tmp_path / "out.csv", "csv", delete
+    )
+    assert f"{last.name} was deleted while it was being exported" in report.missing
 
 
 def test_a_store_that_vanishes_ends_the_export(filled: Path, tmp_path: Path) -> None:

@@ -115,7 +115,6 @@ def test_a_fast_recorder_never_takes_more_than_the_quota_and_a_segment(
         while not over.wait(0.01):
             most = max(most, use.measure())
         writer.join()
-        keeper.send_signal(signal.SIGCONT)
     box.close()
     assert quota / 2 < most <= quota + rotate_bytes
     assert events(box.store, "events_only") if stopped else mf.read(box.store).tombstones
@@ -133,9 +132,8 @@ def keeper_process(path: Path, options: KeeperOptions) -> Iterator[subprocess.Po
             time.sleep(0.01)
         yield keeper
     finally:
-        keeper.send_signal(signal.SIGCONT)
-        keeper.terminate()
-        keeper.wait(20)
+        keeper.kill()
+        keeper.wait()
 
 
 def record_fast(box: ManualBox, size: int, over: threading.Event) -> None:

@@ -41,7 +41,7 @@ def judged_space(
     if rate:
         lasts = in_time(room / rate * DAY_S)
         found += f"; {in_bytes(rate)} per day of recording: the oldest goes in {lasts}"
-    if free < min(options.min_free, 2e6 * options.rotate_mb):
+    if free < min(options.min_free, 2 * options.rotate_bytes):
         hint = "make room, or record elsewhere (robot.yaml store.path)"
         return error("free space", found, hint)
     if free < options.min_free:

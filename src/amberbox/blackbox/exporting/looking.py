@@ -69,9 +69,8 @@ class Looking:
 
 
 def _lost(before: Catalogue, after: Catalogue) -> Iterator[str]:
-    """Name files that were deleted for good, not only joined or turned into columns."""
-    for name in before.existing:
-        if name not in after.existing and name not in after.manifest.journals:
-            yield name
-    for deletion in after.manifest.deletions[len(before.manifest.deletions) :]:
-        yield deletion.segment.path
+    """Name journals whose raw data and columns are both gone now, not only one or the other."""
+    was, still = (
+        {*catalogue.existing, *catalogue.manifest.journals} for catalogue in (before, after)
+    )
+    yield from sorted(was - still)

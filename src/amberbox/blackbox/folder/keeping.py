@@ -21,7 +21,7 @@ def keeper_options(folder: RobotFolder) -> KeeperOptions:
         keep_min_s=store.keep_min,
         when_full=store.when_full,
         lifetime=Lifetime(store.lifetime.raw, store.lifetime.columns),
-        headroom=int(store.rotate_mb * 1e6),
+        headroom=store.rotate_bytes,
         incident_share=robot.incidents.share / 100,
         incidents_per_hour=robot.incidents.per_hour,
         triggers=tuple(map(_trigger, robot.triggers)),

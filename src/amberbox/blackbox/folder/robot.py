@@ -18,6 +18,8 @@ NOT_USED_YET = {
 
 
 WhenFull = Literal["overwrite", "stop"]
+_SHARE = 8
+"""A journal file, or the reserve, takes at most this part of the quota."""
 
 
 @dataclass(frozen=True)
@@ -54,6 +56,29 @@ class StoreOptions:
     rotate_mb: float = option(64.0, "a journal file is closed at this size", unit="MB")
     rotate_s: float = option(600.0, "a journal file is closed at this age", unit="s")
 
+    @property
+    def rotate_bytes(self) -> int:
+        """Size of a journal file; smaller than its default where the quota is small."""
+        return self._share(int(self.rotate_mb * 1e6))
+
+    @property
+    def reserve_bytes(self) -> int:
+        """Size of the reserve; smaller than its default where the quota is small."""
+        return self._share(self.reserve)
+
+    def _share(self, size: int) -> int:
+        return size if self.quota is None else min(size, self.quota // _SHARE)
+
+    def _too_large(self) -> Iterator[tuple[str, str]]:
+        """Name what was set to more than its share of the quota; the defaults shrink instead."""
+        sizes = {"rotate_mb": int(self.rotate_mb * 1e6), "reserve": self.reserve}
+        for key, size in sizes.items():
+            is_set = getattr(self, key) != getattr(StoreOptions, key)
+            if is_set and self._share(size) < size:
+                most = f"{(self.quota or 0) / _SHARE / 1e6:g}"
+                unit = "" if key == "rotate_mb" else " MB"
+                yield key, f"must be at most {most}{unit}, an eighth of the quota"
+
     def check(self) -> Iterator[tuple[str, str]]:
         """Say which values cannot work."""
         above_zero = ("write_s", "sync_s", "ring_s", "queue", "rotate_mb", "rotate_s")
@@ -65,6 +90,8 @@ class StoreOptions:
                 yield key, "must not be below 0"
         if self.quota is not None and self.quota <= 0:
             yield "quota", "must be above 0"
+        else:
+            yield from self._too_large()
         if not 0 < self.quota_percent <= 100:
             yield "quota_percent", "must be above 0 and at most 100"
         if self.sync_s < self.write_s:

@@ -168,10 +168,3 @@ def _deleted(catalogue: Catalogue) -> Iterator[Gap]:
         if journal.name not in existing:
             yield from journal.gaps
             yield from sealed[journal.name].gaps() if journal.name in sealed else ()
-    for deletion in catalogue.manifest.deletions:
-        for part in deletion.segment.parts:
-            if part.journal not in existing:
-                yield Gap(
-                    part.writer, part.run, part.from_ns, part.to_ns + 1,
-                    f"deleted: {deletion.reason}", deletion.segment.item, part.rows,
-                )  # fmt: skip

@@ -183,7 +183,7 @@ def _pipeline(folder: RobotFolder, store: Store, clock: Clock) -> Pipeline:
     Raises AmberboxError when not even a run's first bytes can be written.
     """
     options, virtual_ns = folder.robot.store, virtual_start_ns(folder)
-    room = Room(store.path, options.reserve)
+    room = Room(store.path, options.reserve_bytes)
     try:
         if not is_locked(store, "main"):
             room.begin()
@@ -196,7 +196,7 @@ def _pipeline(folder: RobotFolder, store: Store, clock: Clock) -> Pipeline:
                 boot_id=clock.boot_id(),
                 counts_silence=virtual_ns is None,
                 queue_bytes=options.queue,
-                rotate_bytes=int(options.rotate_mb * 1e6),
+                rotate_bytes=options.rotate_bytes,
                 rotate_ns=int(options.rotate_s * NS),
                 ring_rotate_ns=int(min(options.ring_s / 5, options.rotate_s) * NS),
             ),

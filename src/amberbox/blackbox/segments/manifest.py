@@ -111,15 +111,6 @@ def part_clock(part: Part) -> ClockPoints:
 
 
 @dataclass(frozen=True, slots=True)
-class Deletion:
-    """A segment that was deleted on purpose: what is missing now, and why."""
-
-    segment: Segment
-    reason: str
-    at_ns: int
-
-
-@dataclass(frozen=True, slots=True)
 class Journal:
     """A journal whose rows are all in segments, but those in ``gaps``.
 
@@ -151,7 +142,6 @@ class Manifest:
     schemas: Mapping[str, TableSchema] = field(default_factory=dict)
     segments: Mapping[str, tuple[Segment, ...]] = field(default_factory=dict)
     journals: Mapping[str, Journal] = field(default_factory=dict)
-    deletions: tuple[Deletion, ...] = ()
     sealed: Mapping[str, Sealed] = field(default_factory=dict)
     tombstones: tuple[Tombstone, ...] = ()
     confirmed: frozenset[str] = frozenset()
@@ -193,7 +183,6 @@ class _State:
     schemas: dict[str, TableSchema] = field(default_factory=dict)
     live: dict[str, Segment] = field(default_factory=dict)
     paths_of: dict[str, set[str]] = field(default_factory=dict)
-    deletions: list[Deletion] = field(default_factory=list)
     journals: dict[str, Journal] = field(default_factory=dict)
     sealed: dict[str, Sealed] = field(default_factory=dict)
     tombstones: list[Tombstone] = field(default_factory=list)
@@ -209,9 +198,6 @@ class _State:
         match record["kind"]:
             case "segment":
                 self._take_segment(record)
-            case "deleted" if record["path"] in self.live:
-                gone = self.live.pop(record["path"])
-                self.deletions.append(Deletion(gone, record["reason"], record["at_ns"]))
             case "schema":
                 self.schemas[record["id"]] = TableSchema.from_json(record["schema"])
             case "journal":
@@ -267,7 +253,7 @@ class _State:
         """Return what it all says, not touched by records to come."""
         return Manifest(
             dict(self.schemas), _by_item(self.live.values()), dict(self.journals),
-            tuple(self.deletions), dict(self.sealed), tuple(self.tombstones),
+            dict(self.sealed), tuple(self.tombstones),
             frozenset(self.confirmed), tuple(self.signatures), tuple(read.damage), read.last_hash,
             frozenset(self.columns_gone), frozenset(self.raw_gone), frozenset(self.gone_segments),
             read.number, dict(self.incidents),
@@ -333,11 +319,6 @@ def _journal_from_json(record: Mapping[str, Any]) -> Journal:
 
 def _gap_to_json(gap: Gap) -> dict[str, Any]:
     return {name: getattr(gap, name) for name in _GAP_FIELDS}
-
-
-def deleted_record(path: str, reason: str, at_ns: int) -> dict[str, Any]:
-    """Say that a segment is deleted, and why; append it before the file goes."""
-    return {"kind": "deleted", "path": path, "reason": reason, "at_ns": at_ns}
 
 
 def append(store: Path, records: Sequence[Mapping[str, Any]]) -> None:
