@@ -16,6 +16,7 @@ from amberbox.blackbox.follow.chain import previous_chain
 from amberbox.blackbox.follow.read import journal_file
 from amberbox.blackbox.keeper import confirm
 from amberbox.blackbox.keeper.deleter import Deleter
+from amberbox.blackbox.keeper.limit import NO_ROOM
 from amberbox.blackbox.keeper.notary import Notary
 from amberbox.blackbox.keeper.options import KeeperOptions
 from amberbox.blackbox.keeper.ownjournal import OwnJournal
@@ -129,7 +130,7 @@ class Keeper:
                 return
             built += self._build_one(name)
         if built:
-            merge_small(self._store.path, self.breathe)
+            self._merge()
 
     def _interrupted(self, stop: threading.Event) -> bool:
         """See to the room that is left amid long work, and tell whether it is time to go."""
@@ -154,9 +155,19 @@ class Keeper:
         except FileNotFoundError:  # deleted for room meanwhile
             return 0
         except Exception as error:  # whatever it is: the other journals go on
+            if isinstance(error, OSError) and error.errno in NO_ROOM:
+                return 0  # tried again with the next step
             self._refused.add(name)  # its rows stay readable in the journal
             print(f"amberbox keeper: {name}: no segments: {error}", file=sys.stderr)
             return 0
+
+    def _merge(self) -> None:
+        """Join small segments, where there is room for that."""
+        try:
+            merge_small(self._store.path, self.breathe)
+        except OSError as error:
+            if error.errno not in NO_ROOM:
+                raise
 
     def _build_from(self, name: str) -> int:
         journal = journal_file(self._store.path / name, name)

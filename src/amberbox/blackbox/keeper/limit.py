@@ -20,7 +20,8 @@ _GROWING = 2
 """Journals that may grow by a file's size before the next look: those of main and bulk."""
 _SHARE = 4
 """At most this part of the limit is held free for files that grow."""
-_NO_ROOM = (errno.ENOSPC, errno.EDQUOT)
+NO_ROOM = (errno.ENOSPC, errno.EDQUOT)
+"""What a disk says that takes nothing more."""
 
 Result = TypeVar("Result")
 
@@ -97,7 +98,7 @@ def with_reserve(store: Store, action: Callable[[], Result]) -> Result:
         try:
             return action()
         except OSError as error:
-            if error.errno not in _NO_ROOM or not shrink(store.path / RESERVE):
+            if error.errno not in NO_ROOM or not shrink(store.path / RESERVE):
                 raise
 
 
