@@ -74,6 +74,16 @@ def files_of(store: Store, writer: str) -> list[JournalFile]:
     return found
 
 
+def newest_first(store: Store, writer: str) -> Iterator[JournalFile]:
+    """Look into one writer's journal files from the newest back, no further than is asked for."""
+    for path in reversed(store.journal_files(writer)):
+        try:
+            found = journal_file(path, f"{path.parent.name}/{path.name}")
+        except FileNotFoundError:
+            continue
+        yield found
+
+
 def journal_file(path: Path, name: str = "") -> JournalFile:
     """Look into a journal file; what was found is remembered until the file changes."""
     status = path.stat()

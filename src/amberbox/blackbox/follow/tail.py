@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left, bisect_right
 from collections.abc import Collection, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -27,9 +29,9 @@ from amberbox.blackbox.follow.deleted import (
 )
 from amberbox.blackbox.follow.read import (
     JournalFile,
-    files_of,
     journal_file,
     missing,
+    newest_first,
     sound_chunks,
 )
 from amberbox.blackbox.journal.buffer import open_buffer
@@ -303,15 +305,11 @@ def _outline(live: _Live, writer: str, run: int, number: int) -> JournalFile:
 
 def _first_of_interest(files: list[Path], run: int, seq: int) -> int:
     """Skip files that lie before a position, looking only at their names and start records."""
-    first = 0
-    for place, path in enumerate(files):
-        file_run, _ = run_and_number(path)
-        if file_run < run:
-            first = place + 1
-        elif file_run == run and place > first and _starts_at(path) <= seq:
-            first = place
-        elif file_run > run:
-            break
+    runs = [run_and_number(path)[0] for path in files]
+    first, end = bisect_left(runs, run), bisect_right(runs, run)
+    for place in range(end - 1, first, -1):  # most positions are near the end
+        if _starts_at(files[place]) <= seq:
+            return place
     return first
 
 
@@ -340,15 +338,17 @@ def position_at(
     """Find where to begin: at the cursor, or ``lookback_s`` before it, or before the end."""
     if lookback_s <= 0:
         return cursor or WriterCursor()
-    files = files_of(store, writer)
-    before = [
-        f for f in files if cursor is None or (f.run, f.first_seq) <= (cursor.run, cursor.seq)
-    ]
-    if not before:
+    before = (
+        f
+        for f in newest_first(store, writer)
+        if cursor is None or (f.run, f.first_seq) <= (cursor.run, cursor.seq)
+    )
+    newest = next(before, None)
+    if newest is None:
         return cursor or WriterCursor()
-    end_ns = _time_of(before[-1], cursor)
-    start = cursor or WriterCursor(before[-1].run, before[-1].end_seq)
-    for journal in reversed(before):
+    end_ns = _time_of(newest, cursor)
+    start = cursor or WriterCursor(newest.run, newest.end_seq)
+    for journal in chain([newest], before):
         seq = journal.first_seq
         for place in journal.places:
             if place.end_ns >= end_ns - lookback_s * NS:

@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 
 from amberbox import __version__
-from amberbox.blackbox.follow.read import files_of, sound_chunks
+from amberbox.blackbox.follow.read import newest_first, sound_chunks
 from amberbox.blackbox.journal import reserved
 from amberbox.blackbox.journal.writer import JournalOptions, JournalWriter
 from amberbox.blackbox.store import Store
@@ -139,7 +139,7 @@ def event(kind: str, text: str, source: str = "", **details: Any) -> Record:
 
 def last_progress(store: Store, writer: str, reader: str = "") -> Progress | None:
     """Return how far a reader had come when the writer wrote it down last; None if it never did."""
-    for journal in reversed(files_of(store, writer)):
+    for journal in newest_first(store, writer):
         numbers = [n for n, s in journal.streams.items() if s.topic.name == reserved.CURSOR]
         newest = None
         for chunk in sound_chunks(journal) if numbers else ():

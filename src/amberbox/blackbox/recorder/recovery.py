@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from amberbox.blackbox.follow.follow import RECORDED
-from amberbox.blackbox.follow.read import JournalFile, files_of, holes
+from amberbox.blackbox.follow.read import JournalFile, holes, newest_first
 from amberbox.blackbox.recorder.pipeline import Pipeline
 from amberbox.blackbox.store import Store
 
@@ -25,7 +25,7 @@ def _last_files(store: Store) -> list[JournalFile]:
     """Return each writer's last file with messages, and what came after it without any."""
     found: list[JournalFile] = []
     for writer in RECORDED:
-        for journal in reversed(files_of(store, writer)):
+        for journal in newest_first(store, writer):
             found.append(journal)
             if journal.rows:
                 break
