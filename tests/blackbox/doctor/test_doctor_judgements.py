@@ -14,12 +14,18 @@ from amberbox.blackbox.doctor.finding import Finding, in_bytes, in_time
 from amberbox.blackbox.doctor.latency import judged_latency
 from amberbox.blackbox.doctor.mount import Mount, mount_of
 from amberbox.blackbox.doctor.power import judged_power
-from amberbox.blackbox.doctor.service import Unit, judged_recorder, judged_service
+from amberbox.blackbox.doctor.service import (
+    Unit,
+    judged_recorder,
+    judged_service,
+    why_only_events,
+)
 from amberbox.blackbox.doctor.traffic import Traffic
 from amberbox.blackbox.doctor.versions import OPTIONAL, judged_packages
 from amberbox.blackbox.doctor.wear import Disk, judged_disk, judged_traffic
 from amberbox.blackbox.folder.robot import StoreOptions
 from amberbox.blackbox.journal.head import Head
+from amberbox.blackbox.store import create_store
 from amberbox.core.clock import NS
 
 GB = 1_000_000_000
@@ -199,6 +205,16 @@ HEAD = Head("id", 3, 500, 480, NOW_NS - NS // 5, "x.mcap", 1000)
 )
 def test_recorder(pid: int | None, head: Head | None, level: str, word: str) -> None:
     assert_finding(judged_recorder(pid, head, NOW_NS, 2.0, FOLDER), level, word)
+
+
+def test_a_store_that_takes_events_only_is_noticed(tmp_path: Path) -> None:
+    store = create_store(tmp_path)
+    assert why_only_events(store, 1_000) == ""
+    (tmp_path / "reserve").touch()
+    assert why_only_events(store, 0) == ""
+    assert why_only_events(store, 1_000) == "disk full"
+    (tmp_path / "full").write_text("nothing that is left may be deleted\n")
+    assert why_only_events(store, 1_000) == "nothing that is left may be deleted"
 
 
 UNIT = Unit("amberbox.service", True, "10")

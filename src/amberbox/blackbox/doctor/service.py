@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from amberbox.blackbox.doctor.finding import Finding, error, in_time, ok, warn
 from amberbox.blackbox.doctor.host import Host
 from amberbox.blackbox.doctor.subject import Subject
 from amberbox.blackbox.journal.head import Head, read_head
+from amberbox.blackbox.keeper.limit import FULL, RESERVE
 from amberbox.blackbox.store import Store, is_locked
 from amberbox.blackbox.unitfile import UNITS, argument
 from amberbox.core.clock import NS
@@ -26,7 +28,22 @@ def recorder(subject: Subject, host: Host) -> Iterator[Finding]:
         return
     head = read_head(store.folder("main"))
     late_s = max(_PATIENCE_S, 20 * subject.options.write_s)
-    yield judged_recorder(writer_pid(store), head, host.clock.wall_ns(), late_s, subject.path)
+    found = judged_recorder(writer_pid(store), head, host.clock.wall_ns(), late_s, subject.path)
+    why = why_only_events(store, subject.options.reserve)
+    if why and found.level == "ok":
+        hint = "amberbox events tells since when; make room, raise store.quota or lower keep_min"
+        found = error("recorder", f"{found.found}, but only events are recorded: {why}", hint)
+    yield found
+
+
+def why_only_events(store: Store, reserve: int) -> str:
+    """Say why a store takes events only; empty while it takes everything."""
+    with suppress(OSError):
+        return (store.path / FULL).read_text(errors="replace").strip() or "store is full"
+    with suppress(OSError):
+        if reserve and not (store.path / RESERVE).stat().st_size:
+            return "disk full"
+    return ""
 
 
 def judged_recorder(
