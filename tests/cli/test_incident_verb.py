@@ -59,6 +59,7 @@ def test_mark_list_show_release(robot: Path, capsys: pytest.CaptureFixture[str])
     assert shown["items"] == {"ros_count": 30}
     assert shown["bytes"] > 0
     assert any(found["file"].startswith(f"incidents/{made['id']}/ring") for found in shown["files"])
+    assert answer(capsys, "incident", "show", where, "last", "--json") == shown
     assert main(["incident", "show", where, made["id"]]) == 0
     text = capsys.readouterr().out
     assert "bump" in text

@@ -46,14 +46,8 @@ def window_of(args: argparse.Namespace, record: Record) -> Window:
 
 
 def _of_incident(incident_id: str, record: Record) -> list[tuple[int, int]]:
-    from amberbox.blackbox.incidents.incident import load, load_all
+    from amberbox.blackbox.incidents.incident import chosen
     from amberbox.blackbox.incidents.window import windows_of
     from amberbox.blackbox.store import open_store
 
-    store = open_store(record.path)
-    if incident_id != "last":
-        return windows_of(record, load(store, incident_id))
-    known = load_all(store)
-    if not known:
-        raise UsageError(f"{record.path} has no incident", "amberbox incident list shows them")
-    return windows_of(record, max(known, key=lambda incident: incident.made_ns))
+    return windows_of(record, chosen(open_store(record.path), incident_id))

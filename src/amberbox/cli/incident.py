@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from amberbox.blackbox.incidents.budget import held_bytes, held_files
-from amberbox.blackbox.incidents.incident import Incident, load, load_all, unreadable
+from amberbox.blackbox.incidents.incident import Incident, chosen, load_all, unreadable
 from amberbox.blackbox.incidents.marking import mark, release_incident
 from amberbox.blackbox.incidents.window import windows_of
 from amberbox.blackbox.journal.reserved import PREFIX
@@ -82,7 +82,7 @@ def _list(rest: list[str], as_json: bool) -> None:
 
 def _show(rest: list[str], as_json: bool) -> None:
     store = open_store(store_path(rest[0]))
-    incident = load(store, rest[1])
+    incident = chosen(store, rest[1])
     files = _files(store, incident)
     rows = _rows(Record(store.path), incident)
     if as_json:

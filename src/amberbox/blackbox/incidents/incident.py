@@ -253,6 +253,12 @@ def load(store: Store, incident_id: str) -> Incident:
     )
 
 
+def chosen(store: Store, text: str) -> Incident:
+    """Return the incident of an id; ``last`` is the one made last."""
+    known = load_all(store) if text == "last" else ()
+    return max(known, key=lambda incident: incident.made_ns) if known else load(store, text)
+
+
 def encoded(incident: Incident) -> str:
     """Write an incident as its file has it."""
     return msgspec.json.format(msgspec.json.encode(incident), indent=2).decode()
