@@ -21,6 +21,7 @@ from amberbox.blackbox.keeper.notary import Notary
 from amberbox.blackbox.keeper.options import KeeperOptions
 from amberbox.blackbox.keeper.ownjournal import OwnJournal
 from amberbox.blackbox.keeper.roomthread import RoomThread
+from amberbox.blackbox.keeper.situation import Situations
 from amberbox.blackbox.segments import manifest
 from amberbox.blackbox.segments.build import (
     build_segments,
@@ -63,6 +64,9 @@ class Keeper:
         self._missions = _missions(store, self._options, self.journal)
         self._recovered = False
         self._room: RoomThread | None = None
+        self._situations = Situations(store)
+        self._dropped: manifest.Manifest | None = None
+        """The manifest for which nothing is left to be dropped."""
 
     def mind_room(self) -> None:
         """Make room in a thread of its own from now on, whatever else there is to do."""
@@ -75,7 +79,8 @@ class Keeper:
         self._missions.step()
         self._make_room()
         confirm.take_requests(self._store)
-        self.build(stop)
+        if self._situations.changed(self._deleter.is_full):
+            self.build(stop)
         self._deleter.trim_ring()
         self._deleter.expire()
         self._drop_gone()
@@ -86,13 +91,17 @@ class Keeper:
 
     def _drop_gone(self) -> None:
         """Take the rows of deleted journals out of segments that hold others, too."""
-        if self._with_segments:
+        known = manifest.read(self._store.path)
+        if self._with_segments and known is not self._dropped:
             with suppress(OSError):  # no room for it just now
                 drop_gone(self._store.path, self.breathe)
+                self._dropped = known
 
     def _make_room(self) -> None:
         if self._room is None:
             self._deleter.make_room()
+        else:
+            self._room.check()
 
     def breathe(self) -> None:
         """See to the room that is left, where no thread does; to be called often in long work."""

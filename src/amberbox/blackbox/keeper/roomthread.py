@@ -20,14 +20,23 @@ class RoomThread:
 
     def __init__(self, look: Callable[[], None]) -> None:
         self._look = look
+        self._error: Exception | None = None
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._run, name="room", daemon=True)
         sys.setswitchinterval(_SWITCH_S)
         self._thread.start()
 
     def _run(self) -> None:
-        while not self._over.wait(PERIOD_S):
-            self._look()
+        try:
+            while not self._over.wait(PERIOD_S):
+                self._look()
+        except Exception as error:  # whatever it is: the keeper is not to go on without
+            self._error = error
+
+    def check(self) -> None:
+        """Raise what has ended the thread, if anything has."""
+        if self._error is not None:
+            raise self._error
 
     def stop(self) -> None:
         """End it, once it has done what it is at."""
