@@ -78,7 +78,7 @@ def _range(args: argparse.Namespace, stop: threading.Event) -> None:
     with opened(args.where) as record:
         window = record.time_ns(args.from_), record.time_ns(args.to)
         frames = (ColumnFrames if args.columns else MessageFrames)(record, args.item, window)
-        span = span_of(frames.looking.catalogue, window)
+        span = frames.looking.ask(lambda catalogue: span_of(catalogue, window))
         tell(frames.report.missing)
         playback = Playback(frames, span, args.speed)
         server = Server(Listener(playback.control))

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import TypeVar
 
 from amberbox.blackbox.exporting.report import ExportReport
 from amberbox.blackbox.follow.read import JournalFile
@@ -12,6 +13,8 @@ from amberbox.blackbox.query.catalogue import Catalogue, look
 from amberbox.blackbox.query.gather import DamagedSegmentError, Gathered, tell_damaged
 from amberbox.blackbox.segments.build import can_build
 from amberbox.core.errors import AmberboxError
+
+Answer = TypeVar("Answer")
 
 _ATTEMPTS = 3
 
@@ -29,6 +32,17 @@ class Looking:
     def moved_on(self) -> None:
         """Note that something was read since the last look."""
         self._failed = 0
+
+    def ask(self, question: Callable[[Catalogue], Answer]) -> Answer:
+        """Answer from the current look; look again when a file goes meanwhile."""
+        while True:
+            try:
+                answer = question(self.catalogue)
+            except FileNotFoundError:
+                self.again()
+            else:
+                self.moved_on()
+                return answer
 
     def again(self) -> None:
         """Look again after a file went; raises AmberboxError when this leads nowhere."""

@@ -33,13 +33,14 @@ def read_originals(job: Job) -> Originals:
     Each window begins with a copy of what each latched topic had said last, so that a player
     shows it. Raises AmberboxError when there is not one message.
     """
-    catalogue = job.looking.catalogue
-    chosen = MessageStream(chosen_items(catalogue, job.view), job.view.with_box)
+    ask = job.looking.ask
+    items = ask(lambda catalogue: chosen_items(catalogue, job.view))
+    chosen = MessageStream(items, job.view.with_box)
     windows = ordered_windows(job.view.windows)
     for window in windows:
-        for text in without_originals(catalogue, chosen, window):
+        for text in without_originals(job.looking.catalogue, chosen, window):
             job.report.miss(text)
-    streams = chosen.streams(catalogue)
+    streams = ask(chosen.streams)
     if not streams:
         raise AmberboxError(
             "there are no original messages of these items",
@@ -60,7 +61,7 @@ def _blocks(job: Job, chosen: MessageStream, windows: list[Window]) -> Iterator[
 
 
 def _latched(job: Job, chosen: MessageStream, from_ns: int) -> Iterator[Messages]:
-    found = latched_before(job.looking.catalogue, chosen, from_ns)
+    found = job.looking.ask(lambda catalogue: latched_before(catalogue, chosen, from_ns))
     if found:
         for stream, _, _ in found:
             job.report.note(f"{stream.item} is latched: its last message stands at the start again")

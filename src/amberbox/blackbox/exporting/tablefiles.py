@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import Protocol
 
 from amberbox.blackbox.exporting.job import Job, new_file, new_folder, size_of
-from amberbox.blackbox.exporting.tables import Block, TableStream, table_stream
-from amberbox.blackbox.exporting.view import chosen_tables
+from amberbox.blackbox.exporting.tables import Block, TableStream, table_streams
 from amberbox.core.errors import UsageError
 
 
@@ -41,9 +40,7 @@ def write_tables(job: Job, ending: str, open_table: OpenTable) -> None:
 
 def streams_of(job: Job) -> list[TableStream]:
     """Choose tables and columns."""
-    catalogue = job.looking.catalogue
-    tables = chosen_tables(catalogue, job.view)
-    return [table_stream(catalogue, schema, job.view) for schema in tables]
+    return job.looking.ask(lambda catalogue: table_streams(catalogue, job.view))
 
 
 def only_table(job: Job, streams: list[TableStream]) -> TableStream:

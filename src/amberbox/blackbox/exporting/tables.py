@@ -8,7 +8,7 @@ from functools import partial
 
 from amberbox.blackbox.exporting.looking import Looking
 from amberbox.blackbox.exporting.slices import Part, slices
-from amberbox.blackbox.exporting.view import View, Window, ordered_windows
+from amberbox.blackbox.exporting.view import View, Window, chosen_tables, ordered_windows
 from amberbox.blackbox.follow.read import JournalFile
 from amberbox.blackbox.query.catalogue import Catalogue, item_of
 from amberbox.blackbox.query.gather import (
@@ -66,6 +66,11 @@ class TableStream:
                 table = make_table(self.schema, self.wanted, rows)
                 share = (number + done) / len(self.windows)
                 yield Block(table, rows.received_ns, rows.timestamp_ns, share)
+
+
+def table_streams(catalogue: Catalogue, view: View) -> list[TableStream]:
+    """Choose the tables of a view and their columns."""
+    return [table_stream(catalogue, schema, view) for schema in chosen_tables(catalogue, view)]
 
 
 def table_stream(catalogue: Catalogue, schema: TableSchema, view: View) -> TableStream:

@@ -14,8 +14,8 @@ from amberbox.blackbox.exporting.jsonrows import json_rows, json_topic
 from amberbox.blackbox.exporting.looking import Looking
 from amberbox.blackbox.exporting.messages import MessageStream, latched_before, without_originals
 from amberbox.blackbox.exporting.report import ExportReport
-from amberbox.blackbox.exporting.tables import TableStream, table_stream
-from amberbox.blackbox.exporting.view import View, Window, chosen_items, chosen_tables
+from amberbox.blackbox.exporting.tables import TableStream, table_streams
+from amberbox.blackbox.exporting.view import View, Window, chosen_items
 from amberbox.blackbox.foxglove.server import Frame
 from amberbox.blackbox.journal.clocktable import ClockTable
 from amberbox.blackbox.query.catalogue import Catalogue
@@ -35,18 +35,19 @@ class MessageFrames:
     def __post_init__(self) -> None:
         self.report = ExportReport(None, "messages")
         self.looking = Looking(self.record.path, self.report)
-        self.chosen = MessageStream(chosen_items(self.looking.catalogue, View(items=self.items)))
+        view = View(items=self.items)
+        self.chosen = MessageStream(self.looking.ask(lambda known: chosen_items(known, view)))
         for text in without_originals(self.looking.catalogue, self.chosen, self.window):
             self.report.miss(text)
 
     @cached_property
     def topics(self) -> list[Topic]:
         """The topics that there are."""
-        return [stream.topic for stream in self.chosen.streams(self.looking.catalogue)]
+        return [stream.topic for stream in self.looking.ask(self.chosen.streams)]
 
     def latched(self, at_ns: int) -> list[Frame]:
         """Return what latched topics had said before a moment."""
-        found = latched_before(self.looking.catalogue, self.chosen, at_ns)
+        found = self.looking.ask(lambda known: latched_before(known, self.chosen, at_ns))
         return [Frame(stream.topic, at_ns, data) for stream, _, data in found]
 
     def read(self, from_ns: int) -> Iterator[Frame]:
@@ -70,8 +71,7 @@ class ColumnFrames:
         self.report = ExportReport(None, "columns")
         self.looking = Looking(self.record.path, self.report)
         view = View(items=self.items)
-        tables = chosen_tables(self.looking.catalogue, view)
-        self._streams = [table_stream(self.looking.catalogue, table, view) for table in tables]
+        self._streams = self.looking.ask(lambda known: table_streams(known, view))
 
     @cached_property
     def topics(self) -> list[Topic]:

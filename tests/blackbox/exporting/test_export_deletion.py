@@ -1,0 +1,58 @@
+"""The keeper deletes while an export looks at what there is: the rest is exported, with a word."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+import amberbox
+from amberbox.blackbox.exporting import View, export
+from amberbox.blackbox.follow.read import JournalFile, journal_file
+from amberbox.blackbox.foxglove.frames import MessageFrames
+from amberbox.blackbox.query import catalogue
+from tests.blackbox.exporting.conftest import record_robot
+
+
+def delete_at_look(monkeypatch: pytest.MonkeyPatch, store: Path, number: int) -> list[int]:
+    """Delete the oldest journal just before a journal is looked into for the nth time."""
+    looks: list[int] = []
+
+    def deleting(path: Path, name: str = "") -> JournalFile:
+        looks.append(len(looks))
+        if len(looks) == number:
+            min((store / "journal").glob("*.mcap")).unlink()
+        return journal_file(path, name)
+
+    monkeypatch.setattr(catalogue, "journal_file", deleting)
+    return looks
+
+
+@pytest.mark.parametrize("form", ["csv", "mcap", "mcap-json", "bag"])
+@pytest.mark.parametrize("number", [4, 6, 8, 12])
+def test_a_journal_that_goes_is_named_and_the_rest_is_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, form: str, number: int
+) -> None:
+    store, target = tmp_path / "store", tmp_path / ("out.csv" if form == "csv" else "out")
+    record_robot(store, rotate_s=1).close()
+    record = amberbox.open(store)
+    looks = delete_at_look(monkeypatch, store, number)
+    report = export(record, View(items=["ros_text"]), target, form)
+    assert len(looks) >= number and target.exists()
+    (missing,) = report.missing
+    assert missing.endswith("was deleted while it was being exported")
+    left = amberbox.open(store).query("ros_text")
+    assert report.counts == {"ros_text": len(left)} and len(left) < 30
+
+
+def test_playback_seeks_after_files_were_deleted(tmp_path: Path) -> None:
+    store = tmp_path / "store"
+    record_robot(store, rotate_s=1).close()
+    record = amberbox.open(store)
+    frames = MessageFrames(record, (), (None, None))
+    assert len(frames.topics) == 3
+    min((store / "journal").glob("*.mcap")).unlink()
+    last_ns = record.last_ns()
+    assert last_ns is not None
+    assert [frame.topic.name for frame in frames.latched(last_ns)] == ["/map_name"]
+    assert len(list(frames.read(0))) > 20
