@@ -70,6 +70,13 @@ def test_only_the_store_can_be_written(service: Service, folder: Path) -> None:
     assert protection["ReadWritePaths"] == str(folder / "store")
 
 
+def test_a_ring_elsewhere_can_be_written_if_it_is_there(service: Service) -> None:
+    ring = Path("/tmp/ring")
+    protection = sections(unit_text(replace(service, ring=ring)))["Service"]
+    assert protection["ReadWritePaths"] == f"{service.store} -{ring}"
+    assert protection["PrivateTmp"] == "no"
+
+
 def test_homes_are_seen_only_if_something_lies_there(service: Service) -> None:
     home = "/".join(("", "home", "anna", "robot"))
     there = sections(unit_text(replace(service, folder=Path(home), store=Path(home, "store"))))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -30,6 +30,7 @@ class Service:
     store: Path
     write_s: float
     python: Path = Path(sys.executable)
+    ring: Path | None = None
 
     @property
     def unit(self) -> str:
@@ -47,7 +48,9 @@ def service_of(folder: RobotFolder, name: str, user: str) -> Service:
     if not is_id(name):
         raise UsageError(f"'{name}' is no name for a service", f"--name {derive_id(name)}")
     path, store = folder.path.resolve(), folder.store_path.resolve()
-    return Service(name, user, folder.robot.id, path, store, folder.robot.store.write_s)
+    options = folder.robot.store
+    ring = (path / options.ring_path).resolve() if options.ring_path else None
+    return Service(name, user, folder.robot.id, path, store, options.write_s, ring=ring)
 
 
 def unit_text(service: Service) -> str:
@@ -99,16 +102,23 @@ def _protection(service: Service) -> Sequence[str]:
     temporary = any(_lies_in(path, _TEMPORARY) for path in _needed(service))
     return (
         "ProtectSystem=strict",
-        f"ReadWritePaths={argument(service.store)}",
+        " ".join(_written(service)),
         f"ProtectHome={'read-only' if at_home else 'yes'}",
         f"PrivateTmp={'no' if temporary else 'yes'}",
     )
 
 
+def _written(service: Service) -> Iterator[str]:
+    yield f"ReadWritePaths={argument(service.store)}"
+    if service.ring is not None:  # one in memory is gone after a start: its absence is no error
+        yield argument(f"-{service.ring}")
+
+
 def _needed(service: Service) -> Sequence[Path]:
-    package = Path(__file__).resolve()
-    python = service.python
-    return service.folder, service.store, python, python.resolve(), Path(sys.prefix), package
+    package, python = Path(__file__).resolve(), service.python
+    ring = () if service.ring is None else (service.ring,)
+    places = (service.folder, service.store, *ring)
+    return *places, python, python.resolve(), Path(sys.prefix), package
 
 
 def _lies_in(path: Path, places: Sequence[str]) -> bool:
