@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import shlex
 from pathlib import Path
 
 from amberbox.blackbox.folder.folder import BLACK_BOX_FILE, ROBOT_FILE, SOURCES, load_folder
@@ -62,7 +63,8 @@ def run(args: argparse.Namespace) -> int:
         print(json.dumps({"folder": str(folder), "files": sorted(files)}))
     else:
         print(f"wrote {' and '.join(sorted(files))} in {folder}")
-        print(f"next: look at them, then amberbox check {folder}, amberbox record {folder}")
+        word = shlex.quote(str(folder))
+        print(f"next: look at them, then amberbox check {word}, amberbox record {word}")
     return 0
 
 

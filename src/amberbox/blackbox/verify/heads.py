@@ -38,9 +38,10 @@ def read_noted(text: str) -> Noted:
         return Noted(text, hash=plain)
     try:
         content = text if plain.startswith("{") else Path(text).read_text()
-        return Noted(text, heads=parse_heads(content))
+        return Noted("--head" if plain.startswith("{") else text, heads=parse_heads(content))
     except (OSError, ValueError) as error:
-        raise UsageError(f"no head in {text}: {error}", _HINT) from None
+        why = getattr(error, "strerror", None) or error
+        raise UsageError(f"no head in {text}: {why}", _HINT) from None
 
 
 @dataclass(frozen=True)
@@ -104,8 +105,10 @@ def refuse_forged(heads: SignedHeads, store_id: str, key: str) -> None:
 
 def check_heads(heads: SignedHeads, known: Known, file: str) -> Iterator[Finding]:
     """Compare a statement with what is there: name what is missing of each journal."""
-    stands = heads.manifest in known.manifest.hashes or heads.manifest == known.manifest.checkpoint
-    if not stands and heads.manifest != "0" * 64 and not known.manifest.checkpoint:
+    lines = known.manifest
+    stands = heads.manifest in lines.hashes or heads.manifest == lines.checkpoint
+    condensed = lines.checkpoint and heads.since != lines.first_hash  # after it was stated
+    if not stands and heads.manifest != "0" * 64 and not condensed:
         text = f"the line that {file} names is gone: the newest lines were cut off or changed"
         yield Finding("missing", mf.NAME, text, to_ns=heads.at_ns)
     for writer, reach in heads.writers.items():
@@ -164,13 +167,23 @@ def check_own_heads(
 ) -> tuple[list[Finding], SignedHeads | None]:
     """Check the statement that lies in the store; None where there is none to go by."""
     heads = own.heads
+    if heads is None and not own.content:
+        text = "there is none: nobody states how far the journals reach"
+        return list(_unstated(known, text)), None
     if heads is None:
-        return [_bad_heads(own.content, "cannot be read")] if own.content else [], None
+        return [_bad_heads(own.content, "cannot be read")], None
     if heads.signature and key and (heads.key != key or not heads.holds()):
         return [_bad_heads(own.content, "is not signed with the robot's key")], None
     if heads.store_id != known.store_id:
         return [Finding("altered", HEADS, f"is that of another store ({heads.store_id})")], None
-    return list(check_heads(heads, known, HEADS)), heads
+    unsigned = _unstated(known, "is not signed") if not heads.signature else ()
+    return [*unsigned, *check_heads(heads, known, HEADS)], heads
+
+
+def _unstated(known: Known, text: str) -> Iterator[Finding]:
+    """Say that a statement is missing in a store that has signatures."""
+    if known.manifest.signatures:
+        yield Finding("unsigned", HEADS, text)
 
 
 def _bad_heads(content: bytes, text: str) -> Finding:
