@@ -125,7 +125,8 @@ class Pins:
         """Write an incident's state down for good, then note that this was done."""
         if incident.told == incident.state:
             return
-        line = to_line(incident, self._journal.now_ns())
+        ring = sorted(p.name for p in (folder_of(self._store, incident.id) / RING).glob("*.mcap"))
+        line = {**to_line(incident, self._journal.now_ns()), "ring": ring}
         self._write([(reserved.INCIDENT, line["incident"]), _event(incident)])
         with_reserve(self._store, lambda: manifest.append(self._store.path, [line]))
         with pin_lock(self._store):

@@ -17,6 +17,7 @@ from amberbox.blackbox.journal.head import read_head
 from amberbox.blackbox.keeper.keys import SigningKey, holds
 from amberbox.blackbox.segments import manifest as mf
 from amberbox.blackbox.segments.entries import Sealed, Signature, to_record
+from amberbox.blackbox.segments.lines import first_hash
 from amberbox.blackbox.store import Store, is_locked, replace_file, run_and_number
 from amberbox.blackbox.verify.links import Link, links
 
@@ -45,7 +46,11 @@ class Reach:
 
 @dataclass(frozen=True, slots=True)
 class SignedHeads:
-    """The robot's statement of how far everything reaches; without a key it is not signed."""
+    """The robot's statement of how far everything reaches; without a key it is not signed.
+
+    ``manifest`` is the hash of the last line, ``since`` that of the first: it is another one once
+    the manifest has been condensed.
+    """
 
     store_id: str
     at_ns: int
@@ -53,6 +58,7 @@ class SignedHeads:
     writers: Mapping[str, Reach] = field(default_factory=dict)
     key: str = ""
     signature: str = ""
+    since: str = ""
 
     def message(self) -> bytes:
         """Return the bytes that are signed: all but the signature, in one way of writing."""
@@ -143,7 +149,8 @@ def write_heads(store: Store, key: SigningKey | None, now_ns: int | None = None)
 
 def signed_heads(store: Store, key: SigningKey | None, now_ns: int | None = None) -> SignedHeads:
     """Compose the statement of how far everything reaches; only what is durable counts."""
-    known = mf.read(store.path)
+    with mf.CHANGING:  # it is not condensed in between
+        since, known = first_hash(store.path / mf.NAME), mf.read(store.path)
     found = {writer: reach_of(store, writer, known.sealed) for writer in STATED}
     heads = SignedHeads(
         store.id,
@@ -151,6 +158,7 @@ def signed_heads(store: Store, key: SigningKey | None, now_ns: int | None = None
         known.last_hash,
         {writer: reach for writer, reach in found.items() if reach is not None},
         "" if key is None else key.public,
+        since=since,
     )
     return heads if key is None else replace(heads, signature=key.sign(heads.message()))
 

@@ -61,6 +61,16 @@ def decode(line: bytes) -> Record | None:
     return record
 
 
+def first_hash(path: Path) -> str:
+    """Return the hash that the first line of a manifest states; empty where there is none."""
+    try:
+        with path.open("rb") as file:
+            begin = file.read(_HASH_FIELD)
+    except FileNotFoundError:
+        return ""
+    return begin[9:-2].decode("ascii", "replace") if len(begin) == _HASH_FIELD else ""
+
+
 def encode(records: Sequence[Mapping[str, Any]], last_hash: str) -> bytes:
     """Write records as lines that follow the line with ``last_hash``."""
     lines = []

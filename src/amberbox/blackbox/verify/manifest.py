@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,7 @@ from amberbox.blackbox.keeper.keys import holds
 from amberbox.blackbox.keeper.signing import signature_message
 from amberbox.blackbox.segments import lines
 from amberbox.blackbox.segments import manifest as mf
-from amberbox.blackbox.segments.entries import Sealed, Signature, from_record
+from amberbox.blackbox.segments.entries import Sealed, Signature, Tombstone, from_record
 from amberbox.blackbox.segments.manifest import Manifest
 from amberbox.blackbox.verify.findings import Finding, State
 from amberbox.blackbox.verify.mended import without_one_bit
@@ -37,12 +37,15 @@ class CheckedManifest:
     """What the lines say and how far they can be believed.
 
     ``hashes`` are the numbers of the lines with each hash, ``sealed`` those that seal each journal;
-    ``signatures`` are those that hold, with the line they stand in; ``known`` is what it all says.
+    ``signatures`` are those that hold, with the line they stand in; ``claims`` is what each line
+    says of other files than sealed ones; ``known`` is what it all says.
     """
 
     hashes: dict[str, int] = field(default_factory=dict)
     sealed: dict[str, tuple[int, Sealed]] = field(default_factory=dict)
     signatures: list[tuple[int, Signature]] = field(default_factory=list)
+    claims: list[tuple[int, str, str]] = field(default_factory=list)
+    first_hash: str = ""
     checkpoint: str = ""
     last_hash: str = lines.FIRST_HASH
     findings: list[Finding] = field(default_factory=list)
@@ -173,6 +176,7 @@ def _check_order(found: Sequence[Line], checked: CheckedManifest) -> None:
             checked.checkpoint = prev
         elif prev != expected:
             checked.findings.append(_break(line, moved=prev in all_hashes))
+        checked.first_hash = checked.first_hash or line.record["hash"]
         checked.hashes[line.record["hash"]] = line.number
         expected = line.record["hash"]
     checked.last_hash = expected
@@ -193,8 +197,12 @@ def _take(line: Line, store_id: str, checked: CheckedManifest, *, can_check: boo
         text = f"line {line.number} cannot be understood"
         checked.findings.append(_finding("altered", text, line.offset, 0))
         return
+    checked.claims += [(line.number, *claim) for claim in _claims(line.record, entry)]
     if isinstance(entry, Sealed):
-        checked.sealed[entry.journal] = (line.number, entry)
+        first, known = checked.sealed.setdefault(entry.journal, (line.number, entry))
+        if known != entry:
+            text = f"line {line.number} says of {entry.journal} otherwise than line {first}"
+            checked.findings.append(_finding("altered", text, line.offset, 0))
     elif isinstance(entry, Signature) and can_check:
         message = signature_message(store_id, entry.head, entry.at_ns)
         if holds(entry.key, entry.signature, message):
@@ -202,3 +210,13 @@ def _take(line: Line, store_id: str, checked: CheckedManifest, *, can_check: boo
         else:
             text = f"the signature in line {line.number} does not hold"
             checked.findings.append(_finding("altered", text, line.offset, 0))
+
+
+def _claims(record: Mapping[str, Any], entry: object) -> Iterator[tuple[str, str]]:
+    """Give the files that a line lists or says to be deleted, and what it says."""
+    if isinstance(entry, Tombstone):
+        yield from ((name, f"was deleted ({entry.reason})") for name in entry.journals)
+    elif record["kind"] == "deleted":
+        yield str(record["path"]), "was deleted"
+    elif record["kind"] == "segment":
+        yield str(record["segment"]["path"]), "is as it was written"

@@ -89,9 +89,17 @@ def unsigned_ends(
     vouched = max(trust.signed_line, lines.hashes.get(signed.manifest, 0) if signed else 0)
     if last - _own_signature(lines, last) > vouched:
         found.append(_manifest_end(last - vouched, trust.signed_ns))
+    found += _unsigned_claims(lines, vouched)
     for writer in STATED:
         found += _journal_end(by_writer.get(writer, ()), lines, vouched, signed)
     return found
+
+
+def _unsigned_claims(lines: CheckedManifest, vouched: int) -> Iterator[Finding]:
+    """Name the files of which only lines that are not signed yet say what became of them."""
+    for number, file, text in lines.claims:
+        if number > vouched:
+            yield Finding("unsigned", file, f"{text}, says line {number}, which is not signed")
 
 
 def _own_signature(lines: CheckedManifest, last: int) -> int:

@@ -15,7 +15,7 @@ from amberbox.blackbox.segments import manifest as mf
 from amberbox.blackbox.segments.manifest import Manifest, Segment
 from amberbox.blackbox.store import is_locked, open_store
 from amberbox.blackbox.verify.continuity import Graves, check_continuity
-from amberbox.blackbox.verify.findings import Collected, Finding, HeadLine, Report
+from amberbox.blackbox.verify.findings import BAD, Collected, Finding, HeadLine, Report
 from amberbox.blackbox.verify.heads import (
     Known,
     Noted,
@@ -25,6 +25,7 @@ from amberbox.blackbox.verify.heads import (
     read_noted,
     read_own,
 )
+from amberbox.blackbox.verify.incidents import check_incidents
 from amberbox.blackbox.verify.journal import Checked, Target, check_journal
 from amberbox.blackbox.verify.links import links
 from amberbox.blackbox.verify.manifest import CheckedManifest, check_manifest
@@ -92,6 +93,8 @@ class _Verification:
         graves = Graves(manifest.tombstones)
         self._continuity(lines, journals, graves)
         self._segments(manifest, lines)
+        for name, findings in check_incidents(self.store, manifest):
+            self.collected.take(name, findings)
         sealed = {name: entry for name, (_, entry) in lines.sealed.items()}
         known = Known(store_id, lines, journals.by_name, sealed, graves)
         heads = self._heads(known, trust.key)
@@ -181,8 +184,14 @@ class _Verification:
             missing, text = check_noted(noted, known, key)
             for finding in missing:
                 self.collected.take(finding.file, [finding])
-            self.notes += [text] if text else []
+            self.notes += [self._qualified(text)] if text else []
         return heads
+
+    def _qualified(self, text: str) -> str:
+        """Do not say that all is as it was where something is not."""
+        if any(finding.state in BAD for finding in self.collected.findings):
+            return text.partition(": ")[0] + ": but not all before it is as it was"
+        return text
 
 
 def _last_link(path: Path) -> str:
