@@ -7,10 +7,15 @@ from collections.abc import Generator
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
 
 SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 NO_DATA = "needs_data: the folder ../shared/data beside the repository is absent"
 SKIPPED: pytest.StashKey[list[tuple[str, str]]] = pytest.StashKey()
+
+settings.register_profile("soak", max_examples=400)  # about twenty minutes of random histories
+if os.environ.get("HYPOTHESIS_PROFILE"):
+    settings.load_profile(os.environ["HYPOTHESIS_PROFILE"])
 
 
 def in_ci() -> bool:

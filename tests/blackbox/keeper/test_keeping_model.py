@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import itertools
+import os
 import shutil
 import tempfile
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 from unittest import mock
 
 import numpy as np
@@ -26,15 +29,18 @@ from hypothesis.stateful import (
 
 from amberbox.blackbox.follow.follow import follow
 from amberbox.blackbox.incidents import Incident, Wish, advance, load, pin, release
+from amberbox.blackbox.incidents.incident import save
+from amberbox.blackbox.journal.writer import JournalWriter
 from amberbox.blackbox.keeper.confirm import confirm
 from amberbox.blackbox.keeper.keeper import Keeper
 from amberbox.blackbox.keeper.options import KeeperOptions
-from amberbox.blackbox.keeper.removal import Remover
 from amberbox.blackbox.query.catalogue import look
 from amberbox.blackbox.query.gather import Request, gather
 from amberbox.blackbox.query.record import Record
 from amberbox.blackbox.recorder.pipeline import PipelineOptions
+from amberbox.blackbox.segments import lines
 from amberbox.blackbox.segments import manifest as mf
+from amberbox.blackbox.segments.parquet import TableFile
 from amberbox.blackbox.store import Store, open_store
 from amberbox.core.clock import NS
 from amberbox.core.errors import UsageError
@@ -50,12 +56,24 @@ RING = Topic("/ring", COUNT.message_encoding, COUNT.schema)
 TOPICS = [TopicOptions("/bulky", keep="bulk"), TopicOptions("/ring", keep="ring")]
 ITEMS = {"ros_count": COUNT, "ros_bulky": BULKY, "ros_ring": RING}
 RING_S = 120.0
+SOAKING = os.environ.get("HYPOTHESIS_PROFILE") == "soak"
 ROOMY = 50_000_000
 TIGHT = 200_000
 
 
 class KilledError(BaseException):
-    """Stands for ``kill -9`` in the middle of a deletion."""
+    """Stands for ``kill -9`` at any moment."""
+
+
+ACTS: list[tuple[Any, str]] = [
+    (lines, "append_durably"),
+    (Path, "unlink"),
+    (Path, "rename"),
+    (Path, "replace"),
+    (TableFile, "finish"),
+    (JournalWriter, "write"),
+]
+"""What a keeper does that outlives it."""
 
 
 @dataclass
@@ -179,6 +197,18 @@ class World:
         spans = [(s.start_ns, s.end_ns) for s in stones if s.writer == writer]
         return {v for v, at in rows.items() if not any(a <= at <= b for a, b in spans)}
 
+    def told_gone(self, item: str) -> set[int]:
+        """Return the rows that lie well inside what was deleted, raw and columns."""
+        stones = mf.read(self.path).tombstones
+        writer = {"ros_bulky": "bulk", "ros_ring": "ring"}.get(item, "main")
+        spans = [
+            (s.start_ns + NS, s.end_ns - NS)
+            for s in stones
+            if s.writer == writer and s.what == "both"
+        ]
+        rows = self.model.rows[item]
+        return {v for v, at in rows.items() if any(a <= at <= b for a, b in spans)}
+
     @property
     def roomy(self) -> bool:
         return not any(s.writer == "ring" for s in mf.read(self.path).tombstones)
@@ -197,9 +227,21 @@ def _explained(at_ns: int, item: str, gaps: list[Gap]) -> bool:
 
 
 @contextmanager
-def killed_at(step: str) -> Iterator[None]:
-    """Let the keeper die at a step of its next deletion."""
-    with mock.patch.object(Remover, step, side_effect=KilledError), suppress(KilledError):
+def killed_at(act: int) -> Iterator[None]:
+    """Let the keeper die before its n-th act from now on that lasts: write, rename, unlink."""
+    done = itertools.count(1)
+
+    def or_die(function: Callable[..., Any]) -> Callable[..., Any]:
+        def acting(*args: Any, **options: Any) -> Any:
+            if next(done) >= act:
+                raise KilledError
+            return function(*args, **options)
+
+        return acting
+
+    with ExitStack() as patches, suppress(KilledError):
+        for owner, name in ACTS:
+            patches.enter_context(mock.patch.object(owner, name, or_die(getattr(owner, name))))
         yield
 
 
@@ -243,11 +285,20 @@ class BoxMachine(RuleBasedStateMachine):
     def keep(self) -> None:
         self.world.keep()
 
-    @rule(step=st.sampled_from(["_unlink_raw", "_unlink_segments", "_keep_own"]))
-    def keeper_dies(self, step: str) -> None:
-        with killed_at(step):
+    @rule(act=st.integers(1, 30))
+    def keeper_dies(self, act: int) -> None:
+        with killed_at(act):
             self.world.keep()
         self.world.forget_keeper()
+
+    @rule()
+    def settle(self) -> None:
+        """Keep until nothing more is deleted: then nothing of what has a tombstone is left."""
+        stones = -1
+        while stones != (stones := len(mf.read(self.world.path).tombstones)):
+            self.world.keep()
+        for item in ITEMS:
+            assert self.world.told_gone(item).isdisjoint(self.world.query(item))
 
     @rule(quota=st.sampled_from([TIGHT, 2 * TIGHT, ROOMY]))
     def change_quota(self, quota: int) -> None:
@@ -291,6 +342,13 @@ class BoxMachine(RuleBasedStateMachine):
             del self.pinned[incident]
             release(self.world.store, load(self.world.store, incident))
 
+    @rule(incident=consumes(incidents))
+    def confirm_incident(self, incident: str) -> None:
+        """A server holds it: it may go, when there is nothing else to go for room."""
+        if incident in self.pinned:
+            del self.pinned[incident]
+            save(self.world.store, replace(load(self.world.store, incident), confirmed=True))
+
     @rule()
     def check(self) -> None:
         self.world.check(self.pinned)
@@ -298,7 +356,7 @@ class BoxMachine(RuleBasedStateMachine):
 
 TestBox = BoxMachine.TestCase
 TestBox.settings = settings(
-    max_examples=5,
+    max_examples=settings().max_examples if SOAKING else 5,
     stateful_step_count=15,
     deadline=None,
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.filter_too_much],
