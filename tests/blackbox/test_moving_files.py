@@ -99,3 +99,18 @@ def test_what_a_ring_forgot_is_told_as_such(
     assert main(["gaps", str(tmp_path)]) == 0
     row = next(line for line in capsys.readouterr().out.splitlines() if "older than" in line)
     assert "all of ring" in row
+
+
+def test_what_incidents_hold_outlives_a_ring_in_memory(tmp_path: Path) -> None:
+    fill_store(tmp_path)
+    held = tmp_path / "incidents" / "2026-11-21-071006-2a7e" / "ring"
+    held.mkdir(parents=True)
+    first = ring_of(tmp_path)[0]
+    before = len(amberbox.open(tmp_path).query("battery"))
+    first.rename(held / first.name)
+    memory = tmp_path / "ring"
+    for file in memory.glob("*"):
+        file.unlink()
+    memory.rmdir()
+    memory.symlink_to(tmp_path / "gone")
+    assert len(amberbox.open(tmp_path).query("battery")) == before - 20

@@ -7,6 +7,7 @@ import json
 import os
 import time
 import uuid
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
@@ -49,8 +50,7 @@ class Store:
         """
         found = {path.name: path for path in self.folder(writer).glob("*.mcap")}
         if writer == "ring":
-            held = (self.path / INCIDENTS).glob(f"*/{self.folder(writer).name}/*.mcap")
-            found = {path.name: path for path in held} | found
+            found = {path.name: path for path in self._held()} | found
         return sorted(found.values(), key=run_and_number)
 
     def journal_path(self, name: str) -> Path:
@@ -63,7 +63,14 @@ class Store:
 
     def writers(self) -> list[str]:
         """Writers that have a journal here."""
-        return [writer for writer in FOLDERS if self.folder(writer).is_dir()]
+        found = [writer for writer in FOLDERS if self.folder(writer).is_dir()]
+        if "ring" not in found and any(self._held()):  # a ring in memory goes, these stay
+            found.append("ring")
+        return found
+
+    def _held(self) -> Iterator[Path]:
+        """Give the files of the ring that incidents hold."""
+        return (self.path / INCIDENTS).glob(f"*/{FOLDERS['ring']}/*.mcap")
 
     def next_run(self) -> int:
         """Count one more run, never one that was used before, also after a power cut."""
