@@ -7,6 +7,7 @@ import threading
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from amberbox.blackbox.incidents import Wish, load_all, pin, release
 from amberbox.blackbox.keeper.keeper import Keeper, wait_for_lock
 from amberbox.blackbox.keeper.options import KeeperOptions, Lifetime
 from amberbox.blackbox.recorder.pipeline import PipelineOptions
@@ -53,6 +54,8 @@ class History:
         keeper = self._keeper() if self.random.random() < 0.8 else None
         for _ in range(self.random.randint(0, 30)):
             self._write(box)
+            if self.random.random() < 0.03:
+                self._mark(box.store)
             if keeper is not None and self.random.random() < 0.15:
                 self.events.append("step")
                 keeper.keeper.step(self._stop)
@@ -72,6 +75,18 @@ class History:
                 mark.wait()
         if self.random.random() < 0.05:
             self.clock.step(self.random.uniform(-5, 5))
+
+    def _mark(self, path: Path) -> None:
+        """Mark an incident, or release one."""
+        store = open_store(path)
+        known = [incident for incident in load_all(store) if incident.is_pinned]
+        if known and self.random.random() < 0.4:
+            release(store, self.random.choice(known))
+            self.events.append("release")
+        elif store.journal_files("main"):
+            wish = Wish(self.random.uniform(0, 3), self.random.uniform(0, 3), "bump", "test")
+            pin(store, wish, KeeperOptions(quota=_QUOTA_BYTES))
+            self.events.append("incident")
 
     def _end(self, box: ManualBox, keeper: _KeeperProcess | None) -> None:
         """End the recorder and its keeper, each cleanly or not, in either order."""
