@@ -95,7 +95,7 @@ def test_what_a_ring_forgot_is_told_as_such(
     fill_store(tmp_path)
     ring_of(tmp_path)[1].unlink()
     (gap,) = [g for g in amberbox.open(tmp_path).gaps() if g.writer == "ring"]
-    assert (gap.reason, gap.count) == ("older than the ring", 10)
+    assert (gap.reason, gap.count) == ("deleted: older than the ring", 10)
     assert main(["gaps", str(tmp_path)]) == 0
     row = next(line for line in capsys.readouterr().out.splitlines() if "older than" in line)
     assert "all of ring" in row

@@ -18,7 +18,7 @@ from amberbox.blackbox.store import Store, run_and_number
 from amberbox.core.types import Batch, Gap
 
 LOST = "deleted or lost with its file"
-FORGOTTEN = "older than the ring"
+FORGOTTEN = "deleted: older than the ring"
 _GAP_ITEM = reserved.GAP.replace("/", "_")
 
 
