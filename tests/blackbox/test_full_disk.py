@@ -17,9 +17,14 @@ import pytest
 
 import amberbox
 from amberbox.blackbox.follow.follow import follow
+from amberbox.blackbox.keeper.options import KeeperOptions
+from amberbox.blackbox.keeper.usage import DiskUse
+from amberbox.blackbox.recorder.pipeline import PipelineOptions
+from amberbox.blackbox.recorder.room import Room
+from amberbox.blackbox.segments import manifest as mf
 from amberbox.blackbox.store import is_store
-from amberbox.core.types import Batch, Gap
-from amberbox.testing.box import events, last_counters, own_records
+from amberbox.core.types import Batch, Gap, Schema, Topic
+from amberbox.testing.box import COUNT, ManualBox, events, last_counters, number, own_records
 from amberbox.testing.realros import free_port, wait_until
 
 pytest.importorskip("zmq", reason="the sender speaks ZMQ; pip install 'amberbox[zmq]'")
@@ -27,6 +32,7 @@ pytest.importorskip("zmq", reason="the sender speaks ZMQ; pip install 'amberbox[
 DISK_BYTES = 12_000_000
 RESERVE = 1_000_000
 ITEM = "zmq_count"
+NOISE = Topic("/noise", "ros1", Schema("test/Noise", "ros1msg", b"uint8[] data\n"))
 
 
 @pytest.fixture
@@ -261,3 +267,29 @@ def test_a_recorder_killed_while_the_disk_is_full(
         at = sender.sent_ns[n]
         assert any(g.from_ns - 200_000_000 <= at <= g.to_ns + 50_000_000 for g in covered), n
     assert len(lost) > 100
+
+
+def test_the_keeper_makes_room_on_a_full_disk_with_the_help_of_the_reserve(
+    request: pytest.FixtureRequest, disk: Path | None
+) -> None:
+    if disk is None:
+        run_apart(request)
+        return
+    room = Room(disk / "store", RESERVE)
+    box = ManualBox(disk / "store", options=PipelineOptions(rotate_bytes=200_000), room=room)
+    room.begin()
+    for value in range(40):
+        box.hear(COUNT, number(value))
+        box.hear(NOISE, (100_000).to_bytes(4, "little") + os.urandom(100_000))
+        box.write()
+    box.close()
+    fill(disk)
+    assert (box.store / "reserve").stat().st_size == RESERVE
+    options = KeeperOptions(quota=3_000_000, min_free=0, keep_min_s=0.0, headroom=200_000)
+    command = [sys.executable, "-m", "amberbox.blackbox.keeper", str(box.store), "--once"]
+    subprocess.run([*command, "--options", options.to_json()], check=True)
+    assert (box.store / "reserve").stat().st_size < RESERVE
+    assert mf.read(box.store).tombstones
+    assert not mf.read(box.store).damage
+    assert events(box.store, "deleted")
+    assert DiskUse(box.store).measure() <= 3_000_000

@@ -33,7 +33,7 @@ from amberbox.blackbox.segments import manifest as mf
 from amberbox.blackbox.segments.build import can_build
 from amberbox.blackbox.store import WriterLock, open_store
 from amberbox.core.clock import NS
-from amberbox.core.types import Batch, Schema, Topic
+from amberbox.core.types import Batch, Gap, Schema, Topic
 from amberbox.testing import ManualClock
 from amberbox.testing.box import COUNT, ManualBox, events, number
 
@@ -240,3 +240,22 @@ def test_confirmed_incidents_go_last(tmp_path: Path) -> None:
     assert load(store, done.id).state == "released"
     assert events(box.store, "incident_released")
     box.close()
+
+
+@needs_pyarrow
+def test_follow_says_that_columns_need_pyarrow_where_the_journal_is_gone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    box = full_box(tmp_path / "store", 6)
+    box.close()
+    keep(box, replace(OPTIONS, quota=50_000_000))
+    for _ in range(2):
+        keep(box, replace(OPTIONS, quota=50_000_000, lifetime=Lifetime(raw_s=1e-6)))
+    stones = [s for s in mf.read(box.store).tombstones if s.what == "raw"]
+    assert stones
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    gaps = [d for d in follow(box.store, ["ros_count"], live=False) if isinstance(d, Gap)]
+    for stone in stones:
+        assert any(
+            "needs pyarrow" in gap.reason and gap.from_seq == stone.first_seq for gap in gaps
+        )

@@ -16,7 +16,7 @@ from amberbox.blackbox.follow.chain import previous_chain
 from amberbox.blackbox.follow.read import journal_file
 from amberbox.blackbox.keeper import confirm
 from amberbox.blackbox.keeper.deleter import Deleter
-from amberbox.blackbox.keeper.limit import NO_ROOM
+from amberbox.blackbox.keeper.limit import NO_ROOM, with_reserve
 from amberbox.blackbox.keeper.notary import Notary
 from amberbox.blackbox.keeper.options import KeeperOptions
 from amberbox.blackbox.keeper.ownjournal import OwnJournal
@@ -204,7 +204,7 @@ def wait_for_lock(store: Store, patience_s: float, stop: threading.Event) -> Wri
     end = time.monotonic() + patience_s
     while True:
         try:
-            return WriterLock(store, "keeper")
+            return with_reserve(store, lambda: WriterLock(store, "keeper"))
         except UsageError:
             if time.monotonic() >= end or stop.wait(0.2):
                 raise
