@@ -10,7 +10,7 @@ import pytest
 
 import amberbox
 from amberbox.blackbox.follow.read import journals
-from amberbox.blackbox.query import record as query
+from amberbox.blackbox.query import catalogue as query
 from amberbox.blackbox.query.catalogue import look
 from amberbox.blackbox.segments import build as segments
 from amberbox.blackbox.segments import manifest as mf

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
-from amberbox.blackbox.follow.follow import follow
+from amberbox.blackbox.follow.follow import RECORDED
+from amberbox.blackbox.follow.read import journal_file
+from amberbox.blackbox.follow.tail import Delivery, WriterTail
 from amberbox.blackbox.journal import reserved
 from amberbox.blackbox.journal.clocktable import ClockTable
 from amberbox.blackbox.query.catalogue import Catalogue
@@ -16,7 +19,8 @@ from amberbox.blackbox.query.tabletext import plain
 from amberbox.blackbox.segments.flat import Flat
 from amberbox.blackbox.segments.manifest import Journal
 from amberbox.blackbox.segments.parquet import overlaps
-from amberbox.core.types import Gap
+from amberbox.blackbox.store import Store, open_store
+from amberbox.core.types import Gap, WriterCursor
 
 _SAME = ("writer", "run", "item", "reason")
 _FIELDS = ("item", "peer", "from_ns", "to_ns", "reason", "count")
@@ -125,9 +129,26 @@ def _holes(catalogue: Catalogue) -> Iterator[Gap]:
 
     What was deleted comes with its reason, from the tombstones.
     """
-    for delivery in follow(catalogue.store, items=(), live=False):
-        if isinstance(delivery, Gap) and delivery.from_seq is not None:
-            yield from _outside_segments(delivery, catalogue)
+    store = open_store(catalogue.store)
+    for writer in (writer for writer in store.writers() if writer in RECORDED):
+        for delivery in _HoleTail(store, writer, catalogue.done).step():
+            if isinstance(delivery, Gap) and delivery.from_seq is not None:
+                yield from _outside_segments(delivery, catalogue)
+
+
+class _HoleTail(WriterTail):
+    """Finds rows that are not there; journals whose rows are in segments are not read again."""
+
+    def __init__(self, store: Store, writer: str, condensed: Collection[str]) -> None:
+        super().__init__(store, writer, (), WriterCursor())
+        self._condensed = condensed
+
+    def _static(self, path: Path) -> Iterator[Delivery]:
+        journal = journal_file(path, f"{path.parent.name}/{path.name}")
+        if journal.name in self._condensed and journal.places:
+            yield from self._enter(journal.run, journal.first_seq, journal)
+            self.seq, self.last_ns = max(self.seq, journal.end_seq), journal.end_ns
+        yield from super()._static(path)
 
 
 def _outside_segments(gap: Gap, catalogue: Catalogue) -> Iterator[Gap]:
@@ -167,4 +188,5 @@ def _deleted(catalogue: Catalogue) -> Iterator[Gap]:
     for journal in catalogue.manifest.journals.values():
         if journal.name not in existing:
             yield from journal.gaps
+        if journal.name not in existing or journal.name in catalogue.done:
             yield from sealed[journal.name].gaps() if journal.name in sealed else ()
