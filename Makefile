@@ -44,7 +44,7 @@ bench: $(TEST)  ## measure the numbers that the documentation quotes (BENCH_ARGS
 
 soak: $(TEST)  ## what takes long: random lives of stores, verified and kept (about half an hour)
 	$(BIN)/python -m benchmarks.soak_verify
-	HYPOTHESIS_PROFILE=soak $(BIN)/python -m pytest --timeout=0 tests/blackbox/keeper/test_keeping_model.py
+	HYPOTHESIS_PROFILE=soak $(BIN)/python -m pytest --timeout=0 tests/blackbox/deletion/test_keeping_model.py
 
 venv: $(TEST)  ## only install
 

@@ -15,12 +15,12 @@ from amberbox.blackbox.follow.follow import follow
 from amberbox.blackbox.follow.read import journals
 from amberbox.blackbox.journal import reserved
 from amberbox.blackbox.journal.clocktable import ClockReading, ClockTable, simplified
-from amberbox.blackbox.keeper.sealing import seal_journals
 from amberbox.blackbox.query.catalogue import look
 from amberbox.blackbox.query.clockbook import ClockBook, JournalClock, book_of
 from amberbox.blackbox.query.gaps import _as_known_now
 from amberbox.blackbox.query.record import Record
 from amberbox.blackbox.segments.build import build_segments
+from amberbox.blackbox.signing.sealing import seal_journals
 from amberbox.blackbox.store import create_store, open_store
 from amberbox.core.clock import NS
 from amberbox.core.types import Batch, Gap, IntArray

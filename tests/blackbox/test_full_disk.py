@@ -16,9 +16,9 @@ import numpy as np
 import pytest
 
 import amberbox
+from amberbox.blackbox.deletion.usage import DiskUse
 from amberbox.blackbox.follow.follow import follow
 from amberbox.blackbox.keeper.options import KeeperOptions
-from amberbox.blackbox.keeper.usage import DiskUse
 from amberbox.blackbox.recorder.pipeline import PipelineOptions
 from amberbox.blackbox.recorder.room import Room
 from amberbox.blackbox.segments import manifest as mf

@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import asdict
 
-from amberbox.blackbox.keeper.keys import parse_public
+from amberbox.blackbox.signing.keys import parse_public
 from amberbox.blackbox.verify.findings import STATES, Finding, Report, as_text
 from amberbox.blackbox.verify.verify import verify
 from amberbox.blackbox.where import store_path

@@ -30,10 +30,10 @@ from amberbox.blackbox.incidents.extent import Extent, extent
 from amberbox.blackbox.incidents.timeline import look_back
 from amberbox.blackbox.incidents.window import windows_of
 from amberbox.blackbox.keeper.incidents import IncidentKeeping
-from amberbox.blackbox.keeper.notary import Notary
 from amberbox.blackbox.keeper.options import KeeperOptions
 from amberbox.blackbox.keeper.ownjournal import OwnJournal
 from amberbox.blackbox.recorder.pipeline import PipelineOptions
+from amberbox.blackbox.signing.notary import Notary
 from amberbox.blackbox.store import Store, open_store
 from amberbox.core.clock import NS
 from amberbox.core.errors import UsageError

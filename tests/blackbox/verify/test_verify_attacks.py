@@ -13,16 +13,16 @@ import zstandard
 
 from amberbox.blackbox.journal import mcap
 from amberbox.blackbox.journal.chunk import decompress
-from amberbox.blackbox.keeper.keys import open_keys, public_key
-from amberbox.blackbox.keeper.signing import (
+from amberbox.blackbox.segments import lines
+from amberbox.blackbox.segments import manifest as mf
+from amberbox.blackbox.segments.entries import Tombstone, to_record
+from amberbox.blackbox.signing.keys import open_keys, public_key
+from amberbox.blackbox.signing.signing import (
     HEADS,
     load_heads,
     sign_manifest,
     write_heads,
 )
-from amberbox.blackbox.segments import lines
-from amberbox.blackbox.segments import manifest as mf
-from amberbox.blackbox.segments.entries import Tombstone, to_record
 from amberbox.blackbox.store import open_store
 from amberbox.blackbox.verify import heads as heads_module
 from amberbox.blackbox.verify import signed as signed_module

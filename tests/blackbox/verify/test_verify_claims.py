@@ -8,13 +8,13 @@ from dataclasses import replace
 from pathlib import Path
 
 from amberbox.blackbox.incidents import Incident, Wish, pin, release
-from amberbox.blackbox.keeper.keys import open_keys
 from amberbox.blackbox.keeper.options import KeeperOptions
-from amberbox.blackbox.keeper.signing import HEADS, signature_record, write_heads
 from amberbox.blackbox.segments import lines
 from amberbox.blackbox.segments import manifest as mf
 from amberbox.blackbox.segments.condense import live_records
 from amberbox.blackbox.segments.entries import Tombstone, to_record
+from amberbox.blackbox.signing.keys import open_keys
+from amberbox.blackbox.signing.signing import HEADS, signature_record, write_heads
 from amberbox.blackbox.store import open_store
 from amberbox.core.source import TopicOptions
 from amberbox.testing.box import COUNT, ManualBox, number

@@ -9,11 +9,11 @@ from pathlib import Path
 import pytest
 
 from amberbox.blackbox.keeper.keeper import Keeper
-from amberbox.blackbox.keeper.notary import Notary
 from amberbox.blackbox.keeper.options import KeeperOptions
 from amberbox.blackbox.recorder.pipeline import PipelineOptions
 from amberbox.blackbox.segments import manifest as mf
 from amberbox.blackbox.segments.condense import condense
+from amberbox.blackbox.signing.notary import Notary
 from amberbox.blackbox.store import open_store
 from amberbox.blackbox.verify.findings import Report
 from amberbox.blackbox.verify.verify import verify

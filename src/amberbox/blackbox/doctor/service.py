@@ -8,11 +8,11 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
+from amberbox.blackbox.deletion.limit import FULL, RESERVE
 from amberbox.blackbox.doctor.finding import Finding, error, in_time, ok, warn
 from amberbox.blackbox.doctor.host import Host
 from amberbox.blackbox.doctor.subject import Subject
 from amberbox.blackbox.journal.head import Head, read_head
-from amberbox.blackbox.keeper.limit import FULL, RESERVE
 from amberbox.blackbox.store import Store, is_locked
 from amberbox.blackbox.unitfile import UNITS, argument
 from amberbox.core.clock import NS

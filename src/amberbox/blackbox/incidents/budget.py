@@ -7,12 +7,12 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
+from amberbox.blackbox.deletion.limit import quota_bytes
+from amberbox.blackbox.deletion.usage import bytes_of
 from amberbox.blackbox.follow.follow import RECORDED
 from amberbox.blackbox.incidents.extent import extent
 from amberbox.blackbox.incidents.incident import RING, Incident, folder_of, load_all
-from amberbox.blackbox.keeper.limit import quota_bytes
 from amberbox.blackbox.keeper.options import KeeperOptions
-from amberbox.blackbox.keeper.usage import bytes_of
 from amberbox.blackbox.segments import manifest
 from amberbox.blackbox.segments.entries import Sealed
 from amberbox.blackbox.segments.manifest import Part

@@ -17,6 +17,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from amberbox import __version__
+from amberbox.blackbox.deletion.pinlock import pin_lock
 from amberbox.blackbox.incidents.budget import Refusal, refused_by_budget
 from amberbox.blackbox.incidents.extent import extent
 from amberbox.blackbox.incidents.incident import (
@@ -35,7 +36,6 @@ from amberbox.blackbox.incidents.incident import (
 )
 from amberbox.blackbox.incidents.timeline import Timeline, look_back
 from amberbox.blackbox.keeper.options import KeeperOptions
-from amberbox.blackbox.keeper.pinlock import pin_lock
 from amberbox.blackbox.store import (
     INCIDENTS,
     Store,

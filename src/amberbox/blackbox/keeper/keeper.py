@@ -12,15 +12,14 @@ import time
 from contextlib import suppress
 from typing import TYPE_CHECKING
 
+from amberbox.blackbox.deletion import confirm
+from amberbox.blackbox.deletion.deleter import Deleter
+from amberbox.blackbox.deletion.limit import NO_ROOM, with_reserve
+from amberbox.blackbox.deletion.roomthread import RoomThread
 from amberbox.blackbox.follow.chain import previous_chain
 from amberbox.blackbox.follow.read import journal_file
-from amberbox.blackbox.keeper import confirm
-from amberbox.blackbox.keeper.deleter import Deleter
-from amberbox.blackbox.keeper.limit import NO_ROOM, with_reserve
-from amberbox.blackbox.keeper.notary import Notary
 from amberbox.blackbox.keeper.options import KeeperOptions
 from amberbox.blackbox.keeper.ownjournal import OwnJournal
-from amberbox.blackbox.keeper.roomthread import RoomThread
 from amberbox.blackbox.keeper.situation import Situations
 from amberbox.blackbox.segments import manifest
 from amberbox.blackbox.segments.build import (
@@ -30,6 +29,7 @@ from amberbox.blackbox.segments.build import (
     remove_leftovers,
 )
 from amberbox.blackbox.segments.dropping import drop_gone
+from amberbox.blackbox.signing.notary import Notary
 from amberbox.blackbox.store import Store, WriterLock
 from amberbox.core.clock import Clock
 from amberbox.core.errors import UsageError

@@ -9,6 +9,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from amberbox.blackbox import requests
+from amberbox.blackbox.deletion.limit import with_reserve
+from amberbox.blackbox.deletion.pinlock import pin_lock
 from amberbox.blackbox.incidents.budget import Refusal, held_bytes
 from amberbox.blackbox.incidents.incident import (
     RING,
@@ -24,10 +26,8 @@ from amberbox.blackbox.incidents.incident import (
 from amberbox.blackbox.incidents.pin import Wish, advance, pin
 from amberbox.blackbox.incidents.timeline import look_back
 from amberbox.blackbox.journal import reserved
-from amberbox.blackbox.keeper.limit import with_reserve
 from amberbox.blackbox.keeper.options import KeeperOptions
 from amberbox.blackbox.keeper.ownjournal import OwnJournal, Record, event
-from amberbox.blackbox.keeper.pinlock import pin_lock
 from amberbox.blackbox.keeper.ratelimit import Refusals, refused_by_rate
 from amberbox.blackbox.requests import Request
 from amberbox.blackbox.segments import manifest

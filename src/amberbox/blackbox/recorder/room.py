@@ -7,7 +7,7 @@ import time
 from contextlib import suppress
 from pathlib import Path
 
-from amberbox.blackbox.keeper.allowance import Allowance
+from amberbox.blackbox.deletion.allowance import Allowance
 
 RESERVE = "reserve"
 """File in the store that holds room free for the last events."""

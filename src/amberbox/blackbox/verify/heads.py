@@ -6,10 +6,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from amberbox.blackbox.keeper.keys import can_sign
-from amberbox.blackbox.keeper.signing import HEADS, STATED, Reach, SignedHeads, parse_heads
 from amberbox.blackbox.segments import manifest as mf
 from amberbox.blackbox.segments.entries import Sealed
+from amberbox.blackbox.signing.keys import can_sign
+from amberbox.blackbox.signing.signing import HEADS, STATED, Reach, SignedHeads, parse_heads
 from amberbox.blackbox.verify.continuity import Graves, place_of
 from amberbox.blackbox.verify.findings import Finding
 from amberbox.blackbox.verify.journal import Checked

@@ -8,12 +8,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from amberbox.blackbox.keeper.keys import holds
-from amberbox.blackbox.keeper.signing import signature_message
 from amberbox.blackbox.segments import lines
 from amberbox.blackbox.segments import manifest as mf
 from amberbox.blackbox.segments.entries import Sealed, Signature, Tombstone, from_record
 from amberbox.blackbox.segments.manifest import Manifest
+from amberbox.blackbox.signing.keys import holds
+from amberbox.blackbox.signing.signing import signature_message
 from amberbox.blackbox.verify.findings import Finding, State
 from amberbox.blackbox.verify.mended import without_one_bit
 from amberbox.blackbox.verify.place import TROUBLE

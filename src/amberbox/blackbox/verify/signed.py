@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from amberbox.blackbox.keeper.keys import PUBLIC, can_sign, is_key, public_key
-from amberbox.blackbox.keeper.signing import STATED, SignedHeads
 from amberbox.blackbox.segments import manifest as mf
 from amberbox.blackbox.segments.entries import Signature
+from amberbox.blackbox.signing.keys import PUBLIC, can_sign, is_key, public_key
+from amberbox.blackbox.signing.signing import STATED, SignedHeads
 from amberbox.blackbox.verify.findings import BAD, Finding, as_text
 from amberbox.blackbox.verify.journal import Checked
 from amberbox.blackbox.verify.manifest import CheckedManifest

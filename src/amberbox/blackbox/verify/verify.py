@@ -9,10 +9,10 @@ from pathlib import Path
 
 from amberbox.blackbox.journal.buffer import open_buffer
 from amberbox.blackbox.journal.scan import start_record
-from amberbox.blackbox.keeper.keys import PUBLIC, can_sign
-from amberbox.blackbox.keeper.signing import LOCKS, SignedHeads
 from amberbox.blackbox.segments import manifest as mf
 from amberbox.blackbox.segments.manifest import Manifest, Segment
+from amberbox.blackbox.signing.keys import PUBLIC, can_sign
+from amberbox.blackbox.signing.signing import LOCKS, SignedHeads
 from amberbox.blackbox.store import is_locked, open_store
 from amberbox.blackbox.verify.continuity import Graves, check_continuity
 from amberbox.blackbox.verify.findings import BAD, Collected, Finding, HeadLine, Report

@@ -8,7 +8,7 @@ from pathlib import Path
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from amberbox.blackbox.keeper.usage import DiskUse
+from amberbox.blackbox.deletion.usage import DiskUse
 
 NAMES = ["journal/1.mcap", "journal/2.mcap", "segments/a/1.parquet", "segments/a/.1.parquet.tmp",
          "manifest", "incidents/x/ring/1.mcap", "journal/head"]  # fmt: skip

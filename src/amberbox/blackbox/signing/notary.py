@@ -8,10 +8,10 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from typing import Any
 
-from amberbox.blackbox.keeper.keys import Keys, open_keys
 from amberbox.blackbox.keeper.ownjournal import OwnJournal, event
-from amberbox.blackbox.keeper.sealing import seal_journals
-from amberbox.blackbox.keeper.signing import sign_manifest, signature_record, write_heads
+from amberbox.blackbox.signing.keys import Keys, open_keys
+from amberbox.blackbox.signing.sealing import seal_journals
+from amberbox.blackbox.signing.signing import sign_manifest, signature_record, write_heads
 from amberbox.blackbox.store import Store
 
 STATE_S = 10.0

@@ -9,11 +9,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from amberbox.blackbox.deletion.rule import Unit, Window, ages_s
+from amberbox.blackbox.deletion.usage import DiskUse
 from amberbox.blackbox.follow.follow import RECORDED
 from amberbox.blackbox.follow.read import JournalFile, journal_file
 from amberbox.blackbox.journal.clocktable import ClockTable
-from amberbox.blackbox.keeper.deletion import Unit, Window, ages_s
-from amberbox.blackbox.keeper.usage import DiskUse
 from amberbox.blackbox.segments import manifest as mf
 from amberbox.blackbox.segments.manifest import Manifest
 from amberbox.blackbox.store import FOLDERS, Store, is_locked

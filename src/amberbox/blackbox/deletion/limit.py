@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
+from amberbox.blackbox.deletion.usage import free_bytes, total_bytes
 from amberbox.blackbox.keeper.options import KeeperOptions
-from amberbox.blackbox.keeper.usage import free_bytes, total_bytes
 from amberbox.blackbox.store import Store, replace_file
 
 FULL = "full"

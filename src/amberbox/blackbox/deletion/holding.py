@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from amberbox.blackbox.keeper.deletion import Window
+from amberbox.blackbox.deletion.rule import Window
 from amberbox.blackbox.store import INCIDENTS, Store
 
 if TYPE_CHECKING:

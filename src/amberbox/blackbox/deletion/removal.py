@@ -7,11 +7,11 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 
+from amberbox.blackbox.deletion.kept import KeptJournal
+from amberbox.blackbox.deletion.limit import with_reserve
+from amberbox.blackbox.deletion.pinlock import pin_lock
+from amberbox.blackbox.deletion.rule import Pin, Removal, Window, unpinned
 from amberbox.blackbox.follow.read import journal_file
-from amberbox.blackbox.keeper.deletion import Pin, Removal, Window, unpinned
-from amberbox.blackbox.keeper.kept import KeptJournal
-from amberbox.blackbox.keeper.limit import with_reserve
-from amberbox.blackbox.keeper.pinlock import pin_lock
 from amberbox.blackbox.segments import manifest as mf
 from amberbox.blackbox.segments.entries import Tombstone, What, to_record
 from amberbox.blackbox.segments.manifest import Manifest

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from hypothesis import given
 from hypothesis import strategies as st
 
-from amberbox.blackbox.keeper.deletion import (
+from amberbox.blackbox.deletion.rule import (
     Unit,
     Window,
     ages_s,

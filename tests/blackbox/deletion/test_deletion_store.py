@@ -18,14 +18,14 @@ import pytest
 
 import amberbox
 from amberbox.blackbox import requests
+from amberbox.blackbox.deletion import allowance, confirm
+from amberbox.blackbox.deletion.usage import DiskUse
 from amberbox.blackbox.follow.follow import follow
 from amberbox.blackbox.incidents import Incident, Wish, advance, pin
 from amberbox.blackbox.incidents.incident import load, save
-from amberbox.blackbox.keeper import allowance, confirm
 from amberbox.blackbox.keeper import keeper as module
 from amberbox.blackbox.keeper.keeper import Keeper
 from amberbox.blackbox.keeper.options import KeeperOptions, Lifetime
-from amberbox.blackbox.keeper.usage import DiskUse
 from amberbox.blackbox.query import record
 from amberbox.blackbox.recorder.pipeline import PipelineOptions
 from amberbox.blackbox.recorder.room import Room

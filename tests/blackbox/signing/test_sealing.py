@@ -12,17 +12,17 @@ import pytest
 
 from amberbox.blackbox.keeper import keeper as keeper_module
 from amberbox.blackbox.keeper.keeper import Keeper
-from amberbox.blackbox.keeper.keys import SigningKey, open_keys
 from amberbox.blackbox.keeper.options import KeeperOptions
-from amberbox.blackbox.keeper.sealing import seal_journals
-from amberbox.blackbox.keeper.signing import (
+from amberbox.blackbox.recorder.pipeline import PipelineOptions
+from amberbox.blackbox.segments import manifest as mf
+from amberbox.blackbox.signing.keys import SigningKey, open_keys
+from amberbox.blackbox.signing.sealing import seal_journals
+from amberbox.blackbox.signing.signing import (
     load_heads,
     sign_manifest,
     signed_heads,
     write_heads,
 )
-from amberbox.blackbox.recorder.pipeline import PipelineOptions
-from amberbox.blackbox.segments import manifest as mf
 from amberbox.blackbox.store import Store, open_store
 from amberbox.core.clock import NS
 from amberbox.core.source import TopicOptions

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from amberbox.blackbox.keeper import allowance
-from amberbox.blackbox.keeper.allowance import Allowance, Statement
-from amberbox.blackbox.keeper.deleter import Deleter
+from amberbox.blackbox.deletion import allowance
+from amberbox.blackbox.deletion.allowance import Allowance, Statement
+from amberbox.blackbox.deletion.deleter import Deleter
 from amberbox.blackbox.keeper.keeper import Keeper
 from amberbox.blackbox.keeper.options import KeeperOptions
 from amberbox.blackbox.store import open_store

@@ -7,19 +7,19 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 
-from amberbox.blackbox.keeper import allowance
-from amberbox.blackbox.keeper.allowance import Statement
-from amberbox.blackbox.keeper.deletion import Removal, Unit, Window, for_room, too_old, unpinned
-from amberbox.blackbox.keeper.deletionlog import DeletionLog
-from amberbox.blackbox.keeper.holding import is_needed, pinning, release_confirmed
-from amberbox.blackbox.keeper.kept import KeptJournal
-from amberbox.blackbox.keeper.limit import FullMark, Room, room, with_reserve
+from amberbox.blackbox.deletion import allowance
+from amberbox.blackbox.deletion.allowance import Statement
+from amberbox.blackbox.deletion.holding import is_needed, pinning, release_confirmed
+from amberbox.blackbox.deletion.kept import KeptJournal
+from amberbox.blackbox.deletion.limit import FullMark, Room, room, with_reserve
+from amberbox.blackbox.deletion.log import DeletionLog
+from amberbox.blackbox.deletion.pinlock import pin_lock
+from amberbox.blackbox.deletion.removal import Remover
+from amberbox.blackbox.deletion.rule import Removal, Unit, Window, for_room, too_old, unpinned
+from amberbox.blackbox.deletion.stock import Stock
+from amberbox.blackbox.deletion.usage import DiskUse
 from amberbox.blackbox.keeper.options import KeeperOptions
 from amberbox.blackbox.keeper.ownjournal import OwnJournal, event
-from amberbox.blackbox.keeper.pinlock import pin_lock
-from amberbox.blackbox.keeper.removal import Remover
-from amberbox.blackbox.keeper.stock import Stock
-from amberbox.blackbox.keeper.usage import DiskUse
 from amberbox.blackbox.segments import manifest as mf
 from amberbox.blackbox.segments.condense import LARGE_BYTES, SignHead, condense
 from amberbox.blackbox.store import Store

@@ -27,11 +27,11 @@ from hypothesis.stateful import (
     rule,
 )
 
+from amberbox.blackbox.deletion.confirm import confirm
 from amberbox.blackbox.follow.follow import follow
 from amberbox.blackbox.incidents import Incident, Wish, advance, load, pin, release
 from amberbox.blackbox.incidents.incident import save
 from amberbox.blackbox.journal.writer import JournalWriter
-from amberbox.blackbox.keeper.confirm import confirm
 from amberbox.blackbox.keeper.keeper import Keeper
 from amberbox.blackbox.keeper.options import KeeperOptions
 from amberbox.blackbox.query.catalogue import look

@@ -14,10 +14,10 @@ import msgspec
 
 from amberbox.blackbox.journal.buffer import open_buffer
 from amberbox.blackbox.journal.head import read_head
-from amberbox.blackbox.keeper.keys import SigningKey, holds
 from amberbox.blackbox.segments import manifest as mf
 from amberbox.blackbox.segments.entries import Sealed, Signature, to_record
 from amberbox.blackbox.segments.lines import first_hash
+from amberbox.blackbox.signing.keys import SigningKey, holds
 from amberbox.blackbox.store import Store, is_locked, replace_file, run_and_number
 from amberbox.blackbox.verify.links import Link, links
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from amberbox.blackbox.keeper import keys
+from amberbox.blackbox.signing import keys
 from amberbox.blackbox.store import create_store
 from amberbox.core.errors import UsageError
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass
 
-from amberbox.blackbox.keeper.deletion import Removal
+from amberbox.blackbox.deletion.rule import Removal
 from amberbox.blackbox.keeper.ownjournal import Record, event
 from amberbox.blackbox.segments.entries import Tombstone
 from amberbox.core.timetext import format_time

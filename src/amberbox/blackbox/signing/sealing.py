@@ -10,10 +10,10 @@ import numpy as np
 
 from amberbox.blackbox.follow.read import JournalFile, holes, journal_file, run_messages
 from amberbox.blackbox.journal.clocktable import ClockTable
-from amberbox.blackbox.keeper.keys import SigningKey
-from amberbox.blackbox.keeper.signing import LOCKS, STATED, sign_manifest
 from amberbox.blackbox.segments import manifest as mf
 from amberbox.blackbox.segments.entries import Hole, Sealed, to_record
+from amberbox.blackbox.signing.keys import SigningKey
+from amberbox.blackbox.signing.signing import LOCKS, STATED, sign_manifest
 from amberbox.blackbox.store import Store, is_locked
 from amberbox.blackbox.verify.findings import BAD
 from amberbox.blackbox.verify.journal import Checked, check_journal
