@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 
 from amberbox.blackbox.journal.writer import JournalOptions, JournalWriter
-from amberbox.blackbox.keeper.keys import open_keys
-from amberbox.blackbox.keeper.sealing import seal_journals
 from amberbox.blackbox.segments import manifest as mf
+from amberbox.blackbox.signing.keys import open_keys
+from amberbox.blackbox.signing.sealing import seal_journals
 from amberbox.blackbox.store import Store, create_store
 from amberbox.blackbox.verify.verify import verify
 from benchmarks.common import Row, percentile, wall_s
@@ -89,7 +89,7 @@ def _seal_again(store: Store, work: Callable[[], object]) -> None:
 _SEALING = """
 import os, sys
 from pathlib import Path
-from amberbox.blackbox.keeper.sealing import seal_journals
+from amberbox.blackbox.signing.sealing import seal_journals
 from amberbox.blackbox.store import open_store
 os.nice(10)
 store = open_store(Path(sys.argv[1]))
