@@ -358,6 +358,8 @@ def test_words_stand_for_missions(three: Robot) -> None:
     for wrong in ("visit", "last:0", "last:x"):
         with pytest.raises(UsageError):
             named(known, wrong)
+    with pytest.raises(UsageError, match="no mission has failed"):
+        named(known[:1], "failed:3")
 
 
 def test_missions_are_chosen_by_time(three: Robot) -> None:

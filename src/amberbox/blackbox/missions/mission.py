@@ -193,4 +193,6 @@ def named(missions: Sequence[Mission], text: str) -> list[Mission]:
         return found
     known = sorted({*(m.id for m in missions), *(m.name for m in missions)})
     hint = "amberbox mission list WHERE shows them" if missions else "there are none yet"
+    if missions and word == "failed":
+        raise UsageError("no mission has failed", hint)
     raise UsageError(f"there is no mission '{text}'{did_you_mean(text, known)}", hint)
