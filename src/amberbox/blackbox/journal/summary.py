@@ -13,6 +13,7 @@ from amberbox.blackbox.journal.mcap import Channel
 from amberbox.core.types import Schema
 
 FOOTER_SIZE = 9 + 20 + len(mcap.MAGIC)
+_DATA_END_SIZE = 13
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,6 +132,13 @@ def is_finished(data: bytes | memoryview) -> bool:
         return False
     opcode, length, start = struct.unpack_from("<BQQ", data, len(data) - FOOTER_SIZE)
     return (opcode, length, start) == (mcap.FOOTER, 20, 0)
+
+
+def ends_of_data(data: bytes | memoryview) -> tuple[int, int]:
+    """Return where the DataEnd record and the footer of a finished file must lie."""
+    footer = len(data) - FOOTER_SIZE
+    _, _, start = struct.unpack_from("<BQQ", data, footer)
+    return (start or footer) - _DATA_END_SIZE, footer
 
 
 def _parse(data: bytes | memoryview, start: int, end: int) -> Summary:

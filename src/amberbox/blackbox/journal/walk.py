@@ -16,7 +16,7 @@ from amberbox.blackbox.journal import mcap
 from amberbox.blackbox.journal.buffer import Buffer
 from amberbox.blackbox.journal.chunk import Chunk, decompress, index_offsets, open_chunk
 from amberbox.blackbox.journal.mcap import CHAIN_METADATA, START_METADATA
-from amberbox.blackbox.journal.summary import is_finished
+from amberbox.blackbox.journal.summary import ends_of_data, is_finished
 from amberbox.core.types import IntArray
 
 _KNOWN = {1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15}
@@ -229,6 +229,9 @@ class Walk:
         if not is_finished(self.data):
             if not self.grows:
                 self._fail("summary is damaged")
+            return
+        if self.at not in ends_of_data(self.data):  # a damaged record that looks like the end
+            self._fail("end of data in the middle")
             return
         self.finished = True
         self.at = len(self.data)
