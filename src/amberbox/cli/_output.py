@@ -39,16 +39,6 @@ def room(file: IO[str], more: str) -> Room | None:
     return Room(shutil.get_terminal_size().columns, more) if file.isatty() else None
 
 
-def size(count: int) -> str:
-    """Write a number of bytes for a person."""
-    value = float(count)
-    for unit in ("B", "kB", "MB", "GB"):
-        if value < 1000:
-            return f"{value:.0f} {unit}" if unit == "B" else f"{value:.1f} {unit}"
-        value /= 1000
-    return f"{value:.1f} TB"
-
-
 def tell(notes: Iterable[str]) -> None:
     """Say on stderr what could not be read."""
     for note in notes:

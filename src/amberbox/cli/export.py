@@ -11,10 +11,11 @@ from pathlib import Path
 from amberbox.blackbox.exporting import FORMS, ExportOptions, ExportReport, View, export
 from amberbox.blackbox.query.record import Record
 from amberbox.blackbox.query.variables import closest
-from amberbox.cli._output import add_range, opened, print_json, size, writable
+from amberbox.cli._output import add_range, opened, print_json, writable
 from amberbox.cli._progress import progress_bar
 from amberbox.cli._window import add_window, windows
 from amberbox.core.errors import UsageError
+from amberbox.core.units import in_bytes
 
 _ENDINGS = {".csv": "csv", ".parquet": "parquet", ".mcap": "mcap", ".bag": "bag"}
 
@@ -128,7 +129,7 @@ def _tell(report: ExportReport, seconds: float) -> None:
     """Print the report, on stderr where the rows went to stdout."""
     output = sys.stdout if report.target else sys.stderr
     what = "messages" if report.form in ("mcap", "bag") else "rows"
-    into = f", {size(report.bytes)} in {report.target}" if report.target else ""
+    into = f", {in_bytes(report.bytes)} in {report.target}" if report.target else ""
     lines = report.lines() if report.target else [f"note: {text}" for text in report.notes]
     lines += [] if report.target else [f"missing: {text}" for text in report.missing]
     for line in [*lines, f"{report.total} {what} in {seconds:.1f} s{into}"]:

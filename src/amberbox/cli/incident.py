@@ -14,12 +14,12 @@ from amberbox.blackbox.journal.reserved import PREFIX
 from amberbox.blackbox.query.record import Record
 from amberbox.blackbox.store import Store, open_store
 from amberbox.blackbox.where import store_path
-from amberbox.cli._output import print_grid, print_json, size, tell
+from amberbox.cli._output import print_grid, print_json, tell
 from amberbox.cli._text import in_columns
 from amberbox.core.clock import NS
 from amberbox.core.errors import UsageError
 from amberbox.core.timetext import format_time
-from amberbox.core.units import parse_duration_s
+from amberbox.core.units import in_bytes, parse_duration_s
 
 _USAGE = "amberbox incident WHERE, list WHERE, show WHERE ID, release WHERE ID"
 _HEADER = ("id", "state", "from (UTC)", "seconds", "who", "reason")
@@ -75,7 +75,7 @@ def _list(rest: list[str], as_json: bool) -> None:
         print_json([incident.to_json() for incident in incidents])
     elif incidents:
         print_grid(_HEADER, map(_row, incidents))
-        print(f"they hold {size(held_bytes(store, incidents))}")
+        print(f"they hold {in_bytes(held_bytes(store, incidents))}")
     else:
         print("there are no incidents")
 
@@ -91,7 +91,7 @@ def _show(rest: list[str], as_json: bool) -> None:
                     "files": found, "items": rows})  # fmt: skip
         return
     print("\n".join(_described(incident, held_bytes(store, [incident]))))
-    print("\n".join(["files:", *in_columns([(name, size(count)) for name, count in files])]))
+    print("\n".join(["files:", *in_columns([(name, in_bytes(count)) for name, count in files])]))
     print("\n".join(["items:", *in_columns([(name, f"{n} rows") for name, n in rows.items()])]))
 
 
@@ -128,7 +128,7 @@ def _described(incident: Incident, held: int) -> Iterator[str]:
         ("state", incident.state + (", confirmed" if incident.confirmed else "")),
         ("window", f"{_range(incident)} (UTC)"),
         ("made", format_time(incident.made_ns)[:19]),
-        ("holds", size(held)),
+        ("holds", in_bytes(held)),
         *((name, value) for name, value in incident.versions.items() if value),
     ]
     yield from in_columns(facts, "")

@@ -6,9 +6,10 @@ import argparse
 
 from amberbox.blackbox.journal.reserved import PREFIX
 from amberbox.blackbox.query.overview import ItemInfo
-from amberbox.cli._output import opened, print_grid, print_json, size, tell
+from amberbox.cli._output import opened, print_grid, print_json, tell
 from amberbox.core.clock import NS
 from amberbox.core.timetext import format_time
+from amberbox.core.units import in_bytes
 
 _HEADER = ("item", "type", "rows", "rate Hz", "first (UTC)", "last (UTC)", "stamp offset s", "size")
 
@@ -49,7 +50,7 @@ def _row(item: ItemInfo) -> tuple[object, ...]:
         _short(item.first_ns),
         _short(item.last_ns),
         None if item.stamp_offset_s is None else round(item.stamp_offset_s, 4),
-        size(item.bytes) if item.bytes else None,
+        in_bytes(item.bytes) if item.bytes else None,
     )
 
 

@@ -14,8 +14,7 @@ from dataclasses import asdict
 from amberbox.blackbox.folder.folder import load_folder
 from amberbox.blackbox.recorder.recorder import Recorder, RecorderState
 from amberbox.blackbox.service import is_service
-from amberbox.cli._output import size
-from amberbox.core.units import in_unit
+from amberbox.core.units import in_bytes, in_unit
 
 _TABLE_S = 1.0
 _NO_TROUBLE = {"started", "stopped", "source_ended", "imported", "power_mains"}
@@ -109,7 +108,8 @@ def _redraw(rows: list[str], before: int) -> int:
 def table(state: RecorderState, elapsed_s: float) -> list[str]:
     """Lay the live table out as lines of text."""
     rows = [_HEADINGS, *(
-        (i.name, f"{i.rate_hz:.1f}", str(i.kept), str(i.filtered), str(i.dropped), size(i.bytes))
+        (i.name, f"{i.rate_hz:.1f}", str(i.kept), str(i.filtered), str(i.dropped),
+         in_bytes(i.bytes))
         for i in state.items
     )]  # fmt: skip
     widths = [max(len(row[column]) for row in rows) for column in range(len(_HEADINGS))]
@@ -118,8 +118,8 @@ def table(state: RecorderState, elapsed_s: float) -> list[str]:
         + "".join("  " + c.rjust(w) for c, w in zip(row[1:], widths[1:], strict=True))
         for row in rows
     ]
-    foot = f"{elapsed_s:.0f} s, written {size(state.written_bytes)}, "
-    foot += f"queue {size(state.queue_bytes)}, disk left {size(state.disk_free_bytes)}"
+    foot = f"{elapsed_s:.0f} s, written {in_bytes(state.written_bytes)}, "
+    foot += f"queue {in_bytes(state.queue_bytes)}, disk left {in_bytes(state.disk_free_bytes)}"
     return [*lines, foot, *_trouble(state)]
 
 
@@ -129,7 +129,7 @@ def summary(state: RecorderState) -> str:
     dropped = sum(item.dropped for item in state.items)
     rate = sum(item.rate_hz for item in state.items)
     text = f"{len(state.items)} items, {rate:.0f} messages/s, {kept} kept, {dropped} dropped, "
-    text += f"{size(state.written_bytes)} written, {size(state.disk_free_bytes)} left"
+    text += f"{in_bytes(state.written_bytes)} written, {in_bytes(state.disk_free_bytes)} left"
     return "; ".join([text, *_trouble(state)])
 
 

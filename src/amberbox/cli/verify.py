@@ -11,8 +11,9 @@ from amberbox.blackbox.signing.keys import parse_public
 from amberbox.blackbox.verify.findings import STATES, Finding, Report, as_text
 from amberbox.blackbox.verify.verify import verify
 from amberbox.blackbox.where import store_path
-from amberbox.cli._output import print_json, size, tell
+from amberbox.cli._output import print_json, tell
 from amberbox.cli._text import in_columns
+from amberbox.core.units import in_bytes
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -53,7 +54,7 @@ def _lines(report: Report) -> Iterator[str]:
             yield f"{'':<8}  {place}"
     counts = Counter(report.files.values())
     states = ", ".join(f"{counts[state]} {state}" for state in STATES if counts[state])
-    yield f"{len(report.files)} files, {size(report.bytes)}: {states or 'nothing to verify'}"
+    yield f"{len(report.files)} files, {in_bytes(report.bytes)}: {states or 'nothing to verify'}"
     heads = [("head", h.what, h.hash, _short(h.at_ns), h.file) for h in report.heads]
     yield from in_columns(heads, "")
 

@@ -69,6 +69,16 @@ def parse_duration_s(text: str) -> float:
     return seconds
 
 
+def in_bytes(count: float) -> str:
+    """Write a number of bytes for a person."""
+    value = float(count)
+    for unit in ("B", "kB", "MB", "GB"):
+        if value < 1000:
+            return f"{value:.0f} {unit}" if unit == "B" else f"{value:.1f} {unit}"
+        value /= 1000
+    return f"{value:.1f} TB"
+
+
 def _unknown_unit(written: str, units: Mapping[str, int]) -> str:
     if not units:
         return f"has a unit '{written}' where a plain number is expected"

@@ -10,7 +10,7 @@ import pytest
 
 from amberbox.blackbox.doctor.clock import judged_clock
 from amberbox.blackbox.doctor.disk import judged_file_system, judged_root, judged_space
-from amberbox.blackbox.doctor.finding import Finding, in_bytes, in_time
+from amberbox.blackbox.doctor.finding import Finding, in_time
 from amberbox.blackbox.doctor.latency import judged_latency
 from amberbox.blackbox.doctor.mount import Mount, mount_of
 from amberbox.blackbox.doctor.power import judged_power
@@ -27,6 +27,7 @@ from amberbox.blackbox.folder.robot import StoreOptions
 from amberbox.blackbox.journal.head import Head
 from amberbox.blackbox.store import create_store
 from amberbox.core.clock import NS
+from amberbox.core.units import in_bytes
 
 GB = 1_000_000_000
 FOLDER = Path("/data/robot")

@@ -7,12 +7,13 @@ import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
-from amberbox.blackbox.doctor.finding import Finding, error, in_bytes, in_time, ok, warn
+from amberbox.blackbox.doctor.finding import Finding, error, in_time, ok, warn
 from amberbox.blackbox.doctor.host import Host
 from amberbox.blackbox.doctor.mount import MOUNTS, Mount, mount_of
 from amberbox.blackbox.doctor.subject import Subject
 from amberbox.blackbox.doctor.traffic import DAY_S, Traffic
 from amberbox.blackbox.folder.robot import StoreOptions
+from amberbox.core.units import in_bytes
 
 _NEWEST_S = DAY_S
 """What shall never be deleted unseen: the newest day."""

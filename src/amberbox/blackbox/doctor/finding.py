@@ -33,16 +33,6 @@ def error(check: str, found: str, hint: str) -> Finding:
     return Finding(check, "error", found, hint)
 
 
-def in_bytes(count: float) -> str:
-    """Write a number of bytes for a person."""
-    value = float(count)
-    for unit in ("B", "kB", "MB", "GB"):
-        if value < 1000:
-            return f"{value:.0f} {unit}" if unit == "B" else f"{value:.1f} {unit}"
-        value /= 1000
-    return f"{value:.1f} TB"
-
-
 def in_time(seconds: float) -> str:
     """Write a duration for a person."""
     for limit, size, unit in ((120, 1, "s"), (7200, 60, "min"), (172_800, 3600, "h")):

@@ -6,11 +6,12 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from amberbox.blackbox.doctor.finding import Finding, in_bytes, in_time, ok, warn
+from amberbox.blackbox.doctor.finding import Finding, in_time, ok, warn
 from amberbox.blackbox.doctor.host import Host
 from amberbox.blackbox.doctor.mount import MOUNTS, disk_of, mount_of
 from amberbox.blackbox.doctor.subject import Subject
 from amberbox.blackbox.doctor.traffic import DAY_S, Traffic
+from amberbox.core.units import in_bytes
 
 ENDURANCE = {"SD card": 300, "eMMC": 1000, "disk": 600}
 """How often a whole device can be written: careful guesses, for nobody prints it on a card."""
