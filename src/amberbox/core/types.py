@@ -217,3 +217,30 @@ class Watermark:
 
 
 Level: TypeAlias = Literal["ok", "warn", "error", "stale", "unknown"]
+"""What a monitor makes of a component; ``docs/monitoring.md`` describes each."""
+
+Output: TypeAlias = "bool | int | float | str | None"
+
+
+@dataclass(frozen=True, slots=True)
+class Status:
+    """What the monitors say of one mode of a component, or of the component (``mode`` empty).
+
+    ``state`` is ``nominal``, ``not_initialised``, ``not_monitored``, or the name of a fault state.
+    ``blocked_by`` names the nearest dependencies that are not ok. ``measured_ns`` is the instant
+    of the record it is about, ``since_ns`` when level and state became what they are.
+    ``live_only`` marks what a replay cannot see, such as that the recorder was dead.
+    """
+
+    robot: str
+    component: str
+    mode: str
+    level: Level
+    state: str
+    outputs: Mapping[str, Output]
+    blocked_by: tuple[str, ...]
+    measured_ns: int
+    since_ns: int
+    reason: str
+    config_hash: str
+    live_only: bool = False

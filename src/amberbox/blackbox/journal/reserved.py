@@ -17,6 +17,8 @@ EVENT = "amberbox/event"
 GAP = "amberbox/gap"
 INCIDENT = "amberbox/incident"
 MISSION = "amberbox/mission"
+STATUS = "amberbox/status"
+ALARM = "amberbox/alarm"
 CURSOR = "amberbox/cursor"
 """How far the writer of a journal had read others when it wrote what stands beside it."""
 
@@ -84,6 +86,47 @@ _FIELDS: dict[str, dict[str, object]] = {
         "to_ns": {"type": ["integer", "null"]},
         "who": _TEXT,
         "details": _TEXT,
+    },
+    STATUS: {
+        "robot": _TEXT,
+        "component": _TEXT,
+        "mode": _TEXT,
+        "level": _TEXT,
+        "state": _TEXT,
+        "outputs": {
+            "type": "array",
+            "items": {
+                "type": "object",
+                "properties": {
+                    "name": _TEXT,
+                    "type": _TEXT,
+                    "value": {"type": ["number", "null"]},
+                    "text": {"type": ["string", "null"]},
+                },
+            },
+        },
+        "blocked_by": {"type": "array", "items": _TEXT},
+        "measured_ns": _COUNT,
+        "since_ns": _COUNT,
+        "reason": _TEXT,
+        "config_hash": _TEXT,
+        "live_only": {"type": "boolean"},
+    },
+    ALARM: {
+        "id": _TEXT,
+        "robot": _TEXT,
+        "component": _TEXT,
+        "severity": _TEXT,
+        "state": _TEXT,
+        "level": _TEXT,
+        "reason": _TEXT,
+        "opened_ns": _COUNT,
+        "changed_ns": _COUNT,
+        "count": _COUNT,
+        "who": _TEXT,
+        "until_ns": {"type": ["integer", "null"]},
+        "config_hash": _TEXT,
+        "live_only": {"type": "boolean"},
     },
     CURSOR: {"cursor": _TEXT, "reader": _TEXT, "state": _TEXT},
 }

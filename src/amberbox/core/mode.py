@@ -1,0 +1,116 @@
+"""The contract of a monitor mode: a pure function from inputs to outputs, in one file.
+
+A mode is a module whose file name is what ``monitor:`` says in a mode file. It defines
+
+- ``Config``: a frozen dataclass, built from ``arguments:`` of the mode file (see ``core.config``);
+- ``ACCEPTS``: what its inputs may be, a tuple of ``variable``, ``list``, ``item``, ``probe``;
+- ``RESULTS``: what it finds out, a tuple of ``Result``; outputs of a mode file are bound to them;
+- ``SAMPLE``: a mode file as one would write it, shown by ``amberbox plugins``, checked and run;
+- ``evaluate(config, inputs, now)``: the results by name at ``now``, from the inputs.
+
+``evaluate`` is called only where every input has a fresh value; for what is missing or stale the
+status says so by itself. It must not keep anything between calls, look at a clock or touch the
+machine. It may also define
+
+- ``COLUMNS = True``: ``evaluate`` takes many instants at once (``now`` is an array) as well as
+  one; everything the inputs give and everything numpy computes works for both. Otherwise it is
+  called for one instant at a time, which is slower and simpler;
+- ``PER_INPUT = True``: it is called for each input of a mapping alone. One output then says
+  whether all are well, or there is one output for each;
+- ``TIMED = True``: the results change as time passes, also without a new sample;
+- ``SEES_SILENCE = True``: it wants to be called also where its inputs are stale;
+- ``history_s(config)``: how far back it looks, in seconds;
+- ``reads(config)``: further addresses that it reads; they follow the inputs of the mapping;
+- ``probe_of(config, text)``: kind and subject of the probe that an input means which is no
+  recorded variable; without it ``PROBE`` is the kind and the text is the subject;
+- ``explain(config, results)``: one sentence on why the results are not as they should be.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal, Protocol
+
+import numpy as np
+
+from amberbox.core.samples import Flow, Now, Samples, Window
+
+Kind = Literal["variable", "list", "item", "probe"]
+"""What an input may be: a variable, a list of numbers, a whole item, or what a probe measures."""
+
+ResultType = Literal["bool", "int", "float", "string"]
+
+FALSE, TRUE, UNKNOWN, HOLD = 0, 1, 2, 3
+"""What a bool result may be, beside plain bools: HOLD stays at what it was last."""
+
+
+@dataclass(frozen=True, slots=True)
+class Result:
+    """One thing that a mode finds out.
+
+    ``nominal`` is what a healthy robot gives: a bool output without ``expected`` expects it.
+    ``relation`` says how an ``expected`` number is meant: the value equals it, or is at least or
+    at most that.
+    """
+
+    name: str
+    type: ResultType
+    doc: str
+    unit: str = ""
+    nominal: bool = True
+    relation: Literal["==", ">=", "<="] = "=="
+
+
+@dataclass(slots=True, eq=False)
+class Input:
+    """One input of a mode, as it looks at the instants asked for.
+
+    ``name`` is its text in the mode file. For a ``list`` the values are the mean of what is
+    finite in each row, and ``parts`` has ``count finite min max mean`` of each; for a probe they
+    are its ``ok``, and ``parts`` are all that it measures.
+    """
+
+    name: str
+    samples: Samples = field(default_factory=Samples)
+    flow: Flow = field(default_factory=Flow)
+    stamps: Samples = field(default_factory=Samples)
+    """The own stamps (ns) of the item's rows, by their time of receipt."""
+    parts: Mapping[str, Samples] = field(default_factory=dict)
+
+    def at(self, now: Now) -> Any:
+        """Return the value at ``now``."""
+        return self.samples.at(now)
+
+    def over(self, now: Now, seconds: float) -> Window:
+        """Return the window of the last ``seconds``."""
+        return Window(self.samples, now, seconds)
+
+    def part(self, name: str) -> Input:
+        """Return another variable of the same probe, or another figure of the same list."""
+        return Input(f"{self.name} {name}", self.parts[name], self.flow, self.stamps)
+
+    def age_s(self, now: Now) -> Any:
+        """Return for how long nothing of its item has been received, before any filter."""
+        return self.flow.age_s(now)
+
+    def rate_hz(self, now: Now, seconds: float) -> Any:
+        """Return messages of its item per second over the last ``seconds``, before any filter."""
+        return self.flow.rate_hz(now, seconds)
+
+
+class Evaluate(Protocol):
+    """The function that a mode is."""
+
+    def __call__(self, config: Any, inputs: Sequence[Input], now: Now) -> Mapping[str, Any]:
+        """Return the results by name at ``now``; what is left out is unknown."""
+
+
+def where_known(known: Any, value: Any) -> Any:
+    """Return the bools of ``value`` where they are known, UNKNOWN elsewhere."""
+    return np.where(known, value, UNKNOWN)
+
+
+def with_hysteresis(good: Any, bad: Any) -> Any:
+    """Return FALSE where it is bad, TRUE where it is good, and what it was in between."""
+    return np.where(bad, FALSE, np.where(good, TRUE, HOLD))

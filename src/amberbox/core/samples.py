@@ -1,0 +1,259 @@
+"""What is known of a variable over time: its newest samples, looked at from one instant or many.
+
+``now`` is an instant (an int, which gives one value) or an array of instants (which gives a
+column); both give the same answers. A variable has the value of its last sample at or before an
+instant; samples after it do not count.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from amberbox.core.clock import NS
+from amberbox.core.expression_windows import reduce_windows
+from amberbox.core.types import IntArray
+
+Now: TypeAlias = "int | IntArray"
+"""Nanoseconds: one instant, or many in order."""
+
+_ROOM = 64
+
+
+class Samples:
+    """Samples of one variable in order of time; old ones are forgotten when told to."""
+
+    __slots__ = ("_end", "_null", "_start", "_times", "_values")
+
+    def __init__(self) -> None:
+        self._times: IntArray = np.zeros(_ROOM, np.int64)
+        self._values: NDArray[Any] = np.zeros(_ROOM)
+        self._null: NDArray[np.bool_] | None = None
+        self._start = self._end = 0
+
+    def __len__(self) -> int:
+        return self._end - self._start
+
+    @property
+    def times_ns(self) -> IntArray:
+        """Times of the samples, not decreasing."""
+        return self._times[self._start : self._end]
+
+    @property
+    def values(self) -> NDArray[Any]:
+        """Values of the samples; what stands where ``null`` is true means nothing."""
+        return self._values[self._start : self._end]
+
+    @property
+    def null(self) -> NDArray[np.bool_] | None:
+        """Which samples are unknown; None if all are known."""
+        return None if self._null is None else self._null[self._start : self._end]
+
+    def column(self) -> NDArray[Any]:
+        """Return the values as expressions take them: masked where unknown."""
+        null = self.null
+        if null is None:
+            return self.values
+        if self.values.dtype != object:
+            return np.ma.MaskedArray(self.values, null)
+        objects = self.values.copy()
+        objects[null] = None
+        return objects
+
+    def extend(self, times_ns: IntArray, values: NDArray[Any]) -> None:
+        """Take further samples, none of them before the last one; masked or None is unknown."""
+        count = len(times_ns)
+        if not count:
+            return
+        data, null = _split(values)
+        self._make_room(count, data.dtype)
+        if null is not None and self._null is None:
+            self._null = np.zeros(len(self._times), bool)
+        place = slice(self._end, self._end + count)
+        self._times[place] = times_ns
+        self._values[place] = data
+        if self._null is not None:
+            self._null[place] = False if null is None else null
+        self._end += count
+
+    def _make_room(self, count: int, dtype: np.dtype[Any]) -> None:
+        if self._start == self._end:
+            self._start = self._end = 0
+            if dtype != self._values.dtype:
+                self._values = np.zeros(len(self._times), dtype)
+        elif dtype != self._values.dtype:
+            self._values = self._values.astype(_common(dtype, self._values.dtype))
+        if self._end + count <= len(self._times):
+            return
+        kept = slice(self._start, self._end)
+        room = max(_ROOM, 2 * (len(self) + count))
+        for name in ("_times", "_values", "_null"):
+            old = getattr(self, name)
+            if old is not None:
+                new = np.zeros(room, old.dtype)
+                new[: len(self)] = old[kept]
+                setattr(self, name, new)
+        self._start, self._end = 0, self._end - self._start
+
+    def forget_before(self, time_ns: int) -> None:
+        """Forget what no longer matters at ``time_ns``: all samples before the last one by then."""
+        last = int(self.times_ns.searchsorted(time_ns, "right")) - 1
+        if last > 0:
+            self._start += last
+
+    def last(self, now: Now) -> Any:
+        """Return the place of the last sample at or before ``now``, -1 where there is none."""
+        return self.times_ns.searchsorted(now, "right") - 1
+
+    def at(self, now: Now) -> Any:
+        """Return the value at ``now``; only where ``known``."""
+        return self.values[self.last(now)]
+
+    def known(self, now: Now) -> Any:
+        """Tell where there is a value."""
+        last = self.last(now)
+        null = self.null
+        if null is None or not len(null):
+            return last >= 0
+        return (last >= 0) & ~null[last]
+
+    def since_ns(self, now: Now) -> Any:
+        """Return the time of the last sample at or before ``now``; only where there is one."""
+        return self.times_ns[self.last(now)]
+
+
+def _split(values: NDArray[Any]) -> tuple[NDArray[Any], NDArray[np.bool_] | None]:
+    if isinstance(values, np.ma.MaskedArray):
+        null = np.ma.getmaskarray(values)
+        return np.ma.getdata(values), null if null.any() else None
+    if values.dtype == object:
+        null = np.array([value is None for value in values], bool)
+        return values, null if null.any() else None
+    return values, None
+
+
+def _common(one: np.dtype[Any], other: np.dtype[Any]) -> np.dtype[Any]:
+    try:
+        return np.result_type(one, other)
+    except TypeError:
+        return np.dtype(object)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Window:
+    """The samples of the last ``seconds`` before ``now``: times in ``(now - seconds, now]``.
+
+    What does not exist (the least of no samples) is NaN.
+    """
+
+    samples: Samples
+    now: Now
+    seconds: float
+
+    def count(self) -> Any:
+        """Return how many samples there are."""
+        first, end = self._bounds()
+        return self._shaped(end - first)
+
+    def min(self) -> Any:
+        """Return the least value."""
+        return self._reduced("min")
+
+    def max(self) -> Any:
+        """Return the greatest value."""
+        return self._reduced("max")
+
+    def mean(self) -> Any:
+        """Return the mean."""
+        return self._reduced("mean")
+
+    def std(self) -> Any:
+        """Return the population standard deviation."""
+        return self._reduced("std")
+
+    def rate(self) -> Any:
+        """Return the change per second between the first and the last sample."""
+        return self._reduced("rate")
+
+    def changes(self) -> Any:
+        """Return how many samples differ from the one before them, which may be older."""
+        values = self.samples.values
+        if values.dtype.kind == "f":
+            differs = (values[1:] != values[:-1]) & ~(np.isnan(values[1:]) & np.isnan(values[:-1]))
+        else:
+            differs = values[1:] != values[:-1]
+        total = np.concatenate([[0, 0], np.cumsum(differs.astype(bool))])[: len(values) + 1]
+        first, end = self._bounds()
+        return self._shaped(total[end] - total[first])
+
+    def sum_of(self, flags: NDArray[np.bool_]) -> Any:
+        """Return how many samples of the window have their flag set, one flag per sample."""
+        total = np.concatenate([[0], np.cumsum(flags)])
+        first, end = self._bounds()
+        return self._shaped(total[end] - total[first])
+
+    def _edges(self) -> tuple[IntArray, IntArray]:
+        until = np.atleast_1d(np.asarray(self.now, np.int64))
+        return until - round(self.seconds * NS), until
+
+    def _bounds(self) -> tuple[IntArray, IntArray]:
+        after, until = self._edges()
+        times = self.samples.times_ns
+        return times.searchsorted(after, "right"), times.searchsorted(until, "right")
+
+    def _reduced(self, name: str) -> Any:
+        times, values = self.samples.times_ns, self.samples.values
+        null = self.samples.null
+        if null is not None:
+            times, values = times[~null], values[~null]
+        found = reduce_windows(name, times, values.astype(np.float64), *self._edges())
+        return self._shaped(np.where(found.null, np.nan, found.data))
+
+    def _shaped(self, column: NDArray[Any]) -> Any:
+        return column[0] if np.ndim(self.now) == 0 else column
+
+
+@dataclass(slots=True, eq=False)
+class Flow:
+    """How messages of an item have come, as the recorder counted them before any filter."""
+
+    received: Samples = field(default_factory=Samples)
+    """Messages received since the run began, by the time of the count."""
+    last_ns: Samples = field(default_factory=Samples)
+    """When the last one was received."""
+    open_gaps: Samples = field(default_factory=Samples)
+    """How many publishers of it are known to be lost."""
+
+    def age_s(self, now: Now) -> Any:
+        """Return for how long nothing has been received; infinite before the first message."""
+        last = self.last_ns.last(now)
+        if not len(self.last_ns):
+            return np.inf if np.ndim(now) == 0 else np.full(len(np.atleast_1d(now)), np.inf)
+        ages = np.maximum(now - self.last_ns.values[last], 0) / NS
+        return np.where(last >= 0, ages, np.inf)[()]
+
+    def rate_hz(self, now: Now, seconds: float) -> Any:
+        """Return messages received per second over the last ``seconds``, silence included.
+
+        NaN before anything is known.
+        """
+        before = now - round(seconds * NS)
+        if not len(self.received):
+            return np.nan if np.ndim(now) == 0 else np.full(len(np.atleast_1d(now)), np.nan)
+        first = np.maximum(self.received.last(before), 0)
+        last = self.received.last(now)
+        counts, times = self.received.values, self.received.times_ns
+        began = np.maximum(before, times[first])
+        elapsed_s = np.maximum((now - began) / NS, 1e-9)
+        known = (last >= 0) & (now > began)
+        return np.where(known, (counts[last] - counts[first]) / elapsed_s, np.nan)[()]
+
+    def lost(self, now: Now) -> Any:
+        """Tell whether its publishers are known to be lost."""
+        if not len(self.open_gaps):
+            return False if np.ndim(now) == 0 else np.zeros(len(np.atleast_1d(now)), bool)
+        last = self.open_gaps.last(now)
+        return (last >= 0) & (self.open_gaps.values[last] > 0)

@@ -1,0 +1,1 @@
+"""Component and mode files: read, bound to what is recorded, and judged."""

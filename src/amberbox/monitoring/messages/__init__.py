@@ -1,0 +1,1 @@
+"""Statuses as messages for others: the paper's JSON, HEALTH-STATUS, DiagnosticArray."""

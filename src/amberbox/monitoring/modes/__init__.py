@@ -1,0 +1,1 @@
+"""Monitor modes, one file each; the contract is ``core.mode``."""
