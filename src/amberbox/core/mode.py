@@ -19,6 +19,7 @@ machine. It may also define
   whether all are well, or there is one output for each;
 - ``TIMED = True``: the results change as time passes, also without a new sample;
 - ``SEES_SILENCE = True``: it wants to be called also where its inputs are stale;
+- ``PARTS = True``: an ``item`` input brings all columns of its rows in ``parts``;
 - ``history_s(config)``: how far back it looks, in seconds;
 - ``reads(config)``: further addresses that it reads; they follow the inputs of the mapping;
 - ``probe_of(config, text)``: kind and subject of the probe that an input means which is no

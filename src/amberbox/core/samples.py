@@ -216,44 +216,68 @@ class Window:
         return column[0] if np.ndim(self.now) == 0 else column
 
 
+NONE_OPEN = 1 << 62
+"""Stands for the beginning of a gap where none is open."""
+
+
 @dataclass(slots=True, eq=False)
 class Flow:
-    """How messages of an item have come, as the recorder counted them before any filter."""
+    """How messages of an item have come: as the recorder counted them, before any filter.
+
+    Where nobody counted (another program's recording), the rows themselves are what is known.
+    """
 
     received: Samples = field(default_factory=Samples)
     """Messages received since the run began, by the time of the count."""
     last_ns: Samples = field(default_factory=Samples)
-    """When the last one was received."""
-    open_gaps: Samples = field(default_factory=Samples)
-    """How many publishers of it are known to be lost."""
+    """When the last one was received, by the time of the count."""
+    rows: Samples = field(default_factory=Samples)
+    """Rows recorded since the run began, by the time of each."""
+    gap_from_ns: Samples = field(default_factory=Samples)
+    """Since when its publishers are known to be lost, NONE_OPEN where they are not."""
+
+    def last_received_ns(self, now: Now) -> Any:
+        """Return when the last message known of at ``now`` was received; -1 before the first."""
+        seen = _held(self.rows, now, self.rows.times_ns, -1)
+        counted = _held(self.last_ns, now, self.last_ns.values, -1)
+        return np.maximum(seen, counted)
 
     def age_s(self, now: Now) -> Any:
         """Return for how long nothing has been received; infinite before the first message."""
-        last = self.last_ns.last(now)
-        if not len(self.last_ns):
-            return np.inf if np.ndim(now) == 0 else np.full(len(np.atleast_1d(now)), np.inf)
-        ages = np.maximum(now - self.last_ns.values[last], 0) / NS
-        return np.where(last >= 0, ages, np.inf)[()]
+        last_ns = self.last_received_ns(now)
+        ages = np.maximum(now - last_ns, 0) / NS
+        return np.where(last_ns >= 0, ages, np.inf)[()]
 
     def rate_hz(self, now: Now, seconds: float) -> Any:
         """Return messages received per second over the last ``seconds``, silence included.
 
-        NaN before anything is known.
+        Less is looked at where less is known; NaN before anything is.
         """
-        before = now - round(seconds * NS)
-        if not len(self.received):
-            return np.nan if np.ndim(now) == 0 else np.full(len(np.atleast_1d(now)), np.nan)
-        first = np.maximum(self.received.last(before), 0)
-        last = self.received.last(now)
-        counts, times = self.received.values, self.received.times_ns
-        began = np.maximum(before, times[first])
-        elapsed_s = np.maximum((now - began) / NS, 1e-9)
-        known = (last >= 0) & (now > began)
-        return np.where(known, (counts[last] - counts[first]) / elapsed_s, np.nan)[()]
+        counted = _rate(self.received, now, seconds)
+        return np.where(np.isnan(counted), _rate(self.rows, now, seconds), counted)[()]
 
     def lost(self, now: Now) -> Any:
-        """Tell whether its publishers are known to be lost."""
-        if not len(self.open_gaps):
-            return False if np.ndim(now) == 0 else np.zeros(len(np.atleast_1d(now)), bool)
-        last = self.open_gaps.last(now)
-        return (last >= 0) & (self.open_gaps.values[last] > 0)
+        """Tell whether its publishers are known to be lost, and nothing has come since."""
+        since_ns = _held(self.gap_from_ns, now, self.gap_from_ns.values, NONE_OPEN)
+        return (since_ns != NONE_OPEN) & (self.last_received_ns(now) <= since_ns)
+
+
+def _held(samples: Samples, now: Now, values: NDArray[Any], missing: int) -> Any:
+    """Return the value of the last sample at ``now``, or ``missing`` before the first."""
+    if not len(samples):
+        return missing if np.ndim(now) == 0 else np.full(np.shape(now), missing, np.int64)
+    last = samples.last(now)
+    return np.where(last >= 0, values[last], missing)[()]
+
+
+def _rate(counts: Samples, now: Now, seconds: float) -> Any:
+    """Return how much a growing count has grown per second; NaN where nobody can know."""
+    if not len(counts):
+        return np.nan if np.ndim(now) == 0 else np.full(np.shape(now), np.nan)
+    before = now - round(seconds * NS)
+    first, last = np.maximum(counts.last(before), 0), counts.last(now)
+    began = np.maximum(before, counts.times_ns[first])
+    elapsed_s = (now - began) / NS
+    grown = (counts.values[last] - counts.values[first]).astype(np.float64)
+    known = (last >= 0) & (elapsed_s > 0)
+    return np.where(known, grown / np.where(known, elapsed_s, 1.0), np.nan)[()]
