@@ -22,12 +22,11 @@ machine. It may also define
 - ``PARTS = True``: an ``item`` input brings all columns of its rows in ``parts``;
 - ``history_s(config)``: how far back it looks, in seconds;
 - ``results_of(config, inputs, bools)``: the results of a mapping, where they depend on the
-  arguments or on how many inputs and bool outputs it has; ``RESULTS`` then describes them;
+  arguments or on how many inputs and bool outputs it has (ints); outputs are bound to these, and
+  ``RESULTS`` are those that it always has;
 - ``reads(config)``: further addresses that it reads; they follow the inputs of the mapping;
 - ``probe_of(config, text)``: kind and subject of the probe that an input means which is no
   recorded variable; without it ``PROBE`` is the kind and the text is the subject;
-- ``results_of(config)``: its results where they depend on the configuration; ``RESULTS`` are then
-  those that it always has, and outputs are bound to what ``results_of`` returns;
 - ``explain(config, results)``: one sentence on why the results are not as they should be.
 """
 
