@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from amberbox.blackbox.folder.blocks import Blocks, SourceBlock, read_blocks
+from amberbox.blackbox.folder.monitoring import disclosures
 from amberbox.blackbox.folder.robot import NOT_USED_YET, RobotConfig
 from amberbox.core.config import build, load_yaml, refuse
 from amberbox.core.errors import Problem, UsageError
@@ -111,6 +112,7 @@ def _read_robot(place: Path, problems: list[Problem]) -> RobotConfig | None:
     node = load_yaml(path, problems)
     robot = build(RobotConfig, node, problems) if node else None
     problems.extend(_not_used_yet(node) if node else ())
+    problems.extend(disclosures(node, robot.monitoring) if node and robot else ())
     return dataclasses.replace(robot, id=robot.id or derived) if robot else None
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from amberbox.blackbox.folder.missions import MissionOptions
+from amberbox.blackbox.folder.monitoring import MonitoringOptions
 from amberbox.blackbox.folder.triggers import IncidentOptions, TriggerOptions, repeated
 from amberbox.core.ids import derive_id, is_id
 from amberbox.core.options import option
@@ -123,6 +124,7 @@ class RobotConfig:
     triggers: Sequence[TriggerOptions] = option((), "what makes an incident")
     missions: Sequence[MissionOptions] = option((), "what begins and ends missions")
     incidents: IncidentOptions = option(IncidentOptions(), "limits of incidents")
+    monitoring: MonitoringOptions = option(MonitoringOptions(), "what holds for all monitors")
 
     def check(self) -> Iterator[tuple[str, str]]:
         """Say what is wrong with the id, and which names are there twice."""
