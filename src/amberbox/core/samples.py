@@ -104,13 +104,19 @@ class Samples:
         if last > 0:
             self._start += last
 
+    def clear(self) -> None:
+        """Forget all samples."""
+        self._start = self._end = 0
+        self._null = None
+
     def last(self, now: Now) -> Any:
         """Return the place of the last sample at or before ``now``, -1 where there is none."""
         return self.times_ns.searchsorted(now, "right") - 1
 
     def at(self, now: Now) -> Any:
-        """Return the value at ``now``; only where ``known``."""
-        return self.values[self.last(now)]
+        """Return the value at ``now``; what it gives means something only where ``known``."""
+        values = self.values if len(self) else np.zeros(1, self._values.dtype)
+        return values[self.last(now)]
 
     def known(self, now: Now) -> Any:
         """Tell where there is a value."""
@@ -122,7 +128,14 @@ class Samples:
 
     def since_ns(self, now: Now) -> Any:
         """Return the time of the last sample at or before ``now``; only where there is one."""
-        return self.times_ns[self.last(now)]
+        times = self.times_ns if len(self) else np.zeros(1, np.int64)
+        return times[self.last(now)]
+
+    def derived(self, values: NDArray[Any]) -> Samples:
+        """Return samples at the same times with other values, one for each of these."""
+        made = Samples()
+        made._times, made._values, made._end = self.times_ns, values, len(self)
+        return made
 
 
 def _split(values: NDArray[Any]) -> tuple[NDArray[Any], NDArray[np.bool_] | None]:
@@ -183,13 +196,17 @@ class Window:
         return self._reduced("rate")
 
     def changes(self) -> Any:
-        """Return how many samples differ from the one before them, which may be older."""
-        values = self.samples.values
+        """Return how many samples differ from the one before them, which may be older.
+
+        All unknown values are alike, and so are all NaN.
+        """
+        values, null = self.samples.values, self.samples.null
+        differs = (values[1:] != values[:-1]).astype(bool)
         if values.dtype.kind == "f":
-            differs = (values[1:] != values[:-1]) & ~(np.isnan(values[1:]) & np.isnan(values[:-1]))
-        else:
-            differs = values[1:] != values[:-1]
-        total = np.concatenate([[0, 0], np.cumsum(differs.astype(bool))])[: len(values) + 1]
+            differs &= ~(np.isnan(values[1:]) & np.isnan(values[:-1]))
+        if null is not None:
+            differs = np.where(null[1:] | null[:-1], null[1:] != null[:-1], differs)
+        total = np.concatenate([[0, 0], np.cumsum(differs)])[: len(values) + 1]
         first, end = self._bounds()
         return self._shaped(total[end] - total[first])
 
@@ -239,6 +256,8 @@ class Flow:
     """Rows recorded since the run began, by the time of each."""
     gap_from_ns: Samples = field(default_factory=Samples)
     """Since when its publishers are known to be lost, NONE_OPEN where they are not."""
+    began_ns: int | None = None
+    """When listening began, as far as the record tells; before it nobody could have heard it."""
 
     def last_received_ns(self, now: Now) -> Any:
         """Return when the last message known of at ``now`` was received; -1 before the first."""
@@ -259,6 +278,17 @@ class Flow:
         """
         counted = _rate(self.received, now, seconds)
         return np.where(np.isnan(counted), _rate(self.rows, now, seconds), counted)[()]
+
+    def reaches_back(self, now: Now, seconds: float) -> Any:
+        """Tell whether something had been heard of it ``seconds`` ago already."""
+        before = now - round(seconds * NS)
+        return (self.received.last(before) >= 0) | (self.rows.last(before) >= 0)
+
+    def listened(self, now: Now, seconds: float) -> Any:
+        """Tell whether it has been listened to for ``seconds``, heard or not."""
+        if self.began_ns is None:
+            return self.reaches_back(now, seconds)
+        return now - self.began_ns >= round(seconds * NS)
 
     def lost(self, now: Now) -> Any:
         """Tell whether its publishers are known to be lost, and nothing has come since."""

@@ -1,0 +1,43 @@
+"""Device: the operating system shows it, which does not yet mean that it works."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from amberbox.core.mode import Input, Result, where_known
+from amberbox.core.samples import Now
+
+ACCEPTS = ("probe",)
+PROBE = "path_exists"
+COLUMNS = True
+PER_INPUT = True
+RESULTS = (Result("present", "bool", "the path is there"),)
+SAMPLE = """\
+name: laser_device_monitor
+monitor: device
+description: laser devices recognised by the operating system
+mappings:
+  - mapping:
+      inputs: [/dev/front_laser, /dev/rear_laser]
+      outputs:
+        - output: {name: front_laser_present, type: bool, expected: true}
+        - output: {name: rear_laser_present, type: bool, expected: true}
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class Config:
+    """A device needs no arguments."""
+
+
+def evaluate(config: Config, inputs: Sequence[Input], now: Now) -> Mapping[str, Any]:
+    """Tell where the path was there when it was last looked for."""
+    (path,) = inputs
+    return {"present": where_known(path.samples.known(now), path.at(now))}
+
+
+def explain(config: Config, results: Mapping[str, Any]) -> str:
+    """Say that the path is missing."""
+    return "" if results["present"] else "the operating system does not show the device"

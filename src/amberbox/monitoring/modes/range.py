@@ -1,0 +1,65 @@
+"""Range: a value lies within limits; what is not a number lies outside of all."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from math import inf
+from typing import Any
+
+import numpy as np
+
+from amberbox.core.mode import Input, Result, where_known, with_hysteresis
+from amberbox.core.options import option
+from amberbox.core.samples import Now
+from amberbox.core.standins import Finding
+
+ACCEPTS = ("variable",)
+COLUMNS = True
+PER_INPUT = True
+RESULTS = (
+    Result("in_range", "bool", "the value lies within the limits"),
+    Result("value", "float", "the value"),
+)
+SAMPLE = """\
+name: motor_temperature_monitor
+monitor: range
+description: the left motor is not too hot
+mappings:
+  - mapping:
+      inputs: [motor_left.temperature]
+      outputs:
+        - output: {name: temperature_in_range, type: bool, expected: true, severity: warning}
+        - output: {name: temperature, result: value, type: float}
+arguments:
+  max: 80
+  hysteresis: 5
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class Config:
+    """The limits, which belong to the range."""
+
+    min: float = option(-inf, "the least value that is well")
+    max: float = option(inf, "the greatest value that is well")
+    hysteresis: float = option(0.0, "how far inside the limits it is well again after a fault")
+
+    def check(self) -> Iterator[Finding]:
+        """Refuse limits that nothing can be within or outside of."""
+        if self.min == -inf and self.max == inf:
+            yield "give 'min', 'max' or both"
+        if self.hysteresis < 0:
+            yield "hysteresis", "must not lie below 0"
+        if not self.min + self.hysteresis <= self.max - self.hysteresis:
+            yield "nothing is within these limits"
+
+
+def evaluate(config: Config, inputs: Sequence[Input], now: Now) -> Mapping[str, Any]:
+    """Compare the last value with the limits."""
+    (variable,) = inputs
+    value, known = variable.at(now), variable.samples.known(now)
+    inside = (value >= config.min) & (value <= config.max)
+    well = (value >= config.min + config.hysteresis) & (value <= config.max - config.hysteresis)
+    in_range = where_known(known, with_hysteresis(well, ~inside))
+    return {"in_range": in_range, "value": np.where(known, value, np.nan)}
