@@ -1,0 +1,111 @@
+"""A probe that is ready to look: loaded from its file, its answers checked."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TypeAlias
+
+from amberbox.core import plugins
+from amberbox.core.errors import AmberboxError
+from amberbox.core.probe import PERIOD_S, TIMEOUT_S, Measured, ProbeOrder
+
+PROBES = "amberbox.monitoring.probes"
+DEFINES = ("MEASURES", "SUBJECT", "measure")
+
+Row: TypeAlias = Mapping[str, Any]
+"""``subject``, ``ok``, ``error``, and all that the probe measures; null is unknown."""
+
+_TYPES: Mapping[str, Callable[[Any], Any]] = {
+    "bool": bool,
+    "int": int,
+    "float": float,
+    "string": str,
+}
+
+
+class ProbeDefectError(Exception):
+    """A probe gave what its contract does not allow."""
+
+
+@dataclass(frozen=True, slots=True)
+class Probe:
+    """What a probe's file defines; see ``core.probe``."""
+
+    kind: str
+    measure: Callable[[str], Measured]
+    measures: Mapping[str, tuple[str, str, str]] = field(default_factory=dict)
+    period_s: float = PERIOD_S
+    timeout_s: float = TIMEOUT_S
+
+    def look(self, subject: str) -> Row:
+        """Look once; whatever goes wrong stands in the row as its error."""
+        try:
+            return self._row(subject, self.measure(subject))
+        except AmberboxError as error:
+            return self.unknown(subject, error.what)
+        except OSError as error:
+            return self.unknown(subject, os_error_text(error))
+        except Exception as error:  # a defect of the probe: its row says so, others go on
+            return self.unknown(subject, f"crashed: {type(error).__name__}: {error}")
+
+    def unknown(self, subject: str, error: str) -> Row:
+        """Make the row of a look that found nothing out."""
+        return {"subject": subject, "ok": None, "error": error, **dict.fromkeys(self.measures)}
+
+    def _row(self, subject: str, measured: Measured) -> Row:
+        extra = sorted(set(measured) - set(self.measures) - {"ok", "error"})
+        if extra:
+            raise ProbeDefectError(f"it gives '{extra[0]}', which its MEASURES do not name")
+        values = {
+            name: _as_type(kind, measured.get(name)) for name, (kind, _, _) in self.measures.items()
+        }
+        ok, error = _as_type("bool", measured["ok"]), str(measured.get("error", ""))
+        return {"subject": subject, "ok": ok, "error": error, **values}
+
+
+def load_probe(kind: str, extra_dirs: Sequence[Path] = ()) -> Probe:
+    """Load a probe by its kind; raise AmberboxError if there is none or it cannot be loaded."""
+    plugin = plugins.get(PROBES, kind, extra_dirs, DEFINES)
+    try:
+        module = plugin.load()
+    except AmberboxError:
+        raise
+    except Exception as error:  # a robot's own probe may fail in any way when it is imported
+        what = f"probe '{kind}' cannot be loaded: {type(error).__name__}: {error}"
+        raise AmberboxError(what, f"look at {plugin.path}") from error
+    period_s = float(getattr(module, "PERIOD_S", PERIOD_S))
+    timeout_s = float(getattr(module, "TIMEOUT_S", TIMEOUT_S))
+    return Probe(kind, module.measure, module.MEASURES, period_s, timeout_s)
+
+
+def probe_for(order: ProbeOrder, extra_dirs: Sequence[Path] = ()) -> Probe:
+    """Load the probe of an order; one that cannot be loaded says so with every look."""
+    try:
+        return load_probe(order.kind, extra_dirs)
+    except AmberboxError as error:
+        return broken(order.kind, error)
+
+
+def broken(kind: str, error: AmberboxError) -> Probe:
+    """Return a probe that knows nothing but why."""
+
+    def measure(subject: str) -> Measured:
+        raise AmberboxError(error.what, error.hint)
+
+    return Probe(kind, measure)
+
+
+def os_error_text(error: OSError) -> str:
+    """Say what the system refused, with the file it is about."""
+    place = f"{error.filename}: " if error.filename else ""
+    return f"{place}{error.strerror or error or type(error).__name__}"
+
+
+def _as_type(kind: str, value: Any) -> Any:
+    """Give every value the type that it was promised with, so that columns never change theirs."""
+    if value is None or (isinstance(value, float) and not math.isfinite(value)):
+        return None
+    return _TYPES[kind](value)
