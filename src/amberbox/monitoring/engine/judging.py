@@ -1,0 +1,111 @@
+"""Whether an output is as it is expected to be: one value, or a column of them."""
+
+from __future__ import annotations
+
+import math
+import operator
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from amberbox.core.mode import HOLD, TRUE, UNKNOWN
+from amberbox.core.types import Output
+from amberbox.monitoring.plan import Expectation, OutputPlan
+
+OK, BAD, NOT_KNOWN, AS_BEFORE = 0, 1, 2, 3
+"""What a value is judged to be."""
+
+_COMPARE: Mapping[str, Callable[[Any, Any], Any]] = {
+    "==": operator.eq,
+    "!=": operator.ne,
+    ">=": operator.ge,
+    "<=": operator.le,
+    ">": operator.gt,
+    "<": operator.lt,
+}
+
+
+class Judge:
+    """Judges the results that one output of a plan is bound to."""
+
+    __slots__ = ("_expectation", "_expected", "is_bool", "is_discrete", "is_int", "result")
+
+    def __init__(self, output: OutputPlan) -> None:
+        self.result = output.result.name
+        self.is_bool = output.type == "bool"
+        self.is_int = output.type == "int"
+        self.is_discrete = output.type in ("bool", "string")
+        expectation = output.expectation
+        self._expectation: Expectation | None = (
+            expectation if expectation.value is not None else None
+        )
+        self._expected = int(expectation.value) if self.is_bool and self._simple() else None
+
+    def _simple(self) -> bool:
+        return self._expectation is not None and self._expectation.relation == "=="
+
+    def one(self, result: Any) -> tuple[int, Any]:
+        """Judge one value; return it as it is kept (bools as their code)."""
+        if self.is_bool:
+            code = int(result)
+            if code > TRUE:
+                return (NOT_KNOWN if code == UNKNOWN else AS_BEFORE), code
+            if self._expected is not None:
+                return (OK if code == self._expected else BAD), code
+            return self._compared(code), code
+        return self._compared(result), result.item() if isinstance(result, np.generic) else result
+
+    def _compared(self, value: Any) -> int:
+        expectation = self._expectation
+        if expectation is None:
+            return OK
+        if value is None or value != value:
+            return NOT_KNOWN
+        try:
+            good = _holds(expectation, value)
+        except TypeError:
+            return NOT_KNOWN
+        return OK if good else BAD
+
+    def many(self, results: Any, count: int) -> tuple[Any, list[Any]]:
+        """Judge a column; return codes and the values as they are kept."""
+        column = np.broadcast_to(np.asarray(results), (count,))
+        if column.dtype == object:
+            judged = [self.one(value) for value in column]
+            return np.array([code for code, _ in judged], np.int8), [value for _, value in judged]
+        if self.is_bool:
+            kept = column.astype(np.int8)
+            if self._expected is not None:
+                known = np.where(kept == self._expected, OK, BAD)
+            else:
+                known = self._compared_column(kept.astype(np.float64))
+            unknown = np.where(kept == HOLD, AS_BEFORE, NOT_KNOWN)
+            return np.where(kept > TRUE, unknown, known), kept.tolist()
+        return self._compared_column(column), column.tolist()
+
+    def _compared_column(self, column: Any) -> Any:
+        expectation = self._expectation
+        if expectation is None:
+            return np.full(len(column), OK)
+        codes = np.where(_holds(expectation, column), OK, BAD)
+        return np.where(column != column, NOT_KNOWN, codes)
+
+    def output(self, kept: Any) -> Output:
+        """Return a value that was kept as people read it."""
+        if kept is None:
+            return None
+        if self.is_bool:
+            return None if kept > TRUE else kept == TRUE
+        if isinstance(kept, float):
+            if math.isnan(kept):
+                return None
+            return int(kept) if self.is_int and math.isfinite(kept) else kept
+        value: Output = kept
+        return value
+
+
+def _holds(expectation: Expectation, value: Any) -> Any:
+    if expectation.relation == "within":
+        return (value >= expectation.value) & (value <= expectation.high)
+    return _COMPARE[expectation.relation](value, expectation.value)

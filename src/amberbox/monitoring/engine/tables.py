@@ -1,0 +1,313 @@
+"""What the record says of each item that monitors read: samples, counts, gaps, by item."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from amberbox.blackbox.journal import reserved
+from amberbox.core.clock import NS
+from amberbox.core.expression_tree import Fault
+from amberbox.core.expression_values import element_of
+from amberbox.core.mode import Input
+from amberbox.core.names import identifier
+from amberbox.core.samples import NONE_OPEN, Flow, Samples
+from amberbox.core.types import Batch, IntArray, Ragged
+from amberbox.monitoring.engine.lists import FIGURES, figures_of
+from amberbox.monitoring.plan import InputPlan
+
+COUNTERS = identifier(reserved.COUNTERS)
+GAPS = identifier(reserved.GAP)
+
+Key = tuple[str, int | None]
+"""A column, or an element of a list column."""
+
+
+@dataclass(slots=True)
+class Table:
+    """One item: the columns that are read, when rows came, how many were received."""
+
+    item: str
+    flow: Flow = field(default_factory=Flow)
+    stamps: Samples = field(default_factory=Samples)
+    columns: dict[Key, Samples] = field(default_factory=dict)
+    lists: dict[str, Mapping[str, Samples]] = field(default_factory=dict)
+    whole: dict[str, Samples] | None = None
+    """All columns, where they are wanted."""
+    keep_ns: int = NS
+    fresh: list[IntArray] = field(default_factory=list)
+    """Times of rows that no instant has been evaluated for yet."""
+    _gaps: dict[tuple[str, int], int] = field(default_factory=dict)
+    _held_ns: dict[str, int] = field(default_factory=dict)
+    """Up to when everything is held already, after ``resume``: such rows come again."""
+
+    def feed(self, batch: Batch, after_ns: int) -> None:
+        """Take the rows of a batch that are later than what is held."""
+        times_ns = batch.log_time_ns
+        keep = self._new("rows", times_ns)
+        if keep is not None:
+            times_ns = times_ns[keep]
+        if not len(times_ns):
+            return
+        self._count_rows(times_ns)
+        if batch.schema.stamp:
+            self.stamps.extend(times_ns, _part(batch.timestamp_ns, keep))
+        for key, samples in self.columns.items():
+            samples.extend(times_ns, _part(self._column(batch, *key), keep))
+        for name, figures in self.lists.items():
+            for figure, values in figures_of(batch.columns.get(name), len(batch)).items():
+                figures[figure].extend(times_ns, _part(values, keep))
+        if self.whole is not None:
+            self._take_all(self.whole, batch, times_ns, keep)
+        if times_ns[-1] > after_ns:
+            self.fresh.append(times_ns[times_ns > after_ns])
+
+    def _count_rows(self, times_ns: IntArray) -> None:
+        rows = self.flow.rows
+        before = int(rows.values[-1]) if len(rows) else 0
+        rows.extend(times_ns, np.arange(before + 1, before + 1 + len(times_ns)))
+
+    def _column(self, batch: Batch, name: str, index: int | None) -> Any:
+        column = batch.columns.get(name)
+        if column is None:
+            return _unknown(len(batch))
+        if index is None:
+            return column if not isinstance(column, Ragged) else _unknown(len(batch))
+        try:
+            values = element_of(column, index, 0)
+        except Fault:
+            return _unknown(len(batch))
+        return np.ma.MaskedArray(values.data, values.null)
+
+    def _take_all(
+        self, whole: dict[str, Samples], batch: Batch, times_ns: IntArray, keep: Any
+    ) -> None:
+        for name, column in batch.columns.items():
+            if not isinstance(column, Ragged) and name not in whole:
+                whole[name] = Samples()
+        for name, samples in whole.items():
+            samples.extend(times_ns, _part(self._column(batch, name, None), keep))
+
+    def count(self, times_ns: IntArray, received: IntArray, last_ns: IntArray) -> None:
+        """Take what the recorder counted."""
+        keep = self._new("received", times_ns)
+        times_ns = _part(times_ns, keep)
+        self.flow.received.extend(times_ns, _part(received, keep))
+        self.flow.last_ns.extend(times_ns, _part(last_ns, keep))
+
+    def gap(self, at_ns: int, peer: str, from_ns: int, is_open: bool) -> None:
+        """Take note that a publisher was lost, or came back."""
+        if at_ns <= self._held_ns.get("gap", -1):
+            return
+        if is_open:
+            self._gaps[peer, from_ns] = from_ns
+        else:
+            self._gaps.pop((peer, from_ns), None)
+        newest = max(self._gaps.values(), default=NONE_OPEN)
+        self.flow.gap_from_ns.extend(np.array([at_ns]), np.array([newest]))
+
+    def _new(self, what: str, times_ns: IntArray) -> Any:
+        """Choose the rows that are not held already; None for all of them."""
+        held_ns = self._held_ns.get(what)
+        if held_ns is None or not len(times_ns) or times_ns[0] > held_ns:
+            return None
+        return times_ns > held_ns
+
+    def samples(self) -> Iterator[tuple[str, Samples]]:
+        """Name everything that is held."""
+        flow = self.flow
+        yield from (("received", flow.received), ("last", flow.last_ns), ("rows", flow.rows))
+        yield from (("gap", flow.gap_from_ns), ("stamps", self.stamps))
+        for (name, index), samples in self.columns.items():
+            yield f"column {name} {index}", samples
+        for name, figures in self.lists.items():
+            for figure, samples in figures.items():
+                yield f"list {name} {figure}", samples
+        for name, samples in (self.whole or {}).items():
+            yield f"whole {name}", samples
+
+    def forget_before(self, time_ns: int) -> None:
+        """Forget what no longer matters at ``time_ns`` and later."""
+        for _, samples in self.samples():
+            samples.forget_before(time_ns - self.keep_ns)
+
+    def snapshot(self, at_ns: int) -> dict[str, Any]:
+        """Return what is older than the rows that will be read again, and open gaps."""
+        held = {name: _last_by(samples, at_ns - self.keep_ns) for name, samples in self.samples()}
+        gaps = [[peer, from_ns] for peer, from_ns in self._gaps]
+        return {"held": {n: v for n, v in held.items() if v is not None}, "gaps": gaps}
+
+    def resume(self, snapshot: Mapping[str, Any]) -> None:
+        """Go on with what ``snapshot`` returned."""
+        self._gaps = {(peer, from_ns): from_ns for peer, from_ns in snapshot["gaps"]}
+        if self.whole is not None:
+            names = [n.removeprefix("whole ") for n in snapshot["held"] if n.startswith("whole ")]
+            self.whole.update({name: Samples() for name in names})
+        for name, samples in self.samples():
+            held = snapshot["held"].get(name)
+            if held is not None:
+                samples.extend(np.array([held[0]]), _single(held[1]))
+                self._held_ns[name] = held[0]
+
+    def forget(self) -> None:
+        """Forget everything, as at the beginning of an epoch."""
+        for _, samples in self.samples():
+            samples.clear()
+        self.fresh.clear()
+        self._gaps.clear()
+        self._held_ns.clear()
+
+
+class Tables:
+    """The tables of all items that a plan reads."""
+
+    def __init__(self) -> None:
+        self._tables: dict[str, Table] = {}
+
+    @property
+    def items(self) -> frozenset[str]:
+        """Names of the items whose batches are wanted."""
+        parents = {name for item in self._tables for name in _with_parents(item)}
+        return frozenset(parents | {COUNTERS, GAPS})
+
+    def __iter__(self) -> Iterator[Table]:
+        return iter(self._tables.values())
+
+    def input(self, plan: InputPlan, history_s: float, parts: bool) -> Input:
+        """Return what a mode reads, which grows as rows come."""
+        table = self._tables.setdefault(plan.item, Table(plan.item))
+        table.keep_ns = max(table.keep_ns, round((history_s + 1.0) * NS))
+        return _INPUT[plan.kind](plan, table, parts)
+
+    def table(self, item: str) -> Table:
+        """Return the table of an item that is read."""
+        return self._tables[item]
+
+    def feed(self, batch: Batch, after_ns: int) -> None:
+        """Take a batch and its child tables."""
+        if batch.item == COUNTERS:
+            self._take_counters(batch)
+        elif batch.item == GAPS:
+            self._take_gaps(batch)
+        else:
+            table = self._tables.get(batch.item)
+            if table is not None and len(batch):
+                table.feed(batch, after_ns)
+            for child in batch.children.values():
+                self.feed(child, after_ns)
+
+    def _take_counters(self, batch: Batch) -> None:
+        rows = batch.children.get("items")
+        if rows is None or not {"item", "received", "last_received_ns"} <= rows.columns.keys():
+            return
+        names: Any = rows.columns["item"]
+        for item, places in _places(names).items():
+            table = self._tables.get(item)
+            if table is not None:
+                counts: list[Any] = [rows.columns[n] for n in ("received", "last_received_ns")]
+                table.count(rows.log_time_ns[places], *(np.ma.getdata(c)[places] for c in counts))
+
+    def _take_gaps(self, batch: Batch) -> None:
+        columns = {name: _objects(column) for name, column in batch.columns.items()}
+        for row in range(len(batch)):
+            values = {name: column[row] for name, column in columns.items()}
+            for table in self._of(values["item"]):
+                table.gap(
+                    int(batch.log_time_ns[row]), values["peer"] or "",
+                    int(values["from_ns"]), values["to_ns"] is None,
+                )  # fmt: skip
+
+    def _of(self, item: str) -> Iterable[Table]:
+        """Return the tables that a gap is about; none named means all of them."""
+        if not item:
+            return self._tables.values()
+        return [t for name, t in self._tables.items() if name == item or _is_below(name, item)]
+
+
+def _variable(plan: InputPlan, table: Table, parts: bool) -> Input:
+    key = (plan.variable, plan.index)
+    samples = table.columns.setdefault(key, Samples())
+    return Input(plan.text, samples, table.flow, table.stamps)
+
+
+def _list(plan: InputPlan, table: Table, parts: bool) -> Input:
+    figures = table.lists.setdefault(plan.variable, {name: Samples() for name in FIGURES})
+    return Input(plan.text, figures["mean"], table.flow, table.stamps, figures)
+
+
+def _item(plan: InputPlan, table: Table, parts: bool) -> Input:
+    if parts and table.whole is None:
+        table.whole = {}
+    whole = table.whole if parts and table.whole is not None else {}
+    return Input(plan.text, table.flow.rows, table.flow, table.stamps, whole)
+
+
+def _probe(plan: InputPlan, table: Table, parts: bool) -> Input:
+    if table.whole is None:
+        table.whole = {}
+    samples = table.whole.setdefault("ok", Samples())
+    return Input(plan.text, samples, table.flow, table.stamps, table.whole)
+
+
+_INPUT: Mapping[str, Callable[[InputPlan, Table, bool], Input]] = {
+    "variable": _variable,
+    "list": _list,
+    "item": _item,
+    "probe": _probe,
+}
+
+
+def _part(column: Any, keep: Any) -> Any:
+    return column if keep is None else column[keep]
+
+
+def _unknown(count: int) -> Any:
+    return np.ma.MaskedArray(np.zeros(count), np.ones(count, bool))
+
+
+def _objects(column: Any) -> Any:
+    if isinstance(column, np.ma.MaskedArray):
+        objects = np.ma.getdata(column).astype(object)
+        objects[np.ma.getmaskarray(column)] = None
+        return objects
+    return column
+
+
+def _places(names: Any) -> dict[str, IntArray]:
+    """Return the rows of each name."""
+    found: dict[str, list[int]] = {}
+    for place, name in enumerate(names):
+        found.setdefault(name, []).append(place)
+    return {name: np.array(places) for name, places in found.items()}
+
+
+def _last_by(samples: Samples, time_ns: int) -> list[Any] | None:
+    last = int(samples.last(time_ns))
+    if last < 0:
+        return None
+    value = samples.column()[last]
+    plain = None if value is np.ma.masked else getattr(value, "item", lambda: value)()
+    return [int(samples.times_ns[last]), plain]
+
+
+def _single(value: Any) -> Any:
+    if value is None:
+        return _unknown(1)
+    if isinstance(value, str):
+        return np.array([value], object)
+    return np.array([value])
+
+
+def _with_parents(item: str) -> Iterator[str]:
+    """Name an item and the items that it may be a child table of."""
+    yield item
+    while "__" in item:
+        item = item.rpartition("__")[0]
+        yield item
+
+
+def _is_below(name: str, item: str) -> bool:
+    return name.startswith(f"{item}__")
