@@ -82,6 +82,8 @@ class Input:
     stamps: Samples = field(default_factory=Samples)
     """The own stamps (ns) of the item's rows, by their time of receipt."""
     parts: Mapping[str, Samples] = field(default_factory=dict)
+    labels: Mapping[int, str] = field(default_factory=dict)
+    """Names of its values, as the constants of the message say."""
 
     def at(self, now: Now) -> Any:
         """Return the value at ``now``."""
@@ -113,9 +115,13 @@ class Evaluate(Protocol):
 
 def where_known(known: Any, value: Any) -> Any:
     """Return the bools of ``value`` where they are known, UNKNOWN elsewhere."""
+    if isinstance(known, bool | np.bool_):  # np.where costs more than all the rest
+        return value if known else UNKNOWN
     return np.where(known, value, UNKNOWN)
 
 
 def with_hysteresis(good: Any, bad: Any) -> Any:
     """Return FALSE where it is bad, TRUE where it is good, and what it was in between."""
+    if isinstance(bad, bool | np.bool_):
+        return FALSE if bad else TRUE if good else HOLD
     return np.where(bad, FALSE, np.where(good, TRUE, HOLD))

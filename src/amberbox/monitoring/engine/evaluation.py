@@ -223,11 +223,18 @@ class MappingRun:
     ) -> Found:
         why = ""
         if code == BAD and self._explain is not None:
-            plain = {n: _plain(value, n in self._bools) for n, value in results.items()}
-            why = self._explain(self._config, plain)
+            why = self._explained(results)
         elif code == NOT_KNOWN:
             why = f"{output.plan.name} is not known"
         return Found(now, output.number, _WHAT[code], output.judge.output(kept), why)
+
+    def _explained(self, results: Mapping[str, Any]) -> str:
+        assert self._explain is not None, "asked for where there is one"
+        plain = {n: _plain(value, n in self._bools) for n, value in results.items()}
+        try:
+            return str(self._explain(self._config, plain))
+        except Exception as error:  # what was found stands, whatever its words
+            return f"no explanation: {type(error).__name__}: {error}"
 
     def _not_fresh(self, now: int, code: int, found: list[Found]) -> None:
         entry = self._culprit(now, code)
@@ -327,12 +334,12 @@ def _as_json(value: Any) -> Any:
 
 
 def _plain(value: Any, is_bool: bool) -> Any:
-    """Return a result as plain Python, None where it is not known."""
+    """Return a result as plain Python; a bool that is not known is None, a number NaN."""
     if np.ndim(value) == 0 and isinstance(value, np.ndarray | np.generic):
         value = value.item()
     if is_bool and value is not None:
         return None if int(value) in (UNKNOWN, HOLD) else bool(value)
-    return None if value is None or value != value else value
+    return value
 
 
 def _row(value: Any, row: int, count: int) -> Any:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from amberbox.core.mode import HOLD, TRUE, UNKNOWN
+from amberbox.core.mode import FALSE, HOLD, TRUE, UNKNOWN
 from amberbox.core.types import Output
 from amberbox.monitoring.plan import Expectation, OutputPlan
 
@@ -36,14 +36,10 @@ class Judge:
         self.is_bool = output.type == "bool"
         self.is_int = output.type == "int"
         self.is_discrete = output.type in ("bool", "string")
-        expectation = output.expectation
-        self._expectation: Expectation | None = (
-            expectation if expectation.value is not None else None
-        )
-        self._expected = int(expectation.value) if self.is_bool and self._simple() else None
-
-    def _simple(self) -> bool:
-        return self._expectation is not None and self._expectation.relation == "=="
+        expects = output.expectation
+        self._expectation: Expectation | None = None if expects.value is None else expects
+        is_simple = self.is_bool and isinstance(expects.value, bool) and expects.relation == "=="
+        self._expected = (TRUE if expects.value else FALSE) if is_simple else None
 
     def one(self, result: Any) -> tuple[int, Any]:
         """Judge one value; return it as it is kept (bools as their code)."""
