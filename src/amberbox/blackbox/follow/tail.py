@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from itertools import chain
@@ -27,6 +27,7 @@ from amberbox.blackbox.follow.deleted import (
     outline_of,
     rows_of_gone,
 )
+from amberbox.blackbox.follow.joining import joined
 from amberbox.blackbox.follow.read import (
     JournalFile,
     journal_file,
@@ -34,6 +35,7 @@ from amberbox.blackbox.follow.read import (
     newest_first,
     sound_chunks,
 )
+from amberbox.blackbox.journal import reserved
 from amberbox.blackbox.journal.buffer import open_buffer
 from amberbox.blackbox.journal.chunk import Chunk, sequences
 from amberbox.blackbox.journal.clocktable import ClockTable, held_points
@@ -109,11 +111,21 @@ class WriterTail:
             yield from self._enter(journal.run, journal.first_seq, journal)
         clock = ClockTable(held_points(journal.readings), held=True)
         skip_before = _skipper(journal, self.run, self.seq)
-        for chunk in sound_chunks(journal, skip_before):
+        chunks = sound_chunks(journal, skip_before)
+        for chunk in joined(chunks, journal.first_seq, self._wanted(journal.streams)):
             yield from self._deliver(chunk, journal, clock, journal.streams)
         yield from self._missing_end(journal)
         self._ends_at = (journal.run, journal.end_seq)
         self._done = run_and_number(path)
+
+    def _wanted(self, streams: Mapping[int, Stream]) -> frozenset[int]:
+        """Name the channels whose messages are read: those of the items, and what is said of gaps."""
+        return frozenset(
+            number
+            for number, stream in streams.items()
+            if stream.topic.name == reserved.GAP
+            or (not stream.repeated and (self.items is None or stream.item in self.items))
+        )
 
     def _deleted_before(
         self, gone: list[GoneJournal], place: tuple[int, int] | None
