@@ -40,4 +40,5 @@ def evaluate(config: Config, inputs: Sequence[Input], now: Now) -> Mapping[str, 
 
 def explain(config: Config, results: Mapping[str, Any]) -> str:
     """Say that the path is missing."""
-    return "" if results["present"] else "the operating system does not show the device"
+    missing = results["present"] is False
+    return "the operating system does not show the device" if missing else ""

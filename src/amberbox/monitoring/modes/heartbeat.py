@@ -92,8 +92,8 @@ def evaluate(config: Config, inputs: Sequence[Input], now: Now) -> Mapping[str, 
 def explain(config: Config, results: Mapping[str, Any]) -> str:
     """Say whether it is silent, or too slow."""
     age_s, rate_hz = results["age_s"], results["rate_hz"]
-    if results["alive"]:
+    if results["alive"] is not False:
         return ""
-    if not age_s <= config.max_age:
-        return f"no message for {age_s:.1f} s" if np.isfinite(age_s) else "no message at all"
+    if age_s is None or age_s > config.max_age:
+        return "no message at all" if age_s is None else f"no message for {age_s:.1f} s"
     return f"{rate_hz:.3g} messages per second, {config.rate:g} expected"
