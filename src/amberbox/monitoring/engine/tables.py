@@ -201,13 +201,17 @@ class Tables:
 
     def _take_counters(self, batch: Batch) -> None:
         rows = batch.children.get("items")
-        if rows is None or not {"item", "received", "last_received_ns"} <= rows.columns.keys():
+        if rows is None:
             return
-        names: Any = rows.columns["item"]
+        # Every table has a column `received` of its own, so a variable of that name has another.
+        columns = {column.path: rows.columns[column.name] for column in rows.schema.columns}
+        if not {"item", "received", "last_received_ns"} <= columns.keys():
+            return
+        names: Any = columns["item"]
         for item, places in _places(names).items():
             table = self._tables.get(item)
             if table is not None:
-                counts: list[Any] = [rows.columns[n] for n in ("received", "last_received_ns")]
+                counts: list[Any] = [columns[n] for n in ("received", "last_received_ns")]
                 table.count(rows.log_time_ns[places], *(np.ma.getdata(c)[places] for c in counts))
 
     def _take_gaps(self, batch: Batch) -> None:
