@@ -32,6 +32,17 @@ SOURCES = f"{OURS}.blackbox.sources"
 PROTOCOLS = (f"{OURS}.blackbox.ros1", f"{OURS}.blackbox.formats", f"{OURS}.sim")
 """Protocol libraries of our own: what a source may import besides ``core``."""
 
+MODES = f"{OURS}.monitoring.modes"
+PROBES = f"{OURS}.monitoring.probes"
+ROS1 = f"{OURS}.blackbox.ros1"
+
+PLUGINS: Mapping[str, tuple[str, Sequence[str]]] = {
+    SOURCES: ("source", PROTOCOLS),
+    MODES: ("mode", ()),
+    PROBES: ("probe", (ROS1,)),
+}
+"""Packages of plugins: what one is called, and what it may import besides ``core``."""
+
 HEAVY = frozenset({"pyarrow", "duckdb", "zmq", "matplotlib", "pandas", "polars", "tsdownsample"})
 RECORDING = tuple(
     f"{OURS}.{name}"
@@ -66,8 +77,9 @@ def _complaints(module: str, entry: Import) -> Iterator[str]:
         yield f"imports {entry.target} at its top: import it inside the function that uses it"
     if _top(entry.target) != OURS:
         return
-    if _within(module, (SOURCES,)):
-        yield from _source_complaints(module, entry.target)
+    package = next((package for package in PLUGINS if _within(module, (package,))), None)
+    if package is not None:
+        yield from _plugin_complaints(package, module, entry.target)
     elif _package(entry.target) not in _may_know(_package(module)):
         yield f"imports {entry.target}, which {_package(module) or 'the front door'} may not know"
 
@@ -77,14 +89,17 @@ def _may_know(package: str) -> frozenset[str]:
     return ALLOWED.get(package, frozenset()) | {package, ""}
 
 
-def _source_complaints(module: str, target: str) -> Iterator[str]:
+def _plugin_complaints(package: str, module: str, target: str) -> Iterator[str]:
+    """Judge an import of a plugin; what its package shares is in files that begin with ``_``."""
+    kind, protocols = PLUGINS[package]
     plugin = ".".join(module.split(".")[:4])
-    if target == SOURCES or _within(target, (plugin, f"{OURS}.core", *PROTOCOLS)):
+    if target == package or _within(target, (plugin, f"{OURS}.core", *protocols)):
         return
-    if _within(target, (SOURCES,)):
+    if not _within(target, (package,)):
+        library = " and its protocol library" if protocols else ""
+        yield f"imports {target}: a {kind} knows core{library} only"
+    elif not target.removeprefix(f"{package}.").startswith("_"):
         yield f"imports {target}: a plugin never imports another plugin"
-    else:
-        yield f"imports {target}: a source knows core and its protocol library only"
 
 
 def _pyarrow_in_record(

@@ -21,6 +21,13 @@ MODULES = (
     "blackbox/sources/__init__",
     "blackbox/sources/ros",
     "blackbox/sources/zmq",
+    "monitoring/plan",
+    "monitoring/modes/__init__",
+    "monitoring/modes/device",
+    "monitoring/modes/range",
+    "monitoring/probes/__init__",
+    "monitoring/probes/_ros",
+    "monitoring/probes/ros_node",
     "diagnosis/covering",
     "fleet/server",
     "cli/record",
@@ -54,6 +61,16 @@ def tree(folder: Path, **planted: str) -> Path:
             "import amberbox.blackbox.store",
             "core and its protocol",
         ),
+        (
+            "monitoring_modes_device",
+            "from amberbox.monitoring.modes import range",
+            "another plugin",
+        ),
+        ("monitoring_modes_device", "import amberbox.blackbox.ros1", "a mode knows core only"),
+        ("monitoring_modes_device", "from amberbox.monitoring import plan", "knows core only"),
+        ("monitoring_probes_ros_node", "import amberbox.blackbox.query", "its protocol library"),
+        ("monitoring_probes__ros", "import amberbox.monitoring.plan", "its protocol library"),
+        ("monitoring_probes__ros", "from . import ros_node", "another plugin"),
         ("blackbox_query", "import pyarrow.parquet", "at its top"),
         ("blackbox_sources_zmq", "import zmq", "at its top"),
         ("cli_record", "try:\n    import polars\nexcept ImportError: pass", "at its top"),
@@ -82,6 +99,12 @@ def test_allowed_imports_are_not_complained_about(tmp_path: Path) -> None:
         "core_types": "from __future__ import annotations\nimport numpy",
         "blackbox_query": "from amberbox.core.types import x\ndef f():\n    import pyarrow",
         "blackbox_sources_ros": "import amberbox.blackbox.ros1\nfrom amberbox.core import types",
+        "monitoring_modes_device": "from amberbox.core.types import x\nimport numpy",
+        "monitoring_probes_ros_node": (
+            "from amberbox.monitoring.probes._ros import x\nimport amberbox.core.types"
+        ),
+        "monitoring_probes__ros": "import amberbox.blackbox.ros1",
+        "monitoring_plan": "import amberbox.blackbox.query",
         "blackbox_sources_zmq": (
             "from typing import TYPE_CHECKING\n"
             "if TYPE_CHECKING:\n    import zmq\n"

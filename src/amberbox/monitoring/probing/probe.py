@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeAlias
 
 from amberbox.core import plugins
 from amberbox.core.errors import AmberboxError
-from amberbox.core.probe import PERIOD_S, TIMEOUT_S, Measured, ProbeOrder
+from amberbox.core.probe import PERIOD_S, TIMEOUT_S, Measured
 
 PROBES = "amberbox.monitoring.probes"
 DEFINES = ("MEASURES", "SUBJECT", "measure")
@@ -81,12 +81,21 @@ def load_probe(kind: str, extra_dirs: Sequence[Path] = ()) -> Probe:
     return Probe(kind, module.measure, module.MEASURES, period_s, timeout_s)
 
 
-def probe_for(order: ProbeOrder, extra_dirs: Sequence[Path] = ()) -> Probe:
-    """Load the probe of an order; one that cannot be loaded says so with every look."""
+def known_probes(extra_dirs: Sequence[Path] = ()) -> Mapping[str, plugins.Plugin]:
+    """Find all probes, ours and those of a robot folder; none of them is imported."""
+    return plugins.find(PROBES, extra_dirs, DEFINES)
+
+
+def probes_for(kinds: Iterable[str], extra_dirs: Sequence[Path] = ()) -> Mapping[str, Probe]:
+    """Load probes, each once; one that cannot be loaded says so with every look."""
+    return {kind: _probe_for(kind, extra_dirs) for kind in sorted(set(kinds))}
+
+
+def _probe_for(kind: str, extra_dirs: Sequence[Path]) -> Probe:
     try:
-        return load_probe(order.kind, extra_dirs)
+        return load_probe(kind, extra_dirs)
     except AmberboxError as error:
-        return broken(order.kind, error)
+        return broken(kind, error)
 
 
 def broken(kind: str, error: AmberboxError) -> Probe:

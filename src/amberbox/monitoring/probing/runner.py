@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TypeAlias
 
 from amberbox.core.probe import ProbeOrder, in_order
-from amberbox.monitoring.probing.probe import Probe, Row, probe_for
+from amberbox.monitoring.probing.probe import Probe, Row, probes_for
 
 Put: TypeAlias = Callable[[ProbeOrder, Row], None]
 """Takes a finished row; called from many threads, for one order always in order of time."""
@@ -49,7 +49,8 @@ class ProbeRunner:
         self, orders: Sequence[ProbeOrder], put: Put, extra_dirs: Sequence[Path] = ()
     ) -> None:
         self._put = put
-        self._posts = [_Post(order, probe_for(order, extra_dirs)) for order in in_order(orders)]
+        probes = probes_for({order.kind for order in orders}, extra_dirs)
+        self._posts = [_Post(order, probes[order.kind]) for order in in_order(orders)]
         self._stop = threading.Event()
         self._threads: list[threading.Thread] = []
         self.failure: Exception | None = None

@@ -1,0 +1,52 @@
+"""How busy the processor is, whole or one of its cores."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+from amberbox.core.errors import UsageError
+from amberbox.core.probe import Measured
+
+MEASURES = {
+    "percent": ("float", "%", "busy during one second; 100: all that was asked for is busy"),
+    "load_1m": ("float", "", "processes that ran or waited to run, mean of the last minute"),
+    "cores": ("int", "", "cores that are switched on"),
+}
+SUBJECT = "all, or a core such as cpu0"
+PERIOD_S = 2.0
+
+_WINDOW_S = 1.0
+_IDLE, _WAITING = 3, 4  # columns of /proc/stat: idle, waiting for a disk
+_COUNTED = 8  # those after it (guests) are part of others
+
+
+def measure(subject: str) -> Measured:
+    """Measure over one second; ok says only that it could be measured."""
+    stat = Path("/proc/stat")
+    before = stat.read_text()
+    time.sleep(_WINDOW_S)
+    return judge(subject, before, stat.read_text(), Path("/proc/loadavg").read_text())
+
+
+def judge(subject: str, before: str, after: str, loadavg: str) -> Measured:
+    """Compare two looks at ``/proc/stat``."""
+    first, last = _times(before), _times(after)
+    name = "cpu" if subject in ("", "all") else subject
+    if name not in first or name not in last:
+        known = ", ".join(core for core in last if core != "cpu")
+        raise UsageError(f"there is no core '{subject}'", f"known: all, {known}")
+    spent = [b - a for a, b in zip(first[name], last[name], strict=True)]
+    idle = spent[_IDLE] + spent[_WAITING]
+    whole = sum(spent)
+    return {
+        "ok": True,
+        "percent": 100 * (whole - idle) / whole if whole > 0 else None,
+        "load_1m": float(loadavg.split()[0]),
+        "cores": len(last) - 1,
+    }
+
+
+def _times(stat: str) -> dict[str, list[int]]:
+    lines = (line.split() for line in stat.splitlines() if line.startswith("cpu"))
+    return {name: [int(text) for text in times[:_COUNTED]] for name, *times in lines}
