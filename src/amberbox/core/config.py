@@ -30,7 +30,9 @@ Legacy = Callable[[str], "str | None"]
 """Answers with a note for a key that older files have and we do not need, by its path
 (``ros.topics.metadata``), or None if it does not know the key."""
 
-WRAPPERS = frozenset({"topic", "element", "listener", "interface_specification"})
+WRAPPERS = frozenset(
+    {"topic", "element", "listener", "interface_specification", "mapping", "output"}
+)
 """Single keys that the paper's format wraps around the entries of a list."""
 
 _FAILED: Any = Unread()

@@ -1,0 +1,226 @@
+"""What components need: the edges between them, and what speaks for each."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+from amberbox.core.config import did_you_mean
+from amberbox.core.errors import Problem
+from amberbox.core.nodes import Node
+from amberbox.monitoring.configuration.files import ComponentFile
+from amberbox.monitoring.plan import ComponentPlan, DependencyPlan, ModePlan
+
+NOBODY = "none"
+
+
+@dataclass(frozen=True)
+class Named:
+    """A component with its file, and the names that its modes go by."""
+
+    plan: ComponentPlan
+    file: ComponentFile | None
+    node: Node
+    stems: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Judge:
+    """A mode that speaks for something, or an output of it."""
+
+    component: ComponentPlan
+    mode: ModePlan
+    output: str = ""
+
+
+class Names:
+    """Components and modes by the names that people write."""
+
+    def __init__(self, components: Sequence[Named]) -> None:
+        self._components = {entry.plan.name: entry for entry in components}
+        self._components |= {entry.plan.id: entry for entry in components}
+
+    def component(self, name: str) -> ComponentPlan | None:
+        """Return a component by its name or id."""
+        entry = self._components.get(name)
+        return entry.plan if entry else None
+
+    def near(self, name: str) -> str:
+        """Suggest a component."""
+        return did_you_mean(name, self._components)
+
+    def judge(self, text: str) -> Judge | str:
+        """Find ``COMPONENT/MODE`` or ``COMPONENT/MODE/OUTPUT``; or say what is wrong with it."""
+        parts = text.split("/")
+        if len(parts) not in (2, 3):
+            return f"'{text}' is no monitor: write COMPONENT/MODE, or none"
+        entry = self._components.get(parts[0])
+        if entry is None:
+            return f"there is no component '{parts[0]}'{self.near(parts[0])}"
+        modes = dict(zip(entry.stems, entry.plan.modes, strict=True))
+        modes |= {mode.id: mode for mode in entry.plan.modes}
+        modes |= {mode.name: mode for mode in entry.plan.modes}
+        mode = modes.get(parts[1])
+        if mode is None:
+            return f"{entry.plan.id} has no mode '{parts[1]}'{did_you_mean(parts[1], modes)}"
+        if len(parts) == 3 and parts[2] not in outputs_of(mode):
+            near = did_you_mean(parts[2], outputs_of(mode))
+            return f"{parts[0]}/{parts[1]} has no output '{parts[2]}'{near}"
+        return Judge(entry.plan, mode, parts[2] if len(parts) == 3 else "")
+
+
+def outputs_of(mode: ModePlan) -> list[str]:
+    """Return the names of a mode's outputs."""
+    return [output.name for mapping in mode.mappings for output in mapping.outputs]
+
+
+def with_dependencies(components: Sequence[Named], problems: list[Problem]) -> list[ComponentPlan]:
+    """Return the components with their edges; what dangles or goes in a circle is told."""
+    names = Names(components)
+    plans = [
+        replace(entry.plan, dependencies=tuple(_edges(entry, names, problems)))
+        for entry in components
+    ]
+    return _without_cycles(plans, components, problems)
+
+
+def _edges(entry: Named, names: Names, problems: list[Problem]) -> Iterator[DependencyPlan]:
+    if entry.file is None:
+        return
+    monitors = entry.file.dependency_monitors
+    by_kind = {"heartbeat": monitors.heartbeat, "functional": monitors.functional}
+    keys = entry.node.mapping or {}
+    nodes = dict(
+        zip(entry.file.dependencies, keys.get("dependencies", entry.node).items or (), strict=False)
+    )
+    for name in dict.fromkeys(entry.file.dependencies):
+        judged = [(kind, of[name]) for kind, of in by_kind.items() if name in of]
+        if not judged:
+            yield _plain_edge(name, nodes[name], names, problems)
+        for kind, text in judged:
+            yield _Edge(name, kind, _place(entry.node, kind, name), names, problems).made(text)
+    for kind, of in by_kind.items():
+        for name in of:
+            if name not in nodes:
+                place, where = _place(entry.node, kind, name), f"dependency_monitors.{kind}.{name}"
+                what = f"'{name}' is not among the dependencies{did_you_mean(name, nodes)}"
+                problems.append(place.problem(where, what))
+
+
+def _place(node: Node, *keys: str) -> Node:
+    for key in ("dependency_monitors", *keys):
+        node = (node.mapping or {}).get(key, node)
+    return node
+
+
+def _plain_edge(name: str, node: Node, names: Names, problems: list[Problem]) -> DependencyPlan:
+    component = names.component(name)
+    if component is not None:
+        return DependencyPlan(name, "", component.id)
+    what = f"there is no component '{name}'{names.near(name)}"
+    problems.append(node.problem("dependencies", what, "write its file, or take it out"))
+    return DependencyPlan(name, problem=what)
+
+
+@dataclass(frozen=True)
+class _Edge:
+    """One dependency with a monitor."""
+
+    name: str
+    kind: str
+    node: Node
+    names: Names
+    problems: list[Problem]
+
+    def made(self, text: str) -> DependencyPlan:
+        """Return the edge: judged by an output, a mode, the component, or nobody."""
+        component = self.names.component(self.name)
+        edge = DependencyPlan(self.name, self.kind, component.id if component else None)  # type: ignore[arg-type]  # kinds are keys of the file
+        if text == NOBODY:
+            self._note_missing(component, "and nothing judges it")
+            return replace(edge, judged=False)
+        judge = self.names.judge(text)
+        if isinstance(judge, str):
+            self._tell(judge)
+            return edge if component else replace(edge, problem=judge)
+        output = judge.output or self._output_of(judge)
+        if output is None:
+            return self._not_told(edge, judge, text)
+        shown = f"{text}/{output}" if output and not judge.output else text
+        self._note_missing(component, f"{shown} speaks for it")
+        return replace(edge, component=judge.component.id, mode=judge.mode.id, output=output)
+
+    def _output_of(self, judge: Judge) -> str | None:
+        """Return the output of the dependency's name, '' for the whole mode, None for neither."""
+        outputs = outputs_of(judge.mode)
+        if self.name in outputs:
+            return self.name
+        is_its_own = judge.component is self.names.component(self.name)
+        return "" if is_its_own or len(outputs) <= 1 else None
+
+    def _not_told(self, edge: DependencyPlan, judge: Judge, text: str) -> DependencyPlan:
+        outputs = outputs_of(judge.mode)
+        what = f"{text} has no output '{self.name}'{did_you_mean(self.name, outputs)}"
+        self._tell(what, f"write {text}/OUTPUT; outputs: {', '.join(outputs)}")
+        return edge if edge.component else replace(edge, problem=what)
+
+    def _note_missing(self, component: ComponentPlan | None, but: str) -> None:
+        if component is None:
+            what = f"there is no component '{self.name}'{self.names.near(self.name)}; {but}"
+            self._tell(what, is_error=False)
+
+    def _tell(self, what: str, hint: str = "", *, is_error: bool = True) -> None:
+        where = f"dependency_monitors.{self.kind}.{self.name}"
+        self.problems.append(self.node.problem(where, what, hint, is_error=is_error))
+
+
+def _without_cycles(
+    plans: Sequence[ComponentPlan], components: Sequence[Named], problems: list[Problem]
+) -> list[ComponentPlan]:
+    """Take out the edge that closes each circle, and tell it."""
+    nodes = {entry.plan.id: entry.node for entry in components}
+    by_id = {plan.id: plan for plan in plans}
+    for cycle in _cycles({plan.id: _needed(plan, by_id) for plan in plans}):
+        last, first = cycle[-1], cycle[0]
+        what = f"needs itself: {' -> '.join((*cycle, first))}"
+        node = (nodes[last].mapping or {}).get("dependencies", nodes[last])
+        problems.append(node.problem("dependencies", what))
+        edges = tuple(
+            replace(edge, component=None, mode="", output="", problem=what)
+            if first in _targets(edge, by_id)
+            else edge
+            for edge in by_id[last].dependencies
+        )
+        by_id[last] = replace(by_id[last], dependencies=edges)
+    return [by_id[plan.id] for plan in plans]
+
+
+def _needed(plan: ComponentPlan, by_id: Mapping[str, ComponentPlan]) -> list[str]:
+    return [target for edge in plan.dependencies for target in _targets(edge, by_id)]
+
+
+def _targets(edge: DependencyPlan, by_id: Mapping[str, ComponentPlan]) -> list[str]:
+    """Return the component that an edge leads to, if it is the component itself that counts."""
+    if edge.component is not None and not edge.mode and edge.component in by_id:
+        return [edge.component]
+    return [plan.id for plan in by_id.values() if edge.name in (plan.id, plan.name)]
+
+
+def _cycles(graph: Mapping[str, Sequence[str]]) -> Iterator[tuple[str, ...]]:
+    """Yield the path from where each back edge leads to where it begins (depth first)."""
+    done: set[str] = set()
+    for start in graph:
+        if start in done:
+            continue
+        path: list[str] = [start]
+        waiting = [iter(graph[start])]
+        while waiting:
+            target = next(waiting[-1], None)
+            if target is None:
+                waiting.pop()
+                done.add(path.pop())
+            elif target in path:
+                yield tuple(path[path.index(target) :])
+            elif target not in done and target in graph:
+                path.append(target)
+                waiting.append(iter(graph[target]))

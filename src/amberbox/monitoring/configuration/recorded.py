@@ -1,0 +1,190 @@
+"""What the black box will record, as far as it can be told without a device."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+from amberbox.blackbox.folder.blocks import SourceBlock
+from amberbox.blackbox.folder.folder import SOURCES, RobotFolder
+from amberbox.blackbox.unroll import unroller
+from amberbox.blackbox.unroll.jsonschema import OURS
+from amberbox.core.errors import AmberboxError
+from amberbox.core.names import extend_names, item_name
+from amberbox.core.plugins import get
+from amberbox.core.source import TopicOptions
+from amberbox.core.types import ItemSchema, Schema, Topic
+from amberbox.monitoring.configuration.variables import tokens
+
+
+@dataclass(frozen=True)
+class Item:
+    """An item to come. ``schema`` is None where nothing tells its variables.
+
+    ``complete`` is false where only some variables are known: those of ``variable_names``.
+    """
+
+    name: str
+    source: str
+    topic: str
+    options: TopicOptions
+    schema: ItemSchema | None = None
+    chosen: tuple[str, ...] = ()
+    """Variables named in ``black_box.yaml``, where the type is not known."""
+
+
+class Recorded:
+    """The items of a robot folder: configured ones, and what sources tell of theirs."""
+
+    def __init__(self, folder: RobotFolder, sources: str = SOURCES) -> None:
+        self._folder = folder
+        known = [(block, _topics(block, sources)) for block in folder.blocks]
+        self.items = tuple(
+            _named(item for block, topics in known for item in _items(block, topics))
+        )
+        self.open = tuple(block.name for block, topics in known if topics is None)
+        """Names of the blocks that record everything they hear."""
+
+    @cached_property
+    def by_name(self) -> Mapping[str, Item]:
+        """The items by name."""
+        return {item.name: item for item in self.items}
+
+    def schema(self, item: Item) -> ItemSchema | None:
+        """Return the variables of an item: by its source or type, else as recorded before."""
+        return item.schema if item.schema is not None else self._stored.get(item.name)
+
+    def stored(self, name: str) -> ItemSchema | None:
+        """Return the variables of an item that was recorded before."""
+        return self._stored.get(name)
+
+    @cached_property
+    def _stored(self) -> Mapping[str, ItemSchema]:
+        """What has been recorded already; empty if there is no store, or none that can be read."""
+        with suppress(AmberboxError, OSError):
+            return _stored_schemas(self._folder)
+        return {}
+
+
+def _stored_schemas(folder: RobotFolder) -> Mapping[str, ItemSchema]:
+    from amberbox.blackbox.query.catalogue import ask, union  # needs the store's readers
+
+    if not folder.store_path.is_dir():
+        return {}
+
+    def tables(catalogue: Any) -> Mapping[str, ItemSchema]:
+        found = {name: union(versions) for name, versions in catalogue.schemas.items()}
+        plain = {
+            name: ItemSchema(table.type, table.columns, {}, table.stamp)
+            for name, table in found.items()
+        }
+        return {name: _with_children(name, found, plain) for name in found}
+
+    return ask(folder.store_path, tables)
+
+
+def _with_children(
+    name: str, tables: Mapping[str, Any], plain: Mapping[str, ItemSchema]
+) -> ItemSchema:
+    """Hang child tables below their item, by the end of their names."""
+    children = {
+        child.removeprefix(f"{name}__"): plain[child]
+        for child, table in tables.items()
+        if table.parent == name
+    }
+    return replace(plain[name], children=children)
+
+
+def _topics(block: SourceBlock, sources: str) -> Sequence[tuple[TopicOptions, Topic | None]] | None:
+    """Return the topics of a block, as announced where the source knows; None for everything."""
+    try:
+        module = get(sources, block.plugin).load()
+        configured = module.Source(block.config, block.name).topics()
+        announced = _announced(module, block)
+    except AmberboxError:
+        return None
+    if not configured:
+        return [(TopicOptions(topic.name), topic) for topic in announced.values()] or None
+    return [(options, announced.get(options.name)) for options in configured]
+
+
+def _announced(module: Any, block: SourceBlock) -> Mapping[str, Topic]:
+    """Ask a source which topics it will announce, where that is known without a device."""
+    known = getattr(module, "known_topics", None)
+    return {} if known is None else {topic.name: topic for topic in known(block.config)}
+
+
+def _items(
+    block: SourceBlock, topics: Sequence[tuple[TopicOptions, Topic | None]] | None
+) -> Iterator[Item]:
+    for options, announced in topics or ():
+        schema = _schema(announced) if announced is not None else schema_of_type(options.type)
+        chosen = () if schema is not None else tuple(options.variable_names)
+        name = item_name(block.name, options.name)
+        yield Item(name, block.name, options.name, options, schema, chosen)
+
+
+def _named(items: Iterable[Item]) -> Iterator[Item]:
+    """Name items as a new store would: a name that is taken gets a suffix."""
+    names: dict[str, str] = {}
+    for item in items:
+        key = f"{item.source} {item.topic.strip('/')}"
+        taken = {name.casefold() for name in names.values()}
+        names[key] = item.name
+        if item.name.casefold() in taken:
+            del names[key]
+            names = extend_names(names, [key], lambda name: False)
+        yield replace(item, name=names[key])
+
+
+def _schema(topic: Topic) -> ItemSchema | None:
+    """Return the columns of an announced topic; JSON Schema documents are taken at their word."""
+    if topic.schema is None:
+        return None
+    schema = topic.schema
+    if schema.encoding == "jsonschema":
+        document = json.loads(schema.data) | {"$comment": OURS}
+        schema = Schema(schema.name, schema.encoding, json.dumps(document).encode())
+    return unroller(replace(topic, schema=schema)).schema
+
+
+def schema_of_type(name: str) -> ItemSchema | None:
+    """Return the columns of a standard ROS type such as ``nav_msgs/Odometry``; None for others."""
+    package, _, kind = name.replace("/msg/", "/").partition("/")
+    if not package or not kind:
+        return None
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS1_NOETIC)
+    if f"{package}/msg/{kind}" not in store.fielddefs:
+        return None
+    text, _ = store.generate_msgdef(f"{package}/msg/{kind}")
+    schema = Schema(f"{package}/{kind}", "ros1msg", text.encode())
+    return unroller(Topic(name, "ros1", schema)).schema
+
+
+def chosen_place(item: Item, text: str) -> bool | None:
+    """Tell whether ``variable_names`` of an item name a variable, or what it lies below.
+
+    None if there are none, which says nothing.
+    """
+    if not item.chosen:
+        return None
+    asked = tokens(text)
+    return any(_related(tokens(entry), asked) for entry in item.chosen)
+
+
+def _related(entry: tuple[str, ...], asked: tuple[str, ...]) -> bool:
+    """Tell whether a variable is an entry, ends like it, or lies below it."""
+    flat, wanted = "_".join(entry), "_".join(asked)
+    return (
+        flat == wanted
+        or flat.endswith(f"_{wanted}")
+        or wanted.startswith(f"{flat}_")
+        or wanted.endswith(f"_{flat}")
+        or f"_{flat}_" in wanted
+    )
