@@ -1,0 +1,110 @@
+"""Several inputs of a mode looked at together: at common instants, by name, against each other."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from amberbox.core.clock import NS
+from amberbox.core.expression import Expression
+from amberbox.core.mode import Input
+from amberbox.core.samples import Now, Samples, Window
+from amberbox.core.types import IntArray
+
+
+def place_name(place: int) -> str:
+    """Return what expressions of a mode call its inputs: ``input_1`` is the first."""
+    return f"input_{place + 1}"
+
+
+def reads_of(*expressions: Expression | None) -> tuple[str, ...]:
+    """Return the addresses that expressions read, each once, without inputs of the mapping."""
+    names = [name for one in expressions if one is not None for name in one.addresses()]
+    return tuple(dict.fromkeys(name for name in names if not _is_place(name)))
+
+
+def by_name(inputs: Sequence[Input], reads: Sequence[str]) -> dict[str, Input]:
+    """Name what a mode is given: inputs of the mapping by their place, then what it reads."""
+    own = len(inputs) - len(reads)
+    names = [*(place_name(place) for place in range(own)), *reads]
+    return dict(zip(names, inputs, strict=True))
+
+
+def value_of(expression: Expression, inputs: Mapping[str, Input], now: Now) -> Any:
+    """Return the value of an expression; NaN where it is unknown, bools as 0 and 1."""
+    series = {
+        name: (one.samples.times_ns, one.samples.column())
+        for name, one in inputs.items()
+        if name in expression.addresses()
+    }
+    column = expression.evaluate_series(series, np.atleast_1d(np.asarray(now, np.int64)))
+    numbers = np.ma.filled(np.ma.asarray(column).astype(np.float64), np.nan)
+    return numbers.reshape(np.shape(now))[()]
+
+
+def sample_times(inputs: Iterable[Input], now: Now, seconds: float) -> IntArray:
+    """Return when any of the inputs changed in the windows before ``now``, and right before."""
+    since, until = int(np.min(now)) - round(seconds * NS), int(np.max(now))
+    parts = []
+    for one in inputs:
+        first, end = max(int(one.samples.last(since)), 0), int(one.samples.last(until)) + 1
+        parts.append(one.samples.times_ns[first:end])
+    return np.unique(np.concatenate(parts))
+
+
+def numbers_at(one: Input, now: Now | IntArray) -> Any:
+    """Return the value as a number at each instant; NaN where it is unknown or infinite."""
+    values = numbers(one.samples.at(now))
+    return np.where(one.samples.known(now) & np.isfinite(values), values, np.nan)[()]
+
+
+def numbers(values: Any) -> NDArray[np.float64]:
+    """Return values as numbers; texts and the like are NaN."""
+    column = np.asarray(values)
+    if column.dtype != object:
+        return column.astype(np.float64)
+    plain = [v if isinstance(v, int | float | np.number) else np.nan for v in column.flat]
+    return np.array(plain, np.float64).reshape(column.shape)
+
+
+def middles(values: NDArray[np.float64]) -> tuple[Any, Any]:
+    """Return the two middle numbers over the first axis, which are one where it is odd.
+
+    NaN does not count; where nothing else is, the middle is NaN.
+    """
+    if not len(values):
+        nobody = np.full(values.shape[1:], np.nan)
+        return nobody, nobody
+    ordered = np.sort(values, axis=0)
+    count = np.isfinite(ordered).sum(axis=0)[None]
+    places = (np.maximum(count - 1, 0) // 2, np.minimum(count // 2, len(values) - 1))
+    low, high = (np.take_along_axis(ordered, place, 0)[0] for place in places)
+    return low, high
+
+
+def typical(window: Window) -> Any:
+    """Return the median of a window, or the last sample where the window has none."""
+    known = window.samples.known(window.now)
+    last = np.where(known, window.samples.at(window.now), np.nan)
+    return np.where(window.count() > 0, window.median(), last)[()]
+
+
+def worst_of(values: Sequence[Any], limit: float) -> Any:
+    """Return the greatest number; NaN where something is unknown and all the rest within limits."""
+    greatest = np.fmax.reduce(values)
+    unknown = np.isnan(values).any(axis=0) & (greatest <= limit)
+    return np.where(unknown, np.nan, greatest)[()]
+
+
+def samples_of(times_ns: IntArray, values: NDArray[Any]) -> Samples:
+    """Make samples of what has been computed."""
+    samples = Samples()
+    samples.extend(times_ns, values)
+    return samples
+
+
+def _is_place(name: str) -> bool:
+    return name.startswith("input_") and name.removeprefix("input_").isdigit()

@@ -1,0 +1,112 @@
+"""Diagnostics: what ROS nodes say of themselves in DiagnosticArray messages."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from math import inf
+from typing import Any, Literal, NamedTuple
+
+from amberbox.core.clock import NS
+from amberbox.core.mode import UNKNOWN, Input, Result
+from amberbox.core.options import option
+from amberbox.core.samples import Now, Samples
+from amberbox.core.standins import Finding
+
+ACCEPTS = ("item",)
+PARTS = True
+TIMED = True
+RESULTS = (
+    Result("ok", "bool", "all entries that are meant are there, and none says it is not well"),
+    Result("level", "int", "the worst level: 0 OK, 1 WARN, 2 ERROR, 3 STALE", relation="<="),
+    Result("message", "string", "what the worst entry says"),
+)
+SAMPLE = """\
+name: imu_diagnostics_monitor
+monitor: diagnostics
+description: what the drivers of the IMU and the laser say of themselves
+mappings:
+  - mapping:
+      inputs: [ros_diagnostics__status]
+      outputs:
+        - output: {name: drivers_ok, type: bool}
+        - output: {name: worst_level, result: level, type: int, expected: 1, severity: critical}
+        - output: {name: message, type: string}
+arguments:
+  names: ["^imu_node: ", "^hokuyo_node: Frequency"]
+"""
+OK, WARN, ERROR, STALE = range(4)
+_WORDS = {"ok": OK, "warn": WARN, "warning": WARN, "error": ERROR, "stale": STALE}
+
+
+@dataclass(frozen=True, slots=True)
+class Config:
+    """Which entries are meant, and how bad they may be."""
+
+    names: tuple[str, ...] = option(
+        doc="regular expressions found in the names of entries; each must find one"
+    )
+    worst: Literal["ok", "warn"] = option("ok", "the worst level that is well")
+    max_age: float = option(5.0, "how long after an entry it is stale", unit="s")
+
+    def check(self) -> Iterator[Finding]:
+        """Refuse patterns that cannot be read."""
+        if not self.names:
+            yield "names", "name at least one entry"
+        for name in self.names:
+            try:
+                re.compile(name)
+            except re.error as error:
+                yield "names", f"'{name}' is no regular expression: {error}"
+        if not 0 < self.max_age < inf:
+            yield "max_age", "must lie above 0"
+
+
+class Entry(NamedTuple):
+    """One row of the array."""
+
+    level: int
+    text: str
+
+
+def history_s(config: Config) -> float:
+    """Return how far back it looks: publishers send arrays of their own, each at its pace."""
+    return config.max_age
+
+
+def evaluate(config: Config, inputs: Sequence[Input], now: Now) -> Mapping[str, Any]:
+    """Take the last entry of each name, and of these the worst."""
+    entries = _newest(inputs[0], now, config.max_age)
+    heard = inputs[0].flow.reaches_back(now, config.max_age)
+    worst = max((_of(pattern, entries) for pattern in config.names), key=lambda e: e.level)
+    if worst.level == STALE and not worst.text and not heard:
+        return {"ok": UNKNOWN}
+    text = worst.text or f"no entry for {config.max_age:g} s"
+    return {"ok": worst.level <= _WORDS[config.worst], "level": worst.level, "message": text}
+
+
+def _of(pattern: str, entries: Mapping[str, Entry]) -> Entry:
+    """Return the worst entry of a pattern; without any it is stale and has no text."""
+    found = [entry for name, entry in entries.items() if re.search(pattern, str(name))]
+    return max(found, key=lambda entry: entry.level, default=Entry(STALE, ""))
+
+
+def _newest(item: Input, now: Now, seconds: float) -> Mapping[str, Entry]:
+    """Return the last entry of each name, of those that are not too old."""
+    columns = [item.parts.get(name, Samples()) for name in ("name", "level", "message")]
+    edges = (now - round(seconds * NS), now)
+    first, end = (int(columns[0].times_ns.searchsorted(edge, "right")) for edge in edges)
+    rows = zip(*(samples.column()[first:end].tolist() for samples in columns), strict=True)
+    return {name: Entry(_level(level), f"{name}: {text or ''}") for name, level, text in rows}
+
+
+def _level(value: Any) -> int:
+    """Return the number of a level, which JSON may spell out; what it cannot be is an error."""
+    number = _WORDS.get(value.lower()) if isinstance(value, str) else value
+    return int(number) if number in (OK, WARN, ERROR, STALE) else ERROR
+
+
+def explain(config: Config, results: Mapping[str, Any]) -> str:
+    """Repeat what the worst entry says."""
+    return str(results["message"]) if results.get("ok") is False else ""

@@ -1,0 +1,91 @@
+"""Expression: any condition or number over variables, in the language of expressions."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from amberbox.core.expression import Expression
+from amberbox.core.mode import Input, Result, where_known
+from amberbox.core.options import option
+from amberbox.core.samples import Now
+from amberbox.core.standins import Finding
+from amberbox.core.together import by_name, reads_of, value_of
+
+ACCEPTS = ("variable",)
+COLUMNS = True
+TIMED = True
+RESULTS = (
+    Result("holds", "bool", "the condition holds"),
+    Result("value", "float", "the number"),
+)
+SAMPLE = """\
+name: brake_monitor
+monitor: expression
+description: the brake holds the robot, and the motors do not work against it
+mappings:
+  - mapping:
+      inputs: []
+      outputs:
+        - output: {name: brake_holds, type: bool, for: 200 ms}
+        - output: {name: slip, result: value, type: float}
+arguments:
+  condition: not (brake.closed != 0 and abs(ros_odom.twist_linear_x) > 0.05)
+  number: max(abs(ros_odom.twist_linear_x) over 2s)
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class Config:
+    """What is asked; inputs of the mapping are called input_1, input_2 ..."""
+
+    condition: Expression | None = option(None, "what holds on a healthy robot")
+    number: Expression | None = option(None, "what to show, or to compare with `expected`")
+
+    def check(self) -> Iterator[Finding]:
+        """Refuse what asks for nothing, or for something else."""
+        if self.condition is None and self.number is None:
+            yield "give 'condition', 'number' or both"
+        if self.condition is not None and self.condition.kind not in ("condition", "any"):
+            yield "condition", f"is a {self.condition.kind}, no condition"
+        if self.number is not None and self.number.kind == "text":
+            yield "number", "is a text, no number"
+
+
+def reads(config: Config) -> tuple[str, ...]:
+    """Return the variables that are no inputs."""
+    return reads_of(config.condition, config.number)
+
+
+def history_s(config: Config) -> float:
+    """Return how far back it looks."""
+    asked = (config.condition, config.number)
+    return max(one.history_ns / 1e9 for one in asked if one is not None)
+
+
+def results_of(config: Config, inputs: int, bools: int) -> tuple[Result, ...]:
+    """Return what is asked for."""
+    asked = (config.condition, config.number)
+    return tuple(r for r, one in zip(RESULTS, asked, strict=True) if one is not None)
+
+
+def evaluate(config: Config, inputs: Sequence[Input], now: Now) -> Mapping[str, Any]:
+    """Evaluate at the instants, over all that is known by then."""
+    named = by_name(inputs, reads(config))
+    found: dict[str, Any] = {}
+    if config.condition is not None:
+        truth = value_of(config.condition, named, now)
+        found["holds"] = where_known(~np.isnan(truth), truth == 1)
+    if config.number is not None:
+        found["value"] = value_of(config.number, named, now)
+    return found
+
+
+def explain(config: Config, results: Mapping[str, Any]) -> str:
+    """Repeat the condition that does not hold."""
+    if config.condition is None or results["holds"] is not False:
+        return ""
+    return f"it does not hold that {config.condition.text}"

@@ -1,0 +1,145 @@
+"""Redundancy: what should be equal is, or equals what can be computed from other variables."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from math import inf
+from typing import Any
+
+import numpy as np
+
+from amberbox.core.expression import Expression
+from amberbox.core.mode import Input, Result, where_known
+from amberbox.core.options import option
+from amberbox.core.samples import Now, Window
+from amberbox.core.standins import Finding
+from amberbox.core.together import (
+    by_name,
+    middles,
+    numbers_at,
+    place_name,
+    reads_of,
+    sample_times,
+    samples_of,
+    typical,
+    value_of,
+    worst_of,
+)
+
+ACCEPTS = ("variable",)
+COLUMNS = True
+RESULTS = (
+    Result("agree", "bool", "all members agree"),
+    Result("residual", "float", "how far the worst member is off", relation="<="),
+)
+SAMPLE = """\
+name: barometers_monitor
+monitor: redundancy
+description: the barometers of the four wheels measure the same air
+mappings:
+  - mapping:
+      inputs: [wheel_1.pressure, wheel_2.pressure, wheel_3.pressure, wheel_4.pressure]
+      outputs:
+        - output: {name: barometer_1, type: bool}
+        - output: {name: barometer_2, type: bool}
+        - output: {name: barometer_3, type: bool}
+        - output: {name: barometer_4, type: bool}
+arguments:
+  threshold: 10.0
+  window: 1 s
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class Config:
+    """How far a member may be off, and from what."""
+
+    threshold: float = option(doc="how far a member may be off, in its own unit")
+    window: float = option(
+        0.0, "the median of that long counts, so that single bad samples do not", unit="s"
+    )
+    formula: Expression | None = option(
+        None,
+        "what a member should be; the inputs are input_1, input_2 ..., and those it does not "
+        "name are members (without it a member should be what its siblings are)",
+    )
+
+    def check(self) -> Iterator[Finding]:
+        """Refuse what nobody can agree within."""
+        if not 0 <= self.threshold < inf:
+            yield "threshold", "must be 0 or more"
+        if not 0 <= self.window < inf:
+            yield "window", "must be 0 or more"
+
+
+def reads(config: Config) -> tuple[str, ...]:
+    """Return the variables of the formula that are no inputs."""
+    return reads_of(config.formula)
+
+
+def history_s(config: Config) -> float:
+    """Return how far back it looks."""
+    past_ns = 0 if config.formula is None else config.formula.history_ns
+    return config.window + past_ns / 1e9
+
+
+def results_of(config: Config, inputs: int, bools: int) -> tuple[Result, ...]:
+    """Return results per member first where a mapping has several bool outputs."""
+    count = len(_members(config, inputs))
+    each = [Result(f"member_{k}", "bool", f"member {k} agrees") for k in range(1, count + 1)]
+    offs = [
+        Result(f"residual_{k}", "float", f"how far member {k} is off", relation="<=")
+        for k in range(1, count + 1)
+    ]
+    return (*each, *offs, *RESULTS) if bools > 1 else (*RESULTS, *each, *offs)
+
+
+def evaluate(config: Config, inputs: Sequence[Input], now: Now) -> Mapping[str, Any]:
+    """Take the median distance of each member from what it should be."""
+    named = by_name(inputs, reads(config))
+    times_ns = sample_times(named.values(), now, config.window)
+    places = _members(config, len(inputs) - len(reads(config)))
+    values = np.array([numbers_at(named[place_name(place)], times_ns) for place in places])
+    found: dict[str, Any] = {}
+    residuals = []
+    for k in range(len(places)):
+        should = _should_be(config, named, times_ns, values, k)
+        off = np.where(np.isnan(values[k]), inf, np.min(np.abs(values[k] - should), axis=0))
+        off = np.where(np.isnan(should[0]), np.nan, off)
+        residuals.append(typical(Window(samples_of(times_ns, off), now, config.window)))
+        found |= _judged(config, residuals[k], f"member_{k + 1}", f"residual_{k + 1}")
+    return found | _judged(config, worst_of(residuals, config.threshold), "agree", "residual")
+
+
+def _members(config: Config, inputs: int) -> list[int]:
+    named = () if config.formula is None else config.formula.addresses()
+    return [place for place in range(inputs) if place_name(place) not in named]
+
+
+def _should_be(config: Config, named: Any, times_ns: Any, values: Any, k: int) -> Any:
+    """Return what a member should be; of two middle siblings the nearer one counts."""
+    if config.formula is not None:
+        return value_of(config.formula, named, times_ns)[None]
+    return np.array(middles(np.delete(values, k, axis=0)))
+
+
+def _judged(config: Config, residual: Any, verdict: str, number: str) -> dict[str, Any]:
+    well = where_known(~np.isnan(residual), residual <= config.threshold)
+    return {verdict: well, number: np.where(np.isfinite(residual), residual, np.nan)[()]}
+
+
+def explain(config: Config, results: Mapping[str, Any]) -> str:
+    """Name the members that are off, and how far."""
+    off = {
+        k: results[f"residual_{k}"] for k in _numbers(results) if results[f"member_{k}"] is False
+    }
+    return ", ".join(f"member {k} is off" + _by(far) for k, far in off.items())
+
+
+def _numbers(results: Mapping[str, Any]) -> list[int]:
+    return [int(name.removeprefix("member_")) for name in results if name.startswith("member_")]
+
+
+def _by(far: float | None) -> str:
+    return " and shows no number" if far is None else f" by {far:.4g}"
