@@ -11,15 +11,12 @@ from amberbox.core.types import Level, Output, Status
 from amberbox.monitoring.plan import Severity
 
 __all__ = [
-    *("AlarmChange", "AlarmState", "Condition", "Finding", "Found", "Level", "Output"),
-    *("SECOND_NS", "Status", "TICK_NS", "Transition", "View", "What"),
-]
+    "NS", "TICK_NS", "AlarmChange", "AlarmState", "Condition", "Finding", "Found", "Level",
+    "Output", "Status", "Transition", "View", "What",
+]  # fmt: skip
 
 TICK_NS = NS // 20
 """Everything happens at multiples of this."""
-SECOND_NS = NS
-"""Statuses of all come at multiples of this, also where nothing has changed."""
-
 What: TypeAlias = Literal["ok", "bad", "unknown", "stale"]
 AlarmState: TypeAlias = Literal["open", "acknowledged", "shelved", "healed"]
 
