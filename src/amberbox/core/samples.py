@@ -134,7 +134,8 @@ class Samples:
     def derived(self, values: NDArray[Any]) -> Samples:
         """Return samples at the same times with other values, one for each of these."""
         made = Samples()
-        made._times, made._values, made._end = self.times_ns, values, len(self)
+        made._times, made._end = self.times_ns, len(self)
+        made._values, made._null = _split(values)
         return made
 
 
@@ -173,11 +174,11 @@ class Window:
 
     def min(self) -> Any:
         """Return the least value."""
-        return self._reduced("min")
+        return self._reduced("min") + 0.0  # which of 0 and -0 is less depends on their places
 
     def max(self) -> Any:
         """Return the greatest value."""
-        return self._reduced("max")
+        return self._reduced("max") + 0.0
 
     def mean(self) -> Any:
         """Return the mean."""
@@ -210,8 +211,11 @@ class Window:
         first, end = self._bounds()
         return self._shaped(total[end] - total[first])
 
-    def sum_of(self, flags: NDArray[np.bool_]) -> Any:
-        """Return how many samples of the window have their flag set, one flag per sample."""
+    def sum_of(self, flags: NDArray[np.bool_] | IntArray) -> Any:
+        """Return how many samples of the window have their flag set, or the sum of whole numbers.
+
+        There is one flag, or number, per sample.
+        """
         total = np.concatenate([[0], np.cumsum(flags)])
         first, end = self._bounds()
         return self._shaped(total[end] - total[first])

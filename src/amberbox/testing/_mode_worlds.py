@@ -48,11 +48,12 @@ class Series:
 class Given:
     """All there will ever be of one input, by the name of the place it goes to."""
 
+    name: str
     series: Mapping[str, Series]
 
     def empty(self) -> Input:
         """Return the input before there is any sample."""
-        made = Input("x")
+        made = Input(self.name)
         made.parts = {n[6:]: Samples() for n in self.series if n.startswith("parts ")}
         return made
 
@@ -116,15 +117,18 @@ def sampled_worlds(
     """Return a strategy that draws worlds fit for a mode."""
     from hypothesis import strategies as st
 
-    count = 1 if getattr(module, "PER_INPUT", False) else len(file.inputs[0])
+    texts = file.inputs[0][:1] if getattr(module, "PER_INPUT", False) else file.inputs[0]
     reads = getattr(module, "reads", None)
-    count += len(reads(file.config)) if reads else 0
+    names = [*texts, *(reads(file.config) if reads else ())]
     kinds = ("float", "int", "bool", *(["string"] if text else []))
 
     @st.composite
     def worlds(draw: DrawFn) -> World:
-        inputs = [_given(draw, draw(st.sampled_from(module.ACCEPTS)), kinds, parts)
-                  for _ in range(count)]  # fmt: skip
+        accepted = [module.ACCEPTS if n < len(texts) else ("variable",) for n in range(len(names))]
+        inputs = [
+            Given(name, _series_of(draw, draw(st.sampled_from(some)), kinds, parts))
+            for name, some in zip(names, accepted, strict=True)
+        ]
         ticks = draw(st.lists(st.integers(0, 200), min_size=1, max_size=6, unique=True))
         instants = np.array(sorted(ticks), np.int64) * TICK_NS + T0_NS
         cuts = sorted(draw(st.sets(st.integers(1, 30), max_size=4)))
@@ -133,8 +137,10 @@ def sampled_worlds(
     return worlds()
 
 
-def _given(draw: DrawFn, kind: str, kinds: Sequence[str], parts: Mapping[str, str]) -> Given:
-    """Draw one input: its values, parts and stamps share the times of its rows."""
+def _series_of(
+    draw: DrawFn, kind: str, kinds: Sequence[str], parts: Mapping[str, str]
+) -> Mapping[str, Series]:
+    """Draw what one input has: values, parts and stamps share the times of its rows."""
     from hypothesis import strategies as st
 
     times = _times(draw)
@@ -154,7 +160,7 @@ def _given(draw: DrawFn, kind: str, kinds: Sequence[str], parts: Mapping[str, st
         gaps = _times(draw)
         open_ = np.arange(len(gaps)) % 2 == 0
         series["gap_from_ns"] = Series(gaps, np.where(open_, gaps, NONE_OPEN))
-    return Given(series)
+    return series
 
 
 def _times(draw: DrawFn) -> IntArray:

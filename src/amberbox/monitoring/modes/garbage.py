@@ -1,0 +1,117 @@
+"""Garbage: values that cannot be, such as NaN, counted over a window."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from math import inf
+from typing import Any
+
+import numpy as np
+
+from amberbox.core.clock import NS
+from amberbox.core.mode import Input, Result, where_known
+from amberbox.core.options import option
+from amberbox.core.samples import Now
+from amberbox.core.standins import Finding
+
+ACCEPTS = ("variable", "list")
+COLUMNS = True
+PER_INPUT = True
+TIMED = True
+RESULTS = (
+    Result("clean", "bool", "no more of it is garbage than is tolerated"),
+    Result("garbage", "int", "how many values of the window are garbage", relation="<="),
+    Result("share", "float", "how many of a hundred are", "%", relation="<="),
+)
+SAMPLE = """\
+name: wheel_garbage_monitor
+monitor: garbage
+description: the left wheel sends no impossible frames
+mappings:
+  - mapping:
+      inputs: [wheel_left.velocity]
+      outputs:
+        - output: {name: wheel_left_clean, type: bool, expected: true}
+        - output: {name: bad_frames, result: garbage, type: int}
+arguments:
+  min: -100
+  max: 100
+  window: 10 s
+  tolerated: 1 %
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class Config:
+    """What is garbage beside NaN and infinity, and how much of it is well."""
+
+    min: float = option(-inf, "what lies below is impossible")
+    max: float = option(inf, "what lies above is impossible")
+    allowed: Sequence[float] = option((), "the only values that are possible")
+    mask: int | None = option(None, "the bits that a status word may have set: 0x1f")
+    window: float = option(5.0, "over how long it is counted", unit="s")
+    tolerated: float = option(0.0, "which share of garbage is still well", unit="%")
+
+    def check(self) -> Iterator[Finding]:
+        """Refuse what nothing can fulfil."""
+        if not 0 < self.window < inf:
+            yield "window", "must lie above 0"
+        if not 0 <= self.tolerated < 100:
+            yield "tolerated", "must lie between 0 % and 100 %"
+        if not self.min <= self.max:
+            yield "nothing lies between 'min' and 'max'"
+        if self.mask is not None and self.mask < 0:
+            yield "mask", "must not lie below 0"
+
+
+def history_s(config: Config) -> float:
+    """Return how far back it looks."""
+    return config.window
+
+
+def evaluate(config: Config, inputs: Sequence[Input], now: Now) -> Mapping[str, Any]:
+    """Count over the window, with the value that was in force when it began."""
+    (entry,) = inputs
+    of, bad = _in_lists(config, entry) if "finite" in entry.parts else _in_values(config, entry)
+    window, before = entry.over(now, config.window), now - round(config.window * NS)
+    held = entry.samples.last(before)
+    total, garbage = (window.sum_of(n) + np.append(n, 0)[held] for n in (of, bad))
+    share = np.where(total > 0, 100 * garbage / np.maximum(total, 1), np.nan)
+    clean = where_known(total > 0, share <= config.tolerated)
+    return {"clean": clean, "garbage": garbage, "share": share}
+
+
+def _in_values(config: Config, entry: Input) -> tuple[Any, Any]:
+    """Return for each sample whether it is known (1 or 0), and whether it is garbage."""
+    values, null = entry.samples.values, entry.samples.null
+    good = np.isfinite(values) & (values >= config.min) & (values <= config.max)
+    if config.allowed:
+        good &= np.logical_or.reduce([values == value for value in config.allowed])
+    if config.mask is not None:
+        good &= _whole(values) & ~config.mask == 0
+    known = np.ones(len(values), bool) if null is None else ~null
+    return known.astype(np.int64), (known & ~good).astype(np.int64)
+
+
+def _in_lists(config: Config, entry: Input) -> tuple[Any, Any]:
+    """Return for each row how long the list is, and how much of it is garbage at least."""
+    columns = (entry.parts[name].column() for name in ("count", "finite", "min", "max"))
+    count, finite, low, high = (np.ma.filled(column, np.nan) for column in columns)
+    outside = (low < config.min).astype(np.int64) + (high > config.max)
+    length, good = np.maximum(_whole(count), 0), np.maximum(_whole(finite), 0)
+    return length, np.clip(length - good + outside, 0, length)
+
+
+def _whole(numbers: Any) -> Any:
+    """Return numbers as whole ones, -1 for what is none."""
+    floats = numbers.astype(np.float64)
+    is_whole = (np.abs(floats) < 1 << 53) & (floats % 1 == 0)
+    return np.where(is_whole, floats, -1).astype(np.int64)
+
+
+def explain(config: Config, results: Mapping[str, Any]) -> str:
+    """Say how much of it is garbage."""
+    if results["clean"] is not False:
+        return ""
+    return f"{results['share']:.3g} % of the values of the last {config.window:g} s are garbage"

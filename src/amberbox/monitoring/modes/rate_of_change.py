@@ -1,0 +1,88 @@
+"""Rate of change: how fast a value rises or falls lies within limits."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from math import inf
+from typing import Any
+
+import numpy as np
+
+from amberbox.core.clock import NS
+from amberbox.core.mode import Input, Result, where_known
+from amberbox.core.options import option
+from amberbox.core.samples import Now
+from amberbox.core.standins import Finding
+
+ACCEPTS = ("variable", "list")
+COLUMNS = True
+PER_INPUT = True
+TIMED = True
+RESULTS = (
+    Result("in_limits", "bool", "the value rises and falls as fast as it may"),
+    Result("rate", "float", "change per second over the window", "1/s", relation="<="),
+)
+SAMPLE = """\
+name: tank_pressure_monitor
+monitor: rate_of_change
+description: the tank does not leak
+mappings:
+  - mapping:
+      inputs: [tank.pressure]
+      outputs:
+        - output: {name: pressure_holds, type: bool, expected: true, for: 5 s}
+        - output: {name: pressure_rate, result: rate, type: float}
+arguments:
+  min: -0.2
+  window: 10 s
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class Config:
+    """The limits, which are well themselves."""
+
+    min: float = option(-inf, "the least change per second; below 0 it may fall")
+    max: float = option(inf, "the greatest change per second")
+    window: float = option(1.0, "over how long the change is measured", unit="s")
+    turn: float | None = option(None, "for an angle: a full turn, 360 or 6.2832")
+
+    def check(self) -> Iterator[Finding]:
+        """Refuse limits that nothing can be within or outside of."""
+        if self.min == -inf and self.max == inf:
+            yield "give 'min', 'max' or both"
+        if self.min > self.max:
+            yield "nothing is within these limits"
+        if not 0 < self.window < inf:
+            yield "window", "must lie above 0"
+        if self.turn is not None and not 0 < self.turn < inf:
+            yield "turn", "must lie above 0"
+
+
+def history_s(config: Config) -> float:
+    """Return how far back it looks."""
+    return config.window
+
+
+def evaluate(config: Config, inputs: Sequence[Input], now: Now) -> Mapping[str, Any]:
+    """Compare the value with the one that was in force a window ago."""
+    (variable,) = inputs
+    before = now - round(config.window * NS)
+    known = variable.samples.known(now) & variable.samples.known(before)
+    change = _number(variable.at(now)) - _number(variable.at(before))
+    if config.turn is not None:
+        change = (change + config.turn / 2) % config.turn - config.turn / 2
+    rate = np.where(known, change / config.window, np.nan)
+    in_limits = (rate >= config.min) & (rate <= config.max)
+    return {"in_limits": where_known(np.isfinite(rate), in_limits), "rate": rate}
+
+
+def _number(value: Any) -> Any:
+    return np.asarray(value).astype(np.float64)
+
+
+def explain(config: Config, results: Mapping[str, Any]) -> str:
+    """Say how fast it changes."""
+    out = results["in_limits"] is False
+    return f"changes by {results['rate']:.4g} per second" if out else ""
