@@ -137,7 +137,8 @@ class MappingRun:
             return
         codes = self._codes(block)
         if self._columns and not block.few:
-            before = (self.code, [output.key for output in self.outputs], len(found))
+            counts = (len(found), self.evaluations)
+            before = (self.code, [output.key for output in self.outputs], *counts)
             try:
                 self._at_once(block, codes, found)
             except Exception:  # one by one shows at which instant
@@ -146,8 +147,10 @@ class MappingRun:
                 return
         self._one_by_one(block, codes, found)
 
-    def _set_back(self, found: list[Found], code: int, keys: list[Key | None], count: int) -> None:
-        self.code = code
+    def _set_back(
+        self, found: list[Found], code: int, keys: list[Key | None], count: int, evaluations: int
+    ) -> None:
+        self.code, self.evaluations = code, evaluations
         del found[count:]
         for output, key in zip(self.outputs, keys, strict=True):
             output.key, output.times, output.column = key, [], []

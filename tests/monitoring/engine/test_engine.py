@@ -1,0 +1,229 @@
+"""The engine: what is found does not depend on how the record came, and nothing stays green."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from amberbox.core.clock import NS
+from amberbox.core.types import Batch, Level, Status
+from amberbox.monitoring.engine.engine import Engine
+from amberbox.monitoring.engine.findings import TICK_NS, Finding
+from amberbox.monitoring.plan import ModePlan
+from tests.monitoring.engine.plans import (
+    ALIVE,
+    CRASHING,
+    POSITIVE,
+    POSITIVE_SLOWLY,
+    STEADY,
+    VALUE,
+    WORD,
+    counts,
+    gap,
+    mode,
+    one,
+    output,
+    rows,
+    seconds,
+    variable,
+)
+
+
+def watch(modes: Sequence[ModePlan], batches: Sequence[Batch], until_s: float) -> list[Finding]:
+    engine = Engine(one(*modes))
+    engine.begin(0)
+    for batch in batches:
+        engine.feed(batch)
+    return engine.advance(round(until_s * NS))
+
+
+def levels(findings: Sequence[Finding], name: str = "m") -> list[tuple[float, Level]]:
+    """Return the levels of a mode and since when, each once."""
+    found: list[tuple[float, Level]] = []
+    for status in findings:
+        if isinstance(status, Status) and status.mode == name:
+            entry = (status.since_ns / NS, status.level)
+            if not found or found[-1] != entry:
+                found.append(entry)
+    return found
+
+
+def test_an_instant_comes_after_the_row_that_it_is_about() -> None:
+    batch = rows(seconds(1.0, 1.01, 2.0), v=[1.0, -2.0, 1.0])
+    found = levels(watch([mode(POSITIVE, variable())], [batch], 3.0))
+    assert found == [(0.0, "unknown"), (1.0, "ok"), (1.05, "error"), (2.0, "ok")]
+
+
+def test_between_the_limits_it_stays_as_it_was() -> None:
+    batch = rows(seconds(1, 2, 3, 4, 5), v=[-0.5, -2.0, -0.5, 1.0, -0.5])
+    found = levels(watch([mode(POSITIVE, variable())], [batch], 6.0))
+    assert found == [(0.0, "unknown"), (1.0, "ok"), (2.0, "error"), (4.0, "ok")]
+
+
+def test_what_depends_on_time_changes_without_a_row() -> None:
+    batch = rows(seconds(1.0), v=[5.0])
+    found = levels(watch([mode(STEADY, variable())], [batch], 3.0))
+    assert found == [(0.0, "unknown"), (1.0, "error"), (2.0, "ok")]
+
+
+def test_a_value_gets_stale() -> None:
+    batch = rows(seconds(1.0), v=[1.0])
+    findings = watch([mode(POSITIVE, variable(), stale_s=2.0)], [batch], 5.0)
+    assert levels(findings) == [(0.0, "unknown"), (1.0, "ok"), (3.25, "stale")]
+    last = [f for f in findings if isinstance(f, Status) and f.mode == "m"][-1]
+    assert last.reason == "nothing received of a.v for 2 s"
+    assert last.outputs == {"good": None, "value": None}
+
+
+def test_counted_messages_keep_a_filtered_value_fresh() -> None:
+    counted = counts(seconds(1, 2, 3, 4), [10, 20, 30, 30], seconds(1, 2, 3, 3))
+    batches = [rows(seconds(1.0), v=[1.0]), counted]
+    found = levels(watch([mode(POSITIVE, variable(), stale_s=1.5)], batches, 6.0))
+    assert found == [(0.0, "unknown"), (1.0, "ok"), (4.75, "stale")]
+
+
+def test_a_lost_publisher_is_told_at_once() -> None:
+    batches = [rows(seconds(1.0, 4.0), v=[1.0, 1.0]), gap(2 * NS, 2 * NS, None)]
+    batches.append(gap(4 * NS, 2 * NS, 4 * NS))
+    findings = watch([mode(POSITIVE, variable(), stale_s=None)], batches, 5.0)
+    assert levels(findings) == [(0.0, "unknown"), (1.0, "ok"), (2.0, "stale"), (4.0, "ok")]
+
+
+def test_another_publisher_of_the_same_keeps_it_fresh() -> None:
+    batches = [rows(seconds(1.0, 2.1, 3.0), v=[1.0] * 3), gap(2 * NS, 2 * NS, None)]
+    found = levels(watch([mode(POSITIVE, variable(), stale_s=None)], batches, 3.0))
+    assert found == [(0.0, "unknown"), (1.0, "ok"), (2.0, "stale"), (2.1, "ok")]
+
+
+def test_a_mode_that_crashes_is_unknown_and_disturbs_nobody() -> None:
+    batch = rows(seconds(1, 2, 3, 4), v=[1.0, 1.0, 3.0, 1.0])
+    crashing = mode(CRASHING, variable(), id="crashing", outputs=[output()])
+    findings = watch([crashing, mode(POSITIVE, variable())], [batch], 5.0)
+    assert levels(findings, "crashing") == [(0.0, "unknown"), (1.0, "ok"), (3.0, "unknown")]
+    last = [f for f in findings if isinstance(f, Status) and f.mode == "crashing"][-1]
+    assert last.reason == "crashed: RuntimeError: above two"
+    assert levels(findings) == [(0.0, "unknown"), (1.0, "ok")]
+
+
+def test_a_value_that_is_null_is_not_known() -> None:
+    batch = rows(seconds(1, 2, 3), v=np.ma.MaskedArray([1.0, 1.0, 1.0], [False, True, False]))
+    found = levels(watch([mode(POSITIVE, variable())], [batch], 3.0))
+    assert found == [(0.0, "unknown"), (1.0, "ok"), (2.0, "unknown"), (3.0, "ok")]
+
+
+def test_an_epoch_begins_with_nothing_known() -> None:
+    engine = Engine(one(mode(POSITIVE, variable())))
+    engine.begin(0)
+    engine.feed(rows(seconds(1.0), v=[1.0]))
+    engine.advance(2 * NS)
+    engine.begin(NS)  # the clock went back
+    found = levels(engine.advance(2 * NS))
+    assert found == [(1.0, "unknown")]
+
+
+_ALL = (
+    mode(POSITIVE, variable(), id="fast", outputs=[output(), output(VALUE), output(WORD)]),
+    mode(POSITIVE_SLOWLY, variable(), id="slow", outputs=[output(), output(VALUE), output(WORD)]),
+    mode(STEADY, variable(), id="steady", outputs=[output(for_s=0.3, heal_s=0.2), output(VALUE)]),
+    mode(CRASHING, variable(), id="crashing", outputs=[output()]),
+    mode(ALIVE, variable(), id="alive"),
+    mode(POSITIVE, variable("w", "b"), id="other", stale_s=0.7),
+)
+
+
+@st.composite
+def records(draw: st.DrawFn) -> list[Batch]:
+    """Rows of two items, counters and gaps, in batches of one row, by time."""
+    steps = draw(st.lists(st.integers(1, 400), min_size=5, max_size=60))
+    at_ms = np.cumsum(steps).tolist()
+    batches = []
+    for at in at_ms:
+        ns, kind = at * 1_000_000, draw(st.sampled_from("aaaabbcg"))
+        value = draw(st.sampled_from([-2.0, -0.5, 0.5, 1.5, 2.5, np.nan, np.inf]))
+        if kind in "ab":
+            batches.append(rows([ns], kind, **{"v" if kind == "a" else "w": [value]}))
+        elif kind == "c":
+            batches.append(counts([ns], [at], [max(ns - 200_000_000, 0)]))
+        else:
+            batches.append(gap(ns, ns, None if value < 0 else ns, "b"))
+    return batches
+
+
+def _as_text(findings: Sequence[Finding]) -> list[str]:
+    return [str(finding) for finding in findings]
+
+
+def _end_ns(batches: Sequence[Batch]) -> int:
+    return int(batches[-1].log_time_ns[-1]) + 2 * NS
+
+
+@given(records(), st.data())
+@settings(max_examples=60, deadline=None)
+def test_findings_do_not_depend_on_how_the_record_came(batches: list[Batch], data: Any) -> None:
+    """Once as a whole (a replay at full speed), once row by row in random steps (live)."""
+    end_ns = _end_ns(batches)
+    whole = Engine(one(*_ALL))
+    whole.begin(0)
+    for batch in batches:
+        whole.feed(batch)
+    expected = _as_text(whole.advance(end_ns))
+    live, found = Engine(one(*_ALL)), []
+    live.begin(0)
+    for batch in batches:
+        live.feed(batch)
+        complete_ns = int(batch.log_time_ns[-1]) - 1
+        if data.draw(st.booleans()):
+            found += live.advance(complete_ns)
+    found += live.advance(end_ns)
+    assert _as_text(found) == expected
+    assert whole.evaluations == live.evaluations
+
+
+@given(records(), st.data())
+@settings(max_examples=60, deadline=None)
+def test_a_snapshot_and_the_last_rows_are_enough_to_go_on(batches: list[Batch], data: Any) -> None:
+    end_ns = _end_ns(batches)
+    whole = Engine(one(*_ALL))
+    whole.begin(0)
+    for batch in batches:
+        whole.feed(batch)
+    expected = _as_text(whole.advance(end_ns))
+    first, found = Engine(one(*_ALL)), []
+    first.begin(0)
+    stop = data.draw(st.integers(1, len(batches)))
+    for batch in batches[:stop]:
+        first.feed(batch)
+    until_ns = int(batches[stop - 1].log_time_ns[-1]) - 1
+    found += first.advance(until_ns)
+    snapshot = json.loads(json.dumps(first.snapshot()))
+    second = Engine(one(*_ALL))
+    second.resume(snapshot)
+    since_ns = first.until_ns - round(second.history_s * NS)
+    for batch in batches:
+        if int(batch.log_time_ns[-1]) > since_ns:
+            second.feed(batch)
+    found += second.advance(end_ns)
+    assert _as_text(found) == expected
+
+
+@given(records())
+@settings(max_examples=40, deadline=None)
+def test_nothing_stays_green_when_the_record_goes_silent(batches: list[Batch]) -> None:
+    engine = Engine(one(*_ALL))
+    engine.begin(0)
+    for batch in batches:
+        engine.feed(batch)
+    engine.advance(int(batches[-1].log_time_ns[-1]) + 6 * NS)
+    assert "ok" not in {status.level for status in engine.statuses()}
+
+
+def test_instants_are_multiples_of_the_tick() -> None:
+    findings = watch([mode(POSITIVE, variable())], [rows(seconds(0.123), v=[1.0])], 2.0)
+    times = [f.measured_ns for f in findings if isinstance(f, Status)]
+    assert all(time % TICK_NS == 0 for time in times)
+    assert 150_000_000 in times
