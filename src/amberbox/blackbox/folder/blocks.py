@@ -16,6 +16,7 @@ from amberbox.core.ids import derive_id, is_id
 from amberbox.core.nodes import Node
 from amberbox.core.options import option
 from amberbox.core.plugins import Plugin, find
+from amberbox.core.probe import SOURCE as PROBES
 from amberbox.core.source import TopicOptions
 
 DEFAULTS = "default_parameters"
@@ -142,7 +143,8 @@ def _names(blocks: Sequence[_Block], problems: list[Problem]) -> list[str]:
     shares = Counter(block.plugin for block in blocks)
     names: list[str] = []
     for block in blocks:
-        name = _name(block, problems) if shares[block.plugin] > 1 else block.plugin
+        own = shares[block.plugin] > 1 or (block.given_name and block.given_name.text == PROBES)
+        name = _name(block, problems) if own else block.plugin
         if name in names:
             what = f"a second block is called '{name}'"
             hint = "give each of the blocks of one source a 'name:' of its own"

@@ -1,0 +1,237 @@
+"""Look at what only the robot's computer can see, and publish it for a box elsewhere."""
+
+from __future__ import annotations
+
+import argparse
+import queue
+import signal
+import sys
+import threading
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+from amberbox.blackbox.folder.folder import load_folder
+from amberbox.cli._output import print_json, tell
+from amberbox.cli._text import in_columns
+from amberbox.core.errors import UsageError
+from amberbox.core.probe import ProbeOrder, in_order
+from amberbox.monitoring.probing.probe import Row, known_probes, load_probe
+from amberbox.monitoring.probing.publisher import HERE, Publisher, encode, is_open
+from amberbox.monitoring.probing.runner import ProbeRunner, Put
+
+if TYPE_CHECKING:
+    from types import ModuleType
+
+_EXIT = "exit status with --once or --probe: 0 all are ok, 1 something is not, or is unknown"
+_SAID_AGAIN_S = 0.2  # how soon a signal is noticed
+
+_Found: TypeAlias = "queue.SimpleQueue[tuple[ProbeOrder, Row]]"
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the verb's arguments."""
+    parser.add_argument(
+        "folder", nargs="?", metavar="FOLDER", help="robot folder: the probes its monitors need"
+    )
+    parser.add_argument(
+        "--probe", nargs=2, action="append", default=[], metavar=("KIND", "SUBJECT"),
+        help="this probe, such as: --probe path_exists /dev/ttyUSB0; again for more",
+    )  # fmt: skip
+    parser.add_argument("--once", action="store_true", help="look once and stop")
+    parser.add_argument(
+        "--publish", nargs="?", const=HERE, metavar="ADDRESS",
+        help=f"publish over ZeroMQ, such as tcp://*:5561; without ADDRESS {HERE}",
+    )  # fmt: skip
+    parser.add_argument("--json", action="store_true", help="one JSON object per line")
+    parser.add_argument(
+        "--list", action="store_true", help="only list the folder's probes; without FOLDER all"
+    )
+    parser.epilog = _EXIT
+
+
+def run(args: argparse.Namespace) -> int:
+    """Look, and print or publish what is found."""
+    if args.list and not (args.folder or args.probe):
+        _list_kinds(args.json)
+        return 0
+    orders, extra_dirs = _orders(args)
+    if args.list:
+        _list_orders(orders, args.json)
+        return 0
+    if not orders:
+        raise UsageError("there is nothing to probe", "name a FOLDER, or --probe KIND SUBJECT")
+    if args.publish is None and (args.once or not args.folder):
+        return _once(orders, extra_dirs, args.json)
+    if args.once:
+        raise UsageError("--once does not go with --publish: nobody would be listening yet")
+    with _stopped_by_signal() as stop:
+        if args.publish is None:
+            _print_on(orders, extra_dirs, args.json, stop)
+        else:
+            _publish(orders, extra_dirs, args, stop)
+    return 0
+
+
+def _orders(args: argparse.Namespace) -> tuple[Sequence[ProbeOrder], Sequence[Path]]:
+    """Return what is to be probed, and where else probes are."""
+    orders: list[ProbeOrder] = []
+    extra_dirs: list[Path] = []
+    if args.folder:
+        from amberbox.monitoring.configuration.load import load_plan
+
+        folder = load_folder(args.folder)
+        plan, problems = load_plan(folder)
+        count = sum(problem.is_error for problem in problems)
+        if count:
+            tell([f"{count} errors in the monitors; amberbox check {args.folder} shows them"])
+        orders, extra_dirs = list(plan.probes()), [folder.path / "probes"]
+    for kind, subject in args.probe:
+        load_probe(kind, extra_dirs)
+        orders.append(ProbeOrder(kind, subject))
+    return in_order(orders), extra_dirs
+
+
+@contextmanager
+def _stopped_by_signal() -> Iterator[threading.Event]:
+    stop = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    yield stop
+
+
+@contextmanager
+def _running(
+    orders: Sequence[ProbeOrder], put: Put, extra_dirs: Sequence[Path]
+) -> Iterator[ProbeRunner]:
+    runner = ProbeRunner(orders, put, extra_dirs)
+    runner.start()
+    try:
+        yield runner
+    finally:
+        runner.close()
+
+
+def _once(orders: Sequence[ProbeOrder], extra_dirs: Sequence[Path], as_json: bool) -> int:
+    """Take the first row of each probe; one that hangs has its row as well."""
+    found: _Found = queue.SimpleQueue()
+    rows: dict[ProbeOrder, Row] = {}
+    with _running(orders, lambda order, row: found.put((order, row)), extra_dirs):
+        while len(rows) < len(orders):
+            order, row = found.get()
+            rows.setdefault(order, row)
+    ordered = [(order, rows[order]) for order in orders]
+    if as_json:
+        for order, row in ordered:
+            print(_line(order, row))
+    else:
+        _print_table(("probe", "subject", "ok", "measured"), [_cells(*entry) for entry in ordered])
+    return 0 if all(row["ok"] for row in rows.values()) else 1
+
+
+def _print_on(
+    orders: Sequence[ProbeOrder],
+    extra_dirs: Sequence[Path],
+    as_json: bool,
+    stop: threading.Event,
+) -> None:
+    """Print rows as they come; for people only when one differs in ``ok`` or its error."""
+    found: _Found = queue.SimpleQueue()
+    said: dict[ProbeOrder, tuple[Any, Any]] = {}
+    with _running(orders, lambda order, row: found.put((order, row)), extra_dirs):
+        while not stop.is_set():
+            try:
+                order, row = found.get(timeout=_SAID_AGAIN_S)
+            except queue.Empty:
+                continue
+            if as_json:
+                print(_line(order, row), flush=True)
+            elif said.get(order) != (row["ok"], row["error"]):
+                said[order] = row["ok"], row["error"]
+                print("  ".join(_cells(order, row)), flush=True)
+
+
+def _publish(
+    orders: Sequence[ProbeOrder],
+    extra_dirs: Sequence[Path],
+    args: argparse.Namespace,
+    stop: threading.Event,
+) -> None:
+    with Publisher(args.publish) as publisher:
+        who = "whoever reaches this computer" if is_open(args.publish) else "only this computer"
+        text = f"{len(orders)} probes, published at {publisher.endpoint}; {who} can read them"
+        print(text, file=sys.stderr, flush=True)
+
+        def put(order: ProbeOrder, row: Row) -> None:
+            publisher.put(order, row)
+            if args.json:
+                print(_line(order, row), flush=True)
+
+        with _running(orders, put, extra_dirs) as runner:
+            while runner.failure is None and not stop.is_set():
+                stop.wait(_SAID_AGAIN_S)
+
+
+def _line(order: ProbeOrder, row: Row) -> str:
+    return encode({"item": order.item, "kind": order.kind, **row}).decode()
+
+
+def _cells(order: ProbeOrder, row: Row) -> tuple[str, str, str, str]:
+    return order.kind, order.subject, _word(row["ok"]), _measured(row)
+
+
+def _print_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    """Print whole cells: an error or a name that is cut helps nobody."""
+    print("\n".join(in_columns([header, *rows], indent="")))
+
+
+def _word(ok: bool | None) -> str:
+    return "unknown" if ok is None else "ok" if ok else "not ok"
+
+
+def _measured(row: Row) -> str:
+    left_out = ("subject", "ok", "error")
+    values = [f"{k}={_short(v)}" for k, v in row.items() if k not in left_out and v is not None]
+    return " ".join([*values, f"({row['error']})"] if row["error"] else values)
+
+
+def _short(value: Any) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def _list_orders(orders: Sequence[ProbeOrder], as_json: bool) -> None:
+    rows = [(order.kind, order.subject, order.item) for order in orders]
+    if as_json:
+        print_json([dict(zip(("kind", "subject", "item"), row, strict=True)) for row in rows])
+    elif rows:
+        _print_table(("probe", "subject", "item"), rows)
+    else:
+        print("no monitor of this folder needs a probe")
+
+
+def _list_kinds(as_json: bool) -> None:
+    """List all probes: what each is for, its subject, and what it measures."""
+    modules = {name: plugin.load() for name, plugin in known_probes().items()}
+    if as_json:
+        print_json([_described(name, module) for name, module in modules.items()])
+        return
+    for name, module in modules.items():
+        print(f"{name}: {(module.__doc__ or '').partition(chr(10))[0]}")
+        print("\n".join(in_columns(_explained(module))))
+
+
+def _described(name: str, module: ModuleType) -> Mapping[str, Any]:
+    measures = [
+        {"name": column, "type": kind, "unit": unit, "doc": doc}
+        for column, (kind, unit, doc) in module.MEASURES.items()
+    ]
+    return {"name": name, "subject": module.SUBJECT, "measures": measures}
+
+
+def _explained(module: ModuleType) -> Iterator[tuple[str, str]]:
+    yield "subject", module.SUBJECT
+    for name, (_, unit, doc) in module.MEASURES.items():
+        yield name, f"{doc} [{unit}]" if unit else doc
