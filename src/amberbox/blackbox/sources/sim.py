@@ -16,10 +16,12 @@ from amberbox.core.errors import UsageError
 from amberbox.core.options import option
 from amberbox.core.source import Sink, TopicOptions
 from amberbox.core.timetext import parse_time
+from amberbox.core.types import Topic
+from amberbox.core.types import Topic
 from amberbox.sim.catalogue import catalogue
 from amberbox.sim.mission import SCENARIOS
 from amberbox.sim.robot import START_NS, Robot
-from amberbox.sim.topics import TOPIC_BY_NAME, TOPICS
+from amberbox.sim.topics import TOPIC_BY_NAME, TOPICS, TopicSpec
 
 SAMPLE = """\
 - sim:
@@ -110,6 +112,11 @@ class Config:
             yield "start", error.what
 
 
+def known_topics(config: Config) -> Sequence[Topic]:
+    """Return the topics that will be announced, which are known without running the robot."""
+    return [spec.topic() for spec in _chosen(config)]
+
+
 class Source:
     """Runs one simulated robot and hands over what it publishes."""
 
@@ -141,9 +148,7 @@ class Source:
             sink.link_down(topic, config.robot, reason)
 
     def _announce(self, sink: Sink) -> dict[str, int]:
-        wanted = {topic.name for topic in self.config.topics}
-        chosen = [spec for spec in TOPICS if not wanted or spec.name in wanted]
-        streams = {spec.name: sink.topic(spec.topic()) for spec in chosen}
+        streams = {spec.name: sink.topic(spec.topic()) for spec in _chosen(self.config)}
         for name in streams:
             sink.link_up(name, self.config.robot)
         return streams
@@ -164,6 +169,17 @@ class Source:
             if end_s is not None:
                 self.progress = robot.now_s / end_s
             yield topic, sent_ns, encode(message)
+
+
+def _chosen(config: Config) -> Sequence[TopicSpec]:
+    wanted = {topic.name for topic in config.topics}
+    return [spec for spec in TOPICS if not wanted or spec.name in wanted]
+
+
+def known_topics(config: Config) -> Sequence[Topic]:
+    """Return the topics that will be announced; all of them are known beforehand."""
+    wanted = {topic.name for topic in config.topics}
+    return [spec.topic() for spec in TOPICS if not wanted or spec.name in wanted]
 
 
 def make_robot(config: Config) -> Robot:
