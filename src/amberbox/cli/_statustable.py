@@ -1,0 +1,176 @@
+"""Statuses laid out for the eye: all components as a tree, or one with its outputs."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+from amberbox.cli._colour import Paint, plain
+from amberbox.cli._text import in_columns
+from amberbox.core.types import Level, Status
+from amberbox.monitoring.engine.findings import AlarmChange
+from amberbox.monitoring.engine.outputs import RANK
+from amberbox.monitoring.messages.board import Board, duration
+from amberbox.monitoring.messages.diagnostics import text_of
+from amberbox.monitoring.messages.naming import Naming
+from amberbox.monitoring.messages.tree import Branch, branches
+from amberbox.monitoring.plan import OutputPlan, Plan
+
+_DOTS = "..."
+_GAP = "  "
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """How statuses are shown: with what plan, in what colours, how wide; None is any width."""
+
+    plan: Plan | None = None
+    paint: Paint = plain
+    width: int | None = None
+
+
+def overview(board: Board, view: View) -> Iterator[str]:
+    """Write all components as a tree, and the alarms."""
+    components = board.components
+    yield from _head(board, list(components.values()), view)
+    rows = [
+        (f"{'  ' * branch.depth}{branch.component}", components[branch.component])
+        for branch in _branches(board, view.plan)
+        if branch.component in components
+    ]
+    yield from _table(rows, board.measured_ns, view)
+    yield from _alarms(board.alarms, board.measured_ns, view)
+
+
+def detail(board: Board, component: str, view: View) -> Iterator[str]:
+    """Write one component with its modes, outputs, dependencies and alarms."""
+    status = board.components[component]
+    modes = board.modes_of(component)
+    yield from _head(board, [status], view)
+    naming = Naming.of(view.plan)
+    rows = [(component, status), *((f"  {naming.monitor(mode)}", mode) for mode in modes)]
+    yield from _table(rows, board.measured_ns, view)
+    yield from _outputs(modes, naming, view)
+    yield from _needs(board, component, view)
+    yield from _alarms([a for a in board.alarms if a.component == component],
+                       board.measured_ns, view)  # fmt: skip
+
+
+def waiting(board: Board, component: str) -> str:
+    """Say in one line why a component cannot be built on."""
+    status = board.components.get(component)
+    if status is None:
+        return f"{component}: {board.silence or 'no status of it yet'}"
+    if board.silence:
+        return f"{component}: {board.silence}"
+    if status.state == "not_initialised":
+        return f"{component}: not initialised: {status.reason}"
+    state = f"{status.level} ({status.state})" if status.state != status.level else status.level
+    return f"{component}: {state}: {status.reason}" if status.reason else f"{component}: {state}"
+
+
+def _head(board: Board, statuses: Sequence[Status], view: View) -> Iterator[str]:
+    levels = Counter(status.level for status in statuses)
+    worst = max(levels, key=RANK.__getitem__, default="unknown")
+    counted = ", ".join(
+        view.paint(f"{levels[level]} {level}", level)
+        for level in sorted(levels, key=RANK.__getitem__, reverse=True)
+    )
+    yield f"{view.paint(board.robot or 'robot', worst)}: {counted or 'nothing is known'}"
+    if board.silence:
+        yield view.paint(board.silence, "unknown")
+
+
+def _branches(board: Board, plan: Plan | None) -> list[Branch]:
+    known = branches(plan) if plan is not None else []
+    planned = {branch.component for branch in known}
+    return known + [Branch(0, name) for name in board.components if name not in planned]
+
+
+def _table(rows: Sequence[tuple[str, Status]], now_ns: int, view: View) -> Iterator[str]:
+    cells = [(name, s.level, _state(s), _lasted(s, now_ns), _why(s)) for name, s in rows]
+    header = ("component", "level", "state", "for", "reason")
+    lines = in_columns([header, *cells], "")
+    yield lines[0]
+    at = 2 + max(len(cell[0]) for cell in (header, *cells))
+    for line, (_, status) in zip(lines[1:], rows, strict=True):
+        end = at + len(status.level)
+        fitted = _fit(line, view.width)
+        yield fitted[:at] + view.paint(fitted[at:end], status.level) + fitted[end:]
+
+
+def _state(status: Status) -> str:
+    return "" if status.state == status.level else status.state.replace("_", " ")
+
+
+def _lasted(status: Status, now_ns: int) -> str:
+    return duration(now_ns - status.since_ns) if status.since_ns else ""
+
+
+def _why(status: Status) -> str:
+    blocked = f"blocked by {', '.join(status.blocked_by)}" if status.blocked_by else ""
+    if status.state == "not_initialised":  # its reason is the chain already
+        blocked = ""
+    return "; ".join(filter(None, (blocked, status.reason)))
+
+
+def _fit(line: str, width: int | None) -> str:
+    return line if width is None or len(line) <= width else line[: width - len(_DOTS)] + _DOTS
+
+
+def _outputs(modes: Sequence[Status], naming: Naming, view: View) -> Iterator[str]:
+    rows = [row for mode in modes for row in _rows_of(mode, naming)]
+    if rows:
+        yield ""
+        yield from (
+            _fit(line, view.width)
+            for line in in_columns([("output", "value", "expected", "description"), *rows], "")
+        )
+
+
+def _rows_of(mode: Status, naming: Naming) -> Iterator[tuple[str, ...]]:
+    known = naming.modes.get((mode.component, mode.mode))
+    mappings = known.mappings if known else ()
+    plans = {output.name: output for mapping in mappings for output in mapping.outputs}
+    name = naming.monitor(mode)
+    for output, value in mode.outputs.items():
+        plan = plans.get(output)
+        description = plan.description if plan else ""
+        yield f"{name} / {output}", text_of(value), _expected(plan), description
+
+
+def _expected(plan: OutputPlan | None) -> str:
+    return "" if plan is None or plan.expectation.value is None else str(plan.expectation)
+
+
+def _needs(board: Board, component: str, view: View) -> Iterator[str]:
+    """Say what it depends on, and what is written down to do about it."""
+    found = [c for c in view.plan.components if c.id == component] if view.plan else []
+    for plan in found:
+        needs = [_need(board, dependency.name, view) for dependency in plan.dependencies]
+        if plan.part_of:
+            yield f"part of: {plan.part_of}"
+        if needs:
+            yield f"needs: {', '.join(needs)}"
+        if plan.recovery_actions:
+            yield f"recovery actions (not carried out): {', '.join(plan.recovery_actions)}"
+
+
+def _need(board: Board, name: str, view: View) -> str:
+    status = board.components.get(name)
+    level: Level = status.level if status else "unknown"
+    word = status.level if status else "not monitored"
+    return f"{name} ({view.paint(word, level)})"
+
+
+def _alarms(alarms: Sequence[AlarmChange], now_ns: int, view: View) -> Iterator[str]:
+    if alarms:
+        yield ""
+        yield f"{len(alarms)} {'alarm' if len(alarms) == 1 else 'alarms'}:"
+    for alarm in alarms:
+        times = f", {alarm.count} times" if alarm.count > 1 else ""
+        said = f" by {alarm.who}" if alarm.who else ""
+        lasts = f"for {duration(now_ns - alarm.opened_ns)}"
+        about = f"{alarm.severity}, {alarm.state}{said}, {lasts}{times}"
+        yield f"  {view.paint(alarm.id, alarm.level)} ({about}): {alarm.reason}"

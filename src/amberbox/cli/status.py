@@ -1,0 +1,235 @@
+"""Say how a robot and its components are, as its watcher sees them now; wait for one of them."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import shutil
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from amberbox.blackbox.folder.folder import inspect_folder, store_of
+from amberbox.blackbox.store import is_store, open_store
+from amberbox.blackbox.where import store_path
+from amberbox.cli._colour import painter
+from amberbox.cli._output import print_json, tell
+from amberbox.cli._statustable import View, detail, overview, waiting
+from amberbox.core.clock import NS
+from amberbox.core.config import did_you_mean
+from amberbox.core.errors import AmberboxError, UsageError
+from amberbox.core.timetext import format_time
+from amberbox.core.types import Output, Status
+from amberbox.core.units import parse_duration_s
+from amberbox.monitoring.messages.board import Board, BoardReader
+from amberbox.monitoring.messages.formats import FORMATS
+from amberbox.monitoring.messages.naming import Naming
+from amberbox.monitoring.plan import Plan
+
+_PERIOD_S = 1.0
+_WAIT_S = 0.2
+_UNKNOWN_HINT = "amberbox watch {where} judges what is recorded"
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the verb's arguments."""
+    parser.add_argument("where", metavar="WHERE", help="robot folder or store")
+    parser.add_argument("component", nargs="?", metavar="COMPONENT", help="only this one, in full")
+    parser.add_argument(
+        "--wait", metavar="TIME", help="wait so long (30s) for it to be ok and initialised"
+    )
+    parser.add_argument("--watch", action="store_true", help="draw anew every second")
+    parser.add_argument(
+        "--format", choices=["table", *FORMATS], default="table",
+        help="as messages for others, one per line, instead of a table",
+    )  # fmt: skip
+    parser.add_argument("--json", action="store_true", help="print JSON")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print what is known; 1 if anything is in error, or the watcher says nothing."""
+    if args.wait is not None:
+        return _wait(args, parse_duration_s(args.wait))
+    plan = _plan_of(args.where)
+    reader = BoardReader(open_store(store_path(args.where)))
+    if args.watch:
+        return _watch(reader, args, plan)
+    board = _read(reader, args, plan)
+    _show(board, args, plan)
+    return _verdict(board)
+
+
+def _watch(reader: BoardReader, args: argparse.Namespace, plan: Plan | None) -> int:
+    """Draw again and again until Ctrl-C."""
+    while True:
+        board = _read(reader, args, plan)
+        if sys.stdout.isatty():
+            print("\x1b[H\x1b[J", end="")
+        _show(board, args, plan)
+        sys.stdout.flush()
+        try:
+            time.sleep(_PERIOD_S)
+        except KeyboardInterrupt:
+            return _verdict(board)
+
+
+def _read(reader: BoardReader, args: argparse.Namespace, plan: Plan | None) -> Board:
+    board = reader.read(time.time_ns())
+    known = board.components
+    if not args.component:
+        return board
+    if known and args.component not in known:
+        near = did_you_mean(args.component, known)
+        raise UsageError(
+            f"there is no component '{args.component}'{near}", f"known: {', '.join(known)}"
+        )
+    statuses = [status for status in board.statuses if status.component == args.component]
+    return board if args.format == "table" and not args.json else _only(board, statuses)
+
+
+def _only(board: Board, statuses: Sequence[Status]) -> Board:
+    of = {status.component for status in statuses}
+    alarms = [alarm for alarm in board.alarms if alarm.component in of]
+    return Board(statuses, alarms, board.measured_ns, board.silence)
+
+
+def _verdict(board: Board) -> int:
+    return int(bool(board.silence) or any(status.level == "error" for status in board.statuses))
+
+
+def _show(board: Board, args: argparse.Namespace, plan: Plan | None) -> None:
+    if args.json:
+        print_json(_as_json(board))
+    elif args.format != "table":
+        for message in FORMATS[args.format](board.statuses, Naming.of(plan)):
+            print(msgspec.json.encode(message).decode())
+    else:
+        print("\n".join(_lines(board, args, plan)))
+    if plan and {status.config_hash for status in board.statuses} - {plan.config_hash}:
+        tell(["the robot folder is not as it was when the watcher began"])
+    if board.silence:
+        print(f"hint: {_UNKNOWN_HINT.format(where=args.where)}", file=sys.stderr)
+
+
+def _lines(board: Board, args: argparse.Namespace, plan: Plan | None) -> Iterator[str]:
+    width = shutil.get_terminal_size().columns if sys.stdout.isatty() else None
+    view = View(plan, painter(sys.stdout), width)
+    if args.component and args.component in board.components:
+        return detail(board, args.component, view)
+    return overview(board, view)
+
+
+def _wait(args: argparse.Namespace, seconds: float) -> int:
+    """Wait for a component, or for all; say in the end what is still waited for."""
+    plan = _plan_of(args.where)
+    _refuse_unknown(args.component, plan)
+    until_s = time.monotonic() + seconds
+    reader: BoardReader | None = None
+    while True:
+        reader = reader or _reader_of(args.where)
+        board = Board(silence="nothing is recorded yet")
+        if reader is not None:
+            board = reader.read(time.time_ns())
+        missing = [name for name in _wanted(board, args.component, plan) if not _is_up(board, name)]
+        if not missing and board.statuses:
+            return 0
+        if time.monotonic() >= until_s:
+            raise AmberboxError(
+                "\n".join(waiting(board, name) for name in missing) or board.silence,
+                _UNKNOWN_HINT.format(where=args.where) if board.silence else "",
+            )
+        time.sleep(min(_WAIT_S, max(until_s - time.monotonic(), 0)))
+
+
+def _refuse_unknown(component: str | None, plan: Plan | None) -> None:
+    known = [entry.id for entry in plan.components] if plan else []
+    if component and known and component not in known:
+        near = did_you_mean(component, known)
+        raise UsageError(f"there is no component '{component}'{near}", f"known: {', '.join(known)}")
+
+
+def _reader_of(where: str) -> BoardReader | None:
+    """Open the store; None as long as nothing has been recorded."""
+    path = Path(where)
+    store = path if is_store(path) else store_of(path)
+    if store is None:
+        store = store_path(path)  # says what is wrong
+    return BoardReader(open_store(store)) if is_store(store) else None
+
+
+def _wanted(board: Board, component: str | None, plan: Plan | None) -> list[str]:
+    """Name what is waited for; without a component all that have a monitor."""
+    if component:
+        return [component]
+    planned = [entry.id for entry in plan.components if entry.modes] if plan else []
+    return planned or [c for c, s in board.components.items() if s.state != "not_monitored"]
+
+
+def _is_up(board: Board, component: str) -> bool:
+    status = board.components.get(component)
+    if status is None or status.state == "not_initialised":
+        return False
+    return status.level in ("ok", "warn")
+
+
+def _plan_of(where: str) -> Plan | None:
+    """Read what is to be monitored, for names and order; None if WHERE is only a store."""
+    from amberbox.monitoring.configuration.load import load_plan
+
+    if is_store(Path(where)) or not Path(where).exists():
+        return None
+    folder, _ = inspect_folder(where)
+    return load_plan(folder)[0] if folder is not None else None
+
+
+def _as_json(board: Board) -> dict[str, Any]:
+    return {
+        "robot": board.robot,
+        "measured": format_time(board.measured_ns) if board.measured_ns else None,
+        "silence": board.silence,
+        "components": [
+            _status_json(status) | {"modes": [_mode_json(m) for m in board.modes_of(name)]}
+            for name, status in board.components.items()
+        ],
+        "alarms": [
+            {
+                "id": alarm.id,
+                "component": alarm.component,
+                "severity": alarm.severity,
+                "state": alarm.state,
+                "reason": alarm.reason,
+                "opened": format_time(alarm.opened_ns),
+                "count": alarm.count,
+                "who": alarm.who,
+                "until": format_time(alarm.until_ns) if alarm.until_ns is not None else None,
+            }
+            for alarm in board.alarms
+        ],
+    }
+
+
+def _mode_json(status: Status) -> dict[str, Any]:
+    outputs = {name: _in_json(value) for name, value in status.outputs.items()}
+    return {"mode": status.mode, **_status_json(status), "outputs": outputs}
+
+
+def _in_json(value: Output) -> Output:
+    """JSON has no NaN and no infinity: they are null."""
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _status_json(status: Status) -> dict[str, Any]:
+    return {
+        "component": status.component,
+        "level": status.level,
+        "state": status.state,
+        "reason": status.reason,
+        "blocked_by": list(status.blocked_by),
+        "since": format_time(status.since_ns),
+        "for_s": (status.measured_ns - status.since_ns) / NS,
+        "live_only": status.live_only,
+    }
