@@ -8,7 +8,9 @@ A source is a module whose file name is its name in ``black_box.yaml``. It defin
 - ``Source``: a class that takes ``(config, name)`` and offers ``topics`` and ``run``;
 - ``SAMPLE``: a block of YAML as one would write it, shown by ``amberbox plugins`` and checked;
 - ``PASSIVE``: one line that says why it does not disturb, shown by ``amberbox doctor``; it may
-  name parts of the configuration, as in ``{config.caller_id}``.
+  name parts of the configuration, as in ``{config.caller_id}``;
+- optionally ``known_topics(config)``: the topics that it will announce, with their schemas, as far
+  as that is certain without a device; ``check`` judges names of variables by them.
 
 A source only listens. It always reads, stamps on receipt, and never waits for the disk: when the
 recorder's queue is full the message is dropped there and counted.

@@ -176,12 +176,6 @@ def _chosen(config: Config) -> Sequence[TopicSpec]:
     return [spec for spec in TOPICS if not wanted or spec.name in wanted]
 
 
-def known_topics(config: Config) -> Sequence[Topic]:
-    """Return the topics that will be announced; all of them are known beforehand."""
-    wanted = {topic.name for topic in config.topics}
-    return [spec.topic() for spec in TOPICS if not wanted or spec.name in wanted]
-
-
 def make_robot(config: Config) -> Robot:
     """Return the robot of a configuration with its faults scheduled."""
     robot = Robot(config.seed, config.robot, config.scenario, config.start_ns())

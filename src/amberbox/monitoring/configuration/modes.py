@@ -64,16 +64,16 @@ def _plan(
     plan = replace(plan, description=file.description, stale_s=stale_s)
     function = _function(plan.name, file, node, bench.functions, problems)
     if function is None:
-        return replace(plan, mappings=_outlines(file))
+        return replace(plan, mappings=_outlines(file, node, problems))
     try:
         module = bench.functions.load(function)
     except AmberboxError as error:
         problems.append(_at(node, "monitor").problem("monitor", error.what, error.hint))
-        return replace(plan, mappings=_outlines(file))
+        return replace(plan, mappings=_outlines(file, node, problems))
     arguments = (node.mapping or {}).get("arguments") or Node(node.file, node.line, None)
     config = build(module.Config, arguments, problems, "arguments")
     if config is None:
-        return replace(plan, module=module, mappings=_outlines(file))
+        return replace(plan, module=module, mappings=_outlines(file, node, problems))
     mappings = _Mappings(module, config, bench.inputs, problems).of(file, node)
     plan = replace(plan, module=module, config=config, mappings=mappings)
     problems.extend(filter_problems(plan, node, bench.inputs.recorded))
@@ -107,16 +107,28 @@ def _at(node: Node, key: str) -> Node:
     return (node.mapping or {}).get(key, node)
 
 
-def _outlines(file: ModeFile) -> tuple[MappingPlan, ...]:
-    """Return the outputs of a mode that cannot run: their names are known, and nothing else."""
-    return tuple(MappingPlan((), _outlined(mapping)) for mapping in file.mappings)
-
-
-def _outlined(mapping: MappingOptions) -> tuple[OutputPlan, ...]:
+def _outlines(file: ModeFile, node: Node, problems: list[Problem]) -> tuple[MappingPlan, ...]:
+    """Return the outputs of a mode that cannot run: what can be told of them is judged."""
     return tuple(
-        OutputPlan(o.name.strip(), output_type(o), Result(o.name.strip(), output_type(o), ""))
-        for o in mapping.outputs
+        MappingPlan((), _outlined(mapping, entry, f"mappings[{index}]", problems))
+        for index, (mapping, entry) in enumerate(zip(file.mappings, _entries(node), strict=True))
     )
+
+
+def _outlined(
+    mapping: MappingOptions, node: Node, where: str, problems: list[Problem]
+) -> tuple[OutputPlan, ...]:
+    """Bind outputs to results of their own names, which any monitor might have."""
+    names = [
+        (output.result or output.name.strip(), output_type(output)) for output in mapping.outputs
+    ]
+    results = [Result(name, kind, "") for name, kind in dict(names).items()]
+    nodes = _at(node, "outputs").items or ()
+    return tuple(bind_outputs(mapping.outputs, nodes, results, 1, False, where, problems))
+
+
+def _entries(node: Node) -> list[Node]:
+    return [_unwrapped(entry, "mapping") for entry in _at(node, "mappings").items or ()]
 
 
 @dataclass(frozen=True)
@@ -130,7 +142,7 @@ class _Mappings:
 
     def of(self, file: ModeFile, node: Node) -> tuple[MappingPlan, ...]:
         """Return all mappings of a file."""
-        entries = [_unwrapped(n, "mapping") for n in _at(node, "mappings").items or ()]
+        entries = _entries(node)
         if not file.mappings:
             self.problems.append(_at(node, "mappings").problem("mappings", "there are none"))
         self._repeated(file, entries)

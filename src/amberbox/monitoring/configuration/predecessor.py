@@ -1,14 +1,292 @@
-"""Modes of the predecessor's robots, written as ours."""
+"""Mode files of the predecessor's robots, read as ours: by their names, and their arguments.
+
+Their monitors were told a pattern of variables and a number of wheels where ours are told inputs.
+What has no counterpart here (slip, cart attachment, Zyre nodes) is not pretended to have one.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, TypeAlias
+
 from amberbox.core.errors import Problem
 from amberbox.core.nodes import Node
-from amberbox.monitoring.configuration.functions import Functions
+from amberbox.monitoring.configuration.functions import Functions, function_of
+
+ROBOT_NUMBER = "ROPODID"
+"""Stands in their inputs for the number of the robot: 001 of ropod_001."""
+
+Keys: TypeAlias = dict[str, Node]
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One of their monitors: what it is here, and what becomes of its keys.
+
+    ``renamed`` gives arguments another name; ``dropped`` are those that become inputs, or nothing.
+    ``fixed`` are arguments that its code had. ``mappings`` rewrites each mapping.
+    """
+
+    monitor: str
+    does: str
+    renamed: Mapping[str, str] = field(default_factory=dict)
+    dropped: Sequence[str] = ()
+    fixed: Mapping[str, Any] = field(default_factory=dict)
+    arguments: Callable[[Keys], Mapping[str, Any]] = lambda keys: {}
+    mappings: Callable[[Node, Keys], list[Node]] = lambda node, keys: [node]
+    refuses: Callable[[str], str] = lambda text: ""
+    """Says why an input of theirs cannot be one of ours."""
 
 
 def translated(
     name: str, node: Node, functions: Functions, robot: str, problems: list[Problem]
 ) -> Node:
-    """Return a mode file as ours."""
-    return node
+    """Return a mode file as ours; one that is ours already as it is."""
+    node = _with_number(node, robot.rpartition("_")[2])
+    keys = node.mapping or {}
+    entry = ENTRIES.get(name)
+    if entry is None or "monitor" in keys or entry.monitor not in functions.modes:
+        return node
+    given = keys.get("arguments")
+    arguments = (given.mapping if given is not None else None) or {}
+    theirs = {*entry.renamed, *entry.dropped} & arguments.keys()
+    if function_of(name, functions.modes) is not None and not theirs:
+        return node
+    note = f"read as the monitor '{entry.monitor}': {entry.does}"
+    problems.append(keys.get("name", node).problem("name", note, is_error=False))
+    problems.extend(_objections(keys.get("mappings", node), entry))
+    return _as_ours(node, keys, dict(arguments), entry)
+
+
+def _objections(mappings: Node, entry: Entry) -> Iterator[Problem]:
+    for index, mapping in enumerate(mappings.items or ()):
+        keys = mapping.mapping or {}
+        inputs = (keys.get("mapping", mapping).mapping or {}).get("inputs", mapping)
+        for node in inputs.items or ():
+            what = entry.refuses(node.text)
+            if what:
+                yield node.problem(f"mappings[{index}].inputs", what)
+
+
+def _as_ours(node: Node, keys: Keys, arguments: Keys, entry: Entry) -> Node:
+    place = keys.get("arguments", node)
+    kept = {
+        entry.renamed.get(key, key): value
+        for key, value in arguments.items()
+        if key not in entry.dropped
+    }
+    added = {**entry.fixed, **entry.arguments(arguments)}
+    kept |= {key: as_node(value, place) for key, value in added.items()}
+    mappings = keys.get("mappings", node)
+    entries = [new for old in mappings.items or () for new in entry.mappings(old, arguments)]
+    return replace(
+        node,
+        value=keys
+        | {
+            "monitor": as_node(entry.monitor, keys.get("name", node)),
+            "arguments": replace(place, value=kept),
+            "mappings": replace(mappings, value=tuple(entries)),
+        },
+    )
+
+
+def as_node(value: Any, place: Node) -> Node:
+    """Write plain values as they would stand at a place in a file."""
+    if isinstance(value, Mapping):
+        inner: Any = {key: as_node(entry, place) for key, entry in value.items()}
+    elif isinstance(value, list | tuple):
+        inner = tuple(as_node(entry, place) for entry in value)
+    else:
+        inner = value
+    return Node(place.file, place.line, inner, "" if inner is not value else str(value))
+
+
+def _with_number(node: Node, number: str) -> Node:
+    """Put the robot's number in the inputs of all mappings."""
+    keys = node.mapping
+    if keys is not None:
+        return replace(node, value={k: _with_number(inner, number) for k, inner in keys.items()})
+    if node.items is not None:
+        return replace(node, value=tuple(_with_number(inner, number) for inner in node.items))
+    if ROBOT_NUMBER not in node.text:
+        return node
+    text = node.text.replace(ROBOT_NUMBER, number)
+    return replace(node, value=text, text=text)
+
+
+def _changed(mapping: Node, change: Callable[[Keys], Mapping[str, Any]]) -> Node:
+    """Change keys of a mapping, wrapped in ``mapping:`` or not."""
+    keys = mapping.mapping or {}
+    inner = keys.get("mapping")
+    if inner is not None and inner.mapping is not None:
+        return replace(mapping, value={"mapping": _changed(inner, change)})
+    new = {key: as_node_kept(value, mapping) for key, value in change(keys).items()}
+    return replace(mapping, value=keys | new)
+
+
+def as_node_kept(value: Any, place: Node) -> Node:
+    """Return a node as it is, and plain values as nodes."""
+    return value if isinstance(value, Node) else as_node(value, place)
+
+
+def _number(arguments: Keys, key: str, default: float) -> float:
+    value = arguments[key].value if key in arguments else default
+    return value if isinstance(value, int | float) else default
+
+
+def _wheels(text: str, arguments: Keys) -> list[str]:
+    count = round(_number(arguments, "number_of_wheels", 4))
+    return [text.replace("*", str(wheel), 1) for wheel in range(count)]
+
+
+def _of_pattern(mapping: Node, arguments: Keys) -> list[Node]:
+    """Take the variables of all wheels for inputs."""
+    pattern = arguments.get("variable_name_pattern")
+    if pattern is None:
+        return [mapping]
+    return [_changed(mapping, lambda keys: {"inputs": _wheels(pattern.text, arguments)})]
+
+
+def _each_wheel(mapping: Node, arguments: Keys) -> list[Node]:
+    """Make a mapping for each wheel, its outputs with the number of the wheel."""
+
+    def of(wheel: int) -> Callable[[Keys], Mapping[str, Any]]:
+        def change(keys: Keys) -> Mapping[str, Any]:
+            inputs = keys["inputs"].items or () if "inputs" in keys else ()
+            outputs = keys["outputs"].items or () if "outputs" in keys else ()
+            return {
+                "inputs": [_wheels(entry.text, arguments)[wheel] for entry in inputs],
+                "outputs": replace(
+                    keys.get("outputs", mapping),
+                    value=tuple(_numbered(output, wheel + 1) for output in outputs),
+                ),
+            }
+
+        return change
+
+    return [_changed(mapping, of(wheel)) for wheel in range(len(_wheels("*", arguments)))]
+
+
+def _numbered(output: Node, number: int) -> Node:
+    keys = output.mapping or {}
+    inner = keys.get("output")
+    if inner is not None:
+        return replace(output, value={"output": _numbered(inner, number)})
+    if "name" not in keys:
+        return output
+    name = f"{keys['name'].text.strip()}_{number}"
+    return replace(output, value=keys | {"name": as_node(name, keys["name"])})
+
+
+def _covariance(mapping: Node, arguments: Keys) -> list[Node]:
+    """Take x, y and heading of a covariance of 6 x 6 for inputs."""
+    variable = arguments.get("bb_variable_name")
+    if variable is None:
+        return [mapping]
+    names = [f"{variable.text}/{place}" for place in (0, 7, 35)]
+    return [_changed(mapping, lambda keys: {"inputs": names})]
+
+
+def _only(*inputs: str) -> Callable[[Node, Keys], list[Node]]:
+    """Give these inputs to mappings that have none."""
+
+    def change(keys: Keys) -> Mapping[str, Any]:
+        given = keys["inputs"].items if "inputs" in keys else ()
+        return {} if given else {"inputs": list(inputs)}
+
+    return lambda mapping, arguments: [_changed(mapping, change)]
+
+
+def _global_names(mapping: Node, arguments: Keys) -> list[Node]:
+    """Write names of ROS with their leading slash."""
+
+    def change(keys: Keys) -> Mapping[str, Any]:
+        entries = (keys["inputs"].items or ()) if "inputs" in keys else ()
+        return {"inputs": [f"/{entry.text.lstrip('/')}" for entry in entries]}
+
+    return [_changed(mapping, change)]
+
+
+def _no_container(text: str) -> str:
+    what = f"'{text}' names an image: write the name of its container"
+    return what if ":" in text else ""
+
+
+def _kinematics(arguments: Keys) -> Mapping[str, Any]:
+    """Say what the pivot's velocity should be, by the velocities of the two wheels."""
+    radius = _number(arguments, "wheel_diameter", 0.073) / 2
+    distance = _number(arguments, "inter_wheel_distance", 0.0893)
+    return {"formula": f"-{radius:.6g} * (input_1 + input_2) / {distance:.6g}", "window": 1}
+
+
+_PATTERN = ("variable_name_pattern", "number_of_wheels")
+
+ENTRIES: Mapping[str, Entry] = {
+    "battery_functional_monitor": Entry(
+        "battery",
+        "the mean of the wheels' bus voltages between lowest and highest_voltage",
+        dropped=_PATTERN,
+        mappings=_of_pattern,
+    ),
+    "e_stop_functional_monitor": Entry(
+        "state_bits",
+        "bit 2 of the wheels' status words, which is not set when all is well",
+        dropped=_PATTERN,
+        fixed={"bits": {"e_stop_pressed": {"bit": 2, "nominal": False}}},
+        mappings=_of_pattern,
+    ),
+    "smart_wheel_status_monitor": Entry(
+        "state_bits",
+        "bit 0 of each wheel's status word",
+        dropped=_PATTERN,
+        fixed={"bits": {"enabled": 0}},
+        mappings=_of_pattern,
+    ),
+    "pressure_functional_monitor": Entry(
+        "redundancy",
+        "the barometers of the wheels against each other; median_window_size in seconds",
+        renamed={"fault_threshold": "threshold", "median_window_size": "window"},
+        dropped=_PATTERN,
+        mappings=_of_pattern,
+    ),
+    "diff_drive_kinematics_monitor": Entry(
+        "redundancy",
+        "the pivot's velocity against the wheels', for each wheel with outputs of its own",
+        renamed={"pivot_velocity_threshold": "threshold"},
+        dropped=("number_of_wheels", "wheel_diameter", "inter_wheel_distance"),
+        arguments=_kinematics,
+        mappings=_each_wheel,
+    ),
+    "localisation_functional_monitor": Entry(
+        "localisation",
+        "the variances of x, y and heading in the covariance",
+        dropped=("bb_variable_name",),
+        mappings=_covariance,
+    ),
+    "wifi_functional_monitor": Entry(
+        "network", "quality and strength of the interface wlan0", mappings=_only("wifi wlan0")
+    ),
+    "docker_container_monitor": Entry(
+        "service", "containers that run", fixed={"kind": "container"}, refuses=_no_container
+    ),
+    "ros_master_monitor": Entry(
+        "service",
+        "the master that ROS_MASTER_URI names",
+        fixed={"kind": "ros_master"},
+        mappings=_only("default"),
+    ),
+    "ros_node_monitor": Entry(
+        "service", "nodes that answer", fixed={"kind": "ros_node"}, mappings=_global_names
+    ),
+    "ros_topic_monitor": Entry(
+        "service",
+        "topics that somebody publishes",
+        fixed={"kind": "ros_topic"},
+        mappings=_global_names,
+    ),
+    "systemd_services_active_monitor": Entry(
+        "service", "units that are active", fixed={"kind": "unit"}
+    ),
+}
+"""Their monitors by the name of the mode, and what they are here."""

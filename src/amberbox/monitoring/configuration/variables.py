@@ -58,7 +58,15 @@ def names_of(schema: ItemSchema) -> list[str]:
 
 
 def guessed(item: str, text: str) -> Place:
-    """Return what a name most likely stands for where nothing is known of the item."""
+    """Return what a name most likely stands for where nothing is known of the item.
+
+    A number within a path is a row of a child table: messages hold lists of structures.
+    """
+    parts = tokens(text)
+    row = next((place for place, part in enumerate(parts) if part.isdigit()), 0)
+    if 0 < row < len(parts) - 1:
+        table = f"{item}__{identifier('_'.join(parts[:row]))}"
+        return Place(table, identifier("_".join(parts[row + 1 :])), int(parts[row]))
     path, bracket, number = text.strip("./").partition("[")
     index = int(number[:-1]) if bracket and number[:-1].isdigit() else None
     rest = "" if index is not None or not bracket else f"_{number[:-1]}"
