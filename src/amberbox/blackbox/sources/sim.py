@@ -17,7 +17,6 @@ from amberbox.core.options import option
 from amberbox.core.source import Sink, TopicOptions
 from amberbox.core.timetext import parse_time
 from amberbox.core.types import Topic
-from amberbox.core.types import Topic
 from amberbox.sim.catalogue import catalogue
 from amberbox.sim.mission import SCENARIOS
 from amberbox.sim.robot import START_NS, Robot
