@@ -96,7 +96,7 @@ def assert_mode_contract(
     configs: Sequence[Any] = (),
     text: bool = False,
     parts: Mapping[str, str] | None = None,
-    examples: int = 60,
+    examples: int = 40,
 ) -> None:
     """Check a mode: what it defines, its sample, and its function on made-up samples.
 

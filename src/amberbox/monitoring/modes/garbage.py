@@ -106,7 +106,7 @@ def _in_lists(config: Config, entry: Input) -> tuple[Any, Any]:
 def _whole(numbers: Any) -> Any:
     """Return numbers as whole ones, -1 for what is none."""
     floats = numbers.astype(np.float64)
-    is_whole = (np.abs(floats) < 1 << 53) & (floats % 1 == 0)
+    is_whole = (np.abs(floats) < 1 << 53) & (np.trunc(floats) == floats)
     return np.where(is_whole, floats, -1).astype(np.int64)
 
 

@@ -80,7 +80,7 @@ def evaluate(config: Config, inputs: Sequence[Input], now: Now) -> Mapping[str, 
     """Take the last word apart; what is no whole number has no bits."""
     (variable,) = inputs
     value = np.asarray(variable.at(now)).astype(np.float64)
-    known = variable.samples.known(now) & (np.abs(value) < 1 << 53) & (value % 1 == 0)
+    known = variable.samples.known(now) & (np.abs(value) < 1 << 53) & (np.trunc(value) == value)
     word = np.where(known, value, 0).astype(np.int64)
     bits = {name: (word >> bit.bit) & 1 for name, bit in config.named()}
     ok = np.logical_and.reduce([bits[name] == bit.nominal for name, bit in config.named()])
