@@ -119,7 +119,7 @@ class WriterTail:
         self._done = run_and_number(path)
 
     def _wanted(self, streams: Mapping[int, Stream]) -> frozenset[int]:
-        """Name the channels whose messages are read: those of the items, and what is said of gaps."""
+        """Name the channels whose messages are read: those of the items, and of gaps."""
         return frozenset(
             number
             for number, stream in streams.items()

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import msgspec
 import numpy as np
@@ -14,12 +14,30 @@ from amberbox import __version__
 from amberbox.blackbox.follow.read import newest_first, sound_chunks
 from amberbox.blackbox.journal import reserved
 from amberbox.blackbox.journal.writer import JournalOptions, JournalWriter
+from amberbox.blackbox.keeper.ownstreams import Message, Own, Streams
+from amberbox.blackbox.keeper.syncthread import SyncThread
 from amberbox.blackbox.store import Store
 from amberbox.core.clock import Clock, RunClock, SystemClock
 from amberbox.core.types import Cursor
 
 Record = tuple[str, Mapping[str, Any]]
 """Reserved channel and values of one record."""
+
+
+class LogClock(Protocol):
+    """What stamps the records: a RunClock, or the log time of the recorder that is followed."""
+
+    def now_ns(self) -> int:
+        """Log time now."""
+
+    def boot_ns(self, log_ns: int) -> int | None:
+        """Time since the computer's start at a log time; None if it does not count from there."""
+
+    def offset_ns(self) -> int:
+        """Wall minus log time."""
+
+    def synchronised(self) -> bool | None:
+        """Tell whether the wall clock is disciplined; None if nobody can know."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,7 +52,8 @@ class Progress:
 class OwnJournal:
     """Appends records of the box's own to a writer's journal, durable when ``write`` returns.
 
-    The first write begins a run and its file. One owner, who holds the store's lock; any thread.
+    ``append`` does not wait for that. The first write begins a run and its file. One owner, who
+    holds the store's lock; any thread.
     """
 
     def __init__(
@@ -49,17 +68,26 @@ class OwnJournal:
     ) -> None:
         self._store = store
         self._writer_name = writer
-        self._about = {"robot": robot, "config_hash": config_hash}
+        self._about = {"robot": robot, "config_hash": config_hash, "input": ""}
         self._clock = clock or SystemClock()
-        self._log = RunClock(self._clock)
+        self._log: LogClock = RunClock(self._clock)
         self._chain = chain
         self._writer: JournalWriter | None = None
-        self._channels: dict[str, int] = {}
+        self._streams = Streams()
+        self._sync = SyncThread()
+        self._last_ns = 0
         self._lock = threading.Lock()
 
     def now_ns(self) -> int:
         """Log time of a record that is written now."""
         return self._log.now_ns()
+
+    def begin_run(self, log: LogClock, of: str) -> None:
+        """Begin a run with the next write, on another axis of log time; ``of`` is its input."""
+        with self._lock:
+            self._finish()
+            self._log = log
+            self._about["input"] = of
 
     def write(self, records: Sequence[Record], progress: Progress | None = None) -> None:
         """Write records, and how far others had been read for them, as one chunk.
@@ -67,32 +95,47 @@ class OwnJournal:
         Raises OSError when the disk does not take them.
         """
         with self._lock:
-            self._write(records, progress)
+            self._write([*map(_own, records), *_said(progress)])
+            assert self._writer is not None
+            self._sync.finish()
+            self._writer.mark_sync().wait()
+            self._writer.publish_head(self._last_ns)
 
-    def _write(self, records: Sequence[Record], progress: Progress | None) -> None:
+    def append(
+        self, rows: Sequence[Message], progress: Sequence[Progress] = (), *, urgent: bool = False
+    ) -> None:
+        """Write rows as ``write`` does, without waiting for the disk.
+
+        They are durable after a second, or with ``urgent`` as soon as the disk can. Raises OSError
+        when an earlier write did not reach the disk.
+        """
+        with self._lock:
+            self._write([*rows, *(message for entry in progress for message in _said(entry))])
+            assert self._writer is not None
+            self._sync.see_to(self._writer.mark_sync, urgent=urgent)
+            self._writer.publish_head(self._last_ns)
+
+    def _write(self, messages: Sequence[Message]) -> None:
         writer = self._opened()
-        rows = [(topic, msgspec.json.encode(values)) for topic, values in records]
-        if progress is not None:
-            values = {"cursor": progress.cursor.to_json(), "reader": progress.reader}
-            values["state"] = progress.state
-            rows.append((reserved.CURSOR, msgspec.json.encode(values)))
         if writer.rotation_due(self._log.now_ns()):
             writer.rotate()
-        now_ns = self._log.now_ns()
-        clock = (reserved.CLOCK, self._clock_record(now_ns))
-        rows[:0] = [clock] if writer.path is not None else [self._about_run(writer), clock]
+        now_ns = self._last_ns = self._log.now_ns()
+        clock = Own(reserved.CLOCK, self._clock_record(now_ns))
+        first = [clock] if writer.path is not None else [self._about_run(writer), clock]
+        rows = [self._streams.placed(writer, message) for message in (*first, *messages)]
         at_ns = [now_ns] * len(rows)
-        channels = [self._channel(writer, topic) for topic, _ in rows]
-        writer.write(channels, at_ns, at_ns, [data for _, data in rows])
-        writer.mark_sync().wait()
-        writer.publish_head(at_ns[0])
+        writer.write([channel for channel, _ in rows], at_ns, at_ns, [data for _, data in rows])
 
     def close(self) -> None:
         """Finish the file, if one was begun."""
         with self._lock:
-            if self._writer is not None:
-                self._writer.close()
-                self._writer = None
+            self._finish()
+
+    def _finish(self) -> None:
+        self._sync.finish()
+        if self._writer is not None:
+            self._writer.close()
+            self._writer = None
 
     def _opened(self) -> JournalWriter:
         if self._writer is None:
@@ -101,10 +144,11 @@ class OwnJournal:
                 self._store.next_run(), self._clock.boot_id(),
             )  # fmt: skip
             chain = {} if self._chain is None else {"chain": self._chain()}
-            self._writer, self._channels = JournalWriter(options, **chain), {}
+            self._writer = JournalWriter(options, **chain)
+            self._streams.begin()
         return self._writer
 
-    def _about_run(self, writer: JournalWriter) -> tuple[str, bytes]:
+    def _about_run(self, writer: JournalWriter) -> Own:
         about = {
             "writer": self._writer_name,
             "run": writer.options.run,
@@ -112,10 +156,9 @@ class OwnJournal:
             "boot_id": self._clock.boot_id(),
             "version": __version__,
             "items": "{}",
-            "input": "",
             **self._about,
         }
-        return reserved.RUN, msgspec.json.encode(about)
+        return Own(reserved.RUN, msgspec.json.encode(about))
 
     def _clock_record(self, at_ns: int) -> bytes:
         return msgspec.json.encode({
@@ -124,11 +167,17 @@ class OwnJournal:
             "boot_ns": self._log.boot_ns(at_ns),
         })  # fmt: skip
 
-    def _channel(self, writer: JournalWriter, topic: str) -> int:
-        if topic not in self._channels:
-            marks = {"item": topic.replace("/", "_"), "source": reserved.SOURCE}
-            self._channels[topic] = writer.channel(reserved.topic_of(topic), marks)
-        return self._channels[topic]
+
+def _own(record: Record) -> Own:
+    topic, values = record
+    return Own(topic, msgspec.json.encode(values))
+
+
+def _said(progress: Progress | None) -> Iterator[Own]:
+    """Give the record that says how far a reader has come."""
+    if progress is not None:
+        values = {"cursor": progress.cursor.to_json(), "reader": progress.reader}
+        yield _own((reserved.CURSOR, {**values, "state": progress.state}))
 
 
 def event(kind: str, text: str, source: str = "", **details: Any) -> Record:

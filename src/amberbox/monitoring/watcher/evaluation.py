@@ -1,0 +1,101 @@
+"""The engine over a record: blocks in, findings out; the same live and in replay."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+from amberbox.core.types import Batch, Status
+from amberbox.monitoring.engine.findings import Finding
+from amberbox.monitoring.watcher.epoch import Epoch
+from amberbox.monitoring.watcher.memory import Memory, Place
+from amberbox.monitoring.watcher.reader import Block
+
+
+class Evaluates(Protocol):
+    """What is asked of the engine."""
+
+    def begin(self, at_ns: int) -> None:
+        """Begin an epoch."""
+
+    def feed(self, batch: Batch) -> None:
+        """Take rows."""
+
+    def advance(self, until_ns: int) -> Sequence[Finding]:
+        """Evaluate up to an instant."""
+
+    def statuses(self) -> Sequence[Status]:
+        """Return the newest status of each mode and component."""
+
+    def snapshot(self) -> dict[str, Any]:
+        """Return all that is needed to go on, beside the rows of the last time."""
+
+    def resume(self, snapshot: Mapping[str, Any]) -> None:
+        """Go on from a snapshot."""
+
+
+@dataclass(slots=True)
+class Evaluation:
+    """Feeds an engine block by block, and knows up to which instant it has come.
+
+    With a memory it goes on there: what was found before is not given again.
+    """
+
+    engine: Evaluates
+    memory: Memory = field(default_factory=Memory)
+    place: Place | None = None
+    _epoch: Epoch | None = None
+    _known: Place | None = None
+    _more: int = 0
+
+    def __post_init__(self) -> None:
+        self._known, self._more = self.memory.place, self.memory.more
+
+    def take(self, block: Block) -> Iterator[list[Finding]]:
+        """Evaluate a block; give what is new in it, once ``place`` has been moved on."""
+        if block.epoch != self._epoch and not self._enter(block.epoch, block.start_ns):
+            return
+        for batch in block.batches:
+            self.engine.feed(batch)
+        if self.place is not None and block.until_ns <= self.place.until_ns:
+            return
+        if self._known is not None:
+            self._repeat(self._known, block)
+        if self._known is None and (self.place is None or block.until_ns > self.place.until_ns):
+            found = list(self.engine.advance(block.until_ns))
+            self.place = Place(block.epoch, block.until_ns)
+            found, self._more = found[self._more :], max(self._more - len(found), 0)
+            yield found
+
+    def _enter(self, epoch: Epoch, start_ns: int) -> bool:
+        """Go over to an epoch; False for one that lies before what is remembered."""
+        left = self.memory.checkpoint
+        if self._epoch is None and left is not None and epoch.run <= left.place.epoch.run:
+            if epoch != left.place.epoch:
+                return False
+            if left.engine:
+                self.engine.resume(left.engine)
+                self._epoch, self.place = epoch, left.place
+                return True
+        self.engine.begin(start_ns)
+        self._epoch, self.place = epoch, None
+        return True
+
+    @property
+    def is_behind(self) -> bool:
+        """Tell whether what was evaluated before is not reached again yet."""
+        return self._known is not None
+
+    def _repeat(self, known: Place, block: Block) -> None:
+        """Evaluate silently what has been evaluated, and written down, before."""
+        if block.epoch.run > known.epoch.run:
+            self._known, self._more = None, 0
+            return
+        is_there = block.epoch == known.epoch
+        until_ns = min(block.until_ns, known.until_ns) if is_there else block.until_ns
+        if self.place is None or until_ns > self.place.until_ns:
+            self.engine.advance(until_ns)
+            self.place = Place(block.epoch, until_ns)
+        if is_there and block.until_ns >= known.until_ns:
+            self._known = None

@@ -1,0 +1,72 @@
+"""A mode that does not come back is interrupted, so that all others go on."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import CodeType, FrameType
+
+from amberbox.monitoring.plan import Plan
+
+LIMIT_S = 2.0
+_LOOKS = 5
+
+
+class HangError(TimeoutError):
+    """An evaluation took too long."""
+
+
+class _Guard:
+    """Looks now and then whether the same call is still under way."""
+
+    def __init__(self, codes: frozenset[CodeType]) -> None:
+        self._codes = codes
+        self._frame: FrameType | None = None
+        self._looks = 0
+
+    def look(self, _number: int, frame: FrameType | None) -> None:
+        """Interrupt a call that was there at so many looks.
+
+        Looks are counted, not seconds: while the whole process is suspended there are none.
+        """
+        call = self._call_in(frame)
+        self._looks = self._looks + 1 if call is not None and call is self._frame else 0
+        self._frame = call
+        if self._looks >= _LOOKS:
+            self._frame, self._looks = None, 0
+            raise HangError(f"no answer within {LIMIT_S:g} s")
+
+    def _call_in(self, frame: FrameType | None) -> FrameType | None:
+        while frame is not None and frame.f_code not in self._codes:
+            frame = frame.f_back
+        return frame
+
+
+@contextmanager
+def guarded(plan: Plan, limit_s: float = LIMIT_S) -> Iterator[None]:
+    """Raise ``HangError`` inside a mode's evaluation that takes longer than ``limit_s``.
+
+    It is interrupted where it stands; the engine takes it for a crash of that mode. Works in the
+    main thread; in others nothing is guarded.
+    """
+    codes = frozenset(_codes(plan))
+    if threading.current_thread() is not threading.main_thread() or not codes:
+        yield
+        return
+    before = signal.signal(signal.SIGALRM, _Guard(codes).look)
+    signal.setitimer(signal.ITIMER_REAL, limit_s / _LOOKS, limit_s / _LOOKS)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
+
+
+def _codes(plan: Plan) -> Iterator[CodeType]:
+    """Give the code of each mode's function."""
+    for _, mode in plan.modes():
+        code = getattr(getattr(mode.module, "evaluate", None), "__code__", None)
+        if code is not None:
+            yield code

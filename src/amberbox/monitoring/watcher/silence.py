@@ -1,0 +1,52 @@
+"""A recorder that says nothing: then nothing is known, whatever was known before."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+
+from amberbox.core.types import Status
+
+GONE_S = 2.0
+"""Without a recorder the record ends; statuses are said to be unknown after this long."""
+STUCK_S = 3.0
+"""A recorder writes once a second at least, however silent its sources are."""
+_PERIOD_S = 1.0
+
+
+@dataclass(slots=True)
+class Silence:
+    """Watches by the machine's steady clock whether the record goes on."""
+
+    clock_s: Callable[[], float]
+    _heard_s: float = field(init=False)
+    _told_s: float | None = None
+
+    def __post_init__(self) -> None:
+        self._heard_s = self.clock_s()
+
+    def heard(self) -> None:
+        """Take note that the record has gone on."""
+        self._heard_s, self._told_s = self.clock_s(), None
+
+    def due(self, *, is_recording: bool) -> float:
+        """Return for how many seconds nothing has come, once a second; 0 if that is no matter."""
+        now_s = self.clock_s()
+        silent_s = now_s - self._heard_s
+        if silent_s <= (STUCK_S if is_recording else GONE_S):
+            return 0.0
+        if self._told_s is not None and now_s - self._told_s < _PERIOD_S:
+            return 0.0
+        self._told_s = now_s
+        return silent_s
+
+
+def unknown(statuses: Sequence[Status], now_ns: int, silent_s: float) -> Iterator[Status]:
+    """Say of everything that it is not known; a replay cannot see that."""
+    reason = f"the recorder has written nothing for {silent_s:.0f} s"
+    since_ns = now_ns - round(silent_s * 1e9)
+    for status in statuses:
+        yield replace(
+            status, level="unknown", state="unknown", measured_ns=now_ns, since_ns=since_ns,
+            reason=reason, blocked_by=(), live_only=True,
+        )  # fmt: skip

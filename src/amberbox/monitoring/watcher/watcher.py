@@ -1,0 +1,225 @@
+"""The watcher: follows a record, evaluates what it says, and writes down what it finds.
+
+It reads its own rows back like all others, so a replay sees what it saw. Killed at any moment it
+goes on where it was: no finding is lost, none is written twice.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from amberbox.blackbox.folder.folder import RobotFolder
+from amberbox.blackbox.follow.follow import RECORDED
+from amberbox.blackbox.follow.tail import position_at
+from amberbox.blackbox.keeper.ownjournal import Progress
+from amberbox.blackbox.keeper.ownstreams import Row
+from amberbox.blackbox.store import Store, WriterLock
+from amberbox.core.clock import NS, Clock, SystemClock
+from amberbox.core.probe import SOURCE, ProbeOrder
+from amberbox.core.types import Status, WriterCursor
+from amberbox.monitoring.engine.engine import Engine
+from amberbox.monitoring.engine.findings import Finding
+from amberbox.monitoring.messages.publisher import Publisher
+from amberbox.monitoring.plan import Plan
+from amberbox.monitoring.probing.runner import ProbeRunner
+from amberbox.monitoring.watcher import commands
+from amberbox.monitoring.watcher.evaluation import Evaluation
+from amberbox.monitoring.watcher.guard import guarded
+from amberbox.monitoring.watcher.memory import Checkpoint, Memory, Place, recall
+from amberbox.monitoring.watcher.reader import WATCH, Reader
+from amberbox.monitoring.watcher.silence import Silence, unknown
+from amberbox.monitoring.watcher.writing import Journal
+
+POLL_S = 0.02
+CHECKPOINT_S = 10.0
+FIRST_S = 60.0
+"""A watcher without a memory begins this long before the end of the record."""
+_MARGIN_S = 5.0
+_REQUESTS_S = 0.2
+
+Tell = Callable[[Sequence[Finding]], None]
+
+
+@dataclass
+class Watch:
+    """What is watched: a plan, and the store whose record it is about."""
+
+    plan: Plan
+    store: Store
+    folder: RobotFolder | None = None
+    clock: Clock = field(default_factory=SystemClock)
+    clock_s: Callable[[], float] = time.monotonic
+
+
+class Watcher:
+    """Watches one store; ``step`` does what there is to do now, ``run`` until told to stop.
+
+    ``tell`` hears of everything that is written down.
+    """
+
+    def __init__(self, watch: Watch, tell: Tell | None = None) -> None:
+        self._watch = watch
+        self._tell = tell or _tell_nobody
+        self._lock = WriterLock(watch.store, WATCH)
+        self._journal = Journal(watch.store, watch.plan.robot, watch.plan.config_hash, watch.clock)
+        self._engine = Engine(watch.plan)
+        memory = _memory_of(watch, self._engine.history_s)
+        self._start = _start_of(watch, memory.checkpoint, self._engine.history_s)
+        self._is_new = memory.checkpoint is None
+        self._evaluation = Evaluation(self._engine, memory)
+        probes = [order.item for order in own_probes(watch)]
+        self._reader = Reader(watch.store, self._engine.items, probes, self._start)
+        self._silence = Silence(watch.clock_s)
+        self._silent: list[Status] = []
+        self._noted_s = self._asked_s = watch.clock_s()
+        self._measured: list[tuple[ProbeOrder, Mapping[str, Any]]] = []
+        self._measured_lock = threading.Lock()
+        options = () if watch.folder is None else watch.folder.robot.monitoring.publish
+        self._publisher = Publisher(options, watch.plan, watch.clock_s)
+        if memory.place is not None:
+            self._journal.passed(memory.place)
+
+    def run(self, stop: threading.Event) -> None:
+        """Watch until told to stop; probes run meanwhile."""
+        runner = self._probes()
+        self._publisher.open()
+        try:
+            if runner is not None:
+                runner.start()
+            with guarded(self._watch.plan):
+                while not stop.is_set():
+                    self.step()
+                    stop.wait(POLL_S)
+        finally:
+            if runner is not None:
+                runner.close()
+            self.close()
+
+    def step(self) -> None:
+        """Write what was measured, read on, evaluate, write what was found."""
+        self._write_measured()
+        for block in self._reader.step():
+            self._silence.heard()
+            for found in self._evaluation.take(block):
+                self._write(found)
+        self._carry_out_requests()
+        self._say_silence()
+        if self._publisher.is_due():
+            self._publisher.publish(self._silent or self._engine.statuses())
+
+    def close(self) -> None:
+        """Write down all that is needed to go on, and give the store free."""
+        if self._evaluation.place is not None and not self._evaluation.is_behind:
+            self._journal.found([], [self._checkpoint(self._evaluation.place)])
+        self._publisher.close()
+        self._journal.close()
+        self._lock.release()
+
+    def measured(self, order: ProbeOrder, values: Mapping[str, Any]) -> None:
+        """Take a row of a probe; from any thread."""
+        with self._measured_lock:
+            self._measured.append((order, values))
+
+    def _write_measured(self) -> None:
+        """Write what probes have measured, each row after all that is evaluated."""
+        with self._measured_lock:
+            taken, self._measured = self._measured, []
+        if taken and self._journal.is_live:
+            self._journal.measured([
+                Row(f"{SOURCE}/{order.topic}", order.item, SOURCE, values)
+                for order, values in taken
+            ])  # fmt: skip
+
+    def _write(self, found: Sequence[Finding]) -> None:
+        """Write what was found up to a place beside a note of the place."""
+        place = self._evaluation.place
+        assert place is not None
+        self._journal.passed(place)
+        if self._is_new:
+            self._journal.found([], [self._first(place)])
+            self._is_new = False
+        notes = [place.note(self._watch.store.id)]
+        if self._watch.clock_s() - self._noted_s >= CHECKPOINT_S:
+            notes.append(self._checkpoint(place))
+        self._journal.found(found, notes)
+        self._silent = []
+        self._tell(found)
+
+    def _first(self, place: Place) -> Progress:
+        """Say where the reading began: whoever is killed before the next note begins there."""
+        about = self._watch.plan.config_hash
+        return Checkpoint(place.before(), self._start, 0.0, {}, about).note(self._watch.store.id)
+
+    def _checkpoint(self, place: Place) -> Progress:
+        self._noted_s = self._watch.clock_s()
+        ahead_s = max(self._reader.last_ns() - place.until_ns, 0) / NS
+        return Checkpoint(
+            place, self._reader.positions(), self._engine.history_s + ahead_s + _MARGIN_S,
+            self._engine.snapshot(), self._watch.plan.config_hash,
+        ).note(self._watch.store.id)  # fmt: skip
+
+    def _carry_out_requests(self) -> None:
+        """Do what people say of alarms, and remember it at once."""
+        place, now_s = self._evaluation.place, self._watch.clock_s()
+        if place is None or self._evaluation.is_behind or now_s - self._asked_s < _REQUESTS_S:
+            return
+        self._asked_s = now_s
+        for request in commands.requests(self._watch.store):
+            shift_ns = self._journal.now_ns() - self._watch.clock.wall_ns()
+            changes = commands.carry_out(
+                request, self._engine.states.command, place.until_ns, shift_ns
+            )
+            if changes:
+                self._journal.found(changes, [self._checkpoint(place)])
+                self._tell(changes)
+            commands.done(request)
+
+    def _say_silence(self) -> None:
+        """Say of everything that it is unknown while the record does not go on."""
+        silent_s = self._silence.due(is_recording=self._reader.is_recording)
+        if silent_s:
+            now_ns = self._journal.now_ns()
+            self._silent = list(unknown(self._engine.statuses(), now_ns, silent_s))
+            self._journal.found(self._silent, ())
+            self._tell(self._silent)
+
+    def _probes(self) -> ProbeRunner | None:
+        """Make what runs the probes, unless the recorder gets their rows from elsewhere."""
+        orders, folder = own_probes(self._watch), self._watch.folder
+        extra = () if folder is None else (folder.path / "probes",)
+        return ProbeRunner(orders, self.measured, extra) if orders else None
+
+
+def _memory_of(watch: Watch, history_s: float) -> Memory:
+    """Recall what the last watcher left behind; what it knew counts if its monitors are ours."""
+    memory = recall(watch.store)
+    left = memory.checkpoint
+    if left is not None and left.config_hash != watch.plan.config_hash:
+        memory.checkpoint = replace(left, engine={}, lookback_s=history_s + FIRST_S)
+        memory.more = 0
+    return memory
+
+
+def _start_of(watch: Watch, left: Checkpoint | None, history_s: float) -> dict[str, WriterCursor]:
+    """Return where the reading begins in each journal."""
+    known = {} if left is None else left.positions
+    lookback_s = history_s + FIRST_S if left is None else left.lookback_s
+    return {
+        writer: position_at(watch.store, writer, known.get(writer), lookback_s)
+        for writer in (*RECORDED, WATCH)
+        if watch.store.folder(writer).is_dir() and (left is None or writer in known)
+    }
+
+
+def own_probes(watch: Watch) -> list[ProbeOrder]:
+    """Return the probes that the watcher runs itself: none where a source block gives them."""
+    blocks = () if watch.folder is None else watch.folder.blocks
+    return [] if any(block.name == SOURCE for block in blocks) else watch.plan.probes()
+
+
+def _tell_nobody(_: Sequence[Finding]) -> None:
+    """Say nothing."""

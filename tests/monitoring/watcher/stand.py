@@ -1,0 +1,182 @@
+"""A recorder moved by hand, small monitors of what it records, and a watcher beside it."""
+
+from __future__ import annotations
+
+import random
+import struct
+import threading
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from amberbox.blackbox.follow import read
+from amberbox.blackbox.journal import reserved
+from amberbox.blackbox.recorder.pipeline import PipelineOptions
+from amberbox.blackbox.store import open_store
+from amberbox.core.clock import NS
+from amberbox.core.mode import Input, Result
+from amberbox.core.probe import ProbeOrder
+from amberbox.core.samples import Now
+from amberbox.core.source import TopicOptions
+from amberbox.core.types import Schema, Topic
+from amberbox.monitoring.engine.findings import Finding
+from amberbox.monitoring.messages.records import encoded
+from amberbox.monitoring.plan import (
+    ComponentPlan,
+    DependencyPlan,
+    Expectation,
+    InputPlan,
+    MappingPlan,
+    ModePlan,
+    OutputPlan,
+    Plan,
+)
+from amberbox.monitoring.watcher.replay import replay
+from amberbox.monitoring.watcher.watcher import Watch, Watcher
+from amberbox.testing.box import ManualBox
+from amberbox.testing.clock import ManualClock
+
+VALUE = Schema("std_msgs/Float64", "ros1msg", b"float64 data\n")
+NUMBERS = {keep: Topic(f"/{keep}", "ros1", VALUE) for keep in ("main", "bulk", "ring")}
+TOPICS = [TopicOptions("/bulk", keep="bulk"), TopicOptions("/ring", keep="ring")]
+PROBE = ProbeOrder("path_exists", "/dev/laser")
+GOOD = Result("good", "bool", "it is well")
+
+
+def positive(config: Any, inputs: Sequence[Input], now: Now) -> Mapping[str, Any]:
+    """Good while the value is above 0."""
+    return {"good": inputs[0].at(now) > 0}
+
+
+def steady(config: Any, inputs: Sequence[Input], now: Now) -> Mapping[str, Any]:
+    """Good while the mean of the last second is above 0: looks back."""
+    return {"good": inputs[0].over(now, 1.0).mean() > 0}
+
+
+def there(config: Any, inputs: Sequence[Input], now: Now) -> Mapping[str, Any]:
+    """Good while the probe says so."""
+    return {"good": inputs[0].at(now) == 1}
+
+
+def endless(config: Any, inputs: Sequence[Input], now: Now) -> Mapping[str, Any]:
+    """Never come back."""
+    while True:
+        pass
+
+
+def module_of(function: Any, **marks: Any) -> Any:
+    return SimpleNamespace(
+        evaluate=function, RESULTS=(GOOD,), ACCEPTS=("variable",), COLUMNS=True, **marks
+    )
+
+
+def component(
+    name: str, function: Any, entry: InputPlan, *needs: str, **marks: Any
+) -> ComponentPlan:
+    output = OutputPlan("good", "bool", GOOD, expectation=Expectation(True))
+    module = module_of(function, **marks)
+    mode = ModePlan("m", "m", module, None, [MappingPlan([entry], [output])])
+    return ComponentPlan(name, name, [mode], [DependencyPlan(n, "", n) for n in needs])
+
+
+def variable(item: str) -> InputPlan:
+    return InputPlan(f"{item}.data", "variable", item, "data")
+
+
+def plan_of(*more: ComponentPlan, config_hash: str = "hash") -> Plan:
+    probe = InputPlan(PROBE.subject, "probe", PROBE.item, "ok", probe=PROBE)
+    back = {"history_s": lambda config: 1.0, "TIMED": True}
+    return Plan("robot", config_hash, [
+        component("base", positive, variable("ros_main")),
+        component("arm", steady, variable("ros_bulk"), "base", **back),
+        component("eye", positive, variable("ros_ring"), "arm"),
+        component("laser", there, probe),
+        *more,
+    ])  # fmt: skip
+
+
+@dataclass
+class Stand:
+    """A store whose recorder says random things, run after run."""
+
+    path: Path
+    seed: int = 0
+    clock: ManualClock = field(default_factory=ManualClock)
+
+    def __post_init__(self) -> None:
+        self.random = random.Random(self.seed)
+        self.box = self._box()
+        self.ok = True
+
+    def _box(self, rotate_s: float = 600.0) -> ManualBox:
+        options = PipelineOptions(boot_id=self.clock.boot_id(), rotate_ns=round(rotate_s * NS))
+        return ManualBox(self.path, TOPICS, clock=self.clock, options=options)
+
+    def tick(self) -> None:
+        """Hear something, or nothing, and write it."""
+        for topic in NUMBERS.values():
+            for _ in range(self.random.choice([0, 0, 1, 1, 3])):
+                self.box.hear(topic, struct.pack("<d", self.random.uniform(-1, 3)))
+        self.box.write(self.random.choice([0.03, 0.1, 0.1, 0.17]))
+
+    def restart(self, *, clean: bool = True) -> None:
+        """End the recorder, and begin another run a moment later."""
+        self.box.close() if clean else self.box.crash()
+        self.clock.advance(self.random.uniform(0.1, 2))
+        self.box = self._box(self.random.choice([1.0, 600.0]))
+
+    def watcher(self, plan: Plan | None = None) -> Watcher:
+        """Begin to watch; probes are not run, ``measured`` gives their rows."""
+        return Watcher(self.watch(plan))
+
+    def watch(self, plan: Plan | None = None) -> Watch:
+        store = open_store(self.path)
+        return Watch(plan or plan_of(), store, clock=self.clock, clock_s=self.clock_s)
+
+    def clock_s(self) -> float:
+        return self.clock.boot / NS
+
+    def replayed(self, plan: Plan | None = None) -> list[bytes]:
+        return [line_of(f) for f in replay(plan or plan_of(), open_store(self.path))]
+
+
+def kill(watcher: Watcher) -> None:
+    """Leave what a watcher has written as ``kill -9`` does."""
+    watcher._lock.release()
+
+
+def line_of(finding: Finding) -> bytes:
+    channel, data = encoded(finding)
+    return channel.encode() + b" " + data
+
+
+def written(store: Path, *, live_only: bool = False) -> list[bytes]:
+    """Return the findings in the journal of the watcher, in order."""
+    return [line for line, is_live in _written(store) if is_live == live_only]
+
+
+def _written(store: Path) -> Iterator[tuple[bytes, bool]]:
+    channels = (reserved.STATUS, reserved.EVENT, reserved.ALARM)
+    for journal in read.files_of(open_store(store), "watch"):
+        names = {n: s.topic.name for n, s in journal.streams.items()}
+        wanted = [number for number, name in names.items() if name in channels]
+        for chunk in read.sound_chunks(journal):
+            rows = np.flatnonzero(np.isin(chunk.channel, wanted))
+            for number, data in zip(chunk.channel[rows], chunk.messages(rows), strict=True):
+                values = msgspec.json.decode(data)
+                details = msgspec.json.decode(values.get("details", b"{}"))
+                is_live = bool(values.get("live_only") or details.get("live_only"))
+                yield names[int(number)].encode() + b" " + data, is_live
+
+
+def run_for(watcher: Watcher, stop: threading.Event, seconds: float) -> None:
+    """Run a watcher for a while, in this thread."""
+    timer = threading.Timer(seconds, stop.set)
+    timer.start()
+    watcher.run(stop)
+    timer.join()
