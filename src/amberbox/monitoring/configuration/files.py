@@ -11,7 +11,6 @@ from amberbox.core.options import option
 from amberbox.monitoring.plan import Policy, Severity
 
 OutputType = Literal["bool", "int", "float", "double", "string"]
-STALE_S = 5.0
 
 LEGACY_KEYS: Mapping[str, str] = {
     "monitor_name": "ignored: the mode files say which monitors there are",
@@ -85,13 +84,13 @@ class ModeFile:
     mappings: Sequence[MappingOptions] = option((), "inputs and outputs")
     arguments: Mapping[str, Any] = option({}, "what the monitor wants to know")
     states: Mapping[str, Expression] = option({}, "fault states by name: conditions over outputs")
-    stale_after: float | Literal["never"] = option(
-        STALE_S, "after this long without a message of an input it is stale", unit="s"
+    stale_after: float | Literal["never"] | None = option(
+        None, "after this long without a message of an input it is stale, or never", unit="s"
     )
 
     def check(self) -> Iterator[tuple[str, str]]:
         """Say which values cannot work."""
-        if self.stale_after != "never" and not 0 < self.stale_after < float("inf"):
+        if isinstance(self.stale_after, float | int) and not 0 < self.stale_after < float("inf"):
             yield "stale_after", "must be above 0, or never"
 
 

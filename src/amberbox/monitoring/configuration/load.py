@@ -16,7 +16,7 @@ from amberbox.monitoring.configuration.inputs import Inputs
 from amberbox.monitoring.configuration.modes import Bench, plan_mode
 from amberbox.monitoring.configuration.parts import part_problems
 from amberbox.monitoring.configuration.recorded import Recorded
-from amberbox.monitoring.configuration.recovery import recovery_problems
+from amberbox.monitoring.configuration.recovery import with_recovery
 from amberbox.monitoring.configuration.tree import FOLDER, ComponentSource, Tree, read_tree
 from amberbox.monitoring.plan import ComponentPlan, ModePlan, Plan
 
@@ -36,13 +36,13 @@ def load_plan(folder: RobotFolder) -> tuple[Plan, list[Problem]]:
     if not tree.components and not tree.unlisted and tree.recovery is None:
         return plan, problems
     functions = find_functions(folder.path)
-    bench = Bench(functions, Inputs(Recorded(folder), functions), folder.robot.id, problems)
+    bench = Bench(functions, Inputs(Recorded(folder), functions), folder.robot, problems)
     components = _components(tree, bench)
     for mode in tree.unlisted:
         plan_mode(mode, bench)
+    components = with_recovery(tree.recovery, components, problems)
     plans = with_dependencies(components, problems)
     problems.extend(part_problems(components))
-    problems.extend(recovery_problems(tree.recovery, components))
     problems.extend(_not_known_yet(bench.inputs, folder))
     problems.sort(key=lambda problem: (problem.file, problem.line))
     return replace(plan, components=tuple(plans)), problems

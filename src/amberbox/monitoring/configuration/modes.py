@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from types import ModuleType
 from typing import Any
 
+from amberbox.blackbox.folder.robot import RobotConfig
 from amberbox.core.config import build
 from amberbox.core.errors import AmberboxError, Problem
 from amberbox.core.expression import Expression
@@ -33,7 +34,7 @@ class Bench:
 
     functions: Functions
     inputs: Inputs
-    robot: str
+    robot: RobotConfig
     problems: list[Problem]
 
 
@@ -44,7 +45,7 @@ def plan_mode(source: ModeSource, bench: Bench) -> ModePlan:
     if source.node is None:
         return plan if plan.problem else replace(plan, problem=f"{source.path} cannot be read")
     own: list[Problem] = []
-    node = translated(name, source.node, bench.functions, bench.robot, own)
+    node = translated(name, source.node, bench.functions, bench.robot.id, own)
     file = build(ModeFile, node, own, "", legacy_note)
     made = _plan(plan, file, node, bench, own) if file is not None else plan
     bench.problems.extend(own)
@@ -61,6 +62,8 @@ def _plan(
     plan: ModePlan, file: ModeFile, node: Node, bench: Bench, problems: list[Problem]
 ) -> ModePlan:
     stale_s = None if file.stale_after == "never" else file.stale_after
+    if file.stale_after is None:
+        stale_s = bench.robot.monitoring.stale_s
     plan = replace(plan, description=file.description, stale_s=stale_s)
     function = _function(plan.name, file, node, bench.functions, problems)
     if function is None:
