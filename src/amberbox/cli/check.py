@@ -1,10 +1,11 @@
-"""Judge a robot folder without touching a device, and show what would be recorded."""
+"""Judge a robot folder without touching a device; show what would be recorded and monitored."""
 
 from __future__ import annotations
 
 import argparse
 import json
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 from amberbox.blackbox.folder.folder import ROBOT_FILE, RobotFolder, inspect_folder
@@ -14,6 +15,10 @@ from amberbox.cli._text import in_columns
 from amberbox.core.config import load_yaml
 from amberbox.core.errors import ConfigurationError, Problem
 from amberbox.core.redaction import as_plain
+from amberbox.monitoring.configuration import load_plan, summary
+from amberbox.monitoring.plan import Plan
+from amberbox.monitoring.ruletests.files import find_rules
+from amberbox.monitoring.ruletests.running import run_rules
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -27,12 +32,24 @@ def run(args: argparse.Namespace) -> int:
     folder, problems = inspect_folder(args.folder)
     items = planned_items(folder, problems) if folder else []
     problems += _triggers(folder, items) if folder else []
+    plan = _monitors(folder, problems) if folder and Path(args.folder).is_dir() else None
     ok = not any(problem.is_error for problem in problems)
     if args.json:
-        print(json.dumps(_report(folder, items, problems, ok), indent=2))
+        monitoring = {} if plan is None else {"monitoring": summary.as_data(plan)}
+        print(json.dumps(_report(folder, items, problems, ok) | monitoring, indent=2))
     else:
-        print("\n".join(_lines(args.folder, folder, items, problems)))
+        print("\n".join(_lines(args.folder, folder, items, problems, plan)))
     return 0 if ok else ConfigurationError.exit_code
+
+
+def _monitors(folder: RobotFolder, problems: list[Problem]) -> Plan:
+    """Judge the monitors and run their tests; what is wrong is added to the problems."""
+    plan, found = load_plan(folder)
+    problems += found
+    rules = find_rules(folder.path, skip=folder.store_path)
+    problems += rules.problems
+    problems += [problem for entry in rules.rules for problem in run_rules(entry, plan)]
+    return plan
 
 
 def _triggers(folder: RobotFolder, items: Sequence[PlannedItem]) -> list[Problem]:
@@ -67,12 +84,22 @@ def _lines(
     folder: RobotFolder | None,
     items: Sequence[PlannedItem],
     problems: Sequence[Problem],
+    plan: Plan | None,
 ) -> list[str]:
     errors = [str(problem) for problem in problems if problem.is_error]
     notes = [str(problem) for problem in problems if not problem.is_error]
     verdict = f"{_count(errors, 'error')}, {_count(notes, 'note')}" if errors else "fine"
-    plan = _plan(folder, items) if folder and not errors else []
-    return [*plan, *notes, *errors, f"{name}: {verdict}"]
+    recorded = _plan(folder, items) if folder and (plan is not None or not errors) else []
+    return [*recorded, *_monitored(plan), *notes, *errors, f"{name}: {verdict}"]
+
+
+def _monitored(plan: Plan | None) -> list[str]:
+    if plan is None or not plan.components:
+        return []
+    actions = list(summary.actions(plan))
+    shown = ["recovery actions, not carried out:", *in_columns(actions), ""] if actions else []
+    table = in_columns(summary.table(plan))
+    return [f"would monitor: {summary.in_words(plan)}", *table, "", *shown]
 
 
 def _count(of: Sequence[object], what: str) -> str:
