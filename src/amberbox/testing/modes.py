@@ -129,6 +129,7 @@ def _check_function(
         max_examples=examples,
         deadline=None,
         database=None,
+        report_multiple_bugs=False,
         suppress_health_check=list(HealthCheck),
     )
     @given(sampled_worlds(module, file, *kinds))
