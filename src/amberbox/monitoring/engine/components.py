@@ -130,7 +130,7 @@ class ComponentState:
     ) -> None:
         """Go on from what ``snapshot`` returned; modes and dependencies have been resumed."""
         since, self.initialised = entry
-        self.since_ns = began_ns + since
+        self.since_ns, self.status = began_ns + since, None
         self.judge_modes()
         self.judge(components)
         self.told = Condition(self.level, self.state)

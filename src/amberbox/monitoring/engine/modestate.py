@@ -116,7 +116,7 @@ class ModeState:
     def resume(self, entry: Sequence[Any], began_ns: int) -> None:
         """Go on from what ``snapshot`` returned; the outputs have been resumed before."""
         since, state, self.awaited, *told = entry
-        self.since_ns = began_ns + since
+        self.since_ns, self.status = began_ns + since, None
         self.judge({})
         self.state = self.state if state is None else state
         self.told = Condition(self.level, self.state)

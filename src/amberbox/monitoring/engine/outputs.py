@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, Final
+from typing import Any, Final, Literal, TypeAlias
 
 from amberbox.core.clock import NS
 from amberbox.core.types import Level, Output
@@ -16,6 +16,8 @@ SEVERITIES: Final[tuple[Severity, ...]] = ("warning", "urgent", "critical", "fat
 FUNCTIONAL: Final[frozenset[Level]] = frozenset(("ok", "warn"))
 """Levels of what others can build on."""
 NOT_MEASURED: Final = "not measured yet"
+News: TypeAlias = Literal["none", "other", "value"]
+"""What is new of an output: nothing, another value of a bool or a text, or something else."""
 _CODES: Final[tuple[What, ...]] = ("ok", "bad", "unknown", "stale")
 _PLAIN: Final[tuple[Any, ...]] = (0, None, "", False, True, None, 1, [], None)
 """Snapshot of an output that is ok and has been for long."""
@@ -65,20 +67,17 @@ class OutputState:
         """What the robot can still do, by what is shown."""
         return self.plan.severity if self.shown == "bad" else "urgent"
 
-    def take(self, found: Found) -> bool:
-        """Take what is found; tell whether it differs as a bool or a text.
-
-        A number that changes alone is no news.
-        """
+    def take(self, found: Found) -> News:
+        """Take what is found; a number that changes alone is no news."""
         at_ns, _, what, value, why = found
         differs = self._discrete and value != self._value
         if what != self._raw:
             self._turn(what, at_ns)
         elif not differs and why == self._why:
-            return False
+            return "none"
         self._value = value if self._discrete else _number_text(value) if what == "bad" else None
         self._raw, self._why = what, why
-        return differs
+        return "value" if differs else "other"
 
     def _turn(self, what: What, at_ns: int) -> None:
         self.due_ns = None

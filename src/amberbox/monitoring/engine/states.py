@@ -179,8 +179,11 @@ class States:
         """Take what was found and what is due; return the modes to look at."""
         touched: dict[int, OutputState] = {}
         for number, entry in {entry.output: entry for entry in found}.items():
-            output = touched[number] = self._outputs[number]
-            if output.take(entry):
+            output = self._outputs[number]
+            news = output.take(entry)
+            if news != "none":
+                touched[number] = output
+            if news == "value":
                 changes.modes.add(output.mode)
         while self._timers and self._timers[0][0] <= now_ns:
             due_ns, number = heapq.heappop(self._timers)
