@@ -43,6 +43,13 @@ PLUGINS: Mapping[str, tuple[str, Sequence[str]]] = {
 }
 """Packages of plugins: what one is called, and what it may import besides ``core``."""
 
+READERS: Mapping[str, Sequence[str]] = {
+    f"{SOURCES}.status": tuple(
+        f"{OURS}.blackbox.{name}" for name in ("follow", "journal.reserved", "store", "where")
+    ),
+}
+"""Plugins whose protocol is our own record: what a robot's watcher writes is read by its team."""
+
 HEAVY = frozenset({"pyarrow", "duckdb", "zmq", "matplotlib", "pandas", "polars", "tsdownsample"})
 RECORDING = tuple(
     f"{OURS}.{name}"
@@ -93,7 +100,8 @@ def _plugin_complaints(package: str, module: str, target: str) -> Iterator[str]:
     """Judge an import of a plugin; what its package shares is in files that begin with ``_``."""
     kind, protocols = PLUGINS[package]
     plugin = ".".join(module.split(".")[:4])
-    if target == package or _within(target, (plugin, f"{OURS}.core", *protocols)):
+    readers = READERS.get(plugin, ())
+    if target == package or _within(target, (plugin, f"{OURS}.core", *protocols, *readers)):
         return
     if not _within(target, (package,)):
         library = " and its protocol library" if protocols else ""

@@ -18,7 +18,7 @@ PAGE = Path(__file__).resolve().parents[2] / "docs" / "configuration.md"
 def test_every_key_is_documented() -> None:
     page = PAGE.read_text(encoding="utf-8")
     general = [row.key for row in describe(DefaultParameters, "default_parameters.")]
-    groups = ("store", "store.lifetime", "server", "incidents")
+    groups = ("store", "store.lifetime", "server", "incidents", "monitoring")
     robot = [row.key for row in describe(RobotConfig) if row.key not in groups]
     topic = [row.key for row in describe(TopicOptions)]
     for key in (*general, *robot, *topic):

@@ -11,7 +11,7 @@ import pytest
 
 from amberbox.blackbox.follow import newest
 from amberbox.blackbox.follow.newest import newest_records
-from amberbox.blackbox.follow.seldom import SeldomChannel
+from amberbox.blackbox.follow.records import OwnRecords
 from amberbox.blackbox.journal import reserved
 from amberbox.blackbox.journal.chunk import Chunk
 from amberbox.blackbox.journal.walk import chunk_at
@@ -42,7 +42,7 @@ def store(tmp_path: Path) -> Store:
 
 def test_journal_that_is_not_there_has_none(store: Store) -> None:
     assert newest_records(store, "watch", STATUSES, 5) == []
-    assert SeldomChannel(store, "watch", reserved.ALARM).step() == []
+    assert OwnRecords(store, "watch", {reserved.ALARM}).step() == []
 
 
 @pytest.mark.parametrize("is_finished", [True, False])
@@ -106,8 +106,8 @@ def test_wall_time_is_log_time_and_what_the_clock_was_off(store: Store) -> None:
     assert [record.wall_ns - record.log_ns for record in written] == [7, 7]
 
 
-def test_seldom_channel_gives_each_record_once(store: Store) -> None:
-    reader = SeldomChannel(store, "watch", reserved.ALARM)
+def test_own_records_give_each_record_once(store: Store) -> None:
+    reader = OwnRecords(store, "watch", {reserved.ALARM})
     run = FakeRun(store.path, "watch")
     fill(run, 0, 160)
     assert ids(reader) == ["50", "150"]
@@ -118,19 +118,19 @@ def test_seldom_channel_gives_each_record_once(store: Store) -> None:
     assert ids(reader) == ["250", "350"]
     run.close()
     assert ids(reader) == []
-    assert ids(SeldomChannel(store, "watch", reserved.ALARM)) == ["50", "150", "250", "350"]
+    assert ids(OwnRecords(store, "watch", {reserved.ALARM})) == ["50", "150", "250", "350"]
 
 
-def ids(reader: SeldomChannel) -> list[str]:
+def ids(reader: OwnRecords) -> list[str]:
     return [record.values["id"] for record in reader.step()]
 
 
-def test_seldom_channel_decodes_only_what_holds_it(store: Store) -> None:
+def test_only_what_holds_them_is_decoded(store: Store) -> None:
     run = FakeRun(store.path, "watch")
     fill(run, 0, 160)
     run.close()
     with counted() as decoded:
-        assert ids(SeldomChannel(store, "watch", reserved.ALARM)) == ["50", "150"]
+        assert ids(OwnRecords(store, "watch", {reserved.ALARM})) == ["50", "150"]
     assert len(decoded) == 2
 
 
@@ -144,5 +144,5 @@ def counted() -> Iterator[list[int]]:
         return chunk_at(data, offset)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("amberbox.blackbox.follow.seldom.chunk_at", counting)
+        patch.setattr("amberbox.blackbox.follow.records.chunk_at", counting)
         yield decoded

@@ -20,6 +20,8 @@ from amberbox.core.probe import SOURCE as PROBES
 from amberbox.core.source import TopicOptions
 
 DEFAULTS = "default_parameters"
+NAMED = ("status",)
+"""Sources whose blocks are always called by their ``name``: others may join them later."""
 NOT_BUILT_YET = (
     *("can", "dds", "ethercat", "event", "foxglove", "host", "journald", "mavlink", "modbus"),
     *("mqtt", "opcua", "power", "probe", "ros2", "serial", "video", "vda5050", "zenoh", "zyre"),
@@ -143,7 +145,8 @@ def _names(blocks: Sequence[_Block], problems: list[Problem]) -> list[str]:
     shares = Counter(block.plugin for block in blocks)
     names: list[str] = []
     for block in blocks:
-        own = shares[block.plugin] > 1 or (block.given_name and block.given_name.text == PROBES)
+        given = block.given_name.text if block.given_name else ""
+        own = shares[block.plugin] > 1 or block.plugin in NAMED or given == PROBES
         name = _name(block, problems) if own else block.plugin
         if name in names:
             what = f"a second block is called '{name}'"

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from amberbox.blackbox.follow.newest import newest_records
-from amberbox.blackbox.follow.seldom import SeldomChannel
+from amberbox.blackbox.follow.records import OwnRecords
 from amberbox.blackbox.journal import reserved
 from amberbox.blackbox.store import Store, is_locked
 from amberbox.core.clock import NS
@@ -55,7 +55,7 @@ class BoardReader:
 
     def __init__(self, store: Store) -> None:
         self._store = store
-        self._alarm_records = SeldomChannel(store, WRITER, reserved.ALARM)
+        self._alarm_records = OwnRecords(store, WRITER, {reserved.ALARM})
         self._alarms: dict[str, AlarmChange] = {}
 
     def read(self, now_ns: int) -> Board:

@@ -1,0 +1,236 @@
+"""Statuses of another robot, as its watcher writes them: the members of a team."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from amberbox.blackbox.follow.newest import Written
+from amberbox.blackbox.follow.records import OwnRecords
+from amberbox.blackbox.journal import reserved
+from amberbox.blackbox.store import open_store
+from amberbox.blackbox.where import store_path
+from amberbox.core.clock import NS
+from amberbox.core.errors import AmberboxError
+from amberbox.core.options import option
+from amberbox.core.source import Sink, TopicOptions
+from amberbox.core.types import Schema, Topic
+
+SAMPLE = """\
+- status:
+    where: ../ropod_001
+    topics:
+      - topic: {name: robot}
+      - topic: {name: laser, max_frequency: 1}
+"""
+PASSIVE = "reads the record of {config.where}; nothing there is written to"
+
+ROBOT = "robot"
+"""Topic of the member as a whole."""
+WRITER = "watch"
+LEVELS = ("ok", "warn", "unknown", "stale", "error")
+"""From good to bad; ``level_code`` is the place of a level."""
+
+_POLL_S = 0.1
+_RETRY_S = 1.0
+_SILENT_S = 3.0
+"""A watcher says all statuses every second."""
+_ROUND_NS = 5 * NS // 2
+_TEXT, _COUNT, _NUMBER = {"type": "string"}, {"type": "integer"}, {"type": "number"}
+_COMMON = {"level": _TEXT, "level_code": _COUNT, "reason": _TEXT, "measured_ns": _COUNT}
+_FIELDS: Mapping[str, Mapping[str, Any]] = {
+    "component": {**_COMMON, "state": _TEXT, "blocked_by": _TEXT, "since_ns": _COUNT,
+                  "age_s": _NUMBER},
+    "robot": {**_COMMON, "worst": _TEXT, "components": _COUNT,
+              **dict.fromkeys(LEVELS, _COUNT), "alarms": _COUNT, "age_s": _NUMBER},
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Config:
+    """The ``status`` block."""
+
+    where: str = option(doc="the member: its robot folder or its store, seen from this folder")
+    topics: Sequence[TopicOptions] = option(
+        (), "components to record, and robot for all together; everything when absent"
+    )
+    late_s: float = option(
+        5.0, "what was written so long after it was measured is left out", unit="s"
+    )
+
+    def in_folder(self, folder: Path) -> Config:
+        """Return the same with the place seen from a folder."""
+        return replace(self, where=str(folder / Path(self.where).expanduser()))
+
+    def notes(self) -> Iterator[tuple[str, str]]:
+        """Say that the member may come later."""
+        if not Path(self.where).exists():
+            yield "where", f"there is nothing at {self.where} yet"
+
+    def check(self) -> Iterator[tuple[str, str]]:
+        """Say which values cannot work."""
+        if self.late_s <= 0:
+            yield "late_s", "must be above 0"
+
+
+def known_topics(config: Config) -> Sequence[Topic]:
+    """Return the topics that are configured; without any, the member's own folder names them."""
+    return [_topic(options.name) for options in config.topics]
+
+
+def _topic(name: str) -> Topic:
+    kind = "robot" if name == ROBOT else "component"
+    document = {"type": "object", "properties": _FIELDS[kind]}
+    schema = Schema(f"amberbox/{kind}_status", "jsonschema", msgspec.json.encode(document))
+    return Topic(name, "json", schema)
+
+
+class Source:
+    """Follows the statuses that the watcher of one member writes."""
+
+    lossless = False
+
+    def __init__(self, config: Config, name: str) -> None:
+        self.config = config
+        self.name = name
+
+    def topics(self) -> Sequence[TopicOptions]:
+        return self.config.topics
+
+    def run(self, sink: Sink, stop: threading.Event) -> None:
+        """Follow until ``stop`` is set; a member that is not there yet is awaited."""
+        member: _Member | None = None
+        was_told = False
+        while not stop.is_set():
+            if member is None:
+                try:
+                    member = _Member(self.config, sink)
+                except AmberboxError as error:
+                    if not was_told:
+                        text = f"{error.what}; it is tried again"
+                        sink.event("unreachable", text, where=self.config.where)
+                    was_told = True
+            if member is not None:
+                member.step()
+            stop.wait(_RETRY_S if member is None else _POLL_S)
+        if member is not None:
+            member.down("stopped")
+
+
+@dataclass
+class _Member:
+    """What is known of the member: the newest statuses of its components, and its alarms."""
+
+    config: Config
+    sink: Sink
+    streams: dict[str, int] = field(default_factory=dict)
+    newest: dict[str, Mapping[str, Any]] = field(default_factory=dict)
+    alarms: dict[str, str] = field(default_factory=dict)
+    is_up: bool = False
+    heard_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        store = open_store(store_path(self.config.where))
+        self._statuses = OwnRecords(store, WRITER, {reserved.STATUS})
+        self._statuses.skip()  # what was said before is not how it is now
+        self._alarms = OwnRecords(store, WRITER, {reserved.ALARM})
+        self._wanted = {topic.name for topic in self.config.topics}
+
+    def step(self) -> None:
+        """Hand on what is new; say so when the watcher falls silent."""
+        for record in self._alarms.step():
+            self.alarms[record.values["id"]] = record.values["state"]
+        statuses = [record for record in self._statuses.step() if self._is_of_now(record)]
+        components = [record for record in statuses if not record.values["mode"]]
+        now_s = time.monotonic()
+        if components:
+            self.heard_s = now_s
+            self._hand_on(components)
+        elif self.is_up and now_s - self.heard_s > _SILENT_S:
+            self.down(f"the watcher of {self.config.where} has said nothing for {_SILENT_S:g} s")
+
+    def down(self, reason: str) -> None:
+        """Say that nothing is heard any more."""
+        if self.is_up:
+            self.is_up = False
+            for topic in self.streams:
+                self.sink.link_down(topic, self.config.where, reason)
+
+    def _is_of_now(self, record: Written) -> bool:
+        """Tell what the watcher only catches up with from what it sees now."""
+        return _age_s(record) <= self.config.late_s or bool(record.values["live_only"])
+
+    def _hand_on(self, records: Sequence[Written]) -> None:
+        if not self.is_up:
+            self.is_up = True
+            for topic in self.streams:
+                self.sink.link_up(topic, self.config.where)
+        for record in records:
+            component = record.values["component"]
+            self.newest[component] = record.values
+            self._say(topic_name(component), _component_row(record))
+        newest_ns = max(values["measured_ns"] for values in self.newest.values())
+        self.newest = {
+            component: values
+            for component, values in self.newest.items()
+            if values["measured_ns"] >= newest_ns - _ROUND_NS
+        }
+        self._say(ROBOT, self._robot_row(records[-1]))
+
+    def _robot_row(self, last: Written) -> Mapping[str, Any]:
+        known = [v for v in self.newest.values() if v["state"] != "not_monitored"]
+        counts = Counter(values["level"] for values in known)
+        worst = max(known, key=lambda values: LEVELS.index(values["level"]), default=None)
+        level = "unknown" if worst is None else worst["level"]
+        standing = sum(state in ("open", "acknowledged") for state in self.alarms.values())
+        return {
+            "level": level,
+            "level_code": LEVELS.index(level),
+            "reason": "nothing is monitored" if worst is None else worst["reason"],
+            "measured_ns": last.values["measured_ns"],
+            "worst": "" if worst is None or level == "ok" else worst["component"],
+            "components": len(known),
+            **{name: counts[name] for name in LEVELS},
+            "alarms": standing,
+            "age_s": _age_s(last),
+        }
+
+    def _say(self, topic: str, row: Mapping[str, Any]) -> None:
+        if self._wanted and topic not in self._wanted:
+            return
+        if topic not in self.streams:
+            self.streams[topic] = self.sink.topic(_topic(topic))
+            self.sink.link_up(topic, self.config.where)
+        data = msgspec.json.encode(row)
+        self.sink.message(self.streams[topic], data, self.sink.now_ns())
+
+
+def topic_name(component: str) -> str:
+    """Name the topic of a component; one that is called ``robot`` makes room for the whole."""
+    return f"{ROBOT}_component" if component == ROBOT else component
+
+
+def _component_row(record: Written) -> Mapping[str, Any]:
+    values = record.values
+    return {
+        "level": values["level"],
+        "level_code": LEVELS.index(values["level"]),
+        "reason": values["reason"],
+        "measured_ns": values["measured_ns"],
+        "state": values["state"],
+        "blocked_by": ", ".join(values["blocked_by"]),
+        "since_ns": values["since_ns"],
+        "age_s": _age_s(record),
+    }
+
+
+def _age_s(record: Written) -> float:
+    """Seconds from the measurement to its record, both by the member's clock."""
+    return float((record.wall_ns - record.values["measured_ns"]) / NS)
