@@ -57,7 +57,7 @@ def test_where_nobody_listens_it_is_not_ok() -> None:
 
 
 def test_a_name_without_an_address_is_unknown() -> None:
-    with pytest.raises(OSError, match="not known|resolution"):
+    with pytest.raises(OSError, match=r"not known|resolution"):
         measure("http://no-such-host.invalid/")
 
 

@@ -180,8 +180,12 @@ def program(folder: Path, printed: str, status: int, said: str = "") -> Sequence
 
 @pytest.mark.parametrize(
     ("printed", "status", "ok", "latency_ms", "loss"),
-    [(IPUTILS, 0, True, 0.5, 33.3333), (BUSYBOX, 0, True, 0.095, 0.0), (SILENT, 1, False, None, 100)],
-)  # fmt: skip
+    [
+        (IPUTILS, 0, True, 0.5, 33.3333),
+        (BUSYBOX, 0, True, 0.095, 0.0),
+        (SILENT, 1, False, None, 100.0),
+    ],
+)
 def test_what_the_program_prints_is_read(
     tmp_path: Path, printed: str, status: int, ok: bool, latency_ms: float | None, loss: float
 ) -> None:
@@ -190,7 +194,7 @@ def test_what_the_program_prints_is_read(
 
 
 def test_a_program_that_cannot_is_no_answer_of_the_host(tmp_path: Path) -> None:
-    with pytest.raises(AmberboxError, match="^ping: socket: Operation not permitted$"):
+    with pytest.raises(AmberboxError, match=r"^ping: socket: Operation not permitted$"):
         by_program(program(tmp_path, "", 2, "ping: socket: Operation not permitted"), "192.168.1.7")
     with pytest.raises(AmberboxError, match="no program ping"):
         by_program([str(tmp_path / "ping")], "192.168.1.7")

@@ -21,7 +21,8 @@ def root(tmp_path: Path) -> Path:
           temp1_label="Package id 0", temp1_input="61000", temp1_crit="100000",
           temp2_label="Core 0", temp2_input="58000", temp2_crit="100000")  # fmt: skip
     files(tmp_path / "hwmon" / "hwmon1", name="nvme",
-          temp1_input="84850", temp1_crit="84850", temp2_input="40000", temp2_crit="65261850")  # fmt: skip
+          temp1_input="84850", temp1_crit="84850",
+          temp2_input="40000", temp2_crit="65261850")  # fmt: skip
     return tmp_path
 
 

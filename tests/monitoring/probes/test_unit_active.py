@@ -62,7 +62,7 @@ def test_systemctl_is_only_asked_to_show(
 
 def test_where_systemd_does_not_run_nothing_is_known(tmp_path: Path) -> None:
     code = "import sys\nsys.exit('System has not been booted with systemd\\nas init system')"
-    with pytest.raises(AmberboxError, match="^systemctl: System has not been booted with systemd$"):
+    with pytest.raises(AmberboxError, match=r"^systemctl: System has not been booted"):
         ask(systemctl(tmp_path, code), "rosbridge")
     with pytest.raises(AmberboxError, match="systemctl gave no state"):
         ask(systemctl(tmp_path, ""), "rosbridge")
