@@ -1,4 +1,4 @@
-"""``amberbox plugins``: sources, what they lack, and all their keys."""
+"""``amberbox plugins``: sources, modes and probes, what they lack, and all their keys."""
 
 from __future__ import annotations
 
@@ -15,6 +15,8 @@ from amberbox.core.plugins import find, get
 from amberbox.core.source import TopicOptions
 
 ALL = sorted(find(SOURCES, defines=("Config", "Source")))
+MODES = sorted(verb.KINDS["mode"].plugins())
+PROBES = sorted(verb.KINDS["probe"].plugins())
 
 
 def test_list(capsys: pytest.CaptureFixture[str]) -> None:
@@ -23,9 +25,17 @@ def test_list(capsys: pytest.CaptureFixture[str]) -> None:
     assert "  ros" in text
     assert "ROS 1: topics of a robot" in text
     assert main(["plugins", "--json"]) == 0
-    rows = {row["name"]: row for row in json.loads(capsys.readouterr().out)}
-    assert set(rows) == set(ALL)
-    assert rows["ros"]["missing"] == []
+    rows = json.loads(capsys.readouterr().out)
+    assert [row["name"] for row in rows] == [*ALL, *MODES, *PROBES]
+    ros = next(row for row in rows if row["name"] == "ros")
+    assert (ros["kind"], ros["missing"]) == ("source", [])
+
+
+def test_list_of_one_kind(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["plugins", "--kind", "mode"]) == 0
+    text = capsys.readouterr().out
+    assert "  heartbeat " in text
+    assert "  ros " not in text
 
 
 def test_missing_package_is_named(
@@ -66,7 +76,55 @@ def test_json_of_one(capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_unknown(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["plugins", "roz"]) == 2
-    assert "there is no source 'roz'; did you mean 'ros'?" in capsys.readouterr().err
+    assert "there is no plugin 'roz'; did you mean 'ros'?" in capsys.readouterr().err
+    assert main(["plugins", "--kind", "mode", "ros"]) == 2
+    assert "there is no mode 'ros'" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", MODES)
+def test_every_mode_shows_a_mode_file_and_all_there_is_to_write(
+    name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["plugins", name, "--kind", "mode"]) == 0
+    text = capsys.readouterr().out
+    module = verb.KINDS["mode"].plugins()[name].load()
+    assert module.SAMPLE.rstrip() in text
+    for word in (*module.ACCEPTS, *(result.name for result in module.RESULTS)):
+        assert word in text
+    for row in describe(module.Config):
+        assert f"  {row.key} " in text
+
+
+@pytest.mark.parametrize("name", PROBES)
+def test_every_probe_shows_its_subject_and_what_it_measures(
+    name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["plugins", name, "--kind", "probe"]) == 0
+    text = capsys.readouterr().out
+    module = verb.KINDS["probe"].plugins()[name].load()
+    assert module.SUBJECT in text
+    for measure in module.MEASURES:
+        assert f"  {measure} " in text
+
+
+def test_json_of_a_mode_and_a_probe(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["plugins", "range", "--json"]) == 0
+    shown = json.loads(capsys.readouterr().out)
+    assert [result["name"] for result in shown["results"]] == ["in_range", "value"]
+    assert {row["key"] for row in shown["options"]} == {"min", "max", "hysteresis"}
+    assert main(["plugins", "wifi", "--json"]) == 0
+    shown = json.loads(capsys.readouterr().out)
+    assert {"name", "type", "unit", "doc"} == set(shown["measures"][0])
+
+
+def test_a_name_that_is_taken_twice_needs_the_kind(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(verb.KINDS, "probe", verb.KINDS["mode"])
+    assert main(["plugins", "range"]) == 2
+    assert "'range' is a mode and a probe\nhint: say which: --kind mode" in capsys.readouterr().err
+    monkeypatch.undo()
+    assert main(["plugins", "range"]) == 0
 
 
 def test_describe_reaches_nested_keys() -> None:

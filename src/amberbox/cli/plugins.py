@@ -1,71 +1,166 @@
-"""List the sources that the box can listen to, or explain one of them."""
+"""List the sources, monitor modes and probes that are there, or explain one of them."""
 
 from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Sequence
-from dataclasses import asdict
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from typing import Any
 
 from amberbox.blackbox.folder.folder import SOURCES
 from amberbox.cli._text import in_columns
+from amberbox.core.config import did_you_mean
 from amberbox.core.describe import OptionRow, describe
-from amberbox.core.plugins import Plugin, find, get, install_hint, missing_packages
+from amberbox.core.errors import UsageError
+from amberbox.core.plugins import Plugin, find, install_hint, missing_packages
+from amberbox.monitoring.configuration.functions import (
+    MODE_DEFINES,
+    MODES,
+    PROBE_DEFINES,
+    PROBES,
+)
+
+
+@dataclass(frozen=True)
+class Kind:
+    """One kind of plugin: where it lies, what it defines, and what it is for."""
+
+    package: str
+    defines: tuple[str, ...]
+    use: str
+
+    def plugins(self) -> Mapping[str, Plugin]:
+        """Find all of this kind."""
+        return find(self.package, defines=self.defines)
+
+
+KINDS = {
+    "source": Kind(SOURCES, ("Config", "Source"), "each a block of black_box.yaml"),
+    "mode": Kind(MODES, MODE_DEFINES, "named by 'monitor:' in a mode file"),
+    "probe": Kind(PROBES, PROBE_DEFINES, "what modes ask the robot's computer for"),
+}
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of this verb."""
-    parser.add_argument("name", nargs="?", help="a source: show a sample and all its keys")
+    parser.add_argument(
+        "name", nargs="?", help="a source, mode or probe: show a sample and all its keys"
+    )
+    parser.add_argument("--kind", choices=KINDS, help="only plugins of this kind")
     parser.add_argument("--json", action="store_true", help="print JSON")
 
 
 def run(args: argparse.Namespace) -> int:
-    """List all sources, or show one."""
-    return _show(args.name, args.json) if args.name else _list(args.json)
+    """List all plugins, or show one."""
+    kinds = [args.kind] if args.kind else list(KINDS)
+    return _show(args.name, kinds, args.json) if args.name else _list(kinds, args.json)
 
 
-def _list(as_json: bool) -> int:
-    found = [_overview(plugin) for plugin in find(SOURCES, defines=("Config", "Source")).values()]
+def _list(kinds: Sequence[str], as_json: bool) -> int:
+    found = {kind: [_overview(kind, p) for p in KINDS[kind].plugins().values()] for kind in kinds}
+    rows = [row for some in found.values() for row in some]
     if as_json:
-        print(json.dumps(found, indent=2))
+        print(json.dumps(rows, indent=2))
         return 0
-    print("sources, each a block of black_box.yaml:")
-    print("\n".join(in_columns((row["name"], row["summary"]) for row in found)))
-    for row in found:
+    for kind, some in found.items():
+        print(f"{kind}s, {KINDS[kind].use}:")
+        print("\n".join(in_columns((row["name"], row["summary"]) for row in some)) + "\n")
+    for row in rows:
         if row["missing"]:
             print(f"'{row['name']}' lacks {', '.join(row['missing'])}. {row['install']}".rstrip())
     print("amberbox plugins NAME shows a sample and all keys")
     return 0
 
 
-def _overview(plugin: Plugin) -> dict[str, Any]:
+def _overview(kind: str, plugin: Plugin) -> dict[str, Any]:
     missing = missing_packages(plugin)
     hint = install_hint(plugin.name) if missing else ""
     return {
         "name": plugin.name,
+        "kind": kind,
         "summary": plugin.summary,
         "missing": missing,
         "install": hint,
     }
 
 
-def _show(name: str, as_json: bool) -> int:
-    plugin = get(SOURCES, name, defines=("Config", "Source"))
-    module = plugin.load()
-    options = list(describe(module.Config))
+def _show(name: str, kinds: Sequence[str], as_json: bool) -> int:
+    kind, plugin = _one(name, kinds)
+    details = _DETAILS[kind](plugin.load())
     if as_json:
-        rows = [asdict(row) for row in options]
-        print(json.dumps(_overview(plugin) | {"sample": module.SAMPLE, "options": rows}, indent=2))
+        print(json.dumps(_overview(kind, plugin) | details, indent=2))
         return 0
-    print(f"{plugin.name}: {plugin.summary}\n\n{module.SAMPLE.rstrip()}\n\nkeys:")
-    print("\n".join(in_columns(_option_rows(options))))
+    print(f"{plugin.name}: {plugin.summary}")
+    print("\n".join(_SHOWN[kind](details)))
     return 0
 
 
-def _option_rows(options: Sequence[OptionRow]) -> list[tuple[str, str, str, str]]:
+def _one(name: str, kinds: Sequence[str]) -> tuple[str, Plugin]:
+    """Return the plugin of a name; raise UsageError if there is none, or more than one."""
+    known = {kind: KINDS[kind].plugins() for kind in kinds}
+    found = [(kind, plugins[name]) for kind, plugins in known.items() if name in plugins]
+    if len(found) > 1:
+        what = f"'{name}' is a {' and a '.join(kind for kind, _ in found)}"
+        raise UsageError(what, f"say which: --kind {found[0][0]}")
+    if not found:
+        names: Collection[str] = {name for plugins in known.values() for name in plugins}
+        what = f"there is no {kinds[0] if len(kinds) == 1 else 'plugin'} '{name}'"
+        raise UsageError(what + did_you_mean(name, names), "amberbox plugins lists all")
+    return found[0]
+
+
+def _source_details(module: Any) -> dict[str, Any]:
+    return {"sample": module.SAMPLE, "options": [asdict(row) for row in describe(module.Config)]}
+
+
+def _mode_details(module: Any) -> dict[str, Any]:
+    results = [asdict(result) for result in module.RESULTS]
+    return {"inputs": list(module.ACCEPTS), "results": results, **_source_details(module)}
+
+
+def _probe_details(module: Any) -> dict[str, Any]:
+    measures = [
+        {"name": name, "type": kind, "unit": unit, "doc": doc}
+        for name, (kind, unit, doc) in module.MEASURES.items()
+    ]
+    return {"subject": module.SUBJECT, "measures": measures}
+
+
+def _source_text(details: Mapping[str, Any]) -> Iterator[str]:
+    yield from ("", details["sample"].rstrip(), "", "keys:")
+    yield from _option_table(details["options"])
+
+
+def _mode_text(details: Mapping[str, Any]) -> Iterator[str]:
+    yield from ("", details["sample"].rstrip(), "")
+    yield f"inputs: {' or '.join(details['inputs'])}"
+    yield from ("", "results:")
+    yield from in_columns(_with_unit(row, row["name"]) for row in details["results"])
+    yield from ("", "arguments:")
+    yield from _option_table(details["options"]) if details["options"] else ["  none"]
+
+
+def _probe_text(details: Mapping[str, Any]) -> Iterator[str]:
+    yield f"subject: {details['subject']}"
+    yield from ("", "measures:")
+    rows = [("ok", "bool", "whether all is well; null if nobody can know")]
+    yield from in_columns([*rows, *(_with_unit(r, r["name"]) for r in details["measures"])])
+
+
+def _with_unit(row: Mapping[str, Any], name: str) -> tuple[str, str, str]:
+    return name, row["type"], f"{row['doc']} [{row['unit']}]" if row["unit"] else row["doc"]
+
+
+_DETAILS = {"source": _source_details, "mode": _mode_details, "probe": _probe_details}
+_SHOWN = {"source": _source_text, "mode": _mode_text, "probe": _probe_text}
+
+
+def _option_table(options: Sequence[Mapping[str, Any]]) -> Iterator[str]:
+    rows = [OptionRow(**row) for row in options]
     header = ("key", "value", "default", "meaning")
-    return [header, *((row.key, row.type, _default(row), _meaning(row)) for row in options)]
+    table = [(row.key, row.type, _default(row), _meaning(row)) for row in rows]
+    yield from in_columns([header, *table])
 
 
 def _default(row: OptionRow) -> str:
