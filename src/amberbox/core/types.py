@@ -244,3 +244,81 @@ class Status:
     reason: str
     config_hash: str
     live_only: bool = False
+
+
+SymptomState: TypeAlias = Literal["present", "absent", "unknown"]
+
+
+@dataclass(frozen=True, slots=True)
+class Symptom:
+    """One observation that speaks for or against faults.
+
+    ``id`` is the address of a monitor's output (``component/mode/output``) or
+    ``detector.finding.item[.variable]``; ``source`` says who found it, ``strength`` is the share
+    of it that counts (1: all). ``evidence`` names what was measured: address, from and to.
+    """
+
+    id: str
+    state: SymptomState
+    address: str = ""
+    onset_ns: int | None = None
+    confirmed_ns: int | None = None
+    strength: float = 1.0
+    source: str = "monitor"
+    evidence: tuple[tuple[str, int, int], ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Hypothesis:
+    """A set of failure modes (``component#mode``) that may be what is broken.
+
+    ``ambiguity`` are the ids of hypotheses that no symptom tells from this one.
+    """
+
+    id: str
+    faults: frozenset[str]
+    probability: float
+    explains: tuple[str, ...] = ()
+    unexplained: tuple[str, ...] = ()
+    contradicted: tuple[str, ...] = ()
+    ambiguity: tuple[str, ...] = ()
+    proof: str = ""
+    criticality: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Test:
+    """Something that can be looked at, asked or done to learn more.
+
+    ``gain_bits`` is the information expected from it, ``outcomes`` how probable each answer is.
+    """
+
+    id: str
+    kind: Literal["read", "question", "check", "experiment", "unit_test"]
+    text: str
+    role: str = ""
+    cost_s: float = 0.0
+    risk: float = 0.0
+    gain_bits: float = 0.0
+    outcomes: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Diagnosis:
+    """The one answer: hypotheses from likely to unlikely, and what to do next.
+
+    ``mass_covered`` is the probability of all hypotheses that were looked at; ``incomplete`` says
+    which budget ended the search, empty if none did. ``findings`` are what nothing maps to a
+    failure mode.
+    """
+
+    id: str
+    revision: int
+    robot: str
+    at_ns: int
+    config_hash: str
+    hypotheses: tuple[Hypothesis, ...]
+    mass_covered: float
+    incomplete: str = ""
+    findings: tuple[str, ...] = ()
+    next_tests: tuple[Test, ...] = ()
