@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import shlex
+from collections.abc import Iterable
 from pathlib import Path
 
 from amberbox.blackbox.folder.folder import BLACK_BOX_FILE, ROBOT_FILE, SOURCES, load_folder
@@ -57,12 +58,13 @@ def run(args: argparse.Namespace) -> int:
     _refuse_to_overwrite(folder, files)
     folder.mkdir(parents=True, exist_ok=True)
     for name, text in files.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_text(text, encoding="utf-8")
     load_folder(folder)
     if args.json:
         print(json.dumps({"folder": str(folder), "files": sorted(files)}))
     else:
-        print(f"wrote {' and '.join(sorted(files))} in {folder}")
+        print(f"wrote {_listed(files)} in {folder}")
         word = shlex.quote(str(folder))
         print(f"next: look at them, then amberbox check {word}, amberbox record {word}")
     return 0
@@ -70,10 +72,23 @@ def run(args: argparse.Namespace) -> int:
 
 def _files(folder: Path, source: str) -> dict[str, str]:
     plugin = get(SOURCES, source, defines=("Config", "Source"))
-    sample = plugin.load().SAMPLE
+    module = plugin.load()
+    more = _texts(module.FOLDER) if hasattr(module, "FOLDER") else {}
+    sample = more.pop(BLACK_BOX_FILE, module.SAMPLE)
     robot = _ROBOT.replace("{id}", derive_id(folder.resolve().name))
     black_box = _BLACK_BOX.replace("{plugin}", plugin.name).replace("{sample}", sample)
-    return {ROBOT_FILE: robot, BLACK_BOX_FILE: black_box}
+    return {ROBOT_FILE: robot, BLACK_BOX_FILE: black_box, **more}
+
+
+def _texts(folder: Path) -> dict[str, str]:
+    """Return the files that come with a source, such as its monitors, by their paths."""
+    paths = sorted(path for path in folder.rglob("*.yaml") if path.is_file())
+    return {path.relative_to(folder).as_posix(): path.read_text(encoding="utf-8") for path in paths}
+
+
+def _listed(names: Iterable[str]) -> str:
+    """Name files, and folders for all that is in them."""
+    return " and ".join(sorted({name.partition("/")[0] for name in names}))
 
 
 def _refuse_to_overwrite(folder: Path, files: dict[str, str]) -> None:
@@ -81,7 +96,7 @@ def _refuse_to_overwrite(folder: Path, files: dict[str, str]) -> None:
         raise UsageError(f"'{folder}' is a file", "name a folder")
     there = [name for name in files if (folder / name).exists()]
     if there:
-        what = f"'{folder}' has {' and '.join(there)} already, nothing was written"
+        what = f"'{folder}' has {_listed(there)} already, nothing was written"
         raise UsageError(
             what, f"edit what is there, or name another folder; amberbox check {folder}"
         )

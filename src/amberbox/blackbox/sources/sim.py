@@ -6,6 +6,7 @@ import threading
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 import msgspec
@@ -32,6 +33,8 @@ SAMPLE = """\
       - topic: {name: odom, max_frequency: 10}
       - topic: {name: wheels}
 """
+FOLDER = Path(__file__).parents[2] / "sim" / "folder"
+"""What ``amberbox new`` writes for it: a block that records everything, and its monitors."""
 PASSIVE = "simulated in this process: there is no robot that could be disturbed"
 _NOT_WORTH_WAITING_NS = 500_000
 
