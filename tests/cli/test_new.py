@@ -19,8 +19,9 @@ def test_the_new_folder_passes_the_check(source: str, tmp_path: Path) -> None:
     built = load_folder(place)
     assert built.robot.id == "my_robot"
     assert [block.plugin for block in built.blocks] == [source]
-    not_there_yet = [note for note in built.notes if note.where == "recording.path"]
-    assert built.notes == tuple(not_there_yet) and bool(not_there_yet) == (source == "recording")
+    not_there_yet = [n for n in built.notes if n.where in ("recording.path", "status.where")]
+    others = source in ("recording", "status")
+    assert built.notes == tuple(not_there_yet) and bool(not_there_yet) == others
     assert main(["check", str(place)]) == 0
 
 
@@ -28,6 +29,19 @@ def test_files_are_commented(tmp_path: Path) -> None:
     assert main(["new", str(tmp_path / "r"), "--from", "ros"]) == 0
     for name in ("robot.yaml", "black_box.yaml"):
         assert (tmp_path / "r" / name).read_text().startswith("# ")
+
+
+def test_the_simulated_robot_comes_with_its_monitors(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    place = tmp_path / "r"
+    assert main(["new", str(place)]) == 0
+    assert "black_box.yaml and components and robot.yaml" in capsys.readouterr().out
+    assert (place / "components" / "laser_front" / "heartbeat.yaml").is_file()
+    assert main(["check", str(place)]) == 0
+    assert "wheel_rear_right" in capsys.readouterr().out
+    assert main(["new", str(place)]) == 2
+    assert "components and robot.yaml already" in capsys.readouterr().err
 
 
 def test_nothing_is_written_over(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
