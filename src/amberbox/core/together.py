@@ -73,12 +73,12 @@ def numbers(values: Any) -> NDArray[np.float64]:
 def middles(values: NDArray[np.float64]) -> tuple[Any, Any]:
     """Return the two middle numbers over the first axis, which are one where it is odd.
 
-    NaN does not count; where nothing else is, the middle is NaN.
+    What is not finite does not count; where nothing else is, the middle is NaN.
     """
     if not len(values):
         nobody = np.full(values.shape[1:], np.nan)
         return nobody, nobody
-    ordered = np.sort(values, axis=0)
+    ordered = np.sort(np.where(np.isfinite(values), values, np.nan), axis=0)
     count = np.isfinite(ordered).sum(axis=0)[None]
     places = (np.maximum(count - 1, 0) // 2, np.minimum(count // 2, len(values) - 1))
     low, high = (np.take_along_axis(ordered, place, 0)[0] for place in places)

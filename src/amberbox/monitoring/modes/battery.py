@@ -11,9 +11,9 @@ import numpy as np
 from amberbox.core.clock import NS
 from amberbox.core.mode import Input, Result, where_known, with_hysteresis
 from amberbox.core.options import option
-from amberbox.core.samples import Now
+from amberbox.core.samples import Now, Window
 from amberbox.core.standins import Finding
-from amberbox.core.together import middles, numbers_at
+from amberbox.core.together import middles, numbers_at, typical
 
 ACCEPTS = ("variable",)
 COLUMNS = True
@@ -53,6 +53,7 @@ class Config:
     low: float = option(20.0, "the charge below which it is not ok", unit="%")
     hysteresis: float = option(2.0, "by how much more it must be charged to be ok again", unit="%")
     tolerance: float = option(5.0, "how far below empty or above full is plausible", unit="%")
+    smoothing: float = option(5.0, "the median of that long counts as the charge", unit="s")
     window: float = option(600.0, "over how long the discharge is measured", unit="s")
 
     def check(self) -> Iterator[Finding]:
@@ -65,16 +66,19 @@ class Config:
             yield "'hysteresis' and 'tolerance' must not lie below 0"
         if not 1 <= self.window < np.inf:
             yield "window", "must be 1 s or more"
+        if not 0 <= self.smoothing < np.inf:
+            yield "smoothing", "must be 0 or more"
 
 
 def history_s(config: Config) -> float:
     """Return how far back it looks."""
-    return config.window
+    return max(config.window, config.smoothing)
 
 
 def evaluate(config: Config, inputs: Sequence[Input], now: Now) -> Mapping[str, Any]:
     """Judge the charge, of which one input that shows nonsense takes nothing away."""
-    percent = _percent(config, inputs, now)
+    windows = [Window(one.samples, now, config.smoothing) for one in inputs]
+    percent = _percent(config, [typical(window) for window in windows])
     known = np.logical_or.reduce([one.samples.known(now) for one in inputs])
     plausible = (percent >= -config.tolerance) & (percent <= 100 + config.tolerance)
     good = plausible & (percent >= config.low + config.hysteresis)
@@ -88,18 +92,20 @@ def evaluate(config: Config, inputs: Sequence[Input], now: Now) -> Mapping[str, 
     }
 
 
-def _percent(config: Config, inputs: Sequence[Input], now: Any) -> Any:
-    low, high = middles(np.array([numbers_at(one, now) for one in inputs]))
+def _percent(config: Config, values: Sequence[Any]) -> Any:
+    low, high = middles(np.array(values))
     return ((low + high) / 2 - config.empty) / (config.full - config.empty) * 100
 
 
 def _drain(config: Config, inputs: Sequence[Input], now: Now) -> Any:
-    """Return percent per second: the middle of the older half of the window to the newer's."""
+    """Return percent per second, from the middles of the older and the newer half of a window."""
     ages_ns = np.linspace(config.window * NS, 0, _POINTS).astype(np.int64)
-    percents = _percent(config, inputs, np.atleast_1d(now) - ages_ns[:, None])
+    instants = np.atleast_1d(now) - ages_ns[:, None]
+    percents = _percent(config, [numbers_at(one, instants) for one in inputs])
     older, newer = (np.median(half, axis=0) for half in np.split(percents, 2))
     drop = np.where(older - newer >= _LEAST_DROP, older - newer, np.nan)
-    return (drop / (config.window / 2)).reshape(np.shape(now))[()]
+    apart_s = config.window * (_POINTS / 2) / (_POINTS - 1)
+    return (drop / apart_s).reshape(np.shape(now))[()]
 
 
 def explain(config: Config, results: Mapping[str, Any]) -> str:

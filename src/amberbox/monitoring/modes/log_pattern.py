@@ -20,7 +20,7 @@ ACCEPTS = ("variable",)
 COLUMNS = True
 TIMED = True
 RESULTS = (
-    Result("quiet", "bool", "no bad lines came, or the good ones did"),
+    Result("ok", "bool", "no bad lines came, or enough good ones"),
     Result("lines", "int", "lines that match, within the window", relation="<="),
     Result("last_line", "string", "the last line that matches, within the window"),
 )
@@ -79,11 +79,13 @@ def evaluate(config: Config, inputs: Sequence[Input], now: Now) -> Mapping[str, 
     flags = _matching(config, inputs)
     count = Window(text, now, config.window).sum_of(flags)
     enough = count >= config.count
+    waited = inputs[0].flow.listened(now, config.window)
+    known = (text.last(now) >= 0) & (enough | waited if config.good else True)
     last = np.concatenate([[-1], np.where(flags, np.arange(len(text)), -1)])
     place = np.maximum.accumulate(last)[text.last(now) + 1]
     lines = np.array([*text.values, ""], object)
     return {
-        "quiet": where_known(text.last(now) >= 0, enough if config.good else ~enough),
+        "ok": where_known(known, enough == config.good),
         "lines": count,
         "last_line": lines[np.where(count > 0, place, -1)],
     }
@@ -104,7 +106,7 @@ def _matching(config: Config, inputs: Sequence[Input]) -> Any:
 
 def explain(config: Config, results: Mapping[str, Any]) -> str:
     """Quote the last bad line, or say what has not been read."""
-    if results["quiet"] is not False:
+    if results["ok"] is not False:
         return ""
     if config.good:
         return f"no line with '{config.pattern}' for {config.window:g} s"

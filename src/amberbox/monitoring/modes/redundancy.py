@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from amberbox.core.expression import Expression
-from amberbox.core.mode import Input, Result, where_known
+from amberbox.core.mode import FALSE, Input, Result, where_known
 from amberbox.core.options import option
 from amberbox.core.samples import Now, Window
 from amberbox.core.standins import Finding
@@ -131,15 +131,10 @@ def _judged(config: Config, residual: Any, verdict: str, number: str) -> dict[st
 
 def explain(config: Config, results: Mapping[str, Any]) -> str:
     """Name the members that are off, and how far."""
-    off = {
-        k: results[f"residual_{k}"] for k in _numbers(results) if results[f"member_{k}"] is False
-    }
-    return ", ".join(f"member {k} is off" + _by(far) for k, far in off.items())
-
-
-def _numbers(results: Mapping[str, Any]) -> list[int]:
-    return [int(name.removeprefix("member_")) for name in results if name.startswith("member_")]
+    off = [n for n, value in results.items() if n.startswith("member_") and value == FALSE]
+    names = [name.removeprefix("member_") for name in off]
+    return ", ".join(f"member {k} is off{_by(results[f'residual_{k}'])}" for k in names)
 
 
 def _by(far: float | None) -> str:
-    return " and shows no number" if far is None else f" by {far:.4g}"
+    return " and shows no number" if far is None or np.isnan(far) else f" by {far:.4g}"

@@ -83,4 +83,6 @@ def explain(config: Config, results: Mapping[str, Any]) -> str:
     """Say what the counter is and what it should be."""
     if results["complete"] is not False:
         return ""
-    return f"the working counter is {results['counter']:.0f}, expected {config.expected}"
+    count = results["counter"]
+    shown = "no number" if count is None or np.isnan(count) else f"{count:.0f}"
+    return f"the working counter is {shown}, expected {config.expected}"
