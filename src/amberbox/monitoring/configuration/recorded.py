@@ -6,7 +6,7 @@ import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 from amberbox.blackbox.folder.blocks import SourceBlock
@@ -152,6 +152,7 @@ def _schema(topic: Topic) -> ItemSchema | None:
     return unroller(replace(topic, schema=schema)).schema
 
 
+@lru_cache(maxsize=256)
 def schema_of_type(name: str) -> ItemSchema | None:
     """Return the columns of a standard ROS type such as ``nav_msgs/Odometry``; None for others."""
     package, _, kind = name.replace("/msg/", "/").partition("/")
