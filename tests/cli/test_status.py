@@ -109,6 +109,36 @@ def test_tree_and_what_is_wrong(
     ]
 
 
+def test_documented_overview_is_what_is_shown(
+    store: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    needs = {"navigation": ("localisation", "base"), "localisation": ("laser",)}
+    plan = Plan("ropod_001", "abc", [
+        ComponentPlan(name, name, (), [DependencyPlan(n, component=n) for n in needs.get(name, ())])
+        for name in ("navigation", "localisation", "laser", "base", "wifi")
+    ])  # fmt: skip
+    monkeypatch.setattr("amberbox.cli.status._plan_of", lambda where: plan)
+    _, laser, _ = statuses("error")
+    now_ns = laser.measured_ns
+    well = replace(laser, level="ok", state="nominal", reason="", since_ns=now_ns - 7300 * NS)
+    busy = replace(well, component="navigation", level="warn", state="memory")
+    say(
+        store,
+        replace(busy, reason="memory is 812, expected < 800", since_ns=now_ns - 200 * NS),
+        replace(well, component="localisation", blocked_by=("laser",)),
+        replace(laser, since_ns=now_ns - 12 * NS),
+        replace(well, component="base"),
+        replace(well, component="wifi"),
+        AlarmChange(
+            *("ropod_001", "laser-20261121t140210", "laser", "urgent", "open", "error", GONE),
+            *(now_ns - 12 * NS, now_ns - 12 * NS, 1, "", None, "abc"),
+        ),
+    )
+    main(["status", str(store)])
+    page = (Path(__file__).resolve().parents[2] / "docs" / "status.md").read_text("utf-8")
+    assert f"$ amberbox status ropod_001\n{capsys.readouterr().out}```" in page
+
+
 def test_one_component_in_full(
     store: Path, with_plan: None, capsys: pytest.CaptureFixture[str]
 ) -> None:

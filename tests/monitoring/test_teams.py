@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import threading
 import time
@@ -9,8 +10,10 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import pytest
+import zmq
 
 from amberbox.blackbox.folder.folder import load_folder
 from amberbox.blackbox.store import create_store, open_store
@@ -145,3 +148,32 @@ def test_member_team_and_system(world: Path, capsys: pytest.CaptureFixture[str])
         capsys.readouterr()
         assert main(["status", str(team.folder), "ropod_002"]) == 1
     assert "ropod_002_works" in capsys.readouterr().out
+
+
+def test_watcher_publishes_as_robot_yaml_says(world: Path) -> None:
+    robot = world / "ropod_001"
+    url = f"ipc://{world}/statuses"
+    publish = f'monitoring: {{publish: [{{url: "{url}", every: 0.05}}]}}\n'
+    (robot / "robot.yaml").write_text(f"id: ropod_001\n{publish}")
+    with zmq.Context() as context, context.socket(zmq.SUB) as socket:
+        socket.subscribe(b"")
+        socket.connect(url)
+        with ExitStack() as recorder, watching(robot):
+            recorder.enter_context(recording(robot))
+            hear(socket, True)
+            recorder.close()
+            hear(socket, None)
+
+
+def hear(socket: Any, alive: bool | None) -> None:
+    """Take messages until the base is said to be alive, or that nothing is known of it."""
+    wanted = {
+        "robotId": "ropod_001",
+        "monitorName": "base_heartbeat_monitor",
+        "healthStatus": {"base_alive": alive},
+    }
+    until = time.monotonic() + DEADLINE_S
+    while time.monotonic() < until:
+        if socket.poll(100) and json.loads(socket.recv()) == wanted:
+            return
+    raise TimeoutError(f"nothing is said of base_alive being {alive}")

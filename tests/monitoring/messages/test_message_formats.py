@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, get_args
 
 import msgspec
@@ -37,6 +39,15 @@ def test_paper_message_is_the_one_that_the_paper_prints() -> None:
         b'{"robotId":"ropod_001","monitorName":"laser_device_monitor",'
         b'"healthStatus":{"front_laser_working":true,"rear_laser_working":true}}'
     )
+
+
+def test_documented_messages_are_those_that_are_sent() -> None:
+    page = (Path(__file__).resolve().parents[3] / "docs" / "status.md").read_text("utf-8")
+    said, envelope = map(msgspec.json.decode, re.findall(r"```json\n(.*?)```", page, re.DOTALL))
+    assert said == paper.message(OF_DEVICE, NAMES)
+    (sent,) = health_status.messages([COMPONENT, OF_DEVICE], NAMES)
+    sent["header"] |= {"msgId": "4f0c...", "timestamp": T0_NS / NS + 0.5}
+    assert sent == envelope
 
 
 def test_paper_has_one_message_for_each_mode() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -178,6 +179,17 @@ def test_address_that_is_taken_is_an_error(url: str) -> None:
         with pytest.raises(AmberboxError, match=r"published at tcp://127.0.0.1:5599: Address"):
             other.open()
         assert not other.is_due()
+
+
+def test_documented_entries_are_sound(tmp_path: Path) -> None:
+    page = (Path(__file__).resolve().parents[3] / "docs" / "status.md").read_text("utf-8")
+    (shown,) = re.findall(r"```yaml\n(.*?)```", page, re.DOTALL)
+    (tmp_path / "robot.yaml").write_text(f"id: robot\n{shown}")
+    (tmp_path / "black_box.yaml").write_text("- zmq: {endpoint: tcp://localhost:5555}\n")
+    folder, problems = inspect_folder(tmp_path)
+    assert problems == []
+    assert folder is not None
+    assert [entry.format for entry in folder.robot.monitoring.publish] == ["paper", "health_status"]
 
 
 def folder_problems(folder: Path, monitoring: str) -> list[str]:

@@ -47,6 +47,6 @@ def unknown(statuses: Sequence[Status], now_ns: int, silent_s: float) -> Iterato
     since_ns = now_ns - round(silent_s * 1e9)
     for status in statuses:
         yield replace(
-            status, level="unknown", state="unknown", measured_ns=now_ns, since_ns=since_ns,
-            reason=reason, blocked_by=(), live_only=True,
+            status, level="unknown", state="unknown", outputs=dict.fromkeys(status.outputs),
+            measured_ns=now_ns, since_ns=since_ns, reason=reason, blocked_by=(), live_only=True,
         )  # fmt: skip
