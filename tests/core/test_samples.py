@@ -21,6 +21,13 @@ WINDOW_S = 0.1
 NUMBERS = [0.0, -0.0, 1.0, 2.5, -3.0, 0.1, 1e300, math.nan, math.inf, -math.inf]
 DTYPES = [np.float64, np.float32, np.int64, np.uint8, np.bool_]
 
+
+def above(samples: Samples) -> Any:
+    """One flag per sample; unknown values mean nothing."""
+    flags = samples.values > 1
+    return flags if samples.null is None else flags & ~samples.null
+
+
 Ask = Callable[[Samples, Any], Any]
 ASKED: dict[str, Ask] = {
     "last": lambda s, now: s.since_ns(now),
@@ -34,8 +41,8 @@ ASKED: dict[str, Ask] = {
     "median": lambda s, now: Window(s, now, WINDOW_S).median(),
     "rate": lambda s, now: Window(s, now, WINDOW_S).rate(),
     "changes": lambda s, now: Window(s, now, WINDOW_S).changes(),
-    "sum_of": lambda s, now: Window(s, now, WINDOW_S).sum_of(s.values > 1),
-    "derived": lambda s, now: Window(s.derived(s.values > 1), now, WINDOW_S).mean(),
+    "sum_of": lambda s, now: Window(s, now, WINDOW_S).sum_of(above(s)),
+    "derived": lambda s, now: Window(s.derived(above(s)), now, WINDOW_S).mean(),
 }
 
 
@@ -147,6 +154,23 @@ def test_a_wider_type_comes_later() -> None:
     samples.extend(np.array([1]), np.array([7], np.uint8))
     samples.extend(np.array([2]), np.array([0.5]))
     assert samples.values.tolist() == [7, 0.5]
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.int16, np.float32])
+def test_narrow_numbers_are_held_wide(dtype: type) -> None:
+    samples = Samples()
+    samples.extend(np.array([1, 2]), np.array([3, 200], dtype))
+    assert samples.values.dtype.itemsize == 8
+    assert samples.at(1) - samples.at(2) == -197
+
+
+def test_what_is_unknown_has_no_type() -> None:
+    unknown = np.ma.MaskedArray(np.zeros(1), [True])
+    for columns in ([unknown, np.array([True])], [np.array([True]), unknown]):
+        samples = Samples()
+        for time_ns, column in enumerate(columns):
+            samples.extend(np.array([time_ns]), column)
+        assert samples.values.dtype == bool
 
 
 def test_nothing_is_known_of_no_samples() -> None:

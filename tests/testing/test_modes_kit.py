@@ -197,6 +197,7 @@ def test_inputs_by_hand() -> None:
     assert entry.age_s(at_s(1.75)) == 1.25
     assert entry.rate_hz(at_s(2), 2) == 1
     item = one_input("x", times_s=[0, 1], stamps_s=[5, 6], parts={"ok": [True, None]})
-    assert len(item.samples) == 0
+    assert item.is_item
+    assert not entry.is_item
     assert item.stamps.at(at_s(1)) == at_s(6)
     assert item.part("ok").samples.known(at_s(0, 1)).tolist() == [True, False]

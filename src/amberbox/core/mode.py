@@ -34,6 +34,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cache
+from math import isfinite
 from typing import Any, Literal, Protocol
 
 import numpy as np
@@ -73,7 +75,8 @@ class Input:
 
     ``name`` is its text in the mode file. For a ``list`` the values are the mean of what is
     finite in each row, and ``parts`` has ``count finite min max mean`` of each; for a probe they
-    are its ``ok``, and ``parts`` are all that it measures.
+    are its ``ok``, and ``parts`` are all that it measures. An ``item`` has no values of its own:
+    ``samples`` are then ``flow.rows``, the count of its rows.
     """
 
     name: str
@@ -88,6 +91,11 @@ class Input:
     def at(self, now: Now) -> Any:
         """Return the value at ``now``."""
         return self.samples.at(now)
+
+    @property
+    def is_item(self) -> bool:
+        """Tell whether it is a whole item, which has no values."""
+        return self.samples is self.flow.rows
 
     def over(self, now: Now, seconds: float) -> Window:
         """Return the window of the last ``seconds``."""
@@ -111,6 +119,17 @@ class Evaluate(Protocol):
 
     def __call__(self, config: Any, inputs: Sequence[Input], now: Now) -> Mapping[str, Any]:
         """Return the results by name at ``now``; what is left out is unknown."""
+
+
+@cache
+def as_single(number: float) -> float:
+    """Return a number as single precision has it: most messages hold 0.1 as 0.10000000149.
+
+    Compare with both where a value may lie right on a limit.
+    """
+    with np.errstate(over="ignore"):
+        rounded = float(np.float32(number))
+    return rounded if isfinite(rounded) else float(number)
 
 
 def where_known(known: Any, value: Any) -> Any:

@@ -24,7 +24,11 @@ _ROOM = 64
 
 
 class Samples:
-    """Samples of one variable in order of time; old ones are forgotten when told to."""
+    """Samples of one variable in order of time; old ones are forgotten when told to.
+
+    Numbers are held as int64 or float64 whatever their column had, so that what is computed of
+    them does not depend on it, and nothing runs over.
+    """
 
     __slots__ = ("_end", "_null", "_start", "_times", "_values")
 
@@ -69,6 +73,8 @@ class Samples:
         if not count:
             return
         data, null = _split(values)
+        if null is not None and null.all():
+            data = np.zeros(count, self._values.dtype)
         self._make_room(count, data.dtype)
         if null is not None and self._null is None:
             self._null = np.zeros(len(self._times), bool)
@@ -85,7 +91,11 @@ class Samples:
             if dtype != self._values.dtype:
                 self._values = np.zeros(len(self._times), dtype)
         elif dtype != self._values.dtype:
-            self._values = self._values.astype(_common(dtype, self._values.dtype))
+            null = self.null
+            if null is not None and null.all():
+                self._values = np.zeros(len(self._times), dtype)
+            else:
+                self._values = self._values.astype(_common(dtype, self._values.dtype))
         if self._end + count <= len(self._times):
             return
         kept = slice(self._start, self._end)
@@ -142,11 +152,18 @@ class Samples:
 def _split(values: NDArray[Any]) -> tuple[NDArray[Any], NDArray[np.bool_] | None]:
     if isinstance(values, np.ma.MaskedArray):
         null = np.ma.getmaskarray(values)
-        return np.ma.getdata(values), null if null.any() else None
+        return _wide(np.ma.getdata(values)), null if null.any() else None
     if values.dtype == object:
         null = np.array([value is None for value in values], bool)
         return values, null if null.any() else None
-    return values, None
+    return _wide(values), None
+
+
+def _wide(values: NDArray[Any]) -> NDArray[Any]:
+    kind, size = values.dtype.kind, values.dtype.itemsize
+    if kind == "f" or (kind == "u" and size == 8):
+        return values.astype(np.float64, copy=False)
+    return values.astype(np.int64, copy=False) if kind in "iu" else values
 
 
 def _common(one: np.dtype[Any], other: np.dtype[Any]) -> np.dtype[Any]:

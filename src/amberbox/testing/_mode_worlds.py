@@ -55,6 +55,8 @@ class Given:
         """Return the input before there is any sample."""
         made = Input(self.name)
         made.parts = {n[6:]: Samples() for n in self.series if n.startswith("parts ")}
+        if "samples" not in self.series:
+            made.samples = made.flow.rows
         return made
 
     def whole(self) -> Input:

@@ -57,11 +57,14 @@ def one_input(
 ) -> Input:
     """Make an input by hand: samples at times, None where unknown, messages at the same times.
 
-    ``received_s`` are the times of its messages where these are others than ``times_s``. Without
-    ``values`` it is a whole item, which has none.
+    ``received_s`` are the times of its messages where these are others than ``times_s``. With
+    ``stamps_s`` and no ``values`` it is a whole item.
     """
     made = Input(name, labels=dict(labels or {}))
-    made.samples.extend(_ns(times_s)[: len(values)], _column(values))
+    if len(values):
+        made.samples.extend(_ns(times_s), _column(values))
+    elif stamps_s is not None:
+        made.samples = made.flow.rows
     stamps = np.asarray([T0_NS + round(s * NS) for s in stamps_s or ()], np.int64)
     made.stamps.extend(_ns(times_s)[: len(stamps)], stamps)
     made.parts = {part: Samples() for part in parts or {}}

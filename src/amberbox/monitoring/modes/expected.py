@@ -9,7 +9,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from amberbox.core.mode import Input, Result, where_known
+from amberbox.core.mode import Input, Result, as_single, where_known
 from amberbox.core.options import option
 from amberbox.core.samples import Now
 from amberbox.core.standins import Finding
@@ -69,7 +69,7 @@ def evaluate(config: Config, inputs: Sequence[Input], now: Now) -> Mapping[str, 
     fits = np.reshape([_fits(config, text) for text in texts], values.shape)
     if values.dtype != object:
         for number in (value for value in config.well if not isinstance(value, str)):
-            fits = fits | (values == number)
+            fits = fits | (values == number) | (values == as_single(number))
     shown = np.reshape(np.array(texts, object), values.shape)
     nothing = np.array(None, object)
     return {"as_expected": where_known(known, fits), "value": np.where(known, shown, nothing)[()]}

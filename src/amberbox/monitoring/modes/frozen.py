@@ -81,11 +81,10 @@ def evaluate(config: Config, inputs: Sequence[Input], now: Now) -> Mapping[str, 
     """Look for movement from the value in force when the window began; garbage is none."""
     entry, *others = inputs
     start = now - round(config.window * NS)
-    is_item = entry.samples.last(now) < 0
-    of_values = _spread(entry.samples, config.min, config.max, now, config.window)
-    of_stamps = _spread(entry.stamps, -inf, inf, now, config.window)
-    spread = np.where(is_item, of_stamps, of_values)
-    seen = np.where(is_item, entry.stamps.last(start), entry.samples.last(start)) >= 0
+    low, high = (-inf, inf) if entry.is_item else (config.min, config.max)
+    samples = entry.stamps if entry.is_item else entry.samples
+    spread = _spread(samples, low, high, now, config.window)
+    seen = samples.last(start) >= 0
     still = np.where(_should_move(config, others, now), FALSE, HOLD)
     moving = np.where(spread > config.tolerance, TRUE, np.where(seen, still, UNKNOWN))
     return {"moving": moving, "spread": spread}

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from amberbox.core.clock import NS
-from amberbox.core.mode import Input, Result, where_known
+from amberbox.core.mode import Input, Result, as_single, where_known
 from amberbox.core.options import option
 from amberbox.core.samples import Now
 from amberbox.core.standins import Finding
@@ -85,9 +85,10 @@ def evaluate(config: Config, inputs: Sequence[Input], now: Now) -> Mapping[str, 
 def _in_values(config: Config, entry: Input) -> tuple[Any, Any]:
     """Return for each sample whether it is known (1 or 0), and whether it is garbage."""
     values, null = entry.samples.values, entry.samples.null
-    good = np.isfinite(values) & (values >= config.min) & (values <= config.max)
+    low, high = min(config.min, as_single(config.min)), max(config.max, as_single(config.max))
+    good = np.isfinite(values) & (values >= low) & (values <= high)
     if config.allowed:
-        good &= np.logical_or.reduce([values == value for value in config.allowed])
+        good &= np.isin(values, [*config.allowed, *map(as_single, config.allowed)])
     if config.mask is not None:
         good &= _whole(values) & ~config.mask == 0
     known = np.ones(len(values), bool) if null is None else ~null
@@ -98,7 +99,8 @@ def _in_lists(config: Config, entry: Input) -> tuple[Any, Any]:
     """Return for each row how long the list is, and how much of it is garbage at least."""
     columns = (entry.parts[name].column() for name in ("count", "finite", "min", "max"))
     count, finite, low, high = (np.ma.filled(column, np.nan) for column in columns)
-    outside = (low < config.min).astype(np.int64) + (high > config.max)
+    least, greatest = as_single(config.min), as_single(config.max)
+    outside = (low < min(config.min, least)).astype(np.int64) + (high > max(config.max, greatest))
     length, good = np.maximum(_whole(count), 0), np.maximum(_whole(finite), 0)
     return length, np.clip(length - good + outside, 0, length)
 

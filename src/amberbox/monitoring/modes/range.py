@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from amberbox.core.mode import Input, Result, where_known, with_hysteresis
+from amberbox.core.mode import Input, Result, as_single, where_known, with_hysteresis
 from amberbox.core.options import option
 from amberbox.core.samples import Now
 from amberbox.core.standins import Finding
@@ -59,7 +59,8 @@ def evaluate(config: Config, inputs: Sequence[Input], now: Now) -> Mapping[str, 
     """Compare the last value with the limits."""
     (variable,) = inputs
     value, known = variable.at(now), variable.samples.known(now)
-    inside = (value >= config.min) & (value <= config.max)
-    well = (value >= config.min + config.hysteresis) & (value <= config.max - config.hysteresis)
+    low, high = min(config.min, as_single(config.min)), max(config.max, as_single(config.max))
+    inside = (value >= low) & (value <= high)
+    well = (value >= low + config.hysteresis) & (value <= high - config.hysteresis)
     in_range = where_known(known, with_hysteresis(well, ~inside))
     return {"in_range": in_range, "value": np.where(known, value, np.nan)}
