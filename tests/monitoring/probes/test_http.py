@@ -65,3 +65,8 @@ def test_a_name_without_an_address_is_unknown() -> None:
 def test_what_is_no_address_is_refused(subject: str) -> None:
     with pytest.raises(UsageError, match="no address"):
         measure(subject)
+
+
+def test_an_address_with_a_password_is_refused() -> None:
+    with pytest.raises(UsageError, match="with a password is not asked"):
+        measure("http://admin:secret@localhost/")

@@ -98,7 +98,7 @@ def answers(*given: float | OSError) -> Callable[[int], float]:
 
 
 def test_the_mean_is_of_the_answers_and_losses_are_counted() -> None:
-    found = repeated(answers(0.010, TimeoutError(), 0.030))
+    found = repeated(answers(0.010, TimeoutError(), 0.030), 0)
     assert found["ok"] is True
     assert found["latency_ms"] == pytest.approx(20)
     assert found["loss_percent"] == pytest.approx(100 / 3)
@@ -113,7 +113,7 @@ def test_the_mean_is_of_the_answers_and_losses_are_counted() -> None:
     ],
 )
 def test_a_host_out_of_reach_is_not_ok(error: OSError, text: str) -> None:
-    found = repeated(answers(error, error, error))
+    found = repeated(answers(error, error, error), 0)
     assert (found["ok"], found["error"], found["loss_percent"]) == (False, text, 100.0)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from amberbox.core.errors import UsageError
@@ -25,6 +26,7 @@ def measure(subject: str) -> Measured:
     """Measure over one second; ok says only that it could be measured."""
     stat = Path("/proc/stat")
     before = stat.read_text()
+    _core(subject, _times(before))
     time.sleep(_WINDOW_S)
     return judge(subject, before, stat.read_text(), Path("/proc/loadavg").read_text())
 
@@ -32,11 +34,8 @@ def measure(subject: str) -> Measured:
 def judge(subject: str, before: str, after: str, loadavg: str) -> Measured:
     """Compare two looks at ``/proc/stat``."""
     first, last = _times(before), _times(after)
-    name = "cpu" if subject in ("", "all") else subject
-    if name not in first or name not in last:
-        known = ", ".join(core for core in last if core != "cpu")
-        raise UsageError(f"there is no core '{subject}'", f"known: all, {known}")
-    spent = [b - a for a, b in zip(first[name], last[name], strict=True)]
+    core = _core(subject, first)
+    spent = [b - a for a, b in zip(first[core], last[_core(subject, last)], strict=True)]
     idle = spent[_IDLE] + spent[_WAITING]
     whole = sum(spent)
     return {
@@ -45,6 +44,14 @@ def judge(subject: str, before: str, after: str, loadavg: str) -> Measured:
         "load_1m": float(loadavg.split()[0]),
         "cores": len(last) - 1,
     }
+
+
+def _core(subject: str, times: Mapping[str, Sequence[int]]) -> str:
+    name = "cpu" if subject in ("", "all") else subject
+    if name not in times:
+        known = ", ".join(core for core in times if core != "cpu")
+        raise UsageError(f"there is no core '{subject}'", f"known: all, {known}")
+    return name
 
 
 def _times(stat: str) -> dict[str, list[int]]:

@@ -58,13 +58,13 @@ def split(subject: str) -> tuple[str, int | None]:
     return found["v6"] or found["host"], int(found["port"]) if found["port"] else None
 
 
-def repeated(ask: Callable[[int], float]) -> Measured:
+def repeated(ask: Callable[[int], float], pause_s: float = _PAUSE_S) -> Measured:
     """Ask several times for how long it took, in seconds; OSError is a loss."""
     times_s: list[float] = []
     error = ""
     for number in range(_COUNT):
         if number:
-            time.sleep(_PAUSE_S)
+            time.sleep(pause_s)
         try:
             times_s.append(ask(number))
         except OSError as refused:
@@ -104,7 +104,7 @@ def by_program(ping: Sequence[str], address: str) -> Measured:
     """Let the given program ``ping`` do it; raise AmberboxError if it cannot."""
     command = [*ping, "-n", "-c", str(_COUNT), "-i", f"{_PAUSE_S:g}", "-W", "1", address]
     try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=4 * _WAIT_S)
+        done = subprocess.run(command, capture_output=True, text=True, timeout=3 * _WAIT_S)
     except FileNotFoundError as error:
         what = "this user may send no echo, and there is no program ping"
         raise AmberboxError(f"{what}; name a port instead: HOST:PORT") from error

@@ -18,7 +18,7 @@ PERIOD_S = 2.0
 
 _ASKED = "LoadState,ActiveState,SubState,NRestarts"
 _ACTIVE = ("active", "reloading", "refreshing")
-_WAIT_S = 4.0
+_WAIT_S = 3.0
 
 
 def measure(subject: str) -> Measured:

@@ -1,0 +1,24 @@
+"""The probes of ROS 1 against a real master and a real node that is killed."""
+
+from __future__ import annotations
+
+import signal
+
+from amberbox.monitoring.probes import ros_master, ros_node, ros_topic
+from amberbox.testing.realros import Ros, end, wait_until
+
+
+def test_a_node_that_is_killed_is_seen_though_the_master_still_lists_it(ros: Ros) -> None:
+    address = f"127.0.0.1:{ros.port}"
+    assert ros_master.measure(address)["ok"] is False
+    ros.master()
+    assert ros_master.measure(address)["ok"] is True
+    assert ros_node.measure(f"/robot@{address}")["registered"] is False
+    robot = ros.robot("--topics", "odom")
+    wait_until(lambda: ros_topic.measure(f"/robot/odom@{address}")["ok"], 15, "odom is published")
+    found = ros_node.measure(f"/robot@{address}")
+    assert found == {"ok": True, "registered": True, "answers": True}
+    end(robot, signal.SIGKILL)
+    dead = ros_node.measure(f"/robot@{address}")
+    assert (dead["ok"], dead["registered"], dead["answers"]) == (False, True, False)
+    assert ros_topic.measure(f"/robot/odom@{address}")["publishers"] == 1, "as the master has it"
