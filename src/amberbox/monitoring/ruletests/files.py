@@ -13,6 +13,7 @@ from amberbox.core.nodes import Node
 from amberbox.core.options import option
 from amberbox.core.standins import Finding
 from amberbox.core.types import Level
+from amberbox.monitoring.ruletests.notation import Series
 
 PATTERN = "*.test.yaml"
 
@@ -69,9 +70,13 @@ class RuleTest:
 
     test: str = option(doc="what is tested, in a few words")
     interval: float | None = option(None, "time from one value to the next", unit="s")
-    series: Mapping[str, Any] = option({}, "values by variable, item or input")
-    received: Mapping[str, Any] = option({}, "messages received in each interval, by item")
-    stamps: Mapping[str, Any] = option({}, "own stamps of an item's rows, s after the first value")
+    series: Mapping[str, Series | Mapping[str, Series]] = option(
+        {}, "values by variable, item or input"
+    )
+    received: Mapping[str, Series] = option({}, "messages received in each interval, by item")
+    stamps: Mapping[str, Series] = option(
+        {}, "own stamps of an item's rows, s after the first value"
+    )
     lost: Sequence[Loss] = option((), "publishers that are lost")
     expect: Sequence[ExpectedStatus] = option((), "statuses at times")
     transitions: Sequence[ExpectedTransition] | None = option(None, "changes that must come")
@@ -103,10 +108,16 @@ class RuleFile:
 
 
 class Rules(NamedTuple):
-    """A file that has been read: what it says, and where it says it."""
+    """A file that has been read: what it says, where it says it, and the folder it is for."""
 
     file: RuleFile
     node: Node
+    folder: Path
+
+    @property
+    def mode(self) -> Node | None:
+        """The mode that the file brings along; None if it tests those of its robot."""
+        return (self.node.mapping or {}).get("mode")
 
     def places(self, test: int, key: str = "") -> list[Node]:
         """Return the nodes of the entries of a list in a test; without a key, of the test."""
@@ -127,11 +138,11 @@ class Found:
     problems: list[Problem] = field(default_factory=list)
 
 
-def read_rules(path: Path, name: str, problems: list[Problem]) -> Rules | None:
+def read_rules(path: Path, name: str, folder: Path, problems: list[Problem]) -> Rules | None:
     """Read one file, called ``name`` in messages; None if anything is wrong with it."""
     node = load_yaml(path, problems, name)
     built = build(RuleFile, node, problems) if node is not None else None
-    return Rules(built, node) if built is not None and node is not None else None
+    return Rules(built, node, folder) if built is not None and node is not None else None
 
 
 def find_rules(folder: Path, skip: Path | None = None) -> Found:
@@ -140,7 +151,7 @@ def find_rules(folder: Path, skip: Path | None = None) -> Found:
     for path in sorted(folder.rglob(PATTERN)):
         if skip is not None and path.is_relative_to(skip):
             continue
-        rules = read_rules(path, str(path.relative_to(folder)), found.problems)
+        rules = read_rules(path, str(path), folder, found.problems)
         found.rules += [rules] if rules is not None else []
     return found
 

@@ -6,6 +6,7 @@ import json
 import math
 import re
 from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Any, Final
 
 from amberbox.core.errors import UsageError
@@ -30,6 +31,18 @@ class Absent:
 
 
 ABSENT: Final = Absent()
+
+
+@dataclass(frozen=True, slots=True)
+class Series:
+    """Values, one for each interval; ``ABSENT`` where no message comes."""
+
+    values: tuple[Any, ...]
+
+    @classmethod
+    def from_text(cls, text: str) -> Series:
+        """Read the notation; raise UsageError for what cannot be read."""
+        return cls(tuple(read_series(text)))
 
 
 def read_series(text: str) -> list[Any]:

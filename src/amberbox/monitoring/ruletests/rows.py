@@ -16,7 +16,7 @@ from amberbox.core.names import identifier
 from amberbox.core.types import Batch, Column, ColumnData, IntArray, ItemSchema, Ragged
 from amberbox.monitoring.plan import InputPlan, Plan
 from amberbox.monitoring.ruletests.files import Loss, RuleTest
-from amberbox.monitoring.ruletests.notation import ABSENT, read_series, shown
+from amberbox.monitoring.ruletests.notation import ABSENT, Series, shown
 
 START_NS = 1_790_000_000 * NS
 """When the first value comes."""
@@ -89,7 +89,7 @@ def incoming(test: RuleTest, interval_s: float, plan: Plan) -> Incoming:
         found.received[_item(name, by_text)] = _counts_of(name, written)
     for name, written in test.stamps.items():
         item = _item(name, by_text)
-        found.stamps[item] = _values(name, written)
+        found.stamps[item] = list(written.values)
         found.items[item].setdefault("", found.stamps[item])
     found.losses = [
         Loss(_item(loss.item, by_text), loss.at, loss.until, loss.reason) for loss in test.lost
@@ -100,13 +100,13 @@ def incoming(test: RuleTest, interval_s: float, plan: Plan) -> Incoming:
 def _add_series(found: Incoming, name: str, written: Any, by_text: Mapping[str, InputPlan]) -> None:
     entry = by_text.get(name)
     item, variable = _place(name, entry)
-    if not isinstance(written, Mapping):
-        found.items[item][variable] = _values(name, written)
+    if isinstance(written, Series):
+        found.items[item][variable] = list(written.values)
         return
     if variable and (entry is None or entry.kind != "probe"):
         raise UsageError(f"{name} is a variable, not an item", f"name the item: {item}")
     for column, values in written.items():
-        found.items[item][column] = _values(f"{name} {column}", values)
+        found.items[item][column] = list(values.values)
 
 
 def _place(name: str, entry: InputPlan | None) -> tuple[str, str]:
@@ -127,16 +127,6 @@ def _item(name: str, by_text: Mapping[str, InputPlan]) -> str:
     return _place(name, by_text.get(name))[0]
 
 
-def _values(name: str, written: Any) -> list[Any]:
-    if isinstance(written, list):
-        return list(written)
-    text = written if isinstance(written, str) else shown(written)
-    try:
-        return read_series(text)
-    except UsageError as error:
-        raise UsageError(f"{name}: {error.what}", error.hint) from error
-
-
 def _padded(values: list[Any], count: int) -> list[Any]:
     return values + [ABSENT] * (count - len(values))
 
@@ -145,8 +135,8 @@ def _known(value: Any) -> Any:
     return None if value is ABSENT else value
 
 
-def _counts_of(name: str, written: Any) -> list[Any]:
-    counts = _values(name, written)
+def _counts_of(name: str, written: Series) -> list[Any]:
+    counts = list(written.values)
     for count in counts:
         if count is not ABSENT and (not isinstance(count, int) or count < 0):
             raise UsageError(f"{name}: messages are counted, {shown(count)} is no count")
@@ -186,7 +176,7 @@ def _batch(
     stamp: str = "",
     children: Mapping[str, Batch] | None = None,
 ) -> Batch:
-    made = {name: _column(name, values) for name, values in columns.items()}
+    made = {name: column_of(name, values) for name, values in columns.items()}
     schema = ItemSchema(
         "rule test", tuple(Column(n, n, kind) for n, (kind, _) in made.items()), stamp=stamp
     )
@@ -196,7 +186,7 @@ def _batch(
     )  # fmt: skip
 
 
-def _column(name: str, values: Sequence[Any]) -> tuple[str, ColumnData]:
+def column_of(name: str, values: Sequence[Any]) -> tuple[str, ColumnData]:
     """Return the type and data of a column; raise UsageError if its values are of several types."""
     known = [value for value in values if value is not None]
     if all(isinstance(value, bool) for value in known):

@@ -12,6 +12,7 @@ from amberbox.core.types import Status
 from amberbox.monitoring.engine.engine import Engine
 from amberbox.monitoring.engine.findings import TICK_NS, Finding
 from amberbox.monitoring.plan import Plan
+from amberbox.monitoring.ruletests.bench import COMPONENT, bench_plan
 from amberbox.monitoring.ruletests.comparing import Outcome, component_and_mode, differences
 from amberbox.monitoring.ruletests.files import (
     ExpectedAlarm,
@@ -26,7 +27,15 @@ from amberbox.monitoring.ruletests.rows import START_NS, Incoming, incoming
 
 def run_rules(rules: Rules, plan: Plan) -> list[Problem]:
     """Run every test of a file; return what is not as expected, each with its line."""
-    return [
+    problems: list[Problem] = []
+    if rules.mode is not None:
+        plan, problems = bench_plan(rules.mode, rules.file, rules.folder)
+        mode = plan.components[0].modes[0].id
+        of = rules.file.of or f"{COMPONENT}/{mode}"
+        rules = rules._replace(file=replace(rules.file, of=of))
+    if any(problem.is_error for problem in problems):
+        return problems
+    return problems + [
         problem
         for number in range(len(rules.file.tests))
         for problem in _run_test(rules, number, plan)
