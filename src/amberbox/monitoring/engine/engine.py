@@ -41,6 +41,7 @@ class Engine:
         self.history_s = max((table.keep_ns / NS for table in self._tables), default=1.0)
         self._until_ns = 0
         self._forgot_ns = 0
+        self._began_ns: int | None = None
         self._pending: list[Finding] = []
         self._given_up: list[Found] = []
         self._view = _View(plan, self._outputs)
@@ -70,7 +71,13 @@ class Engine:
         for group in self._groups:
             group.forget()
         self._until_ns = self._forgot_ns = at_ns // TICK_NS * TICK_NS
+        self._listen_since(self._until_ns)
         self._pending += self.states.begin(self._until_ns)
+
+    def _listen_since(self, began_ns: int | None) -> None:
+        self._began_ns = began_ns
+        for table in self._tables:
+            table.flow.began_ns = began_ns
 
     def feed(self, batch: Batch) -> None:
         """Take rows of any item; its log times must not decrease from batch to batch."""
@@ -126,6 +133,7 @@ class Engine:
         return {
             "version": 1,
             "until_ns": self._until_ns,
+            "began_ns": self._began_ns,
             "tables": tables,
             "runs": runs,
             "states": self.states.snapshot(),
@@ -137,6 +145,7 @@ class Engine:
         The rows of the last ``history_s`` before it, and all after it, have to be fed again.
         """
         self._until_ns = self._forgot_ns = int(snapshot["until_ns"])
+        self._listen_since(snapshot["began_ns"])
         for table in self._tables:
             if table.item in snapshot["tables"]:
                 table.resume(snapshot["tables"][table.item])

@@ -15,7 +15,7 @@ from amberbox.core.expression_values import element_of
 from amberbox.core.mode import Input
 from amberbox.core.names import identifier
 from amberbox.core.samples import NONE_OPEN, Flow, Samples
-from amberbox.core.types import Batch, IntArray, Ragged
+from amberbox.core.types import Batch, IntArray, ItemSchema, Ragged
 from amberbox.monitoring.engine.lists import FIGURES, figures_of
 from amberbox.monitoring.plan import InputPlan
 
@@ -37,9 +37,12 @@ class Table:
     lists: dict[str, Mapping[str, Samples]] = field(default_factory=dict)
     whole: dict[str, Samples] | None = None
     """All columns, where they are wanted."""
+    labels: dict[str, dict[int, str]] = field(default_factory=dict)
+    """Names that the message gives values of the columns that are read."""
     keep_ns: int = NS
     fresh: list[IntArray] = field(default_factory=list)
     """Times of rows that no instant has been evaluated for yet."""
+    _schema: ItemSchema | None = None
     _gaps: dict[tuple[str, int], int] = field(default_factory=dict)
     _held_ns: dict[str, int] = field(default_factory=dict)
     """Up to when everything is held already, after ``resume``: such rows come again."""
@@ -53,6 +56,7 @@ class Table:
         if not len(times_ns):
             return
         self._count_rows(times_ns)
+        self._take_labels(batch.schema)
         if batch.schema.stamp:
             self.stamps.extend(times_ns, _part(batch.timestamp_ns, keep))
         for key, samples in self.columns.items():
@@ -69,6 +73,14 @@ class Table:
         rows = self.flow.rows
         before = int(rows.values[-1]) if len(rows) else 0
         rows.extend(times_ns, np.arange(before + 1, before + 1 + len(times_ns)))
+
+    def _take_labels(self, schema: ItemSchema) -> None:
+        if schema is self._schema:
+            return
+        self._schema = schema
+        for column in schema.columns:
+            if column.name in self.labels:
+                self.labels[column.name].update(column.labels)
 
     def _column(self, batch: Batch, name: str, index: int | None) -> Any:
         column = batch.columns.get(name)
@@ -145,7 +157,8 @@ class Table:
         self._gaps = {(peer, from_ns): from_ns for peer, from_ns in snapshot["gaps"]}
         if self.whole is not None:
             names = [n.removeprefix("whole ") for n in snapshot["held"] if n.startswith("whole ")]
-            self.whole.update({name: Samples() for name in names})
+            for name in names:  # inputs hold on to those that are there
+                self.whole.setdefault(name, Samples())
         for name, samples in self.samples():
             held = snapshot["held"].get(name)
             if held is not None:
@@ -234,7 +247,8 @@ class Tables:
 def _variable(plan: InputPlan, table: Table, parts: bool) -> Input:
     key = (plan.variable, plan.index)
     samples = table.columns.setdefault(key, Samples())
-    return Input(plan.text, samples, table.flow, table.stamps)
+    labels = table.labels.setdefault(plan.variable, {})
+    return Input(plan.text, samples, table.flow, table.stamps, labels=labels)
 
 
 def _list(plan: InputPlan, table: Table, parts: bool) -> Input:
