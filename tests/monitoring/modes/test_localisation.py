@@ -61,10 +61,8 @@ def test_a_kidnapped_robot_is_seen_as_its_variance_grows() -> None:
 
 
 def test_explanation() -> None:
-    results = mode.evaluate(Config(), three(0.1, 0.1, 0.1), at_s(0)) | {"localised": False}
-    text = mode.explain(
-        Config(), {name: getattr(v, "item", lambda v=v: v)() for name, v in results.items()}
-    )
+    uncertain = dict.fromkeys(("variance_x", "variance_y", "variance_theta"), 0.1)
+    text = mode.explain(Config(), {"localised": False, **uncertain})
     assert text == "the mean variance is 0.1, less than 0.01 expected"
     missing: dict[str, Any] = {"variance_x": None, "variance_y": 1.0, "variance_theta": 1.0}
     assert mode.explain(Config(), {"localised": False, **missing}) == "a variance is no number"

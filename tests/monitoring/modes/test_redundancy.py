@@ -185,7 +185,7 @@ def test_generated_barometers_agree_until_one_drifts() -> None:
     columns[1][100:] += np.linspace(0, 40, 100)
     for column in columns:
         column[50] = 0.0  # a frame of zeros, as the bus gives where a slave is late
-    inputs = [one_input(times_s=np.arange(200) / 7, values=c) for c in columns]
+    inputs = [one_input(times_s=[k / 7 for k in range(200)], values=c) for c in columns]
     instants = inputs[0].samples.times_ns
     found = members(Config(threshold=10.0, window=1.0), inputs, instants)
     assert [FALSE in verdicts for verdicts in found] == [False, True, False, False]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,10 +17,9 @@ from amberbox.testing.modes import assert_mode_contract, at_s, one_input
 NOMINAL = Config(expected=12)
 
 
-def verdicts(config: Config, counts: list[int], at: object) -> list[int]:
-    entry = one_input(times_s=np.arange(len(counts)) / 10, values=counts)
-    found: list[int] = np.asarray(mode.evaluate(config, [entry], at)["complete"]).tolist()
-    return found
+def verdicts(config: Config, counts: list[int], at: Any) -> Any:
+    entry = one_input(times_s=[k / 10 for k in range(len(counts))], values=counts)
+    return np.asarray(mode.evaluate(config, [entry], at)["complete"]).tolist()
 
 
 def test_contract() -> None:
@@ -29,7 +29,7 @@ def test_contract() -> None:
 
 def test_one_bad_sample_is_forgiven_and_two_in_a_row_are_not() -> None:
     counts = [12, 6, 12, 6, 6, 6, 12, 12]
-    at = at_s(*(np.arange(8) / 10))
+    at = at_s(*(k / 10 for k in range(8)))
     assert verdicts(NOMINAL, counts, at) == [1, 1, 1, 1, 0, 0, 1, 1]
     assert verdicts(Config(expected=12, samples=1), counts, at) == [1, 0, 1, 0, 0, 0, 1, 1]
     assert verdicts(Config(expected=12, samples=3), counts, at) == [1, 1, 1, 1, 1, 0, 1, 1]
@@ -87,6 +87,6 @@ def test_the_one_low_counter_among_182_real_samples_is_forgiven(
 
 def test_a_dead_slave_is_found_within_two_cycles() -> None:
     counts = [12] * 50 + [9] * 20
-    entry = one_input(times_s=np.arange(70) / 7, values=counts)
+    entry = one_input(times_s=[k / 7 for k in range(70)], values=counts)
     found = mode.evaluate(NOMINAL, [entry], entry.samples.times_ns)["complete"]
     assert np.flatnonzero(found == FALSE).tolist() == list(range(51, 70))

@@ -12,7 +12,7 @@ import numpy as np
 
 from amberbox.core.mode import Input, Result, where_known
 from amberbox.core.options import option
-from amberbox.core.samples import Now, Window
+from amberbox.core.samples import Now, Samples, Window
 from amberbox.core.standins import Finding
 from amberbox.core.together import numbers
 
@@ -98,10 +98,18 @@ def _matching(config: Config, inputs: Sequence[Input]) -> Any:
     flags = np.array(found, bool)
     if len(inputs) < 2:
         return flags
-    levels = inputs[1].samples
-    same = len(levels) == len(lines)
-    level = numbers(levels.values if same else levels.at(lines.times_ns))
-    return flags & (level >= config.level)
+    return flags & (_levels(lines, inputs[1].samples) >= config.level)
+
+
+def _levels(lines: Samples, levels: Samples) -> Any:
+    """Return the level of each line: of several at one time the first belongs to the first."""
+    times = lines.times_ns
+    rank = np.arange(len(times)) - times.searchsorted(times)
+    place = levels.times_ns.searchsorted(times) + rank
+    at_once = np.append(levels.times_ns, -1)[np.minimum(place, len(levels))] == times
+    last = levels.times_ns.searchsorted(times, "right") - 1
+    place = np.where(at_once, place, last)
+    return np.append(numbers(levels.values), np.nan)[place]
 
 
 def explain(config: Config, results: Mapping[str, Any]) -> str:
