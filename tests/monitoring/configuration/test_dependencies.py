@@ -189,16 +189,20 @@ def test_parts(tmp_path: Path) -> None:
 
 def test_recovery(tmp_path: Path) -> None:
     recovery = """\
-ros: {monitor: ros/nodes, monitored_parameter: planner, restart: ros.service, component_type: systemd}
+ros:
+    monitor: ros/nodes
+    monitored_parameter: planner
+    restart: ros.service
+    component_type: systemd
 rso: {monitor: ros/nodes, monitored_parameter: planning, restart: ros.service}
 x: {monitor: ros/knots, restrat: x}
 """
     plan, problems = plan_of(tmp_path, ROS | {"sub/recovery_config.yaml": recovery})
     assert errors(problems) == [
-        "sub/recovery_config.yaml:2: rso: there is no component 'rso'; did you mean 'ros'?",
-        "sub/recovery_config.yaml:2: rso.monitored_parameter: ros/nodes has no output "
+        "sub/recovery_config.yaml:6: rso: there is no component 'rso'; did you mean 'ros'?",
+        "sub/recovery_config.yaml:6: rso.monitored_parameter: ros/nodes has no output "
         "'planning'; did you mean 'planner'?",
-        "sub/recovery_config.yaml:3: x: unknown key 'restrat'; did you mean 'restart'?",
+        "sub/recovery_config.yaml:7: x: unknown key 'restrat'; did you mean 'restart'?",
     ]
     assert "not carried out" in notes(problems)[0]
     assert component(plan, "ros").recovery_actions == (

@@ -83,10 +83,8 @@ def test_texts_that_mean_nothing_or_too_much(tmp_path: Path, text: str, what: st
 
 
 def test_two_matches_are_an_error(tmp_path: Path) -> None:
-    black_box = (
-        BLACK_BOX + "- zmq:\n    endpoint: tcp://localhost:5555\n    topics: [{name: odom}]\n"
-    )
-    _, problems = mode_of(tmp_path, ITEM.format(text="odom"), black_box)
+    other = "- zmq:\n    endpoint: tcp://localhost:5555\n    topics: [{name: odom}]\n"
+    _, problems = mode_of(tmp_path, ITEM.format(text="odom"), BLACK_BOX + other)
     assert errors(problems) == [
         "mode.yaml:4: mappings[0].inputs[0]: 'odom' is ambiguous: ros_odom or zmq_odom"
     ]

@@ -174,7 +174,7 @@ def test_a_monitor_of_the_robot_s_own(tmp_path: Path) -> None:
     ("code", "what"),
     [
         (
-            "class Config: ...\ndef evaluate(): ...\nimport nothing_of_the_kind\n",
+            "class Config: ...\ndef evaluate(): ...\nimport no_such_thing\n",
             "cannot be loaded",
         ),
         ("class Config: ...\ndef evaluate(): ...\n1 / 0\n", "ZeroDivisionError"),

@@ -132,13 +132,12 @@ mappings:
     assert (output.expectation.value, output.severity) == (False, "critical")
     assert (output.for_s, output.heal_s, output.flaps, output.flap_s) == (0.5, 120.0, 3, 10.0)
     assert (output.description, output.hint) == ("it lives", "look at it")
-    for wrong, where in (
-        ("for: -1", "for_s"),
-        ("name: a/b", "name"),
-        ("expected: 0.9", "expected"),
-    ):
-        key = wrong.partition(":")[0]
-        old = next(line.strip() for line in text.splitlines()[6:] if line.strip().startswith(key))
-        _, problems = mode_of(tmp_path, text.replace(old, wrong))
+    wrongs = {
+        "for: 500 ms": "for: -1",
+        "name: alive": "name: a/b",
+        "expected: false": "expected: 0",
+    }
+    for right, wrong in wrongs.items():
+        _, problems = mode_of(tmp_path, text.replace(right, wrong))
         (error,) = errors(problems)
-        assert f"mappings[0].outputs[0].{where}: " in error or "outputs[0].for: " in error
+        assert f": mappings[0].outputs[0].{right.partition(':')[0]}" in error

@@ -1,0 +1,114 @@
+"""``amberbox check`` judges component and mode files, and shows what would be monitored."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import socket
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from amberbox.cli.main import main
+
+EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "laser"
+RULES = """\
+of: laser/laser_heartbeat_monitor
+tests:
+  - test: scans come
+    interval: 100 ms
+    received: {/scan_front: 1x100}
+    expect:
+      - {at: 5, level: LEVEL}
+"""
+
+
+@pytest.fixture(autouse=True)
+def no_sockets(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Make every socket an error."""
+
+    def refuse(*arguments: Any, **more: Any) -> None:
+        raise AssertionError("check opened a socket")
+
+    monkeypatch.setattr(socket.socket, "__init__", refuse)
+
+
+@pytest.fixture
+def laser(tmp_path: Path) -> Path:
+    """The paper's laser."""
+    shutil.copytree(EXAMPLE, tmp_path / "laser")
+    return tmp_path / "laser"
+
+
+def test_what_would_be_monitored(laser: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["check", str(laser)]) == 0
+    text = capsys.readouterr().out
+    assert "would monitor: 1 component, 2 modes, 2 outputs, 1 probe\n" in text
+    lines = [line.split() for line in text.splitlines()]
+    assert ["laser", "laser_device_monitor", "device", "-", "front_laser_working"] in lines
+    assert ["laser_heartbeat_monitor", "heartbeat", "front_laser_working"] in lines
+    assert text.endswith("laser: fine\n")
+
+
+def test_as_data(laser: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["check", str(laser), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)["monitoring"]
+    assert found["counts"] == {
+        "components": 1,
+        "not_monitored": 0,
+        "modes": 2,
+        "broken": 0,
+        "outputs": 2,
+        "probes": 1,
+    }
+    assert found["probes"] == [
+        {
+            "kind": "path_exists",
+            "subject": "/dev/front_laser",
+            "item": "probe_path_exists_dev_front_laser",
+        }
+    ]
+    (component,) = found["components"]
+    device, heartbeat = component["modes"]
+    assert (device["monitor"], heartbeat["monitor"]) == ("device", "heartbeat")
+    assert heartbeat["inputs"][0]["item"] == "ros_scan_front"
+    assert heartbeat["outputs"][0]["expected"] == "true"
+
+
+def test_what_is_wrong(laser: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    heartbeat = laser / "components" / "laser" / "heartbeat.yaml"
+    heartbeat.write_text(heartbeat.read_text().replace("expected: true", "expected: 0.9"))
+    component = laser / "components" / "laser.yaml"
+    component.write_text(component.read_text().replace("[]", "[power]"))
+    assert main(["check", str(laser)]) == 2
+    text = capsys.readouterr().out
+    assert f"{heartbeat}:10: mappings[0].outputs[0].expected: a bool is true or false" in text
+    assert f"{component}:4: dependencies: there is no component 'power'" in text
+    assert "2 modes (1 that cannot run)" in text
+    assert "would record:" in text, "the recording is not affected"
+    assert text.endswith(f"{laser}: 2 errors, 0 notes\n")
+
+
+def test_a_folder_without_components(laser: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    shutil.rmtree(laser / "components")
+    assert main(["check", str(laser)]) == 0
+    assert "would monitor" not in capsys.readouterr().out
+
+
+def test_recovery_actions_are_shown(laser: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    component = laser / "components" / "laser.yaml"
+    component.write_text(component.read_text() + "recovery_actions: [restart]\n")
+    assert main(["check", str(laser)]) == 0
+    text = capsys.readouterr().out
+    assert "recovery actions, not carried out:\n  laser  restart\n" in text
+
+
+@pytest.mark.parametrize(("level", "code"), [("ok", 0), ("error", 2)])
+def test_rule_tests_run(
+    laser: Path, capsys: pytest.CaptureFixture[str], level: str, code: int
+) -> None:
+    (laser / "components" / "laser.test.yaml").write_text(RULES.replace("LEVEL", level))
+    assert main(["check", str(laser)]) == code
+    text = capsys.readouterr().out
+    assert ("laser.test.yaml:7: test 'scans come'" in text) == (code == 2)
