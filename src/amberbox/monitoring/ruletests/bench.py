@@ -57,10 +57,11 @@ class _Told(Recorded):
 def _items(file: RuleFile) -> Iterator[Item]:
     columns: dict[str, dict[str, str]] = defaultdict(dict)
     for test in file.tests:
-        for name, written in test.series.items():
+        for name, series in test.series.items():
             item, _, variable = name.strip("/").partition(".")
-            if isinstance(written, Series) or not variable:
-                columns[item] |= dict(_types(variable, written))
+            columns[item] |= dict(_types({variable: series}))
+        for item, rows in test.rows.items():
+            columns[item.strip("/")] |= dict(_types(rows))
         for name in (*test.received, *test.stamps, *(loss.item for loss in test.lost)):
             columns[name.strip("/")] |= {}
     for name, types in columns.items():
@@ -70,8 +71,8 @@ def _items(file: RuleFile) -> Iterator[Item]:
             yield Item(name, "", f"/{name}", TopicOptions(name), schema)
 
 
-def _types(variable: str, written: Series | Mapping[str, Series]) -> Iterator[tuple[str, str]]:
-    """Yield the columns that a series gives its item, with their types."""
-    for name, series in ({variable: written} if isinstance(written, Series) else written).items():
+def _types(columns: Mapping[str, Series]) -> Iterator[tuple[str, str]]:
+    """Yield columns with their types."""
+    for name, series in columns.items():
         with suppress(UsageError):  # said when the test runs
             yield name, column_of(name, [v for v in series.values if v is not ABSENT])[0]

@@ -70,8 +70,9 @@ class RuleTest:
 
     test: str = option(doc="what is tested, in a few words")
     interval: float | None = option(None, "time from one value to the next", unit="s")
-    series: Mapping[str, Series | Mapping[str, Series]] = option(
-        {}, "values by variable, item or input"
+    series: Mapping[str, Series] = option({}, "values by variable, item or input")
+    rows: Mapping[str, Mapping[str, Series]] = option(
+        {}, "values of several columns of an item, or of what a probe measures"
     )
     received: Mapping[str, Series] = option({}, "messages received in each interval, by item")
     stamps: Mapping[str, Series] = option(

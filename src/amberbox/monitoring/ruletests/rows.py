@@ -83,8 +83,12 @@ def incoming(test: RuleTest, interval_s: float, plan: Plan) -> Incoming:
     """Read what a test says that comes in; raise UsageError with what cannot be read."""
     found = Incoming(round(interval_s * NS))
     by_text = {entry.text: entry for entry in plan.inputs()}
-    for name, written in test.series.items():
-        _add_series(found, name, written, by_text)
+    for name, series in test.series.items():
+        item, variable = _place(name, by_text.get(name))
+        found.items[item][variable] = list(series.values)
+    for name, columns in test.rows.items():
+        for column, series in columns.items():
+            found.items[_item(name, by_text)][column] = list(series.values)
     for name, written in test.received.items():
         found.received[_item(name, by_text)] = _counts_of(name, written)
     for name, written in test.stamps.items():
@@ -95,18 +99,6 @@ def incoming(test: RuleTest, interval_s: float, plan: Plan) -> Incoming:
         Loss(_item(loss.item, by_text), loss.at, loss.until, loss.reason) for loss in test.lost
     ]
     return found
-
-
-def _add_series(found: Incoming, name: str, written: Any, by_text: Mapping[str, InputPlan]) -> None:
-    entry = by_text.get(name)
-    item, variable = _place(name, entry)
-    if isinstance(written, Series):
-        found.items[item][variable] = list(written.values)
-        return
-    if variable and (entry is None or entry.kind != "probe"):
-        raise UsageError(f"{name} is a variable, not an item", f"name the item: {item}")
-    for column, values in written.items():
-        found.items[item][column] = list(values.values)
 
 
 def _place(name: str, entry: InputPlan | None) -> tuple[str, str]:

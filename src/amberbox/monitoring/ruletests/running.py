@@ -48,7 +48,8 @@ def _run_test(rules: Rules, number: int, plan: Plan) -> list[Problem]:
     unknown = list(_unknown_names(rules, number, test, plan))
     if unknown:
         return unknown
-    plan = _part_of(plan, {component_and_mode(entry.of)[0] for entry in _entries(test)})
+    named = {component_and_mode(entry.of)[0] for entry in _entries(test)}
+    plan = _part_of(plan, named) if named else plan
     try:
         rows = incoming(test, test.interval or rules.file.interval, plan)
         outcome = _run(test, rows, plan)
