@@ -186,7 +186,7 @@ def test_what_is_published_is_recorded_by_a_box_elsewhere(folder: Path, tmp_path
     finally:
         process.send_signal(signal.SIGINT)
         _, errors = process.communicate(timeout=10)
-    assert errors == f"1 probes, published at {address}; only this computer can read them\n"
+    assert errors == f"1 probe, published at {address}; only this computer can read them\n"
     assert process.returncode == 0
     with amberbox.open(box) as record:
         assert record.query(item).columns["ok"][0] == np.False_

@@ -160,7 +160,8 @@ def _publish(
 ) -> None:
     with Publisher(args.publish) as publisher:
         who = "whoever reaches this computer" if is_open(args.publish) else "only this computer"
-        text = f"{len(orders)} probes, published at {publisher.endpoint}; {who} can read them"
+        count = f"{len(orders)} probe{'s' if len(orders) > 1 else ''}"
+        text = f"{count}, published at {publisher.endpoint}; {who} can read them"
         print(text, file=sys.stderr, flush=True)
 
         def put(order: ProbeOrder, row: Row) -> None:
