@@ -7,6 +7,7 @@ instant; samples after it do not count.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, TypeAlias
 
@@ -191,11 +192,11 @@ class Window:
 
     def min(self) -> Any:
         """Return the least value."""
-        return self._reduced("min") + 0.0  # which of 0 and -0 is less depends on their places
+        return self._extreme("min", np.min)
 
     def max(self) -> Any:
         """Return the greatest value."""
-        return self._reduced("max") + 0.0
+        return self._extreme("max", np.max)
 
     def mean(self) -> Any:
         """Return the mean."""
@@ -246,6 +247,16 @@ class Window:
         times = self.samples.times_ns
         return times.searchsorted(after, "right"), times.searchsorted(until, "right")
 
+    def _extreme(self, name: str, function: Callable[[NDArray[Any]], Any]) -> Any:
+        """Return the least or greatest value; adding 0 takes the sign of -0 away."""
+        if np.ndim(self.now):
+            return self._reduced(name) + 0.0
+        first, end = (int(bound[0]) for bound in self._bounds())
+        values, null = self.samples.values[first:end], self.samples.null
+        if null is not None:
+            values = values[~null[first:end]]
+        return np.float64(function(values.astype(np.float64)) if len(values) else np.nan) + 0.0
+
     def _reduced(self, name: str) -> Any:
         times, values = self.samples.times_ns, self.samples.values
         null = self.samples.null
@@ -284,11 +295,13 @@ class Flow:
         """Return when the last message known of at ``now`` was received; -1 before the first."""
         seen = _held(self.rows, now, self.rows.times_ns, -1)
         counted = _held(self.last_ns, now, self.last_ns.values, -1)
-        return np.maximum(seen, counted)
+        return max(seen, counted) if np.ndim(now) == 0 else np.maximum(seen, counted)
 
     def age_s(self, now: Now) -> Any:
         """Return for how long nothing has been received; infinite before the first message."""
         last_ns = self.last_received_ns(now)
+        if np.ndim(now) == 0:
+            return max(now - last_ns, 0) / NS if last_ns >= 0 else np.inf
         ages = np.maximum(now - last_ns, 0) / NS
         return np.where(last_ns >= 0, ages, np.inf)[()]
 
@@ -298,6 +311,8 @@ class Flow:
         Less is looked at where less is known; NaN before anything is.
         """
         counted = _rate(self.received, now, seconds)
+        if np.ndim(now) == 0:
+            return counted if counted == counted else _rate(self.rows, now, seconds)
         return np.where(np.isnan(counted), _rate(self.rows, now, seconds), counted)[()]
 
     def reaches_back(self, now: Now, seconds: float) -> Any:
@@ -322,7 +337,9 @@ def _held(samples: Samples, now: Now, values: NDArray[Any], missing: int) -> Any
     if not len(samples):
         return missing if np.ndim(now) == 0 else np.full(np.shape(now), missing, np.int64)
     last = samples.last(now)
-    return np.where(last >= 0, values[last], missing)[()]
+    if np.ndim(now) == 0:
+        return int(values[last]) if last >= 0 else missing
+    return np.where(last >= 0, values[last], missing)
 
 
 def _rate(counts: Samples, now: Now, seconds: float) -> Any:
@@ -330,9 +347,20 @@ def _rate(counts: Samples, now: Now, seconds: float) -> Any:
     if not len(counts):
         return np.nan if np.ndim(now) == 0 else np.full(np.shape(now), np.nan)
     before = now - round(seconds * NS)
+    if np.ndim(now) == 0:
+        return _rate_at(counts, int(now), int(before))
     first, last = np.maximum(counts.last(before), 0), counts.last(now)
     began = np.maximum(before, counts.times_ns[first])
     elapsed_s = (now - began) / NS
     grown = (counts.values[last] - counts.values[first]).astype(np.float64)
     known = (last >= 0) & (elapsed_s > 0)
-    return np.where(known, grown / np.where(known, elapsed_s, 1.0), np.nan)[()]
+    return np.where(known, grown / np.where(known, elapsed_s, 1.0), np.nan)
+
+
+def _rate_at(counts: Samples, now: int, before: int) -> float:
+    """Return the same for one instant, without the cost of arrays."""
+    first, last = max(int(counts.last(before)), 0), int(counts.last(now))
+    began = max(before, int(counts.times_ns[first]))
+    if last < 0 or now <= began:
+        return np.nan
+    return float(counts.values[last] - counts.values[first]) / ((now - began) / NS)

@@ -78,7 +78,8 @@ def history_s(config: Config) -> float:
 def evaluate(config: Config, inputs: Sequence[Input], now: Now) -> Mapping[str, Any]:
     """Judge the last message's age, and the rate once there has been a whole window of them."""
     (item,) = inputs
-    age_s, heard = item.age_s(now), np.isfinite(item.age_s(now))
+    age_s = item.age_s(now)
+    heard = np.isfinite(age_s)
     whole = item.flow.reaches_back(now, config.window)
     rate_hz = np.where(whole, item.rate_hz(now, config.window), np.nan)
     alive = (age_s <= config.max_age) & ~(rate_hz < config.least_hz)
