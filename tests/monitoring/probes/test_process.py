@@ -69,7 +69,7 @@ def test_a_busy_script_is_found_by_its_file_or_command_line(tmp_path: Path, star
     assert find(PROC, "*planner_amber.py --name amber_?") == [busy.pid]
     assert find(PROC, "planner_amber") == []
     assert find(PROC, "amber_x") == [], "an argument is no name"
-    assert measure("planner_amber.py")["cpu_percent"] > 10
+    assert measure("planner_amber.py")["cpu_percent"] > 2
 
 
 def test_a_process_that_is_dead_but_not_buried_does_not_count(start: Start) -> None:

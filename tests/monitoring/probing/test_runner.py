@@ -111,6 +111,7 @@ def test_a_probe_that_hangs_says_so_at_its_period_and_disturbs_nobody(
     rows, file = Rows(), tmp_path / "there"
     orders = [ProbeOrder("hanging", str(file)), ProbeOrder("counting", "a")]
     runner = ProbeRunner(orders, rows.put, [probes])
+    start_s = time.monotonic()
     runner.start()
     rows.wait(lambda: len(rows.of("hanging")) == 4)
     counted = len(rows.of("counting"))
@@ -122,8 +123,8 @@ def test_a_probe_that_hangs_says_so_at_its_period_and_disturbs_nobody(
     text = "hangs for 0.15 s or longer"
     assert silent[:4] == [{"subject": str(file), "ok": None, "error": text, "n": None}] * 4
     first_s = next(at_s for at_s, order, _ in rows.all if order.kind == "hanging")
-    assert first_s - rows.all[0][0] >= 0.1
-    assert counted >= 5
+    assert first_s - start_s >= 0.15
+    assert counted >= 2
     assert len(Path(f"{file}.looks").read_text()) >= 2
 
 
