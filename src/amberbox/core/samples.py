@@ -24,6 +24,11 @@ Now: TypeAlias = "int | IntArray"
 _ROOM = 64
 
 
+def is_one(now: Now) -> bool:
+    """Tell whether one instant is meant."""
+    return not isinstance(now, np.ndarray)
+
+
 class Samples:
     """Samples of one variable in order of time; old ones are forgotten when told to.
 
@@ -142,11 +147,11 @@ class Samples:
         times = self.times_ns if len(self) else np.zeros(1, np.int64)
         return times[self.last(now)]
 
-    def derived(self, values: NDArray[Any]) -> Samples:
+    def derived(self, values: NDArray[Any], null: NDArray[np.bool_] | None = None) -> Samples:
         """Return samples at the same times with other values, one for each of these."""
-        made = Samples()
-        made._times, made._end = self.times_ns, len(self)
-        made._values, made._null = _split(values)
+        made = Samples.__new__(Samples)
+        made._times, made._start, made._end = self.times_ns, 0, len(self)
+        made._values, made._null = values, null
         return made
 
 
@@ -249,7 +254,7 @@ class Window:
 
     def _extreme(self, name: str, function: Callable[[NDArray[Any]], Any]) -> Any:
         """Return the least or greatest value; adding 0 takes the sign of -0 away."""
-        if np.ndim(self.now):
+        if not is_one(self.now):
             return self._reduced(name) + 0.0
         first, end = (int(bound[0]) for bound in self._bounds())
         values, null = self.samples.values[first:end], self.samples.null
@@ -266,7 +271,7 @@ class Window:
         return self._shaped(np.where(found.null, np.nan, found.data))
 
     def _shaped(self, column: NDArray[Any]) -> Any:
-        return column[0] if np.ndim(self.now) == 0 else column
+        return column[0] if is_one(self.now) else column
 
 
 NONE_OPEN = 1 << 62
@@ -295,12 +300,12 @@ class Flow:
         """Return when the last message known of at ``now`` was received; -1 before the first."""
         seen = _held(self.rows, now, self.rows.times_ns, -1)
         counted = _held(self.last_ns, now, self.last_ns.values, -1)
-        return max(seen, counted) if np.ndim(now) == 0 else np.maximum(seen, counted)
+        return max(seen, counted) if is_one(now) else np.maximum(seen, counted)
 
     def age_s(self, now: Now) -> Any:
         """Return for how long nothing has been received; infinite before the first message."""
         last_ns = self.last_received_ns(now)
-        if np.ndim(now) == 0:
+        if is_one(now):
             return max(now - last_ns, 0) / NS if last_ns >= 0 else np.inf
         ages = np.maximum(now - last_ns, 0) / NS
         return np.where(last_ns >= 0, ages, np.inf)[()]
@@ -311,7 +316,7 @@ class Flow:
         Less is looked at where less is known; NaN before anything is.
         """
         counted = _rate(self.received, now, seconds)
-        if np.ndim(now) == 0:
+        if is_one(now):
             return counted if counted == counted else _rate(self.rows, now, seconds)
         return np.where(np.isnan(counted), _rate(self.rows, now, seconds), counted)[()]
 
@@ -335,9 +340,9 @@ class Flow:
 def _held(samples: Samples, now: Now, values: NDArray[Any], missing: int) -> Any:
     """Return the value of the last sample at ``now``, or ``missing`` before the first."""
     if not len(samples):
-        return missing if np.ndim(now) == 0 else np.full(np.shape(now), missing, np.int64)
+        return missing if is_one(now) else np.full(np.shape(now), missing, np.int64)
     last = samples.last(now)
-    if np.ndim(now) == 0:
+    if is_one(now):
         return int(values[last]) if last >= 0 else missing
     return np.where(last >= 0, values[last], missing)
 
@@ -345,9 +350,9 @@ def _held(samples: Samples, now: Now, values: NDArray[Any], missing: int) -> Any
 def _rate(counts: Samples, now: Now, seconds: float) -> Any:
     """Return how much a growing count has grown per second; NaN where nobody can know."""
     if not len(counts):
-        return np.nan if np.ndim(now) == 0 else np.full(np.shape(now), np.nan)
+        return np.nan if is_one(now) else np.full(np.shape(now), np.nan)
     before = now - round(seconds * NS)
-    if np.ndim(now) == 0:
+    if is_one(now):
         return _rate_at(counts, int(now), int(before))
     first, last = np.maximum(counts.last(before), 0), counts.last(now)
     began = np.maximum(before, counts.times_ns[first])

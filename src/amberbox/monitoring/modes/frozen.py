@@ -94,7 +94,7 @@ def _spread(samples: Samples, low: float, high: float, now: Now, seconds: float)
     """Return greatest less least value, NaN where all is garbage."""
     values, null = samples.values.astype(np.float64), samples.null
     bad = ~np.isfinite(values) | (values < low) | (values > high)
-    good = samples.derived(np.ma.MaskedArray(values, bad if null is None else bad | null))
+    good = samples.derived(values, bad if null is None else bad | null)
     start, window = now - round(seconds * NS), Window(good, now, seconds)
     held = np.where(good.known(start), good.at(start), np.nan)
     return np.fmax(window.max(), held) - np.fmin(window.min(), held) + 0.0
