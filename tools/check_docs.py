@@ -21,12 +21,30 @@ from tools.markdown import anchors, links, pages
 INTERNAL = ("docs/design.md", "docs/notes/", "CHANGELOG.md")
 """Pages for those who build Amberbox: what is only mentioned there is not documented."""
 
+MODES = ("amberbox.monitoring.modes", ("Config", "evaluate"))
+PROBES = ("amberbox.monitoring.probes", ("MEASURES", "SUBJECT", "measure"))
+MODES_PAGE = "docs/modes.md"
+
 
 def check(root: Path) -> list[Finding]:
     """Return what the pages below ``root`` leave out, and their links that lead nowhere."""
     text = documentation(root)
     missing = [finding for finding, pattern in _to_document() if not re.search(pattern, text, re.M)]
-    return missing + [finding for page in pages(root) for finding in broken_links(page, root)]
+    links_to_nothing = [finding for page in pages(root) for finding in broken_links(page, root)]
+    return [*missing, *arguments_left_out(root), *links_to_nothing]
+
+
+def arguments_left_out(root: Path) -> Iterator[Finding]:
+    """Yield arguments of monitors that their own section of the page leaves out."""
+    page = root / MODES_PAGE
+    text = page.read_text(encoding="utf-8") if page.exists() else ""
+    found = re.findall(r"^## (\w+)\n(.*?)(?=^## |\Z)", text, re.MULTILINE | re.DOTALL)
+    sections = dict(found)
+    for name, plugin in find(MODES[0], defines=MODES[1]).items():
+        for field in dataclasses.fields(plugin.load().Config):
+            if not re.search(_as_code(field.name), sections.get(name, ""), re.MULTILINE):
+                what = f"argument '{field.name}' of the monitor '{name}'"
+                yield _undocumented(plugin, what)
 
 
 def documentation(root: Path) -> str:
@@ -55,6 +73,9 @@ def _to_document() -> Iterator[tuple[Finding, str]]:
         yield _undocumented(verb, f"command 'amberbox {name}'"), rf"\bamberbox {re.escape(name)}\b"
     for name, plugin in find("amberbox.blackbox.sources", defines=("Config", "Source")).items():
         yield _undocumented(plugin, f"source '{name}'"), _as_code(name)
+    for kind, (package, names) in {"monitor": MODES, "probe": PROBES}.items():
+        for name, plugin in find(package, defines=names).items():
+            yield _undocumented(plugin, f"{kind} '{name}'"), rf"{_as_code(name)}|^## {name}$"
     for module, name, key in configuration_keys():
         path = Path(inspect.getsourcefile(module) or "")
         finding = Finding(_shown(path, ROOT), 0, f"key '{key}' of {name} is not documented")

@@ -58,6 +58,8 @@ def test_broken_links_are_found(tmp_path: Path, text: str, complaint: str | None
 def test_what_is_not_documented_is_found(tmp_path: Path) -> None:
     found = " ".join(finding.what for finding in check(tmp_path))
     assert "command 'amberbox record'" in found
+    assert "monitor 'heartbeat' is not documented" in found
+    assert "argument 'tolerance' of the monitor 'heartbeat' is not documented" in found
     assert "source 'ros'" in found
     assert "key 'max_frequency' of TopicOptions" in found
 
