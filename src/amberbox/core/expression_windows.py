@@ -26,7 +26,7 @@ def count(times_ns: IntArray, flags: NDArray[np.bool_], after: IntArray, until: 
 def reduce_windows(
     name: str, times_ns: IntArray, samples: Floats, after: IntArray, until: IntArray
 ) -> Values:
-    """Apply ``min max mean median std rate`` to the samples of each window; null without any."""
+    """Apply ``min max mean std rate`` to the samples of each window; null where there are none."""
     first, last = _bounds(times_ns, after, until)
     if name == "rate":
         return _rate(times_ns, samples, first, last)
@@ -77,13 +77,6 @@ def _std(samples: Floats, first: IntArray, last: IntArray) -> Floats:
     return deviations
 
 
-def _median(samples: Floats, first: IntArray, last: IntArray) -> Floats:
-    """Median of what is a number; NaN where nothing is."""
-    parts = [samples[a:b] for a, b in zip(first.tolist(), last.tolist(), strict=True)]
-    known = (part[~np.isnan(part)] for part in parts)
-    return np.array([np.median(part) if len(part) else np.nan for part in known])
-
-
 def _rate(times_ns: IntArray, samples: Floats, first: IntArray, last: IntArray) -> Values:
     """Change per second between the first and the last sample of each window."""
     data = np.zeros(len(first))
@@ -101,5 +94,4 @@ _REDUCE: dict[str, Callable[[Floats, IntArray, IntArray], Floats]] = {
     "max": lambda samples, first, last: _segments(np.maximum, samples, first, last),
     "mean": _mean,
     "std": _std,
-    "median": _median,
 }

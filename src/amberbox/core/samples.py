@@ -207,10 +207,6 @@ class Window:
         """Return the mean."""
         return self._reduced("mean")
 
-    def median(self) -> Any:
-        """Return the median of what is a number."""
-        return self._reduced("median")
-
     def std(self) -> Any:
         """Return the population standard deviation."""
         return self._reduced("std")

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from amberbox.core.clock import NS
 from amberbox.core.expression import Expression
 from amberbox.core.mode import Input
-from amberbox.core.samples import Now, Samples, Window
+from amberbox.core.samples import Now
 from amberbox.core.types import IntArray
 
 
@@ -85,25 +85,38 @@ def middles(values: NDArray[np.float64]) -> tuple[Any, Any]:
     return low, high
 
 
-def typical(window: Window) -> Any:
-    """Return the median of a window, or the last sample where the window has none."""
-    known = window.samples.known(window.now)
-    last = np.where(known, window.samples.at(window.now), np.nan)
-    return np.where(window.count() > 0, window.median(), last)[()]
+def medians(times_ns: IntArray, rows: NDArray[np.float64], now: Now, seconds: float) -> Any:
+    """Return the median of each row over the ``seconds`` before each instant.
+
+    ``rows`` have a value for each time. NaN does not count; where a window is empty the last
+    value before it does, and without any it is NaN. The result has the shape of ``now`` for each
+    row.
+    """
+    until = np.atleast_1d(np.asarray(now, np.int64))
+    ends = times_ns.searchsorted(until, "right")
+    starts = np.minimum(times_ns.searchsorted(until - round(seconds * NS), "right"), ends - 1)
+    found = np.full((len(until), len(rows)), np.nan)
+    for place, (start, end) in enumerate(zip(starts.tolist(), ends.tolist(), strict=True)):
+        if end:
+            found[place] = _median(rows[:, start:end])
+    return found.T.reshape(len(rows), *np.shape(now))
 
 
-def worst_of(values: Sequence[Any], limit: float) -> Any:
+def _median(rows: NDArray[np.float64]) -> Any:
+    """Return the median of each row, which has one column at least; infinity counts, NaN not."""
+    ordered = np.sort(rows, axis=1)
+    count = np.count_nonzero(~np.isnan(ordered), axis=1)
+    which = np.arange(len(rows))
+    low = ordered[which, (count - 1) // 2]
+    high = ordered[which, np.minimum(count // 2, rows.shape[1] - 1)]
+    return np.where(low == high, low, (low + high) / 2)
+
+
+def worst_of(values: NDArray[np.float64], limit: float) -> Any:
     """Return the greatest number; NaN where something is unknown and all the rest within limits."""
     greatest = np.fmax.reduce(values)
     unknown = np.isnan(values).any(axis=0) & (greatest <= limit)
     return np.where(unknown, np.nan, greatest)[()]
-
-
-def samples_of(times_ns: IntArray, values: NDArray[Any]) -> Samples:
-    """Make samples of what has been computed."""
-    samples = Samples()
-    samples.extend(times_ns, values)
-    return samples
 
 
 def _is_place(name: str) -> bool:

@@ -11,9 +11,9 @@ import numpy as np
 from amberbox.core.clock import NS
 from amberbox.core.mode import Input, Result, where_known, with_hysteresis
 from amberbox.core.options import option
-from amberbox.core.samples import Now, Window
+from amberbox.core.samples import Now
 from amberbox.core.standins import Finding
-from amberbox.core.together import middles, numbers_at, typical
+from amberbox.core.together import medians, middles, numbers_at, sample_times
 
 ACCEPTS = ("variable",)
 COLUMNS = True
@@ -77,8 +77,9 @@ def history_s(config: Config) -> float:
 
 def evaluate(config: Config, inputs: Sequence[Input], now: Now) -> Mapping[str, Any]:
     """Judge the charge, of which one input that shows nonsense takes nothing away."""
-    windows = [Window(one.samples, now, config.smoothing) for one in inputs]
-    percent = _percent(config, [typical(window) for window in windows])
+    times_ns = sample_times(inputs, now, config.smoothing)
+    shown = _percent(config, [numbers_at(one, times_ns) for one in inputs])
+    (percent,) = medians(times_ns, shown[None], now, config.smoothing)
     known = np.logical_or.reduce([one.samples.known(now) for one in inputs])
     plausible = (percent >= -config.tolerance) & (percent <= 100 + config.tolerance)
     good = plausible & (percent >= config.low + config.hysteresis)

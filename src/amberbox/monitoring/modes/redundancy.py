@@ -12,17 +12,16 @@ import numpy as np
 from amberbox.core.expression import Expression
 from amberbox.core.mode import FALSE, Input, Result, where_known
 from amberbox.core.options import option
-from amberbox.core.samples import Now, Window
+from amberbox.core.samples import Now
 from amberbox.core.standins import Finding
 from amberbox.core.together import (
     by_name,
+    medians,
     middles,
     numbers_at,
     place_name,
     reads_of,
     sample_times,
-    samples_of,
-    typical,
     value_of,
     worst_of,
 )
@@ -101,15 +100,14 @@ def evaluate(config: Config, inputs: Sequence[Input], now: Now) -> Mapping[str, 
     times_ns = sample_times(named.values(), now, config.window)
     places = _members(config, len(inputs) - len(reads(config)))
     values = np.array([numbers_at(named[place_name(place)], times_ns) for place in places])
-    found: dict[str, Any] = {}
-    residuals = []
-    for k in range(len(places)):
-        should = _should_be(config, named, times_ns, values, k)
-        off = np.where(np.isnan(values[k]), inf, np.min(np.abs(values[k] - should), axis=0))
-        off = np.where(np.isnan(should[0]), np.nan, off)
-        residuals.append(typical(Window(samples_of(times_ns, off), now, config.window)))
-        found |= _judged(config, residuals[k], f"member_{k + 1}", f"residual_{k + 1}")
-    return found | _judged(config, worst_of(residuals, config.threshold), "agree", "residual")
+    should = _should_be(config, named, times_ns, values)
+    off = np.where(np.isnan(values), inf, np.min(np.abs(values - should), axis=0))
+    off = np.where(np.isnan(should[0]), np.nan, off)
+    residuals = medians(times_ns, off, now, config.window)
+    found = _judged(config, worst_of(residuals, config.threshold), "agree", "residual")
+    for k, residual in enumerate(residuals, 1):
+        found |= _judged(config, residual, f"member_{k}", f"residual_{k}")
+    return found
 
 
 def _members(config: Config, inputs: int) -> list[int]:
@@ -117,11 +115,12 @@ def _members(config: Config, inputs: int) -> list[int]:
     return [place for place in range(inputs) if place_name(place) not in named]
 
 
-def _should_be(config: Config, named: Any, times_ns: Any, values: Any, k: int) -> Any:
-    """Return what a member should be; of two middle siblings the nearer one counts."""
+def _should_be(config: Config, named: Any, times_ns: Any, values: Any) -> Any:
+    """Return what each member should be; of two middle siblings the nearer one will count."""
     if config.formula is not None:
-        return value_of(config.formula, named, times_ns)[None]
-    return np.array(middles(np.delete(values, k, axis=0)))
+        return np.broadcast_to(value_of(config.formula, named, times_ns), (1, *values.shape))
+    others = [[k for k in range(len(values)) if k != own] for own in range(len(values))]
+    return np.array(middles(values[np.array(others, int).T]))
 
 
 def _judged(config: Config, residual: Any, verdict: str, number: str) -> dict[str, Any]:
