@@ -1,0 +1,95 @@
+"""Monitors of the simulated robot: complete, quiet while all is well, right about faults."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from amberbox.core.plugins import find as find_plugins
+from amberbox.core.types import Status
+from amberbox.monitoring.plan import Plan
+from amberbox.sim import Robot, catalogue
+from tests.sim.monitored import FAULT_S, alarms, failures, find, plan_of, with_fault
+
+INITIALISED_S = 16.0
+SAMPLE = {  # fault: seconds until its component must have an alarm
+    "wheel_rear_left_phase_open": 20.0,
+    "wheel_front_right_encoder_stuck": 3.0,
+    "wheel_front_left_power_stage_trips": 3.0,
+    "wheel_rear_right_bus_disconnected": 3.0,
+    "laser_front_frozen": 3.0,
+    "imu_mount_loose": 20.0,
+    "battery_charger_contact": 6.0,
+    "localisation_shift": 2.0,
+    "wifi_congested": 8.0,
+    "task_executor_crash": 7.0,
+    "host_clock_jump": 2.0,
+    "e_stop_line_loose": 3.0,
+}
+
+
+@pytest.fixture(scope="module")
+def plan(tmp_path_factory: pytest.TempPathFactory) -> Plan:
+    loaded, problems = plan_of(tmp_path_factory.mktemp("robot") / "r")
+    assert problems == []
+    return loaded
+
+
+def test_the_configuration_is_complete_and_asks_no_probe(plan: Plan) -> None:
+    outputs = [o for _, mode in plan.modes() for m in mode.mappings for o in m.outputs]
+    assert len(outputs) >= 40 and not plan.probes()
+    assert not [mode.problem for _, mode in plan.modes() if mode.problem]
+    assert {fault.component for fault in catalogue().values()} <= {c.id for c in plan.components}
+    assert all(component.modes and component.description for component in plan.components)
+    assert all(mode.description for _, mode in plan.modes())
+
+
+def test_every_alarm_says_what_to_do_or_what_it_is(plan: Plan) -> None:
+    silent = [
+        f"{component.id}/{mode.id}/{output.name}"
+        for component, mode in plan.modes()
+        for mapping in mode.mappings
+        for output in mapping.outputs
+        if output.type == "bool" and not (output.hint or output.description or mode.description)
+    ]
+    assert silent == []
+
+
+def test_it_shows_a_good_part_of_the_modes(plan: Plan) -> None:
+    used = {Path(str(mode.module.__file__)).stem for _, mode in plan.modes() if mode.module}
+    known = set(find_plugins("amberbox.monitoring.modes", defines=("Config", "evaluate")))
+    assert used <= known
+    assert len(used) >= 12, f"not shown: {sorted(known - used)}"
+
+
+@pytest.mark.parametrize(
+    ("scenario", "seed", "seconds"),
+    [("transport", 7, 240.0), ("charging", 5, 40.0), ("standing", 5, 30.0)],
+)
+def test_nothing_is_wrong_with_a_sound_robot(
+    plan: Plan, scenario: str, seed: int, seconds: float
+) -> None:
+    messages = list(Robot(seed, scenario=scenario).step_until(seconds))
+    findings = find(plan, messages, seconds - 1)
+    assert alarms(findings) == {}
+    assert [transition.text for transition in failures(findings)] == []
+    statuses = {s.component: s for s in findings if isinstance(s, Status) and not s.mode}
+    assert {s.level for s in statuses.values()} == {"ok"} and len(statuses) == len(plan.components)
+    assert all(s.since_ns - messages[0][1] <= INITIALISED_S * 1e9 for s in statuses.values())
+
+
+@pytest.mark.parametrize("fault", SAMPLE)
+def test_a_fault_is_found_where_it_is(plan: Plan, fault: str) -> None:
+    within_s = SAMPLE[fault]
+    findings = find(plan, with_fault(fault, within_s + 1), FAULT_S + within_s)
+    opened = alarms(findings)
+    assert all(at_s > FAULT_S for at_s in opened.values())
+    assert list(opened) == [catalogue()[fault].component]
+
+
+def test_what_depends_on_a_fault_is_blocked_and_has_no_alarm(plan: Plan) -> None:
+    findings = find(plan, with_fault("wheel_rear_right_bus_disconnected", 12), FAULT_S + 10)
+    assert list(alarms(findings)) == ["bus"]
+    blocked = {t.component: t.blocked_by for t in failures(findings) if not t.mode}
+    assert blocked["wheel_rear_right"] == ("bus",)
