@@ -27,7 +27,8 @@ machine. It may also define
 - ``reads(config)``: further addresses that it reads; they follow the inputs of the mapping;
 - ``probe_of(config, text)``: kind and subject of the probe that an input means which is no
   recorded variable; without it ``PROBE`` is the kind and the text is the subject;
-- ``explain(config, results)``: one sentence on why the results are not as they should be.
+- ``explain(config, results)``: one sentence on why the results are not as they should be; bools
+  that are not known are None there, numbers NaN.
 """
 
 from __future__ import annotations

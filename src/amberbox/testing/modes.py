@@ -232,7 +232,7 @@ class _Check:
     def _known(self, name: str, value: Any) -> Any:
         if self.declared[name].type == "bool":
             return None if value in (UNKNOWN, HOLD) else bool(value)
-        return None if isinstance(value, float) and np.isnan(value) else value
+        return value
 
 
 def _row(results: Mapping[str, Any], row: int) -> dict[str, Any]:

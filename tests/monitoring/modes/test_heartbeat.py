@@ -73,7 +73,7 @@ def test_one_message_more_or_less_in_the_window_is_no_fault() -> None:
 def test_explanations() -> None:
     stopped = {"alive": False, "age_s": 3.21, "rate_hz": 0.0}
     assert heartbeat.explain(TEN, stopped) == "no message for 3.2 s"
-    assert heartbeat.explain(TEN, {**stopped, "age_s": None}) == "no message at all"
+    assert heartbeat.explain(TEN, {**stopped, "age_s": np.nan}) == "no message at all"
     slow = {"alive": False, "age_s": 0.1, "rate_hz": 4.0}
     assert heartbeat.explain(TEN, slow) == "4 messages per second, 10 expected"
     assert heartbeat.explain(TEN, {**slow, "alive": True}) == ""

@@ -95,6 +95,6 @@ def explain(config: Config, results: Mapping[str, Any]) -> str:
     age_s, rate_hz = results["age_s"], results["rate_hz"]
     if results["alive"] is not False:
         return ""
-    if age_s is None or age_s > config.max_age:
-        return "no message at all" if age_s is None else f"no message for {age_s:.1f} s"
+    if not age_s <= config.max_age:
+        return "no message at all" if np.isnan(age_s) else f"no message for {age_s:.1f} s"
     return f"{rate_hz:.3g} messages per second, {config.rate:g} expected"
