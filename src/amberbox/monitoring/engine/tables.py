@@ -23,7 +23,7 @@ COUNTERS = identifier(reserved.COUNTERS)
 GAPS = identifier(reserved.GAP)
 
 Key = tuple[str, int | None]
-"""A column, or an element of a list column."""
+"""A column, or an element of a list column, or a column of one row of a child table."""
 
 
 @dataclass(slots=True)
@@ -60,7 +60,7 @@ class Table:
         if batch.schema.stamp:
             self.stamps.extend(times_ns, _part(batch.timestamp_ns, keep))
         for key, samples in self.columns.items():
-            samples.extend(times_ns, _part(self._column(batch, *key), keep))
+            samples.extend(*self._of_row(batch, key, times_ns, keep))
         for name, figures in self.lists.items():
             for figure, values in figures_of(batch.columns.get(name), len(batch)).items():
                 figures[figure].extend(times_ns, _part(values, keep))
@@ -81,6 +81,16 @@ class Table:
         for column in schema.columns:
             if column.name in self.labels:
                 self.labels[column.name].update(column.labels)
+
+    def _of_row(
+        self, batch: Batch, key: Key, times_ns: IntArray, keep: Any
+    ) -> tuple[IntArray, Any]:
+        """Return times and values of a column; of a child table those of the row asked for."""
+        name, index = key
+        if index is None or "parent_seq" not in batch.columns:
+            return times_ns, _part(self._column(batch, *key), keep)
+        here = np.asarray(_part(batch.columns["index"], keep)) == index
+        return times_ns[here], _part(self._column(batch, name, None), keep)[here]
 
     def _column(self, batch: Batch, name: str, index: int | None) -> Any:
         column = batch.columns.get(name)

@@ -70,6 +70,8 @@ class Evaluation:
 
     def _enter(self, epoch: Epoch, start_ns: int) -> bool:
         """Go over to an epoch; False for one that lies before what is remembered."""
+        if self._known is not None and self._epoch == self._known.epoch:
+            self._known = None
         left = self.memory.checkpoint
         if self._epoch is None and left is not None and epoch.run <= left.place.epoch.run:
             if epoch != left.place.epoch:

@@ -15,9 +15,9 @@ from amberbox.blackbox.journal.head import Head, read_head
 from amberbox.blackbox.store import Store, is_locked
 from amberbox.core.types import Batch, WriterCursor
 from amberbox.monitoring.watcher.epoch import Epoch
+from amberbox.monitoring.watcher.start import WATCH, comes_later
 from amberbox.monitoring.watcher.stream import Piece, WriterStream
 
-WATCH = "watch"
 _MAIN = "main"
 
 Positions: TypeAlias = Mapping[str, WriterCursor]
@@ -55,13 +55,14 @@ class Reader:
         self._store = store
         self._items = {**dict.fromkeys(RECORDED, frozenset(items)), WATCH: frozenset(probes)}
         self._start = start or {}
+        self._given: dict[str, WriterCursor] = {}
         self._streams: dict[str, WriterStream] = {}
         self._waiting: dict[str, Piece] = {}
         self._reached: dict[str, int] = {}
         self._counted_ns: int | None = None
         self._start_ns = 0
         self._batches: list[Batch] = []
-        self._past: set[Epoch] = set()
+        self._later: dict[Epoch, bool] = {}
         self._alive: bool | None = None
         self._written: tuple[int, int] | None = None
         self.epoch: Epoch | None = None
@@ -73,8 +74,8 @@ class Reader:
         return bool(self._alive)
 
     def positions(self) -> dict[str, WriterCursor]:
-        """Where the reading stands in each journal; ``until_ns`` lies behind that."""
-        return {writer: stream.position() for writer, stream in self._streams.items()}
+        """Where the rows of the present epoch end that were given so far, in each journal."""
+        return {**self._start, **self._given}
 
     def last_ns(self) -> int:
         """Log time of the newest row that was read of the present epoch."""
@@ -89,13 +90,13 @@ class Reader:
         self._written = _end_of(head) if alive else None
         self._begin(at_once=alive != self._alive)
         self._alive = alive
-        yield from self._released()
+        self._release()
+        yield from self._go_on()
         while (stream := self._behind()) is not None:
             piece = stream.pull()
             if piece is not None:
-                yield from self._sorted_in(stream.writer, piece)
-            elif self._waits_for_next():
-                yield from self._next_epoch()
+                self._sort_in(stream.writer, piece)
+            yield from self._go_on()
         if not alive and self.epoch is not None:
             yield from self._block(self._end_ns())
 
@@ -128,7 +129,14 @@ class Reader:
                 return stream
         return main
 
-    def _sorted_in(self, writer: str, piece: Piece) -> Iterator[Block]:
+    def _go_on(self) -> Iterator[Block]:
+        """Give what has become complete, and go over to the next epoch when this one is."""
+        while self._waits_for_next():
+            yield from self._next_epoch()
+        if self.epoch is not None:
+            yield from self._block(self._complete_ns())
+
+    def _sort_in(self, writer: str, piece: Piece) -> None:
         """Take a piece, or keep it for the epoch that it belongs to."""
         if writer == _MAIN and self.epoch is None and self._is_written(piece):
             self.epoch, self._start_ns = piece.epoch, piece.first_ns
@@ -136,15 +144,16 @@ class Reader:
             return
         if piece.epoch != self.epoch or (writer == _MAIN and not self._is_written(piece)):
             self._waiting[writer] = piece
-            if self._waits_for_next():
-                yield from self._next_epoch()
-            return
-        self._accept(writer, piece)
-        yield from self._block(self._complete_ns())
+        else:
+            self._accept(writer, piece)
 
     def _is_past(self, piece: Piece) -> bool:
-        is_older = self.epoch is not None and piece.epoch.run < self.epoch.run
-        return is_older or piece.epoch in self._past
+        epoch = self.epoch
+        if epoch is None or piece.epoch == epoch:
+            return False
+        if piece.epoch not in self._later:
+            self._later[piece.epoch] = comes_later(self._store, piece.epoch, epoch)
+        return not self._later[piece.epoch]
 
     def _is_written(self, piece: Piece) -> bool:
         """Tell whether all that was written together with a piece can be read."""
@@ -152,6 +161,7 @@ class Reader:
 
     def _accept(self, writer: str, piece: Piece) -> None:
         self._batches += piece.batches
+        self._given[writer] = WriterCursor(*piece.end)
         self._reached[writer] = max(piece.last_ns, self._reached.get(writer, piece.last_ns))
         if writer == _MAIN and piece.counted_ns is not None:
             self._counted_ns = piece.counted_ns
@@ -192,19 +202,18 @@ class Reader:
     def _next_epoch(self) -> Iterator[Block]:
         """End the epoch, and go over to the one that the recorder is in."""
         yield from self._block(self._end_ns(), is_last=True)
-        if self.epoch is not None:
-            self._past.add(self.epoch)
+        self._later.clear()
         first = self._waiting[_MAIN]
         self.epoch, self._start_ns = first.epoch, first.first_ns
         self.until_ns = self._counted_ns = None
         self._batches, self._reached = [], {}
-        yield from self._released()
+        self._release()
 
-    def _released(self) -> Iterator[Block]:
+    def _release(self) -> None:
         """Look again at the pieces that were kept, the main journal's first."""
         kept, self._waiting = self._waiting, {}
         for writer in sorted(kept, key=lambda name: name != _MAIN):
-            yield from self._sorted_in(writer, kept[writer])
+            self._sort_in(writer, kept[writer])
 
 
 def _end_of(head: Head | None) -> tuple[int, int] | None:

@@ -7,7 +7,6 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
-from amberbox.blackbox.follow.follow import RECORDED
 from amberbox.blackbox.follow.read import newest_first
 from amberbox.blackbox.store import Store
 from amberbox.core.clock import NS
@@ -17,7 +16,8 @@ from amberbox.monitoring.engine.findings import AlarmChange, Finding
 from amberbox.monitoring.plan import Plan
 from amberbox.monitoring.watcher.evaluation import Evaluation
 from amberbox.monitoring.watcher.guard import guarded
-from amberbox.monitoring.watcher.reader import WATCH, Block, Reader
+from amberbox.monitoring.watcher.reader import Block, Reader
+from amberbox.monitoring.watcher.start import WRITERS, at_time
 
 WARM_UP_S = 60.0
 """A replay of a part begins this long before it, beside what the monitors look back."""
@@ -66,7 +66,7 @@ def blocks(plan: Plan, store: Store, engine: Engine, part: Part) -> Iterator[Blo
     start: dict[str, WriterCursor] = {}
     if part.from_ns is not None:
         from_ns = part.from_ns - round((WARM_UP_S + engine.history_s) * NS)
-        start = {writer: _position(store, writer, from_ns) for writer in (*RECORDED, WATCH)}
+        start = {writer: at_time(store, writer, from_ns) for writer in WRITERS}
     probes = [order.item for order in plan.probes()]
     return Reader(store, engine.items, probes, start).step()
 
@@ -81,16 +81,6 @@ def instant_of(finding: Finding) -> int:
 def _is_inside(at_ns: int, part: Part) -> bool:
     after = part.from_ns is None or at_ns >= part.from_ns
     return after and (part.to_ns is None or at_ns < part.to_ns)
-
-
-def _position(store: Store, writer: str, from_ns: int) -> WriterCursor:
-    """Return where the file begins that holds a log time, or the first one after it."""
-    at = WriterCursor()
-    for journal in newest_first(store, writer):
-        at = WriterCursor(journal.run, journal.first_seq)
-        if journal.start_ns <= from_ns:
-            break
-    return at
 
 
 def _end_ns(store: Store) -> int | None:

@@ -16,6 +16,7 @@ from amberbox.blackbox.store import Store
 from amberbox.core.names import identifier
 from amberbox.core.types import Batch, WriterCursor
 from amberbox.monitoring.watcher.epoch import Epoch, epoch_of
+from amberbox.monitoring.watcher.start import WATCH, epoch_of_file
 
 RUN = identifier(reserved.RUN)
 CLOCK = identifier(reserved.CLOCK)
@@ -65,10 +66,6 @@ class WriterStream:
         if self.epoch is None:
             self.epoch = _epoch_at(self.store, self.writer, self.start)
 
-    def position(self) -> WriterCursor:
-        """Where the reading stands."""
-        return self._tail.position()
-
     def begin(self, *, at_once: bool) -> None:
         """Begin a step: look for what has come; without ``at_once`` only if the head says so."""
         head = read_head(self.store.folder(self.writer))
@@ -112,7 +109,7 @@ class WriterStream:
 
     def _epoch_of(self, batches: list[Batch]) -> Epoch | None:
         named = {batch.item: batch for batch in batches}
-        if self.writer == "watch":
+        if self.writer == WATCH:
             if RUN in named:
                 self.epoch = epoch_of(str(named[RUN].columns["input"][-1]))
             return self.epoch
@@ -144,23 +141,7 @@ def _base_of(clock: Batch) -> int | None:
 
 def _epoch_at(store: Store, writer: str, at: WriterCursor) -> Epoch | None:
     """Return the epoch in which a position lies, if its file says so."""
-    if (at.run, at.seq) <= (0, 0) or writer == "watch":
-        return _watched_at(store, at) if writer == "watch" else None
     for journal in newest_first(store, writer):
         if (journal.run, journal.first_seq) <= (at.run, at.seq):
-            for reading in journal.readings:
-                if journal.run == at.run and reading.boot_ns is not None:
-                    return Epoch(at.run, reading.log_ns - reading.boot_ns)
-            return None
-    return None
-
-
-def _watched_at(store: Store, at: WriterCursor) -> Epoch | None:
-    """Return what the run of the watcher in which a position lies had followed."""
-    from amberbox.blackbox.follow.read import run_messages
-
-    for journal in newest_first(store, "watch"):
-        if journal.run <= at.run:
-            same = journal.run == at.run
-            return epoch_of(str(run_messages(journal).get("input", ""))) if same else None
+            return epoch_of_file(journal) if journal.run == at.run else None
     return None

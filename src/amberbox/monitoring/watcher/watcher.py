@@ -13,14 +13,12 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from amberbox.blackbox.folder.folder import RobotFolder
-from amberbox.blackbox.follow.follow import RECORDED
-from amberbox.blackbox.follow.tail import position_at
 from amberbox.blackbox.keeper.ownjournal import Progress
 from amberbox.blackbox.keeper.ownstreams import Row
 from amberbox.blackbox.store import Store, WriterLock
 from amberbox.core.clock import NS, Clock, SystemClock
 from amberbox.core.probe import SOURCE, ProbeOrder
-from amberbox.core.types import Status, WriterCursor
+from amberbox.core.types import Status
 from amberbox.monitoring.engine.engine import Engine
 from amberbox.monitoring.engine.findings import Finding
 from amberbox.monitoring.messages.publisher import Publisher
@@ -30,8 +28,9 @@ from amberbox.monitoring.watcher import commands
 from amberbox.monitoring.watcher.evaluation import Evaluation
 from amberbox.monitoring.watcher.guard import guarded
 from amberbox.monitoring.watcher.memory import Checkpoint, Memory, Place, recall
-from amberbox.monitoring.watcher.reader import WATCH, Reader
+from amberbox.monitoring.watcher.reader import Reader
 from amberbox.monitoring.watcher.silence import Silence, unknown
+from amberbox.monitoring.watcher.start import WATCH, before_checkpoint, before_end
 from amberbox.monitoring.watcher.writing import Journal
 
 POLL_S = 0.02
@@ -68,8 +67,14 @@ class Watcher:
         self._journal = Journal(watch.store, watch.plan.robot, watch.plan.config_hash, watch.clock)
         self._engine = Engine(watch.plan)
         memory = _memory_of(watch, self._engine.history_s)
-        self._start = _start_of(watch, memory.checkpoint, self._engine.history_s)
-        self._is_new = memory.checkpoint is None
+        left = memory.checkpoint
+        self._is_new = left is None
+        first_s = self._engine.history_s + FIRST_S
+        self._start = (
+            before_end(watch.store, first_s)
+            if left is None
+            else before_checkpoint(watch.store, left)
+        )
         self._evaluation = Evaluation(self._engine, memory)
         probes = [order.item for order in own_probes(watch)]
         self._reader = Reader(watch.store, self._engine.items, probes, self._start)
@@ -202,17 +207,6 @@ def _memory_of(watch: Watch, history_s: float) -> Memory:
         memory.checkpoint = replace(left, engine={}, lookback_s=history_s + FIRST_S)
         memory.more = 0
     return memory
-
-
-def _start_of(watch: Watch, left: Checkpoint | None, history_s: float) -> dict[str, WriterCursor]:
-    """Return where the reading begins in each journal."""
-    known = {} if left is None else left.positions
-    lookback_s = history_s + FIRST_S if left is None else left.lookback_s
-    return {
-        writer: position_at(watch.store, writer, known.get(writer), lookback_s)
-        for writer in (*RECORDED, WATCH)
-        if watch.store.folder(writer).is_dir() and (left is None or writer in known)
-    }
 
 
 def own_probes(watch: Watch) -> list[ProbeOrder]:
