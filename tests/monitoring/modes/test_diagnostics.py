@@ -85,3 +85,13 @@ def test_explanation() -> None:
 )
 def test_what_finds_no_entry_is_refused(config: Config) -> None:
     assert list(config.check())
+
+
+def test_a_column_may_be_younger_than_the_table() -> None:
+    entry = arrays((0, "imu", 0, "old"), (1, "laser", 0, "fine"), (2, "imu", 0, "fine"))
+    young = one_input(times_s=[1, 2], parts={"message": ["fine", "good"]})
+    entry.parts = {**entry.parts, "message": young.parts["message"]}
+    assert judged(Config(names=("imu",)), entry, 2)[2] == "imu: good"
+    assert judged(Config(names=("laser",)), entry, 2)[2] == "laser: fine"
+    entry.parts = {"name": entry.parts["name"], "level": entry.parts["level"]}
+    assert judged(Config(names=("imu",)), entry, 2) == (True, 0, "imu: ")

@@ -97,8 +97,15 @@ def _newest(item: Input, now: Now, seconds: float) -> Mapping[str, Entry]:
     columns = [item.parts.get(name, Samples()) for name in ("name", "level", "message")]
     edges = (now - round(seconds * NS), now)
     first, end = (int(columns[0].times_ns.searchsorted(edge, "right")) for edge in edges)
-    rows = zip(*(samples.column()[first:end].tolist() for samples in columns), strict=True)
+    behind = len(columns[0]) - first, len(columns[0]) - end
+    rows = zip(*(_cells(samples, *behind) for samples in columns), strict=True)
     return {name: Entry(_level(level), f"{name}: {text or ''}") for name, level, text in rows}
+
+
+def _cells(samples: Samples, first: int, end: int) -> Sequence[Any]:
+    """Return values counted from the end: a column may be younger than the table."""
+    cells = samples.column()[max(len(samples) - first, 0) : max(len(samples) - end, 0)].tolist()
+    return [None] * (first - end - len(cells)) + cells
 
 
 def _level(value: Any) -> int:
