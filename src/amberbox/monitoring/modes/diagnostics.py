@@ -104,7 +104,9 @@ def _newest(item: Input, now: Now, seconds: float) -> Mapping[str, Entry]:
 
 def _cells(samples: Samples, first: int, end: int) -> Sequence[Any]:
     """Return values counted from the end: a column may be younger than the table."""
-    cells = samples.column()[max(len(samples) - first, 0) : max(len(samples) - end, 0)].tolist()
+    cells: list[Any] = samples.column()[
+        max(len(samples) - first, 0) : max(len(samples) - end, 0)
+    ].tolist()
     return [None] * (first - end - len(cells)) + cells
 
 
