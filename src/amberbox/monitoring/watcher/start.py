@@ -75,7 +75,7 @@ def _files_of(
         if (journal.run, journal.first_seq) >= _order(at):
             continue
         matches = epoch_of_file(journal) == epoch
-        if found and not matches or _is_before(journal, epoch):
+        if (found and not matches) or _is_before(journal, epoch):
             return
         if matches:
             found = True
