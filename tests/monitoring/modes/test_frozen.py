@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from math import inf, nan
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+from amberbox.core.clock import NS
 from amberbox.core.config import build, parse_yaml
 from amberbox.core.errors import Problem
 from amberbox.core.expression import parse
@@ -87,6 +90,37 @@ def test_stamps_that_stop_while_messages_come() -> None:
 def test_explanation() -> None:
     assert frozen.explain(TWO_S, {"moving": False}) == "has not moved for 2 s"
     assert frozen.explain(TWO_S, {"moving": None}) == ""
+
+
+@pytest.mark.needs_data
+def test_real_wheels_move_and_one_cut_off_does_not(shared_data: Path, tmp_path: Path) -> None:
+    times, wheels = real_voltages(shared_data, tmp_path)
+    half = len(times) // 2
+    for values in wheels:
+        healthy, dead = Input("wheel"), Input("wheel")
+        healthy.samples.extend(times, values)
+        assert FALSE not in frozen.evaluate(TWO_S, [healthy], times)["moving"]
+        cut_off = np.where(np.arange(len(times)) < half, values, values[half])
+        cut_off[half + 3 :: 9] = 1e30
+        dead.samples.extend(times, cut_off)
+        moving = frozen.evaluate(TWO_S, [dead], times)["moving"]
+        late_s = (times[np.flatnonzero(moving == FALSE)[0]] - times[half]) / NS
+        assert late_s == pytest.approx(2, abs=0.5)
+        assert np.all(moving[times > times[half] + 2.5 * NS] == FALSE)
+
+
+def real_voltages(shared_data: Path, store: Path) -> tuple[Any, list[Any]]:
+    """Return bus voltages of the four wheels of a real robot, and their times."""
+    import amberbox
+    from amberbox.blackbox.formats.options import ReadOptions
+    from amberbox.blackbox.importing import import_recordings
+
+    options = ReadOptions(messages=shared_data / "ropod/message_definitions")
+    import_recordings([shared_data / "ropod/bb_test_data"], store, options=options, segments=False)
+    with amberbox.open(store) as record:
+        table = record.query("ros_sw_ethercat_parser_data__sensors", ["voltage_bus"])
+        times = np.asarray(table["timestamp"]).astype(np.int64).reshape(-1, 4)[:, 0]
+        return times, list(np.asarray(table["voltage_bus"], np.float64).reshape(-1, 4).T)
 
 
 def test_words_of_the_mode_file() -> None:
