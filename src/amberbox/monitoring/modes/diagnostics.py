@@ -104,9 +104,8 @@ def _newest(item: Input, now: Now, seconds: float) -> Mapping[str, Entry]:
 
 def _cells(samples: Samples, first: int, end: int) -> Sequence[Any]:
     """Return values counted from the end: a column may be younger than the table."""
-    cells: list[Any] = samples.column()[
-        max(len(samples) - first, 0) : max(len(samples) - end, 0)
-    ].tolist()
+    column, count = samples.column(), len(samples)
+    cells: list[Any] = column[max(count - first, 0) : max(count - end, 0)].tolist()
     return [None] * (first - end - len(cells)) + cells
 
 
