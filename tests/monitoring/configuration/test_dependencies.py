@@ -172,6 +172,16 @@ def test_no_circles(tmp_path: Path) -> None:
     assert problems == []
 
 
+def test_a_circle_that_a_mode_judges_is_told_and_stays(tmp_path: Path) -> None:
+    text = "component_name: planner\ndependencies: [x]\n"
+    files = ROS | {"planner.yaml": text}
+    files["x.yaml"] = f"component_name: x\n{_of('functional', 'planner', 'ros/nodes')}"
+    plan, problems = plan_of(tmp_path, files)
+    assert errors(problems) == ["x.yaml:2: dependencies: needs itself: planner -> x -> planner"]
+    (edge,) = component(plan, "x").dependencies
+    assert (edge.component, edge.output, edge.problem) == ("ros", "planner", "")
+
+
 def test_parts(tmp_path: Path) -> None:
     files = {
         "a.yaml": "component_name: a\npart_of: b\n",

@@ -63,6 +63,7 @@ def test_the_paper_s_name_and_ours(tmp_path: Path) -> None:
     }
     plan, problems = plan_of(tmp_path, files)
     assert errors(problems) == []
+    assert notes(problems) == ["a.yaml:1: component_name: is 'front_laser' in addresses"]
     assert [(entry.id, entry.name) for entry in plan.components] == [
         ("front_laser", "Front Laser"),
         ("b", "b"),
@@ -189,3 +190,13 @@ def test_a_monitor_that_cannot_be_loaded(tmp_path: Path, code: str, what: str) -
     (error,) = errors(problems)
     assert error.startswith("mode.yaml:2: monitor: ") and what in error
     assert what in mode.problem
+
+
+def test_a_monitor_that_crashes_when_it_is_asked(tmp_path: Path) -> None:
+    own = (EXAMPLE.parents[1] / "src/amberbox/monitoring/modes/range.py").read_text()
+    (tmp_path / "modes").mkdir()
+    (tmp_path / "modes" / "heat.py").write_text(f"{own}\n\ndef results_of(*_):\n    return 1 / 0\n")
+    mode, problems = mode_of(tmp_path, RANGE.replace("monitor: range", "monitor: heat"))
+    what = "its monitor crashed when it was asked: ZeroDivisionError: division by zero"
+    assert errors(problems) == [f"mode.yaml:2: monitor: {what}"]
+    assert mode.problem == what

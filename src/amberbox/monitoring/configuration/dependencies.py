@@ -177,7 +177,7 @@ class _Edge:
 def _without_cycles(
     plans: Sequence[ComponentPlan], components: Sequence[Named], problems: list[Problem]
 ) -> list[ComponentPlan]:
-    """Take out the edge that closes each circle, and tell it."""
+    """Take out the edge that closes each circle, and tell it; one that a mode judges may stay."""
     nodes = {entry.plan.id: entry.node for entry in components}
     by_id = {plan.id: plan for plan in plans}
     for cycle in _cycles({plan.id: _needed(plan, by_id) for plan in plans}):
@@ -187,7 +187,7 @@ def _without_cycles(
         problems.append(node.problem("dependencies", what))
         edges = tuple(
             replace(edge, component=None, mode="", output="", problem=what)
-            if first in _targets(edge, by_id)
+            if first in _targets(edge, by_id) and edge.judged and not edge.mode
             else edge
             for edge in by_id[last].dependencies
         )

@@ -66,6 +66,10 @@ def _component(source: ComponentSource, bench: Bench) -> Named:
     bench.problems.extend(own)
     modes = tuple(_modes(source, bench))
     plan = ComponentPlan(derive_id(source.name), source.name, modes)
+    if plan.id != plan.name:
+        what = f"is '{plan.id}' in addresses"
+        problem = source.node.problem("component_name", what, is_error=False)
+        bench.problems.append(problem)
     if file is None:
         first = next(problem for problem in own if problem.is_error)
         what = f"{first.where}: {first.what} ({first.file}:{first.line})"

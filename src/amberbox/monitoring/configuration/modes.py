@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import ModuleType
 from typing import Any
@@ -44,13 +44,29 @@ def plan_mode(source: ModeSource, bench: Bench) -> ModePlan:
     plan = ModePlan(derive_id(name), name, None, problem=source.problem)
     if source.node is None:
         return plan if plan.problem else replace(plan, problem=f"{source.path} cannot be read")
-    own: list[Problem] = []
+    own = list(_renamed(plan, source.node))
     node = translated(name, source.node, bench.functions, bench.robot.id, own)
     file = build(ModeFile, node, own, "", legacy_note)
-    made = _plan(plan, file, node, bench, own) if file is not None else plan
+    made = _made(plan, file, node, bench, own) if file is not None else plan
     bench.problems.extend(own)
     first = next((problem for problem in own if problem.is_error), None)
     return made if first is None else replace(made, problem=made.problem or first.what)
+
+
+def _made(
+    plan: ModePlan, file: ModeFile, node: Node, bench: Bench, problems: list[Problem]
+) -> ModePlan:
+    try:
+        return _plan(plan, file, node, bench, problems)
+    except Exception as error:  # a robot's own monitor may fail in any way when it is asked
+        what = f"its monitor crashed when it was asked: {type(error).__name__}: {error}"
+        problems.append(_at(node, "monitor").problem("monitor", what))
+        return plan
+
+
+def _renamed(plan: ModePlan, node: Node) -> Iterator[Problem]:
+    if plan.id != plan.name:
+        yield _at(node, "name").problem("name", f"is '{plan.id}' in addresses", is_error=False)
 
 
 def _name(source: ModeSource) -> str:
