@@ -112,3 +112,10 @@ def test_rule_tests_run(
     assert main(["check", str(laser)]) == code
     text = capsys.readouterr().out
     assert ("laser.test.yaml:7: test 'scans come'" in text) == (code == 2)
+
+
+def test_monitors_wait_for_the_black_box(laser: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (laser / "black_box.yaml").write_text("- rso: {}\n")
+    assert main(["check", str(laser)]) == 2
+    text = capsys.readouterr().out
+    assert "components:1: note: file: is judged when robot.yaml and black_box.yaml are" in text

@@ -8,7 +8,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from amberbox.blackbox.folder.folder import ROBOT_FILE, RobotFolder, inspect_folder
+from amberbox.blackbox.folder.folder import (
+    BLACK_BOX_FILE,
+    ROBOT_FILE,
+    RobotFolder,
+    inspect_folder,
+)
 from amberbox.blackbox.folder.plan import PlannedItem, planned_items
 from amberbox.blackbox.folder.triggers import trigger_problems
 from amberbox.cli._text import in_columns
@@ -16,6 +21,7 @@ from amberbox.core.config import load_yaml
 from amberbox.core.errors import ConfigurationError, Problem
 from amberbox.core.redaction import as_plain
 from amberbox.monitoring.configuration import load_plan, summary
+from amberbox.monitoring.configuration.tree import FOLDER as COMPONENTS
 from amberbox.monitoring.plan import Plan
 from amberbox.monitoring.ruletests.files import find_rules
 from amberbox.monitoring.ruletests.running import run_rules
@@ -33,6 +39,7 @@ def run(args: argparse.Namespace) -> int:
     items = planned_items(folder, problems) if folder else []
     problems += _triggers(folder, items) if folder else []
     plan = _monitors(folder, problems) if folder and Path(args.folder).is_dir() else None
+    problems += _not_judged(Path(args.folder)) if folder is None else []
     ok = not any(problem.is_error for problem in problems)
     if args.json:
         monitoring = {} if plan is None else {"monitoring": summary.as_data(plan)}
@@ -40,6 +47,14 @@ def run(args: argparse.Namespace) -> int:
     else:
         print("\n".join(_lines(args.folder, folder, items, problems, plan)))
     return 0 if ok else ConfigurationError.exit_code
+
+
+def _not_judged(path: Path) -> list[Problem]:
+    """Note that component files wait until it is known what is recorded."""
+    if not (path / COMPONENTS).is_dir():
+        return []
+    what = f"is judged when {ROBOT_FILE} and {BLACK_BOX_FILE} are right"
+    return [Problem(str(path / COMPONENTS), 1, "file", what, is_error=False)]
 
 
 def _monitors(folder: RobotFolder, problems: list[Problem]) -> Plan:
