@@ -38,7 +38,6 @@ ASKED: dict[str, Ask] = {
     "max": lambda s, now: Window(s, now, WINDOW_S).max(),
     "mean": lambda s, now: Window(s, now, WINDOW_S).mean(),
     "std": lambda s, now: Window(s, now, WINDOW_S).std(),
-    "median": lambda s, now: Window(s, now, WINDOW_S).median(),
     "rate": lambda s, now: Window(s, now, WINDOW_S).rate(),
     "changes": lambda s, now: Window(s, now, WINDOW_S).changes(),
     "sum_of": lambda s, now: Window(s, now, WINDOW_S).sum_of(above(s)),
