@@ -24,7 +24,7 @@ def wheels(*volts: float | None) -> list[Input]:
 
 
 def test_contract() -> None:
-    assert_mode_contract(mode, "battery", configs=[Config(), Config(empty=0, full=1, window=2)])
+    assert_mode_contract(mode, "battery", configs=[Config(empty=0, full=1, window=2)])
 
 
 def test_the_predecessors_names_of_the_voltages_are_understood() -> None:
