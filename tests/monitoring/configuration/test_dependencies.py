@@ -72,8 +72,8 @@ def test_a_monitor_speaks_for_what_is_no_component(tmp_path: Path) -> None:
     assert edge == DependencyPlan("roscore", "heartbeat", "ros", "ros_master_monitor")
     assert errors(problems) == []
     assert notes(problems) == [
-        "x.yaml:3: dependency_monitors.heartbeat.roscore: there is no component 'roscore'; "
-        "did you mean 'ros'?; ros/ros_master_monitor speaks for it"
+        "x.yaml:3: dependency_monitors.heartbeat.roscore: there is no component 'roscore': "
+        "ros/ros_master_monitor speaks for it; did you mean 'ros'?"
     ]
 
 

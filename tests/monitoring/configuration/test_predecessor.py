@@ -8,7 +8,11 @@ from pathlib import Path
 import pytest
 
 from amberbox.blackbox.folder.folder import load_folder
+from amberbox.blackbox.follow.follow import follow
+from amberbox.cli.main import main
+from amberbox.core.types import Batch
 from amberbox.monitoring.configuration import load_plan
+from amberbox.monitoring.engine.engine import Engine
 from tests.monitoring.configuration.folders import (
     component,
     errors,
@@ -290,3 +294,33 @@ def test_the_real_defects_are_found(ropod: Path) -> None:
     assert len(errors(problems)) == 16
     dangling = [note for note in notes(problems) if "there is no component" in note]
     assert len(dangling) == 17
+
+
+@pytest.mark.needs_data
+def test_the_real_files_run_on_a_real_recording(ropod: Path, shared_data: Path) -> None:
+    data = shared_data / "ropod"
+    command = ["import", str(data / "bb_test_data"), "--store", str(ropod / "store")]
+    assert main([*command, "--msg", str(data / "message_definitions")]) == 0
+    plan, problems = load_plan(load_folder(ropod))
+    assert not any("judged when they have been recorded" in note for note in notes(problems))
+    engine = Engine(plan)
+    found = [entry for entry in follow(ropod / "store", live=False) if isinstance(entry, Batch)]
+    found.sort(key=lambda batch: int(batch.log_time_ns[0]))
+    engine.begin(int(found[0].log_time_ns[0]))
+    for batch in found:
+        engine.feed(batch)
+    engine.advance(max(int(batch.log_time_ns[-1]) for batch in found))
+    statuses = {(status.component, status.mode): status for status in engine.statuses()}
+    assert {name: statuses[name, ""].level for name in ("battery", "e_stop", "pressure")} == {
+        "battery": "ok",
+        "e_stop": "ok",
+        "pressure": "ok",
+    }
+    battery = statuses["battery", "battery_functional_monitor"]
+    assert battery.outputs["battery_percentage"] == pytest.approx(81.3, abs=0.5)
+    assert statuses["e_stop", "e_stop_functional_monitor"].outputs == {"e_stop_pressed": False}
+    wheels = statuses["smart_wheel", "diff_drive_kinematics_monitor"].outputs
+    residuals = [wheels[f"residual_{wheel}"] for wheel in (1, 2, 3, 4)]
+    assert all(isinstance(value, float) and 0 < value < 0.05 for value in residuals)
+    assert statuses["localisation", ""].level == "unknown", "nothing was recorded of it"
+    assert statuses["platform", "slip_monitor"].level == "unknown"

@@ -137,7 +137,7 @@ class _Edge:
         component = self.names.component(self.name)
         edge = DependencyPlan(self.name, self.kind, component.id if component else None)  # type: ignore[arg-type]  # kinds are keys of the file
         if text == NOBODY:
-            self._note_missing(component, "and nothing judges it")
+            self._note_missing(component, "nobody judges it")
             return replace(edge, judged=False)
         judge = self.names.judge(text)
         if isinstance(judge, str):
@@ -166,7 +166,7 @@ class _Edge:
 
     def _note_missing(self, component: ComponentPlan | None, but: str) -> None:
         if component is None:
-            what = f"there is no component '{self.name}'{self.names.near(self.name)}; {but}"
+            what = f"there is no component '{self.name}': {but}{self.names.near(self.name)}"
             self._tell(what, is_error=False)
 
     def _tell(self, what: str, hint: str = "", *, is_error: bool = True) -> None:
