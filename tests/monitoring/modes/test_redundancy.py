@@ -119,7 +119,11 @@ def test_one_bool_output_is_about_all_members_and_several_about_one_each() -> No
 def test_the_explanation_names_the_member() -> None:
     found = mode.evaluate(Config(threshold=1.0), together([7.0], [7.0], [9.5], [nan]), at_s(0))
     text = mode.explain(Config(threshold=1.0), {n: v.item() for n, v in found.items()})
-    assert text == "member 3 is off by 2.5, member 4 is off and shows no number"
+    assert text == "member 3 is off by 2.5, member 4 shows no number (at most 1)"
+    single = {"agree": False, "residual": 3.0, "member_1": False, "residual_1": 3.0}
+    assert mode.explain(Config(threshold=0.5), single) == "it is off by 3 (at most 0.5)"
+    nothing = {"member_1": False, "residual_1": None, "member_2": None, "residual_2": None}
+    assert mode.explain(Config(threshold=0.5), nothing) == "member 1 shows no number"
 
 
 @pytest.mark.parametrize("config", [Config(threshold=-1.0), Config(threshold=1.0, window=-1.0)])

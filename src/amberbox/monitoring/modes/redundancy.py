@@ -130,10 +130,15 @@ def _judged(config: Config, residual: Any, verdict: str, number: str) -> dict[st
 
 def explain(config: Config, results: Mapping[str, Any]) -> str:
     """Name the members that are off, and how far."""
-    off = [n for n, value in results.items() if n.startswith("member_") and value == FALSE]
-    names = [name.removeprefix("member_") for name in off]
-    return ", ".join(f"member {k} is off{_by(results[f'residual_{k}'])}" for k in names)
+    verdicts = {n.removeprefix("member_"): v for n, v in results.items() if n.startswith("member_")}
+    off = {k: results[f"residual_{k}"] for k, verdict in verdicts.items() if verdict == FALSE}
+    far = {
+        k: "shows no number" if not _known(by) else f"is off by {by:.4g}" for k, by in off.items()
+    }
+    who = {k: f"member {k}" if len(verdicts) > 1 else "it" for k in off}
+    limit = f" (at most {config.threshold:g})" if any(map(_known, off.values())) else ""
+    return ", ".join(f"{who[k]} {far[k]}" for k in off) + limit
 
 
-def _by(far: float | None) -> str:
-    return " and shows no number" if far is None or np.isnan(far) else f" by {far:.4g}"
+def _known(number: float | None) -> bool:
+    return number is not None and not np.isnan(number)
