@@ -50,7 +50,8 @@ class Judge:
             if self._expected is not None:
                 return (OK if code == self._expected else BAD), code
             return self._compared(code), code
-        return self._compared(result), result.item() if isinstance(result, np.generic) else result
+        plain = result.item() if isinstance(result, np.generic | np.ndarray) else result
+        return self._compared(plain), plain
 
     def _compared(self, value: Any) -> int:
         expectation = self._expectation
