@@ -331,7 +331,8 @@ class Flow:
     def lost(self, now: Now) -> Any:
         """Tell whether its publishers are known to be lost, and nothing has come since."""
         since_ns = _held(self.gap_from_ns, now, self.gap_from_ns.values, NONE_OPEN)
-        return (since_ns != NONE_OPEN) & (self.last_received_ns(now) <= since_ns)
+        happened = (since_ns != NONE_OPEN) & (since_ns <= now)
+        return happened & (self.last_received_ns(now) <= since_ns)
 
 
 def _held(samples: Samples, now: Now, values: NDArray[Any], missing: int) -> Any:
