@@ -112,7 +112,7 @@ def _drain(config: Config, inputs: Sequence[Input], now: Now) -> Any:
 def explain(config: Config, results: Mapping[str, Any]) -> str:
     """Say that it is low, or that it cannot be believed."""
     if results["plausible"] is False:
-        return "what it says lies far below empty or above full"
+        return "what it says is no number, or lies far below empty or above full"
     if results["ok"] is False:
         return f"{results['charge_percent']:.0f} % are left, below {config.low:.0f} % it is low"
     return ""
