@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from types import ModuleType
 
@@ -47,9 +48,19 @@ class Functions:
 
 def find_functions(folder: Path) -> Functions:
     """Find the monitors and probes: those that come with Amberbox, then the folder's own."""
-    modes = plugins.find(MODES, [folder / OWN_MODES], MODE_DEFINES)
-    probes = plugins.find(PROBES, [folder / OWN_PROBES], PROBE_DEFINES)
+    modes = _found(MODES, folder / OWN_MODES, MODE_DEFINES)
+    probes = _found(PROBES, folder / OWN_PROBES, PROBE_DEFINES)
     return Functions(modes, frozenset(probes))
+
+
+def _found(package: str, own: Path, defines: tuple[str, ...]) -> Mapping[str, plugins.Plugin]:
+    return plugins.find(package, [own], defines) if own.is_dir() else _shipped(package, defines)
+
+
+@lru_cache
+def _shipped(package: str, defines: tuple[str, ...]) -> Mapping[str, plugins.Plugin]:
+    """Find what does not change while the program runs; its files are read once."""
+    return plugins.find(package, (), defines)
 
 
 def short_name(name: str) -> str:

@@ -9,6 +9,7 @@ from typing import Any
 
 from amberbox.core.config import did_you_mean
 from amberbox.core.errors import AmberboxError
+from amberbox.core.names import item_name
 from amberbox.core.probe import SOURCE, ProbeOrder
 from amberbox.core.types import ItemSchema
 from amberbox.monitoring.configuration.functions import Functions
@@ -134,6 +135,8 @@ class Inputs:
         items = [item.name for item in self.recorded.items]
         topics = [item.topic for item in self.recorded.items]
         near = did_you_mean(text, [*items, *topics]) or did_you_mean(_split(text)[0], items)
+        if not near and text.startswith("/") and self.recorded.open:
+            near = f"; write {item_name(self.recorded.open[0], text)}, as its block names no topics"
         return f"nothing that is recorded is called '{text}'{near}"
 
 
