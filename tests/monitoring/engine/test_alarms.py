@@ -267,6 +267,32 @@ def test_alarms_go_on_from_a_snapshot() -> None:
     assert brief(again.findings) == [(20, "laser", "open", 1)]
 
 
+def test_a_component_goes_on_recovering_after_resume() -> None:
+    stand = well(*CHAIN)
+    stand.bad(2, "laser", "loc")
+    stand.ok(20, "laser")
+    stand.until(21)
+    held = json.loads(json.dumps(stand.states.snapshot()))
+    again = Stand(*CHAIN, begin=False)
+    assert again.states.resume(held)
+    assert brief(again.until(60)) == [(25, "loc", "open", 1)]
+
+
+def test_it_follows_from_what_is_wrong_at_the_end_of_the_chain() -> None:
+    stand = well(component("nav", "loc"), *CHAIN)
+    stand.bad(2, "nav")
+    stand.until(3)
+    stand.begin(10)
+    stand.ok(11, "loc")
+    stand.bad(11, "nav")
+    assert alarms(stand.until(12)) == []  # loc waits for laser, of which nothing is known
+    stand.bad(13, "laser")
+    found = alarms(stand.until(14))
+    assert {(a.component, a.state, a.reason[:16]) for a in found} == {
+        ("laser", "open", "working is false"), ("nav", "healed", "follows from loc"),
+    }  # fmt: skip
+
+
 def test_with_another_configuration_only_alarms_are_taken_over() -> None:
     stand = with_alarm()
     held = json.loads(json.dumps(stand.states.snapshot()))

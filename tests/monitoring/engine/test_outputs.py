@@ -138,6 +138,18 @@ def test_flapping_stays_bad_until_it_has_been_calm() -> None:
     assert run.levels[-2:] == [(7, "error"), (91, "ok")]
 
 
+def test_after_calm_changes_are_counted_anew() -> None:
+    run = Run(flaps=2, flap_s=4)
+    run.find(0, "ok", True)
+    for second in (1, 2, 3):
+        run.find(second, "bad" if second % 2 else "ok", second % 2 == 0)
+    run.find(3.5, "ok", True)  # calm from here on
+    run.find(7.5, "bad", False)
+    run.find(7.6, "ok", True)
+    run.wait(20)
+    assert run.levels[-2:] == [(3, "error"), (7.6, "ok")]
+
+
 def test_few_or_slow_changes_are_no_flapping() -> None:
     run = Run(flaps=2, flap_s=10)
     run.find(0, "ok", True)

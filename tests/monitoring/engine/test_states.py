@@ -192,6 +192,20 @@ def test_a_snapshot_is_small() -> None:
     assert len(json.dumps(stand.states.snapshot())) < 50 * 70
 
 
+def test_a_fault_state_by_its_condition_is_followed_after_resume() -> None:
+    charge = output("charge", type="float", expectation=Expectation(20, ">="))
+    battery = mode("battery", charge, states={"empty": parse("charge < 5")})
+    stand = Stand(component("battery", modes=[battery]))
+    stand.find(0.5, "battery", "bad", 15.0)
+    stand.until(0.9)
+    held = json.loads(json.dumps(stand.states.snapshot()))
+    stand.states = States(stand.plan)
+    assert stand.states.resume(held)
+    stand.find(1.5, "battery", "bad", 4.0)
+    stand.until(2)
+    assert stand.now("battery/battery") == ("error", "empty")
+
+
 # What follows: whatever the plan and whatever is found, in whatever pieces it is asked for.
 
 WHATS: list[What] = ["ok", "bad", "unknown", "stale"]
@@ -313,7 +327,7 @@ def _do(states: States, what: str, now_ns: int) -> list[Finding]:
     return list(states.command(action, standing[0].id, "anna", now_ns, until_ns))
 
 
-@settings(max_examples=120, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(stories(), st.data())
 def test_it_does_not_matter_how_often_it_is_asked_or_resumed(
     story: Story, data: st.DataObject
@@ -325,7 +339,7 @@ def test_it_does_not_matter_how_often_it_is_asked_or_resumed(
     assert tell(story, cuts, resumes=True) == whole
 
 
-@settings(max_examples=120, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(stories())
 def test_what_is_told_holds_together(story: Story) -> None:
     findings = tell(story)
