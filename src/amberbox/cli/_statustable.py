@@ -71,8 +71,8 @@ def waiting(board: Board, component: str) -> str:
 
 
 def _head(board: Board, statuses: Sequence[Status], view: View) -> Iterator[str]:
-    levels = Counter(status.level for status in statuses)
-    worst = max(levels, key=RANK.__getitem__, default="unknown")
+    levels: Counter[Level] = Counter(status.level for status in statuses)
+    worst: Level = max(levels, key=RANK.__getitem__) if levels else "unknown"
     counted = ", ".join(
         view.paint(f"{levels[level]} {level}", level)
         for level in sorted(levels, key=RANK.__getitem__, reverse=True)

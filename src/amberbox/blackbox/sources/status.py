@@ -145,13 +145,13 @@ class _Member:
 
     def step(self) -> None:
         """Hand on what is new; say so when the watcher falls silent."""
-        for record in self._alarms.step():
-            self.alarms[record.values["id"]] = record.values["state"]
         statuses = [record for record in self._statuses.step() if self._is_of_now(record)]
         components = [record for record in statuses if not record.values["mode"]]
         now_s = time.monotonic()
         if components:
             self.heard_s = now_s
+            for record in self._alarms.step():
+                self.alarms[record.values["id"]] = record.values["state"]
             self._hand_on(components)
         elif self.is_up and now_s - self.heard_s > _SILENT_S:
             self.down(f"the watcher of {self.config.where} has said nothing for {_SILENT_S:g} s")
