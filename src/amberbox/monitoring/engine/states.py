@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import heapq
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any, Final, NamedTuple
 
@@ -15,7 +15,6 @@ from amberbox.monitoring.engine.edges import edges_of, in_order
 from amberbox.monitoring.engine.findings import (
     NS,
     AlarmChange,
-    Condition,
     Finding,
     Found,
     Transition,
@@ -23,6 +22,7 @@ from amberbox.monitoring.engine.findings import (
 )
 from amberbox.monitoring.engine.modestate import ModeState
 from amberbox.monitoring.engine.outputs import OutputState
+from amberbox.monitoring.engine.wording import Words
 from amberbox.monitoring.plan import OutputPlan, Plan
 
 VERSION: Final = 1
@@ -56,7 +56,7 @@ class States:
 
     def __init__(self, plan: Plan) -> None:
         self.plan = plan
-        self._robot, self._config_hash = plan.robot, plan.config_hash
+        self._words = Words(plan.robot, plan.config_hash)
         self._outputs: list[OutputState] = []
         self._modes: list[ModeState] = []
         self._components: list[ComponentState] = []
@@ -123,7 +123,7 @@ class States:
         for component in self._components:
             name = component.plan.id
             findings += self._alarms.update(name, at_ns, component.own, component.waits)
-        transitions = (self._component_transition(c, at_ns) for c in self._components)
+        transitions = (self._words.component_transition(c, at_ns) for c in self._components)
         findings += [transition for transition in transitions if transition is not None]
         self._tell_all(at_ns, None, findings)
         return findings
@@ -262,84 +262,43 @@ class States:
         found: list[tuple[int, int, Transition | None]] = []
         for number in changes.modes:
             place = self._place_of_mode[number]
-            mode = self._modes[number]
-            found.append((place, number, self._mode_transition(place, mode, now_ns)))
+            component, mode = self._components[place], self._modes[number]
+            found.append((place, number, self._words.mode_transition(component, mode, now_ns)))
         for place in changes.components:
-            transition = self._component_transition(self._components[place], now_ns)
+            transition = self._words.component_transition(self._components[place], now_ns)
             found.append((place, len(self._modes), transition))
         found.sort(key=lambda entry: entry[:2])
         return [transition for _, _, transition in found if transition is not None]
 
-    def _mode_transition(self, place: int, mode: ModeState, now_ns: int) -> Transition | None:
-        before, after = mode.tell()
-        if before is None:
-            return None
-        component = self._components[place]
-        hint = "; ".join(dict.fromkeys(mode.hints()))
-        return Transition(
-            self._robot, component.plan.id, mode.plan.id, before, after, now_ns,
-            mode.reason, component.blocked_by, hint, self._config_hash,
-        )  # fmt: skip
-
-    def _component_transition(self, component: ComponentState, now_ns: int) -> Transition | None:
-        before, after = component.told, Condition(component.level, component.state)
-        component.told = after
-        if before is None or before == after:
-            return None
-        return Transition(
-            self._robot, component.plan.id, "", before, after, now_ns,
-            component.reason, component.blocked_by, component.hint(), self._config_hash,
-        )  # fmt: skip
-
     def _tell_all(self, now_ns: int, view: View | None, out: list[Finding]) -> None:
+        words = self._words
         for component in self._components:
             for mode in component.modes:
-                out.append(self._mode_status(component, mode, now_ns, view))
-            out.append(self._component_status(component, now_ns))
+                out.append(words.mode_status(component, mode, now_ns, view))
+            out.append(words.component_status(component, now_ns))
 
     def _tell(self, now_ns: int, view: View, changes: _Changes, out: list[Finding]) -> None:
+        words = self._words
         places = changes.components | {self._place_of_mode[number] for number in changes.modes}
         for place in sorted(places):
             component = self._components[place]
             for mode in component.modes:
                 if mode.number in changes.modes:
-                    out.append(self._mode_status(component, mode, now_ns, view))
+                    out.append(words.mode_status(component, mode, now_ns, view))
             if place in changes.components:
-                out.append(self._component_status(component, now_ns))
-
-    def _mode_status(
-        self, component: ComponentState, mode: ModeState, now_ns: int, view: View | None
-    ) -> Status:
-        values = mode.blank if view is None or not mode.runs else view.outputs(mode.number, now_ns)
-        mode.status = status = Status(
-            self._robot, component.plan.id, mode.plan.id, mode.level, mode.state, values,
-            component.blocked_by, now_ns, mode.since_ns, mode.reason, self._config_hash,
-        )  # fmt: skip
-        return status
-
-    def _component_status(self, component: ComponentState, now_ns: int) -> Status:
-        component.status = status = Status(
-            self._robot, component.plan.id, "", component.level, component.state, {},
-            component.blocked_by, now_ns, component.since_ns, component.reason, self._config_hash,
-        )  # fmt: skip
-        return status
+                out.append(words.component_status(component, now_ns))
 
     def statuses(self) -> list[Status]:
         """Return the newest status of every mode and component, in the order of the plan.
 
         After ``resume`` numbers are not known until the next whole second.
         """
-        found = []
+        found, now_ns = [], self._done_ns
         for component in self._components:
             for mode in component.modes:
-                found.append(mode.status or self._known_status(component, mode))
-            found.append(component.status or self._component_status(component, self._done_ns))
+                found.append(mode.status or self._words.known_status(component, mode, now_ns))
+            found.append(component.status or self._words.component_status(component, now_ns))
         return found
-
-    def _known_status(self, component: ComponentState, mode: ModeState) -> Status:
-        status = self._mode_status(component, mode, self._done_ns, None)
-        mode.status = status = replace(status, outputs=mode.known_values())
-        return status
 
     def alarms(self) -> list[AlarmChange]:
         """Return the alarms that last, as they stand."""
@@ -359,7 +318,7 @@ class States:
         done_ns, began_ns = self._done_ns, self._began_ns
         return {
             "version": VERSION,
-            "config_hash": self._config_hash,
+            "config_hash": self.plan.config_hash,
             "done_ns": done_ns,
             "began_ns": began_ns,
             "outputs": [output.snapshot(done_ns) for output in self._outputs],
@@ -377,7 +336,7 @@ class States:
         if snapshot.get("version") != VERSION:
             return False
         self._alarms.resume(snapshot["alarms"])
-        if snapshot["config_hash"] != self._config_hash:
+        if snapshot["config_hash"] != self.plan.config_hash:
             return False
         self._done_ns, self._began_ns = snapshot["done_ns"], snapshot["began_ns"]
         self._timers = []
