@@ -12,7 +12,7 @@ from amberbox.monitoring.plan import Plan
 from amberbox.sim import Robot, catalogue
 from tests.sim.monitored import FAULT_S, alarms, failures, find, plan_of, with_fault
 
-INITIALISED_S = 16.0
+INITIALISED_S = 6.0
 SAMPLE = {  # fault: seconds until its component must have an alarm
     "wheel_rear_left_phase_open": 20.0,
     "wheel_front_right_encoder_stuck": 3.0,
