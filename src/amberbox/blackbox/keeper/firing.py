@@ -20,6 +20,10 @@ EVENTS = identifier(reserved.EVENT)
 COUNTERS = identifier(reserved.COUNTERS)
 _COUNTS = f"{COUNTERS}__items"
 _HEARD = "heard"
+_WATCHED = (identifier(reserved.STATUS), identifier(reserved.ALARM))
+_PROBE = "probe_"
+_TRANSITION = "component_state"
+"""Kind of the events by which the watcher says that a component has changed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,6 +156,13 @@ def waits_for(trigger: Trigger) -> frozenset[str]:
     if trigger.event:
         return frozenset()
     return frozenset(a.partition(".")[0] for a in parse(trigger.when).addresses())
+
+
+def reads_watch(trigger: Trigger) -> bool:
+    """Tell whether a trigger is about what the watcher writes, which comes a moment later."""
+    if trigger.event:
+        return fnmatchcase(_TRANSITION, trigger.event)
+    return any(item in _WATCHED or item.startswith(_PROBE) for item in waits_for(trigger))
 
 
 def history_ns(trigger: Trigger) -> int:

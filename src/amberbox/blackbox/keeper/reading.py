@@ -14,7 +14,7 @@ from amberbox.blackbox.follow.tail import WriterTail, position_at
 from amberbox.blackbox.incidents.incident import At
 from amberbox.blackbox.journal import reserved
 from amberbox.blackbox.journal.head import Head, read_head
-from amberbox.blackbox.store import Store
+from amberbox.blackbox.store import Store, is_locked
 from amberbox.core.clock import NS
 from amberbox.core.names import identifier
 from amberbox.core.types import Batch, Cursor, IntArray
@@ -86,6 +86,8 @@ class RunPart:
     until_ns: int = 0
     known: int = 1
     """So many stretches of log time had begun where the reading goes on."""
+    watched_ns: int | None = None
+    """Up to when the watcher has written down what it finds; None where none is at work."""
 
     def left_ns(self, log_ns: int) -> int:
         """Return the time of the log time at which the reading was left."""
@@ -126,13 +128,22 @@ class Reading:
                 self._tails[writer] = WriterTail(self._store, writer, self._items, start)
         if "main" not in self._tails:
             return []
+        watched = read_head(self._store.folder(WATCH))
         parts = list(self._main(self._tails["main"]))
         for writer, tail in self._tails.items():
             if writer != "main" and parts:
                 _sort_in(parts, writer, tail)
+        if parts:
+            parts[-1].watched_ns = self._watched_ns(parts[-1], watched)
         for part in parts[:-1]:  # what other journals have to the end of a run counts, too
             part.until_ns = max([part.until_ns, *(int(times[-1]) for _, times in part.batches)])
         return parts
+
+    def _watched_ns(self, part: RunPart, head: Head | None) -> int | None:
+        """Return up to when what the watcher wrote was read, by its head before that."""
+        if WATCH not in self._tails or head is None or not is_locked(self._store, WATCH):
+            return None
+        return part.axis.time_of(head.watermark_ns)
 
     def cursor(self) -> Cursor:
         """Where the reading stands."""

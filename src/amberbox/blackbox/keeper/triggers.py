@@ -20,6 +20,7 @@ from amberbox.blackbox.keeper.firing import (
     Watcher,
     history_ns,
     items_of,
+    reads_watch,
     waits_for,
     watcher_of,
 )
@@ -42,6 +43,8 @@ _LOOKBACK_NS = 600 * NS
 _FIRST_NS = 60 * NS
 """A keeper without a memory looks at the last minute of the record."""
 _MISSING_NS = 60 * NS
+_PATIENCE_NS = 5 * NS
+"""A watcher that is further behind than this is not waited for."""
 
 
 @dataclass(slots=True)
@@ -51,6 +54,7 @@ class _Watch:
     trigger: Trigger
     watcher: Watcher
     missing: set[str]
+    reads_watch: bool
 
 
 class Triggers:
@@ -123,7 +127,7 @@ class Triggers:
     def _begin(self, part: RunPart, *, is_last: bool) -> None:
         """Begin a run anew: what was true in the one before says nothing about it."""
         self._watches = [
-            _Watch(trigger, watcher_of(trigger), set(waits_for(trigger)))
+            _Watch(trigger, watcher_of(trigger), set(waits_for(trigger)), reads_watch(trigger))
             for trigger in self._triggers
         ]
         self._since_ns = self._start_ns(part, is_last=is_last)
@@ -144,9 +148,10 @@ class Triggers:
         for watch in list(self._watches):
             try:
                 self._feed(watch, part)
+                until_ns = _until(watch, part)
                 if self._since_ns:
-                    watch.watcher.firings(min(self._since_ns, part.until_ns))
-                for firing in watch.watcher.firings(part.until_ns):
+                    watch.watcher.firings(min(self._since_ns, until_ns))
+                for firing in watch.watcher.firings(until_ns):
                     if firing.at_ns > self._since_ns:
                         found.append((watch.trigger, firing))
             except Exception as error:  # whatever it is: the other triggers go on
@@ -194,9 +199,17 @@ class Triggers:
         due = time.monotonic() - self._noted_s >= _NOTE_S and cursor != self._noted
         if at_once or due:
             self._noted, self._noted_s = cursor, time.monotonic()
-            moment = part.moment(part.until_ns)
+            judged_ns = (_until(watch, part) for watch in self._watches)
+            moment = part.moment(min(judged_ns, default=part.until_ns))
             state = msgspec.json.encode(moment).decode()
             self._journal.write([], Progress(cursor, READER, state))
+
+
+def _until(watch: _Watch, part: RunPart) -> int:
+    """Return up to when a trigger can be judged: the watcher writes a moment later than others."""
+    if part.watched_ns is None or not watch.reads_watch:
+        return part.until_ns
+    return min(part.until_ns, max(part.watched_ns, part.until_ns - _PATIENCE_NS))
 
 
 def _about(name: str, problem: str) -> str:

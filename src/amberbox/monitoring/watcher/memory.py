@@ -66,7 +66,8 @@ class Checkpoint:
             "engine": self.engine,
         }
         cursor = Cursor(store_id, self.positions)
-        return Progress(cursor, CHECKPOINT, msgspec.json.encode(state).decode())
+        encoded = msgspec.json.encode(state, enc_hook=_plain)
+        return Progress(cursor, CHECKPOINT, encoded.decode())
 
 
 @dataclass(slots=True)
@@ -79,6 +80,11 @@ class Memory:
     place: Place | None = None
     checkpoint: Checkpoint | None = None
     more: int = 0
+
+
+def _plain(value: Any) -> Any:
+    """Return what numpy has made as plain Python."""
+    return value.tolist()
 
 
 def recall(store: Store) -> Memory:

@@ -1,0 +1,60 @@
+"""Triggers on what the watcher writes, which comes a moment later than what it is about."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import pytest
+
+from amberbox.blackbox.incidents import load_all
+from amberbox.blackbox.keeper.incidents import IncidentKeeping
+from amberbox.blackbox.keeper.options import KeeperOptions, Trigger
+from amberbox.blackbox.keeper.ownjournal import OwnJournal
+from amberbox.blackbox.store import open_store
+from amberbox.core.clock import NS
+from tests.monitoring.watcher.stand import NUMBERS, Stand, plan_of
+
+ALARM = Trigger("alarm", when="amberbox_alarm.state == 'open'", before_s=1, after_s=0.5)
+STATUS = Trigger(
+    "status", when="amberbox_status.level == 'error'", before_s=1, after_s=0.5, hold_off_s=600
+)
+TRANSITION = Trigger("transition", event="component_state", before_s=1, after_s=0.5, hold_off_s=600)
+
+
+@pytest.mark.parametrize(
+    ("trigger", "killed"), [(ALARM, True), (STATUS, False), (TRANSITION, False)]
+)
+def test_a_trigger_on_a_status_makes_an_incident(
+    tmp_path: Path, trigger: Trigger, killed: bool
+) -> None:
+    """The keeper has always read the recorder's rows long before the watcher says anything."""
+    stand = Stand(tmp_path / "store")
+    options = KeeperOptions(triggers=(trigger,))
+    store = open_store(stand.path)
+    stand.box.write()
+    keeper = IncidentKeeping(store, options, OwnJournal(store, "keep", clock=stand.clock))
+    watcher = stand.watcher(plan_of())
+    value, fell_ns = 1.0, 0
+    for number in range(60):
+        if number == 30:
+            value, fell_ns = -1.0, stand.clock.wall
+        for topic in NUMBERS.values():
+            stand.box.hear(topic, struct.pack("<d", value))
+        stand.box.write()
+        keeper.step()
+        if killed and number == 40:
+            keeper.close()
+            keeper = IncidentKeeping(store, options, OwnJournal(store, "keep", clock=stand.clock))
+        if number < 20 or number % 15 == 0:  # late by more than a second
+            watcher.step()
+    watcher.step()
+    stand.box.write(1.0)
+    keeper.step()
+    watcher.close()
+    stand.box.close()
+    (incident, *_) = load_all(store)
+    (reason, *_) = incident.reasons
+    assert reason.trigger == trigger.name
+    if trigger is not TRANSITION:
+        assert 0 <= reason.at_ns - fell_ns <= 3 * NS
