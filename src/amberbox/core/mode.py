@@ -17,7 +17,8 @@ machine. It may also define
   called for one instant at a time, which is slower and simpler;
 - ``PER_INPUT = True``: it is called for each input of a mapping alone. One output then says
   whether all are well, or there is one output for each;
-- ``TIMED = True``: the results change as time passes, also without a new sample;
+- ``TIMED = True``, or ``timed(config)``: the results change as time passes, also without a new
+  sample; it is then called every quarter of a second, not with every sample;
 - ``SEES_SILENCE = True``: it wants to be called also where its inputs are stale;
 - ``PARTS = True``: an ``item`` input brings all columns of its rows in ``parts``;
 - ``history_s(config)``: how far back it looks, in seconds;

@@ -1,8 +1,8 @@
 """The engine: rows of the record in, statuses, transitions and alarms out.
 
 It looks at no clock: everything happens at instants, multiples of ``TICK_NS`` of the record's log
-time. A mode is evaluated where a row of its inputs came since the instant before, and at every
-quarter of a second where it depends on time. How rows are split into batches, and how often
+time. A mode is evaluated where a row of its inputs came since the instant before; one that depends
+on time, at every quarter of a second. How rows are split into batches, and how often
 ``advance`` is called, does not matter; so live and replay give the same.
 """
 
@@ -16,7 +16,7 @@ import numpy as np
 from amberbox.core.clock import NS
 from amberbox.core.types import Batch, IntArray, Output, Status
 from amberbox.monitoring.engine.building import Group, build_groups
-from amberbox.monitoring.engine.evaluation import Block, OutputRun
+from amberbox.monitoring.engine.evaluation import QUARTER_NS, Block, OutputRun
 from amberbox.monitoring.engine.findings import TICK_NS, Finding, Found
 from amberbox.monitoring.engine.states import States
 from amberbox.monitoring.engine.tables import Table, Tables
@@ -24,7 +24,6 @@ from amberbox.monitoring.plan import Plan
 
 __all__ = ["Engine"]
 
-_QUARTER_NS = NS // 4
 _BLOCK_NS = 30 * NS
 """So much of the record is looked at together."""
 _FORGET_NS = 2 * NS
@@ -102,7 +101,7 @@ class Engine:
         self._view.begin_block()
         found, self._given_up = self._given_up, []
         came = {table.item: _ticks(table, until_ns) for table in self._tables}
-        quarters = _multiples(_QUARTER_NS, after_ns, until_ns)
+        quarters = _multiples(QUARTER_NS, after_ns, until_ns)
         for group in self._groups:
             block = _block_of(group, came, quarters)
             if block is not None:

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from amberbox.core.clock import NS
 from amberbox.core.mode import FALSE, HOLD, TRUE, UNKNOWN, Input
 from amberbox.core.types import IntArray, Output
 from amberbox.monitoring.engine import freshness
@@ -21,6 +22,8 @@ from amberbox.monitoring.engine.findings import Found, What
 from amberbox.monitoring.engine.judging import AS_BEFORE, BAD, NOT_KNOWN, OK, Judge
 from amberbox.monitoring.plan import MappingPlan, ModePlan, OutputPlan
 
+QUARTER_NS = NS // 4
+"""Modes whose results change with time are evaluated at multiples of this."""
 _FEW = 4
 """Up to so many instants are evaluated one by one."""
 _WHAT: tuple[What, ...] = ("ok", "bad", "unknown")
@@ -32,13 +35,14 @@ Key = tuple[int, Any]
 class Block:
     """Instants that are looked at together for all modes that read the same items."""
 
-    __slots__ = ("codes", "few", "has_rows", "instants", "times")
+    __slots__ = ("codes", "few", "has_rows", "instants", "is_quarter", "times")
 
     def __init__(self, instants: IntArray, has_rows: Any) -> None:
         self.instants = instants
         self.times: list[int] = instants.tolist()
         self.has_rows = has_rows
         """Where rows came since the instant before."""
+        self.is_quarter = instants % QUARTER_NS == 0
         self.codes: dict[tuple[int, float | None], Any] = {}
         self.few = len(self.times) <= _FEW
 
@@ -102,7 +106,8 @@ class MappingRun:
         self._evaluate: Callable[..., Mapping[str, Any]] = module.evaluate
         self._explain = getattr(module, "explain", None)
         self._columns = getattr(module, "COLUMNS", False)
-        self._timed = getattr(module, "TIMED", False)
+        timed = getattr(module, "timed", None)
+        self._timed = timed(mode.config) if timed else getattr(module, "TIMED", False)
         self._sees_silence = getattr(module, "SEES_SILENCE", False)
         self._config, self._stale_s = mode.config, mode.stale_s
         results = [*getattr(module, "RESULTS", ()), *(output.plan.result for output in outputs)]
@@ -171,9 +176,10 @@ class MappingRun:
 
     def _one_by_one(self, block: Block, codes: Any, found: list[Found]) -> None:
         listed = [freshness.FRESH] * len(block.times) if codes is None else codes.tolist()
-        for now, code, has_rows in zip(block.times, listed, block.has_rows.tolist(), strict=True):
+        is_due = block.is_quarter if self._timed else block.has_rows
+        for now, code, due in zip(block.times, listed, is_due.tolist(), strict=True):
             if code == freshness.FRESH:
-                if has_rows or self._timed or self.code != code:
+                if due or self.code != code:
                     try:
                         self._evaluate_one(now, found)
                     except Exception as error:  # whatever it is: other modes go on
@@ -267,7 +273,8 @@ class MappingRun:
         codes = np.full(count, freshness.FRESH) if codes is None else codes
         before = np.concatenate([[self.code], codes[:-1]])
         is_fresh = codes == freshness.FRESH
-        wanted = is_fresh & (block.has_rows | (codes != before) | self._timed)
+        is_due = block.is_quarter if self._timed else block.has_rows
+        wanted = is_fresh & (is_due | (codes != before))
         turns = np.flatnonzero(~is_fresh & (codes != before)).tolist()
         starts = [0, *turns, count]
         for start, end in pairwise(starts):
