@@ -6,6 +6,7 @@ import struct
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from amberbox.blackbox.journal.mcap import MESSAGE_HEAD, Channel, ChunkHead
 from amberbox.core.types import IntArray, Schema
 
 MAX_CHUNK_BYTES = 1 << 32
+_KEPT_BYTES = 1 << 14
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -91,13 +93,32 @@ def open_chunk(body: bytes, offset: int, end: int, offsets: IntArray | None = No
     records without a hole, otherwise the records are walked one by one.
     """
     try:
-        schemas, channels, at = _definitions(body)
+        schemas, channels, at = _stated(body, offsets)
         starts = _believe(body, at, offsets)
         if starts is None:
             starts = _walk(body, at, schemas, channels)
     except (ValueError, struct.error, IndexError):
         return None
     return _columns(body, starts, offset, end, schemas, channels)
+
+
+def _stated(
+    body: bytes, offsets: IntArray | None
+) -> tuple[dict[int, Schema], dict[int, Channel], int]:
+    """Read the definitions that a chunk begins with; chunks repeat theirs, so they are kept."""
+    end = int(offsets.min()) if offsets is not None and len(offsets) else 0
+    if not 0 < end <= _KEPT_BYTES:
+        return _definitions(body)
+    try:
+        schemas, channels, at = _kept(body[:end])
+    except (ValueError, struct.error):  # the offsets are wrong, the rest need not be
+        return _definitions(body)
+    return (dict(schemas), dict(channels), at) if at == end else _definitions(body)
+
+
+@lru_cache(maxsize=256)
+def _kept(head: bytes) -> tuple[dict[int, Schema], dict[int, Channel], int]:
+    return _definitions(head)
 
 
 def _definitions(body: bytes) -> tuple[dict[int, Schema], dict[int, Channel], int]:
@@ -195,9 +216,8 @@ def sequences(chunk: Chunk, base: int) -> IntArray:
     return widened
 
 
-def index_offsets(records: Sequence[tuple[int, bytes]]) -> IntArray:
-    """Collect the message offsets of message index records (channel, entries)."""
-    if not records:
+def index_offsets(entries: Sequence[bytes | memoryview]) -> IntArray:
+    """Collect the message offsets of the entries of message index records."""
+    if not entries:
         return np.empty(0, np.int64)
-    entries = np.frombuffer(b"".join(data for _, data in records), "<i8")
-    return entries[1::2].astype(np.int64)
+    return np.frombuffer(b"".join(entries), "<i8")[1::2].astype(np.int64)

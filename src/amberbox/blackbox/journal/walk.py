@@ -22,6 +22,7 @@ from amberbox.core.types import IntArray
 _KNOWN = {1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15}
 _LOOSE = {mcap.SCHEMA, mcap.CHANNEL, mcap.MESSAGE}
 _LOOSE_BYTES = 4 << 20
+_INDEX = struct.Struct("<QHI")
 _MARK = re.compile(
     rb"\x06.{36}(?:\x04\0\0\0zstd|\0\0\0\0.{8}[\x03\x04\x05]|\x03\0\0\0lz4)"
     rb"|\x0c.{8}(?:\x0e\0\0\0" + START_METADATA.encode() + rb"|\x0e\0\0\0"
@@ -185,14 +186,14 @@ class Walk:
 
     def _index_after(self, at: int) -> tuple[IntArray, int]:
         """Read the message index records that follow a chunk."""
-        records = []
-        while at + 15 <= len(self.data) and self.data[at] == mcap.MESSAGE_INDEX:
-            length, channel, size = struct.unpack_from("<QHI", self.data, at + 1)
-            if length != size + 6 or size % 16 or at + 9 + length > len(self.data):
+        data, end, entries = self.data, len(self.data), []
+        while at + 15 <= end and data[at] == mcap.MESSAGE_INDEX:
+            length, _, size = _INDEX.unpack_from(data, at + 1)
+            if length != size + 6 or size % 16 or at + 9 + length > end:
                 break
-            records.append((channel, bytes(self.data[at + 15 : at + 15 + size])))
-            at += 9 + int(length)
-        return index_offsets(records), at
+            entries.append(data[at + 15 : at + 15 + size])
+            at += 9 + length
+        return index_offsets(entries), at
 
     def _is_ours(self, chunk: Chunk) -> bool:
         """Tell a chunk of this run from a block of another file that a dying disk put here."""
