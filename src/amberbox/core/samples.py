@@ -289,6 +289,8 @@ class Flow:
     """Rows recorded since the run began, by the time of each."""
     gap_from_ns: Samples = field(default_factory=Samples)
     """Since when its publishers are known to be lost, NONE_OPEN where they are not."""
+    reasons: dict[int, str] = field(default_factory=dict)
+    """Why they were lost, by since when."""
     began_ns: int | None = None
     """When listening began, as far as the record tells; before it nobody could have heard it."""
 

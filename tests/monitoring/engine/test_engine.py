@@ -92,6 +92,8 @@ def test_a_lost_publisher_is_told_at_once() -> None:
     batches.append(gap(4 * NS, 2 * NS, 4 * NS))
     findings = watch([mode(POSITIVE, variable(), stale_s=None)], batches, 5.0)
     assert levels(findings) == [(0.0, "unknown"), (1.0, "ok"), (2.0, "stale"), (4.0, "ok")]
+    reasons = {f.reason for f in findings if isinstance(f, Status) and f.level == "stale"}
+    assert "the publisher of a.v is lost: lost" in reasons
 
 
 def test_another_publisher_of_the_same_keeps_it_fresh() -> None:
@@ -114,6 +116,13 @@ def test_a_value_that_is_null_is_not_known() -> None:
     batch = rows(seconds(1, 2, 3), v=np.ma.MaskedArray([1.0, 1.0, 1.0], [False, True, False]))
     found = levels(watch([mode(POSITIVE, variable())], [batch], 3.0))
     assert found == [(0.0, "unknown"), (1.0, "ok"), (2.0, "unknown"), (3.0, "ok")]
+
+
+def test_rows_of_a_list_of_structures_are_fresh_while_their_messages_come() -> None:
+    counted = counts(seconds(1, 2, 3, 4), [10, 20, 30, 40], seconds(1, 2, 3, 4), "a")
+    batches = [rows(seconds(1.0), "a__parts", v=[1.0]), counted]
+    monitored = mode(POSITIVE, variable("v", "a__parts"), stale_s=1.5)
+    assert levels(watch([monitored], batches, 5.0)) == [(0.0, "unknown"), (1.0, "ok")]
 
 
 def test_an_epoch_begins_with_nothing_known() -> None:

@@ -39,7 +39,8 @@ def reason(code: int, entry: Input, stale_s: float | None, at_ns: int) -> tuple[
     if code == OLD:
         return "stale", f"nothing received of {entry.name} for {stale_s:g} s"
     if code == LOST:
-        return "stale", f"the publisher of {entry.name} is lost"
+        why = entry.flow.reasons.get(int(entry.flow.gap_from_ns.at(at_ns)), "")
+        return "stale", f"the publisher of {entry.name} is lost" + (f": {why}" if why else "")
     if code == NEVER:
         return "unknown", f"nothing received yet of {entry.name}"
     told = _told(entry, at_ns)

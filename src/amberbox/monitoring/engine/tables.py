@@ -120,12 +120,13 @@ class Table:
         self.flow.received.extend(times_ns, _part(received, keep))
         self.flow.last_ns.extend(times_ns, _part(last_ns, keep))
 
-    def gap(self, at_ns: int, peer: str, from_ns: int, is_open: bool) -> None:
+    def gap(self, at_ns: int, peer: str, from_ns: int, is_open: bool, reason: str) -> None:
         """Take note that a publisher was lost, or came back."""
         if at_ns <= self._held_ns.get("gap", -1):
             return
         if is_open:
             self._gaps[peer, from_ns] = from_ns
+            self.flow.reasons[from_ns] = reason
         else:
             self._gaps.pop((peer, from_ns), None)
         newest = max(self._gaps.values(), default=NONE_OPEN)
@@ -159,12 +160,13 @@ class Table:
     def snapshot(self, at_ns: int) -> dict[str, Any]:
         """Return what is older than the rows that will be read again, and open gaps."""
         held = {name: _last_by(samples, at_ns - self.keep_ns) for name, samples in self.samples()}
-        gaps = [[peer, from_ns] for peer, from_ns in self._gaps]
+        gaps = [[peer, at, self.flow.reasons.get(at, "")] for peer, at in self._gaps]
         return {"held": {n: v for n, v in held.items() if v is not None}, "gaps": gaps}
 
     def resume(self, snapshot: Mapping[str, Any]) -> None:
         """Go on with what ``snapshot`` returned."""
-        self._gaps = {(peer, from_ns): from_ns for peer, from_ns in snapshot["gaps"]}
+        self._gaps = {(peer, from_ns): from_ns for peer, from_ns, _ in snapshot["gaps"]}
+        self.flow.reasons.update({from_ns: why for _, from_ns, why in snapshot["gaps"]})
         if self.whole is not None:
             names = [n.removeprefix("whole ") for n in snapshot["held"] if n.startswith("whole ")]
             for name in names:  # inputs hold on to those that are there
@@ -181,6 +183,7 @@ class Table:
             samples.clear()
         self.fresh.clear()
         self._gaps.clear()
+        self.flow.reasons.clear()
         self._held_ns.clear()
 
 
@@ -189,6 +192,7 @@ class Tables:
 
     def __init__(self) -> None:
         self._tables: dict[str, Table] = {}
+        self._families: dict[str, list[Table]] = {}
 
     @property
     def items(self) -> frozenset[str]:
@@ -231,10 +235,9 @@ class Tables:
         if not {"item", "received", "last_received_ns"} <= columns.keys():
             return
         names: Any = columns["item"]
+        counts: list[Any] = [columns[n] for n in ("received", "last_received_ns")]
         for item, places in _places(names).items():
-            table = self._tables.get(item)
-            if table is not None:
-                counts: list[Any] = [columns[n] for n in ("received", "last_received_ns")]
+            for table in self._of(item):
                 table.count(rows.log_time_ns[places], *(np.ma.getdata(c)[places] for c in counts))
 
     def _take_gaps(self, batch: Batch) -> None:
@@ -244,14 +247,19 @@ class Tables:
             for table in self._of(values["item"]):
                 table.gap(
                     int(batch.log_time_ns[row]), values["peer"] or "",
-                    int(values["from_ns"]), values["to_ns"] is None,
+                    int(values["from_ns"]), values["to_ns"] is None, values["reason"] or "",
                 )  # fmt: skip
 
     def _of(self, item: str) -> Iterable[Table]:
-        """Return the tables that a gap is about; none named means all of them."""
+        """Return the tables of an item and of its lists of structures; none named means all."""
         if not item:
             return self._tables.values()
-        return [t for name, t in self._tables.items() if name == item or _is_below(name, item)]
+        if item not in self._families:
+            family = [
+                t for name, t in self._tables.items() if name == item or _is_below(name, item)
+            ]
+            self._families[item] = family
+        return self._families[item]
 
 
 def _variable(plan: InputPlan, table: Table, parts: bool) -> Input:
