@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from amberbox.cli.demo import FAULT
+from amberbox.cli.demo import FAULT, SILENCE, SILENT
 from amberbox.cli.main import main
 
 
@@ -23,6 +23,9 @@ def test_the_demonstration_works_and_shows_every_step(tmp_path: Path) -> None:
     steps = [
         "yesterday.mcap, an ordinary MCAP file",
         f"a fault begins: {FAULT}",
+        f"another fault begins: {SILENCE}",
+        "wheel_rear_right",  # the table of statuses
+        f"ok: the monitors saw that {SILENT} has fallen silent",
         "killed with kill -9",
         "ok: the box stopped cleanly",
         "lost 0",

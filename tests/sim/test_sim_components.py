@@ -24,7 +24,7 @@ SAMPLE = {  # fault: seconds until its component must have an alarm
     "localisation_shift": 2.0,
     "wifi_congested": 8.0,
     "task_executor_crash": 7.0,
-    "host_clock_jump": 2.0,
+    "host_clock_jump": 3.0,
     "e_stop_line_loose": 3.0,
 }
 

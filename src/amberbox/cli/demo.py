@@ -1,4 +1,4 @@
-"""Show the main job: record a simulated robot, kill the box once, and lose nothing."""
+"""Show the main job: record and monitor a simulated robot, kill the box once, lose nothing."""
 
 from __future__ import annotations
 
@@ -23,11 +23,14 @@ import numpy as np
 import amberbox
 from amberbox.blackbox.follow import read
 from amberbox.blackbox.incidents.incident import load_all
+from amberbox.blackbox.sources.sim import FOLDER
 from amberbox.blackbox.store import open_store
 from amberbox.core.clock import NS
 from amberbox.core.errors import AmberboxError, UsageError
 
 FAULT = "wheel_front_left_motor_weak"
+SILENCE, SILENT = "laser_rear_silent", "laser_rear"
+"""A fault that the monitors find within a second or two, and the component it is in."""
 SHOWN = ("sensors_front_left_current_1_q", "sensors_front_right_current_1_q")
 WEAK = " - ".join(f"abs(zmq_wheels.{name})" for name in SHOWN)
 TRIGGER = f"""triggers:
@@ -38,6 +41,7 @@ TRIGGER = f"""triggers:
   reason: a wheel draws more current than its neighbour
 """
 PASSENGER = "recording_odom"
+MONITORS = FOLDER / "components"
 _LOST_AT_KILL_S = 0.15
 
 
@@ -60,11 +64,12 @@ def run(args: argparse.Namespace) -> int:
     if any(place.iterdir()):
         raise UsageError(f"{place} is not empty", "name a new folder, or none")
     demo = Demo(place, args.seconds)
-    for step in (demo.prepare, demo.record, demo.account, demo.show, demo.defend):
+    for step in (demo.prepare, demo.record, demo.tell, demo.account, demo.show, demo.defend):
         step()
     print(f"\nEverything is in {place}. Go on with:")
     for verb in (
         "items {}",
+        "watch {} --replay",
         "query {} zmq_odom --points 5",
         "sql {} 'select count(*) from zmq_imu'",
         "query {} zmq_wheels --incident last --points 5",
@@ -85,6 +90,11 @@ class Demo:
     def folder(self) -> Path:
         """The robot folder."""
         return self.place / "robot"
+
+    @property
+    def watched(self) -> Path:
+        """What the monitors have printed."""
+        return self.place / "watched.txt"
 
     @property
     def truth(self) -> Path:
@@ -114,7 +124,9 @@ class Demo:
         )
         with robot(self.truth) as (process, endpoint):
             write_folder(self.folder, "demo_robot", self._blocks(endpoint), TRIGGER)
+            write_components(self.folder)
             box = start_box(self.folder)
+            watcher = start_watcher(self.folder, self.watched)
             time.sleep(self.seconds * 0.3)
             tell_robot(process, f"fault {FAULT}")
             print(f"  a fault begins: {FAULT}")
@@ -124,10 +136,34 @@ class Demo:
             self.kills_ns.append(time.time_ns())
             print("  the box is killed with kill -9, and started again")
             box = start_box(self.folder)
-            time.sleep(self.seconds * 0.5)
+            time.sleep(self.seconds * 0.35)
+            tell_robot(process, f"fault {SILENCE}")
+            print(f"  another fault begins: {SILENCE}")
+            wait_until(lambda: bool(self.failures()), 60.0)
+            time.sleep(self.seconds * 0.1)
+            self.look()
         time.sleep(0.5)
+        watcher.send_signal(signal.SIGTERM)
+        check(watcher.wait(30) == 0, "the monitors stopped cleanly")
         box.send_signal(signal.SIGTERM)
         check(box.wait(30) == 0, "the box stopped cleanly")
+
+    def look(self) -> None:
+        """Show how the robot is, while it runs."""
+        say("How is the robot? Its monitors follow the record while it is written.")
+        amberbox_verb("status", str(self.folder), expected=1)
+        amberbox_verb("alarm", str(self.folder))
+
+    def failures(self) -> list[str]:
+        """Return what the monitors have printed of the silence so far."""
+        lines = self.watched.read_text().splitlines()
+        return [line for line in lines if SILENT in line and "alive is false" in line]
+
+    def tell(self) -> None:
+        """Show what the monitors have said of the second fault, and since when."""
+        say("What the monitors said of the second fault, as it came:")
+        print("\n".join(f"  {line}" for line in self.failures()))
+        check(bool(self.failures()), f"the monitors saw that {SILENT} has fallen silent")
 
     def _blocks(self, endpoint: str) -> str:
         return (
@@ -209,6 +245,14 @@ def write_folder(folder: Path, name: str, blocks: str, more: str = "") -> None:
     (folder / "black_box.yaml").write_text(blocks)
 
 
+def write_components(folder: Path) -> None:
+    """Give a robot the monitors of the simulated one, whose messages come by ZMQ here."""
+    for path in MONITORS.rglob("*.yaml"):
+        target = folder / path.relative_to(MONITORS.parent)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.write_text(path.read_text().replace("sim_", "zmq_"))
+
+
 def flip_a_bit(path: Path) -> None:
     """Change one bit in the middle of a file."""
     with path.open("r+b") as file:
@@ -235,6 +279,15 @@ def start_box(folder: Path) -> subprocess.Popen[bytes]:
     wait_until(lambda: len(journals(folder)) > len(before) or box.poll() is not None)
     check(box.poll() is None, "the box records")
     return box
+
+
+def start_watcher(folder: Path, output: Path) -> subprocess.Popen[bytes]:
+    """Start the monitors; what they find goes to a file."""
+    command = [sys.executable, "-m", "amberbox", "watch", str(folder)]
+    with output.open("wb") as file:
+        watcher = subprocess.Popen(command, start_new_session=True, stdout=file)
+    atexit.register(watcher.kill)
+    return watcher
 
 
 def journals(folder: Path) -> list[Path]:
