@@ -13,12 +13,15 @@ from typing import TypeAlias
 from amberbox.blackbox.follow.follow import RECORDED
 from amberbox.blackbox.journal.head import Head, read_head
 from amberbox.blackbox.store import Store, is_locked
+from amberbox.core.clock import NS
 from amberbox.core.types import Batch, WriterCursor
 from amberbox.monitoring.watcher.epoch import Epoch
 from amberbox.monitoring.watcher.start import WATCH, comes_later
 from amberbox.monitoring.watcher.stream import Piece, WriterStream
 
 _MAIN = "main"
+_SPAN_NS = NS
+"""While there is more to be read blocks are at least this long: each has its price."""
 
 Positions: TypeAlias = Mapping[str, WriterCursor]
 
@@ -97,8 +100,8 @@ class Reader:
             if piece is not None:
                 self._sort_in(stream.writer, piece)
             yield from self._go_on()
-        if not alive and self.epoch is not None:
-            yield from self._block(self._end_ns())
+        if self.epoch is not None:
+            yield from self._block(self._complete_ns() if alive else self._end_ns())
 
     def _begin(self, *, at_once: bool) -> None:
         for writer, items in self._items.items():
@@ -133,8 +136,9 @@ class Reader:
         """Give what has become complete, and go over to the next epoch when this one is."""
         while self._waits_for_next():
             yield from self._next_epoch()
-        if self.epoch is not None:
-            yield from self._block(self._complete_ns())
+        until_ns = self._complete_ns()
+        if until_ns is not None and until_ns - (self.until_ns or 0) >= _SPAN_NS:
+            yield from self._block(until_ns)
 
     def _sort_in(self, writer: str, piece: Piece) -> None:
         """Take a piece, or keep it for the epoch that it belongs to."""
