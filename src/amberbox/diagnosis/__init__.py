@@ -1,0 +1,1 @@
+"""From symptoms to causes: FMEA, covering, fault trees, rules, explanation. Pure functions."""
