@@ -15,10 +15,12 @@ from amberbox.diagnosis.faulttree.expression import Expression, Number, paramete
 from amberbox.diagnosis.faulttree.formula import Constant, Formula
 from amberbox.diagnosis.faulttree.mef_formula import boolean, content, expression, formula
 from amberbox.diagnosis.faulttree.mef_scope import (
+    ID_ATTRIBUTE,
     KINDS,
     Definition,
     Path,
     Scope,
+    attribute,
 )
 from amberbox.diagnosis.faulttree.tree import (
     DEFAULT_MISSION_TIME_H,
@@ -249,5 +251,7 @@ def _tree_name(definition: Definition, root: Element) -> str:
     if not definition.path:
         return ""
     name = definition.path[0]
-    inside = (tree for tree in root.of_tag("define-fault-tree") if tree.attributes["name"] == name)
+    inside = (
+        tree for tree in root.of_tag("define-fault-tree") if tree.attributes.get("name") == name
+    )
     return next((attribute(tree, ID_ATTRIBUTE) for tree in inside), "") or name
