@@ -36,7 +36,9 @@ def test_the_simulated_robot_comes_with_its_monitors(
 ) -> None:
     place = tmp_path / "r"
     assert main(["new", str(place)]) == 0
-    assert "black_box.yaml and components and robot.yaml" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "black_box.yaml and components and robot.yaml" in printed
+    assert f"and beside it amberbox watch {place}" in printed
     assert (place / "components" / "laser_front" / "heartbeat.yaml").is_file()
     assert main(["check", str(place)]) == 0
     assert "wheel_rear_right" in capsys.readouterr().out

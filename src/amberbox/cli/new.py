@@ -66,7 +66,8 @@ def run(args: argparse.Namespace) -> int:
     else:
         print(f"wrote {_listed(files)} in {folder}")
         word = shlex.quote(str(folder))
-        print(f"next: look at them, then amberbox check {word}, amberbox record {word}")
+        watch = f", and beside it amberbox watch {word}" if "components" in _listed(files) else ""
+        print(f"next: look at them, then amberbox check {word}, amberbox record {word}{watch}")
     return 0
 
 
