@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 from amberbox.diagnosis.faulttree.bdd import Diagram, reachable
 from amberbox.diagnosis.faulttree.budget import Budget, ExhaustedError, check
-from amberbox.diagnosis.faulttree.graph import Graph
+from amberbox.diagnosis.faulttree.graph import FALSE, TRUE, Graph
 from amberbox.diagnosis.faulttree.minimal import (
     Family,
     minimal_solutions,
@@ -140,7 +140,8 @@ def _decisions(graph: Graph, part: Part, budget: Budget) -> tuple[tuple[int, ...
 
 def _build(graph: Graph, part: Part, order: Sequence[int], budget: Budget) -> Nodes:
     bdd = Diagram(budget)
-    made = {leaf: bdd.stored(level, 1, 0) for level, leaf in enumerate(order)}
+    made = {FALSE: 0, TRUE: 1}
+    made |= {leaf: bdd.stored(level, 1, 0) for level, leaf in enumerate(order)}
     uses = _uses(graph, part)
     collected = _COLLECT_ABOVE
     for number in part.inner:

@@ -56,17 +56,17 @@ def coherent(graph: Graph, top: int) -> bool:
 def _part(graph: Graph, top: int, alone: set[int]) -> Part:
     leaves: dict[int, None] = {}
     inner: dict[int, None] = {}
-    waiting = [top]
+    waiting = [top] if graph.vertices[top].inputs else []
     while waiting:
         number = waiting.pop()
         if number < 0:
             inner[~number] = None
-        elif number != top and (number in alone or not graph.vertices[number].inputs):
+        elif number != top and (number in alone or graph.vertices[number].kind == "event"):
             leaves[number] = None
         elif number not in inner:
             waiting.append(~number)
             waiting += reversed([n for n in graph.vertices[number].inputs if n not in inner])
-    if not graph.vertices[top].inputs:
+    if graph.vertices[top].kind == "event":
         return Part(top, (top,), ())
     return Part(top, tuple(leaves), tuple(inner))
 
