@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from amberbox.core.config import did_you_mean
 from amberbox.core.errors import UsageError
-from amberbox.core.expression_eval import Instants, evaluate, rows_of, series_of
+from amberbox.core.expression_eval import Instants, Series, evaluate, rows_of, series_of
+from amberbox.core.expression_instant import At, Look, Track, at_instant
 from amberbox.core.expression_parse import parse_tree
 from amberbox.core.expression_tree import (
     Address,
@@ -24,6 +25,7 @@ from amberbox.core.expression_tree import (
     Fault,
     Kind,
     Tree,
+    current_addresses,
     delays_ns,
     history_ns,
     kind_of,
@@ -31,6 +33,8 @@ from amberbox.core.expression_tree import (
     walk,
     with_addresses,
 )
+from amberbox.core.expression_values import KIND_OF_DTYPE
+from amberbox.core.samples import Samples
 from amberbox.core.types import IntArray
 
 Value: TypeAlias = bool | int | float | str | None
@@ -52,7 +56,7 @@ class Expression:
     """An expression that has been read; ``text`` is what was written."""
 
     text: str
-    tree: Tree = field(repr=False)
+    tree: Tree = field(repr=False, hash=False)
 
     @classmethod
     def from_text(cls, text: str) -> Expression:
@@ -61,6 +65,10 @@ class Expression:
 
     def addresses(self) -> tuple[str, ...]:
         """Return the addresses it reads, in order, each once."""
+        return self._names
+
+    @cached_property
+    def _names(self) -> tuple[str, ...]:
         return tuple(address.name for address in self._reads)
 
     @cached_property
@@ -73,7 +81,7 @@ class Expression:
         """Tell what it gives: ``any`` if only the data can tell."""
         return kind_of(self.tree)
 
-    @property
+    @cached_property
     def needs_history(self) -> bool:
         """Tell whether it looks back in time (``for``, ``over``, ``age``)."""
         return needs_history(self.tree)
@@ -108,11 +116,8 @@ class Expression:
         """
         now = np.zeros(1, np.int64)
         with _located(self.text):
-            series = series_of(
-                self._reads, {name: (now, [value]) for name, value in values.items()}
-            )
-            where = Instants(series, now, slice(0, 1), has_time=False)
-            return _python(evaluate(self.tree, where).scalar(0))
+            series = series_of(self._reads, {n: (now, [value]) for n, value in values.items()})
+            return self._at_instant(self._tracks(series), 0, has_time=False)
 
     def evaluate_columns(self, times_ns: IntArray, columns: Mapping[str, Any]) -> NDArray[Any]:
         """Return its value for each row of columns that share their time stamps.
@@ -133,12 +138,54 @@ class Expression:
         Each address has its own ``(times_ns, values)``, times not decreasing; samples after an
         instant do not count for it. Replay and live therefore give the same answers.
         """
-        instants = np.atleast_1d(np.asarray(at_ns, np.int64))
         checked = {n: (_checked_times(t, f"'{n}'"), values) for n, (t, values) in series.items()}
         with _located(self.text):
-            where = Instants(series_of(self._reads, checked), instants)
-            values = evaluate(self.tree, where)
-        return _python(values.scalar(0)) if np.ndim(at_ns) == 0 else values.column()
+            converted = series_of(self._reads, checked)
+            if np.ndim(at_ns):
+                return evaluate(
+                    self.tree, Instants(converted, np.asarray(at_ns, np.int64))
+                ).column()
+            return self._at_instant(self._tracks(converted), int(at_ns))
+
+    def evaluate_samples(self, samples: Mapping[str, Samples], at_ns: int | IntArray) -> Any:
+        """Return the same as ``evaluate_series`` from samples, which are in order of time.
+
+        Every address must be among them.
+        """
+        with _located(self.text):
+            if np.ndim(at_ns):
+                series = {n: (samples[n].times_ns, samples[n].column()) for n in self._names}
+                return self._evaluate(series_of(self._reads, series), at_ns)
+            return self._at_instant([_track(a, samples[a.name]) for a in self._reads], int(at_ns))
+
+    def _evaluate(self, series: Mapping[str, Series], at_ns: int | IntArray) -> Any:
+        if np.ndim(at_ns):
+            return evaluate(self.tree, Instants(series, np.asarray(at_ns, np.int64))).column()
+        return self._at_instant(self._tracks(series), int(at_ns))
+
+    def _tracks(self, series: Mapping[str, Series]) -> list[Track]:
+        whole = [(series[address.name], address.at) for address in self._reads]
+        found = [(s, s.values, at) for s, at in whole]
+        return [Track(s.times_ns, v.data, v.null, v.kind, at) for s, v, at in found]
+
+    def _at_instant(self, tracks: list[Track], at_ns: int, has_time: bool = True) -> Value:
+        look = Look(at_ns, dict(zip(self._names, tracks, strict=True)), has_time)
+        kinds = look.take(self._current)
+        function = self._functions.get(kinds)
+        if function is None:
+            named = dict(zip(self._current, kinds, strict=True))
+            function = self._functions[kinds] = at_instant(self.tree, named)
+        with np.errstate(all="ignore"):
+            return _python(function(look))
+
+    @cached_property
+    def _functions(self) -> dict[tuple[Kind, ...], At]:
+        """What it is at one instant, by the kinds of what it reads there."""
+        return {}
+
+    @cached_property
+    def _current(self) -> tuple[str, ...]:
+        return current_addresses(self.tree)
 
 
 def parse(text: str) -> Expression:
@@ -161,9 +208,15 @@ def _python(value: Any) -> Value:
     return result
 
 
+def _track(address: Address, samples: Samples) -> Track:
+    data = samples.values
+    kind = KIND_OF_DTYPE.get(data.dtype.kind)
+    return Track(samples.times_ns, data, samples.null, kind, address.at)
+
+
 def _checked_times(times_ns: IntArray, whose: str) -> IntArray:
     times_ns = np.asarray(times_ns, np.int64)
-    if len(times_ns) > 1 and bool((np.diff(times_ns) < 0).any()):
+    if len(times_ns) > 1 and bool((times_ns[1:] < times_ns[:-1]).any()):
         raise UsageError(f"the times of {whose} are not in order", "sort the samples by time")
     return times_ns
 

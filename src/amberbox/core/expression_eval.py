@@ -8,11 +8,12 @@ at once, and one instant is the case of a single one.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from amberbox.core import expression_values as on
 from amberbox.core.config import did_you_mean
@@ -30,9 +31,7 @@ from amberbox.core.expression_tree import (
     Not,
     Tree,
     Window,
-    children,
     needs_history,
-    walk,
 )
 from amberbox.core.expression_values import Values
 from amberbox.core.expression_windows import count, minimum, reduce_windows
@@ -79,7 +78,7 @@ def series_of(
 def evaluate(tree: Tree, where: Instants) -> Values:
     """Return the value of a tree at each instant."""
     with np.errstate(all="ignore"):
-        return _value(tree, where)
+        return value_of(tree, where)
 
 
 def rows_of(tree: Tree, series: Mapping[str, Series], times_ns: IntArray) -> Instants:
@@ -88,7 +87,8 @@ def rows_of(tree: Tree, series: Mapping[str, Series], times_ns: IntArray) -> Ins
     return Instants(series, times_ns, whole)
 
 
-def _value(tree: Tree, where: Instants) -> Values:
+def value_of(tree: Tree, where: Instants) -> Values:
+    """Return the same where numpy keeps quiet already."""
     return _VALUE[type(tree)](tree, where)
 
 
@@ -127,11 +127,11 @@ def _address(tree: Address, where: Instants) -> Values:
 
 
 def _number(tree: Tree, where: Instants, wanted_by: str) -> Values:
-    return on.as_number(_value(tree, where), wanted_by, tree.at)
+    return on.as_number(value_of(tree, where), wanted_by, tree.at)
 
 
 def _condition(tree: Tree, where: Instants, wanted_by: str) -> Values:
-    return on.as_condition(_value(tree, where), wanted_by, tree.at)
+    return on.as_condition(value_of(tree, where), wanted_by, tree.at)
 
 
 def _negative(tree: Negative, where: Instants) -> Values:
@@ -146,7 +146,7 @@ def _arithmetic(tree: Arithmetic, where: Instants) -> Values:
 
 
 def _comparison(tree: Comparison, where: Instants) -> Values:
-    sides = [_value(operand, where) for operand in tree.operands]
+    sides = [value_of(operand, where) for operand in tree.operands]
     pairs = zip(tree.operators, sides, sides[1:], strict=False)
     return on.joined("and", [on.compare(sign, a, b, tree.at) for sign, a, b in pairs])
 
@@ -162,7 +162,7 @@ def _logic(tree: Logic, where: Instants) -> Values:
 
 def _call(tree: Call, where: Instants) -> Values:
     if tree.name == "known":
-        null = _value(tree.arguments[0], where).null
+        null = value_of(tree.arguments[0], where).null
         return Values(~null, np.zeros(len(null), bool), "condition")
     return on.call(tree.name, [_number(part, where, tree.name) for part in tree.arguments])
 
@@ -185,23 +185,37 @@ def _window(tree: Window, where: Instants) -> Values:
     times_ns, values = _samples(tree, where)
     first_ns = where.times_ns - tree.over_ns
     if tree.name == "count":
-        flags = ~values.null & (values.data if values.kind == "condition" else True)
-        return count(times_ns, flags.astype(bool), first_ns, where.times_ns)
+        return count(times_ns, counted(values), first_ns, where.times_ns)
+    known_ns, numbers = known_numbers(tree, times_ns, values)
+    return reduce_windows(tree.name, known_ns, numbers, first_ns, where.times_ns)
+
+
+def counted(values: Values) -> NDArray[np.bool_]:
+    """Return which samples ``count`` counts: conditions that are true, or all that is known."""
+    return ~values.null & values.data if values.kind == "condition" else ~values.null
+
+
+def known_numbers(
+    tree: Window, times_ns: IntArray, values: Values
+) -> tuple[IntArray, NDArray[np.float64]]:
+    """Return what a window is computed of: times and numbers, without what is unknown."""
     numbers = on.as_number(values, tree.name, tree.inner.at)
+    if not numbers.null.any():
+        return times_ns, numbers.data
     known = ~numbers.null
-    return reduce_windows(tree.name, times_ns[known], numbers.data[known], first_ns, where.times_ns)
+    return times_ns[known], numbers.data[known]
 
 
 def _samples(tree: Window, where: Instants) -> tuple[IntArray, Values]:
     """Evaluate the inner tree at every sample of its addresses that a window can hold."""
     since, until = where.times_ns.min() - tree.over_ns, where.times_ns.max()
-    clocks = list(_clocks(tree.inner, where.series))
-    if len(clocks) == 1 and not needs_history(tree.inner):
+    clocks = _clocks(tree.reads, where.series)
+    if len(clocks) == 1 and not tree.is_nested:
         rows = slice(*(int(np.searchsorted(clocks[0], t, "right")) for t in (since, until)))
         times_ns = clocks[0][rows]
-        return times_ns, _value(tree.inner, Instants(where.series, times_ns, rows))
-    times_ns = _between(clocks, since, until)
-    return times_ns, _value(tree.inner, where.moved(times_ns))
+        return times_ns, value_of(tree.inner, Instants(where.series, times_ns, rows))
+    times_ns = _between([(clock, 0) for clock in clocks], since, until)
+    return times_ns, value_of(tree.inner, where.moved(times_ns))
 
 
 def _held(tree: Held, where: Instants) -> Values:
@@ -213,7 +227,8 @@ def _held(tree: Held, where: Instants) -> Values:
     if not len(where):
         return on.constant(None, 0)
     start_ns = where.times_ns - tree.for_ns
-    changes = _between(_breakpoints(tree.inner, where.series), start_ns.min(), where.times_ns.max())
+    breakpoints = [(where.series[name].times_ns, delay) for name, delay in tree.breakpoints]
+    changes = _between(breakpoints, start_ns.min(), where.times_ns.max())
     grid = np.unique(np.concatenate([changes, start_ns, where.times_ns]))
     inner = _condition(tree.inner, where.moved(grid), "'for'")
     false_unknown_true = np.where(inner.null, 1, np.where(inner.data, 2, 0))
@@ -228,43 +243,22 @@ def _require_time(tree: Tree, where: Instants) -> None:
         raise Fault("needs the past, only current values are known here", tree.at)
 
 
-def _clocks(tree: Tree, series: Mapping[str, Series]) -> Iterator[IntArray]:
-    """Yield the different time axes of the addresses in a tree."""
-    seen: list[IntArray] = []
-    for part in walk(tree):
-        if isinstance(part, Address):
-            times_ns = series[part.name].times_ns
-            if not any(times_ns is other or np.array_equal(times_ns, other) for other in seen):
-                seen.append(times_ns)
-                yield times_ns
+def _clocks(names: Iterable[str], series: Mapping[str, Series]) -> list[IntArray]:
+    """Return the different time axes of addresses."""
+    found: list[IntArray] = []
+    for times_ns in (series[name].times_ns for name in names):
+        if not any(times_ns is other or np.array_equal(times_ns, other) for other in found):
+            found.append(times_ns)
+    return found
 
 
-def _breakpoints(tree: Tree, series: Mapping[str, Series]) -> Iterator[IntArray]:
-    """Yield the instants at which the value of a tree may change.
-
-    ``age`` grows between samples: it is looked at right before each sample, where it is largest.
-    """
-    if isinstance(tree, Address):
-        yield series[tree.name].times_ns
-    elif isinstance(tree, Age):
-        yield series[tree.inner.name].times_ns
-        yield series[tree.inner.name].times_ns - 1
-    elif isinstance(tree, Window):
-        for times_ns in _clocks(tree.inner, series):
-            yield times_ns
-            yield times_ns + tree.over_ns
-    else:
-        delay_ns = tree.for_ns if isinstance(tree, Held) else 0
-        for part in children(tree):
-            for times_ns in _breakpoints(part, series):
-                yield times_ns
-                yield times_ns + delay_ns
-
-
-def _between(clocks: Iterable[IntArray], since_ns: int, until_ns: int) -> IntArray:
-    """Join instants in ``(since, until]``, each once, in order."""
-    inside = [c[(c > since_ns) & (c <= until_ns)] for c in clocks]
-    return np.unique(np.concatenate([np.zeros(0, np.int64), *inside]))
+def _between(clocks: Iterable[tuple[IntArray, int]], since_ns: int, until_ns: int) -> IntArray:
+    """Join instants in ``(since, until]``, each once, in order; clocks come with a delay."""
+    inside = [np.zeros(0, np.int64)]
+    for times_ns, delay_ns in clocks:
+        first, end = times_ns.searchsorted([since_ns - delay_ns, until_ns - delay_ns], "right")
+        inside.append(times_ns[first:end] + delay_ns)
+    return np.unique(np.concatenate(inside))
 
 
 _VALUE: dict[type[Tree], Callable[[Any, Instants], Values]] = {

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal, TypeAlias
 
 Kind: TypeAlias = Literal["number", "text", "condition", "null", "any"]
@@ -94,7 +95,7 @@ class Age(Tree):
     inner: Address
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Window(Tree):
     """A function of the samples of the last while, such as ``mean(x over 5s)``."""
 
@@ -102,13 +103,28 @@ class Window(Tree):
     inner: Tree
     over_ns: int
 
+    @cached_property
+    def reads(self) -> tuple[str, ...]:
+        """The addresses below, each once."""
+        return addresses_of(self.inner)
 
-@dataclass(frozen=True, slots=True)
+    @cached_property
+    def is_nested(self) -> bool:
+        """Whether what is below looks back in time itself."""
+        return needs_history(self.inner)
+
+
+@dataclass(frozen=True)
 class Held(Tree):
     """``x for 5s``: the condition has been true without a break for that long."""
 
     inner: Tree
     for_ns: int
+
+    @cached_property
+    def breakpoints(self) -> tuple[tuple[str, int], ...]:
+        """When the condition may change: addresses, and how long (ns) after their samples."""
+        return tuple(dict.fromkeys(_breakpoints(self.inner)))
 
 
 _KINDS: dict[type[Tree], Kind] = {
@@ -183,3 +199,35 @@ def delays_ns(tree: Tree) -> frozenset[int]:
 def needs_history(tree: Tree) -> bool:
     """Tell whether a tree cannot be judged from the values of one instant."""
     return any(isinstance(part, Window | Held | Age) for part in walk(tree))
+
+
+def addresses_of(tree: Tree) -> tuple[str, ...]:
+    """Return the addresses in a tree, each once, from left to right."""
+    return tuple(dict.fromkeys(part.name for part in walk(tree) if isinstance(part, Address)))
+
+
+def current_addresses(tree: Tree) -> tuple[str, ...]:
+    """Return the addresses whose present value is read, each once; in windows only samples are."""
+    if isinstance(tree, Address):
+        return (tree.name,)
+    if isinstance(tree, Window | Age):
+        return ()
+    return tuple(dict.fromkeys(n for child in children(tree) for n in current_addresses(child)))
+
+
+def _breakpoints(tree: Tree) -> Iterator[tuple[str, int]]:
+    """Yield after which samples, and how long after them, the value of a tree may change.
+
+    ``age`` grows between samples: it is looked at right before each sample, where it is largest.
+    """
+    if isinstance(tree, Address):
+        yield tree.name, 0
+    elif isinstance(tree, Age):
+        yield from ((tree.inner.name, 0), (tree.inner.name, -1))
+    elif isinstance(tree, Window):
+        yield from ((name, delay_ns) for name in tree.reads for delay_ns in (0, tree.over_ns))
+    else:
+        for part in children(tree):
+            yield from _breakpoints(part)
+            if isinstance(tree, Held):
+                yield from ((name, delay + tree.for_ns) for name, delay in _breakpoints(part))

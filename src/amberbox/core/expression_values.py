@@ -17,6 +17,8 @@ from amberbox.core.types import Ragged
 Array: TypeAlias = NDArray[Any]
 Mask: TypeAlias = NDArray[np.bool_]
 
+KIND_OF_DTYPE: dict[str, Kind] = {"b": "condition", "i": "number", "u": "number", "f": "number"}
+"""What arrays hold, by the kind of their type; others hold objects."""
 _NAMES: dict[Kind, str] = {"text": "text", "number": "a number", "condition": "a condition"}
 
 
@@ -58,10 +60,22 @@ def values_of(column: Any, at: int) -> Values:
     array = column if isinstance(column, np.ndarray) else _object_array(column)
     null = np.ma.getmaskarray(array) if isinstance(array, np.ma.MaskedArray) else None
     data = np.asarray(np.ma.getdata(array))
-    if data.dtype.kind in "biuf":
-        kind: Kind = "condition" if data.dtype.kind == "b" else "number"
-        return Values(data, np.zeros(len(data), bool) if null is None else null, kind)
-    return _from_objects(data.astype(object), null, at)
+    return values_of_array(data, null, KIND_OF_DTYPE.get(data.dtype.kind), at)
+
+
+def values_of_array(data: Array, null: Mask | None, kind: Kind | None, at: int) -> Values:
+    """Take over an array of one kind, or where each value says what it is."""
+    if kind is None:
+        return _from_objects(data.astype(object), null, at)
+    return Values(data, np.zeros(len(data), bool) if null is None else null, kind)
+
+
+def plain(value: Any, at: int) -> tuple[Any, Kind]:
+    """Return an object as plain Python, and its kind."""
+    kind = _kind_of_object(value, at)
+    if kind == "number":
+        return (int(value) if _is_whole(value) else float(value)), kind
+    return (bool(value) if kind == "condition" else value), kind
 
 
 def element_of(column: Any, index: int, at: int) -> Values:
@@ -88,17 +102,27 @@ def constant(value: object, count: int) -> Values:
 
 def as_number(values: Values, wanted_by: str, at: int) -> Values:
     """Return float64 values; conditions count as 0 and 1."""
-    if values.kind == "text":
+    require_number(values.kind, wanted_by, at)
+    return Values(values.data.astype(np.float64, copy=False), values.null, "number")
+
+
+def require_number(kind: Kind, wanted_by: str, at: int) -> None:
+    """Raise Fault for a text."""
+    if kind == "text":
         raise Fault(f"{wanted_by} needs a number, got text", at)
-    return Values(values.data.astype(np.float64), values.null, "number")
 
 
 def as_condition(values: Values, wanted_by: str, at: int) -> Values:
     """Return the same values if they are true or false."""
-    if values.kind in ("number", "text"):
+    require_condition(values.kind, wanted_by, at)
+    return Values(values.data.astype(bool, copy=False), values.null, "condition")
+
+
+def require_condition(kind: Kind, wanted_by: str, at: int) -> None:
+    """Raise Fault for what is neither true nor false."""
+    if kind in ("number", "text"):
         hint = "compare it with something, such as: x > 0"
-        raise Fault(f"{wanted_by} needs a condition, got {_NAMES[values.kind]}", at, hint)
-    return Values(values.data.astype(bool), values.null, "condition")
+        raise Fault(f"{wanted_by} needs a condition, got {_NAMES[kind]}", at, hint)
 
 
 def arithmetic(sign: str, left: Values, right: Values) -> Values:
@@ -110,16 +134,21 @@ def arithmetic(sign: str, left: Values, right: Values) -> Values:
 def compare(sign: str, left: Values, right: Values, at: int) -> Values:
     """Compare pairs: null where either is; whole numbers exactly, others as float64."""
     null = left.null | right.null
-    kinds = {left.kind, right.kind}
-    if "null" in kinds:
+    require_comparable(sign, left.kind, right.kind, at)
+    if "null" in (left.kind, right.kind):
         return Values(np.zeros(len(null), bool), np.ones(len(null), bool), "condition")
-    if "text" in kinds and (len(kinds) > 1 or sign not in ("==", "!=")):
-        names = " with ".join(sorted(_NAMES[kind] for kind in (left.kind, right.kind)))
-        raise Fault(f"'{sign}' cannot compare {names}", at)
     a, b = left.data, right.data
-    if "text" not in kinds and "f" in (a.dtype.kind, b.dtype.kind):
-        a, b = a.astype(np.float64), b.astype(np.float64)
-    return Values(np.asarray(_COMPARE[sign](a, b), bool), null, "condition")
+    if left.kind != "text" and "f" in (a.dtype.kind, b.dtype.kind):
+        a, b = a.astype(np.float64, copy=False), b.astype(np.float64, copy=False)
+    return Values(np.asarray(COMPARE[sign](a, b), bool), null, "condition")
+
+
+def require_comparable(sign: str, left: Kind, right: Kind, at: int) -> None:
+    """Raise Fault for texts beside other things, or in another order than equal or not."""
+    kinds = {left, right}
+    if "text" in kinds and "null" not in kinds and (len(kinds) > 1 or sign not in ("==", "!=")):
+        names = " with ".join(sorted(_NAMES[kind] for kind in (left, right)))
+        raise Fault(f"'{sign}' cannot compare {names}", at)
 
 
 def negated(values: Values) -> Values:
@@ -174,8 +203,11 @@ def _from_objects(data: Array, mask: Mask | None, at: int) -> Values:
 def _packed(data: Array, kind: Kind) -> Array:
     if kind == "condition":
         return data.astype(bool)
-    whole = all(isinstance(value, int | np.integer) and -(2**63) <= value < 2**63 for value in data)
-    return data.astype(np.int64 if whole else np.float64)
+    return data.astype(np.int64 if all(map(_is_whole, data)) else np.float64)
+
+
+def _is_whole(value: Any) -> bool:
+    return isinstance(value, int | np.integer) and bool(-(2**63) <= value < 2**63)
 
 
 def _kind_of_object(value: object, at: int) -> Kind:
@@ -195,7 +227,7 @@ _ARITHMETIC: dict[str, Callable[[Array, Array], Array]] = {
     "/": np.divide,
     "%": np.mod,
 }
-_COMPARE: dict[str, Callable[[Any, Any], Any]] = {
+COMPARE: dict[str, Callable[[Any, Any], Any]] = {
     "<": operator.lt,
     "<=": operator.le,
     ">": operator.gt,

@@ -36,6 +36,15 @@ def reduce_windows(
     return Values(data, null, "number")
 
 
+def reduce_whole(name: str, times_ns: IntArray, samples: Floats) -> float | None:
+    """Apply it to all samples as to one window; None where there are too few."""
+    ends = np.array([0]), np.array([len(samples)])
+    if name == "rate":
+        rate = _rate(times_ns, samples, *ends)
+        return None if rate.null[0] else float(rate.data[0])
+    return float(_REDUCE[name](samples, *ends)[0]) if len(samples) else None
+
+
 def minimum(values: NDArray[Any], first: IntArray, last: IntArray) -> NDArray[Any]:
     """Return the least of ``values[first:last]`` for each pair, none of them empty."""
     return _segments(np.minimum, values, first, last)
@@ -52,6 +61,9 @@ def _segments(
     """Reduce overlapping segments; the value added at the end lets ``last`` be the length."""
     if not len(first):
         return values[:0]
+    if len(first) == 1:
+        only: NDArray[Any] = function.reduceat(values[first[0] : last[0]], [0])
+        return only
     padded = np.append(values, values[-1:])
     pairs = np.stack([first, last], axis=1).ravel()
     reduced: NDArray[Any] = function.reduceat(padded, pairs)[::2]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 from amberbox.core.clock import NS
 from amberbox.core.expression import Expression
 from amberbox.core.mode import Input
-from amberbox.core.samples import Now
+from amberbox.core.samples import Now, is_one
 from amberbox.core.types import IntArray
 
 
@@ -20,6 +21,7 @@ def place_name(place: int) -> str:
     return f"input_{place + 1}"
 
 
+@cache
 def reads_of(*expressions: Expression | None) -> tuple[str, ...]:
     """Return the addresses that expressions read, each once, without inputs of the mapping."""
     names = [name for one in expressions if one is not None for name in one.addresses()]
@@ -35,14 +37,11 @@ def by_name(inputs: Sequence[Input], reads: Sequence[str]) -> dict[str, Input]:
 
 def value_of(expression: Expression, inputs: Mapping[str, Input], now: Now) -> Any:
     """Return the value of an expression; NaN where it is unknown, bools as 0 and 1."""
-    series = {
-        name: (one.samples.times_ns, one.samples.column())
-        for name, one in inputs.items()
-        if name in expression.addresses()
-    }
-    column = expression.evaluate_series(series, np.atleast_1d(np.asarray(now, np.int64)))
-    numbers = np.ma.filled(np.ma.asarray(column).astype(np.float64), np.nan)
-    return numbers.reshape(np.shape(now))[()]
+    samples = {name: inputs[name].samples for name in expression.addresses()}
+    found = expression.evaluate_samples(samples, now)
+    if is_one(now):
+        return np.nan if found is None else float(found)
+    return np.ma.filled(np.ma.asarray(found).astype(np.float64), np.nan)
 
 
 def sample_times(inputs: Iterable[Input], now: Now, seconds: float) -> IntArray:

@@ -6,8 +6,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
 from amberbox.core.expression import Expression
 from amberbox.core.mode import Input, Result, where_known
 from amberbox.core.options import option
@@ -17,7 +15,6 @@ from amberbox.core.together import by_name, reads_of, value_of
 
 ACCEPTS = ("variable",)
 COLUMNS = True
-TIMED = True
 RESULTS = (
     Result("holds", "bool", "the condition holds"),
     Result("value", "float", "the number"),
@@ -66,6 +63,12 @@ def history_s(config: Config) -> float:
     return max(one.history_ns / 1e9 for one in asked if one is not None)
 
 
+def timed(config: Config) -> bool:
+    """Tell whether what it asks changes as time passes."""
+    asked = (config.condition, config.number)
+    return any(one.needs_history for one in asked if one is not None)
+
+
 def results_of(config: Config, inputs: int, bools: int) -> tuple[Result, ...]:
     """Return what is asked for."""
     asked = (config.condition, config.number)
@@ -78,7 +81,7 @@ def evaluate(config: Config, inputs: Sequence[Input], now: Now) -> Mapping[str, 
     found: dict[str, Any] = {}
     if config.condition is not None:
         truth = value_of(config.condition, named, now)
-        found["holds"] = where_known(~np.isnan(truth), truth == 1)
+        found["holds"] = where_known(truth == truth, truth == 1)  # NaN equals nothing
     if config.number is not None:
         found["value"] = value_of(config.number, named, now)
     return found
