@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import errno
 from pathlib import Path
 
 import pytest
 
+from amberbox.blackbox.keeper.ownjournal import OwnJournal
 from tests.monitoring.watcher.stand import PROBE, Stand, kill, written
 
 
@@ -25,7 +27,7 @@ def test_live_and_replay_give_the_same_bytes(tmp_path: Path) -> None:
     assert live == stand.replayed()
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(4))
 def test_killed_at_any_moment_nothing_is_lost_or_doubled(tmp_path: Path, seed: int) -> None:
     """The recorder restarts, crashes, its clock is set; the watcher is killed amid all this."""
     stand = Stand(tmp_path / "store", seed)
@@ -56,3 +58,29 @@ def test_killed_at_any_moment_nothing_is_lost_or_doubled(tmp_path: Path, seed: i
     live, replayed = written(stand.path), stand.replayed()
     assert len(replayed) > 100
     assert live == replayed
+
+
+def test_what_the_disk_refuses_is_found_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stand = Stand(tmp_path / "store", 20)
+    stand.tick()
+    watcher = stand.watcher()
+    for number in range(90):
+        stand.tick()
+        if number % 30 == 20:
+            with monkeypatch.context() as patched:
+                patched.setattr(OwnJournal, "append", _refuse)
+                with pytest.raises(OSError, match="No space"):
+                    watcher.step()
+            watcher.close()
+            watcher = stand.watcher()
+        watcher.step()
+    stand.box.close()
+    watcher.step()
+    watcher.close()
+    assert written(stand.path) == stand.replayed()
+
+
+def _refuse(*_: object, **__: object) -> None:
+    raise OSError(errno.ENOSPC, "No space left on device")

@@ -45,8 +45,8 @@ class _Guard:
 
 
 @contextmanager
-def guarded(plan: Plan, limit_s: float = LIMIT_S) -> Iterator[None]:
-    """Raise ``HangError`` inside a mode's evaluation that takes longer than ``limit_s``.
+def guarded(plan: Plan) -> Iterator[None]:
+    """Raise ``HangError`` inside a mode's evaluation that takes longer than ``LIMIT_S``.
 
     It is interrupted where it stands; the engine takes it for a crash of that mode. Works in the
     main thread; in others nothing is guarded.
@@ -56,7 +56,7 @@ def guarded(plan: Plan, limit_s: float = LIMIT_S) -> Iterator[None]:
         yield
         return
     before = signal.signal(signal.SIGALRM, _Guard(codes).look)
-    signal.setitimer(signal.ITIMER_REAL, limit_s / _LOOKS, limit_s / _LOOKS)
+    signal.setitimer(signal.ITIMER_REAL, LIMIT_S / _LOOKS, LIMIT_S / _LOOKS)
     try:
         yield
     finally:

@@ -54,7 +54,7 @@ class Checkpoint:
     positions: Mapping[str, WriterCursor]
     lookback_s: float
     engine: Mapping[str, Any]
-    config_hash: str = ""
+    monitors: str = ""
 
     def note(self, store_id: str) -> Progress:
         """Make the note that is written down."""
@@ -62,7 +62,7 @@ class Checkpoint:
             "epoch": str(self.place.epoch),
             "until_ns": self.place.until_ns,
             "lookback_s": self.lookback_s,
-            "config_hash": self.config_hash,
+            "monitors": self.monitors,
             "engine": self.engine,
         }
         cursor = Cursor(store_id, self.positions)
@@ -133,5 +133,5 @@ def _take(memory: Memory, store_id: str, topic: str, values: Mapping[str, Any]) 
         memory.place = place
     if values["reader"] == CHECKPOINT and memory.checkpoint is None:
         memory.checkpoint = Checkpoint(
-            place, cursor.writers, float(state["lookback_s"]), state["engine"], state["config_hash"]
+            place, cursor.writers, float(state["lookback_s"]), state["engine"], state["monitors"]
         )

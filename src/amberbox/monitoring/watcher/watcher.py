@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+from amberbox import __version__
 from amberbox.blackbox.folder.folder import RobotFolder
 from amberbox.blackbox.keeper.ownjournal import Progress
 from amberbox.blackbox.keeper.ownstreams import Row
@@ -53,6 +54,11 @@ class Watch:
     clock: Clock = field(default_factory=SystemClock)
     clock_s: Callable[[], float] = time.monotonic
 
+    @property
+    def monitors(self) -> str:
+        """State which monitors these are: what was known of others says nothing about them."""
+        return f"{self.plan.config_hash} {__version__}"
+
 
 class Watcher:
     """Watches one store; ``step`` does what there is to do now, ``run`` until told to stop.
@@ -79,6 +85,8 @@ class Watcher:
         probes = [order.item for order in own_probes(watch)]
         self._reader = Reader(watch.store, self._engine.items, probes, self._start)
         self._silence = Silence(watch.clock_s)
+        self._is_sound = True
+        """Everything that was evaluated is written down."""
         self._silent: list[Status] = []
         self._noted_s = self._asked_s = watch.clock_s()
         self._measured: list[tuple[ProbeOrder, Mapping[str, Any]]] = []
@@ -105,7 +113,11 @@ class Watcher:
             self.close()
 
     def step(self) -> None:
-        """Write what was measured, read on, evaluate, write what was found."""
+        """Write what was measured, read on, evaluate, write what was found.
+
+        Raises OSError when the disk does not take it; the next watcher goes on before that.
+        """
+        self._is_sound = False
         self._write_measured()
         for block in self._reader.step():
             self._silence.heard()
@@ -115,14 +127,18 @@ class Watcher:
         self._say_silence()
         if self._publisher.is_due():
             self._publisher.publish(self._silent or self._engine.statuses())
+        self._is_sound = True
 
     def close(self) -> None:
         """Write down all that is needed to go on, and give the store free."""
-        if self._evaluation.place is not None and not self._evaluation.is_behind:
-            self._journal.found([], [self._checkpoint(self._evaluation.place)])
-        self._publisher.close()
-        self._journal.close()
-        self._lock.release()
+        place = self._evaluation.place
+        try:
+            if place is not None and self._is_sound and not self._evaluation.is_behind:
+                self._journal.found([], [self._checkpoint(place)])
+            self._journal.close()
+        finally:
+            self._publisher.close()
+            self._lock.release()
 
     def measured(self, order: ProbeOrder, values: Mapping[str, Any]) -> None:
         """Take a row of a probe; from any thread."""
@@ -156,15 +172,15 @@ class Watcher:
 
     def _first(self, place: Place) -> Progress:
         """Say where the reading began: whoever is killed before the next note begins there."""
-        about = self._watch.plan.config_hash
-        return Checkpoint(place.before(), self._start, 0.0, {}, about).note(self._watch.store.id)
+        about, store_id = self._watch.monitors, self._watch.store.id
+        return Checkpoint(place.before(), self._start, 0.0, {}, about).note(store_id)
 
     def _checkpoint(self, place: Place) -> Progress:
         self._noted_s = self._watch.clock_s()
         ahead_s = max(self._reader.last_ns() - place.until_ns, 0) / NS
         return Checkpoint(
             place, self._reader.positions(), self._engine.history_s + ahead_s + _MARGIN_S,
-            self._engine.snapshot(), self._watch.plan.config_hash,
+            self._engine.snapshot(), self._watch.monitors,
         ).note(self._watch.store.id)  # fmt: skip
 
     def _carry_out_requests(self) -> None:
@@ -203,7 +219,7 @@ def _memory_of(watch: Watch, history_s: float) -> Memory:
     """Recall what the last watcher left behind; what it knew counts if its monitors are ours."""
     memory = recall(watch.store)
     left = memory.checkpoint
-    if left is not None and left.config_hash != watch.plan.config_hash:
+    if left is not None and left.monitors != watch.monitors:
         memory.checkpoint = replace(left, engine={}, lookback_s=history_s + FIRST_S)
         memory.more = 0
     return memory
