@@ -1,0 +1,66 @@
+"""Members of a team: what is lost of a robot is a failure mode one level up."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from amberbox.core.config import did_you_mean
+from amberbox.core.nodes import Node, load_yaml
+from amberbox.diagnosis.fmea.entries import Scope, with_ranks
+from amberbox.diagnosis.fmea.file import FmeaFile, MemberFile, MemberFunctionFile, RanksFile
+from amberbox.diagnosis.fmea.model import Component, FailureMode
+from amberbox.diagnosis.fmea.places import child
+
+LOST = "lost"
+"""Name of the failure mode of a member's function."""
+
+
+def members(file: FmeaFile, root: Node, scope: Scope, folder: Path) -> dict[str, Component]:
+    """Return a component ``robot:function`` for each function that the team wants of a robot."""
+    found: dict[str, Component] = {}
+    for robot, member in file.robots.items():
+        node = child(root, "robots", robot)
+        offered = _offered(member, node, scope, folder)
+        for name, entry in member.functions.items():
+            place = child(node, "functions", name)
+            where = f"robots.{robot}.functions.{name}"
+            if offered is not None and name not in offered:
+                what = f"{robot} has no function '{name}'{did_you_mean(name, offered)}"
+                scope.problems.append(place.problem(where, what))
+            component = f"{robot}:{name}"
+            _lost(component, entry, place, where, scope)
+            found[component] = Component(component, "robot", modes=(f"{component}#{LOST}",))
+    return found
+
+
+def _offered(member: MemberFile, node: Node, scope: Scope, folder: Path) -> list[str] | None:
+    """Return the functions in the robot's own file; None if that is not there (yet)."""
+    path = folder / member.where
+    path = path / "fmea.yaml" if path.is_dir() else path
+    if not member.where or not path.is_file():
+        if member.where:
+            what = f"{member.where} is not there yet: its functions are not compared"
+            scope.problems.append(child(node, "where").problem("where", what, is_error=False))
+        return None
+    root = load_yaml(path, scope.problems)
+    functions = (root.mapping or {}).get("functions") if root else None
+    return list(functions.mapping or ()) if functions else []
+
+
+def _lost(component: str, entry: MemberFunctionFile, node: Node, where: str, scope: Scope) -> None:
+    mode_id = f"{component}#{LOST}"
+    place = child(node, "symptoms")
+    links = scope.symptoms.links(entry.symptoms, place, f"{where}.symptoms", mode_id)
+    if (entry.rate is None) == (entry.probability is None):
+        scope.problems.append(node.problem(where, "how probable is it? give probability or rate"))
+    for key, value in (("probability", entry.probability), ("rate", entry.rate)):
+        if value is not None and (value < 0 or (key == "probability" and value > 1)):
+            what = f"{value:g} is {'below 0' if value < 0 else 'above 1'}"
+            scope.problems.append(child(node, key).problem(f"{where}.{key}", what))
+    mode = FailureMode(
+        mode_id, component, LOST, component.replace(":", " cannot: "),
+        severity=entry.severity, rate=entry.rate, probability=entry.probability,
+        exposure_h=scope.file.exposure_h, symptoms=links, unobservable=entry.unobservable,
+        remedy=entry.remedy, line=node.line,
+    )  # fmt: skip
+    scope.modes[mode_id] = with_ranks(mode, RanksFile(), scope.file.scales)

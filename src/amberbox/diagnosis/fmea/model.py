@@ -1,0 +1,193 @@
+"""A failure mode and effects analysis as it is used: types written out, names resolved."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal, TypeAlias
+
+from amberbox.core.expression import Expression
+from amberbox.core.needs import NOTHING, Needs
+
+Severity: TypeAlias = Literal["warning", "urgent", "critical", "fatal"]
+"""What the robot can still do (VDA 5050): work, work and be seen to, not move on, nothing."""
+
+SEVERITIES: tuple[Severity, ...] = ("warning", "urgent", "critical", "fatal")
+
+TestKind: TypeAlias = Literal["read", "question", "check"]
+
+
+@dataclass(frozen=True, slots=True)
+class Symptom:
+    """Something that can be seen: a monitor's output that is bad, or a condition that is true.
+
+    ``id`` is the address of the output, or a name of the file; then ``condition`` is what must
+    be true. ``leak`` is how probable it shows although no cause of it is there. It counts as
+    absent only ``within_s`` after a cause can have begun, and is remembered for ``hold_s``.
+    """
+
+    id: str
+    condition: Expression | None = None
+    leak: float = 0.0
+    within_s: float = 0.0
+    hold_s: float = 0.0
+    description: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Link:
+    """A cause shows a symptom: how probable, within what time, remembered for how long."""
+
+    symptom: str
+    detects: float
+    within_s: float
+    hold_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Effects:
+    """What a failure mode does: to its component (text), next to it, and to the system.
+
+    ``next`` and ``system`` are names of components and functions; what the file does not say is
+    derived from what needs the component.
+    """
+
+    local: str = ""
+    next: tuple[str, ...] = ()
+    system: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Ranks:
+    """Severity, occurrence and detection from 1 (good) to 10 (bad); None where nobody knows."""
+
+    severity: int | None = None
+    occurrence: int | None = None
+    detection: int | None = None
+
+    @property
+    def number(self) -> int | None:
+        """Return the risk priority number S x O x D, None if one of them is not known."""
+        if self.severity is None or self.occurrence is None or self.detection is None:
+            return None
+        return self.severity * self.occurrence * self.detection
+
+
+@dataclass(frozen=True, slots=True)
+class TestResult:
+    """What a test gives when a failure mode is there, and how surely."""
+
+    test: str
+    outcome: str
+    detects: float
+
+
+@dataclass(frozen=True, slots=True)
+class FailureMode:
+    """One way in which a component fails; its ``id`` is ``component#mode``.
+
+    ``rate`` is per hour of exposure (mode ratio times the component's rate, where the file says
+    it so); else ``probability`` holds whatever the exposure. ``beta`` is the conditional
+    probability that the effect on the system comes about. ``takes_down`` tells whether the
+    component stops serving those that need it. ``line`` is where the file has it.
+    """
+
+    id: str
+    component: str
+    name: str
+    description: str = ""
+    cause: str = ""
+    classes: tuple[str, ...] = ()
+    severity: Severity = "urgent"
+    rate: float | None = None
+    probability: float | None = None
+    exposure_h: float = 24.0
+    beta: float = 1.0
+    ranks: Ranks = Ranks()
+    effects: Effects = Effects()
+    symptoms: tuple[Link, ...] = ()
+    unobservable: str = ""
+    tests: tuple[TestResult, ...] = ()
+    remedy: str = ""
+    takes_down: bool = True
+    intermittent: bool = False
+    line: int = 0
+
+    def chance(self, exposure_h: float | None = None) -> float:
+        """Return how probable it is to be there: after an exposure, else its own."""
+        if self.rate is None:
+            return self.probability or 0.0
+        return -math.expm1(-self.rate * (self.exposure_h if exposure_h is None else exposure_h))
+
+
+@dataclass(frozen=True, slots=True)
+class Component:
+    """A part that can fail; it serves when no mode has taken it down and its needs are met."""
+
+    id: str
+    type: str
+    description: str = ""
+    needs: Needs = NOTHING
+    modes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Function:
+    """Something the robot can do; lost when its needs are not met. ``system`` marks the top."""
+
+    id: str
+    needs: Needs
+    description: str = ""
+    system: bool = False
+    severity: Severity = "urgent"
+    symptoms: tuple[Link, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class FmeaTest:
+    """Something to look at, ask or check; the first outcome is that of a sound robot.
+
+    ``sure`` is how probable that outcome is when no failure mode says otherwise.
+    """
+
+    id: str
+    kind: TestKind
+    text: str
+    role: str = ""
+    cost_s: float = 0.0
+    risk: float = 0.0
+    outcomes: tuple[str, ...] = ("no", "yes")
+    sure: float = 0.99
+
+
+@dataclass(frozen=True, slots=True)
+class Other:
+    """Something that is not in this analysis: how probable, and what it shows of anything."""
+
+    probability: float = 1e-3
+    detects: float = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class Fmea:
+    """Everything, by id. ``scales`` are rows of the file's S-O-D tables, for documents."""
+
+    name: str
+    modes: Mapping[str, FailureMode]
+    components: Mapping[str, Component]
+    functions: Mapping[str, Function]
+    symptoms: Mapping[str, Symptom]
+    tests: Mapping[str, FmeaTest] = field(default_factory=dict)
+    other: Other = Other()
+    exposure_h: float = 24.0
+
+    def needs(self) -> dict[str, Needs]:
+        """Return what each component and function needs."""
+        needs = {name: component.needs for name, component in self.components.items()}
+        return needs | {name: function.needs for name, function in self.functions.items()}
+
+    def system_functions(self) -> tuple[str, ...]:
+        """Return the effects on the system: functions that are marked so, else all."""
+        marked = tuple(name for name, function in self.functions.items() if function.system)
+        return marked or tuple(self.functions)
