@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
+import msgspec
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -26,6 +29,7 @@ from tests.monitoring.engine.plans import (
     counts,
     gap,
     mode,
+    mode_module,
     one,
     output,
     rows,
@@ -123,6 +127,46 @@ def test_rows_of_a_list_of_structures_are_fresh_while_their_messages_come() -> N
     batches = [rows(seconds(1.0), "a__parts", v=[1.0]), counted]
     monitored = mode(POSITIVE, variable("v", "a__parts"), stale_s=1.5)
     assert levels(watch([monitored], batches, 5.0)) == [(0.0, "unknown"), (1.0, "ok")]
+
+
+def lists(at_s: float, values: Sequence[float]) -> Batch:
+    """Return a message with a list of structures."""
+    message = rows(seconds(at_s), "a")
+    parts = rows(
+        np.repeat(message.log_time_ns, len(values)), "a__parts", parent_seq=[0] * len(values),
+        index=np.arange(len(values)), v=np.array(values, np.float64),
+    )  # fmt: skip
+    return replace(message, children={"parts": parts})
+
+
+def test_a_row_that_is_no_longer_in_its_list_is_not_known() -> None:
+    """Whoever wrote it has died, though messages with the others still come."""
+    second = mode(POSITIVE, replace(variable("v", "a__parts"), index=1))
+    batches = [lists(1, [1, 2]), lists(2, [1]), lists(3, [1, 2]), lists(4, [])]
+    found = [(0.0, "unknown"), (1.0, "ok"), (2.0, "unknown"), (3.0, "ok"), (4.0, "unknown")]
+    assert levels(watch([second], batches, 5.0)) == found
+    first, resumed = Engine(one(second)), Engine(one(second))
+    first.begin(0)
+    for batch in batches[:3]:
+        first.feed(batch)
+    first.advance(3_500_000_000)
+    resumed.resume(json.loads(json.dumps(first.snapshot())))
+    for batch in batches[2:]:
+        resumed.feed(batch)
+    assert levels(resumed.advance(5 * NS))[-1] == (4.0, "unknown")
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_what_is_no_finite_number_is_remembered(value: float) -> None:
+    """The journal keeps snapshots as strict JSON, which has no NaN and no infinity."""
+    finite = mode_module(lambda _, inputs, now: {"good": bool(np.isfinite(inputs[0].at(now)))})
+    plan = one(mode(finite, variable(), stale_s=None))
+    first, resumed = Engine(plan), Engine(plan)
+    first.begin(0)
+    first.feed(rows(seconds(1), v=[value]))
+    first.advance(5 * NS)
+    resumed.resume(msgspec.json.decode(msgspec.json.encode(first.snapshot())))
+    assert {level for _, level in levels(resumed.advance(6 * NS))} == {"error"}
 
 
 def test_an_epoch_begins_with_nothing_known() -> None:

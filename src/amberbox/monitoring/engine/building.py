@@ -32,10 +32,10 @@ def build_groups(plan: Plan, tables: Tables) -> tuple[list[Group], list[OutputRu
     """Make runs of all modes that can run; outputs are numbered in the order of the plan."""
     groups: dict[tuple[str, ...], Group] = {}
     outputs: list[OutputRun] = []
-    for component, mode in plan.modes():
+    for _, mode in plan.modes():
         for mapping in mode.mappings:
             own = [
-                OutputRun(len(outputs) + place, output, (component.id, mode.id))
+                OutputRun(len(outputs) + place, output)
                 for place, output in enumerate(mapping.outputs)
             ]
             outputs += own

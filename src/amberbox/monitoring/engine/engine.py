@@ -42,7 +42,6 @@ class Engine:
         self._forgot_ns = 0
         self._began_ns: int | None = None
         self._pending: list[Finding] = []
-        self._given_up: list[Found] = []
         self._view = _View(plan, self._outputs)
 
     @property
@@ -99,7 +98,7 @@ class Engine:
 
     def _block(self, after_ns: int, until_ns: int) -> list[Finding]:
         self._view.begin_block()
-        found, self._given_up = self._given_up, []
+        found: list[Found] = []
         came = {table.item: _ticks(table, until_ns) for table in self._tables}
         quarters = _multiples(QUARTER_NS, after_ns, until_ns)
         for group in self._groups:
@@ -109,17 +108,6 @@ class Engine:
                     run.run(block, found)
         found.sort(key=_order)
         return self.states.advance(found, until_ns, self._view)
-
-    def give_up(self, component: str, mode: str, why: str) -> None:
-        """Evaluate a mode no more in this epoch: from the next instant on it is unknown."""
-        found: list[Found] = []
-        numbers = {o.number for o in self._outputs if o.belongs_to == (component, mode)}
-        for group in self._groups:
-            for run in group.runs:
-                if any(output.number in numbers for output in run.outputs):
-                    run.crashed = why
-                    run.give_up(self._until_ns + TICK_NS, why, found)
-        self._given_up += found
 
     def statuses(self) -> list[Status]:
         """Return the newest status of every mode and component."""

@@ -6,7 +6,6 @@ same. What is found are changes: of what an output was judged to be, and of bool
 
 from __future__ import annotations
 
-import math
 from bisect import bisect_right
 from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
@@ -20,6 +19,7 @@ from amberbox.core.types import IntArray, Output
 from amberbox.monitoring.engine import freshness
 from amberbox.monitoring.engine.findings import Found, What
 from amberbox.monitoring.engine.judging import AS_BEFORE, BAD, NOT_KNOWN, OK, Judge
+from amberbox.monitoring.engine.keeping import as_json, of_json
 from amberbox.monitoring.plan import MappingPlan, ModePlan, OutputPlan
 
 QUARTER_NS = NS // 4
@@ -58,13 +58,11 @@ class Block:
 class OutputRun:
     """One output as the blocks go by: how it was judged last, and its values in this block."""
 
-    __slots__ = ("before", "belongs_to", "column", "judge", "key", "number", "plan", "times")
+    __slots__ = ("before", "column", "judge", "key", "number", "plan", "times")
 
-    def __init__(self, number: int, plan: OutputPlan, belongs_to: tuple[str, str]) -> None:
+    def __init__(self, number: int, plan: OutputPlan) -> None:
         self.number = number
         self.plan = plan
-        self.belongs_to = belongs_to
-        """Ids of its component and mode."""
         self.judge = Judge(plan)
         self.forget()
 
@@ -126,7 +124,7 @@ class MappingRun:
 
     def snapshot(self) -> list[Any]:
         """Return what it has to know to go on."""
-        outputs = [[output.key, _as_json(output.last)] for output in self.outputs]
+        outputs = [[output.key, as_json(output.last)] for output in self.outputs]
         return [self.code, self.crashed, outputs]
 
     def resume(self, snapshot: Sequence[Any]) -> None:
@@ -134,7 +132,7 @@ class MappingRun:
         self.code, self.crashed = snapshot[0], snapshot[1]
         for output, (key, before) in zip(self.outputs, snapshot[2], strict=True):
             output.key = None if key is None else (key[0], key[1])
-            output.before = float(before[0]) if isinstance(before, list) else before
+            output.before = of_json(before)
 
     def run(self, block: Block, found: list[Found]) -> None:
         """Evaluate a block; a function that raises is not called again, its outputs are unknown."""
@@ -191,22 +189,14 @@ class MappingRun:
 
     def _crash(self, now: int, error: Exception, found: list[Found]) -> None:
         self.crashed = f"crashed: {type(error).__name__}: {error}".rstrip(": ")
-        self.give_up(now, self.crashed, found)
-
-    def give_up(self, now: int, why: str, found: list[Found]) -> None:
-        """Say of all outputs that they are unknown, and why."""
-        self._say(now, "unknown", why, found)
+        self._say(now, "unknown", self.crashed, found)
 
     def _evaluate_one(self, now: int, found: list[Found]) -> None:
         results = self._evaluate(self._config, self.inputs, now)
         self.evaluations += 1
         for output in self.outputs:
             judge = output.judge
-            result = results.get(judge.result)
-            if result is None:
-                code, kept = NOT_KNOWN, None
-            else:
-                code, kept = judge.one(result)
+            code, kept = judge.one(results.get(judge.result))
             if code == AS_BEFORE:
                 code, kept = self._as_before(output)
             key = (code, kept if judge.is_discrete else None)
@@ -291,11 +281,7 @@ class MappingRun:
         self.evaluations += count
         times: list[int] = instants.tolist()
         for output in self.outputs:
-            result = results.get(output.judge.result)
-            if result is None:
-                codes, kept = np.full(count, NOT_KNOWN), [None] * count
-            else:
-                codes, kept = output.judge.many(result, count)
+            codes, kept = output.judge.many(results.get(output.judge.result), count)
             if (codes == AS_BEFORE).any():
                 codes, kept = self._filled(output, codes, kept)
             output.times += times
@@ -336,11 +322,6 @@ class MappingRun:
         changed = [0, *rows] if key != output.key else rows
         output.key = (int(codes[-1]), kept[-1] if output.judge.is_discrete else None)
         return changed
-
-
-def _as_json(value: Any) -> Any:
-    """Return a value as JSON keeps it, infinities in a list of their own."""
-    return [repr(value)] if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _plain(value: Any, is_bool: bool) -> Any:

@@ -9,12 +9,15 @@ from typing import Any
 
 import numpy as np
 
-from amberbox.core.mode import FALSE, HOLD, TRUE, UNKNOWN
+from amberbox.core.mode import FALSE, HOLD, TRUE
 from amberbox.core.types import Output
 from amberbox.monitoring.plan import Expectation, OutputPlan
 
 OK, BAD, NOT_KNOWN, AS_BEFORE = 0, 1, 2, 3
 """What a value is judged to be."""
+_TEXT, _NUMBER = (str,), (int, float)
+_WHOLE = 1 << 63
+"""Whole numbers beyond this are kept as floats, which JSON can hold."""
 
 _COMPARE: Mapping[str, Callable[[Any, Any], Any]] = {
     "==": operator.eq,
@@ -29,7 +32,10 @@ _COMPARE: Mapping[str, Callable[[Any, Any], Any]] = {
 class Judge:
     """Judges the results that one output of a plan is bound to."""
 
-    __slots__ = ("_expectation", "_expected", "is_bool", "is_discrete", "is_int", "result")
+    __slots__ = (
+        *("result", "is_bool", "is_int", "is_discrete"),
+        *("_expectation", "_expected", "_kinds", "_missing"),
+    )
 
     def __init__(self, output: OutputPlan) -> None:
         self.result = output.result.name
@@ -40,17 +46,30 @@ class Judge:
         self._expectation: Expectation | None = None if expects.value is None else expects
         is_simple = self.is_bool and isinstance(expects.value, bool) and expects.relation == "=="
         self._expected = (TRUE if expects.value else FALSE) if is_simple else None
+        self._kinds = "biu" if self.is_bool else "U" if self.is_discrete else "biuf"
+        judged = self.is_bool or self._expectation is not None
+        self._missing = NOT_KNOWN if judged else OK
 
     def one(self, result: Any) -> tuple[int, Any]:
-        """Judge one value; return it as it is kept (bools as their code)."""
+        """Judge one value, None if there is none; return it as it is kept (bools as their code).
+
+        Raises TypeError if it is not of the output's type.
+        """
+        if result is None:
+            return self._missing, None
         if self.is_bool:
             code = int(result)
             if code > TRUE:
-                return (NOT_KNOWN if code == UNKNOWN else AS_BEFORE), code
+                return (AS_BEFORE if code == HOLD else NOT_KNOWN), code
             if self._expected is not None:
                 return (OK if code == self._expected else BAD), code
             return self._compared(code), code
         plain = result.item() if isinstance(result, np.generic | np.ndarray) else result
+        if not isinstance(plain, _TEXT if self.is_discrete else _NUMBER):
+            wanted = "text" if self.is_discrete else "number"
+            raise TypeError(f"{self.result} is no {wanted}: {repr(plain)[:60]}")
+        if isinstance(plain, int) and not -_WHOLE <= plain < _WHOLE:
+            plain = float(plain)
         return self._compared(plain), plain
 
     def _compared(self, value: Any) -> int:
@@ -68,7 +87,7 @@ class Judge:
     def many(self, results: Any, count: int) -> tuple[Any, list[Any]]:
         """Judge a column; return codes and the values as they are kept."""
         column = np.broadcast_to(np.asarray(results), (count,))
-        if column.dtype == object:
+        if column.dtype.kind not in self._kinds:
             judged = [self.one(value) for value in column]
             return np.array([code for code, _ in judged], np.int8), [value for _, value in judged]
         if self.is_bool:
@@ -97,7 +116,7 @@ class Judge:
         if isinstance(kept, float):
             if math.isnan(kept):
                 return None
-            return int(kept) if self.is_int and math.isfinite(kept) else kept
+            return int(kept) if self.is_int and abs(kept) < _WHOLE else kept
         value: Output = kept
         return value
 

@@ -16,6 +16,7 @@ from amberbox.core.mode import Input
 from amberbox.core.names import identifier
 from amberbox.core.samples import NONE_OPEN, Flow, Samples
 from amberbox.core.types import Batch, IntArray, ItemSchema, Ragged
+from amberbox.monitoring.engine.keeping import as_json, of_json
 from amberbox.monitoring.engine.lists import FIGURES, figures_of
 from amberbox.monitoring.plan import InputPlan
 
@@ -40,6 +41,8 @@ class Table:
     labels: dict[str, dict[int, str]] = field(default_factory=dict)
     """Names that the message gives values of the columns that are read."""
     keep_ns: int = NS
+    is_list: bool = False
+    """It is a list of structures within the messages of another item."""
     fresh: list[IntArray] = field(default_factory=list)
     """Times of rows that no instant has been evaluated for yet."""
     _schema: ItemSchema | None = None
@@ -60,7 +63,8 @@ class Table:
         if batch.schema.stamp:
             self.stamps.extend(times_ns, _part(batch.timestamp_ns, keep))
         for key, samples in self.columns.items():
-            samples.extend(*self._of_row(batch, key, times_ns, keep))
+            if not _is_row(batch, key):
+                samples.extend(times_ns, _part(self._column(batch, *key), keep))
         for name, figures in self.lists.items():
             for figure, values in figures_of(batch.columns.get(name), len(batch)).items():
                 figures[figure].extend(times_ns, _part(values, keep))
@@ -82,15 +86,27 @@ class Table:
             if column.name in self.labels:
                 self.labels[column.name].update(column.labels)
 
-    def _of_row(
-        self, batch: Batch, key: Key, times_ns: IntArray, keep: Any
-    ) -> tuple[IntArray, Any]:
-        """Return times and values of a column; of a child table those of the row asked for."""
-        name, index = key
-        if index is None or "parent_seq" not in batch.columns:
-            return times_ns, _part(self._column(batch, *key), keep)
-        here = np.asarray(_part(batch.columns["index"], keep)) == index
-        return times_ns[here], _part(self._column(batch, name, None), keep)[here]
+    def feed_rows(self, messages: Batch, rows: Batch | None) -> None:
+        """Take single rows of a list of structures: unknown in messages whose list lacks them."""
+        self.is_list |= rows is not None and "index" in rows.columns
+        for (name, index), samples in self.columns.items() if self.is_list else ():
+            if index is None:
+                continue
+            times_ns, values = messages.log_time_ns, self._rows_at(index, name, messages, rows)
+            first = 0 if len(samples) else _first_known(values)
+            keep = self._new(f"column {name} {index}", times_ns[first:])
+            samples.extend(_part(times_ns[first:], keep), _part(values[first:], keep))
+
+    def _rows_at(self, index: int, name: str, messages: Batch, rows: Batch | None) -> Any:
+        """Return a column of one row of each message's list."""
+        if rows is None or not len(rows):
+            return _unknown(len(messages))
+        here = np.flatnonzero(np.asarray(rows.columns["index"]) == index)
+        column = self._column(rows, name, None)[here]
+        values = _unknown(len(messages), column.dtype)
+        places = messages.seq.searchsorted(np.asarray(rows.columns["parent_seq"])[here])
+        values[places] = column
+        return values
 
     def _column(self, batch: Batch, name: str, index: int | None) -> Any:
         column = batch.columns.get(name)
@@ -161,10 +177,12 @@ class Table:
         """Return what is older than the rows that will be read again, and open gaps."""
         held = {name: _last_by(samples, at_ns - self.keep_ns) for name, samples in self.samples()}
         gaps = [[peer, at, self.flow.reasons.get(at, "")] for peer, at in self._gaps]
-        return {"held": {n: v for n, v in held.items() if v is not None}, "gaps": gaps}
+        known = {n: v for n, v in held.items() if v is not None}
+        return {"held": known, "gaps": gaps, "is_list": self.is_list}
 
     def resume(self, snapshot: Mapping[str, Any]) -> None:
         """Go on with what ``snapshot`` returned."""
+        self.is_list = snapshot["is_list"]
         self._gaps = {(peer, from_ns): from_ns for peer, from_ns, _ in snapshot["gaps"]}
         self.flow.reasons.update({from_ns: why for _, from_ns, why in snapshot["gaps"]})
         if self.whole is not None:
@@ -220,11 +238,16 @@ class Tables:
         elif batch.item == GAPS:
             self._take_gaps(batch)
         else:
-            table = self._tables.get(batch.item)
-            if table is not None and len(batch):
-                table.feed(batch, after_ns)
-            for child in batch.children.values():
-                self.feed(child, after_ns)
+            self._take_rows(batch, after_ns)
+
+    def _take_rows(self, batch: Batch, after_ns: int) -> None:
+        batches = {each.item: each for each in _with_children(batch)}
+        for table in self._of(batch.item):
+            rows = batches.get(table.item)
+            if rows is not None and len(rows):
+                table.feed(rows, after_ns)
+            if table.item != batch.item:
+                table.feed_rows(batch, rows)
 
     def _take_counters(self, batch: Batch) -> None:
         rows = batch.children.get("items")
@@ -300,8 +323,15 @@ def _part(column: Any, keep: Any) -> Any:
     return column if keep is None else column[keep]
 
 
-def _unknown(count: int) -> Any:
-    return np.ma.MaskedArray(np.zeros(count), np.ones(count, bool))
+def _unknown(count: int, dtype: Any = np.float64) -> Any:
+    if np.dtype(dtype).kind == "O":
+        return np.full(count, None, object)
+    return np.ma.MaskedArray(np.zeros(count, dtype), np.ones(count, bool))
+
+
+def _first_known(column: Any) -> int:
+    known = np.array([value is not None for value in _objects(column)], bool)
+    return int(known.argmax()) if known.any() else len(known)
 
 
 def _objects(column: Any) -> Any:
@@ -326,15 +356,22 @@ def _last_by(samples: Samples, time_ns: int) -> list[Any] | None:
         return None
     value = samples.column()[last]
     plain = None if value is np.ma.masked else getattr(value, "item", lambda: value)()
-    return [int(samples.times_ns[last]), plain]
+    return [int(samples.times_ns[last]), as_json(plain)]
 
 
-def _single(value: Any) -> Any:
+def _single(held: Any) -> Any:
+    value = of_json(held)
     if value is None:
         return _unknown(1)
     if isinstance(value, str):
         return np.array([value], object)
     return np.array([value])
+
+
+def _with_children(batch: Batch) -> Iterator[Batch]:
+    yield batch
+    for child in batch.children.values():
+        yield from _with_children(child)
 
 
 def _with_parents(item: str) -> Iterator[str]:
@@ -343,6 +380,11 @@ def _with_parents(item: str) -> Iterator[str]:
     while "__" in item:
         item = item.rpartition("__")[0]
         yield item
+
+
+def _is_row(batch: Batch, key: Key) -> bool:
+    """Tell whether a column is that of one row of a list of structures."""
+    return key[1] is not None and "parent_seq" in batch.columns
 
 
 def _is_below(name: str, item: str) -> bool:
