@@ -1,0 +1,142 @@
+"""Why an answer holds: the tree of clauses and facts that it was derived from."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any, Literal, TypeAlias
+
+from amberbox.diagnosis.rules.clauses import Clause
+from amberbox.diagnosis.rules.faults import Place
+from amberbox.diagnosis.rules.terms import Term, make
+from amberbox.diagnosis.rules.unify import Memo, copy
+from amberbox.diagnosis.rules.writer import Names, anonymous, write
+
+Trace: TypeAlias = "tuple[Any, ...] | None"
+"""What was proved so far, newest first: ``(older, ENTER, clause, args)``, ``(older, EXIT)`` or
+``(older, LEAF, term or Node)``."""
+
+ENTER, EXIT, LEAF = "enter", "exit", "leaf"
+
+Kind: TypeAlias = Literal["rule", "fact", "builtin"]
+
+
+@dataclass(slots=True, eq=False)
+class Node:
+    """A goal that holds: by a rule (then its goals are below it), a fact, or built in."""
+
+    goal: Term
+    kind: Kind
+    place: Place | None = None
+    children: list[Node] = field(default_factory=list)
+
+    def leaves(self) -> Iterator[Node]:
+        """Yield the facts and built-in goals at the ends of the tree, from left to right."""
+        for node, _, is_again in self.walk():
+            if not node.children and not is_again:
+                yield node
+
+    def walk(self) -> Iterator[tuple[Node, int, bool]]:
+        """Yield every node with its depth, and whether it was shown before with what is below."""
+        shown: set[int] = set()
+        open_nodes = [(self, 0)]
+        while open_nodes:
+            node, depth = open_nodes.pop()
+            is_again = id(node) in shown and bool(node.children)
+            yield node, depth, is_again
+            if not is_again:
+                shown.add(id(node))
+                open_nodes.extend((child, depth + 1) for child in reversed(node.children))
+
+    def text(self, names: Names = anonymous) -> str:
+        """Write the tree, one goal per line, indented by depth."""
+        lines = []
+        for node, depth, is_again in self.walk():
+            note = "   (shown above)" if is_again else _source(node)
+            lines.append(f"{'  ' * depth}{write(node.goal, names)}{note}")
+        return "\n".join(lines)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the tree as plain Python; what is below a repeated goal is given once."""
+        made: list[tuple[dict[str, Any], int]] = []
+        path: list[dict[str, Any]] = []
+        for node, depth, is_again in self.walk():
+            entry: dict[str, Any] = {"goal": write(node.goal), "by": node.kind}
+            entry |= {"at": str(node.place)} if node.place is not None else {}
+            entry |= {"shown_above": True} if is_again else {}
+            del path[depth:]
+            if path:
+                path[-1].setdefault("because", []).append(entry)
+            path.append(entry)
+            made.append((entry, depth))
+        return made[0][0]
+
+
+def _source(node: Node) -> str:
+    if node.kind == "builtin":
+        return ""
+    return f"   {node.kind}, {node.place}" if node.place is not None else f"   {node.kind}"
+
+
+def nodes_of(trace: Trace) -> list[Node]:
+    """Return the goals that a trace proves, in the order in which they were run."""
+    root = Node("true", "builtin")
+    path = [root]
+    hidden: list[int] = []
+    for event in _events(trace):
+        if event[1] == EXIT:
+            if hidden and hidden[-1] == len(path):
+                hidden.pop()
+            path.pop()
+            continue
+        node = event[2] if isinstance(event[2], Node) else _node(event)
+        if not hidden:
+            path[-1].children.append(node)
+        if event[1] == ENTER:
+            path.append(node)
+            if event[2].place.file == LIBRARY and not hidden:
+                hidden.append(len(path))
+    return root.children
+
+
+LIBRARY = "library"
+"""File of the rules that come with the language: they are shown as if they were built in."""
+
+
+def node_of(trace: Trace, goal: Term) -> Node:
+    """Return the only goal that a trace proves, as it is known after the proof."""
+    node = nodes_of(trace)[0]
+    return Node(goal, node.kind, node.place, node.children)
+
+
+def _events(trace: Trace) -> list[tuple[Any, ...]]:
+    events = []
+    while trace is not None:
+        events.append(trace)
+        trace = trace[0]
+    return events[::-1]
+
+
+def _node(event: tuple[Any, ...]) -> Node:
+    if event[1] == LEAF:
+        return Node(copy(event[2], None), "builtin")
+    clause: Clause = event[2]
+    goal = copy(make(clause.key[0], event[3]), None)
+    if clause.place.file == LIBRARY:
+        return Node(goal, "builtin")
+    return Node(goal, "fact" if clause.body is None else "rule", clause.place)
+
+
+def copy_trace(trace: Trace, memo: Memo) -> Trace:
+    """Copy a trace together with terms that share its variables."""
+    copied: Trace = None
+    for _, kind, *rest in _events(trace):
+        if kind == ENTER:
+            args = tuple(copy(arg, memo) for arg in rest[1])
+            copied = (copied, ENTER, rest[0], args)
+        elif kind == LEAF:
+            leaf = rest[0] if isinstance(rest[0], Node) else copy(rest[0], memo)
+            copied = (copied, LEAF, leaf)
+        else:
+            copied = (copied, EXIT)
+    return copied
