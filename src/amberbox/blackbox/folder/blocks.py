@@ -24,7 +24,7 @@ NAMED = ("status",)
 """Sources whose blocks are always called by their ``name``: others may join them later."""
 NOT_BUILT_YET = (
     *("can", "dds", "ethercat", "event", "foxglove", "host", "journald", "mavlink", "modbus"),
-    *("mqtt", "opcua", "power", "probe", "ros2", "serial", "video", "vda5050", "zenoh", "zyre"),
+    *("mqtt", "opcua", "ros2", "serial", "video", "vda5050", "zenoh", "zyre"),
 )
 """Sources that are planned: their blocks are noted and ignored instead of refused."""
 
