@@ -13,6 +13,7 @@ from amberbox.blackbox.store import open_store
 from amberbox.core.clock import NS
 from amberbox.core.errors import UsageError
 from amberbox.monitoring.watcher.watcher import Watch, Watcher
+from amberbox.testing.box import events
 from tests.monitoring.watcher.stand import (
     NUMBERS,
     PROBE,
@@ -182,3 +183,27 @@ def test_a_watcher_of_nothing_waits(tmp_path: Path) -> None:
     watcher.step()
     watcher.close()
     assert NUMBERS.keys() == {"main", "bulk", "ring"}
+
+
+def test_a_memory_that_makes_no_sense_is_said_and_begun_anew(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stand = Stand(tmp_path / "store", 8)
+    stand.tick()
+    watcher = stand.watcher()
+    for _ in range(30):
+        stand.tick()
+        watcher.step()
+    monkeypatch.setattr(watcher._engine, "snapshot", lambda: {"version": "of tomorrow"})
+    watcher.close()
+    before = values(written(stand.path), "amberbox/status")
+    watcher = stand.watcher()
+    for _ in range(30):
+        stand.tick()
+        watcher.step()
+    watcher.close()
+    after = values(written(stand.path), "amberbox/status")[len(before) :]
+    assert int(str(after[0]["measured_ns"])) >= int(str(before[-1]["measured_ns"]))
+    assert {s["level"] for s in after if s["component"] == "base"} & {"ok", "error"}
+    (told,) = events(stand.path, "watch_anew")
+    assert "of no use: KeyError" in told["text"]

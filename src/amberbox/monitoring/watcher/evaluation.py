@@ -45,6 +45,8 @@ class Evaluation:
     engine: Evaluates
     memory: Memory = field(default_factory=Memory)
     place: Place | None = None
+    trouble: str = ""
+    """Why what was remembered could not be used; empty if it could."""
     _epoch: Epoch | None = None
     _known: Place | None = None
     _more: int = 0
@@ -76,12 +78,20 @@ class Evaluation:
         if self._epoch is None and left is not None and epoch.run <= left.place.epoch.run:
             if epoch != left.place.epoch:
                 return False
-            if left.engine:
-                self.engine.resume(left.engine)
+            if left.engine and self._resumed(left.engine):
                 self._epoch, self.place = epoch, left.place
                 return True
         self.engine.begin(start_ns)
         self._epoch, self.place = epoch, None
+        return True
+
+    def _resumed(self, engine: Mapping[str, Any]) -> bool:
+        """Go on with what the engine knew; False, with the trouble, if it makes no sense of it."""
+        try:
+            self.engine.resume(engine)
+        except Exception as error:  # it is of another version, or damaged: begin anew
+            self.trouble = f"{type(error).__name__}: {error}"
+            return False
         return True
 
     @property

@@ -163,6 +163,10 @@ class Watcher:
         if self._is_new:
             self._journal.found([], [self._first(place)])
             self._is_new = False
+        if self._evaluation.trouble:
+            text = f"begins anew, what was remembered is of no use: {self._evaluation.trouble}"
+            self._journal.told("watch_anew", text)
+            self._evaluation.trouble = ""
         notes = [place.note(self._watch.store.id)]
         if self._watch.clock_s() - self._noted_s >= CHECKPOINT_S:
             notes.append(self._checkpoint(place))

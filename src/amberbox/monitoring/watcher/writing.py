@@ -5,15 +5,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+import msgspec
+
 from amberbox.blackbox.follow.chain import previous_chain
 from amberbox.blackbox.journal.scan import start_record
-from amberbox.blackbox.keeper.ownjournal import OwnJournal, Progress
+from amberbox.blackbox.keeper.ownjournal import OwnJournal, Progress, event
 from amberbox.blackbox.keeper.ownstreams import Own, Row
 from amberbox.blackbox.store import Store, run_and_number
 from amberbox.core.clock import Clock
 from amberbox.core.types import Status
 from amberbox.monitoring.engine.findings import Finding
-from amberbox.monitoring.messages.records import encoded
+from amberbox.monitoring.messages.records import SOURCE, encoded
 from amberbox.monitoring.watcher.axis import RecordAxis
 from amberbox.monitoring.watcher.epoch import Epoch
 from amberbox.monitoring.watcher.memory import Place
@@ -66,6 +68,11 @@ class Journal:
         """Write findings with what is to be remembered beside them."""
         urgent = any(not isinstance(finding, Status) for finding in findings)
         self._own.append([Own(*encoded(finding)) for finding in findings], notes, urgent=urgent)
+
+    def told(self, kind: str, text: str) -> None:
+        """Write an event about the watcher itself."""
+        topic, values = event(kind, text, SOURCE)
+        self._own.append([Own(topic, msgspec.json.encode(values))], urgent=True)
 
     def close(self) -> None:
         """Finish the journal."""
