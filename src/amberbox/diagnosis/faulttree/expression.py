@@ -90,8 +90,8 @@ def count_problem(kind: str, given: int, fewest: int, most: int | None) -> str:
     """Say what is wrong with the number of inputs of something; empty if nothing is."""
     if fewest <= given and (most is None or given <= most):
         return ""
-    wanted = "at least one" if most is None else f"exactly {fewest}"
-    return f"'{kind}' needs {wanted} {'input' if wanted.endswith('e') else 'inputs'}, not {given}"
+    wanted = "at least" if most is None else "exactly"
+    return f"'{kind}' needs {wanted} {fewest} {'input' if fewest == 1 else 'inputs'}, not {given}"
 
 
 def value(expression: Expression, parameters: Mapping[str, float], mission_time_h: float) -> float:

@@ -71,8 +71,13 @@ def read_mef(
         raise ConfigurationError(found)
     _collect(root, scope)
     tree = _tree(scope, root, top, mission_time_h)
-    refuse(found)
+    _refuse(scope)
     return tree
+
+
+def _refuse(scope: Scope) -> None:
+    """Raise ConfigurationError with all problems, in the order of the file."""
+    refuse(sorted(scope.problems, key=lambda problem: problem.line))
 
 
 def _collect(root: Element, scope: Scope) -> None:
@@ -122,7 +127,7 @@ def _tree(scope: Scope, root: Element, top: str, mission_time_h: float) -> Fault
         for entry in scope.of_kind("basic event")
     }
     _check_gates(gates, events, scope)
-    refuse(scope.problems)
+    _refuse(scope)
     chosen = _top(gates, top, scope.file)
     name = _tree_name(scope.known[False, chosen], root)
     tree = FaultTree(name, chosen, gates, events, houses, parameters, mission_time_h)
@@ -221,7 +226,8 @@ def _event(
     if not 0.0 <= chance <= 1.0:
         what = f"the probability {chance:g} is not between 0 and 1"
         scope.fail(definition.element, definition.name, what)
-    return BasicEvent(definition.name, chance, definition.label, read)
+    written = None if isinstance(read, Number) else read
+    return BasicEvent(definition.name, chance, definition.label, written)
 
 
 def _check_gates(gates: Mapping[str, Gate], events: Mapping[str, BasicEvent], scope: Scope) -> None:

@@ -29,7 +29,8 @@ class Gate:
 class BasicEvent:
     """Something that happens or not, of itself.
 
-    ``probability`` is None where nobody has given one. ``expression`` is how a file writes it.
+    ``probability`` is None where nobody has given one. ``expression`` is how a file writes it
+    when it is not just a number.
     """
 
     name: str
