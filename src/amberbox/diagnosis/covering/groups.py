@@ -1,0 +1,72 @@
+"""Ambiguity groups: hypotheses that nothing that is known tells apart."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+from amberbox.core.types import Hypothesis
+from amberbox.diagnosis.covering.evidence import Evidence
+from amberbox.diagnosis.covering.model import Model
+from amberbox.diagnosis.covering.prediction import Prediction, outcomes
+
+EXPECTED = 0.5
+"""From this probability on a symptom is expected of a hypothesis."""
+
+
+@dataclass(frozen=True, slots=True)
+class AmbiguityGroup:
+    """Hypotheses of which the same symptoms are expected, possible and not caused.
+
+    ``members`` are the ids of the smallest sets, the most probable first; ``wider`` those of
+    sets that only add faults to a member without a trace. ``probability`` is that of all.
+    """
+
+    id: str
+    members: tuple[str, ...]
+    wider: tuple[str, ...]
+    probability: float
+
+
+def signature(model: Model, evidence: Evidence, prediction: Prediction) -> tuple[object, ...]:
+    """Return what the known symptoms and answers can see of a hypothesis."""
+    levels = []
+    for name in evidence.observations:
+        place = model.sign_places.get(name)
+        if place is not None and evidence.observations[name].state != "unknown":
+            caused = place in prediction.misses
+            expected = caused and prediction.expected(model, place) >= EXPECTED
+            levels.append((caused, expected))
+    answers = (
+        outcomes(model, a.check, prediction)[a.check.level(a.outcome)] >= EXPECTED
+        for a in evidence.answers
+    )
+    return (prediction.unknown, tuple(levels), tuple(answers))
+
+
+def grouped(
+    hypotheses: Sequence[Hypothesis], signatures: Sequence[object]
+) -> tuple[tuple[Hypothesis, ...], tuple[AmbiguityGroup, ...]]:
+    """Return the hypotheses with their ambiguity filled in, and the groups by probability."""
+    alike: dict[object, list[Hypothesis]] = {}
+    for hypothesis, key in zip(hypotheses, signatures, strict=True):
+        alike.setdefault(key, []).append(hypothesis)
+    groups = sorted(map(_group, alike.values()), key=lambda group: -group.probability)
+    members = {name: g.members for g in groups for name in (*g.members, *g.wider)}
+    filled = tuple(replace(h, ambiguity=_others(h.id, members)) for h in hypotheses)
+    return filled, tuple(groups)
+
+
+def _others(name: str, members: Mapping[str, tuple[str, ...]]) -> tuple[str, ...]:
+    return tuple(other for other in members[name] if other != name)
+
+
+def _group(alike: Sequence[Hypothesis]) -> AmbiguityGroup:
+    smallest = [h for h in alike if not any(other.faults < h.faults for other in alike)]
+    wider = [h for h in alike if h not in smallest]
+    return AmbiguityGroup(
+        smallest[0].id,
+        tuple(h.id for h in smallest),
+        tuple(h.id for h in wider),
+        sum(h.probability for h in alike),
+    )

@@ -1,0 +1,257 @@
+"""One question to the engine: the failure modes that matter for it, in groups that are alike.
+
+Failure modes that touch no clue, neither directly nor through functions shared with others, are
+independent of the rest given the evidence: they are summed out exactly and appear nowhere.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import chain
+
+import numpy as np
+
+from amberbox.diagnosis.covering.clues import Clue, Folded
+from amberbox.diagnosis.covering.gates import Gates, bits
+from amberbox.diagnosis.covering.tables import Floats, Ints, Tables
+
+NEVER = -math.inf
+
+
+class Group:
+    """Failure modes that act alike on every clue and function that matters.
+
+    ``hits`` are (clue, 1 - detects), ``component`` what they take down (-1: nothing that
+    matters), ``modes`` from the most to the least probable.
+    """
+
+    __slots__ = ("_sums", "_weights", "component", "hits", "log_best", "modes")
+
+    def __init__(
+        self,
+        modes: Iterable[tuple[float, int]],
+        hits: tuple[tuple[int, float], ...],
+        component: int,
+    ) -> None:
+        ordered = sorted(modes, key=_likely_first)
+        self.hits = hits
+        self.component = component
+        self.modes = [mode for _, mode in ordered]
+        self._weights = [weight for weight, _ in ordered]
+        self.log_best = self._weights[0]
+        self._sums = [0.0]
+
+    def __len__(self) -> int:
+        return len(self.modes)
+
+    def log_weight(self, place: int) -> float:
+        """Return the logarithm of the weight of the mode at a place."""
+        return self._weights[place]
+
+    def log_sum(self, count: int) -> float:
+        """Return the logarithm of the summed weight of all sets of so many members."""
+        while len(self._sums) <= count:
+            self._extend()
+        return self._sums[count]
+
+    def _extend(self) -> None:
+        """Add the next elementary symmetric polynomial of the weights, scaled by the best."""
+        count = len(self._sums)
+        sums = [1.0] + [0.0] * count
+        for weight in self._weights:
+            ratio = math.exp(weight - self.log_best)
+            for k in range(count, 0, -1):
+                sums[k] += sums[k - 1] * ratio
+        self._sums.append(log(sums[count]) + count * self.log_best)
+
+
+def _likely_first(weighted: tuple[float, int]) -> tuple[float, int]:
+    return (-weighted[0], weighted[1])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Problem:
+    """The groups that matter, with what each clue and function needs of them.
+
+    ``causes[k]`` are the groups that can act on clue k, ``cause_masks`` the same as masks;
+    ``least[k]`` is q of clue k when everything is there. ``log_all`` is the logarithm of the
+    product of 1 + weight over all modes, ``log_odd`` that of all weights above 1.
+    """
+
+    clues: tuple[Clue, ...]
+    groups: tuple[Group, ...]
+    causes: tuple[tuple[int, ...], ...]
+    cause_masks: tuple[int, ...]
+    least: tuple[float, ...]
+    gates: Gates
+    relevant: int
+    log_loss: Sequence[float]
+    function_hits: Mapping[int, Sequence[tuple[int, float]]]
+    log_all: float
+    log_odd: float
+    group_component: Ints
+    log_sums: Floats
+    log_bests: Floats
+    pair_component: Ints
+    pair_loss: Floats
+    pair_function: Ints
+    component_count: int
+
+    def log_losses(self, lost: int) -> Floats:
+        """Return per group the logarithm of what its newly lost functions cost."""
+        loss = self.pair_loss
+        if lost:
+            gone = np.zeros(len(self.log_loss), np.bool_)
+            gone[list(bits(lost))] = True
+            loss = np.where(gone[self.pair_function], 0.0, loss)
+        per = np.bincount(self.pair_component, weights=loss, minlength=self.component_count + 1)
+        result: Floats = per[self.group_component]
+        return result
+
+
+def problem_of(tables: Tables, evidence: Folded) -> Problem:
+    """Find the modes that matter for some clue and group those that are alike."""
+    function_hits = _function_hits(evidence.clues)
+    relevant = _relevant(evidence.log_loss, function_hits)
+    hits = _mode_hits(evidence, tables)
+    components = _components(tables, hits, function_hits, relevant)
+    groups = tuple(_groups(tables, evidence.log_weight, hits, components))
+    causes = tuple(_causes(groups, evidence.clues, tables.gates))
+    weights = np.array([g.log_weight(n) for g in groups for n in range(len(g))])
+    keep = np.array([relevant >> f & 1 for f in tables.pair_function.tolist()], np.bool_)
+    loss = np.maximum(evidence.log_loss, -1e9)  # 0 * inf is no number
+    return Problem(
+        evidence.clues,
+        groups,
+        causes,
+        tuple(sum(1 << group for group in of) for of in causes),
+        tuple(_least(groups, evidence.clues)),
+        tables.gates,
+        relevant,
+        evidence.log_loss.tolist(),
+        function_hits,
+        float(np.logaddexp(0.0, weights).sum()),
+        float(np.maximum(weights, 0.0).sum()),
+        np.array([g.component for g in groups], np.int64),
+        np.array([g.log_sum(1) for g in groups], np.float64),
+        np.array([g.log_best for g in groups], np.float64),
+        tables.pair_component[keep],
+        loss[tables.pair_function[keep]],
+        tables.pair_function[keep],
+        tables.component_count,
+    )
+
+
+def log(value: float) -> float:
+    """Return the natural logarithm, minus infinity for zero."""
+    return math.log(value) if value > 0 else NEVER
+
+
+def _function_hits(clues: Sequence[Clue]) -> dict[int, list[tuple[int, float]]]:
+    hits: dict[int, list[tuple[int, float]]] = {}
+    for place, clue in enumerate(clues):
+        for function, detects in clue.functions:
+            if detects > 0:
+                hits.setdefault(function, []).append((place, 1.0 - detects))
+    return hits
+
+
+def _relevant(log_loss: Floats, function_hits: Mapping[int, object]) -> int:
+    """Return the functions whose loss the evidence speaks for or against."""
+    mask = sum(1 << int(place) for place in np.flatnonzero(log_loss < 0))
+    for place in function_hits:
+        mask |= 1 << place
+    return mask
+
+
+def _mode_hits(evidence: Folded, tables: Tables) -> dict[int, list[tuple[int, float]]]:
+    hits: dict[int, list[tuple[int, float]]] = {}
+    for place, clue in enumerate(evidence.clues):
+        for mode, detects in clue.modes:
+            if detects > 0 and evidence.log_weight[mode] > NEVER:
+                hits.setdefault(mode, []).append((place, 1.0 - detects))
+    return hits
+
+
+def _components(
+    tables: Tables, hits: Iterable[int], function_hits: Iterable[int], relevant: int
+) -> int:
+    """Return the components whose state is tied to some clue through functions that matter."""
+    support = tables.gates.support
+    tied = 0
+    for mode in hits:
+        place = int(tables.component[mode])
+        tied |= 1 << place if place >= 0 else 0
+    for function in function_hits:
+        tied |= support[function]
+    open_functions = [support[place] for place in bits(relevant)]
+    while True:
+        reached = [mask for mask in open_functions if mask & tied]
+        if not reached:
+            break
+        open_functions = [mask for mask in open_functions if not mask & tied]
+        for mask in reached:
+            tied |= mask
+    matter = 0
+    for place in bits(relevant):
+        matter |= support[place]
+    return tied & matter
+
+
+def _groups(
+    tables: Tables,
+    log_weight: Floats,
+    hits: Mapping[int, Sequence[tuple[int, float]]],
+    components: int,
+) -> Iterator[Group]:
+    weights = log_weight.tolist()
+    found: dict[tuple[int, tuple[tuple[int, float], ...]], list[tuple[float, int]]] = {}
+    downed = chain.from_iterable(tables.modes_of[place] for place in bits(components))
+    for mode in dict.fromkeys(chain(hits, downed)):
+        if weights[mode] == NEVER:
+            continue
+        place = int(tables.component[mode])
+        component = place if place >= 0 and components >> place & 1 else -1
+        key = (component, tuple(_merged(hits.get(mode, ()))))
+        found.setdefault(key, []).append((weights[mode], mode))
+    for (component, hit), modes in found.items():
+        yield Group(modes, hit, component)
+
+
+def _merged(hits: Sequence[tuple[int, float]]) -> Iterator[tuple[int, float]]:
+    """Make one hit of several on one clue: links that are there twice."""
+    merged: dict[int, float] = {}
+    for clue, miss in hits:
+        merged[clue] = merged.get(clue, 1.0) * miss
+    return iter(merged.items())
+
+
+def _causes(
+    groups: Sequence[Group], clues: Sequence[Clue], gates: Gates
+) -> Iterator[tuple[int, ...]]:
+    supports = [0] * len(clues)
+    for place, clue in enumerate(clues):
+        for function, detects in clue.functions:
+            supports[place] |= gates.support[function] if detects > 0 else 0
+    direct: list[dict[int, None]] = [{} for _ in clues]
+    for number, group in enumerate(groups):
+        for place, _ in group.hits:
+            direct[place][number] = None
+        if group.component >= 0:
+            for place, support in enumerate(supports):
+                if support >> group.component & 1:
+                    direct[place][number] = None
+    return (tuple(of) for of in direct)
+
+
+def _least(groups: Sequence[Group], clues: Sequence[Clue]) -> list[float]:
+    least = [1.0] * len(clues)
+    for group in groups:
+        for place, miss in group.hits:
+            least[place] *= miss ** len(group)
+    for place, clue in enumerate(clues):
+        for _, detects in clue.functions:
+            least[place] *= 1.0 - detects
+    return least

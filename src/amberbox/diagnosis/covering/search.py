@@ -1,0 +1,211 @@
+"""Best first over sets of faults: the most probable come first, what is left out is bounded.
+
+A node stands for all proper supersets of a set, made from groups that are still open. Opening
+it picks a group of a clue that is not explained yet and splits: one more member of the group is
+faulty, or no more of them. Every set is reached exactly once.
+"""
+
+from __future__ import annotations
+
+import heapq
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from itertools import combinations, count
+
+from amberbox.diagnosis.covering.budget import Budget
+from amberbox.diagnosis.covering.problem import NEVER, Group, Problem
+from amberbox.diagnosis.covering.state import (
+    Bound,
+    State,
+    View,
+    bound,
+    expm,
+    log_likelihood,
+    nothing,
+    with_one_more,
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """Sets of modes (by place) with their probabilities, from likely to unlikely.
+
+    Probabilities are shares of what was enumerated, ``covered`` is the least share that this
+    is of everything. ``incomplete`` says which budget ended the search.
+    """
+
+    sets: tuple[tuple[tuple[int, ...], float], ...]
+    covered: float
+    incomplete: str
+    opened: int
+
+
+@dataclass(slots=True)
+class _Sum:
+    """A sum of exponentials, relative to a reference; exact at the end, running meanwhile."""
+
+    reference: float
+    terms: list[float] = field(default_factory=list)
+    running: float = 0.0
+
+    def add(self, log_value: float) -> None:
+        value = expm(log_value - self.reference)
+        self.terms.append(value)
+        self.running += value
+
+
+@dataclass(frozen=True, slots=True)
+class _Node:
+    state: State
+    closed: int
+    bound: Bound
+
+
+@dataclass(frozen=True, slots=True)
+class _Members:
+    """The sets of one state that have not come up yet, the best first."""
+
+    log_score: float
+    modes: tuple[int, ...]
+    rest: Iterator[tuple[float, tuple[int, ...]]]
+    log_base: float
+
+
+_Entry = tuple[float, int, "_Node | _Members"]
+
+
+class _Search:
+    """The heap of nodes and sets that wait, and what has been found."""
+
+    def __init__(self, problem: Problem, most: int) -> None:
+        self.problem = problem
+        self.most = most
+        self.order = count()
+        self.heap: list[_Entry] = []
+        self.views: dict[int, View] = {}
+        self.opened = 0
+        self.found: list[tuple[tuple[int, ...], float]] = []
+        start = nothing(problem)
+        first = self.bound(start, 0)
+        reference = max(log_likelihood(problem, start), first.log_best)
+        self.reference = 0.0 if reference == NEVER else reference
+        self.enumerated = _Sum(self.reference)
+        self.listed = _Sum(self.reference)
+        self.waiting = 0.0
+        self.reach(start)
+        self.push_node(_Node(start, 0, first))
+
+    def bound(self, state: State, closed: int) -> Bound:
+        """Bound what is beyond a state."""
+        view = self.views.get(state.lost)
+        if view is None:
+            view = self.views[state.lost] = View(self.problem, state.lost)
+        return bound(self.problem, state, closed, view)
+
+    def push_node(self, node: _Node) -> None:
+        """Let a node wait, unless nothing can come of it."""
+        if node.bound.log_best > NEVER:
+            self.waiting += expm(node.bound.log_mass - self.reference)
+            heapq.heappush(self.heap, (-node.bound.log_best, next(self.order), node))
+
+    def reach(self, state: State) -> None:
+        """Count all sets of a state and let them wait."""
+        likelihood = log_likelihood(self.problem, state)
+        if likelihood == NEVER or state.log_best == NEVER:
+            return
+        self.enumerated.add(state.log_sum + likelihood)
+        chosen = _choices(self.problem.groups, state.counts, self.most)
+        cost = state.log_best - sum(
+            self.problem.groups[group].log_weight(k)
+            for group, number in state.counts
+            for k in range(number)
+        )
+        self.push_next(chosen, likelihood + cost)
+
+    def push_next(self, rest: Iterator[tuple[float, tuple[int, ...]]], log_base: float) -> None:
+        """Let the next best set of a state wait."""
+        best = next(rest, None)
+        if best is not None:
+            members = _Members(best[0] + log_base, best[1], rest, log_base)
+            heapq.heappush(self.heap, (-members.log_score, next(self.order), members))
+
+    def step(self) -> None:
+        """Take what is best: list it if it is a set, split it if it is a node."""
+        _, _, best = heapq.heappop(self.heap)
+        if isinstance(best, _Members):
+            self.found.append((best.modes, best.log_score))
+            self.listed.add(best.log_score)
+            self.push_next(best.rest, best.log_base)
+            return
+        self.opened += 1
+        self.waiting -= expm(best.bound.log_mass - self.reference)
+        group = best.bound.branch
+        more = with_one_more(self.problem, best.state, group)
+        full = more.count(group) == len(self.problem.groups[group])
+        if more.log_best > NEVER:
+            self.reach(more)
+            closed = best.closed | (1 << group if full else 0)
+            self.push_node(_Node(more, closed, self.bound(more, closed)))
+        closed = best.closed | 1 << group
+        self.push_node(_Node(best.state, closed, self.bound(best.state, closed)))
+
+    def share_listed(self) -> float:
+        """Return the least share of everything that has been listed."""
+        total = self.enumerated.running + max(0.0, self.waiting)
+        return self.listed.running / total if total > 0 else 0.0
+
+    def result(self, incomplete: str) -> Found:
+        """Return what was found."""
+        mass = math.fsum(self.enumerated.terms)
+        nodes = (entry[2] for entry in self.heap)
+        waiting = math.fsum(
+            expm(node.bound.log_mass - self.reference) for node in nodes if isinstance(node, _Node)
+        )
+        covered = mass / (mass + waiting) if mass > 0 and waiting < math.inf else 0.0
+        sets = [
+            (modes, expm(score - self.reference) / mass) for modes, score in self.found if mass > 0
+        ]
+        return Found(tuple(sets), covered, incomplete, self.opened)
+
+
+def search(problem: Problem, max_sets: int, mass: float, budget: Budget) -> Found:
+    """Enumerate sets of faults until so many are listed or they hold so much of the mass."""
+    running = _Search(problem, max_sets)
+    while running.heap and len(running.found) < max_sets and running.share_listed() < mass:
+        if running.opened >= budget.nodes:
+            return running.result(f"more than {budget.nodes:,} nodes")
+        if budget.deadline():
+            return running.result("the time was up")
+        running.step()
+    return running.result("")
+
+
+def _choices(
+    groups: tuple[Group, ...], counts: tuple[tuple[int, int], ...], most: int
+) -> Iterator[tuple[float, tuple[int, ...]]]:
+    """Yield which members may be meant, at most ``most`` ways, the best first."""
+    parts = [_members(groups[group], number, most) for group, number in counts]
+    if all(len(part) == 1 for part in parts):
+        total = sum(part[0][0] for part in parts)
+        yield total, tuple(mode for part in parts for mode in part[0][1])
+        return
+    ways: list[tuple[float, tuple[int, ...]]] = [(0.0, ())]
+    for part in parts:
+        products = ((a + b, left + right) for a, left in ways for b, right in part)
+        ways = heapq.nsmallest(most, products, key=_best_first)
+    yield from ways
+
+
+def _members(group: Group, number: int, most: int) -> list[tuple[float, tuple[int, ...]]]:
+    """Return the best sets of so many members: they are among the first members."""
+    places = range(min(len(group), number + most - 1))
+    ways = (
+        (sum(group.log_weight(place) for place in chosen), tuple(group.modes[p] for p in chosen))
+        for chosen in combinations(places, number)
+    )
+    return heapq.nsmallest(most, ways, key=_best_first)
+
+
+def _best_first(way: tuple[float, tuple[int, ...]]) -> tuple[float, tuple[int, ...]]:
+    return (-way[0], way[1])
