@@ -7,7 +7,6 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
-from amberbox.blackbox.follow.read import newest_first
 from amberbox.blackbox.store import Store
 from amberbox.core.clock import NS
 from amberbox.core.types import Status, WriterCursor
@@ -16,8 +15,8 @@ from amberbox.monitoring.engine.findings import AlarmChange, Finding
 from amberbox.monitoring.plan import Plan
 from amberbox.monitoring.watcher.evaluation import Evaluation
 from amberbox.monitoring.watcher.guard import guarded
-from amberbox.monitoring.watcher.reader import Block, Reader
-from amberbox.monitoring.watcher.start import WRITERS, at_time
+from amberbox.monitoring.watcher.reader import Block, Positions, Reader
+from amberbox.monitoring.watcher.start import WRITERS, at_time, before_end
 
 WARM_UP_S = 60.0
 """A replay of a part begins this long before it, beside what the monitors look back."""
@@ -55,7 +54,8 @@ def newest(plan: Plan, store: Store) -> tuple[list[Status], int]:
     engine = Engine(plan)
     evaluation = Evaluation(engine)
     with guarded(plan):
-        for block in blocks(plan, store, engine, Part(from_ns=_end_ns(store))):
+        start = before_end(store, WARM_UP_S + engine.history_s)
+        for block in _reader(plan, store, engine, start).step():
             for _ in evaluation.take(block):
                 pass  # only the last statuses count
     return engine.statuses(), 0 if evaluation.place is None else evaluation.place.until_ns
@@ -67,8 +67,11 @@ def blocks(plan: Plan, store: Store, engine: Engine, part: Part) -> Iterator[Blo
     if part.from_ns is not None:
         from_ns = part.from_ns - round((WARM_UP_S + engine.history_s) * NS)
         start = {writer: at_time(store, writer, from_ns) for writer in WRITERS}
-    probes = [order.item for order in plan.probes()]
-    return Reader(store, engine.items, probes, start).step()
+    return _reader(plan, store, engine, start).step()
+
+
+def _reader(plan: Plan, store: Store, engine: Engine, start: Positions) -> Reader:
+    return Reader(store, engine.items, [order.item for order in plan.probes()], start)
 
 
 def instant_of(finding: Finding) -> int:
@@ -81,10 +84,6 @@ def instant_of(finding: Finding) -> int:
 def _is_inside(at_ns: int, part: Part) -> bool:
     after = part.from_ns is None or at_ns >= part.from_ns
     return after and (part.to_ns is None or at_ns < part.to_ns)
-
-
-def _end_ns(store: Store) -> int | None:
-    return next((journal.end_ns for journal in newest_first(store, "main")), None)
 
 
 class Pace:
