@@ -33,7 +33,7 @@ from amberbox.core.expression_tree import (
     walk,
     with_addresses,
 )
-from amberbox.core.expression_values import KIND_OF_DTYPE
+from amberbox.core.expression_values import KIND_OF_DTYPE, Values
 from amberbox.core.samples import Samples
 from amberbox.core.types import IntArray
 
@@ -140,12 +140,7 @@ class Expression:
         """
         checked = {n: (_checked_times(t, f"'{n}'"), values) for n, (t, values) in series.items()}
         with _located(self.text):
-            converted = series_of(self._reads, checked)
-            if np.ndim(at_ns):
-                return evaluate(
-                    self.tree, Instants(converted, np.asarray(at_ns, np.int64))
-                ).column()
-            return self._at_instant(self._tracks(converted), int(at_ns))
+            return self._value(self._tracks(series_of(self._reads, checked)), at_ns)
 
     def evaluate_samples(self, samples: Mapping[str, Samples], at_ns: int | IntArray) -> Any:
         """Return the same as ``evaluate_series`` from samples, which are in order of time.
@@ -153,20 +148,29 @@ class Expression:
         Every address must be among them.
         """
         with _located(self.text):
-            if np.ndim(at_ns):
-                series = {n: (samples[n].times_ns, samples[n].column()) for n in self._names}
-                return self._evaluate(series_of(self._reads, series), at_ns)
-            return self._at_instant([_track(a, samples[a.name]) for a in self._reads], int(at_ns))
+            return self._value([_track(a, samples[a.name]) for a in self._reads], at_ns)
 
-    def _evaluate(self, series: Mapping[str, Series], at_ns: int | IntArray) -> Any:
-        if np.ndim(at_ns):
-            return evaluate(self.tree, Instants(series, np.asarray(at_ns, np.int64))).column()
-        return self._at_instant(self._tracks(series), int(at_ns))
+    def numbers(self, samples: Mapping[str, Samples], at_ns: int | IntArray) -> Any:
+        """Return the same as numbers, bools as 0 and 1: NaN where it is unknown."""
+        tracks = [_track(address, samples[address.name]) for address in self._reads]
+        with _located(self.text):
+            if np.ndim(at_ns) == 0:
+                value = self._at_instant(tracks, int(at_ns))
+                return np.float64(np.nan if value is None else value)
+            values = self._at_instants(tracks, at_ns)
+        return np.where(values.null, np.nan, values.data.astype(np.float64))
+
+    def _value(self, tracks: list[Track], at_ns: int | IntArray) -> Any:
+        if np.ndim(at_ns) == 0:
+            return self._at_instant(tracks, int(at_ns))
+        return self._at_instants(tracks, at_ns).column()
 
     def _tracks(self, series: Mapping[str, Series]) -> list[Track]:
-        whole = [(series[address.name], address.at) for address in self._reads]
-        found = [(s, s.values, at) for s, at in whole]
-        return [Track(s.times_ns, v.data, v.null, v.kind, at) for s, v, at in found]
+        return [_track_of(address, series[address.name]) for address in self._reads]
+
+    def _at_instants(self, tracks: list[Track], at_ns: int | IntArray) -> Values:
+        series = {name: t.series() for name, t in zip(self._names, tracks, strict=True)}
+        return evaluate(self.tree, Instants(series, np.asarray(at_ns, np.int64)))
 
     def _at_instant(self, tracks: list[Track], at_ns: int, has_time: bool = True) -> Value:
         look = Look(at_ns, dict(zip(self._names, tracks, strict=True)), has_time)
@@ -209,9 +213,16 @@ def _python(value: Any) -> Value:
 
 
 def _track(address: Address, samples: Samples) -> Track:
-    data = samples.values
+    data, null = samples.values, samples.null
     kind = KIND_OF_DTYPE.get(data.dtype.kind)
-    return Track(samples.times_ns, data, samples.null, kind, address.at)
+    if not len(data) or (null is not None and null.all()):
+        kind = "null"  # what is not known yet may become anything
+    return Track(samples.times_ns, data, null, kind, address.at)
+
+
+def _track_of(address: Address, series: Series) -> Track:
+    values = series.values
+    return Track(series.times_ns, values.data, values.null, values.kind, address.at)
 
 
 def _checked_times(times_ns: IntArray, whose: str) -> IntArray:

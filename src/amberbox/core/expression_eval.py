@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -34,7 +34,7 @@ from amberbox.core.expression_tree import (
     needs_history,
 )
 from amberbox.core.expression_values import Values
-from amberbox.core.expression_windows import count, minimum, reduce_windows
+from amberbox.core.expression_windows import count, joined_times, minimum, reduce_windows
 from amberbox.core.types import IntArray
 
 _INDEX = re.compile(r"(.+)\[(\d+)\]")
@@ -59,6 +59,8 @@ class Instants:
     times_ns: IntArray
     rows: slice | None = None
     has_time: bool = True
+    looked_up: dict[str, Values] = field(default_factory=dict)
+    """Values of addresses at the instants, each found once."""
 
     def __len__(self) -> int:
         return len(self.times_ns)
@@ -116,12 +118,20 @@ def _constant(tree: Constant, where: Instants) -> Values:
 
 
 def _address(tree: Address, where: Instants) -> Values:
-    series = where.series[tree.name]
+    found = where.looked_up.get(tree.name)
+    if found is None:
+        found = where.looked_up[tree.name] = _held_values(where.series[tree.name], where)
+    return found
+
+
+def _held_values(series: Series, where: Instants) -> Values:
     if where.rows is not None:
         return series.values.at(where.rows)
-    last = np.searchsorted(series.times_ns, where.times_ns, "right") - 1
     if not len(series.times_ns):
         return on.constant(None, len(where))
+    last = series.times_ns.searchsorted(where.times_ns, "right") - 1
+    if not len(last) or last.min() >= 0:
+        return series.values.at(last)
     values = series.values.at(np.maximum(last, 0))
     return Values(values.data, values.null | (last < 0), values.kind)
 
@@ -229,7 +239,7 @@ def _held(tree: Held, where: Instants) -> Values:
     start_ns = where.times_ns - tree.for_ns
     breakpoints = [(where.series[name].times_ns, delay) for name, delay in tree.breakpoints]
     changes = _between(breakpoints, start_ns.min(), where.times_ns.max())
-    grid = np.unique(np.concatenate([changes, start_ns, where.times_ns]))
+    grid = joined_times([changes, start_ns, where.times_ns])
     inner = _condition(tree.inner, where.moved(grid), "'for'")
     false_unknown_true = np.where(inner.null, 1, np.where(inner.data, 2, 0))
     first = np.searchsorted(grid, start_ns, "left")
@@ -258,7 +268,7 @@ def _between(clocks: Iterable[tuple[IntArray, int]], since_ns: int, until_ns: in
     for times_ns, delay_ns in clocks:
         first, end = times_ns.searchsorted([since_ns - delay_ns, until_ns - delay_ns], "right")
         inside.append(times_ns[first:end] + delay_ns)
-    return np.unique(np.concatenate(inside))
+    return joined_times(inside)
 
 
 _VALUE: dict[type[Tree], Callable[[Any, Instants], Values]] = {

@@ -56,6 +56,10 @@ class Track(NamedTuple):
         null = None if self.null is None else self.null[rows]
         return on.values_of_array(self.data[rows], null, self.kind, self.at)
 
+    def series(self) -> Series:
+        """Return all of them as those of many instants."""
+        return Series(self.times_ns, self.part(slice(None)))
+
     def value(self, at_ns: int) -> tuple[Any, Kind]:
         """Return the last value by an instant as plain Python, None for null, and its kind."""
         last = int(self.times_ns.searchsorted(at_ns, "right")) - 1
@@ -78,8 +82,7 @@ class Look:
     @cached_property
     def whole(self) -> Instants:
         """The instant as ``expression_eval`` takes it, over all samples."""
-        everything = slice(None)
-        series = {n: Series(t.times_ns, t.part(everything)) for n, t in self.tracks.items()}
+        series = {name: track.series() for name, track in self.tracks.items()}
         return Instants(series, np.array([self.at_ns], np.int64), has_time=self.has_time)
 
     def take(self, names: Sequence[str]) -> tuple[Kind, ...]:

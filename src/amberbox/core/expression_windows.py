@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -43,6 +43,14 @@ def reduce_whole(name: str, times_ns: IntArray, samples: Floats) -> float | None
         rate = _rate(times_ns, samples, *ends)
         return None if rate.null[0] else float(rate.data[0])
     return float(_REDUCE[name](samples, *ends)[0]) if len(samples) else None
+
+
+def joined_times(parts: Sequence[IntArray]) -> IntArray:
+    """Join times, each once, in order; times that are in order already cost little."""
+    joined = np.sort(np.concatenate(parts), kind="stable")
+    is_new = np.ones(len(joined), bool)
+    np.not_equal(joined[1:], joined[:-1], out=is_new[1:])
+    return joined[is_new]
 
 
 def minimum(values: NDArray[Any], first: IntArray, last: IntArray) -> NDArray[Any]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
+from math import isfinite
 from typing import Any
 
 import numpy as np
@@ -11,11 +12,13 @@ from numpy.typing import NDArray
 
 from amberbox.core.clock import NS
 from amberbox.core.expression import Expression
+from amberbox.core.expression_windows import joined_times
 from amberbox.core.mode import Input
 from amberbox.core.samples import Now, is_one
 from amberbox.core.types import IntArray
 
 
+@cache
 def place_name(place: int) -> str:
     """Return what expressions of a mode call its inputs: ``input_1`` is the first."""
     return f"input_{place + 1}"
@@ -38,26 +41,41 @@ def by_name(inputs: Sequence[Input], reads: Sequence[str]) -> dict[str, Input]:
 def value_of(expression: Expression, inputs: Mapping[str, Input], now: Now) -> Any:
     """Return the value of an expression; NaN where it is unknown, bools as 0 and 1."""
     samples = {name: inputs[name].samples for name in expression.addresses()}
-    found = expression.evaluate_samples(samples, now)
-    if is_one(now):
-        return np.nan if found is None else float(found)
-    return np.ma.filled(np.ma.asarray(found).astype(np.float64), np.nan)
+    return expression.numbers(samples, now)
 
 
 def sample_times(inputs: Iterable[Input], now: Now, seconds: float) -> IntArray:
     """Return when any of the inputs changed in the windows before ``now``, and right before."""
-    since, until = int(np.min(now)) - round(seconds * NS), int(np.max(now))
-    parts = []
+    first_ns, until = (now, now) if is_one(now) else (int(np.min(now)), int(np.max(now)))
+    since = first_ns - round(seconds * NS)
+    parts = {}
     for one in inputs:
-        first, end = max(int(one.samples.last(since)), 0), int(one.samples.last(until)) + 1
-        parts.append(one.samples.times_ns[first:end])
-    return np.unique(np.concatenate(parts))
+        times_ns = one.samples.times_ns
+        first, end = (int(times_ns.searchsorted(t, "right")) for t in (since, until))
+        part = times_ns[max(first - 1, 0) : end]
+        parts[part.tobytes()] = part  # variables of one message share their times
+    return joined_times(list(parts.values()))
 
 
 def numbers_at(one: Input, now: Now | IntArray) -> Any:
     """Return the value as a number at each instant; NaN where it is unknown or infinite."""
-    values = numbers(one.samples.at(now))
-    return np.where(one.samples.known(now) & np.isfinite(values), values, np.nan)[()]
+    samples = one.samples
+    if not len(samples):
+        return np.full(np.shape(now), np.nan)[()]
+    last, null = samples.last(now), samples.null
+    if is_one(now):
+        known = last >= 0 and (null is None or not null[last])
+        return finite(numbers(samples.values[last])[()]) if known else np.float64(np.nan)
+    column = numbers(samples.values[last])
+    known = (last >= 0) & np.isfinite(column)
+    return np.where(known if null is None else known & ~null[last], column, np.nan)
+
+
+def finite(values: Any) -> Any:
+    """Return numbers that are finite, NaN in place of others."""
+    if isinstance(values, float):  # np.where costs more than all the rest
+        return values if isfinite(values) else np.float64(np.nan)
+    return np.where(np.isfinite(values), values, np.nan)
 
 
 def numbers(values: Any) -> NDArray[np.float64]:
@@ -77,6 +95,9 @@ def middles(values: NDArray[np.float64]) -> tuple[Any, Any]:
     if not len(values):
         nobody = np.full(values.shape[1:], np.nan)
         return nobody, nobody
+    if np.isfinite(values).all():
+        ordered = np.sort(values, axis=0)
+        return ordered[(len(values) - 1) // 2], ordered[len(values) // 2]
     ordered = np.sort(np.where(np.isfinite(values), values, np.nan), axis=0)
     count = np.isfinite(ordered).sum(axis=0)[None]
     places = (np.maximum(count - 1, 0) // 2, np.minimum(count // 2, len(values) - 1))
@@ -104,6 +125,9 @@ def medians(times_ns: IntArray, rows: NDArray[np.float64], now: Now, seconds: fl
 def _median(rows: NDArray[np.float64]) -> Any:
     """Return the median of each row, which has one column at least; infinity counts, NaN not."""
     ordered = np.sort(rows, axis=1)
+    if not np.isnan(ordered[:, -1]).any():
+        low, high = ordered[:, (rows.shape[1] - 1) // 2], ordered[:, rows.shape[1] // 2]
+        return np.where(low == high, low, (low + high) / 2)
     count = np.count_nonzero(~np.isnan(ordered), axis=1)
     which = np.arange(len(rows))
     low = ordered[which, (count - 1) // 2]

@@ -103,7 +103,9 @@ def _drain(config: Config, inputs: Sequence[Input], now: Now) -> Any:
     ages_ns = np.linspace(config.window * NS, 0, _POINTS).astype(np.int64)
     instants = np.atleast_1d(now) - ages_ns[:, None]
     percents = _percent(config, [numbers_at(one, instants) for one in inputs])
-    older, newer = (np.median(half, axis=0) for half in np.split(percents, 2))
+    ordered = np.sort(percents.reshape(2, _POINTS // 2, -1), axis=1)  # NaN comes last
+    middle = (ordered[:, _POINTS // 4 - 1] + ordered[:, _POINTS // 4]) / 2
+    older, newer = np.where(np.isnan(ordered[:, -1]), np.nan, middle)
     drop = np.where(older - newer >= _LEAST_DROP, older - newer, np.nan)
     apart_s = config.window * (_POINTS / 2) / (_POINTS - 1)
     return (drop / apart_s).reshape(np.shape(now))[()]

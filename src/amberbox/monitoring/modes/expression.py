@@ -33,6 +33,7 @@ arguments:
   condition: not (brake.closed != 0 and abs(ros_odom.twist_linear_x) > 0.05)
   number: max(abs(ros_odom.twist_linear_x) over 2s)
 """
+_MOST_SHOWN = 100  # characters: who meets a longer condition in an alarm does not read it
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,4 +92,5 @@ def explain(config: Config, results: Mapping[str, Any]) -> str:
     """Repeat the condition that does not hold."""
     if config.condition is None or results["holds"] is not False:
         return ""
-    return f"it does not hold that {config.condition.text}"
+    text = " ".join(config.condition.text.split())
+    return f"it does not hold that {text}" if len(text) <= _MOST_SHOWN else ""

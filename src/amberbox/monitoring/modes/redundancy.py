@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import reduce
 from math import inf
 from typing import Any
 
@@ -16,6 +17,7 @@ from amberbox.core.samples import Now
 from amberbox.core.standins import Finding
 from amberbox.core.together import (
     by_name,
+    finite,
     medians,
     middles,
     numbers_at,
@@ -83,6 +85,11 @@ def history_s(config: Config) -> float:
     return config.window + past_ns / 1e9
 
 
+def timed(config: Config) -> bool:
+    """Tell whether there is a window, which samples leave as time passes."""
+    return history_s(config) > 0 or (config.formula is not None and config.formula.needs_history)
+
+
 def results_of(config: Config, inputs: int, bools: int) -> tuple[Result, ...]:
     """Return results per member first where a mapping has several bool outputs."""
     count = len(_members(config, inputs))
@@ -101,8 +108,8 @@ def evaluate(config: Config, inputs: Sequence[Input], now: Now) -> Mapping[str, 
     places = _members(config, len(inputs) - len(reads(config)))
     values = np.array([numbers_at(named[place_name(place)], times_ns) for place in places])
     should = _should_be(config, named, times_ns, values)
-    off = np.where(np.isnan(values), inf, np.min(np.abs(values - should), axis=0))
-    off = np.where(np.isnan(should[0]), np.nan, off)
+    off = reduce(np.minimum, [np.abs(values - one) for one in should])
+    off = np.where(np.isnan(should[0]), np.nan, np.where(np.isnan(values), inf, off))
     residuals = medians(times_ns, off, now, config.window)
     found = _judged(config, worst_of(residuals, config.threshold), "agree", "residual")
     for k, residual in enumerate(residuals, 1):
@@ -115,17 +122,17 @@ def _members(config: Config, inputs: int) -> list[int]:
     return [place for place in range(inputs) if place_name(place) not in named]
 
 
-def _should_be(config: Config, named: Any, times_ns: Any, values: Any) -> Any:
+def _should_be(config: Config, named: Any, times_ns: Any, values: Any) -> tuple[Any, ...]:
     """Return what each member should be; of two middle siblings the nearer one will count."""
     if config.formula is not None:
-        return np.broadcast_to(value_of(config.formula, named, times_ns), (1, *values.shape))
+        return (value_of(config.formula, named, times_ns),)
     others = [[k for k in range(len(values)) if k != own] for own in range(len(values))]
-    return np.array(middles(values[np.array(others, int).T]))
+    return middles(values[np.array(others, int).T])
 
 
 def _judged(config: Config, residual: Any, verdict: str, number: str) -> dict[str, Any]:
     well = where_known(~np.isnan(residual), residual <= config.threshold)
-    return {verdict: well, number: np.where(np.isfinite(residual), residual, np.nan)[()]}
+    return {verdict: well, number: finite(residual)}
 
 
 def explain(config: Config, results: Mapping[str, Any]) -> str:
