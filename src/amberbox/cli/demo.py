@@ -144,7 +144,7 @@ class Demo:
             self.look()
         time.sleep(0.5)
         watcher.send_signal(signal.SIGTERM)
-        check(watcher.wait(30) == 0, "the monitors stopped cleanly")
+        check(watcher.wait(60) == 0, "the monitors stopped cleanly")
         box.send_signal(signal.SIGTERM)
         check(box.wait(30) == 0, "the box stopped cleanly")
 
