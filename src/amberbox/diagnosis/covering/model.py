@@ -8,7 +8,7 @@ from functools import cached_property
 
 from amberbox.core.config import did_you_mean
 from amberbox.core.errors import UsageError
-from amberbox.core.needs import Needs
+from amberbox.core.needs import Needs, cycles
 from amberbox.diagnosis.covering.tables import Tables
 
 UNKNOWN = "unknown#other"
@@ -100,6 +100,8 @@ class Model:
 
     def __post_init__(self) -> None:
         self._check_names()
+        for circle in cycles({function.id: function.needs for function in self.functions}):
+            raise UsageError(f"needs go in a circle: {' -> '.join((*circle, circle[0]))}")
         for mode in self.modes:
             _probability(mode.prior, f"prior of {mode.id}")
         for sign in self.signs:

@@ -107,8 +107,8 @@ class Problem:
             gone[list(bits(lost))] = True
             loss = np.where(gone[self.pair_function], 0.0, loss)
         per = np.bincount(self.pair_component, weights=loss, minlength=self.component_count + 1)
-        result: Floats = per[self.group_component]
-        return result
+        losses: Floats = per[self.group_component].astype(np.float64)
+        return losses
 
 
 def problem_of(tables: Tables, evidence: Folded) -> Problem:

@@ -52,7 +52,8 @@ class Links:
         """Return per cause the logarithm of the chance that no absent symptom shows."""
         chosen = absent[self.sign]
         weights = self.log_miss[chosen]
-        return np.bincount(self.cause[chosen], weights=weights, minlength=causes)
+        sums: Floats = np.bincount(self.cause[chosen], weights, causes).astype(np.float64)
+        return sums
 
 
 @dataclass(frozen=True, slots=True, eq=False)
