@@ -280,3 +280,28 @@ def test_instants_are_multiples_of_the_tick() -> None:
     times = [f.measured_ns for f in findings if isinstance(f, Status)]
     assert all(time % TICK_NS == 0 for time in times)
     assert 150_000_000 in times
+
+
+def test_the_reason_names_what_is_missing_now() -> None:
+    """Of two inputs one comes back just when the other has gone: the level stays as it is."""
+    both = mode(POSITIVE, variable(), variable("w", "b"), stale_s=1.0)
+    batches = [
+        rows(seconds(1, 5, 5.5, 6, 6.5), "a", v=[1.0] * 5),
+        rows(seconds(2, 3, 3.9), "b", w=[1.0] * 3),
+    ]
+    for step_s in (7.0, 0.05):
+        engine, found = Engine(one(both)), list[Finding]()
+        engine.begin(0)
+        for batch in batches:
+            engine.feed(batch)
+        for until_s in np.arange(step_s, 7.01, step_s):
+            found += engine.advance(round(until_s * NS))
+        reasons = [f.reason for f in found if isinstance(f, Status) and f.mode]
+        assert list(dict.fromkeys(reasons)) == [
+            "not measured yet",
+            "nothing received yet of a.v",
+            "nothing received yet of b.w",
+            "",
+            "nothing received of a.v for 1 s",
+            "nothing received of b.w for 1 s",
+        ]

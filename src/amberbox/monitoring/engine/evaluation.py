@@ -24,6 +24,8 @@ from amberbox.monitoring.plan import MappingPlan, ModePlan, OutputPlan
 
 QUARTER_NS = NS // 4
 """Modes whose results change with time are evaluated at multiples of this."""
+_CODES = 8
+"""There are fewer codes of freshness than this; the place of an input is counted above them."""
 _FEW = 4
 """Up to so many instants are evaluated one by one."""
 _WHAT: tuple[What, ...] = ("ok", "bad", "unknown")
@@ -174,6 +176,8 @@ class MappingRun:
 
     def _one_by_one(self, block: Block, codes: Any, found: list[Found]) -> None:
         listed = [freshness.FRESH] * len(block.times) if codes is None else codes.tolist()
+        if any(listed):
+            listed = self._with_culprits(block).tolist()
         is_due = block.is_quarter if self._timed else block.has_rows
         for now, code, due in zip(block.times, listed, is_due.tolist(), strict=True):
             if code == freshness.FRESH:
@@ -235,9 +239,21 @@ class MappingRun:
         except Exception as error:  # what was found stands, whatever its words
             return f"no explanation: {type(error).__name__}: {error}"
 
+    def _with_culprits(self, block: Block) -> Any:
+        """Return the codes with the place of the first input that is as bad: it changes alone."""
+        worst: Any = np.zeros(len(block.times), np.int64)
+        places = np.zeros(len(block.times), np.int64)
+        for place, entry in enumerate(self.inputs):
+            codes = block.flow_codes(entry, self._stale_s)
+            values = freshness.value_codes(entry, block.instants) if entry in self._valued else None
+            codes = codes if values is None else np.maximum(codes, values)
+            places[codes > worst] = place
+            worst = np.maximum(worst, codes)
+        return worst + places * _CODES
+
     def _not_fresh(self, now: int, code: int, found: list[Found]) -> None:
-        entry = self._culprit(now, code)
-        self._say(now, *freshness.reason(code, entry, self._stale_s, now), found)
+        place, code = divmod(code, _CODES)
+        self._say(now, *freshness.reason(code, self.inputs[place], self._stale_s, now), found)
 
     def _say(self, now: int, what: What, why: str, found: list[Found]) -> None:
         for output in self.outputs:
@@ -246,21 +262,11 @@ class MappingRun:
             output.column.append(None)
             found.append(Found(now, output.number, what, None, why))
 
-    def _culprit(self, now: int, code: int) -> Input:
-        """Return the first input that is as bad as the worst."""
-        at = np.array([now])
-        for entry in self.inputs:
-            if freshness.flow_codes(entry.flow, self._stale_s, at)[0] == code:
-                return entry
-        for entry in self._valued:
-            codes = freshness.value_codes(entry, at)
-            if codes is not None and codes[0] == code:
-                return entry
-        return self.inputs[0]
-
     def _at_once(self, block: Block, codes: Any, found: list[Found]) -> None:
         count = len(block.times)
         codes = np.full(count, freshness.FRESH) if codes is None else codes
+        if codes.any():
+            codes = self._with_culprits(block)
         before = np.concatenate([[self.code], codes[:-1]])
         is_fresh = codes == freshness.FRESH
         is_due = block.is_quarter if self._timed else block.has_rows

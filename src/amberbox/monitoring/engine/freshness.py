@@ -11,7 +11,7 @@ from amberbox.core.samples import Flow
 from amberbox.core.types import IntArray
 from amberbox.monitoring.engine.findings import What
 
-FRESH, NEVER, NO_VALUE, OLD, LOST = 0, 1, 2, 3, 4
+FRESH, NO_VALUE, NEVER, OLD, LOST = 0, 1, 2, 3, 4
 """From good to bad: of several inputs the worst counts."""
 
 
