@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 
 from amberbox.core.config import did_you_mean
@@ -15,9 +15,18 @@ from amberbox.diagnosis.fmea.places import child
 from amberbox.diagnosis.fmea.propagation import dependents, links_of
 
 
-def check(fmea: Fmea, root: Node, parts: Sequence[Part], problems: list[Problem]) -> Fmea | None:
-    """Return the analysis with all effects filled in; None if names or needs are wrong."""
-    found = [*_name_problems(fmea, root, parts), *_circles(fmea, root, parts)]
+def check(
+    fmea: Fmea,
+    root: Node,
+    parts: Sequence[Part],
+    names: Collection[str],
+    problems: list[Problem],
+) -> Fmea | None:
+    """Return the analysis with all effects filled in; None if names or needs are wrong.
+
+    ``names`` are all components and functions of the file, those that cannot be read, too.
+    """
+    found = [*_name_problems(fmea, root, parts, names), *_circles(fmea, root, parts)]
     problems += found
     if any(problem.is_error for problem in found):
         return None
@@ -28,8 +37,9 @@ def check(fmea: Fmea, root: Node, parts: Sequence[Part], problems: list[Problem]
     return replace(fmea, modes=modes)
 
 
-def _name_problems(fmea: Fmea, root: Node, parts: Sequence[Part]) -> Iterator[Problem]:
-    names = {*fmea.components, *fmea.functions}
+def _name_problems(
+    fmea: Fmea, root: Node, parts: Sequence[Part], names: Collection[str]
+) -> Iterator[Problem]:
     for name in fmea.functions:
         if name in fmea.components:
             what = f"'{name}' is a component and a function"

@@ -28,7 +28,7 @@ from amberbox.diagnosis.fmea.model import (
 )
 from amberbox.diagnosis.fmea.places import child
 from amberbox.diagnosis.fmea.symptoms import Symptoms
-from amberbox.diagnosis.fmea.tests import results_of
+from amberbox.diagnosis.fmea.testing import results_of
 from amberbox.diagnosis.fmea.vocabulary import resolve
 
 

@@ -204,6 +204,7 @@ class TypeFile:
     rate: float | None = option(None, "failures per hour of the component, for 'ratio'")
     failure_modes: Mapping[str, ModeFile] = option({}, "how it fails", aliases=("modes",))
     tests: Mapping[str, TestFile] = option({}, "tests of each instance")
+    symptoms: Mapping[str, SymptomFile] = option({}, "conditions with a name, of each instance")
 
     def check(self) -> Iterator[Finding]:
         """Yield what is wrong."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from amberbox.core.config import build, parse_yaml
@@ -17,8 +17,8 @@ from amberbox.diagnosis.fmea.members import members
 from amberbox.diagnosis.fmea.model import Fmea, FmeaTest, Other
 from amberbox.diagnosis.fmea.places import child
 from amberbox.diagnosis.fmea.symptoms import Symptoms
-from amberbox.diagnosis.fmea.tests import test_of
-from amberbox.diagnosis.fmea.writing_out import instances
+from amberbox.diagnosis.fmea.testing import made_test
+from amberbox.diagnosis.fmea.writing_out import Instance, instances
 
 FILE = "fmea.yaml"
 """Its name in a robot folder."""
@@ -52,11 +52,15 @@ def _loaded(
 
 def _made(root: Node, known: Known | None, problems: list[Problem], folder: Path) -> Fmea | None:
     file = build(FmeaFile, root, problems)
-    parts = _parts(root, known, problems)
+    found = instances(root, problems)
+    parts = _parts(found, root, known, problems)
     if file is None:
         return None
     symptoms = Symptoms(file, known, problems)
-    symptoms.judge_named(child(root, "symptoms"))
+    symptoms.add(file.symptoms, child(root, "symptoms"), "symptoms")
+    for part in parts:
+        where, place = f"types.{part.type}.symptoms", child(part.node, "symptoms")
+        symptoms.add(part.file.symptoms, place, where, part.component)
     tests = _tests(file, parts, root, symptoms)
     scope = Scope(file, symptoms, tests, problems)
     for part in parts:
@@ -78,28 +82,38 @@ def _made(root: Node, known: Known | None, problems: list[Problem], folder: Path
         Other(file.other.probability, file.other.detects),
         file.exposure_h,
     )
-    return check(fmea, root, parts, problems)
+    names = {*components, *functions, *(entry.component for entry in found)}
+    return check(fmea, root, parts, names, problems)
 
 
-def _parts(root: Node, known: Known | None, problems: list[Problem]) -> list[Part]:
-    """Read the types, once for each of their components."""
+def _parts(
+    found: Sequence[Instance], root: Node, known: Known | None, problems: list[Problem]
+) -> list[Part]:
+    """Read the types, once for each of their components.
+
+    Of what component files say that is needed, what the file does not have is left out.
+    """
     parts = []
-    for entry in instances(root, problems):
+    names = {entry.component for entry in found} | set(child(root, "functions").mapping or ())
+    inherited = {
+        name: Needs(len(kept), kept)
+        for name, needs in (known.needs if known else {}).items()
+        if (kept := tuple(needed for needed in needs.names() if needed in names))
+    }
+    for entry in found:
         where = f"types.{entry.type}"
         file = build(TypeFile, entry.node, problems, where)
         if file is not None:
-            needs = _needs(entry.node, entry.component, known, problems, where)
+            needs = _needs(entry.node, inherited.get(entry.component, NOTHING), problems, where)
             parts.append(Part(entry.component, entry.type, file, entry.node, needs))
     return parts
 
 
-def _needs(
-    node: Node, component: str, known: Known | None, problems: list[Problem], where: str
-) -> Needs:
+def _needs(node: Node, inherited: Needs, problems: list[Problem], where: str) -> Needs:
     """Return what the type says that it needs, else what the component's own file says."""
     entry = (node.mapping or {}).get("needs")
     if entry is None:
-        return known.needs.get(component, NOTHING) if known else NOTHING
+        return inherited
     return parse_needs(entry, problems, f"{where}.needs", may_be_empty=True) or NOTHING
 
 
@@ -107,13 +121,13 @@ def _tests(
     file: FmeaFile, parts: list[Part], root: Node, symptoms: Symptoms
 ) -> Mapping[str, FmeaTest]:
     tests = {
-        name: test_of(name, entry, child(root, "tests", name), symptoms)
+        name: made_test(name, entry, child(root, "tests", name), symptoms)
         for name, entry in file.tests.items()
     }
     for part in parts:
         for name, entry in part.file.tests.items():
             test_id = f"{part.component}.{name}"
-            tests[test_id] = test_of(test_id, entry, child(part.node, "tests", name), symptoms)
+            tests[test_id] = made_test(test_id, entry, child(part.node, "tests", name), symptoms)
     return tests
 
 

@@ -15,7 +15,7 @@ Severity: TypeAlias = Literal["warning", "urgent", "critical", "fatal"]
 
 SEVERITIES: tuple[Severity, ...] = ("warning", "urgent", "critical", "fatal")
 
-TestKind: TypeAlias = Literal["read", "question", "check"]
+Kind: TypeAlias = Literal["read", "question", "check"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +75,7 @@ class Ranks:
 
 
 @dataclass(frozen=True, slots=True)
-class TestResult:
+class Outcome:
     """What a test gives when a failure mode is there, and how surely."""
 
     test: str
@@ -108,7 +108,7 @@ class FailureMode:
     effects: Effects = Effects()
     symptoms: tuple[Link, ...] = ()
     unobservable: str = ""
-    tests: tuple[TestResult, ...] = ()
+    tests: tuple[Outcome, ...] = ()
     remedy: str = ""
     takes_down: bool = True
     intermittent: bool = False
@@ -152,7 +152,7 @@ class FmeaTest:
     """
 
     id: str
-    kind: TestKind
+    kind: Kind
     text: str
     role: str = ""
     cost_s: float = 0.0

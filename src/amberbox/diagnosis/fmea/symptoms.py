@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
 from amberbox.core.config import did_you_mean
@@ -20,17 +20,18 @@ class Symptoms:
 
     def __init__(self, file: FmeaFile, known: Known | None, problems: list[Problem]) -> None:
         self._defaults = file.defaults
-        self._named = file.symptoms
+        self._named: dict[str, SymptomFile] = {}
         self._known = known
         self._problems = problems
-        self.found: dict[str, Symptom] = {
-            name: self._made(name, entry) for name, entry in file.symptoms.items()
-        }
+        self.found: dict[str, Symptom] = {}
 
     def links(
         self, entries: Sequence[str | LinkFile], node: Node, where: str, owner: str
     ) -> tuple[Link, ...]:
-        """Return the links of a cause; ``node`` is the list in the file."""
+        """Return the links of a cause; ``node`` is the list in the file.
+
+        ``owner`` is the id of the cause: ``component#mode`` may use names of its component.
+        """
         found = []
         for place, entry in enumerate(entries):
             at = f"{where}[{place}]"
@@ -39,7 +40,7 @@ class Symptoms:
             if symptom is not None:
                 found.append(self._link(symptom, link))
         self._tell_twice(found, node, where)
-        return tuple(found)
+        return tuple(link for link in found if link.detects > 0)
 
     def address(self, text: str, node: Node, where: str) -> str | None:
         """Return the address of an output as monitors have it, or tell that there is none."""
@@ -54,10 +55,10 @@ class Symptoms:
             when = self._condition(link.when, child(node, "when"), where)
             made = Symptom(name, when, self._defaults.leak)
             return self.found.setdefault(name, made) if when is not None else None
-        text = link.symptom
-        if text in self.found and self.found[text].condition is not None:
-            return self.found[text]
-        return self._output(text, child(node, "symptom"), where)
+        for text in (f"{name.partition('#')[0]}.{link.symptom}", link.symptom):
+            if text in self.found and self.found[text].condition is not None:
+                return self.found[text]
+        return self._output(link.symptom, child(node, "symptom"), where)
 
     def _output(self, text: str, node: Node, where: str) -> Symptom | None:
         known = self._known
@@ -97,16 +98,26 @@ class Symptoms:
         within_s, hold_s = entry.within_s or 0.0, entry.hold_s or 0.0
         return Symptom(name, entry.when, leak, within_s, hold_s, entry.description)
 
-    def judge_named(self, node: Node) -> None:
-        """Tell which names are neither an output nor have a condition, and resolve conditions."""
-        for name, entry in self._named.items():
-            place = child(node, name)
-            where = f"symptoms.{name}"
-            if entry.when is None:
-                self.address(name, place, where)
-                continue
-            when = self._condition(entry.when, child(place, "when"), f"{where}.when")
-            self.found[name] = replace(self.found[name], condition=when or entry.when)
+    def add(
+        self, entries: Mapping[str, SymptomFile], node: Node, where: str, component: str = ""
+    ) -> None:
+        """Take symptoms with a name; those of a component are ``component.name``.
+
+        Tells which are neither an output nor have a condition, and resolves conditions.
+        """
+        for short, entry in entries.items():
+            place = child(node, short)
+            name = f"{component}.{short}" if component else short
+            self._named[name] = entry
+            self.found[name] = self._made(name, entry)
+            self._judge(name, entry, place, f"{where}.{short}")
+
+    def _judge(self, name: str, entry: SymptomFile, place: Node, where: str) -> None:
+        if entry.when is None:
+            self.address(name, place, where)
+            return
+        when = self._condition(entry.when, child(place, "when"), f"{where}.when")
+        self.found[name] = replace(self.found[name], condition=when or entry.when)
 
     def _condition(self, when: Expression, node: Node, where: str) -> Expression | None:
         if when.kind not in ("condition", "any"):

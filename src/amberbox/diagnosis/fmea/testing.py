@@ -8,16 +8,16 @@ from amberbox.core.config import did_you_mean
 from amberbox.core.errors import Problem
 from amberbox.core.nodes import Node
 from amberbox.diagnosis.fmea.file import ResultFile, TestFile
-from amberbox.diagnosis.fmea.model import FmeaTest, TestKind, TestResult
+from amberbox.diagnosis.fmea.model import FmeaTest, Kind, Outcome
 from amberbox.diagnosis.fmea.places import child
 from amberbox.diagnosis.fmea.symptoms import Symptoms
 
 MINUTE_S = 60.0
 
 
-def test_of(name: str, entry: TestFile, node: Node, symptoms: Symptoms) -> FmeaTest:
+def made_test(name: str, entry: TestFile, node: Node, symptoms: Symptoms) -> FmeaTest:
     """Make a test; one that reads an output reads one that there is."""
-    kind: TestKind = "question" if entry.question else "check" if entry.check_ else "read"
+    kind: Kind = "question" if entry.question else "check" if entry.check_ else "read"
     text = entry.question or entry.check_ or entry.text or f"Read off {entry.read}."
     if entry.read:
         symptoms.address(entry.read, child(node, "read"), f"tests.{name}.read")
@@ -33,7 +33,7 @@ def results_of(
     tests: Mapping[str, FmeaTest],
     node: Node,
     problems: list[Problem],
-) -> Iterator[TestResult]:
+) -> Iterator[Outcome]:
     """Yield what tests give when a mode is there; ``node`` is the mapping in the file."""
     for name, entry in given.items():
         place = child(node, name)
@@ -49,4 +49,4 @@ def results_of(
             what = f"the test gives no '{result.outcome}'{near}"
             problems.append(place.problem(f"tests.{name}", what, f"it gives {', '.join(known)}"))
         else:
-            yield TestResult(test_id, result.outcome, result.detects)
+            yield Outcome(test_id, result.outcome, result.detects)

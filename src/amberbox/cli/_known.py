@@ -1,0 +1,38 @@
+"""What a robot folder has that its failure modes can refer to."""
+
+from __future__ import annotations
+
+from amberbox.blackbox.folder.folder import RobotFolder
+from amberbox.core.needs import Needs
+from amberbox.diagnosis.fmea.known import Known
+from amberbox.monitoring.configuration import load_plan
+from amberbox.monitoring.plan import ComponentPlan, OutputPlan, Plan
+
+
+def known_of(folder: RobotFolder) -> Known:
+    """Return the outputs of a folder's monitors, and what its components need."""
+    return known_of_plan(load_plan(folder)[0])
+
+
+def known_of_plan(plan: Plan) -> Known:
+    """Return what a plan has."""
+    outputs = {
+        f"{component.id}/{mode.id}/{output.name}": output
+        for component, mode in plan.modes()
+        for mapping in mode.mappings
+        for output in mapping.outputs
+    }
+    watched = [address for address, output in outputs.items() if _watched(output)]
+    needs = {component.id: _needs(component) for component in plan.components}
+    return Known(frozenset(outputs), frozenset(watched), needs)
+
+
+def _watched(output: OutputPlan) -> bool:
+    """Tell whether an output can be bad: something is expected of it."""
+    return output.expectation.value is not None
+
+
+def _needs(component: ComponentPlan) -> Needs:
+    names = (edge.component for edge in component.dependencies)
+    needed = tuple(dict.fromkeys(name for name in names if name is not None))
+    return Needs(len(needed), needed)
