@@ -49,8 +49,11 @@ def _formula(draw: st.DrawFn, operators: Sequence[Operator], names: Sequence[str
     if operator in ("xor", "iff", "imply"):
         fewest = most = 2
     inputs = tuple(draw(st.lists(some, min_size=fewest, max_size=most)))
+    if operator not in ("atleast", "cardinality"):
+        return Operation(operator, inputs)
     low = draw(st.integers(0, len(inputs)))
-    return Operation(operator, inputs, low, draw(st.integers(low, len(inputs))))
+    high = draw(st.integers(low, len(inputs))) if operator == "cardinality" else 0
+    return Operation(operator, inputs, low, high)
 
 
 def _pair(entry: st.SearchStrategy[Name]) -> st.SearchStrategy[Formula]:

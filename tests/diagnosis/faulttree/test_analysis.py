@@ -109,7 +109,7 @@ def test_a_deadline_ends_with_incomplete() -> None:
 
 
 def test_a_deadline_during_the_cut_sets_leaves_the_probability() -> None:
-    results = [analyse(redundant(20), budget=Budget(deadline=after(n))) for n in range(200)]
+    results = [analyse(redundant(20), budget=Budget(deadline=after(n))) for n in range(40, 120)]
     late = [entry for entry in results if entry.incomplete == "cut sets: the time was up"]
     assert late and all(entry.cut_sets is None for entry in late)
     assert {entry.top_probability for entry in late} == {analyse(redundant(20)).top_probability}
@@ -141,7 +141,8 @@ def test_what_is_closest_to_complete() -> None:
     assert closest(tree, {"b": True, "c": True}) == [
         Closeness(("c",), ("d", "e"), 0.25), Closeness(("b",), ("a",), 0.1),
     ]  # fmt: skip
-    assert closest(tree, {"d": False, "a": 0.9}) == [Closeness((), ("a", "b"), pytest.approx(0.18))]
+    (only,) = closest(tree, {"d": False, "a": 0.9})
+    assert only.missing == ("a", "b") and only.probability == pytest.approx(0.18)
     assert closest(tree, {"a": True, "b": True})[0] == Closeness(("a", "b"), (), 1.0)
     assert len(closest(tree, {}, 1)) == 1
 

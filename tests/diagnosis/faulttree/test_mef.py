@@ -101,7 +101,7 @@ def test_what_is_written_is_read_again(tmp_path: Path) -> None:
     assert read(tmp_path, write_mef(tree)) == tree
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(trees())
 def test_any_tree_survives_being_written(
     tmp_path_factory: pytest.TempPathFactory, tree: FaultTree
@@ -264,7 +264,8 @@ def test_a_tree_made_by_hand_is_checked_as_well() -> None:
 
 
 def test_a_constant_top_has_no_event() -> None:
-    for value, cut_sets in ((True, [frozenset()]), (False, [])):
+    answers: tuple[tuple[bool, list[frozenset[str]]], ...] = ((True, [frozenset()]), (False, []))
+    for value, cut_sets in answers:
         analysis = analyse(replace(fault_tree("t", "g", {}, {}), gates={
             "g": Gate("g", Constant(value)),
         }))  # fmt: skip

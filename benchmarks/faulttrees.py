@@ -1,0 +1,84 @@
+"""Fault trees: probability and all minimal cut sets, beside SCRAM where it is installed.
+
+The trees of the Aralia benchmark are measured where they lie beside the project; the others are
+made here: robots whose functions share power, network and computers.
+"""
+
+from __future__ import annotations
+
+import random
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+from amberbox.diagnosis.faulttree import (
+    FaultTree,
+    analyse,
+    closest,
+    fault_tree,
+    read_mef,
+    write_mef,
+)
+from amberbox.diagnosis.faulttree.formula import Formula, all_of, any_of, at_least, names
+from benchmarks.common import Row, wall_s
+
+ARALIA = Path(__file__).resolve().parents[2] / "shared" / "data" / "diagnosis" / "fault_trees"
+TARGETS = {"baobab1": "to be <= 1 s"}
+
+
+def measure() -> list[Row]:
+    """Measure seconds from the file to probability and number of cut sets."""
+    with tempfile.TemporaryDirectory() as folder:
+        files = [*sorted(ARALIA.glob("*.xml")), *_made(Path(folder))]
+        return [row for path in files for row in _of_file(path)]
+
+
+def _of_file(path: Path) -> Iterator[Row]:
+    tree = read_mef(path)
+    analysis = analyse(tree)
+    taken = wall_s(lambda: analyse(read_mef(path)).minimal_cut_sets, 3)
+    count = f"{len(analysis.events)} events, {analysis.minimal_cut_sets:,} cut sets"
+    peer = _scram_s(path)
+    name = f"{path.stem}: read and solve"
+    note = f"{count}; {TARGETS[path.stem]}" if path.stem in TARGETS else count
+    if peer is None:
+        yield Row(name, taken, "s", note=note)
+    else:
+        yield Row(name, taken, "s", f"SCRAM {peer:.3g} s", peer / taken, note)
+    happened = dict.fromkeys(list(tree.events)[:3], True)
+    live = wall_s(lambda: closest(analysis, happened, 5), 3)
+    yield Row(f"{path.stem}: the 5 cut sets closest to complete", live, "s", note="solved before")
+
+
+def _scram_s(path: Path) -> float | None:
+    """Return the seconds of a whole run of SCRAM without its order limit; None without SCRAM."""
+    program = shutil.which("scram")
+    if program is None:
+        return None
+    command = [program, "--bdd", "--probability", "on", "--limit-order", "1000", "-o", "/dev/null"]
+    return wall_s(lambda: subprocess.run([*command, str(path)], check=True), 3)
+
+
+def _made(folder: Path) -> Iterator[Path]:
+    for components in (50, 200):
+        path = folder / f"robot of {components} components.xml"
+        path.write_text(write_mef(robot(components)), encoding="utf-8")
+        yield path
+
+
+def robot(components: int) -> FaultTree:
+    """Make a robot: components with needs, in pairs or triples, on shared supplies."""
+    rng = random.Random(components)
+    gates: dict[str, Formula] = {}
+    events = [f"c{n}_broken" for n in range(components)] + ["power", "network", "computer"]
+    for n in range(components):
+        needs = [f"c{rng.randrange(max(0, n - 12), n)}" for _ in range(min(n, rng.choice((1, 2))))]
+        supply = rng.choice(("power", "network", "computer"))
+        gates[f"c{n}"] = any_of(f"c{n}_broken", all_of(*dict.fromkeys(needs), supply))
+    unused = [name for name in gates if not any(name in names(f) for f in gates.values())]
+    last = [f"c{n}" for n in range(components - 9, components)]
+    lost = any_of(at_least(2, *last[:3]), all_of(*last[3:5]), at_least(3, *last[5:]))
+    gates["top"] = any_of(lost, at_least(2, *unused))
+    return fault_tree("robot", "top", gates, dict.fromkeys(events, 0.001))
