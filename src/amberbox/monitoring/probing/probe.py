@@ -26,6 +26,11 @@ _TYPES: Mapping[str, Callable[[Any], Any]] = {
 }
 
 
+_WHOLE = 1 << 63
+"""Whole numbers lie below this."""
+_INFINITE = (math.inf, -math.inf)
+
+
 class ProbeDefectError(Exception):
     """A probe gave what its contract does not allow."""
 
@@ -53,7 +58,8 @@ class Probe:
 
     def unknown(self, subject: str, error: str) -> Row:
         """Make the row of a look that found nothing out."""
-        return {"subject": subject, "ok": None, "error": error, **dict.fromkeys(self.measures)}
+        unknown = dict.fromkeys(self.measures)
+        return {"subject": _readable(subject), "ok": None, "error": _readable(error), **unknown}
 
     def _row(self, subject: str, measured: Measured) -> Row:
         extra = sorted(set(measured) - set(self.measures) - {"ok", "error"})
@@ -63,7 +69,7 @@ class Probe:
             name: _as_type(kind, measured.get(name)) for name, (kind, _, _) in self.measures.items()
         }
         ok, error = _as_type("bool", measured["ok"]), str(measured.get("error", ""))
-        return {"subject": subject, "ok": ok, "error": error, **values}
+        return {"subject": _readable(subject), "ok": ok, "error": _readable(error), **values}
 
 
 def load_probe(kind: str, extra_dirs: Sequence[Path] = ()) -> Probe:
@@ -114,7 +120,19 @@ def os_error_text(error: OSError) -> str:
 
 
 def _as_type(kind: str, value: Any) -> Any:
-    """Give every value the type that it was promised with, so that columns never change theirs."""
-    if value is None or (isinstance(value, float) and not math.isfinite(value)):
+    """Give every value the type that it was promised with, so that columns never change theirs.
+
+    What JSON cannot hold is unknown, or shown as well as it can be.
+    """
+    if value is None or (kind != "string" and (value != value or value in _INFINITE)):
         return None
-    return _TYPES[kind](value)
+    made = _TYPES[kind](value)
+    if kind == "string":
+        return _readable(made)
+    fits = math.isfinite(made) if kind == "float" else -_WHOLE <= made < _WHOLE
+    return made if fits else None
+
+
+def _readable(text: str) -> str:
+    """Show bytes of the system that are no text as question marks."""
+    return text.encode("utf-8", "replace").decode()
