@@ -61,7 +61,8 @@ def diagnose(
         known.hypothesis(model, faults, share, prediction)
         for (faults, share), prediction in zip(sets, predictions, strict=True)
     ]
-    signatures = [signature(model, evidence, prediction) for prediction in predictions]
+    seen = known.absent.union(place for _, place in known.present)
+    signatures = [signature(model, evidence, seen, prediction) for prediction in predictions]
     filled, groups = grouped(hypotheses, signatures)
     findings = tuple(name for name in evidence.observations if name not in model.sign_places)
     return Answer(filled, groups, found.covered, found.incomplete, findings, found.opened)

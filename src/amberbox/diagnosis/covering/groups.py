@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from amberbox.core.types import Hypothesis
@@ -28,20 +28,17 @@ class AmbiguityGroup:
     probability: float
 
 
-def signature(model: Model, evidence: Evidence, prediction: Prediction) -> tuple[object, ...]:
-    """Return what the known symptoms and answers can see of a hypothesis."""
-    levels = []
-    for name in evidence.observations:
-        place = model.sign_places.get(name)
-        if place is not None and evidence.observations[name].state != "unknown":
-            caused = place in prediction.misses
-            expected = caused and prediction.expected(model, place) >= EXPECTED
-            levels.append((caused, expected))
+def signature(
+    model: Model, evidence: Evidence, known: Collection[int], prediction: Prediction
+) -> tuple[object, ...]:
+    """Return what the known symptoms (by place) and answers can see of a hypothesis."""
+    caused = [place for place in prediction.misses if place in known]
+    expected = (place for place in caused if prediction.expected(model, place) >= EXPECTED)
     answers = (
         outcomes(model, a.check, prediction)[a.check.level(a.outcome)] >= EXPECTED
         for a in evidence.answers
     )
-    return (prediction.unknown, tuple(levels), tuple(answers))
+    return (prediction.unknown, frozenset(caused), frozenset(expected), tuple(answers))
 
 
 def grouped(

@@ -45,7 +45,7 @@ def predict(model: Model, faults: Collection[str]) -> Prediction:
     modes = [model.mode_place(name) for name in faults if name != UNKNOWN]
     down = 0
     for mode in modes:
-        place = int(tables.component[mode])
+        place = tables.component[mode]
         down |= 1 << place if place >= 0 else 0
     lost = frozenset(bits(tables.gates.lost(down)))
     misses: dict[int, float] = {}

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from itertools import chain
 
 import numpy as np
+from numpy.typing import NDArray
 
 from amberbox.diagnosis.covering.clues import Clue, Folded
 from amberbox.diagnosis.covering.gates import Gates, bits
@@ -27,28 +28,24 @@ class Group:
     matters), ``modes`` from the most to the least probable.
     """
 
-    __slots__ = ("_sums", "_weights", "component", "hits", "log_best", "modes")
+    __slots__ = ("_sums", "component", "hits", "log_best", "modes", "weights")
 
     def __init__(
         self,
-        modes: Iterable[tuple[float, int]],
+        modes: Sequence[tuple[float, int]],
         hits: tuple[tuple[int, float], ...],
         component: int,
     ) -> None:
-        ordered = sorted(modes, key=_likely_first)
+        ordered = sorted(modes, key=_likely_first) if len(modes) > 1 else modes
         self.hits = hits
         self.component = component
         self.modes = [mode for _, mode in ordered]
-        self._weights = [weight for weight, _ in ordered]
-        self.log_best = self._weights[0]
-        self._sums = [0.0]
+        self.weights = [weight for weight, _ in ordered]
+        self.log_best = self.weights[0]
+        self._sums = [0.0, self.log_best] if len(modes) == 1 else [0.0]
 
     def __len__(self) -> int:
         return len(self.modes)
-
-    def log_weight(self, place: int) -> float:
-        """Return the logarithm of the weight of the mode at a place."""
-        return self._weights[place]
 
     def log_sum(self, count: int) -> float:
         """Return the logarithm of the summed weight of all sets of so many members."""
@@ -60,7 +57,7 @@ class Group:
         """Add the next elementary symmetric polynomial of the weights, scaled by the best."""
         count = len(self._sums)
         sums = [1.0] + [0.0] * count
-        for weight in self._weights:
+        for weight in self.weights:
             ratio = math.exp(weight - self.log_best)
             for k in range(count, 0, -1):
                 sums[k] += sums[k - 1] * ratio
@@ -76,7 +73,7 @@ class Problem:
     """The groups that matter, with what each clue and function needs of them.
 
     ``causes[k]`` are the groups that can act on clue k, ``cause_masks`` the same as masks;
-    ``least[k]`` is q of clue k when everything is there. ``log_all`` is the logarithm of the
+    ``limits[k]`` is its likelihood when everything is there. ``log_all`` is the logarithm of the
     product of 1 + weight over all modes, ``log_odd`` that of all weights above 1.
     """
 
@@ -84,7 +81,8 @@ class Problem:
     groups: tuple[Group, ...]
     causes: tuple[tuple[int, ...], ...]
     cause_masks: tuple[int, ...]
-    least: tuple[float, ...]
+    limits: tuple[float, ...]
+    log_limits: tuple[float, ...]
     gates: Gates
     relevant: int
     log_loss: Sequence[float]
@@ -114,22 +112,25 @@ class Problem:
 def problem_of(tables: Tables, evidence: Folded) -> Problem:
     """Find the modes that matter for some clue and group those that are alike."""
     function_hits = _function_hits(evidence.clues)
-    relevant = _relevant(evidence.log_loss, function_hits)
+    matters = evidence.log_loss < 0
+    matters[list(function_hits)] = True
     hits = _mode_hits(evidence, tables)
-    components = _components(tables, hits, function_hits, relevant)
+    components = _components(tables, hits, function_hits, np.flatnonzero(matters).tolist())
     groups = tuple(_groups(tables, evidence.log_weight, hits, components))
     causes = tuple(_causes(groups, evidence.clues, tables.gates))
-    weights = np.array([g.log_weight(n) for g in groups for n in range(len(g))])
-    keep = np.array([relevant >> f & 1 for f in tables.pair_function.tolist()], np.bool_)
+    weights = np.array([weight for group in groups for weight in group.weights], np.float64)
+    keep = matters[tables.pair_function]
+    limits = tuple(_limits(groups, evidence.clues))
     loss = np.maximum(evidence.log_loss, -1e9)  # 0 * inf is no number
     return Problem(
         evidence.clues,
         groups,
         causes,
         tuple(sum(1 << group for group in of) for of in causes),
-        tuple(_least(groups, evidence.clues)),
+        limits,
+        tuple(map(log, limits)),
         tables.gates,
-        relevant,
+        _mask(matters),
         evidence.log_loss.tolist(),
         function_hits,
         float(np.logaddexp(0.0, weights).sum()),
@@ -158,12 +159,8 @@ def _function_hits(clues: Sequence[Clue]) -> dict[int, list[tuple[int, float]]]:
     return hits
 
 
-def _relevant(log_loss: Floats, function_hits: Mapping[int, object]) -> int:
-    """Return the functions whose loss the evidence speaks for or against."""
-    mask = sum(1 << int(place) for place in np.flatnonzero(log_loss < 0))
-    for place in function_hits:
-        mask |= 1 << place
-    return mask
+def _mask(chosen: NDArray[np.bool_]) -> int:
+    return int.from_bytes(np.packbits(chosen, bitorder="little").tobytes(), "little")
 
 
 def _mode_hits(evidence: Folded, tables: Tables) -> dict[int, list[tuple[int, float]]]:
@@ -176,28 +173,25 @@ def _mode_hits(evidence: Folded, tables: Tables) -> dict[int, list[tuple[int, fl
 
 
 def _components(
-    tables: Tables, hits: Iterable[int], function_hits: Iterable[int], relevant: int
+    tables: Tables, hits: Iterable[int], function_hits: Iterable[int], matter: Sequence[int]
 ) -> int:
     """Return the components whose state is tied to some clue through functions that matter."""
-    support = tables.gates.support
+    supports = [tables.gates.support[place] for place in matter]
     tied = 0
     for mode in hits:
-        place = int(tables.component[mode])
+        place = tables.component[mode]
         tied |= 1 << place if place >= 0 else 0
     for function in function_hits:
-        tied |= support[function]
-    open_functions = [support[place] for place in bits(relevant)]
-    while True:
-        reached = [mask for mask in open_functions if mask & tied]
-        if not reached:
-            break
-        open_functions = [mask for mask in open_functions if not mask & tied]
-        for mask in reached:
-            tied |= mask
-    matter = 0
-    for place in bits(relevant):
-        matter |= support[place]
-    return tied & matter
+        tied |= tables.gates.support[function]
+    all_supports = 0
+    for support in supports:
+        all_supports |= support
+    apart = supports
+    while reached := [support for support in apart if support & tied]:
+        apart = [support for support in apart if not support & tied]
+        for support in reached:
+            tied |= support
+    return tied & all_supports
 
 
 def _groups(
@@ -212,20 +206,22 @@ def _groups(
     for mode in dict.fromkeys(chain(hits, downed)):
         if weights[mode] == NEVER:
             continue
-        place = int(tables.component[mode])
+        place = tables.component[mode]
         component = place if place >= 0 and components >> place & 1 else -1
-        key = (component, tuple(_merged(hits.get(mode, ()))))
+        key = (component, _merged(hits[mode]) if mode in hits else ())
         found.setdefault(key, []).append((weights[mode], mode))
     for (component, hit), modes in found.items():
         yield Group(modes, hit, component)
 
 
-def _merged(hits: Sequence[tuple[int, float]]) -> Iterator[tuple[int, float]]:
+def _merged(hits: Sequence[tuple[int, float]]) -> tuple[tuple[int, float], ...]:
     """Make one hit of several on one clue: links that are there twice."""
+    if len(hits) == 1:
+        return (hits[0],)
     merged: dict[int, float] = {}
     for clue, miss in hits:
         merged[clue] = merged.get(clue, 1.0) * miss
-    return iter(merged.items())
+    return tuple(merged.items())
 
 
 def _causes(
@@ -246,7 +242,7 @@ def _causes(
     return (tuple(of) for of in direct)
 
 
-def _least(groups: Sequence[Group], clues: Sequence[Clue]) -> list[float]:
+def _limits(groups: Sequence[Group], clues: Sequence[Clue]) -> Iterator[float]:
     least = [1.0] * len(clues)
     for group in groups:
         for place, miss in group.hits:
@@ -254,4 +250,4 @@ def _least(groups: Sequence[Group], clues: Sequence[Clue]) -> list[float]:
     for place, clue in enumerate(clues):
         for _, detects in clue.functions:
             least[place] *= 1.0 - detects
-    return least
+        yield clue.alpha + clue.beta * least[place]

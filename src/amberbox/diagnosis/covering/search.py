@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import heapq
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import combinations, count
 
@@ -64,15 +64,17 @@ class _Node:
 
 @dataclass(frozen=True, slots=True)
 class _Members:
-    """The sets of one state that have not come up yet, the best first."""
+    """The sets of one state that have not come up yet, the best first.
 
-    log_score: float
-    modes: tuple[int, ...]
-    rest: Iterator[tuple[float, tuple[int, ...]]]
+    ``ways`` are (weight of the members chosen, their modes), ``log_base`` the rest of the score.
+    """
+
+    first: tuple[float, tuple[int, ...]]
+    ways: Iterator[tuple[float, tuple[int, ...]]]
     log_base: float
 
 
-_Entry = tuple[float, int, "_Node | _Members"]
+_Entry = tuple[float, int, "_Node | _Members | State"]
 
 
 class _Search:
@@ -115,29 +117,33 @@ class _Search:
         if likelihood == NEVER or state.log_best == NEVER:
             return
         self.enumerated.add(state.log_sum + likelihood)
-        chosen = _choices(self.problem.groups, state.counts, self.most)
-        cost = state.log_best - sum(
-            self.problem.groups[group].log_weight(k)
-            for group, number in state.counts
-            for k in range(number)
-        )
-        self.push_next(chosen, likelihood + cost)
+        heapq.heappush(self.heap, (-state.log_best - likelihood, next(self.order), state))
 
-    def push_next(self, rest: Iterator[tuple[float, tuple[int, ...]]], log_base: float) -> None:
-        """Let the next best set of a state wait."""
-        best = next(rest, None)
-        if best is not None:
-            members = _Members(best[0] + log_base, best[1], rest, log_base)
-            heapq.heappush(self.heap, (-members.log_score, next(self.order), members))
+    def list_best(self, members: _Members) -> None:
+        """List a set, and let the next one of its state wait."""
+        score, modes = members.first
+        self.found.append((modes, score + members.log_base))
+        self.listed.add(score + members.log_base)
+        following = next(members.ways, None)
+        if following is not None:
+            rest = _Members(following, members.ways, members.log_base)
+            score = following[0] + members.log_base
+            heapq.heappush(self.heap, (-score, next(self.order), rest))
 
     def step(self) -> None:
-        """Take what is best: list it if it is a set, split it if it is a node."""
-        _, _, best = heapq.heappop(self.heap)
-        if isinstance(best, _Members):
-            self.found.append((best.modes, best.log_score))
-            self.listed.add(best.log_score)
-            self.push_next(best.rest, best.log_base)
-            return
+        """Take what is best: list it if it is a set of faults, split it if it is a node."""
+        minus_score, _, best = heapq.heappop(self.heap)
+        if isinstance(best, State):
+            ways = _ways(self.problem.groups, best.counts, self.most)
+            first = next(ways)
+            self.list_best(_Members(first, ways, -minus_score - first[0]))
+        elif isinstance(best, _Members):
+            self.list_best(best)
+        else:
+            self.split(best)
+
+    def split(self, best: _Node) -> None:
+        """Add one more member of the group to decide, and do not."""
         self.opened += 1
         self.waiting -= expm(best.bound.log_mass - self.reference)
         group = best.bound.branch
@@ -181,31 +187,30 @@ def search(problem: Problem, max_sets: int, mass: float, budget: Budget) -> Foun
     return running.result("")
 
 
-def _choices(
-    groups: tuple[Group, ...], counts: tuple[tuple[int, int], ...], most: int
-) -> Iterator[tuple[float, tuple[int, ...]]]:
+_Way = tuple[float, tuple[int, ...]]
+
+
+def _ways(groups: Sequence[Group], counts: Sequence[tuple[int, int]], most: int) -> Iterator[_Way]:
     """Yield which members may be meant, at most ``most`` ways, the best first."""
     parts = [_members(groups[group], number, most) for group, number in counts]
-    if all(len(part) == 1 for part in parts):
-        total = sum(part[0][0] for part in parts)
-        yield total, tuple(mode for part in parts for mode in part[0][1])
-        return
-    ways: list[tuple[float, tuple[int, ...]]] = [(0.0, ())]
+    ways: list[_Way] = [(0.0, ())]
     for part in parts:
-        products = ((a + b, left + right) for a, left in ways for b, right in part)
-        ways = heapq.nsmallest(most, products, key=_best_first)
+        products = [(a + b, left + right) for a, left in ways for b, right in part]
+        ways = heapq.nsmallest(most, products, key=_best_first) if len(ways) > 1 else products
     yield from ways
 
 
-def _members(group: Group, number: int, most: int) -> list[tuple[float, tuple[int, ...]]]:
+def _members(group: Group, number: int, most: int) -> list[_Way]:
     """Return the best sets of so many members: they are among the first members."""
     places = range(min(len(group), number + most - 1))
+    if number == 1:
+        return [(group.weights[place], (group.modes[place],)) for place in places]
     ways = (
-        (sum(group.log_weight(place) for place in chosen), tuple(group.modes[p] for p in chosen))
+        (sum(group.weights[place] for place in chosen), tuple(group.modes[p] for p in chosen))
         for chosen in combinations(places, number)
     )
     return heapq.nsmallest(most, ways, key=_best_first)
 
 
-def _best_first(way: tuple[float, tuple[int, ...]]) -> tuple[float, tuple[int, ...]]:
+def _best_first(way: _Way) -> tuple[float, tuple[int, ...]]:
     return (-way[0], way[1])

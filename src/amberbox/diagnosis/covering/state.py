@@ -57,7 +57,7 @@ def with_one_more(problem: Problem, state: State, number: int) -> State:
         tuple(misses),
         down,
         lost,
-        state.log_best + cost + group.log_weight(count),
+        state.log_best + cost + group.weights[count],
         state.log_sum + cost + more,
     )
 
@@ -77,15 +77,30 @@ class View:
     with what the functions cost that this member alone would lose.
     """
 
-    __slots__ = ("bests", "order", "sums", "total")
+    __slots__ = ("_causes", "_problem", "bests", "order", "sums", "total")
 
     def __init__(self, problem: Problem, lost: int) -> None:
         losses = problem.log_losses(lost)
-        self.bests: list[float] = (problem.log_bests + losses).tolist()
+        bests = problem.log_bests + losses
         sums = np.exp(problem.log_sums + losses)
+        self.bests: list[float] = bests.tolist()
         self.sums: list[float] = sums.tolist()
         self.total = float(sums.sum())
-        self.order = np.argsort(-(problem.log_bests + losses), kind="stable").tolist()
+        self.order: list[int] = np.argsort(-bests, kind="stable").tolist()
+        self._problem = problem
+        self._causes: dict[int, tuple[int, float]] = {}
+
+    def causes(self, clue: int, closed: int) -> tuple[int, float]:
+        """Return the best open cause of a clue (there is one), and the sum over all of them."""
+        if closed & self._problem.cause_masks[clue]:
+            return self._open_causes(clue, closed)
+        if clue not in self._causes:
+            self._causes[clue] = self._open_causes(clue, 0)
+        return self._causes[clue]
+
+    def _open_causes(self, clue: int, closed: int) -> tuple[int, float]:
+        groups = [group for group in self._problem.causes[clue] if not closed >> group & 1]
+        return max(groups, key=self.bests.__getitem__), sum(self.sums[group] for group in groups)
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,51 +126,42 @@ def bound(problem: Problem, state: State, closed: int, view: View) -> Bound:
     added, or none is and its likelihood stays as it is. The tightest counts.
     """
     best_open = next((group for group in view.order if not closed >> group & 1), -1)
-    if best_open < 0:
-        return DEAD
-    now, most = _likelihoods(problem, state, closed)
-    top = sum(map(log, most))
-    if top == NEVER:
+    top, unexplained = _limits(problem, state, closed)
+    if best_open < 0 or top == NEVER:
         return DEAD
     left = max(0.0, view.total - sum(view.sums[group] for group in bits(closed)))
-    result = Bound(top + view.bests[best_open], top + log(left), best_open)
-    for clue, (value, limit) in enumerate(zip(now, most, strict=True)):
-        if value < 0.5 * limit:
-            tighter = _through(problem, clue, closed, view, (value / limit, left, best_open))
-            if tighter.log_best + top < result.log_best:
-                mass = min(result.log_mass, tighter.log_mass + top)
-                result = Bound(tighter.log_best + top, mass, tighter.branch)
+    branch, log_best, mass = best_open, view.bests[best_open], left
+    for clue, share in unexplained:
+        cause, weight = view.causes(clue, closed)
+        tighter = max(view.bests[cause], log(share) + view.bests[best_open])
+        mass = min(mass, weight + share * left)
+        if tighter < log_best:
+            branch, log_best = cause, tighter
     return Bound(
-        result.log_best + state.log_best + problem.log_odd,
-        result.log_mass + state.log_sum + problem.log_all,
-        result.branch,
+        log_best + top + state.log_best + problem.log_odd,
+        log(mass) + top + state.log_sum + problem.log_all,
+        branch,
     )
 
 
-def _likelihoods(problem: Problem, state: State, closed: int) -> tuple[list[float], list[float]]:
-    """Return each clue's likelihood now, and the most that open groups can make of it."""
-    now, most = [], []
+def _limits(problem: Problem, state: State, closed: int) -> tuple[float, list[tuple[int, float]]]:
+    """Return the most that open groups can make of all clues, as a logarithm.
+
+    With it come the clues that are not explained yet, each with the share of its limit that it
+    has now.
+    """
+    top = 0.0
+    unexplained = []
     for place, clue in enumerate(problem.clues):
         value = clue.alpha + clue.beta * state.misses[place]
-        can_rise = clue.beta < 0 and problem.cause_masks[place] & ~closed
-        now.append(value)
-        most.append(clue.alpha + clue.beta * problem.least[place] if can_rise else value)
-    return now, most
-
-
-def _through(
-    problem: Problem, clue: int, closed: int, view: View, without: tuple[float, float, int]
-) -> Bound:
-    """Bound by one clue: a cause of it is added, or its likelihood stays at ``share``."""
-    share, left, best_open = without
-    branch, log_best, mass = -1, NEVER, 0.0
-    for group in problem.causes[clue]:
-        if not closed >> group & 1:
-            mass += view.sums[group]
-            if view.bests[group] > log_best or branch < 0:
-                branch, log_best = group, view.bests[group]
-    log_best = max(log_best, log(share) + view.bests[best_open])
-    return Bound(log_best, log(mass + share * left), branch)
+        limit = problem.limits[place]
+        if clue.beta < 0 and problem.cause_masks[place] & ~closed:
+            top += problem.log_limits[place]
+            if value < 0.5 * limit:
+                unexplained.append((place, value / limit))
+        else:
+            top += log(value)
+    return top, unexplained
 
 
 def expm(value: float) -> float:

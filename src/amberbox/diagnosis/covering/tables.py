@@ -65,7 +65,7 @@ class Tables:
     """
 
     log_odds: Floats
-    component: Ints
+    component: tuple[int, ...]
     modes: Links
     functions: Links
     gates: Gates
@@ -85,7 +85,7 @@ class Tables:
         component += [-1] * (len(model.mode_ids) - len(model.modes))
         return cls(
             _log_odds(model),
-            np.array(component, np.int64),
+            tuple(component),
             _links(model, model.mode_places),
             _links(model, model.function_places),
             gates,
