@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 
 from amberbox.core.errors import Problem
 from amberbox.core.ids import is_id
-from amberbox.core.needs import NOTHING, Needs, parse_needs
+from amberbox.core.needs import NOTHING, parse_needs
 from amberbox.core.nodes import Node
 from amberbox.diagnosis.fmea.file import (
     FmeaFile,
@@ -27,25 +27,10 @@ from amberbox.diagnosis.fmea.model import (
     Ranks,
 )
 from amberbox.diagnosis.fmea.places import child
+from amberbox.diagnosis.fmea.reading import Part
 from amberbox.diagnosis.fmea.symptoms import Symptoms
 from amberbox.diagnosis.fmea.testing import results_of
 from amberbox.diagnosis.fmea.vocabulary import resolve
-
-
-@dataclass(frozen=True, slots=True)
-class Part:
-    """A component as the file has it: its type written out."""
-
-    component: str
-    type: str
-    file: TypeFile
-    node: Node
-    needs: Needs
-
-    def mode_node(self, name: str) -> Node:
-        """Return where a failure mode stands."""
-        entries = child(self.node, "failure_modes")
-        return child(child(self.node, "modes") if entries is self.node else entries, name)
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +46,7 @@ class Scope:
 
 def component_of(part: Part) -> Component:
     """Make a component."""
-    modes = tuple(f"{part.component}#{name}" for name in part.file.failure_modes)
+    modes = tuple(f"{part.component}#{name}" for name in part.modes)
     return Component(part.component, part.type, part.file.description, part.needs, modes)
 
 
@@ -78,7 +63,7 @@ def function_of(name: str, entry: FunctionFile, node: Node, scope: Scope) -> Fun
 
 def mode_of(part: Part, name: str, scope: Scope) -> None:
     """Make a failure mode and add it to the scope."""
-    entry, node = part.file.failure_modes[name], part.mode_node(name)
+    entry, node = part.modes[name], part.mode_node(name)
     where = f"types.{part.type}.failure_modes.{name}"
     mode_id = f"{part.component}#{name}"
     if not is_id(name):
@@ -86,9 +71,7 @@ def mode_of(part: Part, name: str, scope: Scope) -> None:
     symptoms = child(node, "symptoms")
     links = scope.symptoms.links(entry.symptoms, symptoms, f"{where}.symptoms", mode_id)
     rate, probability = _chance(entry, part.file, scope.file.scales, node, where, scope)
-    results = results_of(
-        entry.tests, part.component, scope.tests, child(node, "tests"), scope.problems
-    )
+    results = results_of(entry.tests, part, scope.tests, child(node, "tests"), scope.problems)
     exposure_h = scope.file.exposure_h if entry.exposure_h is None else entry.exposure_h
     mode = FailureMode(
         mode_id, part.component, name, entry.description, entry.cause,

@@ -202,19 +202,13 @@ class TypeFile:
     description: str = option("", "what it is")
     needs: Any = option(None, "what it needs; otherwise what its component file says")
     rate: float | None = option(None, "failures per hour of the component, for 'ratio'")
-    failure_modes: Mapping[str, ModeFile] = option({}, "how it fails", aliases=("modes",))
-    tests: Mapping[str, TestFile] = option({}, "tests of each instance")
-    symptoms: Mapping[str, SymptomFile] = option({}, "conditions with a name, of each instance")
+    failure_modes: Any = option(None, "how it fails", aliases=("modes",))
+    tests: Any = option(None, "tests of each instance")
+    symptoms: Any = option(None, "conditions with a name, of each instance")
 
     def check(self) -> Iterator[Finding]:
         """Yield what is wrong."""
         yield from _not_below_zero(self, "rate")
-        total = sum(mode.ratio or 0.0 for mode in self.failure_modes.values())
-        if total > 1 + 1e-9:
-            yield "failure_modes", f"their ratios sum up to {total:g}, more than 1"
-        for name, mode in self.failure_modes.items():
-            if mode.ratio is not None and self.rate is None:
-                yield "failure_modes", f"{name} has a ratio, but the type has no rate"
 
 
 @dataclass(frozen=True)
@@ -259,10 +253,10 @@ class FmeaFile:
     scales: ScalesFile = option(ScalesFile(), "tables for S, O and D")
     types: Any = option(None, "kinds of components with their failure modes")
     instances: Any = option(None, "components of each type")
-    functions: Mapping[str, FunctionFile] = option({}, "what the robot can do")
-    symptoms: Mapping[str, SymptomFile] = option({}, "conditions with a name; leaks of outputs")
-    tests: Mapping[str, TestFile] = option({}, "tests of no component in particular")
-    robots: Mapping[str, MemberFile] = option({}, "members of the team, one level down")
+    functions: Any = option(None, "what the robot can do")
+    symptoms: Any = option(None, "conditions with a name; leaks of outputs")
+    tests: Any = option(None, "tests of no component in particular")
+    robots: Any = option(None, "members of the team, one level down")
 
     def check(self) -> Iterator[Finding]:
         """Yield what is wrong."""

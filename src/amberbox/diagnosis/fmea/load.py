@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 
-from amberbox.core.config import build, parse_yaml
+from amberbox.core.config import parse_yaml
 from amberbox.core.errors import Problem
-from amberbox.core.needs import NOTHING, Needs, parse_needs
 from amberbox.core.nodes import Node, load_yaml
 from amberbox.diagnosis.fmea.checking import check
-from amberbox.diagnosis.fmea.entries import Part, Scope, component_of, function_of, mode_of
-from amberbox.diagnosis.fmea.file import FmeaFile, TypeFile
+from amberbox.diagnosis.fmea.entries import Scope, component_of, function_of, mode_of
 from amberbox.diagnosis.fmea.known import Known
 from amberbox.diagnosis.fmea.members import members
 from amberbox.diagnosis.fmea.model import Fmea, FmeaTest, Other
 from amberbox.diagnosis.fmea.places import child
+from amberbox.diagnosis.fmea.reading import Sheet, read
 from amberbox.diagnosis.fmea.symptoms import Symptoms
 from amberbox.diagnosis.fmea.testing import made_test
-from amberbox.diagnosis.fmea.writing_out import Instance, instances
 
 FILE = "fmea.yaml"
 """Its name in a robot folder."""
@@ -51,81 +49,42 @@ def _loaded(
 
 
 def _made(root: Node, known: Known | None, problems: list[Problem], folder: Path) -> Fmea | None:
-    file = build(FmeaFile, root, problems)
-    found = instances(root, problems)
-    parts = _parts(found, root, known, problems)
-    if file is None:
-        return None
-    symptoms = Symptoms(file, known, problems)
-    symptoms.add(file.symptoms, child(root, "symptoms"), "symptoms")
-    for part in parts:
-        where, place = f"types.{part.type}.symptoms", child(part.node, "symptoms")
-        symptoms.add(part.file.symptoms, place, where, part.component)
-    tests = _tests(file, parts, root, symptoms)
-    scope = Scope(file, symptoms, tests, problems)
-    for part in parts:
-        for name in part.file.failure_modes:
+    sheet = read(root, known, problems)
+    symptoms = _symptoms(sheet, known, problems)
+    scope = Scope(sheet.file, symptoms, _tests(sheet, symptoms), problems)
+    for part in sheet.parts:
+        for name in part.modes:
             mode_of(part, name, scope)
     functions = {
         name: function_of(name, entry, child(root, "functions", name), scope)
-        for name, entry in file.functions.items()
+        for name, entry in sheet.functions.items()
     }
-    components = {part.component: component_of(part) for part in parts}
-    components |= members(file, root, scope, folder)
+    components = {part.component: component_of(part) for part in sheet.parts}
+    components |= members(sheet.robots, root, scope, folder)
+    other = Other(sheet.file.other.probability, sheet.file.other.detects)
     fmea = Fmea(
-        file.description,
-        scope.modes,
-        components,
-        functions,
-        symptoms.found,
-        tests,
-        Other(file.other.probability, file.other.detects),
-        file.exposure_h,
-    )
-    names = {*components, *functions, *(entry.component for entry in found)}
-    return check(fmea, root, parts, names, problems)
+        sheet.file.description, scope.modes, components, functions, symptoms.found, scope.tests,
+        other, sheet.file.exposure_h,
+    )  # fmt: skip
+    return check(fmea, sheet, problems)
 
 
-def _parts(
-    found: Sequence[Instance], root: Node, known: Known | None, problems: list[Problem]
-) -> list[Part]:
-    """Read the types, once for each of their components.
-
-    Of what component files say that is needed, what the file does not have is left out.
-    """
-    parts = []
-    names = {entry.component for entry in found} | set(child(root, "functions").mapping or ())
-    inherited = {
-        name: Needs(len(kept), kept)
-        for name, needs in (known.needs if known else {}).items()
-        if (kept := tuple(needed for needed in needs.names() if needed in names))
-    }
-    for entry in found:
-        where = f"types.{entry.type}"
-        file = build(TypeFile, entry.node, problems, where)
-        if file is not None:
-            needs = _needs(entry.node, inherited.get(entry.component, NOTHING), problems, where)
-            parts.append(Part(entry.component, entry.type, file, entry.node, needs))
-    return parts
+def _symptoms(sheet: Sheet, known: Known | None, problems: list[Problem]) -> Symptoms:
+    symptoms = Symptoms(sheet.file.defaults, known, problems)
+    symptoms.add(sheet.symptoms, child(sheet.root, "symptoms"), "symptoms")
+    for part in sheet.parts:
+        where, place = f"types.{part.type}.symptoms", child(part.node, "symptoms")
+        symptoms.add(part.symptoms, place, where, part.component)
+    return symptoms
 
 
-def _needs(node: Node, inherited: Needs, problems: list[Problem], where: str) -> Needs:
-    """Return what the type says that it needs, else what the component's own file says."""
-    entry = (node.mapping or {}).get("needs")
-    if entry is None:
-        return inherited
-    return parse_needs(entry, problems, f"{where}.needs", may_be_empty=True) or NOTHING
-
-
-def _tests(
-    file: FmeaFile, parts: list[Part], root: Node, symptoms: Symptoms
-) -> Mapping[str, FmeaTest]:
+def _tests(sheet: Sheet, symptoms: Symptoms) -> Mapping[str, FmeaTest]:
     tests = {
-        name: made_test(name, entry, child(root, "tests", name), symptoms)
-        for name, entry in file.tests.items()
+        name: made_test(name, entry, child(sheet.root, "tests", name), symptoms)
+        for name, entry in sheet.tests.items()
     }
-    for part in parts:
-        for name, entry in part.file.tests.items():
+    for part in sheet.parts:
+        for name, entry in part.tests.items():
             test_id = f"{part.component}.{name}"
             tests[test_id] = made_test(test_id, entry, child(part.node, "tests", name), symptoms)
     return tests

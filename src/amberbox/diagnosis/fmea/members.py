@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 from amberbox.core.config import did_you_mean
 from amberbox.core.nodes import Node, load_yaml
 from amberbox.diagnosis.fmea.entries import Scope, with_ranks
-from amberbox.diagnosis.fmea.file import FmeaFile, MemberFile, MemberFunctionFile, RanksFile
+from amberbox.diagnosis.fmea.file import MemberFile, MemberFunctionFile, RanksFile
 from amberbox.diagnosis.fmea.model import Component, FailureMode
 from amberbox.diagnosis.fmea.places import child
 
@@ -15,10 +16,12 @@ LOST = "lost"
 """Name of the failure mode of a member's function."""
 
 
-def members(file: FmeaFile, root: Node, scope: Scope, folder: Path) -> dict[str, Component]:
+def members(
+    robots: Mapping[str, MemberFile], root: Node, scope: Scope, folder: Path
+) -> dict[str, Component]:
     """Return a component ``robot:function`` for each function that the team wants of a robot."""
     found: dict[str, Component] = {}
-    for robot, member in file.robots.items():
+    for robot, member in robots.items():
         node = child(root, "robots", robot)
         offered = _offered(member, node, scope, folder)
         for name, entry in member.functions.items():

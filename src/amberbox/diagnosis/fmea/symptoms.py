@@ -9,7 +9,7 @@ from amberbox.core.config import did_you_mean
 from amberbox.core.errors import AmberboxError, Problem
 from amberbox.core.expression import Expression
 from amberbox.core.nodes import Node
-from amberbox.diagnosis.fmea.file import FmeaFile, LinkFile, SymptomFile
+from amberbox.diagnosis.fmea.file import DefaultsFile, LinkFile, SymptomFile
 from amberbox.diagnosis.fmea.known import Known
 from amberbox.diagnosis.fmea.model import Link, Symptom
 from amberbox.diagnosis.fmea.places import child
@@ -18,8 +18,10 @@ from amberbox.diagnosis.fmea.places import child
 class Symptoms:
     """Collects the symptoms that something links to, and those that the file names."""
 
-    def __init__(self, file: FmeaFile, known: Known | None, problems: list[Problem]) -> None:
-        self._defaults = file.defaults
+    def __init__(
+        self, defaults: DefaultsFile, known: Known | None, problems: list[Problem]
+    ) -> None:
+        self._defaults = defaults
         self._named: dict[str, SymptomFile] = {}
         self._known = known
         self._problems = problems
@@ -101,13 +103,13 @@ class Symptoms:
     def add(
         self, entries: Mapping[str, SymptomFile], node: Node, where: str, component: str = ""
     ) -> None:
-        """Take symptoms with a name; those of a component are ``component.name``.
+        """Take symptoms with a name or address; a component's names are ``component.name``.
 
         Tells which are neither an output nor have a condition, and resolves conditions.
         """
         for short, entry in entries.items():
             place = child(node, short)
-            name = f"{component}.{short}" if component else short
+            name = f"{component}.{short}" if component and "/" not in short else short
             self._named[name] = entry
             self.found[name] = self._made(name, entry)
             self._judge(name, entry, place, f"{where}.{short}")

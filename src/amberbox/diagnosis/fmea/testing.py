@@ -10,6 +10,7 @@ from amberbox.core.nodes import Node
 from amberbox.diagnosis.fmea.file import ResultFile, TestFile
 from amberbox.diagnosis.fmea.model import FmeaTest, Kind, Outcome
 from amberbox.diagnosis.fmea.places import child
+from amberbox.diagnosis.fmea.reading import Part, child_keys
 from amberbox.diagnosis.fmea.symptoms import Symptoms
 
 MINUTE_S = 60.0
@@ -29,7 +30,7 @@ def made_test(name: str, entry: TestFile, node: Node, symptoms: Symptoms) -> Fme
 
 def results_of(
     given: Mapping[str, str | ResultFile],
-    component: str,
+    part: Part,
     tests: Mapping[str, FmeaTest],
     node: Node,
     problems: list[Problem],
@@ -37,10 +38,12 @@ def results_of(
     """Yield what tests give when a mode is there; ``node`` is the mapping in the file."""
     for name, entry in given.items():
         place = child(node, name)
-        test_id = next((key for key in (f"{component}.{name}", name) if key in tests), None)
+        test_id = next((key for key in (f"{part.component}.{name}", name) if key in tests), None)
         result = ResultFile(entry) if isinstance(entry, str) else entry
+        if test_id is None and name in child_keys(part.node, "tests"):
+            continue  # it is wrong, which has been told
         if test_id is None:
-            short = [key.removeprefix(f"{component}.") for key in tests]
+            short = [key.removeprefix(f"{part.component}.") for key in tests]
             what = f"there is no test '{name}'{did_you_mean(name, short)}"
             problems.append(place.problem("tests", what))
         elif result.outcome not in tests[test_id].outcomes:
