@@ -1,9 +1,10 @@
-"""From the analysis to the numbers that the covering engine reasons with."""
+"""From the analysis to the numbers and tests that the covering engine reasons with."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
+from amberbox.diagnosis.covering.check import Check, Sight
 from amberbox.diagnosis.covering.model import Function, Link, Mode, Model, Sign, Unknown
 from amberbox.diagnosis.fmea.criticality import mode_criticality
 from amberbox.diagnosis.fmea.model import Fmea
@@ -35,3 +36,25 @@ def _links(fmea: Fmea) -> Iterator[Link]:
     for cause, links in causes:
         for link in links:
             yield Link(cause, link.symptom, link.detects)
+
+
+def compile_checks(fmea: Fmea) -> tuple[Check, ...]:
+    """Return the tests with what each failure mode makes them give."""
+    sights: dict[str, list[Sight]] = {name: [] for name in fmea.tests}
+    for mode in fmea.modes.values():
+        for given in mode.tests:
+            sights[given.test].append(Sight(mode.id, given.outcome, given.detects))
+    return tuple(
+        Check(
+            test.id,
+            test.kind,
+            test.text,
+            test.role,
+            test.cost_s,
+            test.risk,
+            test.outcomes,
+            test.sure,
+            tuple(sights[test.id]),
+        )
+        for test in fmea.tests.values()
+    )
