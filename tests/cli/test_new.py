@@ -37,13 +37,13 @@ def test_the_simulated_robot_comes_with_its_monitors(
     place = tmp_path / "r"
     assert main(["new", str(place)]) == 0
     printed = capsys.readouterr().out
-    assert "black_box.yaml and components and robot.yaml" in printed
+    assert "wrote black_box.yaml and components and " in printed
     assert f"and beside it amberbox watch {place}" in printed
     assert (place / "components" / "laser_front" / "heartbeat.yaml").is_file()
     assert main(["check", str(place)]) == 0
     assert "wheel_rear_right" in capsys.readouterr().out
     assert main(["new", str(place)]) == 2
-    assert "components and robot.yaml already" in capsys.readouterr().err
+    assert "black_box.yaml and components and " in capsys.readouterr().err
 
 
 def test_nothing_is_written_over(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
