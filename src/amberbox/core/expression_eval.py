@@ -210,7 +210,7 @@ def known_numbers(
 ) -> tuple[IntArray, NDArray[np.float64]]:
     """Return what a window is computed of: times and numbers, without what is unknown."""
     numbers = on.as_number(values, tree.name, tree.inner.at)
-    if not numbers.null.any():
+    if not np.count_nonzero(numbers.null):
         return times_ns, numbers.data
     known = ~numbers.null
     return times_ns[known], numbers.data[known]

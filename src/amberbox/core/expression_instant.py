@@ -237,8 +237,8 @@ def _window(tree: Window, kinds: Kinds) -> tuple[At, Kind]:
         first = int(clock.searchsorted(look.at_ns - tree.over_ns, "right"))
         rows = slice(first, int(clock.searchsorted(look.at_ns, "right")))
         times_ns = clock[rows]
-        series = {n: Series(times_ns, look.tracks[n].part(rows)) for n in tree.reads}
-        inside = Instants(series, times_ns, slice(0, len(times_ns)))
+        looked_up = {name: look.tracks[name].part(rows) for name in tree.reads}
+        inside = Instants({}, times_ns, looked_up=looked_up)
         return _reduced(tree, times_ns, value_of(tree.inner, inside))
 
     return window, "number"

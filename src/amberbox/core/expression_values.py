@@ -22,7 +22,7 @@ KIND_OF_DTYPE: dict[str, Kind] = {"b": "condition", "i": "number", "u": "number"
 _NAMES: dict[Kind, str] = {"text": "text", "number": "a number", "condition": "a condition"}
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(slots=True, eq=False)  # not frozen: every part of an expression makes one
 class Values:
     """One value per instant; ``data`` means nothing where ``null`` is true."""
 
@@ -96,13 +96,19 @@ def constant(value: object, count: int) -> Values:
     """Repeat one value."""
     if value is None:
         return Values(np.zeros(count), np.ones(count, bool), "null")
-    data = np.full(count, value, object if isinstance(value, str) else None)
+    if isinstance(value, float):
+        data = np.empty(count)
+        data.fill(value)  # np.full takes three times as long for few
+    else:
+        data = np.full(count, value, object if isinstance(value, str) else None)
     return Values(data, np.zeros(count, bool), kind_of_value(value))
 
 
 def as_number(values: Values, wanted_by: str, at: int) -> Values:
     """Return float64 values; conditions count as 0 and 1."""
     require_number(values.kind, wanted_by, at)
+    if values.kind == "number" and values.data.dtype == np.float64:
+        return values
     return Values(values.data.astype(np.float64, copy=False), values.null, "number")
 
 
@@ -115,6 +121,8 @@ def require_number(kind: Kind, wanted_by: str, at: int) -> None:
 def as_condition(values: Values, wanted_by: str, at: int) -> Values:
     """Return the same values if they are true or false."""
     require_condition(values.kind, wanted_by, at)
+    if values.data.dtype == np.bool_:
+        return Values(values.data, values.null, "condition")
     return Values(values.data.astype(bool, copy=False), values.null, "condition")
 
 
@@ -189,7 +197,8 @@ def _object_array(column: Any) -> Array:
 def _from_objects(data: Array, mask: Mask | None, at: int) -> Values:
     null = np.array([value is None for value in data], bool)
     null = null if mask is None else null | mask
-    kinds = {_kind_of_object(value, at) for value in data[~null]}
+    one_of_each_type = {type(value): value for value in data[~null]}
+    kinds = {_kind_of_object(value, at) for value in one_of_each_type.values()}
     if len(kinds) > 1:
         raise Fault("holds values of different kinds: " + ", ".join(sorted(kinds)), at)
     if not kinds:

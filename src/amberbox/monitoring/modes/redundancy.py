@@ -104,7 +104,8 @@ def results_of(config: Config, inputs: int, bools: int) -> tuple[Result, ...]:
 def evaluate(config: Config, inputs: Sequence[Input], now: Now) -> Mapping[str, Any]:
     """Take the median distance of each member from what it should be."""
     named = by_name(inputs, reads(config))
-    times_ns = sample_times(named.values(), now, config.window)
+    windowed = timed(config)
+    times_ns = sample_times(named.values(), now, config.window) if windowed else np.atleast_1d(now)
     places = _members(config, len(inputs) - len(reads(config)))
     values = np.array([numbers_at(named[place_name(place)], times_ns) for place in places])
     should = _should_be(config, named, times_ns, values)
