@@ -106,10 +106,7 @@ def _power(a: Number, b: Number) -> int | float:
     """Compute ``a ** b``: whole numbers stay whole, and a negative exponent gives a float."""
     if isinstance(a, int) and isinstance(b, int):
         return _whole_power(a, b) if b >= 0 or a in (1, -1) else float(a) ** b
-    value = float(a) ** float(b)
-    if isinstance(value, complex):
-        raise ValueError
-    return value
+    return math.pow(a, b)
 
 
 def _caret(a: Number, b: Number) -> int | float:

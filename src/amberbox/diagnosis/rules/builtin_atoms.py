@@ -125,10 +125,10 @@ def _number_codes(m: Machine, args: Args) -> bool:
 def _atom_number(m: Machine, args: Args) -> bool:
     known = _text(args[0])
     if known is None:
-        value = deref(args[1])
-        if not isinstance(value, int | Real):
+        given = deref(args[1])
+        if not isinstance(given, int | Real):
             raise RuleFault("atom_number/2 needs an atom or a number")
-        return m.unify(args[0], number_text(value))
+        return m.unify(args[0], number_text(given))
     value = parse_number(known)
     return value is not None and m.unify(args[1], value)
 

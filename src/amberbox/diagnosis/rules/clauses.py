@@ -57,6 +57,8 @@ class Clause:
     """The body in source order, as patterns."""
     names: tuple[str, ...] = ()
     """Names of the variables by slot."""
+    calls: dict[Key, Place] = field(default_factory=dict)
+    """Where the body calls what."""
 
 
 @dataclass(slots=True, eq=False)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from amberbox.core.errors import AmberboxError, UsageError
 
 
-class RuleFault(Exception):
+class RuleFault(Exception):  # noqa: N818  # not an error yet: it becomes one with its place
     """Something is wrong; ``at`` is the place in the text being read, -1 where there is none."""
 
     def __init__(self, what: str, hint: str = "", at: int = -1) -> None:
@@ -18,7 +18,7 @@ class RuleFault(Exception):
         self.at = at
 
 
-class StopFault(Exception):
+class StopFault(Exception):  # noqa: N818  # as above
     """The budget is used up."""
 
 

@@ -12,15 +12,17 @@ from amberbox.diagnosis.rules.reader import sentences
 from amberbox.diagnosis.rules.terms import Key
 
 _TEXT = """
-append([], L, L).
-append([H|T], L, [H|R]) :- append(T, L, R).
+append(X, Y, Z) :- '$append'(X, Y, Z).
 append(Lists, List) :- '$append'(Lists, List).
 '$append'([], []).
-'$append'([L|Ls], As) :- append(L, Ws, As), '$append'(Ls, Ws).
+'$append'([L|Ls], As) :- '$append'(L, Ws, As), '$append'(Ls, Ws).
+'$append'([], L, L).
+'$append'([H|T], L, [H|R]) :- '$append'(T, L, R).
 member(X, [H|T]) :- '$member'(T, X, H).
 '$member'(_, X, X).
 '$member'([H|T], X, _) :- '$member'(T, X, H).
-memberchk(X, L) :- member(X, L), !.
+memberchk(X, L) :- '$memberchk'(X, L).
+'$memberchk'(X, [H|T]) :- ( X = H -> true ; '$memberchk'(X, T) ).
 select(X, [X|T], T).
 select(X, [H|T], [H|R]) :- select(X, T, R).
 exclude(_, [], []).
@@ -53,10 +55,12 @@ sum_list(L, S) :- '$sum'(L, 0, S).
 sumlist(L, S) :- '$sum'(L, 0, S).
 '$sum'([], S, S).
 '$sum'([X|Xs], A, S) :- B is A + X, '$sum'(Xs, B, S).
-max_list([X|Xs], M) :- '$max'(Xs, X, M).
+max_list(L, M) :- '$max_of'(L, M).
+'$max_of'([X|Xs], M) :- '$max'(Xs, X, M).
 '$max'([], M, M).
 '$max'([X|Xs], A, M) :- B is max(A, X), '$max'(Xs, B, M).
-min_list([X|Xs], M) :- '$min'(Xs, X, M).
+min_list(L, M) :- '$min_of'(L, M).
+'$min_of'([X|Xs], M) :- '$min'(Xs, X, M).
 '$min'([], M, M).
 '$min'([X|Xs], A, M) :- B is min(A, X), '$min'(Xs, B, M).
 max_member(M, L) :- '$max_member'(L, M).
@@ -73,11 +77,11 @@ numlist(L, H, [L|T]) :- M is L + 1, numlist(M, H, T).
 delete([], _, []).
 delete([X|Xs], Y, Zs) :- ( X \\= Y -> Zs = [X|Ws] ; Zs = Ws ), delete(Xs, Y, Ws).
 subtract([], _, []).
-subtract([X|Xs], L, R) :- ( memberchk(X, L) -> R = S ; R = [X|S] ), subtract(Xs, L, S).
+subtract([X|Xs], L, R) :- ( '$memberchk'(X, L) -> R = S ; R = [X|S] ), subtract(Xs, L, S).
 intersection([], _, []).
-intersection([X|Xs], L, R) :- ( memberchk(X, L) -> R = [X|S] ; R = S ), intersection(Xs, L, S).
+intersection([X|Xs], L, R) :- ( '$memberchk'(X, L) -> R = [X|S] ; R = S ), intersection(Xs, L, S).
 union([], L, L).
-union([X|Xs], L, R) :- ( memberchk(X, L) -> R = S ; R = [X|S] ), union(Xs, L, S).
+union([X|Xs], L, R) :- ( '$memberchk'(X, L) -> R = S ; R = [X|S] ), union(Xs, L, S).
 list_to_set(L, S) :- '$to_set'(L, [], S).
 '$to_set'([], _, []).
 '$to_set'([X|Xs], Seen, S) :-
@@ -85,19 +89,21 @@ list_to_set(L, S) :- '$to_set'(L, [], S).
 '$seen'(X, [Y|_]) :- X == Y, !.
 '$seen'(X, [_|T]) :- '$seen'(X, T).
 permutation([], []).
-permutation(L, [X|P]) :- select(X, L, R), permutation(R, P).
+permutation([H|T], [X|P]) :- '$select'(X, [H|T], R), permutation(R, P).
+'$select'(X, [X|T], T).
+'$select'(X, [H|T], [H|R]) :- '$select'(X, T, R).
 pairs_keys_values([], [], []).
 pairs_keys_values([K-V|T], [K|Ks], [V|Vs]) :- pairs_keys_values(T, Ks, Vs).
 pairs_keys([], []).
 pairs_keys([K-_|T], [K|Ks]) :- pairs_keys(T, Ks).
 pairs_values([], []).
 pairs_values([_-V|T], [V|Vs]) :- pairs_values(T, Vs).
-findall(T, G, L, Rest) :- findall(T, G, Found), append(Found, Rest, L).
+findall(T, G, L, Rest) :- findall(T, G, Found), '$append'(Found, Rest, L).
 aggregate_all(What, G, R) :- '$aggregate'(What, G, R).
 '$aggregate'(count, G, N) :- !, findall(x, G, L), length(L, N).
 '$aggregate'(sum(X), G, S) :- !, findall(X, G, L), '$sum'(L, 0, S).
-'$aggregate'(max(X), G, M) :- !, findall(X, G, L), max_list(L, M).
-'$aggregate'(min(X), G, M) :- !, findall(X, G, L), min_list(L, M).
+'$aggregate'(max(X), G, M) :- !, findall(X, G, L), '$max_of'(L, M).
+'$aggregate'(min(X), G, M) :- !, findall(X, G, L), '$min_of'(L, M).
 '$aggregate'(bag(X), G, L) :- !, findall(X, G, L).
 '$aggregate'(set(X), G, S) :- !, findall(X, G, L), sort(L, S).
 """

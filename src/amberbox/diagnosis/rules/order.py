@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from functools import cmp_to_key
+from typing import Any
 
 from amberbox.diagnosis.rules.faults import RuleFault
 from amberbox.diagnosis.rules.terms import LONGEST, Real, Struct, Term, Text, Var, deref
@@ -73,5 +74,5 @@ def _value(number: int | Real) -> int | float:
     return float(number) if isinstance(number, Real) else number
 
 
-def _sign(a: object, b: object) -> int:
-    return (a > b) - (a < b)  # type: ignore[operator]  # callers give two of a kind
+def _sign(a: Any, b: Any) -> int:
+    return int(a > b) - int(a < b)

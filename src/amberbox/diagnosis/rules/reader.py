@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
@@ -12,6 +13,9 @@ from amberbox.diagnosis.rules.tokens import Token, tokens
 
 _DEEPEST = 100
 _LONGEST_LEFT = 200
+_VALUE = r"\s*(?:[a-z]\w*|\d{1,18})\s*"
+_FACT = re.compile(rf"\s*([a-z]\w*)\(({_VALUE}(?:,{_VALUE})*)\)\.(?=\s|\Z)", re.ASCII)
+"""A fact of plain words and numbers: nearly all of a long file, so it has a short way."""
 _CLOSING = frozenset(")]},|")
 
 
@@ -30,6 +34,11 @@ class Sentence:
 def sentences(text: str, at: int = 0) -> Iterator[Sentence | RuleFault]:
     """Yield what a text says, sentence by sentence; a fault for each that cannot be read."""
     while True:
+        fact = _FACT.match(text, at)
+        if fact is not None:
+            yield _fact(fact)
+            at = fact.end()
+            continue
         reader = _Reader(text, at)
         try:
             sentence = reader.sentence()
@@ -44,6 +53,12 @@ def sentences(text: str, at: int = 0) -> Iterator[Sentence | RuleFault]:
             return
         yield sentence
         at = reader.end
+
+
+def _fact(fact: re.Match[str]) -> Sentence:
+    words = (word.strip() for word in fact[2].split(","))
+    args = tuple(int(word) if word[0].isdigit() else word for word in words)
+    return Sentence(Struct(fact[1], args), fact.start(1))
 
 
 def read_goal(text: str) -> Sentence:

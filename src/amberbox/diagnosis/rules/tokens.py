@@ -59,7 +59,7 @@ def tokens(text: str, at: int = 0) -> Iterator[Token]:
     length = len(text)
     while at < length:
         match = _WORDS.match(text, at)
-        if match is None or text.startswith("/*", at) and match.lastgroup != "blank":
+        if match is None or (text.startswith("/*", at) and match.lastgroup != "blank"):
             raise _foreign(text, at)
         sort, end = match.lastgroup, match.end()
         if sort == "blank":

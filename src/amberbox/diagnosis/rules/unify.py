@@ -51,11 +51,10 @@ def unify(left: Term, right: Term, trail: Trail) -> bool:
 def match(pattern: Term, term: Term, env: list[Term | None], trail: Trail) -> bool:
     """Unify an argument of a clause's head with an argument of a call; fills ``env``."""
     while True:
-        kind = type(pattern)
-        if kind is Slot:
-            known = env[pattern.index]  # type: ignore[union-attr]  # its type was looked at
+        if type(pattern) is Slot:
+            known = env[pattern.index]
             if known is None:
-                env[pattern.index] = term  # type: ignore[union-attr]  # as above
+                env[pattern.index] = term
                 return True
             return unify(known, term, trail)
         term = deref(term)
@@ -63,9 +62,8 @@ def match(pattern: Term, term: Term, env: list[Term | None], trail: Trail) -> bo
             term.ref = build_head(pattern, env)
             trail.append(term)
             return True
-        if kind is not Pattern:
-            return pattern == term or (kind is Struct and unify(pattern, term, trail))
-        assert isinstance(pattern, Pattern)  # the only kind that is left
+        if type(pattern) is not Pattern:
+            return pattern == term or (type(pattern) is Struct and unify(pattern, term, trail))
         if not isinstance(term, Struct) or not _same_form(pattern, term):
             return False
         for inner, part in zip(pattern.args[:-1], term.args[:-1], strict=True):
@@ -96,10 +94,9 @@ def build_head(pattern: Term, env: list[Term | None]) -> Term:
 
 def build(pattern: Term, env: Env) -> Term:
     """Put the variables of a clause into one of its patterns."""
-    kind = type(pattern)
-    if kind is Slot:
-        return env[pattern.index]  # type: ignore[union-attr]  # its type was looked at
-    if kind is not Pattern:
+    if type(pattern) is Slot:
+        return env[pattern.index]
+    if type(pattern) is not Pattern:
         return pattern
     spine: list[tuple[str, list[Term]]] = []
     while type(pattern) is Pattern:

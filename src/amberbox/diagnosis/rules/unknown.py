@@ -10,15 +10,16 @@ from amberbox.diagnosis.rules.terms import Key, show_key
 
 _CHANGES = "rules cannot change facts here: what is known comes from files and from the robot"
 _OUTPUT = "rules cannot read or write: ask a goal and look at its answers"
+_FILES = "give several files: they are read as one"
 _REFUSED: dict[str, str] = {
     **dict.fromkeys(("assert", "asserta", "assertz", "retract", "retractall", "abolish"), _CHANGES),
     **dict.fromkeys(
-        ("write", "print", "writeln", "nl", "format", "read", "writeq", "write_canonical", "put_char",
-         "tab", "open", "close", "consult", "print_message", "read_term", "write_term"), _OUTPUT),
+        ("write", "print", "writeln", "nl", "format", "read", "writeq", "write_canonical",
+         "put_char", "tab", "open", "close", "consult", "print_message", "read_term", "write_term"), _OUTPUT),
     **dict.fromkeys(("catch", "throw"), "an error ends the question and is shown"),
     **dict.fromkeys(("bagof", "setof", "^"), "use findall, and sort for each solution once"),
     **dict.fromkeys(("shell", "halt", "getenv", "setenv"), "rules cannot reach the system"),
-    **dict.fromkeys(("use_module", "module", "ensure_loaded"), "give several files: they are read as one"),
+    **dict.fromkeys(("use_module", "module", "ensure_loaded"), _FILES),
     **dict.fromkeys(("nb_setval", "b_setval", "nb_getval", "b_getval"), _CHANGES),
     "*->": "use (once(A) -> B ; C) or (A, B)",
     ":": "there are no modules: write the goal without its module",

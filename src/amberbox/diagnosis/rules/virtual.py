@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 from amberbox.diagnosis.rules.faults import RuleFault
 from amberbox.diagnosis.rules.terms import Key, Term, Var, deref, make, show_key, to_term
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 Row = Sequence[object]
 """One solution: a value for every argument; strings are atoms, sequences are lists."""
 
-Lookup = Callable[[tuple[Term | None, ...]], Iterable[Row]]
+Lookup: TypeAlias = "Callable[[tuple[Term | None, ...]], Iterable[Row]]"
 """Gets the arguments of a call, None where there is no value yet, and returns rows.
 
 It may return rows that do not match what it was given; they are left out.
