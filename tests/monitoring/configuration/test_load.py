@@ -181,6 +181,7 @@ def test_a_monitor_of_the_robot_s_own(tmp_path: Path) -> None:
         ("class Config: ...\ndef evaluate(): ...\n1 / 0\n", "ZeroDivisionError"),
         ("class Config: ...\ndef evaluate(): ...\n", "does not define ACCEPTS, RESULTS"),
         ("class Config:\n", "cannot be loaded: IndentationError"),
+        ("class Config: ...\ndef evaluate(): ...\nraise SystemExit(3)\n", "SystemExit: 3"),
     ],
 )
 def test_a_monitor_that_cannot_be_loaded(tmp_path: Path, code: str, what: str) -> None:
@@ -192,11 +193,40 @@ def test_a_monitor_that_cannot_be_loaded(tmp_path: Path, code: str, what: str) -
     assert what in mode.problem
 
 
-def test_a_monitor_that_crashes_when_it_is_asked(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("code", "what"),
+    [
+        ("def results_of(*_):\n    return 1 / 0\n", "crashed when it was asked: ZeroDivisionError"),
+        ("def history_s(_):\n    return 1 / 0\n", "crashed when it was asked: ZeroDivisionError"),
+        ("def timed(_):\n    raise SystemExit(3)\n", "crashed when it was asked: SystemExit: 3"),
+        ("def history_s(_):\n    return float('inf')\n", "looks back inf s, which cannot be"),
+    ],
+)
+def test_a_monitor_that_crashes_when_it_is_asked(tmp_path: Path, code: str, what: str) -> None:
+    """All of it is asked here: once it runs, it would take the other monitors with it."""
     own = (EXAMPLE.parents[1] / "src/amberbox/monitoring/modes/range.py").read_text()
     (tmp_path / "modes").mkdir()
-    (tmp_path / "modes" / "heat.py").write_text(f"{own}\n\ndef results_of(*_):\n    return 1 / 0\n")
+    (tmp_path / "modes" / "heat.py").write_text(f"{own}\n\n{code}")
     mode, problems = mode_of(tmp_path, RANGE.replace("monitor: range", "monitor: heat"))
-    what = "its monitor crashed when it was asked: ZeroDivisionError: division by zero"
-    assert errors(problems) == [f"mode.yaml:2: monitor: {what}"]
-    assert mode.problem == what
+    (error,) = errors(problems)
+    assert error.startswith("mode.yaml:2: monitor: its monitor ") and what in error
+    assert what in mode.problem
+
+
+def test_what_is_wrong_with_a_file_that_many_list_is_told_once(tmp_path: Path) -> None:
+    files = {f"part{k}.yaml": f"component_name: p{k}\nmodes: [mode.yaml]\n" for k in range(3)}
+    files["mode.yaml"] = RANGE.replace("max: 3", "high: 3")
+    plan, problems = plan_of(tmp_path, files)
+    assert len(errors(problems)) == len(set(errors(problems)))
+    assert all(mode.problem for _, mode in plan.modes())
+
+
+def test_not_all_items_that_are_not_known_yet_are_named(tmp_path: Path) -> None:
+    box = "- ros:\n    topics:\n" + "".join(
+        f"      - topic: {{name: /own{k}, type: own_msgs/Own}}\n" for k in range(20)
+    )
+    inputs = ", ".join(f"ros_own{k}.x" for k in range(20))
+    text = RANGE.replace("ros_odom.pose_pose_position_x", inputs)
+    _, problems = mode_of(tmp_path, text, box)
+    (note,) = [note for note in notes(problems) if "judged when" in note]
+    assert "ros_own19 and 8 more are judged when" in note

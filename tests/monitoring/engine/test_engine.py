@@ -17,6 +17,7 @@ from amberbox.core.clock import NS
 from amberbox.core.types import Batch, Level, Status
 from amberbox.monitoring.engine.engine import Engine
 from amberbox.monitoring.engine.findings import TICK_NS, Finding
+from amberbox.monitoring.messages.records import encoded
 from amberbox.monitoring.plan import ModePlan
 from tests.monitoring.engine.plans import (
     ALIVE,
@@ -114,6 +115,31 @@ def test_a_mode_that_crashes_is_unknown_and_disturbs_nobody() -> None:
     last = [f for f in findings if isinstance(f, Status) and f.mode == "crashing"][-1]
     assert last.reason == "crashed: RuntimeError: above two"
     assert levels(findings) == [(0.0, "unknown"), (1.0, "ok")]
+
+
+@pytest.mark.parametrize("error", [SystemExit(3), ValueError("\udcff")])
+@pytest.mark.parametrize("columns", [True, False])
+def test_a_mode_cannot_end_the_program(error: BaseException, columns: bool) -> None:
+    def evaluate(*_: Any) -> Any:
+        raise error
+
+    findings = watch(
+        [mode(mode_module(evaluate, COLUMNS=columns), variable())],
+        [rows(seconds(1, 2, 3, 4, 5), v=[1.0] * 5)], 5.0,
+    )  # fmt: skip
+    status = [f for f in findings if isinstance(f, Status) and f.mode][-1]
+    assert status.reason.startswith(f"crashed: {type(error).__name__}: ")
+    assert all(encoded(finding) for finding in findings)
+
+
+def test_an_explanation_is_text_that_can_be_written() -> None:
+    def explain(*_: Any) -> Any:
+        return "\udcff"
+
+    module = mode_module(lambda *_: {"good": False}, explain=explain)
+    findings = watch([mode(module, variable())], [rows(seconds(1), v=[1.0])], 2.0)
+    assert all(encoded(finding) for finding in findings)
+    assert any(isinstance(f, Status) and f.reason.endswith(": ?") for f in findings)
 
 
 def test_a_value_that_is_null_is_not_known() -> None:

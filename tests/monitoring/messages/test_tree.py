@@ -47,3 +47,9 @@ def test_each_component_is_shown_once_also_in_a_circle(
     components = [component(n, *needs, part_of=whole) for n, (needs, whole) in graph.items()]
     shown = [line.lstrip("-") for line in drawn(*components)]
     assert sorted(shown) == sorted(graph)
+
+
+def test_a_long_chain_is_shown() -> None:
+    """Deeper than Python calls itself."""
+    chain = [component(f"c{k}", f"c{k + 1}") for k in range(1500)]
+    assert [branch.depth for branch in branches(Plan("r", "h", chain))] == list(range(1500))

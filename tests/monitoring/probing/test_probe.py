@@ -44,3 +44,10 @@ def test_what_the_system_says_can_be_recorded() -> None:
     row = Probe("odd", measure).look("/dev/\udcff")
     assert row["error"] == "/dev/?: No such file"
     assert encode(row)
+
+
+def test_a_probe_that_would_end_the_program_is_unknown() -> None:
+    def measure(subject: str) -> dict[str, Any]:
+        raise SystemExit(3)
+
+    assert Probe("odd", measure).look("a")["error"] == "crashed: SystemExit: 3"

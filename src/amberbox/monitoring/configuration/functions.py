@@ -36,7 +36,7 @@ class Functions:
             module = self.modes[name].load()
         except AmberboxError:
             raise
-        except Exception as error:  # a robot's own monitor may fail in any way when imported
+        except (Exception, SystemExit) as error:  # a robot's own monitor may fail in any way
             what = f"monitor '{name}' cannot be loaded: {type(error).__name__}: {error}"
             raise AmberboxError(what, f"look at {self.modes[name].path}") from error
         missing = [word for word in _NEEDED if not hasattr(module, word)]

@@ -22,6 +22,8 @@ from amberbox.monitoring.plan import ComponentPlan, ModePlan, Plan
 
 BROKEN = "configuration"
 """Name of the mode that stands in for those of a component file that cannot be read."""
+_SHOWN = 12
+"""So many items are named in a note."""
 
 
 def load_plan(folder: RobotFolder) -> tuple[Plan, list[Problem]]:
@@ -44,8 +46,9 @@ def load_plan(folder: RobotFolder) -> tuple[Plan, list[Problem]]:
     plans = with_dependencies(components, problems)
     problems.extend(part_problems(components))
     problems.extend(_not_known_yet(bench.inputs, folder))
-    problems.sort(key=lambda problem: (problem.file, problem.line))
-    return replace(plan, components=tuple(plans)), problems
+    once = dict.fromkeys(problems)  # a mode file may be listed by many components
+    told = sorted(once, key=lambda problem: (problem.file, problem.line))
+    return replace(plan, components=tuple(plans)), told
 
 
 def _components(tree: Tree, bench: Bench) -> list[Named]:
@@ -103,5 +106,7 @@ def _modes(source: ComponentSource, bench: Bench) -> Iterator[ModePlan]:
 def _not_known_yet(inputs: Inputs, folder: RobotFolder) -> Iterator[Problem]:
     names: Sequence[str] = sorted(inputs.unknown_items)
     if names:
-        what = f"variables of {', '.join(names)} are judged when they have been recorded"
+        more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
+        shown = f"{', '.join(names[:_SHOWN])}{more}"
+        what = f"variables of {shown} are judged when they have been recorded"
         yield Problem(str(folder.path / FOLDER), 1, "inputs", what, is_error=False)

@@ -58,7 +58,7 @@ def _made(
 ) -> ModePlan:
     try:
         return _plan(plan, file, node, bench, problems)
-    except Exception as error:  # a robot's own monitor may fail in any way when it is asked
+    except (Exception, SystemExit) as error:  # a robot's own monitor may fail in any way
         what = f"its monitor crashed when it was asked: {type(error).__name__}: {error}"
         problems.append(_at(node, "monitor").problem("monitor", what))
         return plan
@@ -95,8 +95,19 @@ def _plan(
         return replace(plan, module=module, mappings=_outlines(file, node, problems))
     mappings = _Mappings(module, config, bench.inputs, problems).of(file, node)
     plan = replace(plan, module=module, config=config, mappings=mappings)
+    problems.extend(_time_problems(module, config, node))
     problems.extend(filter_problems(plan, node, bench.inputs.recorded))
     return replace(plan, states=_states(file.states, plan, node, problems))
+
+
+def _time_problems(module: Any, config: Any, node: Node) -> Iterator[Problem]:
+    """Ask a monitor what it says of time; raise what it raises."""
+    if hasattr(module, "timed"):
+        module.timed(config)
+    seconds = module.history_s(config) if hasattr(module, "history_s") else 0.0
+    if not 0 <= seconds < float("inf"):
+        what = f"its monitor looks back {seconds:g} s, which cannot be"
+        yield _at(node, "monitor").problem("monitor", what)
 
 
 def _function(

@@ -19,7 +19,7 @@ from amberbox.core.types import IntArray, Output
 from amberbox.monitoring.engine import freshness
 from amberbox.monitoring.engine.findings import Found, What
 from amberbox.monitoring.engine.judging import AS_BEFORE, BAD, NOT_KNOWN, OK, Judge
-from amberbox.monitoring.engine.keeping import as_json, of_json
+from amberbox.monitoring.engine.keeping import as_json, of_json, readable
 from amberbox.monitoring.plan import MappingPlan, ModePlan, OutputPlan
 
 QUARTER_NS = NS // 4
@@ -29,6 +29,9 @@ _CODES = 8
 _FEW = 4
 """Up to so many instants are evaluated one by one."""
 _WHAT: tuple[What, ...] = ("ok", "bad", "unknown")
+
+CRASHES = (Exception, SystemExit)
+"""What a mode may raise so that it is not called any more."""
 
 Key = tuple[int, Any]
 """What an output was judged to be and, of bools and texts, its value."""
@@ -146,7 +149,7 @@ class MappingRun:
             before = (self.code, [output.key for output in self.outputs], *counts)
             try:
                 self._at_once(block, codes, found)
-            except Exception:  # one by one shows at which instant
+            except CRASHES:  # one by one shows at which instant
                 self._set_back(found, *before)
             else:
                 return
@@ -184,15 +187,15 @@ class MappingRun:
                 if due or self.code != code:
                     try:
                         self._evaluate_one(now, found)
-                    except Exception as error:  # whatever it is: other modes go on
+                    except CRASHES as error:  # whatever it is: other modes go on
                         self._crash(now, error, found)
                         return
             elif code != self.code:
                 self._not_fresh(now, code, found)
             self.code = code
 
-    def _crash(self, now: int, error: Exception, found: list[Found]) -> None:
-        self.crashed = f"crashed: {type(error).__name__}: {error}".rstrip(": ")
+    def _crash(self, now: int, error: BaseException, found: list[Found]) -> None:
+        self.crashed = readable(f"crashed: {type(error).__name__}: {error}".rstrip(": "))
         self._say(now, "unknown", self.crashed, found)
 
     def _evaluate_one(self, now: int, found: list[Found]) -> None:
@@ -235,9 +238,9 @@ class MappingRun:
         assert self._explain is not None, "asked for where there is one"
         plain = {n: _plain(value, n in self._bools) for n, value in results.items()}
         try:
-            return str(self._explain(self._config, plain))
-        except Exception as error:  # what was found stands, whatever its words
-            return f"no explanation: {type(error).__name__}: {error}"
+            return readable(str(self._explain(self._config, plain)))
+        except CRASHES as error:  # what was found stands, whatever its words
+            return readable(f"no explanation: {type(error).__name__}: {error}")
 
     def _with_culprits(self, block: Block) -> Any:
         """Return the codes with the place of the first input that is as bad: it changes alone."""

@@ -11,6 +11,7 @@ import numpy as np
 
 from amberbox.core.mode import FALSE, HOLD, TRUE
 from amberbox.core.types import Output
+from amberbox.monitoring.engine.keeping import readable
 from amberbox.monitoring.plan import Expectation, OutputPlan
 
 OK, BAD, NOT_KNOWN, AS_BEFORE = 0, 1, 2, 3
@@ -68,7 +69,9 @@ class Judge:
         if not isinstance(plain, _TEXT if self.is_discrete else _NUMBER):
             wanted = "text" if self.is_discrete else "number"
             raise TypeError(f"{self.result} is no {wanted}: {repr(plain)[:60]}")
-        if isinstance(plain, int) and not -_WHOLE <= plain < _WHOLE:
+        if isinstance(plain, str):
+            plain = readable(plain)
+        elif isinstance(plain, int) and not -_WHOLE <= plain < _WHOLE:
             plain = float(plain)
         return self._compared(plain), plain
 
@@ -98,6 +101,8 @@ class Judge:
                 known = self._compared_column(kept.astype(np.float64))
             unknown = np.where(kept == HOLD, AS_BEFORE, NOT_KNOWN)
             return np.where(kept > TRUE, unknown, known), kept.tolist()
+        if self.is_discrete:
+            return self._compared_column(column), [readable(text) for text in column.tolist()]
         return self._compared_column(column), column.tolist()
 
     def _compared_column(self, column: Any) -> Any:

@@ -1,4 +1,4 @@
-"""Values as a snapshot keeps them: JSON has no NaN and no infinity."""
+"""Values as JSON keeps them, which has no NaN, no infinity and no half characters."""
 
 from __future__ import annotations
 
@@ -14,3 +14,8 @@ def as_json(value: Any) -> Any:
 def of_json(kept: Any) -> Any:
     """Return the value that ``as_json`` kept."""
     return float(kept[0]) if isinstance(kept, list) else kept
+
+
+def readable(text: str) -> str:
+    """Return a text with question marks for what is no character."""
+    return text if text.isascii() else text.encode("utf-8", "replace").decode()

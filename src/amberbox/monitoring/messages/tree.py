@@ -38,16 +38,11 @@ def _walked(known: Sequence[str], below: Mapping[str, Sequence[str]]) -> Iterato
     lower = {name for names in below.values() for name in names}
     roots = [name for name in known if name not in lower]
     seen: set[str] = set()
-    for root in (*roots, *known):
-        yield from _below(root, 0, below, seen)
-
-
-def _below(
-    name: str, depth: int, below: Mapping[str, Sequence[str]], seen: set[str]
-) -> Iterator[Branch]:
-    if name in seen:
-        return
-    seen.add(name)
-    yield Branch(depth, name)
-    for child in below[name]:
-        yield from _below(child, depth + 1, below, seen)
+    left = [Branch(0, name) for name in reversed((*roots, *known))]
+    while left:
+        branch = left.pop()
+        if branch.component not in seen:
+            seen.add(branch.component)
+            yield branch
+            children = reversed(below[branch.component])
+            left += [Branch(branch.depth + 1, child) for child in children]

@@ -53,7 +53,7 @@ class Probe:
             return self.unknown(subject, error.what)
         except OSError as error:
             return self.unknown(subject, os_error_text(error))
-        except Exception as error:  # a defect of the probe: its row says so, others go on
+        except (Exception, SystemExit) as error:  # a defect of the probe: its row says so
             return self.unknown(subject, f"crashed: {type(error).__name__}: {error}")
 
     def unknown(self, subject: str, error: str) -> Row:
@@ -79,7 +79,7 @@ def load_probe(kind: str, extra_dirs: Sequence[Path] = ()) -> Probe:
         module = plugin.load()
     except AmberboxError:
         raise
-    except Exception as error:  # a robot's own probe may fail in any way when it is imported
+    except (Exception, SystemExit) as error:  # a robot's own probe may fail in any way
         what = f"probe '{kind}' cannot be loaded: {type(error).__name__}: {error}"
         raise AmberboxError(what, f"look at {plugin.path}") from error
     period_s = float(getattr(module, "PERIOD_S", PERIOD_S))
