@@ -44,7 +44,7 @@ def _clauses(program: Program) -> Iterator[str]:
 def clause_text(clause: Clause) -> str:
     """Write a clause with the names of its variables and its final dot."""
     env: list[Term] = [Var() for _ in range(clause.size)]
-    labels = {variable: name for variable, name in zip(env, clause.names, strict=False)}
+    labels = dict(zip(env, clause.names, strict=True))
     head = make(clause.key[0], (build(part, env) for part in clause.head))
     goals = [build(goal, env) for goal in clause.goals]
     if not goals:

@@ -15,7 +15,8 @@ _REFUSED: dict[str, str] = {
     **dict.fromkeys(("assert", "asserta", "assertz", "retract", "retractall", "abolish"), _CHANGES),
     **dict.fromkeys(
         ("write", "print", "writeln", "nl", "format", "read", "writeq", "write_canonical",
-         "put_char", "tab", "open", "close", "consult", "print_message", "read_term", "write_term"), _OUTPUT),
+         "put_char",
+         "tab", "open", "close", "consult", "print_message", "read_term", "write_term"), _OUTPUT),
     **dict.fromkeys(("catch", "throw"), "an error ends the question and is shown"),
     **dict.fromkeys(("bagof", "setof", "^"), "use findall, and sort for each solution once"),
     **dict.fromkeys(("shell", "halt", "getenv", "setenv"), "rules cannot reach the system"),
