@@ -274,3 +274,17 @@ def test_a_lost_publisher_is_back_with_its_next_message() -> None:
     flow.rows.extend(np.array([1, 9]) * NS, np.array([1, 2]))
     flow.gap_from_ns.extend(np.array([5]) * NS, np.array([5]) * NS)
     assert [bool(flow.lost(n * NS)) for n in (2, 5, 8, 9)] == [False, True, True, False]
+
+
+def test_what_is_within_windows_is_what_was_in_force_there() -> None:
+    samples = Samples()
+    samples.extend(np.array([1, 2, 4, 7, 9]) * NS, np.ma.masked_equal([1, 2, 3, 4, 5], 2))
+    near = samples.within(7 * NS, 4)
+    assert near.times_ns.tolist() == [2 * NS, 4 * NS, 7 * NS]
+    assert near.column().tolist() == [None, 3, 4]
+    assert samples.within(np.array([3, 9]) * NS, 1).times_ns.tolist() == [
+        t * NS for t in (2, 4, 7, 9)
+    ]
+    assert len(samples.within(NS, 5)) == 1
+    assert not len(samples.within(0, 5))
+    assert not len(Samples().within(NS, 5))

@@ -147,6 +147,20 @@ class Samples:
         times = self.times_ns if len(self) else np.zeros(1, np.int64)
         return times[self.last(now)]
 
+    def within(self, now: Now, seconds: float) -> Samples:
+        """Return the samples that the windows of the last ``seconds`` hold, and the one before.
+
+        At one instant, these are all values that were in force in its window. They share the
+        memory of these samples and cannot be added to.
+        """
+        first_ns = now if is_one(now) else int(np.min(now))
+        until_ns = now if is_one(now) else int(np.max(now))
+        first, last = int(self.last(first_ns - round(seconds * NS))), int(self.last(until_ns))
+        made = Samples.__new__(Samples)
+        made._times, made._values, made._null = self._times, self._values, self._null
+        made._start, made._end = self._start + max(first, 0), self._start + last + 1
+        return made
+
     def derived(self, values: NDArray[Any], null: NDArray[np.bool_] | None = None) -> Samples:
         """Return samples at the same times with other values, one for each of these."""
         made = Samples.__new__(Samples)

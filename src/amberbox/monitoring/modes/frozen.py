@@ -14,8 +14,9 @@ from amberbox.core.clock import NS
 from amberbox.core.expression import Expression, parse
 from amberbox.core.mode import FALSE, HOLD, TRUE, UNKNOWN, Input, Result
 from amberbox.core.options import option
-from amberbox.core.samples import Now, Samples, Window
+from amberbox.core.samples import Now, Samples, Window, is_one
 from amberbox.core.standins import Finding
+from amberbox.core.together import by_name, value_of
 
 ACCEPTS = ("variable", "list", "item")
 COLUMNS = True
@@ -85,16 +86,25 @@ def evaluate(config: Config, inputs: Sequence[Input], now: Now) -> Mapping[str, 
     samples = entry.stamps if entry.is_item else entry.samples
     spread = _spread(samples, low, high, now, config.window)
     seen = samples.last(start) >= 0
-    still = np.where(_should_move(config, others, now), FALSE, HOLD)
-    moving = np.where(spread > config.tolerance, TRUE, np.where(seen, still, UNKNOWN))
+    moving = _moving(spread > config.tolerance, _should_move(config, others, now), seen)
     return {"moving": moving, "spread": spread}
+
+
+def _moving(moves: Any, should: Any, seen: Any) -> Any:
+    if isinstance(moves, np.bool_):  # np.where costs more than all the rest
+        return TRUE if moves else UNKNOWN if not seen else FALSE if should else HOLD
+    return np.where(moves, TRUE, np.where(seen, np.where(should, FALSE, HOLD), UNKNOWN))
 
 
 def _spread(samples: Samples, low: float, high: float, now: Now, seconds: float) -> Any:
     """Return greatest less least value, NaN where all is garbage."""
-    values, null = samples.values.astype(np.float64), samples.null
+    near = samples.within(now, seconds)
+    values, null = near.values.astype(np.float64), near.null
     bad = ~np.isfinite(values) | (values < low) | (values > high)
-    good = samples.derived(values, bad if null is None else bad | null)
+    bad = bad if null is None else bad | null
+    if is_one(now):
+        return np.ptp(values[~bad]) + 0.0 if not bad.all() else np.float64(np.nan)
+    good = near.derived(values, bad)
     start, window = now - round(seconds * NS), Window(good, now, seconds)
     held = np.where(good.known(start), good.at(start), np.nan)
     return np.fmax(window.max(), held) - np.fmin(window.min(), held) + 0.0
@@ -105,9 +115,7 @@ def _should_move(config: Config, others: Sequence[Input], now: Now) -> Any:
     if config.should_move is None:
         return True
     condition = _throughout(config.should_move.text, round(config.window * NS))
-    series = {entry.name: (entry.samples.times_ns, entry.samples.column()) for entry in others}
-    found = condition.evaluate_series(series, now)
-    return found is True if np.ndim(now) == 0 else np.ma.filled(found, False)
+    return value_of(condition, by_name(others, reads(config)), now) == 1
 
 
 @lru_cache

@@ -12,7 +12,7 @@ import numpy as np
 from amberbox.core.clock import NS
 from amberbox.core.mode import Input, Result, as_single, where_known
 from amberbox.core.options import option
-from amberbox.core.samples import Now
+from amberbox.core.samples import Now, is_one
 from amberbox.core.standins import Finding
 
 ACCEPTS = ("variable", "list")
@@ -73,13 +73,23 @@ def history_s(config: Config) -> float:
 def evaluate(config: Config, inputs: Sequence[Input], now: Now) -> Mapping[str, Any]:
     """Count over the window, with the value that was in force when it began."""
     (entry,) = inputs
-    of, bad = _in_lists(config, entry) if "finite" in entry.parts else _in_values(config, entry)
-    window, before = entry.over(now, config.window), now - round(config.window * NS)
-    held = entry.samples.last(before)
-    total, garbage = (window.sum_of(n) + np.append(n, 0)[held] for n in (of, bad))
+    total, garbage = _counted(config, entry, now)
     share = np.where(total > 0, 100 * garbage / np.maximum(total, 1), np.nan)
     clean = where_known(total > 0, share <= config.tolerated)
     return {"clean": clean, "garbage": garbage, "share": share}
+
+
+def _counted(config: Config, entry: Input, now: Now) -> tuple[Any, Any]:
+    """Return how many values there were in the windows, and how many of these are garbage."""
+    near = Input(entry.name, entry.samples.within(now, config.window))
+    near.parts = {name: part.within(now, config.window) for name, part in entry.parts.items()}
+    counts = _in_lists(config, near) if "finite" in near.parts else _in_values(config, near)
+    if is_one(now):
+        return counts[0].sum(), counts[1].sum()
+    window, before = near.over(now, config.window), now - round(config.window * NS)
+    held = near.samples.last(before)
+    total, garbage = (window.sum_of(n) + np.append(n, 0)[held] for n in counts)
+    return total, garbage
 
 
 def _in_values(config: Config, entry: Input) -> tuple[Any, Any]:
