@@ -81,3 +81,15 @@ def test_explanation() -> None:
 )
 def test_what_asks_for_nothing_is_refused(config: Config) -> None:
     assert list(config.check())
+
+
+@pytest.mark.parametrize(
+    ("condition", "number", "is_timed"),
+    [("x > 1", None, False), ("x > 1 for 2s", None, True), (None, "age(x)", True),
+     ("x > 1", "mean(x over 1s)", True)],
+)  # fmt: skip
+def test_only_what_looks_back_changes_as_time_passes(
+    condition: str | None, number: str | None, is_timed: bool
+) -> None:
+    asked = [None if text is None else parse(text) for text in (condition, number)]
+    assert mode.timed(Config(*asked)) is is_timed

@@ -194,3 +194,13 @@ def test_generated_barometers_agree_until_one_drifts() -> None:
     found = members(Config(threshold=10.0, window=1.0), inputs, instants)
     assert [FALSE in verdicts for verdicts in found] == [False, True, False, False]
     assert found[1].index(FALSE) > 100
+
+
+@pytest.mark.parametrize(
+    ("config", "is_timed"),
+    [(Config(1.0), False), (Config(1.0, window=0.5), True),
+     (Config(1.0, formula=parse("input_2 + 1")), False),
+     (Config(1.0, formula=parse("age(input_2)")), True)],
+)  # fmt: skip
+def test_only_what_looks_back_changes_as_time_passes(config: Config, is_timed: bool) -> None:
+    assert mode.timed(config) is is_timed
