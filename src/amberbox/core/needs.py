@@ -90,17 +90,19 @@ def cycles(needs: Mapping[str, Needs]) -> Iterator[tuple[str, ...]]:
 def _cycles_from(
     start: str, needs: Mapping[str, Needs], done: set[str]
 ) -> Iterator[tuple[str, ...]]:
-    path = [start]
+    path, on_path = [start], {start}
     waiting = [iter(needs[start].names())]
     while waiting:
         target = next(waiting[-1], None)
         if target is None:
             waiting.pop()
-            done.add(path.pop())
-        elif target in path:
+            done.add(path[-1])
+            on_path.discard(path.pop())
+        elif target in on_path:
             yield tuple(path[path.index(target) :])
         elif target in needs and target not in done:
             path.append(target)
+            on_path.add(target)
             waiting.append(iter(needs[target].names()))
 
 
