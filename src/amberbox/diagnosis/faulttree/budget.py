@@ -27,11 +27,15 @@ class Budget:
 
 
 class ExhaustedError(Exception):
-    """A budget was used up; ``reason`` says which, in words for the result."""
+    """A budget was used up; ``reason`` says which, in words for the result.
 
-    def __init__(self, reason: str) -> None:
+    ``done`` counts how far the work had come.
+    """
+
+    def __init__(self, reason: str, done: int = 0) -> None:
         super().__init__(reason)
         self.reason = reason
+        self.done = done
 
 
 def check(budget: Budget, held: int) -> None:

@@ -16,7 +16,8 @@ from amberbox.diagnosis.faulttree.minimal import (
 from amberbox.diagnosis.faulttree.modules import Part, split
 from amberbox.diagnosis.faulttree.ordering import orders
 
-_FIRST_ALLOWANCE = 50_000
+_FIRST_ALLOWANCE = 60_000
+_FEWEST_ORDERS = 3
 _GROWTH = 4
 _COLLECT_ABOVE = 200_000
 
@@ -121,20 +122,24 @@ def _smallest(sets: Nodes, weights: Sequence[int]) -> int:
 
 
 def _decisions(graph: Graph, part: Part, budget: Budget) -> tuple[tuple[int, ...], Nodes]:
-    """Build the diagram of a part: try orders with few nodes each, then with more."""
+    """Build the diagram of a part: try all orders with few nodes, the better half with more.
+
+    Better are those that came further through the gates before their nodes were used up.
+    """
     candidates = orders(graph, part)
     allowance = _FIRST_ALLOWANCE
     while True:
+        reached: list[int] = []
         for order in candidates:
             nodes = min(allowance, budget.nodes)
             try:
                 return order, _build(graph, part, order, replace(budget, nodes=nodes))
             except ExhaustedError as error:
-                if budget.deadline():
+                if nodes == budget.nodes or budget.deadline():
                     raise
-                last = error
-        if allowance >= budget.nodes:
-            raise last
+                reached.append(error.done)
+        ranked = sorted(zip(reached, candidates, strict=True), key=lambda entry: -entry[0])
+        candidates = [order for _, order in ranked[: max(_FEWEST_ORDERS, len(ranked) // 2)]]
         allowance *= _GROWTH
 
 
@@ -144,20 +149,29 @@ def _build(graph: Graph, part: Part, order: Sequence[int], budget: Budget) -> No
     made |= {leaf: bdd.stored(level, 1, 0) for level, leaf in enumerate(order)}
     uses = _uses(graph, part)
     collected = _COLLECT_ABOVE
-    for number in part.inner:
-        vertex = graph.vertices[number]
-        made[number] = _gate(bdd, vertex.kind, [made[n] for n in vertex.inputs], vertex.count)
-        for entry in vertex.inputs:
+    for done, number in enumerate(part.inner):
+        try:
+            _add(bdd, graph, number, made)
+        except ExhaustedError as error:
+            raise ExhaustedError(error.reason, done) from error
+        for entry in graph.vertices[number].inputs:
             uses[entry] -= 1
             if not uses[entry]:
                 del made[entry]
-        check(budget, len(bdd))
-        bdd.forget()
         if len(bdd) > collected:
             moved = bdd.compact(made.values())
             made = {key: moved[node] for key, node in made.items()}
             collected = max(_COLLECT_ABOVE, 2 * len(bdd))
     return closed(bdd, made[part.vertex])
+
+
+def _add(bdd: Diagram, graph: Graph, number: int, made: dict[int, int]) -> None:
+    """Make the diagram of one gate of those of its inputs."""
+    vertex = graph.vertices[number]
+    inputs = [made[entry] for entry in vertex.inputs]
+    made[number] = _gate(bdd, vertex.kind, inputs, vertex.count)
+    check(bdd.budget, len(bdd))
+    bdd.forget()
 
 
 def _uses(graph: Graph, part: Part) -> dict[int, int]:

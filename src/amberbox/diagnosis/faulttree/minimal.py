@@ -30,7 +30,7 @@ class Family(Diagram):
         On ``todo`` lie pairs to compute as one number, and inverted what to do with results: even
         numbers make the node of a pair, odd ones take further sets out of the last result.
         """
-        levels, highs, lows = self.levels, self.highs, self.lows
+        levels, highs, lows, tables = self.levels, self.highs, self.lows, self.tables
         cache = self.caches[0]
         todo = [sets << _SHIFT | others]
         done: list[int] = []
@@ -43,8 +43,13 @@ class Family(Diagram):
                     continue
                 key >>= 1
                 low, high = done.pop(), done.pop()
-                f = key >> _SHIFT
-                result = cache[key] = low if high == 0 else self.stored(levels[f], high, low)
+                result = low
+                if high:
+                    level, pair = levels[key >> _SHIFT], high << _SHIFT | low
+                    result = tables[level].get(pair, -1)
+                    if result < 0:
+                        result = self.stored(level, high, low)
+                cache[key] = result
                 if not len(cache) & _LOOK:
                     check(self.budget, len(levels) + len(cache))
                 done.append(result)
