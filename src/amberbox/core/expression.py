@@ -86,7 +86,7 @@ class Expression:
         """Tell whether it looks back in time (``for``, ``over``, ``age``)."""
         return needs_history(self.tree)
 
-    @property
+    @cached_property
     def history_ns(self) -> int:
         """How far it looks back: series must reach back this far, and one sample further."""
         return history_ns(self.tree)
