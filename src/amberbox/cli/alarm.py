@@ -8,11 +8,12 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
+from amberbox.blackbox.follow.records import OwnRecords
 from amberbox.blackbox.journal.reserved import ALARM
 from amberbox.blackbox.requests import submit
 from amberbox.blackbox.store import is_locked, open_store
 from amberbox.blackbox.where import store_path
-from amberbox.cli._output import opened, print_grid, print_json
+from amberbox.cli._output import print_grid, print_json
 from amberbox.core.config import did_you_mean
 from amberbox.core.errors import UsageError
 from amberbox.core.timetext import NS, format_duration, format_time, parse_duration
@@ -57,10 +58,8 @@ def run(args: argparse.Namespace) -> int:
 
 def newest(where: str) -> list[Row]:
     """Return the newest record of every alarm, in the order in which they opened."""
-    with opened(where) as record:
-        names = [info.name for info in record.items() if info.topic == ALARM]
-        rows = [row for name in names for row in record.query(name).rows()]
-    found = {row["id"]: row for row in rows}
+    written = OwnRecords(open_store(store_path(where)), _WRITER, {ALARM}).step()
+    found: dict[str, Row] = {record.values["id"]: dict(record.values) for record in written}
     return sorted(found.values(), key=lambda row: (row["opened_ns"], row["id"]))
 
 

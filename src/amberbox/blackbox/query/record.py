@@ -26,6 +26,7 @@ from amberbox.blackbox.segments.flat import TableSchema
 from amberbox.blackbox.store import is_store
 from amberbox.blackbox.where import store_path
 from amberbox.core.errors import UsageError
+from amberbox.core.names import identifier
 from amberbox.core.timetext import parse_time
 from amberbox.core.types import Column, ColumnData, Gap, ItemSchema
 
@@ -143,11 +144,11 @@ class Record:
 
     def events(self, from_: Time = None, to: Time = None) -> Table:
         """Return what happened to the box: its event channel as a table."""
-        topics = {info.topic: info.name for info in self.items()}
-        if reserved.EVENT not in topics:
+        name = identifier(reserved.EVENT)
+        if not self._ask(lambda catalogue: name in catalogue.schemas):
             return Table("events", (Column("timestamp", "timestamp", "time"),),
                          {"timestamp": np.empty(0, np.int64)})  # fmt: skip
-        return self.query(topics[reserved.EVENT], None, from_, to)
+        return self.query(name, None, from_, to)
 
     def _ask(self, question: Callable[[Catalogue], Answer]) -> Answer:
         return ask(self.path, question, with_segments=can_build())
