@@ -21,6 +21,7 @@ from amberbox.diagnosis.faulttree import (
     read_mef,
 )
 from amberbox.diagnosis.faulttree.formula import Formula, all_of, any_of, at_least, none_of
+from benchmarks.faulttrees import robot
 
 
 def redundant(pairs: int, chance: float = 0.01) -> FaultTree:
@@ -91,6 +92,12 @@ def test_many_variables_in_one_part_need_no_recursion() -> None:
     assert analysis.by_order == (0, 0, size)
     assert len(closest(analysis, {"e5": True}, 3)) == 3
     assert sum(1 for _ in analysis.cut_sets or ()) == size
+
+
+def test_long_chains_of_needs_find_a_good_order_of_events() -> None:
+    analysis = analyse(robot(200), budget=Budget(nodes=400_000))
+    assert not analysis.incomplete
+    assert analysis.minimal_cut_sets == sum(1 for _ in analysis.cut_sets or ())
 
 
 def test_a_budget_of_nodes_ends_with_incomplete_and_says_what() -> None:

@@ -18,7 +18,7 @@ BELOW = 1 << 30
 _SHIFT = 32
 _MASK = (1 << _SHIFT) - 1
 _LOOK = CHECK_EVERY - 1
-_KEEP_CACHE = 200_000
+_SHARE_OF_CACHE = 4
 
 
 @dataclass
@@ -160,9 +160,9 @@ class Diagram:
         return done[0]
 
     def forget(self) -> None:
-        """Drop remembered results when there are many."""
+        """Drop remembered results when they take a good part of the budget."""
         for cache in self.caches:
-            if len(cache) > _KEEP_CACHE:
+            if len(cache) > self.budget.nodes // _SHARE_OF_CACHE:
                 cache.clear()
 
     def compact(self, roots: Iterable[int]) -> dict[int, int]:

@@ -30,7 +30,7 @@ class Family(Diagram):
         On ``todo`` lie pairs to compute as one number, and inverted what to do with results: even
         numbers make the node of a pair, odd ones take further sets out of the last result.
         """
-        levels, highs, lows, tables = self.levels, self.highs, self.lows, self.tables
+        levels, highs, lows = self.levels, self.highs, self.lows
         cache = self.caches[0]
         todo = [sets << _SHIFT | others]
         done: list[int] = []
@@ -43,13 +43,8 @@ class Family(Diagram):
                     continue
                 key >>= 1
                 low, high = done.pop(), done.pop()
-                result = low
-                if high:
-                    level, pair = levels[key >> _SHIFT], high << _SHIFT | low
-                    result = tables[level].get(pair, -1)
-                    if result < 0:
-                        result = self.stored(level, high, low)
-                cache[key] = result
+                level = levels[key >> _SHIFT]
+                result = cache[key] = low if high == 0 else self.stored(level, high, low)
                 if not len(cache) & _LOOK:
                     check(self.budget, len(levels) + len(cache))
                 done.append(result)
@@ -86,6 +81,7 @@ def minimal_solutions(bdd: Diagram, root: int, family: Family) -> int:
     for node in reachable(bdd.highs, bdd.lows, [root]):
         high, low = sets[bdd.highs[node]], sets[bdd.lows[node]]
         sets[node] = family.node(bdd.levels[node], family.without(high, low), low)
+        family.forget()
     return sets[root]
 
 
@@ -106,6 +102,7 @@ def minimal_solutions_up_to(
     for node in (0, 1, *inner):
         for left in needed.get(node, ()):
             sets[node, left] = _limited(bdd, node, left, family, sets, orders)
+        family.forget()
     return sets[root, limit]
 
 
