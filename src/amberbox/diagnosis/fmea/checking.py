@@ -65,7 +65,8 @@ def _mode_problems(fmea: Fmea, places: Mapping[str, Node], sheet: Sheet) -> Iter
     for mode in fmea.modes.values():
         node = places.get(mode.id) or _member_node(mode, sheet)
         yield from _effect_problems(fmea, mode, node, sheet)
-        if not mode.unobservable and not links_of(fmea, mode.id):
+        has_none = child(node, "symptoms") is node  # wrong ones have been told
+        if has_none and not mode.unobservable and not links_of(fmea, mode.id):
             what = "nothing shows it: give symptoms, or 'unobservable:' with the reason"
             yield node.problem(mode.name, what)
 

@@ -1,0 +1,114 @@
+"""The FMEA that comes with the simulated robot: complete, and right about what its monitors see."""
+
+from __future__ import annotations
+
+import itertools
+from pathlib import Path
+
+import pytest
+
+from amberbox.blackbox.folder.folder import load_folder
+from amberbox.cli._known import known_of
+from amberbox.cli.main import main
+from amberbox.diagnosis.fmea import Fmea, Known
+from amberbox.diagnosis.fmea.coverage import coverage
+from amberbox.diagnosis.fmea.load import load_fmea
+from amberbox.diagnosis.fmea.propagation import lost
+from amberbox.monitoring.configuration import load_plan
+from amberbox.monitoring.plan import Plan
+from amberbox.sim import catalogue
+from tests.sim.monitored import FAULT_S, failures, find, with_fault
+
+OTHERWISE = {
+    "load_loose": "base#load_loose",
+    "e_stop_line_loose": "safety#e_stop_line_loose",
+    "bumper_switch_closed": "safety#bumper_switch_closed",
+}
+"""Failure modes whose ids do not follow from the fault's; others are ``component_mode``."""
+
+REACTIONS = {  # fault: seconds until what the FMEA expects of it has shown
+    "wheel_front_right_phase_open": 5.0,
+    "laser_rear_driver_crash": 8.0,
+    "battery_current_sensor_bias": 6.0,
+}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("robot") / "r"
+    assert main(["new", str(path)]) == 0
+    return path
+
+
+@pytest.fixture(scope="module")
+def known(folder: Path) -> Known:
+    return known_of(load_folder(folder))
+
+
+@pytest.fixture(scope="module")
+def fmea(folder: Path, known: Known) -> Fmea:
+    loaded, problems = load_fmea(folder / "fmea.yaml", known)
+    assert loaded is not None and problems == []
+    return loaded
+
+
+@pytest.fixture(scope="module")
+def plan(folder: Path) -> Plan:
+    return load_plan(load_folder(folder))[0]
+
+
+def mode_of(fault: str, fmea: Fmea) -> str:
+    """Return the failure mode that a fault of the catalogue means."""
+    if fault in OTHERWISE:
+        return OTHERWISE[fault]
+    return next(mode for mode in fmea.modes if mode.replace("#", "_") == fault)
+
+
+def test_it_is_large_enough_to_be_an_example(fmea: Fmea) -> None:
+    written = {(fmea.components[m.component].type, m.name) for m in fmea.modes.values()}
+    assert len(written) >= 60 and len(fmea.modes) > len(written)
+    assert all(m.description and m.classes and m.remedy for m in fmea.modes.values())
+    assert all(mode.ranks.number for mode in fmea.modes.values())
+    assert all(mode.cause for mode in fmea.modes.values())
+
+
+def test_every_fault_of_the_catalogue_is_a_failure_mode(fmea: Fmea) -> None:
+    modes = {fault: mode_of(fault, fmea) for fault in catalogue()}
+    assert set(modes.values()) <= set(fmea.modes)
+    assert len(set(modes.values())) == len(modes) == 101
+
+
+def test_most_of_it_can_be_seen_and_told_apart(fmea: Fmea, known: Known) -> None:
+    found = coverage(fmea, sorted(known.watched))
+    assert not found.unexplained
+    assert len(found.unseen) <= 2 and found.distinct >= 0.9 * found.modes
+    assert all(group.tests and not group.left for group in found.alike)
+
+
+def test_redundancy_gives_cut_sets_of_higher_order(fmea: Fmea) -> None:
+    """Two failures in different components cost what neither costs alone."""
+    down = [m for m in fmea.modes.values() if m.takes_down]
+    one = {m.component: m.id for m in down}
+    alone = {component: lost(fmea, [mode]) for component, mode in one.items()}
+    redundant = {
+        effect
+        for (a, first), (b, second) in itertools.combinations(one.items(), 2)
+        for effect in lost(fmea, [first, second]) - alone[a] - alone[b]
+    }
+    assert len(redundant & set(fmea.system_functions())) >= 6
+    assert "know_floor" not in redundant  # that takes three
+    three = [mode for component, mode in one.items() if component.endswith("_barometer")][:3]
+    assert "know_floor" in lost(fmea, three)
+
+
+@pytest.mark.parametrize("fault", REACTIONS)
+def test_monitors_react_as_the_failure_modes_say(fmea: Fmea, plan: Plan, fault: str) -> None:
+    within_s = REACTIONS[fault]
+    findings = find(plan, with_fault(fault, within_s + 1), FAULT_S + within_s)
+    seen = {
+        (t.component, t.mode) for t in failures(findings) if t.mode and t.after.level != "stale"
+    }
+    links = fmea.modes[mode_of(fault, fmea)].symptoms
+    sure = {tuple(k.symptom.split("/")[:2]) for k in links if k.detects >= 0.9}
+    possible = {tuple(k.symptom.split("/")[:2]) for k in links}
+    assert sure <= seen <= possible
