@@ -141,6 +141,17 @@ def test_modes_that_no_component_lists_are_judged(tmp_path: Path) -> None:
     assert errors(problems) == ["heat.yaml:8: arguments: unknown key 'maxx'; did you mean 'max'?"]
 
 
+def test_a_fault_is_called_by_a_name_of_its_own(tmp_path: Path) -> None:
+    """Else a component in error could be said to be nominal."""
+    text = RANGE.replace("name: fine", "name: stale") + "states: {nominal: stale == false}\n"
+    _, problems = mode_of(tmp_path, text)
+    assert errors(problems) == [
+        "mode.yaml:7: mappings[0].outputs[0].name: 'stale' is a state of its own; "
+        "faults are called after outputs",
+        "mode.yaml:9: states: 'nominal' is a state of its own: give the fault another name",
+    ]
+
+
 def test_states_are_conditions_over_outputs(tmp_path: Path) -> None:
     text = RANGE + "states:\n  hot: not fine\n  cold: not fin\n  warm: 3\n"
     mode, problems = mode_of(tmp_path, text)

@@ -10,6 +10,9 @@ from amberbox.core.expression import Expression
 from amberbox.core.options import option
 from amberbox.monitoring.plan import Policy, Severity
 
+STATES = ("nominal", "unknown", "stale", "not_initialised", "not_monitored")
+"""States that everything may be in: a fault is called otherwise."""
+
 OutputType = Literal["bool", "int", "float", "double", "string"]
 
 LEGACY_KEYS: Mapping[str, str] = {
@@ -61,6 +64,8 @@ class OutputOptions:
         """Say which values cannot work."""
         if not self.name.strip() or any(sign in self.name.strip() for sign in "/ \t:#"):
             yield "name", f"'{self.name}' cannot be part of an address: leave out blanks and / : #"
+        if self.name.strip() in STATES:
+            yield "name", f"'{self.name}' is a state of its own; faults are called after outputs"
         for key in ("for_s", "heal_s"):
             if not 0 <= getattr(self, key) < float("inf"):
                 yield key, "must be 0 or more"
@@ -90,6 +95,9 @@ class ModeFile:
 
     def check(self) -> Iterator[tuple[str, str]]:
         """Say which values cannot work."""
+        for name in self.states:
+            if name in STATES:
+                yield "states", f"'{name}' is a state of its own: give the fault another name"
         if isinstance(self.stale_after, float | int) and not 0 < self.stale_after < float("inf"):
             yield "stale_after", "must be above 0, or never"
 
