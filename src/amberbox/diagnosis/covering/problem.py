@@ -20,6 +20,9 @@ from amberbox.diagnosis.covering.tables import Floats, Ints, Tables
 
 NEVER = -math.inf
 
+Hits = tuple[tuple[int, float], ...]
+"""Clues with 1 - detects."""
+
 
 class Group:
     """Failure modes that act alike on every clue and function that matters.
@@ -33,7 +36,7 @@ class Group:
     def __init__(
         self,
         modes: Sequence[tuple[float, int]],
-        hits: tuple[tuple[int, float], ...],
+        hits: Hits,
         component: int,
     ) -> None:
         ordered = sorted(modes, key=_likely_first) if len(modes) > 1 else modes
@@ -72,6 +75,8 @@ def _likely_first(weighted: tuple[float, int]) -> tuple[float, int]:
 class Problem:
     """The groups that matter, with what each clue and function needs of them.
 
+    ``unknown`` is the group of the unknown mode, which is alone in it; -1 if there is none.
+
     ``causes[k]`` are the groups that can act on clue k, ``cause_masks`` the same as masks;
     ``limits[k]`` is its likelihood when everything is there. ``log_all`` is the logarithm of the
     product of 1 + weight over all modes, ``log_odd`` that of all weights above 1.
@@ -96,6 +101,7 @@ class Problem:
     pair_loss: Floats
     pair_function: Ints
     component_count: int
+    unknown: int
 
     def log_losses(self, lost: int) -> Floats:
         """Return per group the logarithm of what its newly lost functions cost."""
@@ -142,6 +148,7 @@ def problem_of(tables: Tables, evidence: Folded) -> Problem:
         loss[tables.pair_function[keep]],
         tables.pair_function[keep],
         tables.component_count,
+        next((n for n, g in enumerate(groups) if g.modes[0] == tables.unknown), -1),
     )
 
 
@@ -201,20 +208,23 @@ def _groups(
     components: int,
 ) -> Iterator[Group]:
     weights = log_weight.tolist()
-    found: dict[tuple[int, tuple[tuple[int, float], ...]], list[tuple[float, int]]] = {}
+    found: dict[object, tuple[list[tuple[float, int]], Hits, int]] = {}
     downed = chain.from_iterable(tables.modes_of[place] for place in bits(components))
     for mode in dict.fromkeys(chain(hits, downed)):
         if weights[mode] == NEVER:
             continue
         place = tables.component[mode]
         component = place if place >= 0 and components >> place & 1 else -1
-        key = (component, _merged(hits[mode]) if mode in hits else ())
-        found.setdefault(key, []).append((weights[mode], mode))
-    for (component, hit), modes in found.items():
+        hit = _merged(hits[mode]) if mode in hits else ()
+        key = (component, hit, mode == tables.unknown)
+        if key not in found:
+            found[key] = ([], hit, component)
+        found[key][0].append((weights[mode], mode))
+    for modes, hit, component in found.values():
         yield Group(modes, hit, component)
 
 
-def _merged(hits: Sequence[tuple[int, float]]) -> tuple[tuple[int, float], ...]:
+def _merged(hits: Sequence[tuple[int, float]]) -> Hits:
     """Make one hit of several on one clue: links that are there twice."""
     if len(hits) == 1:
         return (hits[0],)
@@ -231,12 +241,13 @@ def _causes(
     for place, clue in enumerate(clues):
         for function, detects in clue.functions:
             supports[place] |= gates.support[function] if detects > 0 else 0
+    through = [(place, support) for place, support in enumerate(supports) if support]
     direct: list[dict[int, None]] = [{} for _ in clues]
     for number, group in enumerate(groups):
         for place, _ in group.hits:
             direct[place][number] = None
         if group.component >= 0:
-            for place, support in enumerate(supports):
+            for place, support in through:
                 if support >> group.component & 1:
                     direct[place][number] = None
     return (tuple(of) for of in direct)

@@ -13,14 +13,11 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import combinations, count
 
+from amberbox.diagnosis.covering.bounds import Bound, Bounds
 from amberbox.diagnosis.covering.budget import Budget
 from amberbox.diagnosis.covering.problem import NEVER, Group, Problem
 from amberbox.diagnosis.covering.state import (
-    Bound,
     State,
-    View,
-    bound,
-    expm,
     log_likelihood,
     nothing,
     with_one_more,
@@ -50,7 +47,7 @@ class _Sum:
     running: float = 0.0
 
     def add(self, log_value: float) -> None:
-        value = expm(log_value - self.reference)
+        value = _exp(log_value - self.reference)
         self.terms.append(value)
         self.running += value
 
@@ -85,11 +82,11 @@ class _Search:
         self.most = most
         self.order = count()
         self.heap: list[_Entry] = []
-        self.views: dict[int, View] = {}
+        self.bounds = Bounds(problem)
         self.opened = 0
         self.found: list[tuple[tuple[int, ...], float]] = []
         start = nothing(problem)
-        first = self.bound(start, 0)
+        first = self.bounds.beyond(start, 0)
         reference = max(log_likelihood(problem, start), first.log_best)
         self.reference = 0.0 if reference == NEVER else reference
         self.enumerated = _Sum(self.reference)
@@ -98,17 +95,10 @@ class _Search:
         self.reach(start)
         self.push_node(_Node(start, 0, first))
 
-    def bound(self, state: State, closed: int) -> Bound:
-        """Bound what is beyond a state."""
-        view = self.views.get(state.lost)
-        if view is None:
-            view = self.views[state.lost] = View(self.problem, state.lost)
-        return bound(self.problem, state, closed, view)
-
     def push_node(self, node: _Node) -> None:
         """Let a node wait, unless nothing can come of it."""
         if node.bound.log_best > NEVER:
-            self.waiting += expm(node.bound.log_mass - self.reference)
+            self.waiting += _exp(node.bound.log_mass - self.reference)
             heapq.heappush(self.heap, (-node.bound.log_best, next(self.order), node))
 
     def reach(self, state: State) -> None:
@@ -145,16 +135,16 @@ class _Search:
     def split(self, best: _Node) -> None:
         """Add one more member of the group to decide, and do not."""
         self.opened += 1
-        self.waiting -= expm(best.bound.log_mass - self.reference)
+        self.waiting -= _exp(best.bound.log_mass - self.reference)
         group = best.bound.branch
         more = with_one_more(self.problem, best.state, group)
         full = more.count(group) == len(self.problem.groups[group])
         if more.log_best > NEVER:
             self.reach(more)
             closed = best.closed | (1 << group if full else 0)
-            self.push_node(_Node(more, closed, self.bound(more, closed)))
+            self.push_node(_Node(more, closed, self.bounds.beyond(more, closed)))
         closed = best.closed | 1 << group
-        self.push_node(_Node(best.state, closed, self.bound(best.state, closed)))
+        self.push_node(_Node(best.state, closed, self.bounds.beyond(best.state, closed)))
 
     def share_listed(self) -> float:
         """Return the least share of everything that has been listed."""
@@ -166,11 +156,11 @@ class _Search:
         mass = math.fsum(self.enumerated.terms)
         nodes = (entry[2] for entry in self.heap)
         waiting = math.fsum(
-            expm(node.bound.log_mass - self.reference) for node in nodes if isinstance(node, _Node)
+            _exp(node.bound.log_mass - self.reference) for node in nodes if isinstance(node, _Node)
         )
         covered = mass / (mass + waiting) if mass > 0 and waiting < math.inf else 0.0
         sets = [
-            (modes, expm(score - self.reference) / mass) for modes, score in self.found if mass > 0
+            (modes, _exp(score - self.reference) / mass) for modes, score in self.found if mass > 0
         ]
         return Found(tuple(sets), covered, incomplete, self.opened)
 
@@ -214,3 +204,7 @@ def _members(group: Group, number: int, most: int) -> list[_Way]:
 
 def _best_first(way: _Way) -> tuple[float, tuple[int, ...]]:
     return (-way[0], way[1])
+
+
+def _exp(log_value: float) -> float:
+    return math.exp(log_value) if log_value < 700 else math.inf

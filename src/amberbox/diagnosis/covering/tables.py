@@ -58,7 +58,7 @@ class Links:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tables:
-    """What a search needs of a model, by place; the unknown mode is the last one.
+    """What a search needs of a model, by place; ``unknown`` is the unknown mode's, or -1.
 
     ``component`` is the place of the component that a mode takes down, -1 for none.
     ``pairs`` are (component, function) where the one alone loses the other.
@@ -73,6 +73,7 @@ class Tables:
     modes_of: tuple[tuple[int, ...], ...]
     pair_component: Ints
     pair_function: Ints
+    unknown: int
 
     @classmethod
     def of(cls, model: Model) -> Tables:
@@ -93,6 +94,7 @@ class Tables:
             _modes_of(component, len(names)),
             np.array([pair[0] for pair in pairs], np.int64),
             np.array([pair[1] for pair in pairs], np.int64),
+            -1 if model.unknown is None else len(model.modes),
         )
 
 
