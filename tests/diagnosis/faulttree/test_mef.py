@@ -271,3 +271,8 @@ def test_a_constant_top_has_no_event() -> None:
         }))  # fmt: skip
         assert analysis.top_probability == float(value)
         assert list(analysis.cut_sets or ()) == cut_sets
+
+
+def test_a_file_that_is_not_there_is_said(tmp_path: Path) -> None:
+    with pytest.raises(ConfigurationError, match=r"none\.xml:1: file: cannot be read: No such"):
+        read_mef(tmp_path / "none.xml")

@@ -14,6 +14,8 @@ from amberbox.diagnosis.faulttree.compiled import Nodes
 from amberbox.diagnosis.faulttree.walk import walk
 
 _MOST_TERMS = 400
+_FEWEST_TERMS = 8
+_MOST_WORK = 2_000_000  # nodes looked at: about a second
 _SMALLEST_TERM = 1e-13
 
 
@@ -60,10 +62,13 @@ class CutSets:
     def upper_bound(self, of_event: Mapping[str, float]) -> float | None:
         """Return the min cut upper bound, 1 - product of (1 - probability of each set).
 
-        None where sets are nearly certain and the sum that it is computed from does not end.
+        None where sets are so probable, or so many, that the sum that it is computed from would
+        take too long.
         """
         logarithm = 0.0
-        for power in range(1, _MOST_TERMS + 1):
+        work = sum(len(sets) for sets in self.sets)
+        terms = min(_MOST_TERMS, max(_FEWEST_TERMS, _MOST_WORK // max(1, work)))
+        for power in range(1, terms + 1):
             term = self._power_sum(of_event, power) / power
             logarithm += term
             if term <= _SMALLEST_TERM * logarithm:

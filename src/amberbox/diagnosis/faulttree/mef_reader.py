@@ -61,7 +61,12 @@ def read_mef(
     several gates to choose from.
     """
     found: list[Problem] = []
-    root = parse(FilePath(path).read_bytes(), str(path), found)
+    try:
+        data = FilePath(path).read_bytes()
+    except OSError as error:
+        what = f"cannot be read: {error.strerror}"
+        raise ConfigurationError([Problem(str(path), 1, "file", what)]) from error
+    root = parse(data, str(path), found)
     refuse(found)
     scope = Scope(str(path), found)
     if root is None or root.tag != "opsa-mef":
