@@ -43,7 +43,7 @@ arguments: {max: 80}
 CHANGES = [
     "motor: not_initialised -> nominal",
     "motor/temperature: nominal -> cool: cool is false",
-    "motor: nominal -> cool: cool is false",
+    "motor: nominal -> cool",
 ]
 
 
@@ -75,6 +75,7 @@ def test_a_replay_prints_what_has_changed(folder: Path, capsys: pytest.CaptureFi
     for text in CHANGES:
         assert any(text in line for line in lines), text
     assert any("motor: alarm motor-" in line and "open (urgent)" in line for line in lines)
+    assert sum("cool is false" in line for line in lines) == 1, "a reason is told once"
     assert any("(hint: let it cool down)" in line for line in lines)
     assert lines[0].startswith("2023-11-14T22:13:20.")
 

@@ -174,9 +174,11 @@ def _sayer(args: argparse.Namespace) -> Say:
         _, data = encoded(finding)
         print(data.decode(), flush=True)
 
+    told: set[tuple[int, str, str]] = set()
+
     def as_text(finding: Finding) -> None:
         if not isinstance(finding, Status):
-            print(_line(finding), flush=True)
+            print(_line(finding, told), flush=True)
 
     def silently(_: Finding) -> None:
         pass
@@ -201,15 +203,25 @@ def _with_silence(say: Say) -> Say:
     return hear
 
 
-def _line(finding: Transition | AlarmChange) -> str:
+def _line(finding: Transition | AlarmChange, told: set[tuple[int, str, str]]) -> str:
+    """Write a finding; the reason of an instant is told once, by whom it concerns first."""
     from amberbox.monitoring.engine.findings import Transition
 
     if isinstance(finding, Transition):
+        at_ns, text = finding.at_ns, finding.text.removesuffix(f": {finding.reason}")
         hint = f" (hint: {finding.hint})" if finding.hint else ""
-        return f"{_time(finding.at_ns)} {finding.text}{hint}"
-    times = f", {finding.count} times" if finding.count > 1 else ""
-    about = f"{finding.component}: alarm {finding.id} {finding.state} ({finding.severity}{times})"
-    return f"{_time(finding.changed_ns)} {about}: {finding.reason}"
+    else:
+        at_ns, hint = finding.changed_ns, ""
+        times = f", {finding.count} times" if finding.count > 1 else ""
+        text = f"{finding.component}: alarm {finding.id} {finding.state}"
+        text += f" ({finding.severity}{times})" if finding.state != "healed" else ""
+    said = (at_ns, finding.component, finding.reason)
+    if not finding.reason or said in told or text.endswith("healed"):
+        return f"{_time(at_ns)} {text}"
+    if not any(entry[0] == at_ns for entry in told):
+        told.clear()
+    told.add(said)
+    return f"{_time(at_ns)} {text}: {finding.reason}{hint}"
 
 
 def _status_line(status: Status) -> str:
