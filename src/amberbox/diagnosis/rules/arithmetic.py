@@ -32,12 +32,19 @@ def evaluate(term: Term) -> Number:
     if isinstance(term, Var | Slot):
         raise RuleFault("a number is needed where a variable has no value yet", _ORDER)
     if isinstance(term, Text):
-        raise RuleFault(f'the text "{term.value}" is no number')
+        return _code(term.value)
     if isinstance(term, str):
         if term not in CONSTANTS:
             raise RuleFault(f"'{term}' is no number", "a number or an expression is needed here")
         return CONSTANTS[term]
     return _apply(term)
+
+
+def _code(text: str) -> int:
+    """Return the code of a text of one character, as SWI-Prolog does."""
+    if len(text) != 1:
+        raise RuleFault(f'the text "{text}" is no number')
+    return ord(text)
 
 
 _ORDER = "give it a value in a goal before this one"
@@ -109,12 +116,6 @@ def _power(a: Number, b: Number) -> int | float:
     return math.pow(a, b)
 
 
-def _caret(a: Number, b: Number) -> int | float:
-    if isinstance(a, int) and isinstance(b, int) and b < 0 and a not in (1, -1):
-        raise ValueError
-    return _power(a, b)
-
-
 def _whole_power(a: int, b: int) -> int:
     if abs(a) > 1 and a.bit_length() * b > 2 * _MOST_BITS:
         raise RuleFault("a whole number of more than 4,000 digits")
@@ -134,21 +135,25 @@ def _sign(a: Number) -> int | float:
 
 
 def _round(a: Number) -> int:
-    return int(math.floor(abs(a) + 0.5)) * (-1 if a < 0 else 1) if isinstance(a, Real) else a
+    """Round to the nearest whole number, halves away from zero."""
+    if isinstance(a, int):
+        return a
+    fraction, whole = math.modf(a)
+    return int(whole) + (int(math.copysign(1, a)) if abs(fraction) >= 0.5 else 0)
 
 
 def _larger(a: Number, b: Number) -> Number:
-    return b if float_first(b, a) >= 0 else a
+    return a if _before(b, a) else b
 
 
 def _smaller(a: Number, b: Number) -> Number:
-    return a if float_first(a, b) <= 0 else b
+    return a if _before(a, b) else b
 
 
-def float_first(a: Number, b: Number) -> int:
-    """Compare two numbers by value; of equal ones the float comes first."""
+def _before(a: Number, b: Number) -> bool:
+    """Tell whether a is the one to take: of equal numbers the float, as in SWI-Prolog."""
     x, y = plain(a), plain(b)
-    return (x > y) - (x < y) or isinstance(a, int) - isinstance(b, int)
+    return x < y or (x == y and isinstance(a, Real))
 
 
 def plain(number: Number) -> int | float:
@@ -168,7 +173,7 @@ _ONE: Mapping[str, Callable[..., int | float]] = {
 }  # fmt: skip
 _TWO: Mapping[str, Callable[..., int | float]] = {
     "+": operator.add, "-": operator.sub, "*": operator.mul, "/": _divide, "**": _power,
-    "^": _caret, "//": _integers(_truncated), "div": _integers(operator.floordiv),
+    "^": _power, "//": _integers(_truncated), "div": _integers(operator.floordiv),
     "mod": _integers(operator.mod), "rem": _integers(lambda a, b: a - b * _truncated(a, b)),
     "min": _smaller, "max": _larger, "gcd": _integers(math.gcd), "atan2": math.atan2,
     "atan": math.atan2, ">>": _integers(lambda a, b: _shift(a, -b)), "<<": _integers(_shift),

@@ -48,6 +48,10 @@ def ask(
         return question.answers()
     except StopFault as fault:
         raise StoppedError(str(fault), _STOPPED, tuple(question.found)) from fault
+    except RecursionError as error:
+        raise RuleError("an answer is nested too deeply", "use lists, not f(f(f(...)))") from error
+    except RuleFault as fault:
+        raise RuleError(fault.what, fault.hint) from fault
 
 
 class _Question:

@@ -94,6 +94,9 @@ def _parts(make: Callable[[str], Term], what: str) -> Callable[[Any, Args], bool
 
 
 def _joined(term: Term, what: str) -> str:
+    known = deref(term)
+    if isinstance(known, Text):
+        return known.value
     signs = [deref(item) for item in proper_list(term, what)]
     if not all(isinstance(sign, str) or _is_code(sign) for sign in signs):
         raise RuleFault(f"{what} needs a list of characters")

@@ -38,7 +38,7 @@ def _length(m: Machine, args: Args) -> Iterator[None]:
     items, tail = split_list(args[0])
     wanted = deref(args[1])
     if not isinstance(wanted, Var) and whole(wanted, "length/2") < 0:
-        return
+        raise RuleFault("a list cannot have less than 0 elements")
     if isinstance(tail, Var):
         yield from _longer(m, len(items), tail, wanted)
     elif tail != "[]":

@@ -9,6 +9,7 @@ from amberbox.diagnosis.rules.arithmetic import evaluate, plain
 from amberbox.diagnosis.rules.faults import RuleFault
 from amberbox.diagnosis.rules.order import compare
 from amberbox.diagnosis.rules.terms import (
+    NIL,
     Key,
     Real,
     Struct,
@@ -176,7 +177,7 @@ TESTS: Mapping[Key, Callable[[Any, Args], bool]] = {
     (">=", 2): _arithmetic(lambda a, b: a >= b),
     ("var", 1): _kind(lambda term: isinstance(term, Var)),
     ("nonvar", 1): _kind(lambda term: not isinstance(term, Var)),
-    ("atom", 1): _kind(lambda term: isinstance(term, str)),
+    ("atom", 1): _kind(lambda term: isinstance(term, str) and term != NIL),
     ("number", 1): _kind(lambda term: isinstance(term, int | Real)),
     ("integer", 1): _kind(lambda term: isinstance(term, int)),
     ("float", 1): _kind(lambda term: isinstance(term, Real)),

@@ -23,7 +23,7 @@ def export(program: Program) -> str:
 def _declarations(program: Program) -> Iterator[str]:
     yield "% Facts and rules of a robot; load them with: swipl FILE"
     own = program.predicates
-    tabled = [key for key, predicate in own.items() if predicate.tabled]
+    tabled = [key for key, predicate in own.items() if predicate.tabled and predicate.clauses]
     for key in dict.fromkeys([*own, *VOCABULARY]):
         if key in tabled:
             yield f":- table {_indicator(key)}."

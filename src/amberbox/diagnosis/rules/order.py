@@ -1,4 +1,4 @@
-"""The standard order of terms: variables, numbers, atoms, texts, structures."""
+"""The standard order of terms: variables, numbers, texts, atoms, structures."""
 
 from __future__ import annotations
 
@@ -52,9 +52,9 @@ def _rank(term: Term) -> int:
         return 0
     if isinstance(term, int | Real):
         return 1
-    if isinstance(term, str):
+    if isinstance(term, Text):
         return 3
-    return 4 if isinstance(term, Text) else 5
+    return 4 if isinstance(term, str) else 5
 
 
 def _simple(a: Term, b: Term) -> int:
