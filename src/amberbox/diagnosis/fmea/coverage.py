@@ -8,12 +8,15 @@ from dataclasses import dataclass
 from amberbox.diagnosis.fmea.model import Fmea
 from amberbox.diagnosis.fmea.propagation import links_of
 
+_EXPECTED = 0.5
+"""From this probability on a symptom is expected of a failure mode, below it is possible."""
+
 
 @dataclass(frozen=True, slots=True)
 class Alike:
-    """Failure modes with the same symptoms, and the tests that tell some of them apart.
+    """Failure modes that the same symptoms are expected of and possible for.
 
-    ``left`` are those that no test tells apart either, group by group.
+    ``tests`` tell some of them apart. ``left`` are those that no test tells apart either, group by group.
     """
 
     modes: tuple[str, ...]
@@ -47,12 +50,15 @@ def coverage(fmea: Fmea, watched: Collection[str] = (), weak_below: float = 0.9)
     links = {mode: links_of(fmea, mode) for mode in fmea.modes}
     missed = {mode: _missed([link.detects for link in of]) for mode, of in links.items()}
     unseen = {m.id: m.unobservable for m in fmea.modes.values() if missed[m.id] >= 1.0}
-    by_signature: dict[frozenset[str], list[str]] = {}
+    by_signature: dict[frozenset[tuple[str, bool]], list[str]] = {}
     for mode, of in links.items():
         if mode not in unseen:
-            signature = frozenset(link.symptom for link in of if link.detects > 0)
+            signature = frozenset((link.symptom, link.detects >= _EXPECTED) for link in of)
             by_signature.setdefault(signature, []).append(mode)
-    groups = [_alike(fmea, modes, signature) for signature, modes in by_signature.items()]
+    groups = [
+        _alike(fmea, modes, {symptom for symptom, _ in signature})
+        for signature, modes in by_signature.items()
+    ]
     explained = {link.symptom for of in links.values() for link in of}
     explained |= {link.symptom for f in fmea.functions.values() for link in f.symptoms}
     all_symptoms = dict.fromkeys((*watched, *fmea.symptoms))

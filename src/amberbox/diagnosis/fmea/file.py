@@ -175,7 +175,7 @@ class TestFile:
     """Something that a person or a program can look at to learn more."""
 
     question: str = option("", "what somebody is asked")
-    check_: str = option("", "what somebody looks at or measures", aliases=("check",))
+    look: str = option("", "what somebody looks at or measures", aliases=("check",))
     read: str = option("", "address of an output that somebody reads off")
     text: str = option("", "how to read it", aliases=("how",))
     role: str = option("", "who can do it: operator, technician ...")
@@ -186,7 +186,7 @@ class TestFile:
 
     def check(self) -> Iterator[Finding]:
         """Yield what is wrong."""
-        given = [key for key in ("question", "check_", "read") if getattr(self, key)]
+        given = [key for key in ("question", "look", "read") if getattr(self, key)]
         if len(given) != 1:
             yield "give one of question, check and read"
         yield from _shares(self, "risk", "sure")

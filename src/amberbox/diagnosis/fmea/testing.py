@@ -18,8 +18,8 @@ MINUTE_S = 60.0
 
 def made_test(name: str, entry: TestFile, node: Node, symptoms: Symptoms) -> FmeaTest:
     """Make a test; one that reads an output reads one that there is."""
-    kind: Kind = "question" if entry.question else "check" if entry.check_ else "read"
-    text = entry.question or entry.check_ or entry.text or f"Read off {entry.read}."
+    kind: Kind = "question" if entry.question else "check" if entry.look else "read"
+    text = entry.question or entry.look or entry.text or f"Read off {entry.read}."
     if entry.read:
         symptoms.address(entry.read, child(node, "read"), f"tests.{name}.read")
     return FmeaTest(
