@@ -51,6 +51,21 @@ def test_what_would_be_monitored(laser: Path, capsys: pytest.CaptureFixture[str]
     assert text.endswith("laser: fine\n")
 
 
+def test_many_modes_are_listed_when_asked_for(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = str(tmp_path / "robot")
+    assert main(["new", folder]) == 0
+    capsys.readouterr()
+    assert main(["check", folder]) == 0
+    short = [line.split() for line in capsys.readouterr().out.splitlines()]
+    assert any(line[:1] == ["battery"] and line[1].isdigit() for line in short)
+    assert main(["check", folder, "--modes"]) == 0
+    each = [line.split() for line in capsys.readouterr().out.splitlines()]
+    assert len(each) > len(short) + 50
+    assert any(line[:3] == ["battery", "heartbeat", "heartbeat"] for line in each)
+
+
 def test_as_data(laser: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["check", str(laser), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)["monitoring"]

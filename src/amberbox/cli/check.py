@@ -26,10 +26,14 @@ from amberbox.monitoring.plan import Plan
 from amberbox.monitoring.ruletests.files import find_rules
 from amberbox.monitoring.ruletests.running import run_rules
 
+_FEW_MODES = 20
+"""So many modes are listed one by one without being asked for."""
+
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of this verb."""
     parser.add_argument("folder", help="a robot folder, or a single black_box.yaml")
+    parser.add_argument("--modes", action="store_true", help="list every mode of a component")
     parser.add_argument("--json", action="store_true", help="print JSON")
 
 
@@ -45,7 +49,7 @@ def run(args: argparse.Namespace) -> int:
         monitoring = {} if plan is None else {"monitoring": summary.as_data(plan)}
         print(json.dumps(_report(folder, items, problems, ok) | monitoring, indent=2))
     else:
-        print("\n".join(_lines(args.folder, folder, items, problems, plan)))
+        print("\n".join(_lines(args.folder, folder, items, problems, plan, args.modes)))
     return 0 if ok else ConfigurationError.exit_code
 
 
@@ -100,20 +104,22 @@ def _lines(
     items: Sequence[PlannedItem],
     problems: Sequence[Problem],
     plan: Plan | None,
+    each_mode: bool = False,
 ) -> list[str]:
     errors = [str(problem) for problem in problems if problem.is_error]
     notes = [str(problem) for problem in problems if not problem.is_error]
     verdict = f"{_count(errors, 'error')}, {_count(notes, 'note')}" if errors else "fine"
     recorded = _plan(folder, items) if folder and (plan is not None or not errors) else []
-    return [*recorded, *_monitored(plan), *notes, *errors, f"{name}: {verdict}"]
+    return [*recorded, *_monitored(plan, each_mode), *notes, *errors, f"{name}: {verdict}"]
 
 
-def _monitored(plan: Plan | None) -> list[str]:
+def _monitored(plan: Plan | None, each_mode: bool) -> list[str]:
     if plan is None or not plan.components:
         return []
     actions = list(summary.actions(plan))
     shown = ["recovery actions, not carried out:", *in_columns(actions), ""] if actions else []
-    table = in_columns(summary.table(plan))
+    is_short = each_mode or len(plan.modes()) <= _FEW_MODES
+    table = in_columns(summary.table(plan) if is_short else summary.short_table(plan))
     return [f"would monitor: {summary.in_words(plan)}", *table, "", *shown]
 
 

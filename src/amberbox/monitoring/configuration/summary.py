@@ -67,6 +67,17 @@ def table(plan: Plan) -> Iterator[tuple[str, ...]]:
             yield own[0], mode.id, monitor_of(mode), own[1], shown
 
 
+def short_table(plan: Plan) -> Iterator[tuple[str, ...]]:
+    """Yield a line for each component."""
+    yield "component", "modes", "outputs", "needs"
+    for component in plan.components:
+        broken = sum(bool(mode.problem) for mode in component.modes)
+        modes = f"{len(component.modes)} ({broken} cannot run)" if broken else len(component.modes)
+        outputs = sum(len(outputs_of(mode)) for mode in component.modes)
+        needs = " ".join(dict.fromkeys(edge.name for edge in component.dependencies)) or "-"
+        yield component.id, str(modes), str(outputs), needs
+
+
 def actions(plan: Plan) -> Iterator[tuple[str, str]]:
     """Yield each component's recovery actions, which are not carried out."""
     for component in plan.components:
