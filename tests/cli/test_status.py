@@ -159,6 +159,27 @@ def test_one_component_in_full(
     ]
 
 
+def test_what_it_needs_is_told_by_what_judges_it(
+    store: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A dependency may be written otherwise than the component, or be one of a mode's outputs."""
+    needs = [
+        DependencyPlan("Front Laser", component="laser"),
+        DependencyPlan("scanner", "heartbeat", "laser", "laser_device", "front_laser_working"),
+        DependencyPlan("scanner", "functional", "laser", "laser_device"),
+        DependencyPlan("laser", "heartbeat", "laser", judged=False),
+        DependencyPlan("roscore", problem="there is no component 'roscore'"),
+    ]
+    plan = replace(PLAN, components=(replace(PLAN.components[0], dependencies=needs),))
+    monkeypatch.setattr("amberbox.cli.status._plan_of", lambda where: plan)
+    say(store, *statuses("error"))
+    main(["status", str(store), "navigation"])
+    assert (
+        "needs: Front Laser (error), scanner (error), laser (not monitored), "
+        "roscore (not monitored)" in capsys.readouterr().out.splitlines()
+    )
+
+
 def test_unknown_component_is_wrong_usage(store: Path, capsys: pytest.CaptureFixture[str]) -> None:
     say(store, *statuses())
     assert main(["status", str(store), "lasre"]) == 2

@@ -15,10 +15,9 @@ from amberbox.monitoring.messages.board import Board, duration
 from amberbox.monitoring.messages.diagnostics import text_of
 from amberbox.monitoring.messages.naming import Naming
 from amberbox.monitoring.messages.tree import Branch, branches
-from amberbox.monitoring.plan import OutputPlan, Plan
+from amberbox.monitoring.plan import DependencyPlan, OutputPlan, Plan
 
 _DOTS = "..."
-_GAP = "  "
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,7 +147,7 @@ def _needs(board: Board, component: str, view: View) -> Iterator[str]:
     """Say what it depends on, and what is written down to do about it."""
     found = [c for c in view.plan.components if c.id == component] if view.plan else []
     for plan in found:
-        needs = [_need(board, dependency.name, view) for dependency in plan.dependencies]
+        needs = list(dict.fromkeys(_need(board, edge, view) for edge in plan.dependencies))
         if plan.part_of:
             yield f"part of: {plan.part_of}"
         if needs:
@@ -157,11 +156,13 @@ def _needs(board: Board, component: str, view: View) -> Iterator[str]:
             yield f"recovery actions (not carried out): {', '.join(plan.recovery_actions)}"
 
 
-def _need(board: Board, name: str, view: View) -> str:
-    status = board.components.get(name)
-    level: Level = status.level if status else "unknown"
-    word = status.level if status else "not monitored"
-    return f"{name} ({view.paint(word, level)})"
+def _need(board: Board, edge: DependencyPlan, view: View) -> str:
+    """Name a dependency, and say how it is by what judges it: the component, or a mode."""
+    judge = (edge.component, edge.mode) if edge.judged and not edge.problem else None
+    status = next((s for s in board.statuses if (s.component, s.mode) == judge), None)
+    if status is None or status.state == "not_monitored":
+        return f"{edge.name} ({view.paint('not monitored', 'unknown')})"
+    return f"{edge.name} ({view.paint(status.level, status.level)})"
 
 
 def _alarms(alarms: Sequence[AlarmChange], now_ns: int, view: View) -> Iterator[str]:

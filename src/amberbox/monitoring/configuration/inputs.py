@@ -197,8 +197,3 @@ def _paths_in(text: str, item: Item) -> Iterator[str]:
         if text.startswith((f"{name}.", f"{name}/")) and len(text) > len(name) + 1:
             yield text[len(name) + 1 :]
             return
-
-
-def expanded(text: str, count: int) -> list[str]:
-    """Write ``*`` of a predecessor's variable as 0, 1, ... ."""
-    return [text.replace("*", str(number), 1) for number in range(count)]
