@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from amberbox.diagnosis.fmea.coverage import coverage
-from amberbox.diagnosis.fmea.propagation import dependents, links_of, lost
+from amberbox.diagnosis.fmea.propagation import Structure, links_by_mode, lost
 from tests.diagnosis.fmea.small import ADDRESSES, small
 
 
@@ -24,8 +24,10 @@ def test_what_no_test_tells_apart_is_said() -> None:
 
 def test_a_loss_shows_through_functions() -> None:
     fmea = small()
-    assert [link.symptom for link in links_of(fmea, "hook#bent")] == ["tasks/log/none_given_up"]
-    assert [link.symptom for link in links_of(fmea, "laser_front#dead")] == [
+    assert [link.symptom for link in links_by_mode(fmea)["hook#bent"]] == [
+        "tasks/log/none_given_up"
+    ]
+    assert [link.symptom for link in links_by_mode(fmea)["laser_front#dead"]] == [
         "laser_front/heartbeat/alive"
     ]
     found = coverage(fmea)
@@ -55,4 +57,4 @@ def test_what_is_lost() -> None:
     assert lost(fmea, ["host#off"]) == {
         "host", "laser_front", "laser_rear", "hook", "see", "carry",
     }  # fmt: skip
-    assert dependents(fmea, ["hook"]) == {"carry"}
+    assert Structure.of(fmea.needs()).dependents(["hook"]) == {"carry"}

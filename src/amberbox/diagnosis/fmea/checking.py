@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 from amberbox.core.config import did_you_mean
 from amberbox.core.errors import Problem
@@ -11,7 +11,7 @@ from amberbox.core.needs import cycles
 from amberbox.core.nodes import Node
 from amberbox.diagnosis.fmea.model import Effects, FailureMode, Fmea
 from amberbox.diagnosis.fmea.places import child
-from amberbox.diagnosis.fmea.propagation import dependents, links_of
+from amberbox.diagnosis.fmea.propagation import Structure, links_by_mode
 from amberbox.diagnosis.fmea.reading import Sheet
 
 
@@ -23,9 +23,27 @@ def check(fmea: Fmea, sheet: Sheet, problems: list[Problem]) -> Fmea | None:
         return None
     places = {f"{part.component}#{name}": part.mode_node(name)
               for part in sheet.parts for name in part.modes}  # fmt: skip
-    problems += _mode_problems(fmea, places, sheet)
-    modes = {name: replace(mode, effects=_effects(fmea, mode)) for name, mode in fmea.modes.items()}
+    reach = _Reach.of(fmea)
+    problems += _mode_problems(fmea, reach, places, sheet)
+    modes = {
+        name: replace(mode, effects=_effects(fmea, reach, mode))
+        for name, mode in fmea.modes.items()
+    }
     return replace(fmea, modes=modes)
+
+
+@dataclass(frozen=True, slots=True)
+class _Reach:
+    """What needs each component: next to it, and in the end."""
+
+    next: Mapping[str, tuple[str, ...]]
+    all: Mapping[str, frozenset[str]]
+
+    @classmethod
+    def of(cls, fmea: Fmea) -> _Reach:
+        structure = Structure.of(fmea.needs())
+        reached = {name: structure.dependents([name]) for name in fmea.components}
+        return cls(structure.users, reached)
 
 
 def _name_problems(fmea: Fmea, sheet: Sheet) -> Iterator[Problem]:
@@ -61,12 +79,15 @@ def _circles(fmea: Fmea, sheet: Sheet) -> Iterator[Problem]:
         yield _needs_node(circle[-1], sheet, circle[0]).problem(f"{circle[-1]}.needs", what)
 
 
-def _mode_problems(fmea: Fmea, places: Mapping[str, Node], sheet: Sheet) -> Iterator[Problem]:
+def _mode_problems(
+    fmea: Fmea, reach: _Reach, places: Mapping[str, Node], sheet: Sheet
+) -> Iterator[Problem]:
+    links = links_by_mode(fmea)
     for mode in fmea.modes.values():
         node = places.get(mode.id) or _member_node(mode, sheet)
-        yield from _effect_problems(fmea, mode, node, sheet)
+        yield from _effect_problems(fmea, reach, mode, node, sheet)
         has_none = child(node, "symptoms") is node  # wrong ones have been told
-        if has_none and not mode.unobservable and not links_of(fmea, mode.id):
+        if has_none and not mode.unobservable and not links[mode.id]:
             what = "nothing shows it: give symptoms, or 'unobservable:' with the reason"
             yield node.problem(mode.name, what)
 
@@ -76,9 +97,11 @@ def _member_node(mode: FailureMode, sheet: Sheet) -> Node:
     return child(sheet.root, "robots", robot, "functions", function)
 
 
-def _effect_problems(fmea: Fmea, mode: FailureMode, node: Node, sheet: Sheet) -> Iterator[Problem]:
+def _effect_problems(
+    fmea: Fmea, reach: _Reach, mode: FailureMode, node: Node, sheet: Sheet
+) -> Iterator[Problem]:
     names = {*fmea.components, *sheet.names}
-    reached = dependents(fmea, [mode.component])
+    reached = reach.all[mode.component]
     for key, stated in (("next", mode.effects.next), ("system", mode.effects.system)):
         for place, name in enumerate(stated):
             where = f"{mode.name}.effects.{key}"
@@ -91,12 +114,12 @@ def _effect_problems(fmea: Fmea, mode: FailureMode, node: Node, sheet: Sheet) ->
                 yield at.problem(where, what, is_error=False)
 
 
-def _effects(fmea: Fmea, mode: FailureMode) -> Effects:
+def _effects(fmea: Fmea, reach: _Reach, mode: FailureMode) -> Effects:
     """Fill in what follows from needs: users next to it, and functions of the system."""
     stated = mode.effects
     if not mode.takes_down:
         return stated
-    users = (name for name, of in fmea.needs().items() if mode.component in of.names())
-    reached = dependents(fmea, [mode.component])
-    system = (name for name in fmea.system_functions() if name in reached)
-    return Effects(stated.local, stated.next or tuple(users), stated.system or tuple(system))
+    users = reach.next.get(mode.component, ())
+    reached = reach.all[mode.component]
+    system = tuple(name for name in fmea.system_functions() if name in reached)
+    return Effects(stated.local, stated.next or users, stated.system or system)

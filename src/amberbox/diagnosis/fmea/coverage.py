@@ -6,7 +6,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 from amberbox.diagnosis.fmea.model import Fmea
-from amberbox.diagnosis.fmea.propagation import links_of
+from amberbox.diagnosis.fmea.propagation import links_by_mode
 
 _EXPECTED = 0.5
 """From this probability on a symptom is expected of a failure mode, below it is possible."""
@@ -16,7 +16,8 @@ _EXPECTED = 0.5
 class Alike:
     """Failure modes that the same symptoms are expected of and possible for.
 
-    ``tests`` tell some of them apart. ``left`` are those that no test tells apart either, group by group.
+    ``tests`` tell some of them apart; ``left`` are those that no test tells apart either, group
+    by group.
     """
 
     modes: tuple[str, ...]
@@ -47,7 +48,7 @@ def coverage(fmea: Fmea, watched: Collection[str] = (), weak_below: float = 0.9)
 
     ``weak`` are modes that even all their symptoms together show with less than ``weak_below``.
     """
-    links = {mode: links_of(fmea, mode) for mode in fmea.modes}
+    links = links_by_mode(fmea)
     missed = {mode: _missed([link.detects for link in of]) for mode, of in links.items()}
     unseen = {m.id: m.unobservable for m in fmea.modes.values() if missed[m.id] >= 1.0}
     by_signature: dict[frozenset[tuple[str, bool]], list[str]] = {}
