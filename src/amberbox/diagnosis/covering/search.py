@@ -141,10 +141,14 @@ class _Search:
         full = more.count(group) == len(self.problem.groups[group])
         if more.log_best > NEVER:
             self.reach(more)
-            closed = best.closed | (1 << group if full else 0)
-            self.push_node(_Node(more, closed, self.bounds.beyond(more, closed)))
-        closed = best.closed | 1 << group
-        self.push_node(_Node(best.state, closed, self.bounds.beyond(best.state, closed)))
+            self.push_within(best.bound, more, best.closed | (1 << group if full else 0))
+        self.push_within(best.bound, best.state, best.closed | 1 << group)
+
+    def push_within(self, outer: Bound, state: State, closed: int) -> None:
+        """Let a part of a node wait: what bounds the whole bounds the part."""
+        own = self.bounds.beyond(state, closed)
+        log_best, log_mass = min(outer.log_best, own.log_best), min(outer.log_mass, own.log_mass)
+        self.push_node(_Node(state, closed, Bound(log_best, log_mass, own.branch)))
 
     def share_listed(self) -> float:
         """Return the least share of everything that has been listed."""
