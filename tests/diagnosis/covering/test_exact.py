@@ -12,7 +12,7 @@ from tests.diagnosis.covering.small_models import random_evidence, random_model
 TOLERANCE = 1e-9
 
 
-@pytest.mark.parametrize("seed", range(250))
+@pytest.mark.parametrize("seed", range(200))
 def test_every_probability_equals_that_of_writing_out_all_sets(seed: int) -> None:
     rng = random.Random(seed)
     model = random_model(rng)
@@ -31,12 +31,13 @@ def test_every_probability_equals_that_of_writing_out_all_sets(seed: int) -> Non
     assert sum(p for f, p in expected.items() if f not in ours) < TOLERANCE
     assert answer.mass_covered == 1.0 and not answer.incomplete
     shares = [h.probability for h in answer.hypotheses]
-    assert shares == sorted(shares, reverse=True) or max(
-        later - earlier for earlier, later in zip(shares, shares[1:], strict=False)
-    ) < 1e-15
+    assert (
+        shares == sorted(shares, reverse=True)
+        or max(later - earlier for earlier, later in zip(shares, shares[1:], strict=False)) < 1e-15
+    )
 
 
-@pytest.mark.parametrize("seed", range(250, 350))
+@pytest.mark.parametrize("seed", range(200, 260))
 def test_bounds_hold_however_early_the_search_ends(seed: int) -> None:
     rng = random.Random(seed)
     model = random_model(rng)
