@@ -250,6 +250,14 @@ def test_lost_redundancy_is_said_where_the_component_is_ok() -> None:
     assert stand.status("x").reason == "2 of 3 modes are ok: nothing received of scan for 5 s"
 
 
+def test_half_is_no_majority() -> None:
+    stand = Stand(component("x", modes=[mode("a"), mode("b")], policy="majority"))
+    stand.ok(1, "x/a")
+    stand.bad(1, "x/b")
+    stand.until(1)
+    assert stand.status("x").level == "error"
+
+
 def test_half_of_the_modes_with_warnings_is_a_warning() -> None:
     warning = mode("b", output(severity="warning"))
     stand = Stand(component("x", modes=[mode("a"), warning, mode("c")], policy="majority"))

@@ -18,7 +18,7 @@ from amberbox.core.types import Batch, Level, Status
 from amberbox.monitoring.engine.engine import Engine
 from amberbox.monitoring.engine.findings import TICK_NS, Finding
 from amberbox.monitoring.messages.records import encoded
-from amberbox.monitoring.plan import ModePlan
+from amberbox.monitoring.plan import InputPlan, ModePlan
 from tests.monitoring.engine.plans import (
     ALIVE,
     CRASHING,
@@ -105,6 +105,47 @@ def test_another_publisher_of_the_same_keeps_it_fresh() -> None:
     batches = [rows(seconds(1.0, 2.1, 3.0), v=[1.0] * 3), gap(2 * NS, 2 * NS, None)]
     found = levels(watch([mode(POSITIVE, variable(), stale_s=None)], batches, 3.0))
     assert found == [(0.0, "unknown"), (1.0, "ok"), (2.0, "stale"), (2.1, "ok")]
+
+
+def test_when_both_publishers_are_lost_the_later_one_counts() -> None:
+    """The first has been lost for long when the second goes: what it sent meanwhile is past."""
+    batches = [
+        rows(seconds(1.0, 2.5, 3.5), v=[1.0] * 3),
+        gap(2 * NS, 2 * NS, None),
+        gap(4 * NS, 4 * NS, None),
+    ]
+    monitored = mode(POSITIVE, variable(), stale_s=None)
+    assert levels(watch([monitored], batches, 5.0))[-1] == (4.0, "stale")
+
+
+def test_lost_publishers_are_remembered() -> None:
+    """Two are lost before the snapshot, one comes back after it and says nothing."""
+    plan = one(mode(POSITIVE, variable(), stale_s=None))
+    first, resumed = Engine(plan), Engine(plan)
+    first.begin(0)
+    for batch in (rows(seconds(1), v=[1.0]), gap(2 * NS, 2 * NS, None), gap(3 * NS, 3 * NS, None)):
+        first.feed(batch)
+    first.advance(9 * NS)
+    resumed.resume(json.loads(json.dumps(first.snapshot())))
+    resumed.feed(gap(10 * NS, 3 * NS, 10 * NS))
+    assert {level for _, level in levels(resumed.advance(12 * NS))} == {"stale"}
+
+
+def test_rows_that_come_again_count_once() -> None:
+    """Also the one right where the snapshot begins."""
+    counting = mode_module(lambda _, inputs, now: {"value": float(inputs[0].at(now))})
+    plan = one(mode(counting, InputPlan("a", "item", "a"), outputs=[output(VALUE)]))
+    batch = rows(seconds(1, 2, 3, 4, 5), v=[1.0] * 5)
+    first, resumed = Engine(plan), Engine(plan)
+    first.begin(0)
+    first.feed(batch)
+    first.advance(5 * NS)
+    resumed.resume(json.loads(json.dumps(first.snapshot())))
+    resumed.feed(batch)
+    resumed.feed(rows(seconds(6), v=[1.0]))
+    resumed.advance(6 * NS)
+    (status,) = [status for status in resumed.statuses() if status.mode]
+    assert status.outputs == {"value": 6.0}
 
 
 def test_a_mode_that_crashes_is_unknown_and_disturbs_nobody() -> None:
