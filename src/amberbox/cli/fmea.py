@@ -33,6 +33,7 @@ _USAGE = (
     "amberbox fmea check|table|criticality|coverage WHERE [--json] [--csv FILE] "
     "[--import FILE.csv] [--priorities FILE.csv] [--exposure HOURS]"
 )
+_NOT_COMPARED = "symptoms are not compared with monitors"
 _SHOWN = ("Item", "Failure mode", "Severity", "S", "O", "D", "RPN", "Detection", "Action")
 
 
@@ -119,7 +120,7 @@ def _check(
             print(problem)
         print(f"{args.where}: {_in_words(fmea) if fmea and not wrong else _errors(problems)}")
     if fmea and known is None and not args.json:
-        tell([f"no robot.yaml beside {args.where}: symptoms are not compared with monitors"])
+        tell([f"no robot folder that can be read at {args.where}: {_NOT_COMPARED}"])
     return ConfigurationError.exit_code if wrong else 0
 
 
