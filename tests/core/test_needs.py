@@ -46,6 +46,24 @@ def test_every_combination_of_what_is_up() -> None:
         assert needs.met(state.__getitem__) == (a and (b or c + d + e >= 2))
 
 
+@pytest.mark.parametrize(
+    "needs",
+    [
+        all_of("a", "x", any_of("b", "y")),
+        at_least(2, "a", "b", "x", all_of("c", "y")),
+        any_of("a", "x"),
+        all_of("x", any_of("x", "y"), all_of("a", at_least(2, "b", "c", "y"))),
+    ],
+)
+def test_names_that_are_not_known_are_taken_to_be_up(needs: Needs) -> None:
+    known = ("a", "b", "c")
+    rest = needs.restricted(known.__contains__)
+    assert set(rest.names()) <= set(known)
+    for up in itertools.product((False, True), repeat=3):
+        state = {"x": True, "y": True, **dict(zip(known, up, strict=True))}
+        assert rest.met(state.__getitem__) == needs.met(state.__getitem__)
+
+
 def test_nothing_is_always_met_and_must_be_allowed() -> None:
     assert NOTHING.met(lambda name: False) and str(NOTHING) == "nothing"
     assert parse("needs: []", may_be_empty=True) == (NOTHING, [])

@@ -36,6 +36,17 @@ class Needs:
         """Return the names in order, each once."""
         return tuple(dict.fromkeys(_names(self)))
 
+    def restricted(self, is_known: Callable[[str], bool]) -> Needs:
+        """Return what remains when all names that are not known are taken to be up."""
+        count, parts = self.at_least, list[Needs | str]()
+        for part in self.parts:
+            rest = part.restricted(is_known) if isinstance(part, Needs) else part
+            if rest == NOTHING or (isinstance(rest, str) and not is_known(rest)):
+                count -= 1
+            else:
+                parts.append(rest)
+        return Needs(count, tuple(parts)) if count > 0 else NOTHING
+
     def __str__(self) -> str:
         if not self.parts:
             return "nothing"

@@ -56,6 +56,14 @@ def test_occurrence_gives_the_rate_by_the_table() -> None:
     assert fmea.modes["laser_front#dead"].rate == 1e-4
 
 
+def test_other_spellings_of_keys() -> None:
+    text = TEXT.replace("failure_modes:", "modes:").replace("question:", "look:")
+    fmea, problems = read_fmea(text, KNOWN)
+    assert fmea is not None and not problems
+    assert list(fmea.modes) == list(small().modes)
+    assert fmea.tests["laser_front.look"].kind == "check"
+
+
 def test_a_ratio_is_a_share_of_the_components_rate() -> None:
     text = TEXT.replace("    needs: [host]\n", "    needs: [host]\n    rate: 1.0e-3\n")
     fmea, _ = read_fmea(text.replace("        rate: 1.0e-4\n", "        ratio: 0.6\n"), KNOWN)

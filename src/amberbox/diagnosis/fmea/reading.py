@@ -66,7 +66,7 @@ def read(root: Node, known: Known | None, problems: list[Problem]) -> Sheet:
     return Sheet(
         root,
         file,
-        [part for entry in found if (part := _part(entry, names, known, problems)) is not None],
+        [_part(entry, names, known, problems) for entry in found],
         dict(_entries(FunctionFile, root, "functions", problems)),
         dict(_entries(TestFile, root, "tests", problems)),
         dict(_entries(SymptomFile, root, "symptoms", problems)),
@@ -81,14 +81,10 @@ def child_keys(node: Node, key: str) -> tuple[str, ...]:
     return tuple((entry.mapping if entry else None) or ())
 
 
-def _part(
-    entry: Instance, names: set[str], known: Known | None, problems: list[Problem]
-) -> Part | None:
+def _part(entry: Instance, names: set[str], known: Known | None, problems: list[Problem]) -> Part:
     """Read a type for one of its components."""
     where = f"types.{entry.type}"
-    file = build(TypeFile, entry.node, problems, where)
-    if file is None:
-        file = TypeFile()
+    file = build(TypeFile, entry.node, problems, where) or TypeFile()
     node = entry.node
     key = "failure_modes" if _modes_node(node) is child(node, "failure_modes") else "modes"
     modes = dict(_entries(ModeFile, node, key, problems, where))
@@ -115,15 +111,14 @@ def _needs(
 ) -> Needs:
     """Return what the type says that it needs, else what the component's own file says.
 
-    Of the latter, what is not in this file is left out.
+    Of the latter, what is not in this file is taken to be up.
     """
     entry = (node.mapping or {}).get("needs")
     if entry is not None:
         where = f"{component}.needs"
         return parse_needs(entry, problems, where, may_be_empty=True) or NOTHING
     inherited = known.needs.get(component, NOTHING) if known else NOTHING
-    kept = tuple(name for name in inherited.names() if name in names)
-    return Needs(len(kept), kept)
+    return inherited.restricted(names.__contains__)
 
 
 def _entries(
