@@ -25,8 +25,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
     reasons.add_argument("--why", action="store_true", help="what each answer follows from")
     reasons.add_argument("--why-not", action="store_true", help="what failed if there is no answer")
     parser.add_argument("--export", metavar="FILE", help="write all for SWI-Prolog")
-    parser.add_argument("--steps", type=int, default=Budget().steps, help="stop after so many steps")
-    parser.add_argument("--seconds", type=float, default=30.0, help="stop after so long")
+    parser.add_argument(
+        "--steps", type=int, default=Budget().steps, help="stop after so many steps"
+    )
+    parser.add_argument("--seconds", type=float, default=30.0, help="stop after so long (30)")
     parser.add_argument("--json", action="store_true", help="answers, proof, failed")
 
 

@@ -46,7 +46,9 @@ def ask_swi(folder: Path, text: str, goals: Sequence[str]) -> list[Result]:
     loads = f":- ['{program}'].\n:- discontiguous '$question'/3.\n"
     driver.write_text(loads + questions + _DRIVER, encoding="utf-8")
     command = [need_swipl(), "-q", "--stack-limit=500m", str(driver)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=20, stdin=subprocess.DEVNULL)
+    done = subprocess.run(
+        command, capture_output=True, text=True, timeout=20, stdin=subprocess.DEVNULL
+    )
     assert "rror" not in done.stderr, done.stderr
     return _results(done.stdout, len(goals))
 

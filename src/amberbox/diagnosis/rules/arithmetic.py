@@ -143,17 +143,16 @@ def _round(a: Number) -> int:
 
 
 def _larger(a: Number, b: Number) -> Number:
-    return a if _before(b, a) else b
+    return _float_of(a, b) if plain(a) == plain(b) else max(a, b, key=plain)
 
 
 def _smaller(a: Number, b: Number) -> Number:
-    return a if _before(a, b) else b
+    return _float_of(a, b) if plain(a) == plain(b) else min(a, b, key=plain)
 
 
-def _before(a: Number, b: Number) -> bool:
-    """Tell whether a is the one to take: of equal numbers the float, as in SWI-Prolog."""
-    x, y = plain(a), plain(b)
-    return x < y or (x == y and isinstance(a, Real))
+def _float_of(a: Number, b: Number) -> Number:
+    """Return that of two equal numbers that is a float, if one is."""
+    return a if isinstance(a, Real) else b
 
 
 def plain(number: Number) -> int | float:

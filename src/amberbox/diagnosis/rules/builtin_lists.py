@@ -58,6 +58,7 @@ def _longer(m: Machine, count: int, tail: Var, wanted: Term) -> Iterator[None]:
     number = 0
     while number < _MOST:
         mark = len(m.trail)
+        m.charge(number)
         if m.unify(tail, _fresh(number)) and m.unify(wanted, count + number):
             yield
         undo(m.trail, mark)

@@ -36,6 +36,7 @@ class Machine:
         self.choices: list[Choice] = []
         self.trace: Trace = None
         self.steps = 0
+        self.charged = 0
         self.solved = False
         self.goal: Goal | None = None
         self.frame: Frame | None = None
@@ -104,6 +105,12 @@ class Machine:
             raise StopFault(f"stopped after {self.steps:,} steps, the time is over")
         if not self.choices:
             self.trail.clear()
+
+    def charge(self, size: int) -> None:
+        """Count work on something large as steps, so that few steps cannot take for ever."""
+        self.charged += size
+        if self.charged > self.budget.steps:
+            raise StopFault(f"stopped after {self.steps:,} steps on ever larger terms")
 
     def choose(self, go_on: Callable[..., Frame | None], *rest: Any) -> None:
         """Remember that something else may be tried from here."""

@@ -76,7 +76,9 @@ class _Table:
 
 def call(m: Machine, predicate: Predicate, args: Sequence[Term], after: Frame) -> Frame | None:
     """Call a tabled predicate: use its table, wait for it, or fill it."""
-    key = (predicate.key, variant(args))
+    called = variant(args)
+    m.charge(len(called))
+    key = (predicate.key, called)
     table: _Table | None = m.tables.get(key)
     if table is None:
         return _begin(m, predicate, key, tuple(args), after)
@@ -110,6 +112,7 @@ def _add(m: Machine, goal: Goal, env: Any, cut: int, after: Frame) -> None:
     """Keep an answer, unless it is known, and wake those who wait for it."""
     table, args = env
     key = variant(args)
+    m.charge(len(key))
     if key in table.answers:
         return
     memo: Memo = {}

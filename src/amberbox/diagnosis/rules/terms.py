@@ -16,7 +16,7 @@ NIL = "[]"
 PAIR = "[|]"
 """Name of the structure that lists are made of, as in SWI-Prolog."""
 
-LONGEST = 5_000_000
+LONGEST = 1_000_000
 """Most elements of a list, and most steps of a walk through a term that may contain itself."""
 
 Key: TypeAlias = tuple[str, int]

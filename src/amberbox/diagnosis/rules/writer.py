@@ -93,7 +93,8 @@ class _Writer:
         if len(args) == 1 and name in PREFIX and not isinstance(deref(args[0]), int | Real):
             return self._prefix(term, most)
         inner = ",".join(self.term(arg, 999) for arg in args)
-        return f"{self._atom(name)}({inner})"
+        functor = f"'{name}'" if name in (NIL, "{}") and self.quoted else self._atom(name)
+        return f"{functor}({inner})"
 
     def _list(self, term: Struct) -> str:
         items, tail = split_list(term)
