@@ -64,7 +64,8 @@ def next_tests(
     """Return the tests that are worth most: expected bits of information per price.
 
     The expectation is exact over the hypotheses given; failure modes that are in none of them
-    are taken to be absent. Tests that were asked are left out, as are those that tell nothing.
+    are taken to be absent, and what is not in the FMEA to show nothing more than it denies.
+    Tests that were asked are left out, as are those that tell nothing.
     """
     prices = weights or Weights()
     total = math.fsum(h.probability for h in hypotheses)
@@ -119,12 +120,11 @@ def _informative(
     modes = frozenset().union(*(p.modes for p in predictions))
     lost = frozenset().union(*(p.lost for p in predictions))
     shown = {sign for p in predictions for sign in p.misses}
-    any_unknown = any(prediction.unknown for prediction in predictions)
     for check in checks:
         if check.reads:
             sign = model.sign_places[check.reads]
-            if sign in shown or any_unknown:
-                present = [prediction.present(model, sign) for prediction in predictions]
+            if sign in shown:
+                present = [prediction.expected(model, sign) for prediction in predictions]
                 yield check, [(1.0 - chance, chance) for chance in present]
             continue
         of_modes, of_functions = seers(model, check)
@@ -134,10 +134,10 @@ def _informative(
 
 def _proposal(check: Check, shares: Sequence[float], expected: Outcomes, by: Weights) -> Proposal:
     chances = [
-        math.fsum(share * row[level] for share, row in zip(shares, expected, strict=True))
+        sum(share * row[level] for share, row in zip(shares, expected, strict=True))
         for level in range(len(check.outcomes))
     ]
-    left = math.fsum(share * entropy_bits(row) for share, row in zip(shares, expected, strict=True))
+    left = sum(share * entropy_bits(row) for share, row in zip(shares, expected, strict=True))
     gain = max(0.0, entropy_bits(chances) - left)
     test = Test(
         check.id,
@@ -155,4 +155,4 @@ def _proposal(check: Check, shares: Sequence[float], expected: Outcomes, by: Wei
 
 def entropy_bits(chances: Iterable[float]) -> float:
     """Return the entropy of a distribution in bits."""
-    return -math.fsum(chance * math.log2(chance) for chance in chances if chance > 0)
+    return -sum([chance * math.log2(chance) for chance in chances if chance > 0])
