@@ -9,18 +9,22 @@ is the product of 1 + weight.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import accumulate
 from operator import mul
 
 import numpy as np
-from numpy.typing import NDArray
 
+from amberbox.diagnosis.covering.gates import bits
 from amberbox.diagnosis.covering.problem import NEVER, Problem, log
 from amberbox.diagnosis.covering.state import State
 from amberbox.diagnosis.covering.tables import Floats
 
 LARGEST_EXPONENT = 700.0
+
+FAR = 0.5
+"""A clue with less than this share of its limit is not explained yet."""
 
 SMALLEST = -1000.0
 """The logarithm of the least share that a clue counts with: gains must stay finite."""
@@ -42,7 +46,6 @@ class Bound:
 DEAD = Bound(NEVER, NEVER, -1)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
 class View:
     """What adding one more group weighs while certain functions are lost.
 
@@ -50,28 +53,33 @@ class View:
     all members, with what the functions cost that this member alone would lose.
     """
 
-    bests: Floats
-    sums: Floats
+    __slots__ = ("_order", "bests", "sums", "total")
+
+    def __init__(self, log_bests: Floats, log_sums: Floats) -> None:
+        self.bests: list[float] = log_bests.tolist()
+        self.sums: list[float] = np.exp(log_sums).tolist()
+        self.total = sum(self.sums)
+        self._order: list[int] = np.argsort(-log_bests, kind="stable").tolist()
+
+    def unrelated(self, hidden: int, log_share: float) -> Bound:
+        """Bound the sets of groups that are not hidden; they change no likelihood."""
+        branch = next((group for group in self._order if not hidden >> group & 1), -1)
+        if branch < 0:
+            return DEAD
+        left = self.total - sum(self.sums[group] for group in bits(hidden))
+        # What is left of a difference may be a little less than its best member.
+        mass = max(log(left), self.bests[branch]) + log_share
+        return Bound(self.bests[branch] + log_share, mass, branch)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True)
 class Unexplained:
-    """The clues far from their limits, and the open groups that can bring them nearer.
+    """A clue far from its limit: the share of it that it has now, and its open causes."""
 
-    ``log_shares`` are the shares of their limits that they have now, ``causes`` a row of groups
-    per clue, ``gains`` per group the logarithm of what it can make of all of them at most.
-    """
-
-    clues: list[int]
-    shares: list[float]
-    log_shares: Floats
-    causes: NDArray[np.bool_]
-    gains: Floats
-
-    @property
-    def log_share(self) -> float:
-        """Return the share of the limit that all clues together have now."""
-        return float(self.log_shares.sum())
+    clue: int
+    share: float
+    log_share: float
+    causes: Sequence[int]
 
 
 class Bounds:
@@ -80,10 +88,7 @@ class Bounds:
     def __init__(self, problem: Problem) -> None:
         self._problem = problem
         self._views: dict[int, View] = {}
-        self._causes = np.zeros((len(problem.clues), len(problem.groups)), np.bool_)
-        for clue, causes in enumerate(problem.causes):
-            self._causes[clue, list(causes)] = True
-        self._free = View(problem.log_bests, np.exp(problem.log_sums))
+        self._free = View(problem.log_bests, problem.log_sums)
 
     def beyond(self, state: State, closed: int) -> Bound:
         """Bound all sets that add one or more members of groups that are not closed.
@@ -92,17 +97,16 @@ class Bounds:
         stay; or it has one, then several bounds hold and the tightest counts.
         """
         problem, view = self._problem, self._view(state.lost)
-        top, clues, shares = self._limits(state, closed)
+        top, clues = self._limits(state, closed)
         if top == NEVER:
             return DEAD
-        is_open = ~_unpacked(closed, len(problem.groups))
-        if not clues:
-            best = _unrelated(view, is_open, 0.0)
-        else:
-            open_clues = self._unexplained(clues, shares, is_open)
-            causes = np.logical_or.reduce(open_clues.causes, axis=0)
-            apart = _unrelated(view, is_open & ~causes, open_clues.log_share)
-            best = _either(apart, self._explaining(state, open_clues, causes, closed))
+        hidden, log_share = closed, 0.0
+        for clue in clues:
+            hidden |= problem.cause_masks[clue.clue]
+            log_share += clue.log_share
+        best = view.unrelated(hidden, log_share)
+        if clues:
+            best = _either(best, self._explaining(state, closed, clues))
         return Bound(
             best.log_best + top + state.log_best + problem.log_odd,
             best.log_mass + top + state.log_sum + problem.log_all,
@@ -111,84 +115,89 @@ class Bounds:
 
     def _view(self, lost: int) -> View:
         if lost not in self._views:
-            losses = self._problem.log_losses(lost)
-            sums = np.exp(self._problem.log_sums + losses)
-            self._views[lost] = View(self._problem.log_bests + losses, sums)
+            problem = self._problem
+            losses = problem.log_losses(lost)
+            self._views[lost] = View(problem.log_bests + losses, problem.log_sums + losses)
         return self._views[lost]
 
-    def _limits(self, state: State, closed: int) -> tuple[float, list[int], list[float]]:
+    def _limits(self, state: State, closed: int) -> tuple[float, list[Unexplained]]:
         """Return the most that open groups make of all clues, and those far from their limit."""
         problem, top = self._problem, 0.0
-        clues, shares = [], []
+        clues = []
         for place, clue in enumerate(problem.clues):
             value = clue.alpha + clue.beta * state.misses[place]
-            limit = problem.limits[place]
-            if clue.beta < 0 and problem.cause_masks[place] & ~closed:
+            mask = problem.cause_masks[place]
+            if clue.beta < 0 and mask & ~closed:
                 top += problem.log_limits[place]
-                if value < 0.5 * limit:
-                    clues.append(place)
-                    shares.append(value / limit)
+                share = value / problem.limits[place]
+                if share < FAR:
+                    causes: Sequence[int] = problem.causes[place]
+                    if mask & closed:
+                        causes = [group for group in causes if not closed >> group & 1]
+                    clues.append(Unexplained(place, share, max(SMALLEST, log(share)), causes))
             else:
                 top += log(value)
-        return top, clues, shares
+        return top, clues
 
-    def _unexplained(
-        self, clues: list[int], shares: list[float], is_open: NDArray[np.bool_]
-    ) -> Unexplained:
-        log_shares = np.array([max(SMALLEST, log(share)) for share in shares])
-        causes: NDArray[np.bool_] = self._causes[clues] & is_open
-        gains = -log_shares @ causes
-        return Unexplained(clues, shares, log_shares, causes, gains)
-
-    def _explaining(
-        self, state: State, clues: Unexplained, causes: NDArray[np.bool_], closed: int
-    ) -> Bound:
-        """Bound the sets that have one of these causes of clues that are not explained yet.
+    def _explaining(self, state: State, closed: int, clues: list[Unexplained]) -> Bound:
+        """Bound the sets that have a cause of clues that are not explained yet.
 
         Each clue gives a bound of its own: either one of its causes is added, or none is and
         its likelihood stays as it is. So do clues without common causes together, and so do
         the gains of all that may be added, as if no two of them explained the same clue.
         """
         view = self._view(state.lost)
-        best, left = float(view.bests[causes].max()), float(view.sums[causes].sum())
-        per_clue = np.where(clues.causes, view.bests, NEVER).max(axis=1)
-        tightness = np.maximum(per_clue, clues.log_shares + best)
-        first = int(tightness.argmin())
-        mass = float((clues.causes @ view.sums + np.array(clues.shares) * left).min())
-        among = clues.causes[first] if per_clue[first] >= tightness[first] else causes
-        net = view.bests + clues.gains
-        branch = int(np.where(among, net, NEVER).argmax())
-        result = Bound(float(tightness[first]), log(min(mass, left)), branch)
-        gained = self._gained(view, clues, causes, net)
-        if gained.log_best < result.log_best:
-            branch = gained.branch
-        bounds = [result, gained]
-        if len(clues.clues) > 1:
-            order = tightness.argsort(kind="stable").tolist()
-            bounds.append(self._together(state, closed, clues, order, (best, left)))
-        return Bound(min(b.log_best for b in bounds), min(b.log_mass for b in bounds), branch)
+        gains: dict[int, float] = {}
+        for clue in clues:
+            for group in clue.causes:
+                gains[group] = gains.get(group, 0.0) - clue.log_share
+        best = max(view.bests[group] for group in gains)
+        left = sum(view.sums[group] for group in gains)
+        tightest, among, mass = math.inf, None, left
+        order: list[tuple[float, Unexplained]] = []
+        for clue in clues:
+            cause = max([view.bests[group] for group in clue.causes])
+            without = clue.log_share + best
+            mass = min(mass, sum([view.sums[g] for g in clue.causes]) + clue.share * left)
+            order.append((max(cause, without), clue))
+            if order[-1][0] < tightest:
+                tightest, among = order[-1][0], clue.causes if cause >= without else None
+        net = {group: view.bests[group] + gain for group, gain in gains.items()}
+        result = Bound(tightest, log(mass), max(among or net, key=net.__getitem__))
+        if len(clues) == 1:
+            return result
+        order.sort(key=_tightest_first)
+        gained = self._gained(view, clues, gains, net)
+        apart = self._together(state, closed, [clue for _, clue in order], (best, left))
+        return Bound(
+            min(result.log_best, gained.log_best, apart.log_best),
+            min(result.log_mass, gained.log_mass, apart.log_mass),
+            gained.branch if gained.log_best < result.log_best else result.branch,
+        )
 
     def _gained(
-        self, view: View, clues: Unexplained, causes: NDArray[np.bool_], net: Floats
+        self,
+        view: View,
+        clues: list[Unexplained],
+        gains: Mapping[int, float],
+        net: Mapping[int, float],
     ) -> Bound:
         """Bound by gains: what each group can make of all clues, whatever others make of them."""
-        free = np.where(causes, self._free.bests + clues.gains, NEVER)
-        rising = free > 0
-        branch = int(np.where(causes, net, NEVER).argmax())
-        log_best = float(free[rising].sum()) if rising.any() else float(net[branch])
-        gains = np.exp(np.minimum(clues.gains[causes], LARGEST_EXPONENT))
-        with np.errstate(over="ignore"):
-            others = float(np.log1p(self._free.sums[causes] * gains).sum())
-            one = log(float((view.sums[causes] * gains).sum()))
-        return Bound(log_best + clues.log_share, one + others + clues.log_share, branch)
+        log_share = sum(clue.log_share for clue in clues)
+        branch = max(net, key=net.__getitem__)
+        rising = log_sum = others = 0.0
+        for group, gain in gains.items():
+            rising += max(0.0, self._free.bests[group] + gain)
+            factor = math.exp(min(LARGEST_EXPONENT, gain))
+            log_sum += view.sums[group] * factor
+            others += math.log1p(self._free.sums[group] * factor)
+        log_best = rising if rising > 0 else net[branch]
+        if max(gains.values()) > LARGEST_EXPONENT:
+            return Bound(log_best + log_share, math.inf, branch)
+        return Bound(log_best + log_share, log(log_sum) + others + log_share, branch)
 
     def _together(
-        self,
-        state: State,
-        closed: int,
-        clues: Unexplained,
-        order: list[int],
-        rest: tuple[float, float],
+        self, state: State, closed: int, clues: list[Unexplained], rest: tuple[float, float]
     ) -> Bound:
         """Bound by clues that have no open cause in common but the unknown mode.
 
@@ -200,21 +209,16 @@ class Bounds:
         may_be_unknown = unknown >= 0 and not closed >> unknown & 1
         hidden = closed | (1 << unknown if may_be_unknown else 0)
         chosen, seen = [], 0
-        for place in order:
-            mask = problem.cause_masks[clues.clues[place]] & ~hidden
+        for clue in clues:
+            mask = problem.cause_masks[clue.clue] & ~hidden
             if not mask & seen:
-                chosen.append(place)
+                chosen.append(clue)
                 seen |= mask
-        rows = clues.causes[chosen]
+        free = [_weights(self._free, clue, unknown) for clue in chosen]
+        charged = _weights(self._view(state.lost), chosen[0], unknown)
+        log_best, mass = _apart([clue.share for clue in chosen], charged, free, rest)
         if may_be_unknown:
-            rows[:, unknown] = False
-        free = _weights(self._free, rows)
-        charged = _weights(self._view(state.lost), rows[:1])
-        shares = [clues.shares[place] for place in chosen]
-        log_best, mass = _apart(shares, charged[0], free, rest)
-        if may_be_unknown:
-            places = [clues.clues[place] for place in chosen]
-            best, more = self._with_unknown(state, places, free)
+            best, more = self._with_unknown(state, [clue.clue for clue in chosen], free)
             log_best, mass = max(log_best, best), mass + more
         return Bound(log_best, log(mass), -1)
 
@@ -234,15 +238,6 @@ class Bounds:
         return log_best, mass
 
 
-def _unrelated(view: View, groups: NDArray[np.bool_], log_share: float) -> Bound:
-    """Bound the sets of groups that change no likelihood."""
-    if not groups.any():
-        return DEAD
-    branch = int(np.where(groups, view.bests, NEVER).argmax())
-    mass = log(float(view.sums[groups].sum()))
-    return Bound(float(view.bests[branch]) + log_share, mass + log_share, branch)
-
-
 def _either(left: Bound, right: Bound) -> Bound:
     better = left if left.log_best >= right.log_best else right
     high, low = max(left.log_mass, right.log_mass), min(left.log_mass, right.log_mass)
@@ -250,10 +245,15 @@ def _either(left: Bound, right: Bound) -> Bound:
     return Bound(better.log_best, mass, better.branch)
 
 
-def _weights(view: View, rows: NDArray[np.bool_]) -> list[tuple[float, float]]:
-    """Return per row of groups the logarithm of the best weight, and the sum of all."""
-    bests = np.where(rows, view.bests, NEVER).max(axis=1)
-    return list(zip(bests.tolist(), (rows @ view.sums).tolist(), strict=True))
+def _weights(view: View, clue: Unexplained, unknown: int) -> tuple[float, float]:
+    """Return the logarithm of the best cause's weight and the sum of all, but the unknown one."""
+    causes = [group for group in clue.causes if group != unknown]
+    best = max([view.bests[group] for group in causes], default=NEVER)
+    return best, sum([view.sums[group] for group in causes])
+
+
+def _tightest_first(tightness: tuple[float, Unexplained]) -> float:
+    return tightness[0]
 
 
 def _apart(
@@ -276,8 +276,3 @@ def _apart(
         mass += before[place] * free[place][1] * after
         after *= shares[place] + free[place][1]
     return log_best, mass + before[-1] * left
-
-
-def _unpacked(mask: int, width: int) -> NDArray[np.bool_]:
-    data = np.frombuffer(mask.to_bytes(width // 8 + 1, "little"), np.uint8)
-    return np.unpackbits(data, count=width, bitorder="little").astype(np.bool_)
