@@ -105,7 +105,7 @@ def test_why_not() -> None:
     found = ask(program, "broken_drive(d2)", want="why_not")
     assert found.answers == ()
     assert list(found.failed[0].lines()) == [
-        "fails: broken_drive(d2)   ",
+        "fails: broken_drive(d2)",
         "  broken_drive(d2)   twin.pl:9",
         "    holds: base(rex)",
         "    holds: start_failed(rex)",

@@ -56,7 +56,7 @@ class Failure:
 
     def lines(self, indent: str = "") -> Iterator[str]:
         """Write it with what is below, a line each."""
-        yield f"{indent}fails: {write(self.goal)}   {self.what}"
+        yield f"{indent}fails: {write(self.goal)}   {self.what}".rstrip()
         for tried in self.tried:
             yield from tried.lines(f"{indent}  ")
 
