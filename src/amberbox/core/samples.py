@@ -345,9 +345,12 @@ class Flow:
         return now - self.began_ns >= round(seconds * NS)
 
     def lost(self, now: Now) -> Any:
-        """Tell whether its publishers are known to be lost, and nothing has come since."""
+        """Tell whether a publisher is known to be lost, and nothing has come since for a second.
+
+        Of several publishers of an item one may be lost while the others go on.
+        """
         since_ns = _held(self.gap_from_ns, now, self.gap_from_ns.values, NONE_OPEN)
-        happened = (since_ns != NONE_OPEN) & (since_ns <= now)
+        happened = (since_ns != NONE_OPEN) & (since_ns <= now - NS)
         return happened & (self.last_received_ns(now) <= since_ns)
 
 

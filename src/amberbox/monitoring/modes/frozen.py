@@ -37,7 +37,7 @@ mappings:
         - output: {name: encoder_moving, type: bool, expected: true}
 arguments:
   for: 2 s
-  while: cmd_vel.linear_x != 0 or cmd_vel.angular_z != 0
+  while: wheel_left.setpoint != 0
   min: -100
   max: 100
 """
@@ -62,7 +62,7 @@ class Config:
         if not 0 <= self.tolerance < inf:
             yield "tolerance", "must not lie below 0"
         if self.should_move is not None and self.should_move.kind not in ("any", "condition"):
-            yield "should_move", "must be a condition, such as cmd_vel.linear_x != 0"
+            yield "should_move", "must be a condition, such as wheel_left.setpoint != 0"
         if not self.min < self.max:
             yield "nothing lies between 'min' and 'max'"
 
