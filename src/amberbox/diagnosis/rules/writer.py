@@ -71,8 +71,8 @@ class _Writer:
             return self._struct(term, most)
         if isinstance(term, str):
             text = self._atom(term)
-            is_operator = most < 999 and max(_priority(term)) > most
-            return f"({text})" if is_operator else text
+            is_operand = most not in (999, 1200)
+            return f"({text})" if is_operand and (term in INFIX or term in PREFIX) else text
         if isinstance(term, Var):
             return self.names(term)
         if isinstance(term, Text):
@@ -121,11 +121,6 @@ class _Writer:
         if inner[0] == "(" or (term.name in "+-" and inner[0].isdigit()):
             text = f"{term.name} {inner}"
         return f"({text})" if operator.priority > most else text
-
-
-def _priority(name: str) -> tuple[int, int]:
-    infix, prefix = INFIX.get(name), PREFIX.get(name)
-    return infix.priority if infix else 0, prefix.priority if prefix else 0
 
 
 def _glued(left: str, right: str) -> str:
