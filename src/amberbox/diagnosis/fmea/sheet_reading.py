@@ -197,7 +197,8 @@ class _Content:
             if name not in self._types
         }
         content: dict[str, Any] = {"types": self._types}
-        if any("o" in m.get("ranks", {}) and "rate" not in m for m in self._modes()):
+        known = {"rate", "probability"}
+        if any("o" in m.get("ranks", {}) and not known & m.keys() for m in self._modes()):
             content = {"scales": {"occurrence": _OCCURRENCE}, **content}
             what = "O is taken for failures per hour in powers of ten: put your own into 'scales'"
             self._tell(1, "O", what, is_error=False)
