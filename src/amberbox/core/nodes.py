@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TypeAlias
@@ -90,7 +91,7 @@ def load_yaml(path: Path, problems: list[Problem], name: str = "") -> Node | Non
 def parse_yaml(text: str, file: str, problems: list[Problem]) -> Node | None:
     """Turn YAML text into a tree; None and a problem if its syntax is wrong."""
     try:
-        root = yaml.compose(text, Loader=yaml.BaseLoader)
+        root = _compose(text)
     except yaml.MarkedYAMLError as error:
         problems.append(_syntax_problem(error, file))
     except yaml.reader.ReaderError as error:
@@ -102,6 +103,17 @@ def parse_yaml(text: str, file: str, problems: list[Problem]) -> Node | None:
     else:
         return _tree(root, file, problems)
     return None
+
+
+def _compose(text: str) -> yaml.Node | None:
+    """Parse with libyaml, ten times as fast, where it gives the same: no error, one byte a sign."""
+    fast = getattr(yaml, "CBaseLoader", None)
+    if fast is not None and text.isascii():
+        with suppress(yaml.YAMLError):  # the other one says it in words that people understand
+            quick: yaml.Node | None = yaml.compose(text, Loader=fast)
+            return quick
+    root: yaml.Node | None = yaml.compose(text, Loader=yaml.BaseLoader)
+    return root
 
 
 def _tree(root: yaml.Node | None, file: str, problems: list[Problem]) -> Node | None:
@@ -164,7 +176,7 @@ class _Reader:
 
     def _convert(self, raw: yaml.Node, depth: int, line: int, span: tuple[int, int]) -> Node:
         if isinstance(raw, yaml.ScalarNode):
-            value = scalar(raw.value) if raw.style is None else raw.value
+            value = scalar(raw.value) if not raw.style else raw.value
             return Node(self.file, line, value, raw.value, span)
         if isinstance(raw, yaml.MappingNode):
             return Node(self.file, line, self._mapping(raw, depth), "", span)
@@ -179,7 +191,7 @@ class _Reader:
             if not isinstance(key, yaml.ScalarNode):
                 what = "a key must be a word"
                 self.problems.append(Problem(self.file, line, "syntax", what))
-            elif key.value == "<<" and key.style is None:
+            elif key.value == "<<" and not key.style:
                 merged = dict(_merged(self.node(value, depth + 1))) | merged
             elif key.value in entries:
                 what = f"the key is given twice, first in line {entries[key.value].line}"
