@@ -10,9 +10,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from itertools import accumulate
 from operator import mul
+from typing import NamedTuple
 
 import numpy as np
 
@@ -30,8 +30,7 @@ SMALLEST = -1000.0
 """The logarithm of the least share that a clue counts with: gains must stay finite."""
 
 
-@dataclass(frozen=True, slots=True)
-class Bound:
+class Bound(NamedTuple):
     """What the sets beyond a state can reach at most.
 
     ``log_best`` is the logarithm of the best set's weight, ``log_mass`` that of all together.
@@ -46,6 +45,13 @@ class Bound:
 DEAD = Bound(NEVER, NEVER, -1)
 
 
+class Causes(NamedTuple):
+    """The open causes of a clue; equal ones have the same number."""
+
+    number: int
+    groups: Sequence[int]
+
+
 class View:
     """What adding one more group weighs while certain functions are lost.
 
@@ -53,16 +59,28 @@ class View:
     all members, with what the functions cost that this member alone would lose.
     """
 
-    __slots__ = ("_order", "bests", "sums", "total")
+    __slots__ = ("_known", "_order", "bests", "sums", "total")
 
     def __init__(self, log_bests: Floats, log_sums: Floats) -> None:
         self.bests: list[float] = log_bests.tolist()
         self.sums: list[float] = np.exp(log_sums).tolist()
         self.total = sum(self.sums)
-        self._order: list[int] = np.argsort(-log_bests, kind="stable").tolist()
+        self._order: list[int] | None = None
+        self._known: dict[int, tuple[float, float]] = {}
+
+    def of(self, causes: Causes) -> tuple[float, float]:
+        """Return the logarithm of the best weight among causes, and the sum of all."""
+        known = self._known.get(causes.number)
+        if known is None:
+            best = max([self.bests[group] for group in causes.groups], default=NEVER)
+            known = best, sum([self.sums[group] for group in causes.groups])
+            self._known[causes.number] = known
+        return known
 
     def unrelated(self, hidden: int, log_share: float) -> Bound:
         """Bound the sets of groups that are not hidden; they change no likelihood."""
+        if self._order is None:
+            self._order = sorted(range(len(self.bests)), key=self.bests.__getitem__, reverse=True)
         branch = next((group for group in self._order if not hidden >> group & 1), -1)
         if branch < 0:
             return DEAD
@@ -72,14 +90,13 @@ class View:
         return Bound(self.bests[branch] + log_share, mass, branch)
 
 
-@dataclass(frozen=True, slots=True)
-class Unexplained:
+class Unexplained(NamedTuple):
     """A clue far from its limit: the share of it that it has now, and its open causes."""
 
     clue: int
     share: float
     log_share: float
-    causes: Sequence[int]
+    causes: Causes
 
 
 class Bounds:
@@ -89,6 +106,7 @@ class Bounds:
         self._problem = problem
         self._views: dict[int, View] = {}
         self._free = View(problem.log_bests, problem.log_sums)
+        self._open: dict[tuple[int, int], Causes] = {}
 
     def beyond(self, state: State, closed: int) -> Bound:
         """Bound all sets that add one or more members of groups that are not closed.
@@ -131,13 +149,19 @@ class Bounds:
                 top += problem.log_limits[place]
                 share = value / problem.limits[place]
                 if share < FAR:
-                    causes: Sequence[int] = problem.causes[place]
-                    if mask & closed:
-                        causes = [group for group in causes if not closed >> group & 1]
+                    causes = self._open_causes(place, closed)
                     clues.append(Unexplained(place, share, max(SMALLEST, log(share)), causes))
             else:
                 top += log(value)
         return top, clues
+
+    def _open_causes(self, clue: int, closed: int) -> Causes:
+        key = (clue, closed & self._problem.cause_masks[clue])
+        known = self._open.get(key)
+        if known is None:
+            groups = [group for group in self._problem.causes[clue] if not closed >> group & 1]
+            known = self._open[key] = Causes(len(self._open), groups)
+        return known
 
     def _explaining(self, state: State, closed: int, clues: list[Unexplained]) -> Bound:
         """Bound the sets that have a cause of clues that are not explained yet.
@@ -149,19 +173,19 @@ class Bounds:
         view = self._view(state.lost)
         gains: dict[int, float] = {}
         for clue in clues:
-            for group in clue.causes:
+            for group in clue.causes.groups:
                 gains[group] = gains.get(group, 0.0) - clue.log_share
         best = max(view.bests[group] for group in gains)
         left = sum(view.sums[group] for group in gains)
         tightest, among, mass = math.inf, None, left
         order: list[tuple[float, Unexplained]] = []
         for clue in clues:
-            cause = max([view.bests[group] for group in clue.causes])
+            cause, weight = view.of(clue.causes)
             without = clue.log_share + best
-            mass = min(mass, sum([view.sums[g] for g in clue.causes]) + clue.share * left)
+            mass = min(mass, weight + clue.share * left)
             order.append((max(cause, without), clue))
             if order[-1][0] < tightest:
-                tightest, among = order[-1][0], clue.causes if cause >= without else None
+                tightest, among = order[-1][0], clue.causes.groups if cause >= without else None
         net = {group: view.bests[group] + gain for group, gain in gains.items()}
         result = Bound(tightest, log(mass), max(among or net, key=net.__getitem__))
         if len(clues) == 1:
@@ -214,8 +238,9 @@ class Bounds:
             if not mask & seen:
                 chosen.append(clue)
                 seen |= mask
-        free = [_weights(self._free, clue, unknown) for clue in chosen]
-        charged = _weights(self._view(state.lost), chosen[0], unknown)
+        causes = [self._open_causes(clue.clue, hidden) for clue in chosen]
+        free = [self._free.of(of) for of in causes]
+        charged = self._view(state.lost).of(causes[0])
         log_best, mass = _apart([clue.share for clue in chosen], charged, free, rest)
         if may_be_unknown:
             best, more = self._with_unknown(state, [clue.clue for clue in chosen], free)
@@ -243,13 +268,6 @@ def _either(left: Bound, right: Bound) -> Bound:
     high, low = max(left.log_mass, right.log_mass), min(left.log_mass, right.log_mass)
     mass = high if low == NEVER else high + math.log1p(math.exp(low - high))
     return Bound(better.log_best, mass, better.branch)
-
-
-def _weights(view: View, clue: Unexplained, unknown: int) -> tuple[float, float]:
-    """Return the logarithm of the best cause's weight and the sum of all, but the unknown one."""
-    causes = [group for group in clue.causes if group != unknown]
-    best = max([view.bests[group] for group in causes], default=NEVER)
-    return best, sum([view.sums[group] for group in causes])
 
 
 def _tightest_first(tightness: tuple[float, Unexplained]) -> float:

@@ -12,6 +12,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import combinations, count
+from typing import NamedTuple
 
 from amberbox.diagnosis.covering.bounds import Bound, Bounds
 from amberbox.diagnosis.covering.budget import Budget
@@ -52,15 +53,13 @@ class _Sum:
         self.running += value
 
 
-@dataclass(frozen=True, slots=True)
-class _Node:
+class _Node(NamedTuple):
     state: State
     closed: int
     bound: Bound
 
 
-@dataclass(frozen=True, slots=True)
-class _Members:
+class _Members(NamedTuple):
     """The sets of one state that have not come up yet, the best first.
 
     ``ways`` are (weight of the members chosen, their modes), ``log_base`` the rest of the score.
@@ -138,7 +137,7 @@ class _Search:
         self.waiting -= _exp(best.bound.log_mass - self.reference)
         group = best.bound.branch
         more = with_one_more(self.problem, best.state, group)
-        full = more.count(group) == len(self.problem.groups[group])
+        full = more.members(group) == len(self.problem.groups[group])
         if more.log_best > NEVER:
             self.reach(more)
             self.push_within(best.bound, more, best.closed | (1 << group if full else 0))

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from amberbox.diagnosis.covering.gates import bits
 from amberbox.diagnosis.covering.problem import Problem, log
 
 
-@dataclass(frozen=True, slots=True)
-class State:
+class State(NamedTuple):
     """So many members of each group are faulty, and nothing else.
 
     ``misses[k]`` is q of clue k. ``log_best`` is the weight of the most probable choice of
@@ -23,7 +22,7 @@ class State:
     log_best: float
     log_sum: float
 
-    def count(self, group: int) -> int:
+    def members(self, group: int) -> int:
         """Return how many members of a group are faulty."""
         return next((count for number, count in self.counts if number == group), 0)
 
@@ -35,7 +34,7 @@ def nothing(problem: Problem) -> State:
 
 def with_one_more(problem: Problem, state: State, number: int) -> State:
     """Return the state with one more member of a group faulty."""
-    group, count = problem.groups[number], state.count(number)
+    group, count = problem.groups[number], state.members(number)
     others = tuple(pair for pair in state.counts if pair[0] != number)
     misses = list(state.misses)
     for clue, miss in group.hits:
