@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import shutil
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from amberbox.blackbox.folder.folder import (
 )
 from amberbox.blackbox.folder.plan import PlannedItem, planned_items
 from amberbox.blackbox.folder.triggers import trigger_problems
+from amberbox.cli._plantext import in_full, in_short
 from amberbox.cli._text import in_columns
 from amberbox.core.config import load_yaml
 from amberbox.core.errors import ConfigurationError, Problem
@@ -25,6 +27,9 @@ from amberbox.monitoring.configuration.tree import FOLDER as COMPONENTS
 from amberbox.monitoring.plan import Plan
 from amberbox.monitoring.ruletests.files import find_rules
 from amberbox.monitoring.ruletests.running import run_rules
+
+_WIDTH = 100
+"""Columns of the output where there is no terminal."""
 
 _FEW_MODES = 20
 """So many modes are listed one by one without being asked for."""
@@ -118,8 +123,9 @@ def _monitored(plan: Plan | None, each_mode: bool) -> list[str]:
         return []
     actions = list(summary.actions(plan))
     shown = ["recovery actions, not carried out:", *in_columns(actions), ""] if actions else []
-    is_short = each_mode or len(plan.modes()) <= _FEW_MODES
-    table = in_columns(summary.table(plan) if is_short else summary.short_table(plan))
+    width = shutil.get_terminal_size((_WIDTH, 0)).columns
+    each_mode = each_mode or len(plan.modes()) <= _FEW_MODES
+    table = in_full(plan, width) if each_mode else in_short(plan, width)
     return [f"would monitor: {summary.in_words(plan)}", *table, "", *shown]
 
 

@@ -54,19 +54,6 @@ def in_words(plan: Plan) -> str:
     return ", ".join(parts)
 
 
-def table(plan: Plan) -> Iterator[tuple[str, ...]]:
-    """Yield a line for each mode, and for each component that has none."""
-    yield "component", "mode", "monitor", "needs", "outputs"
-    for component in plan.components:
-        needs = " ".join(dict.fromkeys(edge.name for edge in component.dependencies)) or "-"
-        if not component.modes:
-            yield component.id, "-", "none", needs, "-"
-        for number, mode in enumerate(component.modes):
-            own = (component.id, needs) if number == 0 else ("", "")
-            shown = " ".join(output.name for output in outputs_of(mode)) or "-"
-            yield own[0], mode.id, monitor_of(mode), own[1], shown
-
-
 def short_table(plan: Plan) -> Iterator[tuple[str, ...]]:
     """Yield a line for each component."""
     yield "component", "modes", "outputs", "needs"
