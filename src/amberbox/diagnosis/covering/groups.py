@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
 from amberbox.core.types import Hypothesis
@@ -50,20 +50,20 @@ def grouped(
         alike.setdefault(key, []).append(hypothesis)
     groups = sorted(map(_group, alike.values()), key=lambda group: -group.probability)
     members = {name: g.members for g in groups for name in (*g.members, *g.wider)}
-    filled = tuple(replace(h, ambiguity=_others(h.id, members)) for h in hypotheses)
-    return filled, tuple(groups)
+    return tuple(_filled(h, members[h.id]) for h in hypotheses), tuple(groups)
 
 
-def _others(name: str, members: Mapping[str, tuple[str, ...]]) -> tuple[str, ...]:
-    return tuple(other for other in members[name] if other != name)
+def _filled(hypothesis: Hypothesis, members: Sequence[str]) -> Hypothesis:
+    others = tuple(name for name in members if name != hypothesis.id)
+    return replace(hypothesis, ambiguity=others) if others else hypothesis
 
 
 def _group(alike: Sequence[Hypothesis]) -> AmbiguityGroup:
-    smallest = [h for h in alike if not any(other.faults < h.faults for other in alike)]
-    wider = [h for h in alike if h not in smallest]
+    wider = {h.id for h in alike if any(other.faults < h.faults for other in alike)}
+    members = tuple(h.id for h in alike if h.id not in wider)
     return AmbiguityGroup(
-        smallest[0].id,
-        tuple(h.id for h in smallest),
-        tuple(h.id for h in wider),
+        members[0],
+        members,
+        tuple(h.id for h in alike if h.id in wider),
         sum(h.probability for h in alike),
     )

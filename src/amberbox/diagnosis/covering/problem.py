@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,18 +33,19 @@ class Group:
     __slots__ = ("_sums", "component", "hits", "log_best", "modes", "weights")
 
     def __init__(
-        self,
-        modes: Sequence[tuple[float, int]],
-        hits: Hits,
-        component: int,
+        self, modes: list[int], log_weights: Sequence[float], hits: Hits, component: int
     ) -> None:
-        ordered = sorted(modes, key=_likely_first) if len(modes) > 1 else modes
+        if len(modes) > 1:
+            modes.sort(key=lambda mode: (-log_weights[mode], mode))
+        self.modes = modes
+        self.weights = [log_weights[mode] for mode in modes]
         self.hits = hits
         self.component = component
-        self.modes = [mode for _, mode in ordered]
-        self.weights = [weight for weight, _ in ordered]
-        self.log_best = self.weights[0]
-        self._sums = [0.0, self.log_best] if len(modes) == 1 else [0.0]
+        self.log_best = best = self.weights[0]
+        first = best
+        if len(modes) > 1:
+            first += math.log(sum([math.exp(weight - best) for weight in self.weights]))
+        self._sums = [0.0, first]
 
     def __len__(self) -> int:
         return len(self.modes)
@@ -65,10 +65,6 @@ class Group:
             for k in range(count, 0, -1):
                 sums[k] += sums[k - 1] * ratio
         self._sums.append(log(sums[count]) + count * self.log_best)
-
-
-def _likely_first(weighted: tuple[float, int]) -> tuple[float, int]:
-    return (-weighted[0], weighted[1])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -207,21 +203,20 @@ def _groups(
     hits: Mapping[int, Sequence[tuple[int, float]]],
     components: int,
 ) -> Iterator[Group]:
+    """Yield the modes that clues see by what they do, and the others by their component."""
     weights = log_weight.tolist()
-    found: dict[object, tuple[list[tuple[float, int]], Hits, int]] = {}
-    downed = chain.from_iterable(tables.modes_of[place] for place in bits(components))
-    for mode in dict.fromkeys(chain(hits, downed)):
-        if weights[mode] == NEVER:
-            continue
+    found: dict[tuple[int, Hits, bool], list[int]] = {}
+    for mode, seen in hits.items():
         place = tables.component[mode]
         component = place if place >= 0 and components >> place & 1 else -1
-        hit = _merged(hits[mode]) if mode in hits else ()
-        key = (component, hit, mode == tables.unknown)
-        if key not in found:
-            found[key] = ([], hit, component)
-        found[key][0].append((weights[mode], mode))
-    for modes, hit, component in found.values():
-        yield Group(modes, hit, component)
+        found.setdefault((component, _merged(seen), mode == tables.unknown), []).append(mode)
+    for (component, hit, _), modes in found.items():
+        yield Group(modes, weights, hit, component)
+    for component in bits(components):
+        of = tables.modes_of[component]
+        modes = [mode for mode in of if mode not in hits and weights[mode] > NEVER]
+        if modes:
+            yield Group(modes, weights, (), component)
 
 
 def _merged(hits: Sequence[tuple[int, float]]) -> Hits:
