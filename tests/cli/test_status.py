@@ -200,6 +200,25 @@ def test_nothing_is_green_when_the_watcher_is_silent(
     assert shown.err == f"hint: amberbox watch {store} judges what is recorded\n"
 
 
+@pytest.mark.parametrize(
+    ("level", "state", "code"),
+    [
+        ("warn", "memory", 0),
+        ("unknown", "not_monitored", 0),
+        ("stale", "stale", 1),
+        ("unknown", "unknown", 1),
+        ("unknown", "not_initialised", 1),
+    ],
+)
+def test_what_is_not_known_to_work_is_not_well(
+    store: Path, level: Level, state: str, code: int
+) -> None:
+    say(store, *statuses(level=level, state=state))
+    assert main(["status", str(store)]) == code
+    assert main(["status", str(store), "navigation"]) == code
+    assert main(["status", str(store), "laser"]) == 0, "the others do not matter"
+
+
 def test_store_that_was_never_watched(store: Path, capsys: pytest.CaptureFixture[str]) -> None:
     FakeRun(store).close()
     assert main(["status", str(store)]) == 1

@@ -51,7 +51,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print what is known; 1 if anything is in error, or the watcher says nothing."""
+    """Print what is known; 1 if anything is not ok or warn, or the watcher says nothing."""
     if args.wait is not None:
         return _wait(args, parse_duration_s(args.wait))
     plan = _plan_of(args.where)
@@ -60,7 +60,7 @@ def run(args: argparse.Namespace) -> int:
         return _watch(reader, args, plan)
     board = _read(reader, args, plan)
     _show(board, args, plan)
-    return _verdict(board)
+    return _verdict(board, args.component)
 
 
 def _watch(reader: BoardReader, args: argparse.Namespace, plan: Plan | None) -> int:
@@ -74,7 +74,7 @@ def _watch(reader: BoardReader, args: argparse.Namespace, plan: Plan | None) -> 
         try:
             time.sleep(_PERIOD_S)
         except KeyboardInterrupt:
-            return _verdict(board)
+            return _verdict(board, args.component)
 
 
 def _read(reader: BoardReader, args: argparse.Namespace, plan: Plan | None) -> Board:
@@ -97,8 +97,16 @@ def _only(board: Board, statuses: Sequence[Status]) -> Board:
     return Board(statuses, alarms, board.measured_ns, board.silence)
 
 
-def _verdict(board: Board) -> int:
-    return int(bool(board.silence) or any(status.level == "error" for status in board.statuses))
+def _verdict(board: Board, component: str | None) -> int:
+    """Return 0 if nothing is in error, and every component that is meant is known to work."""
+    meant = [s for s in board.statuses if component in (None, s.component)]
+    well = all(_is_well(status) for status in meant if not status.mode)
+    in_error = any(status.level == "error" for status in meant)
+    return int(bool(board.silence) or in_error or not well)
+
+
+def _is_well(status: Status) -> bool:
+    return status.level in ("ok", "warn") or status.state == "not_monitored"
 
 
 def _show(board: Board, args: argparse.Namespace, plan: Plan | None) -> None:
