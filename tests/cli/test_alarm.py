@@ -97,6 +97,12 @@ def test_what_a_person_says_is_left_for_the_watcher(
     ]  # fmt: skip
 
 
+def test_a_component_stands_for_its_alarm(store: Path) -> None:
+    assert main(["alarm", str(store), "ack", "laser"]) == 0
+    (request,) = pending(open_store(store))
+    assert request.values["id"] == LASER
+
+
 def test_the_user_says_it_and_programs_hear_so(
     store: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -117,6 +123,7 @@ def test_the_user_says_it_and_programs_hear_so(
         (["list", LASER], "takes no more words"),
         (["ack", "laser-2026"], f"did you mean '{LASER}'"),
         (["ack", BASE], "has healed"),
+        (["ack", "lasr"], "did you mean 'laser'"),
         (["ack", LASER, "--for", "2h"], "--for goes with shelve"),
         (["shelve", LASER], "shelved for some time"),
         (["shelve", LASER, "--for", "10ms"], "too short"),

@@ -34,7 +34,13 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
     parser.usage = _USAGE
     parser.add_argument("where", metavar="WHERE", help="robot folder or store")
-    parser.add_argument("words", nargs="*", metavar="ACTION", help="list, ack, shelve or unshelve")
+    parser.add_argument(
+        "words",
+        nargs="*",
+        metavar="ACTION",
+        help="list, ack, shelve or unshelve; "
+        "the last three with the ID of an alarm, or with its component",
+    )
     parser.add_argument("--all", action="store_true", help="list those that have healed, too")
     parser.add_argument("--for", dest="for_", metavar="TIME", help="how long it is shelved: 2h")
     parser.add_argument("--who", default="", metavar="NAME", help="who says so; else the user")
@@ -50,7 +56,7 @@ def run(args: argparse.Namespace) -> int:
     if args.for_ is not None and action != "shelve":
         raise UsageError("--for goes with shelve", _USAGE)
     if len(rest) != (action != "list"):
-        wanted = "no more words" if action == "list" else "the ID of one alarm"
+        wanted = "no more words" if action == "list" else "the ID of one alarm, or its component"
         raise UsageError(f"alarm {action} takes {wanted}", _USAGE)
     _ACTIONS[action](args, *rest)
     return 0
@@ -113,7 +119,7 @@ def _request(
     args: argparse.Namespace, alarm_id: str, action: str, told: str, until_ns: int | None = None
 ) -> None:
     """Leave a request about an alarm that lasts; raises UsageError if there is none like that."""
-    _check(newest(args.where), alarm_id, action)
+    alarm_id = _check(newest(args.where), alarm_id, action, args.where)
     store = open_store(store_path(args.where))
     values = {
         "id": alarm_id,
@@ -131,15 +137,20 @@ def _request(
     print(f"{alarm_id} will be {told}{later}")
 
 
-def _check(rows: Sequence[Row], alarm_id: str, action: str) -> None:
+def _check(rows: Sequence[Row], name: str, action: str, where: str) -> str:
+    """Return the id of the alarm that lasts and has this id, or is of this component."""
     lasting = {row["id"]: row for row in rows if row["state"] != "healed"}
-    hint = "amberbox alarm WHERE list shows them"
+    of = {row["component"]: row["id"] for row in lasting.values()}
+    alarm_id = name if name in lasting else of.get(name, name)
+    hint = f"amberbox alarm {where} list shows them"
     if alarm_id not in lasting:
-        healed = any(row["id"] == alarm_id for row in rows)
-        what = f"the alarm '{alarm_id}' has healed" if healed else f"there is no alarm '{alarm_id}'"
-        raise UsageError(what + ("" if healed else did_you_mean(alarm_id, lasting)), hint)
+        healed = any(row["id"] == name for row in rows)
+        what = f"the alarm '{name}' has healed" if healed else f"there is no alarm '{name}'"
+        near = "" if healed else did_you_mean(name, lasting) or did_you_mean(name, of)
+        raise UsageError(what + near, hint)
     if action == "unshelve" and lasting[alarm_id]["state"] != "shelved":
         raise UsageError(f"the alarm '{alarm_id}' is not shelved", hint)
+    return alarm_id
 
 
 def _user() -> str:
