@@ -183,7 +183,7 @@ def watching(folder: Path) -> subprocess.Popen[str]:
         [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
     )
     assert process.stdout is not None
-    assert "watching robot: 1 components, 1 modes" in process.stdout.readline()
+    assert "watching robot: 1 component, 1 mode, " in process.stdout.readline()
     return process
 
 

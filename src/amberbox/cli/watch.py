@@ -88,6 +88,7 @@ def _plan(folder: RobotFolder) -> Plan:
 
 def _live(args: argparse.Namespace, plan: Plan, folder: RobotFolder) -> int:
     from amberbox.blackbox.store import create_store
+    from amberbox.monitoring.configuration.summary import in_words
     from amberbox.monitoring.watcher.watcher import Watch, Watcher
 
     if args.folder is not None and Path(args.where) != folder.path:
@@ -100,8 +101,7 @@ def _live(args: argparse.Namespace, plan: Plan, folder: RobotFolder) -> int:
 
     watcher = Watcher(Watch(plan, create_store(folder.store_path), folder), hear)
     if not args.quiet and not args.json:
-        modes = len(plan.modes())
-        print(f"watching {plan.robot}: {len(plan.components)} components, {modes} modes")
+        print(f"watching {plan.robot}: {in_words(plan)}", flush=True)
     with _stoppable() as stop:
         watcher.run(stop)
     return 0
@@ -129,9 +129,21 @@ def _replay(args: argparse.Namespace, plan: Plan) -> int:
 
     say = _sayer(args)
     with _record(args.where) as store, _stoppable() as stop:
-        for finding in replay(plan, store, _part(args, store), stop):
+        part = _part(args, store)
+        if part.from_ns is not None and not args.json:
+            _tell_lead(plan)
+        for finding in replay(plan, store, part, stop):
             say(finding)
     return 0
+
+
+def _tell_lead(plan: Plan) -> None:
+    """Say why it takes a while until the first finding of a part comes."""
+    from amberbox.monitoring.engine.engine import Engine
+    from amberbox.monitoring.watcher.replay import WARM_UP_S
+
+    minutes = (WARM_UP_S + Engine(plan).history_s) / 60
+    tell([f"monitors look back: begins {minutes:.0f} min before --from, if there is a record"])
 
 
 @contextmanager
