@@ -15,6 +15,8 @@ from amberbox.diagnosis.rules.faults import StopFault
 from amberbox.diagnosis.rules.terms import Env, Key, Slot, is_atomic
 
 _EVERY = 1024
+_SELDOM = 64 * _EVERY
+_MOST_ROWS = 2_000_000
 
 
 @dataclass
@@ -35,8 +37,11 @@ class Database:
         for group in groups:
             if group[0] not in self.relations:
                 self._fill(group, graph)
-        found = Relation()
-        self._run(query, plan(query, self.relations), found, [])
+        found = self.relations[query.key] = Relation()
+        try:
+            self._run(query, plan(query, self.relations), found, [])
+        finally:
+            del self.relations[query.key]
         return found
 
     def plan(self, query: Rule) -> tuple[dict[Key, list[Key]], list[list[Key]]]:
@@ -153,6 +158,10 @@ class Database:
         return found
 
     def _check(self) -> None:
+        if not self.steps % _SELDOM:
+            rows = sum(len(relation.rows) for relation in self.relations.values())
+            if rows > _MOST_ROWS:
+                raise StopFault(f"stopped after {self.steps:,} steps for want of memory")
         if self.steps > self.limit.steps:
             raise StopFault(f"stopped after {self.steps:,} steps")
         if self.limit.is_over():
