@@ -37,6 +37,7 @@ class Machine:
         self.trace: Trace = None
         self.steps = 0
         self.charged = 0
+        self.check_at = _EVERY
         self.solved = False
         self.goal: Goal | None = None
         self.frame: Frame | None = None
@@ -64,25 +65,22 @@ class Machine:
 
     def _run(self, frame: Frame | None) -> bool:
         steps = self.steps
+        check_at = self.check_at
         while True:
+            steps += 1
+            if steps >= check_at:
+                self.check_at = check_at = steps + _EVERY
+                self.steps = steps
+                self._check(0 if frame is None else frame[4])
             if frame is None:
-                if self.solved:
-                    self.solved = False
+                if self.solved or not self.choices:
                     self.steps = steps
-                    return True
-                if not self.choices:
-                    self.steps = steps
-                    return False
+                    found, self.solved = self.solved, False
+                    return found
                 frame = self._retry()
-                steps += 1
-                if frame is None:
-                    continue
+                continue
             goal, env, cut, up, depth = frame
             self.goal = goal
-            steps += 1
-            if not steps % _EVERY:
-                self.steps = steps
-                self._check(depth)
             follows = goal.next
             after = up if follows is None else (follows, env, cut, up, depth)
             frame = goal.op(self, goal, env, cut, after)
