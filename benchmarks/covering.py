@@ -21,7 +21,15 @@ from typing import Any
 from amberbox.core.needs import Needs, all_of, any_of
 from amberbox.diagnosis.covering.answer import Answer, diagnose
 from amberbox.diagnosis.covering.evidence import Evidence, Observation
-from amberbox.diagnosis.covering.model import Function, Link, Mode, Model, Sign, Unknown
+from amberbox.diagnosis.covering.model import (
+    UNKNOWN,
+    Function,
+    Link,
+    Mode,
+    Model,
+    Sign,
+    Unknown,
+)
 from amberbox.diagnosis.covering.next_test import next_tests, with_answer
 from amberbox.diagnosis.covering.prediction import predict
 from benchmarks.common import Row, percentile
@@ -153,14 +161,16 @@ def _accuracy(name: str, model: Model, outcomes: Sequence[Outcome]) -> Iterator[
         tested = [_with_tests(model, o) for o in of]
         right = [_in_groups(t[0], o.case.faults, 1) for o, t in zip(of, tested, strict=True)]
         sizes = [len(o.answer.groups[0].members) for o in of]
+        other = [UNKNOWN in o.answer.hypotheses[0].faults for o in of]
         tests = statistics.mean(number for _, number in tested)
         what = f"{name}: {count} fault{'s' * (count > 1)}"
         exact = f"{what}, exact set in the first"
         note = f"of {len(of)} cases in which each fault shows something that is read"
-        yield Row(f"{exact} group", 100 * statistics.mean(first), "%", note=note)
-        yield Row(f"{exact} five groups", 100 * statistics.mean(five), "%")
+        yield Row(f"{exact} group", 100 * statistics.fmean(first), "%", note=note)
+        note = f"{100 * statistics.fmean(other):.0f} % begin with something not in the FMEA"
+        yield Row(f"{exact} five groups", 100 * statistics.fmean(five), "%", note=note)
         note = f"{tests:.1f} tests on average, at most {TESTS}"
-        yield Row(f"{exact} group after tests", 100 * statistics.mean(right), "%", note=note)
+        yield Row(f"{exact} group after tests", 100 * statistics.fmean(right), "%", note=note)
         note = f"largest {max(sizes)}"
         yield Row(f"{what}, mean size of the first group", statistics.mean(sizes), "", note=note)
 

@@ -164,6 +164,14 @@ def test_a_budget_of_nodes_ends_with_incomplete() -> None:
     assert 0 < answer.mass_covered < 1
 
 
+def test_the_best_that_was_reached_is_listed_when_a_budget_ends_the_search() -> None:
+    model, seen = _robot()
+    cut = diagnose(model, seen, budget=Budget(nodes=2))
+    assert cut.incomplete and len(cut.hypotheses) == 3
+    shares = [hypothesis.probability for hypothesis in cut.hypotheses]
+    assert shares == sorted(shares, reverse=True) and sum(shares) == pytest.approx(1.0)
+
+
 def test_a_deadline_ends_with_incomplete() -> None:
     model, seen = _robot()
     asked = iter([False, False, True])

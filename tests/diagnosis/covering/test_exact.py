@@ -44,8 +44,8 @@ def test_bounds_hold_however_early_the_search_ends(seed: int) -> None:
     exact = restricted(posterior(model, evidence), named(h.faults for h in full.hypotheses))
     for nodes in (0, 1, 3, 10, 30):
         answer = diagnose(model, evidence, max_hypotheses=5000, mass=2.0, budget=Budget(nodes))
-        for place, hypothesis in enumerate(answer.hypotheses):
+        assert answer.incomplete or answer.mass_covered == 1.0 or not exact
+        for hypothesis in answer.hypotheses:
             share = exact[hypothesis.faults]
             assert share <= hypothesis.probability * (1 + TOLERANCE)
             assert share >= hypothesis.probability * answer.mass_covered * (1 - TOLERANCE)
-            assert share == pytest.approx(sorted(exact.values())[-1 - place], abs=TOLERANCE)

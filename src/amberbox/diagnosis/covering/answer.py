@@ -48,8 +48,9 @@ def diagnose(
 
     The search ends when the hypotheses listed hold at least ``mass`` of all probability, when
     ``max_hypotheses`` are listed, or when the budget is used up (then ``incomplete`` says so).
-    What is listed is exact and in order. Raises UsageError for a conflict or an answer that
-    names what the model does not have.
+    What is listed is exact and in order, unless the budget ended the search: then it is the best
+    that was found, and better ones may hide in what is not covered. Raises UsageError for a
+    conflict or an answer that names what the model does not have.
     """
     problem = problem_of(model.tables, folded(model, evidence))
     found = search(problem, max_hypotheses, mass, budget or Budget())

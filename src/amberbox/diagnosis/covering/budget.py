@@ -13,10 +13,10 @@ def never() -> bool:
 
 @dataclass(frozen=True, slots=True)
 class Budget:
-    """The most nodes that are opened (about 2 kB each), and whether time is up.
+    """The most nodes that are opened (a few kB and 0.1 to 1 ms each), and whether time is up.
 
     ``deadline`` is asked at every node and returns True when the caller wants an end.
     """
 
-    nodes: int = 20_000
+    nodes: int = 2_000
     deadline: Callable[[], bool] = never

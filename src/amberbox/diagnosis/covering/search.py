@@ -29,6 +29,8 @@ from amberbox.diagnosis.covering.state import (
 class Found:
     """Sets of modes (by place) with their probabilities, from likely to unlikely.
 
+    When a budget ended the search, they are the best that were reached: better ones may wait.
+
     Probabilities are shares of what was enumerated, ``covered`` is the least share that this
     is of everything. ``incomplete`` says which budget ended the search.
     """
@@ -122,14 +124,27 @@ class _Search:
     def step(self) -> None:
         """Take what is best: list it if it is a set of faults, split it if it is a node."""
         minus_score, _, best = heapq.heappop(self.heap)
+        if isinstance(best, _Node):
+            self.split(best)
+        else:
+            self.list_from(best, -minus_score)
+
+    def list_from(self, best: State | _Members, score: float) -> None:
+        """List the best set of a state, or the next best."""
         if isinstance(best, State):
             ways = _ways(self.problem.groups, best.counts, self.most)
             first = next(ways)
-            self.list_best(_Members(first, ways, -minus_score - first[0]))
-        elif isinstance(best, _Members):
-            self.list_best(best)
-        else:
-            self.split(best)
+            best = _Members(first, ways, score - first[0])
+        self.list_best(best)
+
+    def list_reached(self) -> None:
+        """List the best of what was reached, though nodes that wait may hold better."""
+        nodes = [entry for entry in self.heap if isinstance(entry[2], _Node)]
+        self.heap = [entry for entry in self.heap if not isinstance(entry[2], _Node)]
+        heapq.heapify(self.heap)
+        while self.heap and len(self.found) < self.most:
+            self.step()
+        self.heap += nodes
 
     def split(self, best: _Node) -> None:
         """Add one more member of the group to decide, and do not."""
@@ -148,6 +163,12 @@ class _Search:
         own = self.bounds.beyond(state, closed)
         log_best, log_mass = min(outer.log_best, own.log_best), min(outer.log_mass, own.log_mass)
         self.push_node(_Node(state, closed, Bound(log_best, log_mass, own.branch)))
+
+    def exhausted(self, budget: Budget) -> str:
+        """Say which budget keeps the search from taking what is best, if one does."""
+        if self.opened >= budget.nodes and isinstance(self.heap[0][2], _Node):
+            return f"more than {budget.nodes:,} nodes"
+        return "the time was up" if budget.deadline() else ""
 
     def share_listed(self) -> float:
         """Return the least share of everything that has been listed."""
@@ -169,15 +190,19 @@ class _Search:
 
 
 def search(problem: Problem, max_sets: int, mass: float, budget: Budget) -> Found:
-    """Enumerate sets of faults until so many are listed or they hold so much of the mass."""
+    """Enumerate sets of faults until so many are listed or they hold so much of the mass.
+
+    Set by set is asked whether a budget is used up; then the best that were reached are listed.
+    """
     running = _Search(problem, max_sets)
+    incomplete = ""
     while running.heap and len(running.found) < max_sets and running.share_listed() < mass:
-        if running.opened >= budget.nodes:
-            return running.result(f"more than {budget.nodes:,} nodes")
-        if budget.deadline():
-            return running.result("the time was up")
+        incomplete = running.exhausted(budget)
+        if incomplete:
+            running.list_reached()
+            break
         running.step()
-    return running.result("")
+    return running.result(incomplete)
 
 
 _Way = tuple[float, tuple[int, ...]]
