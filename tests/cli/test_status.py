@@ -154,6 +154,7 @@ def test_one_component_in_full(
     ]
     main(["status", str(store), "navigation"])
     assert capsys.readouterr().out.splitlines()[3:] == [
+        "",
         "needs: laser (error)",
         "recovery actions (not carried out): restart",
     ]
@@ -349,6 +350,7 @@ CHAIN = f"waits for localisation (not initialised), which waits for laser: {GONE
 def test_wait_is_over_when_the_component_is_ok(store: Path) -> None:
     say(store, *statuses("error", level="warn"))
     assert main(["status", str(store), "navigation", "--wait", "0s"]) == 0
+    assert main(["status", str(store), "--wait", "0s", "navigation"]) == 0
 
 
 def test_wait_names_the_chain_when_time_is_up(

@@ -148,6 +148,8 @@ def _needs(board: Board, component: str, view: View) -> Iterator[str]:
     found = [c for c in view.plan.components if c.id == component] if view.plan else []
     for plan in found:
         needs = list(dict.fromkeys(_need(board, edge, view) for edge in plan.dependencies))
+        if plan.part_of or needs or plan.recovery_actions:
+            yield ""
         if plan.part_of:
             yield f"part of: {plan.part_of}"
         if needs:
