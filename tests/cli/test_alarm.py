@@ -137,3 +137,10 @@ def test_what_makes_no_sense_is_refused(
     assert main(["alarm", str(store), *words]) == 2
     assert what in capsys.readouterr().err
     assert pending(open_store(store)) == []
+
+
+def test_options_may_stand_between_words(store: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["alarm", str(store), "--json", "ack", LASER]) == 0
+    assert json.loads(capsys.readouterr().out)["id"] == LASER
+    assert main(["alarm", "--who", "bo", str(store), "shelve", "--for", "2h", LASER]) == 0
+    assert main(["alarm", str(store), "--no-such", "ack", LASER]) == 2

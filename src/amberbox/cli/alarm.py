@@ -13,6 +13,7 @@ from amberbox.blackbox.journal.reserved import ALARM
 from amberbox.blackbox.requests import submit
 from amberbox.blackbox.store import is_locked, open_store
 from amberbox.blackbox.where import store_path
+from amberbox.cli._anyorder import accept_any_order
 from amberbox.cli._output import print_grid, print_json
 from amberbox.core.config import did_you_mean
 from amberbox.core.errors import UsageError
@@ -32,6 +33,7 @@ Row = dict[str, Any]
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
+    accept_any_order(parser)
     parser.usage = _USAGE
     parser.add_argument("where", metavar="WHERE", help="robot folder or store")
     parser.add_argument(

@@ -16,6 +16,7 @@ import msgspec
 from amberbox.blackbox.folder.folder import inspect_folder, store_of
 from amberbox.blackbox.store import is_store, open_store
 from amberbox.blackbox.where import store_path
+from amberbox.cli._anyorder import accept_any_order
 from amberbox.cli._colour import painter
 from amberbox.cli._output import print_json, tell
 from amberbox.cli._statustable import View, detail, overview, waiting
@@ -37,6 +38,7 @@ _UNKNOWN_HINT = "amberbox watch {where} judges what is recorded"
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
+    accept_any_order(parser)
     parser.add_argument("where", metavar="WHERE", help="robot folder or store")
     parser.add_argument("component", nargs="?", metavar="COMPONENT", help="only this one, in full")
     parser.add_argument(

@@ -53,7 +53,7 @@ class OwnJournal:
     """Appends records of the box's own to a writer's journal, durable when ``write`` returns.
 
     ``append`` does not wait for that. The first write begins a run and its file. One owner, who
-    holds the store's lock; any thread.
+    holds the store's lock; any thread. ``first`` gives what each file begins with.
     """
 
     def __init__(
@@ -65,6 +65,7 @@ class OwnJournal:
         config_hash: str = "",
         clock: Clock | None = None,
         chain: Callable[[], str] | None = None,
+        first: Callable[[], Sequence[Message]] = tuple,
     ) -> None:
         self._store = store
         self._writer_name = writer
@@ -72,6 +73,7 @@ class OwnJournal:
         self._clock = clock or SystemClock()
         self._log: LogClock = RunClock(self._clock)
         self._chain = chain
+        self._each_file = first
         self._writer: JournalWriter | None = None
         self._streams = Streams()
         self._sync = SyncThread()
@@ -121,10 +123,14 @@ class OwnJournal:
             writer.rotate()
         now_ns = self._last_ns = self._log.now_ns()
         clock = Own(reserved.CLOCK, self._clock_record(now_ns))
-        first = [clock] if writer.path is not None else [self._about_run(writer), clock]
+        first: list[Message] = [clock] if writer.path is not None else self._first(writer, clock)
         rows = [self._streams.placed(writer, message) for message in (*first, *messages)]
         at_ns = [now_ns] * len(rows)
         writer.write([channel for channel, _ in rows], at_ns, at_ns, [data for _, data in rows])
+
+    def _first(self, writer: JournalWriter, clock: Own) -> list[Message]:
+        """Return what a file begins with."""
+        return [self._about_run(writer), clock, *self._each_file()]
 
     def close(self) -> None:
         """Finish the file, if one was begun."""

@@ -8,6 +8,7 @@ from typing import Any, Protocol
 
 from amberbox.core.types import Batch, Status
 from amberbox.monitoring.engine.findings import Finding
+from amberbox.monitoring.engine.states import States
 from amberbox.monitoring.watcher.epoch import Epoch
 from amberbox.monitoring.watcher.memory import Memory, Place
 from amberbox.monitoring.watcher.reader import Block
@@ -28,6 +29,10 @@ class Evaluates(Protocol):
     def statuses(self) -> Sequence[Status]:
         """Return the newest status of each mode and component."""
 
+    @property
+    def states(self) -> States:
+        """What it knows of components and their alarms."""
+
     def snapshot(self) -> dict[str, Any]:
         """Return all that is needed to go on, beside the rows of the last time."""
 
@@ -47,6 +52,8 @@ class Evaluation:
     place: Place | None = None
     trouble: str = ""
     """Why what was remembered could not be used; empty if it could."""
+    anew: bool = False
+    """It did not go on with what was remembered, but for the alarms."""
     _epoch: Epoch | None = None
     _known: Place | None = None
     _more: int = 0
@@ -75,12 +82,15 @@ class Evaluation:
         if self._known is not None and self._epoch == self._known.epoch:
             self._known = None
         left = self.memory.checkpoint
-        if self._epoch is None and left is not None and epoch.run <= left.place.epoch.run:
-            if epoch != left.place.epoch:
+        if self._epoch is None and left is not None:
+            if epoch != left.place.epoch and epoch.run <= left.place.epoch.run:
                 return False
-            if left.engine and self._resumed(left.engine):
+            is_there = epoch == left.place.epoch
+            if is_there and left.engine and self.memory.is_ours and self._resumed(left.engine):
                 self._epoch, self.place = epoch, left.place
                 return True
+            self._take_alarms(left.engine)
+        self.anew = self.anew or self._epoch is None
         self.engine.begin(start_ns)
         self._epoch, self.place = epoch, None
         return True
@@ -93,6 +103,20 @@ class Evaluation:
             self.trouble = f"{type(error).__name__}: {error}"
             return False
         return True
+
+    def _take_alarms(self, engine: Mapping[str, Any]) -> None:
+        """Take the alarms alone from what was known: they and their ids outlast the monitors."""
+        if "states" not in engine:
+            return
+        try:
+            self.engine.states.resume({**engine["states"], "config_hash": None})
+        except Exception as error:  # as above
+            self.trouble = f"{type(error).__name__}: {error}"
+
+    @property
+    def has_caught_up(self) -> bool:
+        """Tell whether all that was written before is found again."""
+        return self.place is not None and self._known is None and self._more == 0
 
     @property
     def is_behind(self) -> bool:

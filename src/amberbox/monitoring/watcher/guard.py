@@ -12,6 +12,7 @@ from amberbox.monitoring.plan import Plan
 
 LIMIT_S = 2.0
 _LOOKS = 5
+_FUNCTIONS = ("evaluate", "explain")
 
 
 class HangError(TimeoutError):
@@ -46,10 +47,10 @@ class _Guard:
 
 @contextmanager
 def guarded(plan: Plan) -> Iterator[None]:
-    """Raise ``HangError`` inside a mode's evaluation that takes longer than ``LIMIT_S``.
+    """Raise ``HangError`` inside a function of a mode that takes longer than ``LIMIT_S``.
 
-    It is interrupted where it stands; the engine takes it for a crash of that mode. Works in the
-    main thread; in others nothing is guarded.
+    It is interrupted where it stands; the engine takes it for a crash of that mode, or does without
+    its explanation. Works in the main thread; in others nothing is guarded.
     """
     codes = frozenset(_codes(plan))
     if threading.current_thread() is not threading.main_thread() or not codes:
@@ -65,8 +66,9 @@ def guarded(plan: Plan) -> Iterator[None]:
 
 
 def _codes(plan: Plan) -> Iterator[CodeType]:
-    """Give the code of each mode's function."""
+    """Give the code of each mode's functions."""
     for _, mode in plan.modes():
-        code = getattr(getattr(mode.module, "evaluate", None), "__code__", None)
-        if code is not None:
-            yield code
+        for name in _FUNCTIONS:
+            code = getattr(getattr(mode.module, name, None), "__code__", None)
+            if code is not None:
+                yield code

@@ -80,6 +80,8 @@ class Memory:
     place: Place | None = None
     checkpoint: Checkpoint | None = None
     more: int = 0
+    is_ours: bool = True
+    """What the engine knew was known by the same monitors."""
 
 
 def _plain(value: Any) -> Any:

@@ -41,9 +41,15 @@ class Silence:
         return silent_s
 
 
-def unknown(statuses: Sequence[Status], now_ns: int, silent_s: float) -> Iterator[Status]:
+def silent(silent_s: float) -> str:
+    """Say that the recorder is silent."""
+    return f"the recorder has written nothing for {silent_s:.0f} s"
+
+
+def unknown(
+    statuses: Sequence[Status], now_ns: int, silent_s: float, reason: str
+) -> Iterator[Status]:
     """Say of everything that it is not known; a replay cannot see that."""
-    reason = f"the recorder has written nothing for {silent_s:.0f} s"
     since_ns = now_ns - round(silent_s * 1e9)
     for status in statuses:
         yield replace(

@@ -16,8 +16,10 @@ from amberbox import __version__
 from amberbox.blackbox.folder.folder import RobotFolder
 from amberbox.blackbox.keeper.ownjournal import Progress
 from amberbox.blackbox.keeper.ownstreams import Row
+from amberbox.blackbox.requests import Request
 from amberbox.blackbox.store import Store, WriterLock
 from amberbox.core.clock import NS, Clock, SystemClock
+from amberbox.core.errors import UsageError
 from amberbox.core.probe import SOURCE, ProbeOrder
 from amberbox.core.types import Status
 from amberbox.monitoring.engine.engine import Engine
@@ -30,7 +32,8 @@ from amberbox.monitoring.watcher.evaluation import Evaluation
 from amberbox.monitoring.watcher.guard import guarded
 from amberbox.monitoring.watcher.memory import Checkpoint, Memory, Place, recall
 from amberbox.monitoring.watcher.reader import Reader
-from amberbox.monitoring.watcher.silence import Silence, unknown
+from amberbox.monitoring.watcher.silence import Silence, silent, unknown
+from amberbox.monitoring.watcher.standing import Standing, standing_in
 from amberbox.monitoring.watcher.start import WATCH, before_checkpoint, before_end
 from amberbox.monitoring.watcher.writing import Journal
 
@@ -38,6 +41,8 @@ POLL_S = 0.02
 CHECKPOINT_S = 10.0
 FIRST_S = 60.0
 """A watcher without a memory begins this long before the end of the record."""
+CURRENT_S = 3.0
+"""What is published is how things are if it is evaluated up to so long ago."""
 _MARGIN_S = 5.0
 _REQUESTS_S = 0.2
 
@@ -70,8 +75,11 @@ class Watcher:
         self._watch = watch
         self._tell = tell or _tell_nobody
         self._lock = WriterLock(watch.store, WATCH)
-        self._journal = Journal(watch.store, watch.plan.robot, watch.plan.config_hash, watch.clock)
         self._engine = Engine(watch.plan)
+        self._standing = Standing(standing_in(watch.store), self._engine.states.alarms)
+        self._journal = Journal(
+            watch.store, watch.plan.robot, watch.plan.config_hash, watch.clock, self._standing.again
+        )
         memory = _memory_of(watch, self._engine.history_s)
         left = memory.checkpoint
         self._is_new = left is None
@@ -123,10 +131,11 @@ class Watcher:
             self._silence.heard()
             for found in self._evaluation.take(block):
                 self._write(found)
+        self._settle()
         self._carry_out_requests()
         self._say_silence()
         if self._publisher.is_due():
-            self._publisher.publish(self._silent or self._engine.statuses())
+            self._publisher.publish(self._known_now())
         self._is_sound = True
 
     def close(self) -> None:
@@ -157,6 +166,7 @@ class Watcher:
 
     def _write(self, found: Sequence[Finding]) -> None:
         """Write what was found up to a place beside a note of the place."""
+        self._settle(found)
         place = self._evaluation.place
         assert place is not None
         self._journal.passed(place)
@@ -173,6 +183,34 @@ class Watcher:
         self._journal.found(found, notes)
         self._silent = []
         self._tell(found)
+
+    def _settle(self, found: Sequence[Finding] = ()) -> None:
+        """Once all that was written before is found again: say what new monitors change in it.
+
+        ``found`` is written right after it.
+        """
+        place = self._evaluation.place
+        if place is None or self._standing.settled or not self._evaluation.has_caught_up:
+            return
+        self._journal.passed(place)
+        changes = self._standing.settle(found, place.until_ns, anew=self._evaluation.anew)
+        if changes:
+            self._journal.found(changes, ())
+            self._tell(changes)
+
+    def _known_now(self) -> Sequence[Status]:
+        """Return the statuses as of now: old ones, while it catches up, are not how things are."""
+        if self._silent:
+            return self._silent
+        statuses, now_ns = self._engine.statuses(), self._journal.now_ns()
+        place = self._evaluation.place
+        if place is None or self._evaluation.is_behind or not self._journal.is_live:
+            return list(unknown(statuses, now_ns, 0.0, "not evaluated yet"))
+        late_s = (now_ns - place.until_ns) / NS
+        if late_s < CURRENT_S:
+            return statuses
+        reason = f"evaluated up to {late_s:.0f} s ago only"
+        return list(unknown(statuses, now_ns, late_s, reason))
 
     def _first(self, place: Place) -> Progress:
         """Say where the reading began: whoever is killed before the next note begins there."""
@@ -195,20 +233,33 @@ class Watcher:
         self._asked_s = now_s
         for request in commands.requests(self._watch.store):
             shift_ns = self._journal.now_ns() - self._watch.clock.wall_ns()
-            changes = commands.carry_out(
-                request, self._engine.states.command, place.until_ns, shift_ns
-            )
+            self._carry_out(request, place, shift_ns)
+
+    def _carry_out(self, request: Request, place: Place, shift_ns: int) -> None:
+        """Do what a request says; what cannot be done is said in an event."""
+        command = self._engine.states.command
+        try:
+            changes = commands.carry_out(request, command, place.until_ns, shift_ns)
+        except UsageError as error:  # healed meanwhile, or acknowledged twice
+            self._journal.told("alarm_refused", f"request refused: {error.what}")
+        except ValueError as error:
+            name = commands.set_aside(request)
+            self._journal.told("alarm_refused", f"request {name} cannot be read: {error}")
+            return
+        else:
             if changes:
                 self._journal.found(changes, [self._checkpoint(place)])
                 self._tell(changes)
-            commands.done(request)
+        commands.done(request)
 
     def _say_silence(self) -> None:
         """Say of everything that it is unknown while the record does not go on."""
         silent_s = self._silence.due(is_recording=self._reader.is_recording)
         if silent_s:
             now_ns = self._journal.now_ns()
-            self._silent = list(unknown(self._engine.statuses(), now_ns, silent_s))
+            self._silent = list(
+                unknown(self._engine.statuses(), now_ns, silent_s, silent(silent_s))
+            )
             self._journal.found(self._silent, ())
             self._tell(self._silent)
 
@@ -220,12 +271,12 @@ class Watcher:
 
 
 def _memory_of(watch: Watch, history_s: float) -> Memory:
-    """Recall what the last watcher left behind; what it knew counts if its monitors are ours."""
+    """Recall what the last watcher left behind; if its monitors are not ours only alarms count."""
     memory = recall(watch.store)
     left = memory.checkpoint
     if left is not None and left.monitors != watch.monitors:
-        memory.checkpoint = replace(left, engine={}, lookback_s=history_s + FIRST_S)
-        memory.more = 0
+        memory.checkpoint = replace(left, lookback_s=history_s + FIRST_S)
+        memory.more, memory.is_ours = 0, False
     return memory
 
 

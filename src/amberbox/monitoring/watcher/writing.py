@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import msgspec
@@ -24,12 +24,21 @@ from amberbox.monitoring.watcher.memory import Place
 class Journal:
     """Writes what the watcher has to say on the time axis of the record that it follows."""
 
-    def __init__(self, store: Store, robot: str, config_hash: str, clock: Clock) -> None:
+    def __init__(
+        self,
+        store: Store,
+        robot: str,
+        config_hash: str,
+        clock: Clock,
+        standing: Callable[[], Sequence[Finding]] = tuple,
+    ) -> None:
+        """Prepare to write; each file begins with the alarms that are ``standing`` then."""
         self._store = store
         self._clock = clock
         self._own = OwnJournal(
             store, "watch", robot=robot, config_hash=config_hash, clock=clock,
             chain=lambda: previous_chain(store, "watch"),
+            first=lambda: [Own(*encoded(finding)) for finding in standing()],
         )  # fmt: skip
         self._axis: RecordAxis | None = None
 
@@ -71,7 +80,7 @@ class Journal:
 
     def told(self, kind: str, text: str) -> None:
         """Write an event about the watcher itself."""
-        topic, values = event(kind, text, SOURCE)
+        topic, values = event(kind, text, SOURCE, live_only=True)
         self._own.append([Own(topic, msgspec.json.encode(values))], urgent=True)
 
     def close(self) -> None:

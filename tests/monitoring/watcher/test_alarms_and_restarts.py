@@ -1,0 +1,206 @@
+"""Alarms outlast restarts, other monitors and old files; nothing old goes out as current."""
+
+from __future__ import annotations
+
+import struct
+import threading
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from amberbox.blackbox.requests import FOLDER, pending, submit
+from amberbox.blackbox.store import open_store
+from amberbox.core.types import Status
+from amberbox.monitoring.plan import ComponentPlan, Plan
+from amberbox.monitoring.watcher.standing import CHANGED, standing_in
+from amberbox.monitoring.watcher.watcher import Watcher
+from amberbox.testing.box import events
+from tests.monitoring.watcher.stand import (
+    NUMBERS,
+    Stand,
+    component,
+    kill,
+    positive,
+    run_for,
+    variable,
+    written,
+)
+from tests.monitoring.watcher.test_trouble import values
+
+
+def only(*parts: ComponentPlan, config_hash: str = "hash") -> Plan:
+    return Plan("robot", config_hash, list(parts))
+
+
+def base() -> ComponentPlan:
+    return component("base", positive, variable("ros_main"))
+
+
+def arm() -> ComponentPlan:
+    return component("arm", positive, variable("ros_bulk"))
+
+
+def live(stand: Stand, watcher: Watcher, ticks: int, value: float) -> None:
+    for _ in range(ticks):
+        for topic in NUMBERS.values():
+            stand.box.hear(topic, struct.pack("<d", value))
+        stand.box.write(0.1)
+        watcher.step()
+
+
+def begun(stand: Stand, plan: Plan, value: float = -1.0) -> Watcher:
+    """Watch something that has failed."""
+    stand.box.write(0.1)
+    watcher = stand.watcher(plan)
+    live(stand, watcher, 30, 1.0)
+    live(stand, watcher, 30, value)
+    return watcher
+
+
+def states(stand: Stand) -> dict[str, str]:
+    """Return how each alarm stands by its newest record, live only or not, by component."""
+    alarms = [*values(written(stand.path), "amberbox/alarm")]
+    alarms += values(written(stand.path, live_only=True), "amberbox/alarm")
+    newest = {str(a["component"]): a for a in sorted(alarms, key=lambda a: str(a["changed_ns"]))}
+    lasting = {a.component: a.state for a in standing_in(open_store(stand.path)).values()}
+    return {name: lasting.get(name, "healed") for name in newest}
+
+
+def test_an_alarm_of_a_component_that_is_gone_heals(tmp_path: Path) -> None:
+    stand = Stand(tmp_path / "store")
+    begun(stand, only(base(), arm())).close()
+    assert states(stand) == {"base": "open", "arm": "open"}
+    watcher = stand.watcher(only(base(), config_hash="other"))
+    live(stand, watcher, 20, -1.0)
+    watcher.close()
+    assert states(stand) == {"base": "open", "arm": "healed"}
+    alarms = values(written(stand.path, live_only=True), "amberbox/alarm")
+    (healed,) = [alarm for alarm in alarms if alarm["state"] == "healed"]
+    assert (healed["component"], healed["reason"]) == ("arm", CHANGED)
+
+
+def test_an_alarm_that_stands_heals_under_other_monitors(tmp_path: Path) -> None:
+    """It keeps its id, what was said of it, and its end is written down."""
+    stand = Stand(tmp_path / "store")
+    watcher = begun(stand, only(base()))
+    (opened,) = values(written(stand.path), "amberbox/alarm")
+    submit(watcher._watch.store, "alarm", _said("acknowledge", opened["id"]))
+    live(stand, watcher, 5, -1.0)
+    watcher.close()
+    watcher = stand.watcher(only(base(), config_hash="other"))
+    live(stand, watcher, 10, -1.0)
+    (alarm,) = watcher._engine.states.alarms()
+    assert (alarm.id, alarm.state, alarm.who) == (opened["id"], "acknowledged", "anna")
+    live(stand, watcher, 30, 1.0)
+    watcher.close()
+    healed = values(written(stand.path), "amberbox/alarm")[-1]
+    assert (healed["id"], healed["state"]) == (opened["id"], "healed")
+
+
+def test_what_opens_in_the_silent_repeat_is_written(tmp_path: Path) -> None:
+    """New monitors find wrong at once what was there before they were."""
+    stand = Stand(tmp_path / "store")
+    begun(stand, only(base(), arm()), 1.0).close()
+    strict = component("arm", lambda c, i, n: {"good": i[0].at(n) > 2}, variable("ros_bulk"))
+    watcher = stand.watcher(only(base(), strict, config_hash="other"))
+    live(stand, watcher, 20, 1.0)
+    watcher.close()
+    assert states(stand) == {"arm": "open"}
+
+
+def test_a_new_file_has_the_alarms_that_last(tmp_path: Path) -> None:
+    """The old one may be deleted, or the watcher killed: nothing is forgotten."""
+    stand = Stand(tmp_path / "store")
+    watcher = begun(stand, only(base()))
+    store = open_store(stand.path)
+    (before,) = standing_in(store)
+    (old,) = store.journal_files("watch")
+    for _ in range(2):
+        kill(watcher)
+        watcher = stand.watcher(only(base()))
+        live(stand, watcher, 5, -1.0)
+    watcher.close()
+    old.unlink()
+    assert set(standing_in(store)) == {before}
+    (*_, again) = values(written(stand.path, live_only=True), "amberbox/alarm")
+    assert (again["id"], again["state"]) == (before, "open")
+
+
+class Ear:
+    """Hears what is published."""
+
+    def __init__(self) -> None:
+        self.heard: list[Sequence[Status]] = []
+
+    def is_due(self) -> bool:
+        return True
+
+    def publish(self, statuses: Sequence[Status]) -> None:
+        self.heard.append(statuses)
+
+    def close(self) -> None:
+        pass
+
+
+def levels(stand: Stand, watcher: Watcher, monkeypatch: pytest.MonkeyPatch) -> set[str]:
+    ear = Ear()
+    monkeypatch.setattr(watcher, "_publisher", ear)
+    watcher.step()
+    return {status.level for status in ear.heard[-1]}
+
+
+def test_old_statuses_are_not_published_as_current(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stand = Stand(tmp_path / "store")
+    watcher = begun(stand, only(base()), 1.0)
+    assert levels(stand, watcher, monkeypatch) == {"ok"}
+    watcher.close()
+    stand.box.crash()
+    stand.clock.advance(60)
+    watcher = stand.watcher(only(base()))
+    assert levels(stand, watcher, monkeypatch) == {"unknown"}
+    watcher.close()
+
+
+def _said(action: str, alarm_id: object, until_ns: Any = None) -> Mapping[str, Any]:
+    return {"action": action, "id": alarm_id, "who": "anna", "until_ns": until_ns}
+
+
+def test_a_request_that_cannot_be_done_is_said(tmp_path: Path) -> None:
+    stand = Stand(tmp_path / "store")
+    watcher = begun(stand, only(base()), 1.0)
+    store = open_store(stand.path)
+    submit(store, "alarm", _said("acknowledge", "no-such"))
+    submit(store, "alarm", _said("shelve", "no-such", until_ns="tomorrow"))
+    submit(store, "alarm", _said("shelve", "no-such", until_ns=1 << 70))
+    live(stand, watcher, 5, 1.0)
+    watcher.close()
+    assert pending(store) == []
+    assert len(list((store.path / FOLDER).glob("*.refused"))) == 2
+    refused, *broken = sorted((e["text"] for e in events(stand.path, "alarm_refused")), key=len)
+    assert "there is no alarm 'no-such'" in refused
+    assert all("is no time" in text for text in broken) and len(broken) == 2
+
+
+def stuck(config: Any, results: Any) -> str:
+    """Never come back."""
+    while True:
+        pass
+
+
+def test_an_explanation_that_hangs_is_done_without(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("amberbox.monitoring.watcher.guard.LIMIT_S", 0.1)
+    stand = Stand(tmp_path / "store")
+    for _ in range(20):
+        stand.box.hear(NUMBERS["main"], struct.pack("<d", -1.0))
+        stand.box.write(0.1)
+    watcher = stand.watcher(only(component("base", positive, variable("ros_main"), explain=stuck)))
+    run_for(watcher, threading.Event(), 2.0)
+    (*_, status) = values(written(stand.path), "amberbox/status")
+    assert status["level"] == "error"
+    assert "no explanation: HangError" in str(status["reason"])
