@@ -5,11 +5,15 @@ from __future__ import annotations
 import itertools
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from amberbox.blackbox.folder.folder import load_folder
 from amberbox.cli._known import known_of
 from amberbox.cli.main import main
+from amberbox.core.clock import NS
+from amberbox.core.expression import Expression
+from amberbox.core.types import Batch
 from amberbox.diagnosis.fmea import Fmea, Known
 from amberbox.diagnosis.fmea.coverage import coverage
 from amberbox.diagnosis.fmea.load import load_fmea
@@ -17,7 +21,8 @@ from amberbox.diagnosis.fmea.propagation import lost
 from amberbox.monitoring.configuration import load_plan
 from amberbox.monitoring.plan import Plan
 from amberbox.sim import catalogue
-from tests.sim.monitored import FAULT_S, failures, find, with_fault
+from amberbox.sim.robot import START_NS
+from tests.sim.monitored import FAULT_S, batches, failures, find, with_fault
 
 OTHERWISE = {
     "load_loose": "base#load_loose",
@@ -101,6 +106,34 @@ def test_redundancy_gives_cut_sets_of_higher_order(fmea: Fmea) -> None:
     assert "know_floor" in lost(fmea, three)
 
 
+CONDITIONS = {  # fault: the condition that shows it, beside the monitors
+    "wheel_rear_left_bearing_drag": "wheel_rear_left.pulls_harder",
+    "wheel_front_left_bus_disconnected": "wheel_front_left.frame_stays",
+}
+
+
+@pytest.mark.parametrize("fault", CONDITIONS)
+def test_conditions_show_what_they_are_for(fmea: Fmea, fault: str) -> None:
+    wheels = [message for message in with_fault(fault, 15) if message[0] == "wheels"]
+    batch = next(iter(batches(wheels)))
+    shown = {
+        name
+        for name, symptom in fmea.symptoms.items()
+        if symptom.condition is not None and _shows(symptom.condition, batch)
+    }
+    links = {link.symptom for link in fmea.modes[mode_of(fault, fmea)].symptoms}
+    assert CONDITIONS[fault] in shown
+    assert shown <= links
+
+
+def _shows(condition: Expression, batch: Batch) -> bool:
+    """Tell whether a condition is true within 14 s of a fault."""
+    names = {name: name.partition(".")[2] for name in condition.addresses()}
+    series = {name: (batch.log_time_ns, batch.columns[column]) for name, column in names.items()}
+    at_ns = START_NS + np.arange(round(FAULT_S), round(FAULT_S) + 15) * NS
+    return bool(np.ma.filled(condition.evaluate_series(series, at_ns), False).any())
+
+
 @pytest.mark.parametrize("fault", REACTIONS)
 def test_monitors_react_as_the_failure_modes_say(fmea: Fmea, plan: Plan, fault: str) -> None:
     within_s = REACTIONS[fault]
@@ -108,7 +141,7 @@ def test_monitors_react_as_the_failure_modes_say(fmea: Fmea, plan: Plan, fault: 
     seen = {
         (t.component, t.mode) for t in failures(findings) if t.mode and t.after.level != "stale"
     }
-    links = fmea.modes[mode_of(fault, fmea)].symptoms
+    links = [k for k in fmea.modes[mode_of(fault, fmea)].symptoms if "/" in k.symptom]
     sure = {tuple(k.symptom.split("/")[:2]) for k in links if k.detects >= 0.9}
     possible = {tuple(k.symptom.split("/")[:2]) for k in links}
     assert sure <= seen <= possible
