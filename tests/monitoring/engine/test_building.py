@@ -133,6 +133,15 @@ def test_a_probe_says_why_it_cannot_know() -> None:
     assert (status.level, status.reason) == ("unknown", "/dev/laser: permission denied")
 
 
+def test_what_nobody_has_probed_is_unknown_and_opens_no_alarm() -> None:
+    order = ProbeOrder("path_exists", "/dev/laser")
+    probed = mode(EACH, InputPlan("/dev/laser", "probe", order.item, probe=order),
+                  outputs=[output()])  # fmt: skip
+    found = rows(seconds(1.0), order.item, ok=[True])
+    status = last(probed, [found], 8.0)
+    assert (status.level, status.reason) == ("unknown", "nobody has looked at /dev/laser for 5 s")
+
+
 @pytest.mark.parametrize(
     ("kind", "values", "shown"),
     [("int", [3.0], 3), ("float", [np.inf], np.inf), ("float", [np.nan], None)],

@@ -36,6 +36,8 @@ def value_codes(entry: Input, instants: IntArray) -> Any:
 
 def reason(code: int, entry: Input, stale_s: float | None, at_ns: int) -> tuple[What, str]:
     """Say what an input that is not fresh makes of an output, and why."""
+    if code == OLD and _is_own_probe(entry):
+        return "unknown", f"nobody has looked at {entry.name} for {stale_s:g} s"
     if code == OLD:
         return "stale", f"nothing received of {entry.name} for {stale_s:g} s"
     if code == LOST:
@@ -45,6 +47,14 @@ def reason(code: int, entry: Input, stale_s: float | None, at_ns: int) -> tuple[
         return "unknown", f"nothing received yet of {entry.name}"
     told = _told(entry, at_ns)
     return "unknown", f"{entry.name}: {told}" if told else f"{entry.name} has no value"
+
+
+def _is_own_probe(entry: Input) -> bool:
+    """Tell whether the watcher itself measures it, as no recorder counts its rows.
+
+    Where it is silent, the watcher was dead: that is nobody's fault.
+    """
+    return "ok" in entry.parts and not len(entry.flow.received)
 
 
 def _told(entry: Input, at_ns: int) -> str:
