@@ -33,7 +33,7 @@ class OtherFile:
     """Something that is not in this file."""
 
     probability: float = option(1e-3, "how probable it is that something else is broken")
-    detects: float = option(0.5, "how probable that shows in a symptom, whichever")
+    detects: float = option(0.05, "how probable that shows in a symptom, whichever")
 
     def check(self) -> Iterator[Finding]:
         """Yield what is wrong."""
