@@ -15,7 +15,12 @@ from amberbox.blackbox.store import open_store
 from amberbox.core.clock import NS
 from tests.monitoring.watcher.stand import NUMBERS, Stand, plan_of
 
-ALARM = Trigger("alarm", when="amberbox_alarm.state == 'open'", before_s=1, after_s=0.5)
+ALARM = Trigger(
+    "alarm",
+    when="amberbox_alarm.state == 'open' and not amberbox_alarm.live_only",
+    before_s=1,
+    after_s=0.5,
+)
 STATUS = Trigger(
     "status", when="amberbox_status.level == 'error'", before_s=1, after_s=0.5, hold_off_s=600
 )
