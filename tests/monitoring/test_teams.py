@@ -139,7 +139,9 @@ def test_member_team_and_system(world: Path, capsys: pytest.CaptureFixture[str])
         team.wait_for("ropod_002", "ok")
         levels["ropod_002"].watch.close()
         stale = team.wait_for("ropod_002", "stale")
-        assert stale.reason == "the publisher of ropod_002_robot.level is lost"
+        assert stale.reason.startswith(
+            "the publisher of ropod_002_robot.level is lost: the watcher"
+        )
         assert team.wait_for("ropod_001", "ok")
         assert team.wait_for("carts", "ok")
         levels["ropod_001"].record.close()

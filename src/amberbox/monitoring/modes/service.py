@@ -55,8 +55,8 @@ def evaluate(config: Config, inputs: Sequence[Input], now: Now) -> Mapping[str, 
     if "state" not in one.parts:
         return {"active": active, "state": np.full(np.shape(now), "", object)[()]}
     state = one.part("state")
-    known = np.asarray(state.samples.known(now))
-    return {"active": active, "state": np.where(known, state.at(now), "").astype(object)[()]}
+    words = np.asarray(state.at(now), object)
+    return {"active": active, "state": np.where(state.samples.known(now), words, "")[()]}
 
 
 def explain(config: Config, results: Mapping[str, Any]) -> str:
