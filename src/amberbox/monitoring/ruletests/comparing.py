@@ -49,9 +49,8 @@ def _statuses(rules: Rules, number: int, test: RuleTest, outcome: Outcome) -> It
     for place, entry in zip(rules.places(number, "expect"), test.expect, strict=True):
         status = outcome.statuses[entry.at][component_and_mode(entry.of)]
         for what in _differences(entry, status):
-            got = f"it is {status.level} {status.state}" + (
-                f": {status.reason}" if status.reason else ""
-            )
+            named = " ".join(dict.fromkeys((status.level, status.state)))
+            got = f"it is {named}" + (f": {status.reason}" if status.reason else "")
             yield _problem(place, test, entry.at, f"{entry.of}: {what}", got)
 
 
