@@ -22,6 +22,7 @@ Now: TypeAlias = "int | IntArray"
 """Nanoseconds: one instant, or many in order."""
 
 _ROOM = 64
+_FLOAT = np.dtype(np.float64)
 
 
 def is_one(now: Now) -> bool:
@@ -78,6 +79,11 @@ class Samples:
         count = len(times_ns)
         if not count:
             return
+        if self._takes_as_they_are(values, count):
+            place = slice(self._end, self._end + count)
+            self._times[place], self._values[place] = times_ns, values
+            self._end += count
+            return
         data, null = _split(values)
         if null is not None and null.all():
             data = np.zeros(count, self._values.dtype)
@@ -90,6 +96,15 @@ class Samples:
         if self._null is not None:
             self._null[place] = False if null is None else null
         self._end += count
+
+    def _takes_as_they_are(self, values: NDArray[Any], count: int) -> bool:
+        """Tell whether these are known floats that there is room for, as nearly always."""
+        return (
+            type(values) is np.ndarray
+            and values.dtype == _FLOAT == self._values.dtype
+            and self._null is None
+            and self._end + count <= len(self._times)
+        )
 
     def _make_room(self, count: int, dtype: np.dtype[Any]) -> None:
         if self._start == self._end:
@@ -131,16 +146,24 @@ class Samples:
 
     def at(self, now: Now) -> Any:
         """Return the value at ``now``; what it gives means something only where ``known``."""
+        if type(now) is int and self._ends_by(now):
+            return self._values[self._end - 1]
         values = self.values if len(self) else np.zeros(1, self._values.dtype)
         return values[self.last(now)]
 
     def known(self, now: Now) -> Any:
         """Tell where there is a value."""
+        if type(now) is int and self._ends_by(now):
+            return np.True_ if self._null is None else ~self._null[self._end - 1]
         last = self.last(now)
         null = self.null
         if null is None or not len(null):
             return last >= 0
         return (last >= 0) & ~null[last]
+
+    def _ends_by(self, now: int) -> bool:
+        """Tell whether the newest sample is the last one at an instant, as live it always is."""
+        return self._end > self._start and bool(self._times[self._end - 1] <= now)
 
     def since_ns(self, now: Now) -> Any:
         """Return the time of the last sample at or before ``now``; only where there is one."""

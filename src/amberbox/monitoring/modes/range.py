@@ -7,8 +7,6 @@ from dataclasses import dataclass
 from math import inf
 from typing import Any
 
-import numpy as np
-
 from amberbox.core.mode import Input, Result, as_single, where_known, with_hysteresis
 from amberbox.core.options import option
 from amberbox.core.samples import Now
@@ -63,4 +61,4 @@ def evaluate(config: Config, inputs: Sequence[Input], now: Now) -> Mapping[str, 
     inside = (value >= low) & (value <= high)
     well = (value >= low + config.hysteresis) & (value <= high - config.hysteresis)
     in_range = where_known(known, with_hysteresis(well, ~inside))
-    return {"in_range": in_range, "value": np.where(known, value, np.nan)}
+    return {"in_range": in_range, "value": number_where_known(known, value)}
