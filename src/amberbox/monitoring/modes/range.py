@@ -7,7 +7,14 @@ from dataclasses import dataclass
 from math import inf
 from typing import Any
 
-from amberbox.core.mode import Input, Result, as_single, where_known, with_hysteresis
+from amberbox.core.mode import (
+    Input,
+    Result,
+    as_single,
+    number_where_known,
+    where_known,
+    with_hysteresis,
+)
 from amberbox.core.options import option
 from amberbox.core.samples import Now
 from amberbox.core.standins import Finding
