@@ -141,13 +141,6 @@ def where_known(known: Any, value: Any) -> Any:
     return np.where(known, value, UNKNOWN)
 
 
-def number_where_known(known: Any, value: Any) -> Any:
-    """Return the numbers of ``value`` where they are known, NaN elsewhere."""
-    if isinstance(known, bool | np.bool_):
-        return value if known else np.nan
-    return np.where(known, value, np.nan)
-
-
 def with_hysteresis(good: Any, bad: Any) -> Any:
     """Return FALSE where it is bad, TRUE where it is good, and what it was in between."""
     if isinstance(bad, bool | np.bool_):

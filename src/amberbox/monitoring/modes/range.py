@@ -7,14 +7,9 @@ from dataclasses import dataclass
 from math import inf
 from typing import Any
 
-from amberbox.core.mode import (
-    Input,
-    Result,
-    as_single,
-    number_where_known,
-    where_known,
-    with_hysteresis,
-)
+import numpy as np
+
+from amberbox.core.mode import Input, Result, as_single, where_known, with_hysteresis
 from amberbox.core.options import option
 from amberbox.core.samples import Now
 from amberbox.core.standins import Finding
@@ -68,4 +63,4 @@ def evaluate(config: Config, inputs: Sequence[Input], now: Now) -> Mapping[str, 
     inside = (value >= low) & (value <= high)
     well = (value >= low + config.hysteresis) & (value <= high - config.hysteresis)
     in_range = where_known(known, with_hysteresis(well, ~inside))
-    return {"in_range": in_range, "value": number_where_known(known, value)}
+    return {"in_range": in_range, "value": np.where(known, value, np.nan)}
