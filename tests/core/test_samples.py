@@ -13,7 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from amberbox.core.clock import NS
-from amberbox.core.samples import NONE_OPEN, Flow, Samples, Window
+from amberbox.core.flow import NONE_OPEN, Flow
+from amberbox.core.samples import Samples, Window
 from amberbox.core.types import IntArray
 
 MS = 1_000_000

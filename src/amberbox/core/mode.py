@@ -42,7 +42,8 @@ from typing import Any, Literal, Protocol
 
 import numpy as np
 
-from amberbox.core.samples import Flow, Now, Samples, Window
+from amberbox.core.flow import Flow
+from amberbox.core.samples import Now, Samples, Window
 
 Kind = Literal["variable", "list", "item", "probe"]
 """What an input may be: a variable, a list of numbers, a whole item, or what a probe measures."""

@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from amberbox.core.clock import NS
+from amberbox.core.flow import NONE_OPEN
 from amberbox.core.mode import Input
-from amberbox.core.samples import NONE_OPEN, Samples
+from amberbox.core.samples import Samples
 from amberbox.core.types import IntArray
 from amberbox.testing._mode_files import ModeFile
 

@@ -278,6 +278,15 @@ def _as_text(findings: Sequence[Finding]) -> list[str]:
     return [str(finding) for finding in findings]
 
 
+def _fed(batches: Sequence[Batch]) -> Engine:
+    """Return an engine that has been given a whole record."""
+    engine = Engine(one(*_ALL))
+    engine.begin(0)
+    for batch in batches:
+        engine.feed(batch)
+    return engine
+
+
 def _end_ns(batches: Sequence[Batch]) -> int:
     return int(batches[-1].log_time_ns[-1]) + 2 * NS
 
@@ -287,10 +296,7 @@ def _end_ns(batches: Sequence[Batch]) -> int:
 def test_findings_do_not_depend_on_how_the_record_came(batches: list[Batch], data: Any) -> None:
     """Once as a whole (a replay at full speed), once row by row in random steps (live)."""
     end_ns = _end_ns(batches)
-    whole = Engine(one(*_ALL))
-    whole.begin(0)
-    for batch in batches:
-        whole.feed(batch)
+    whole = _fed(batches)
     expected = _as_text(whole.advance(end_ns))
     live, found = Engine(one(*_ALL)), []
     live.begin(0)
@@ -308,10 +314,7 @@ def test_findings_do_not_depend_on_how_the_record_came(batches: list[Batch], dat
 @settings(max_examples=60, deadline=None)
 def test_a_snapshot_and_the_last_rows_are_enough_to_go_on(batches: list[Batch], data: Any) -> None:
     end_ns = _end_ns(batches)
-    whole = Engine(one(*_ALL))
-    whole.begin(0)
-    for batch in batches:
-        whole.feed(batch)
+    whole = _fed(batches)
     expected = _as_text(whole.advance(end_ns))
     first, found = Engine(one(*_ALL)), []
     first.begin(0)
@@ -334,10 +337,7 @@ def test_a_snapshot_and_the_last_rows_are_enough_to_go_on(batches: list[Batch], 
 @given(records())
 @settings(max_examples=40, deadline=None)
 def test_nothing_stays_green_when_the_record_goes_silent(batches: list[Batch]) -> None:
-    engine = Engine(one(*_ALL))
-    engine.begin(0)
-    for batch in batches:
-        engine.feed(batch)
+    engine = _fed(batches)
     engine.advance(int(batches[-1].log_time_ns[-1]) + 6 * NS)
     assert "ok" not in {status.level for status in engine.statuses()}
 

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from amberbox.core.flow import Flow
 from amberbox.core.mode import Input
-from amberbox.core.samples import Flow
 from amberbox.core.types import IntArray
 from amberbox.monitoring.engine.findings import What
 

@@ -12,9 +12,10 @@ from amberbox.blackbox.journal import reserved
 from amberbox.core.clock import NS
 from amberbox.core.expression_tree import Fault
 from amberbox.core.expression_values import element_of
+from amberbox.core.flow import NONE_OPEN, Flow
 from amberbox.core.mode import Input
 from amberbox.core.names import identifier
-from amberbox.core.samples import NONE_OPEN, Flow, Samples
+from amberbox.core.samples import Samples
 from amberbox.core.types import Batch, IntArray, ItemSchema, Ragged
 from amberbox.monitoring.engine.keeping import as_json, of_json
 from amberbox.monitoring.engine.lists import FIGURES, figures_of

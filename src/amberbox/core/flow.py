@@ -1,0 +1,115 @@
+"""How messages of an item have come, before any filter: when the last one did, and how often."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from amberbox.core.clock import NS
+from amberbox.core.samples import Now, Samples, is_one
+
+NONE_OPEN = 1 << 62
+"""Stands for the beginning of a gap where none is open."""
+
+
+@dataclass(slots=True, eq=False)
+class Flow:
+    """How messages of an item have come: as the recorder counted them, before any filter.
+
+    Where nobody counted (another program's recording), the rows themselves are what is known.
+    """
+
+    received: Samples = field(default_factory=Samples)
+    """Messages received since the run began, by the time of the count."""
+    last_ns: Samples = field(default_factory=Samples)
+    """When the last one was received, by the time of the count."""
+    rows: Samples = field(default_factory=Samples)
+    """Rows recorded since the run began, by the time of each."""
+    gap_from_ns: Samples = field(default_factory=Samples)
+    """Since when its publishers are known to be lost, NONE_OPEN where they are not."""
+    reasons: dict[int, str] = field(default_factory=dict)
+    """Why they were lost, by since when."""
+    began_ns: int | None = None
+    """When listening began, as far as the record tells; before it nobody could have heard it."""
+
+    def last_received_ns(self, now: Now) -> Any:
+        """Return when the last message known of at ``now`` was received; -1 before the first."""
+        seen = _held(self.rows, now, self.rows.times_ns, -1)
+        counted = _held(self.last_ns, now, self.last_ns.values, -1)
+        return max(seen, counted) if is_one(now) else np.maximum(seen, counted)
+
+    def age_s(self, now: Now) -> Any:
+        """Return for how long nothing has been received; infinite before the first message."""
+        last_ns = self.last_received_ns(now)
+        if is_one(now):
+            return max(now - last_ns, 0) / NS if last_ns >= 0 else np.inf
+        ages = np.maximum(now - last_ns, 0) / NS
+        return np.where(last_ns >= 0, ages, np.inf)[()]
+
+    def rate_hz(self, now: Now, seconds: float) -> Any:
+        """Return messages received per second over the last ``seconds``, silence included.
+
+        Less is looked at where less is known; NaN before anything is. Counts come late where a
+        robot runs faster than the box writes: then the rows show more.
+        """
+        counted, kept = _rate(self.received, now, seconds), _rate(self.rows, now, seconds)
+        if is_one(now):
+            return kept if kept > counted or counted != counted else counted
+        return np.fmax(counted, kept)[()]
+
+    def reaches_back(self, now: Now, seconds: float) -> Any:
+        """Tell whether something had been heard of it ``seconds`` ago already."""
+        before = now - round(seconds * NS)
+        return (self.received.last(before) >= 0) | (self.rows.last(before) >= 0)
+
+    def listened(self, now: Now, seconds: float) -> Any:
+        """Tell whether it has been listened to for ``seconds``, heard or not."""
+        if self.began_ns is None:
+            return self.reaches_back(now, seconds)
+        return now - self.began_ns >= round(seconds * NS)
+
+    def lost(self, now: Now) -> Any:
+        """Tell whether a publisher is known to be lost, and nothing has come since for a second.
+
+        Of several publishers of an item one may be lost while the others go on.
+        """
+        since_ns = _held(self.gap_from_ns, now, self.gap_from_ns.values, NONE_OPEN)
+        happened = (since_ns != NONE_OPEN) & (since_ns <= now - NS)
+        return happened & (self.last_received_ns(now) <= since_ns)
+
+
+def _held(samples: Samples, now: Now, values: NDArray[Any], missing: int) -> Any:
+    """Return the value of the last sample at ``now``, or ``missing`` before the first."""
+    if not len(samples):
+        return missing if is_one(now) else np.full(np.shape(now), missing, np.int64)
+    last = samples.last(now)
+    if is_one(now):
+        return int(values[last]) if last >= 0 else missing
+    return np.where(last >= 0, values[last], missing)
+
+
+def _rate(counts: Samples, now: Now, seconds: float) -> Any:
+    """Return how much a growing count has grown per second; NaN where nobody can know."""
+    if not len(counts):
+        return np.nan if is_one(now) else np.full(np.shape(now), np.nan)
+    before = now - round(seconds * NS)
+    if is_one(now):
+        return _rate_at(counts, int(now), int(before))
+    first, last = np.maximum(counts.last(before), 0), counts.last(now)
+    began = np.maximum(before, counts.times_ns[first])
+    elapsed_s = (now - began) / NS
+    grown = (counts.values[last] - counts.values[first]).astype(np.float64)
+    known = (last >= 0) & (elapsed_s > 0)
+    return np.where(known, grown / np.where(known, elapsed_s, 1.0), np.nan)
+
+
+def _rate_at(counts: Samples, now: int, before: int) -> float:
+    """Return the same for one instant, without the cost of arrays."""
+    first, last = max(int(counts.last(before)), 0), int(counts.last(now))
+    began = max(before, int(counts.times_ns[first]))
+    if last < 0 or now <= began:
+        return np.nan
+    return float(counts.values[last] - counts.values[first]) / ((now - began) / NS)
