@@ -256,6 +256,7 @@ class Symptom:
     ``id`` is the address of a monitor's output (``component/mode/output``) or
     ``detector.finding.item[.variable]``; ``source`` says who found it, ``strength`` is the share
     of it that counts (1: all). ``evidence`` names what was measured: address, from and to.
+    ``blocked_by`` names what its component depends on and is not ok: then it is no evidence.
     """
 
     id: str
@@ -266,6 +267,7 @@ class Symptom:
     strength: float = 1.0
     source: str = "monitor"
     evidence: tuple[tuple[str, int, int], ...] = ()
+    blocked_by: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -304,12 +306,27 @@ class Test:
 
 
 @dataclass(frozen=True, slots=True)
+class AmbiguityGroup:
+    """Hypotheses that nothing known tells apart, by id, the most probable first.
+
+    ``wider`` are sets that only add faults to a member without a trace. ``split_by`` is the id of
+    the test that tells the members apart best, empty if there is none or only one member.
+    """
+
+    members: tuple[str, ...]
+    probability: float
+    wider: tuple[str, ...] = ()
+    split_by: str = ""
+
+
+@dataclass(frozen=True, slots=True)
 class Diagnosis:
     """The one answer: hypotheses from likely to unlikely, and what to do next.
 
     ``mass_covered`` is the probability of all hypotheses that were looked at; ``incomplete`` says
     which budget ended the search, empty if none did. ``findings`` are what nothing maps to a
-    failure mode.
+    failure mode. ``symptoms`` are those that were present, in order of onset; once all have
+    healed its last revision says so in ``state`` and keeps the last answer.
     """
 
     id: str
@@ -322,3 +339,6 @@ class Diagnosis:
     incomplete: str = ""
     findings: tuple[str, ...] = ()
     next_tests: tuple[Test, ...] = ()
+    groups: tuple[AmbiguityGroup, ...] = ()
+    symptoms: tuple[str, ...] = ()
+    state: Literal["open", "healed"] = "open"

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from amberbox.core.types import Hypothesis
+from amberbox.core.types import AmbiguityGroup, Hypothesis
 from amberbox.diagnosis.covering.budget import Budget
 from amberbox.diagnosis.covering.clues import folded
 from amberbox.diagnosis.covering.evidence import Evidence
-from amberbox.diagnosis.covering.groups import EXPECTED, AmbiguityGroup, grouped, signature
+from amberbox.diagnosis.covering.groups import EXPECTED, grouped, signature
 from amberbox.diagnosis.covering.model import Model
 from amberbox.diagnosis.covering.prediction import Prediction, predict
 from amberbox.diagnosis.covering.problem import problem_of

@@ -3,29 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
-from amberbox.core.types import Hypothesis
+from amberbox.core.types import AmbiguityGroup, Hypothesis
 from amberbox.diagnosis.covering.evidence import Evidence
 from amberbox.diagnosis.covering.model import Model
 from amberbox.diagnosis.covering.prediction import Prediction, outcomes
 
 EXPECTED = 0.5
 """From this probability on a symptom is expected of a hypothesis."""
-
-
-@dataclass(frozen=True, slots=True)
-class AmbiguityGroup:
-    """Hypotheses of which the same symptoms are expected, possible and not caused.
-
-    ``members`` are the ids of the smallest sets, the most probable first; ``wider`` those of
-    sets that only add faults to a member without a trace. ``probability`` is that of all.
-    """
-
-    id: str
-    members: tuple[str, ...]
-    wider: tuple[str, ...]
-    probability: float
 
 
 def signature(
@@ -61,9 +47,5 @@ def _filled(hypothesis: Hypothesis, members: Sequence[str]) -> Hypothesis:
 def _group(alike: Sequence[Hypothesis]) -> AmbiguityGroup:
     wider = {h.id for h in alike if any(other.faults < h.faults for other in alike)}
     members = tuple(h.id for h in alike if h.id not in wider)
-    return AmbiguityGroup(
-        members[0],
-        members,
-        tuple(h.id for h in alike if h.id in wider),
-        sum(h.probability for h in alike),
-    )
+    others = tuple(h.id for h in alike if h.id in wider)
+    return AmbiguityGroup(members, sum(h.probability for h in alike), others)
