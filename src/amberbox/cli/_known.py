@@ -13,9 +13,9 @@ from amberbox.monitoring.configuration.variables import names_of
 from amberbox.monitoring.plan import ComponentPlan, OutputPlan, Plan
 
 
-def known_of(folder: RobotFolder) -> Known:
+def known_of(folder: RobotFolder, plan: Plan | None = None) -> Known:
     """Return the outputs of a folder's monitors, what its components need, what is recorded."""
-    known = known_of_plan(load_plan(folder)[0])
+    known = known_of_plan(plan or load_plan(folder)[0])
     variables = _variables(Recorded(folder))
     return known if variables is None else replace(known, addresses={*variables, *known.outputs})
 

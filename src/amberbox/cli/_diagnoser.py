@@ -1,0 +1,23 @@
+"""What is known of the faults of a robot folder, for those who diagnose."""
+
+from __future__ import annotations
+
+from amberbox.blackbox.folder.folder import RobotFolder
+from amberbox.cli._known import known_of
+from amberbox.core.errors import Problem
+from amberbox.diagnosis.fmea.load import FILE, load_fmea
+from amberbox.diagnosis.knowledge import Knowledge
+from amberbox.monitoring.plan import Plan
+
+
+def knowledge_of(
+    folder: RobotFolder, plan: Plan, exposure_h: float | None = None
+) -> tuple[Knowledge | None, list[Problem]]:
+    """Read a folder's failure modes; None without the file, and if it has errors."""
+    path = folder.path / FILE
+    if not path.exists():
+        return None, []
+    fmea, problems = load_fmea(path, known_of(folder, plan))
+    if fmea is None:
+        return None, problems
+    return Knowledge(folder.robot.id, fmea, plan.config_hash, exposure_h), problems
