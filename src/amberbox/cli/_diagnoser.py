@@ -4,10 +4,14 @@ from __future__ import annotations
 
 from amberbox.blackbox.folder.folder import RobotFolder
 from amberbox.cli._known import known_of
-from amberbox.core.errors import Problem
+from amberbox.core.errors import ConfigurationError, Problem
 from amberbox.diagnosis.fmea.load import FILE, load_fmea
 from amberbox.diagnosis.knowledge import Knowledge
+from amberbox.diagnosis.rules import read_rules
 from amberbox.monitoring.plan import Plan
+
+RULES = "rules"
+"""The folder of a robot folder that rule files lie in."""
 
 
 def knowledge_of(
@@ -21,3 +25,13 @@ def knowledge_of(
     if fmea is None:
         return None, problems
     return Knowledge(folder.robot.id, fmea, plan.config_hash, exposure_h), problems
+
+
+def rule_problems(folder: RobotFolder) -> list[Problem]:
+    """Judge the rule files of a folder, read as one program."""
+    files = sorted((folder.path / RULES).glob("*.pl"))
+    try:
+        program = read_rules(files)
+    except ConfigurationError as error:
+        return list(error.problems)
+    return [*program.notes, *program.problems()]

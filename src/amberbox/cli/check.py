@@ -17,6 +17,7 @@ from amberbox.blackbox.folder.folder import (
 )
 from amberbox.blackbox.folder.plan import PlannedItem, planned_items
 from amberbox.blackbox.folder.triggers import trigger_problems
+from amberbox.cli._diagnoser import knowledge_of, rule_problems
 from amberbox.cli._plantext import in_full, in_short
 from amberbox.cli._text import in_columns
 from amberbox.core.config import load_yaml
@@ -67,12 +68,13 @@ def _not_judged(path: Path) -> list[Problem]:
 
 
 def _monitors(folder: RobotFolder, problems: list[Problem]) -> Plan:
-    """Judge the monitors and run their tests; what is wrong is added to the problems."""
+    """Judge the monitors, run their tests, judge failure modes and rules; add what is wrong."""
     plan, found = load_plan(folder)
     problems += found
     rules = find_rules(folder.path, skip=folder.store_path)
     problems += rules.problems
     problems += [problem for entry in rules.rules for problem in run_rules(entry, plan)]
+    problems += [*knowledge_of(folder, plan)[1], *rule_problems(folder)]
     return plan
 
 
