@@ -326,7 +326,8 @@ class Diagnosis:
     ``mass_covered`` is the probability of all hypotheses that were looked at; ``incomplete`` says
     which budget ended the search, empty if none did. ``findings`` are what nothing maps to a
     failure mode. ``symptoms`` are those that were present, in order of onset; once all have
-    healed its last revision says so in ``state`` and keeps the last answer.
+    healed its last revision says so in ``state`` and keeps the last answer. ``live_only`` marks
+    a record that a replay does not have: said again in a new file, or ended by a restart.
     """
 
     id: str
@@ -342,3 +343,4 @@ class Diagnosis:
     groups: tuple[AmbiguityGroup, ...] = ()
     symptoms: tuple[str, ...] = ()
     state: Literal["open", "healed"] = "open"
+    live_only: bool = False
