@@ -70,19 +70,19 @@ class Injector:
         self._nominal: dict[tuple[str, str], float] = {}
 
     def add(
-        self, fault_id: str, at_s: float, magnitude: float | None, until_s: float | None
+        self, fault: str | Fault, at_s: float, magnitude: float | None, until_s: float | None
     ) -> None:
         """Schedule a fault; UsageError for an unknown one or a magnitude out of its range."""
-        fault = find_fault(fault_id)
+        fault = find_fault(fault) if isinstance(fault, str) else fault
         size = fault.magnitude
         magnitude = size.default if magnitude is None else magnitude
         if not size.low <= magnitude <= size.high:
             hint = f"take one from {size.low:g} to {size.high:g} {size.unit}"
-            raise UsageError(f"{fault_id}: magnitude {magnitude:g} is out of range", hint)
+            raise UsageError(f"{fault.id}: magnitude {magnitude:g} is out of range", hint)
         end_s = math.inf if until_s is None else until_s
         if end_s <= at_s:
-            raise UsageError(f"{fault_id}: ends at {end_s:g} s, before it begins", "until > at")
-        noise = Noise(self._seed, f"fault {fault_id} {len(self._courses)}")
+            raise UsageError(f"{fault.id}: ends at {end_s:g} s, before it begins", "until > at")
+        noise = Noise(self._seed, f"fault {fault.id} {len(self._courses)}")
         for effect in fault.effects:
             key = (effect.part, effect.knob)
             self._nominal.setdefault(key, getattr(self._parts[effect.part], effect.knob))

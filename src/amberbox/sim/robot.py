@@ -12,6 +12,7 @@ from amberbox.core.errors import UsageError
 from amberbox.sim.base import Base, Odometry, twist_fields
 from amberbox.sim.battery import Battery
 from amberbox.sim.bus import Bus
+from amberbox.sim.catalogue import Fault
 from amberbox.sim.executor import Executor
 from amberbox.sim.faults import ActiveFault, Injector
 from amberbox.sim.geometry import Pose2D
@@ -133,20 +134,21 @@ class Robot:
 
     def inject(
         self,
-        fault_id: str,
+        fault: str | Fault,
         at_s: float | None = None,
         magnitude: float | None = None,
         until_s: float | None = None,
     ) -> None:
-        """Let a fault of the catalogue begin at a time (now when not given).
+        """Let a fault of the catalogue, or one of your own, begin at a time (now when not given).
 
         ``magnitude`` is the catalogue's default when not given, and must lie in its range.
         Raises UsageError for an unknown fault, a magnitude out of range or a time in the past.
         """
         at_s = self.now_s if at_s is None else at_s
         if at_s < self.now_s:
-            raise UsageError(f"{fault_id}: {at_s} s is over, it is {self.now_s} s", "take later")
-        self._injector.add(fault_id, at_s, magnitude, until_s)
+            name = fault if isinstance(fault, str) else fault.id
+            raise UsageError(f"{name}: {at_s} s is over, it is {self.now_s} s", "take later")
+        self._injector.add(fault, at_s, magnitude, until_s)
 
     def heal(self, fault_id: str) -> None:
         """End a fault now; UsageError if it was never injected."""
