@@ -12,7 +12,7 @@ from typing import Any, TypeAlias
 from amberbox.diagnosis.rules.budget import Budget
 from amberbox.diagnosis.rules.clauses import Clause, Frame, Goal, Predicate
 from amberbox.diagnosis.rules.faults import RuleError, RuleFault, StopFault
-from amberbox.diagnosis.rules.proof import ENTER, EXIT, LEAF, Trace
+from amberbox.diagnosis.rules.proof import ENTER, EXIT, LEAF, Looked, Trace
 from amberbox.diagnosis.rules.terms import Env, Key, Struct, Term, Trail, Var
 from amberbox.diagnosis.rules.unify import match, undo, unify
 
@@ -176,10 +176,10 @@ class Machine:
         """Go on once for every solution that an iterator makes by binding variables."""
         self.goal = goal
         mark, trace = len(self.trail), self.trace
-        for _ in solutions:
+        for source in solutions:
             # What the iterator bound since the mark is undone before it makes the next one.
             self.choices.append((mark, trace, Machine.each, solutions, goal, leaf, after))
-            self.note(leaf)
+            self.note(leaf if source is None else Looked(leaf, source))
             return after
         undo(self.trail, mark)
         return None

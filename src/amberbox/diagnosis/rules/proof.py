@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal, NamedTuple, TypeAlias
 
 from amberbox.diagnosis.rules.clauses import Clause
 from amberbox.diagnosis.rules.faults import Place
@@ -18,17 +18,34 @@ Trace: TypeAlias = "tuple[Any, ...] | None"
 
 ENTER, EXIT, LEAF = "enter", "exit", "leaf"
 
-Kind: TypeAlias = Literal["rule", "fact", "builtin"]
+Kind: TypeAlias = Literal["rule", "fact", "builtin", "lookup"]
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """Where something was looked up, in words, and what was measured: address, from, to in ns."""
+
+    text: str
+    evidence: tuple[tuple[str, int, int], ...] = ()
+
+
+class Looked(NamedTuple):
+    """A goal that holds because of what was looked up."""
+
+    goal: Term
+    source: Source
 
 
 @dataclass(slots=True, eq=False)
 class Node:
-    """A goal that holds: by a rule (then its goals are below it), a fact, or built in."""
+    """A goal that holds: by a rule (then its goals are below it), a fact, a lookup, or built in."""
 
     goal: Term
     kind: Kind
     place: Place | None = None
     children: list[Node] = field(default_factory=list)
+    source: Source | None = None
+    """Where it was looked up."""
 
     def leaves(self) -> Iterator[Node]:
         """Yield the facts and built-in goals at the ends of the tree, from left to right."""
@@ -63,6 +80,7 @@ class Node:
         for node, depth, is_again in self.walk():
             entry: dict[str, Any] = {"goal": write(node.goal), "by": node.kind}
             entry |= {"at": str(node.place)} if node.place is not None else {}
+            entry |= {"at": node.source.text} if node.source is not None else {}
             entry |= {"shown_above": True} if is_again else {}
             del path[depth:]
             if path:
@@ -75,6 +93,8 @@ class Node:
 def _source(node: Node) -> str:
     if node.kind == "builtin":
         return ""
+    if node.source is not None:
+        return f"   {node.source.text}"
     return f"   {node.kind}, {node.place}" if node.place is not None else f"   {node.kind}"
 
 
@@ -119,12 +139,18 @@ def _events(trace: Trace) -> list[tuple[Any, ...]]:
 
 def _node(event: tuple[Any, ...]) -> Node:
     if event[1] == LEAF:
-        return Node(copy(event[2], None), "builtin")
+        return _leaf(event[2])
     clause: Clause = event[2]
     goal = copy(make(clause.key[0], event[3]), None)
     if clause.place.file == LIBRARY:
         return Node(goal, "builtin")
     return Node(goal, "fact" if clause.body is None else "rule", clause.place)
+
+
+def _leaf(leaf: Term | Looked) -> Node:
+    if isinstance(leaf, Looked):
+        return Node(copy(leaf.goal, None), "lookup", source=leaf.source)
+    return Node(copy(leaf, None), "builtin")
 
 
 def copy_trace(trace: Trace, memo: Memo) -> Trace:
@@ -135,8 +161,15 @@ def copy_trace(trace: Trace, memo: Memo) -> Trace:
             args = tuple(copy(arg, memo) for arg in rest[1])
             copied = (copied, ENTER, rest[0], args)
         elif kind == LEAF:
-            leaf = rest[0] if isinstance(rest[0], Node) else copy(rest[0], memo)
-            copied = (copied, LEAF, leaf)
+            copied = (copied, LEAF, _copied(rest[0], memo))
         else:
             copied = (copied, EXIT)
     return copied
+
+
+def _copied(leaf: Term | Node | Looked, memo: Memo) -> Term | Node | Looked:
+    if isinstance(leaf, Node):
+        return leaf
+    if isinstance(leaf, Looked):
+        return Looked(copy(leaf.goal, memo), leaf.source)
+    return copy(leaf, memo)

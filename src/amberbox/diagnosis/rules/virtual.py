@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 from amberbox.diagnosis.rules.faults import RuleFault
+from amberbox.diagnosis.rules.proof import Source
 from amberbox.diagnosis.rules.terms import Key, Term, Var, deref, make, show_key, to_term
 from amberbox.diagnosis.rules.unify import copy, undo
 from amberbox.diagnosis.rules.writer import write
@@ -17,7 +18,15 @@ if TYPE_CHECKING:
 Row = Sequence[object]
 """One solution: a value for every argument; strings are atoms, sequences are lists."""
 
-Lookup: TypeAlias = "Callable[[tuple[Term | None, ...]], Iterable[Row]]"
+
+class Sourced(NamedTuple):
+    """A solution, and where it was found."""
+
+    row: Row
+    source: Source
+
+
+Lookup: TypeAlias = "Callable[[tuple[Term | None, ...]], Iterable[Row | Sourced]]"
 """Gets the arguments of a call, None where there is no value yet, and returns rows.
 
 It may return rows that do not match what it was given; they are left out.
@@ -29,7 +38,8 @@ class Virtual:
     """A predicate that is a lookup.
 
     ``needs`` are the arguments, counted from 1, that must have a value; of several sets one is
-    enough. Calls that have too few are refused with ``hint``.
+    enough. Calls that have too few are refused with ``hint``. ``clauses`` writes down what it
+    finds as Prolog that answers the same, for calls with given values of the first argument.
     """
 
     name: str
@@ -37,24 +47,26 @@ class Virtual:
     solve: Lookup
     needs: tuple[frozenset[int], ...] = ()
     hint: str = ""
+    clauses: Callable[[Iterable[Term]], Iterator[str]] | None = None
 
     @property
     def key(self) -> Key:
         """Return name and number of arguments."""
         return self.name, self.arity
 
-    def solutions(self, m: Machine, args: Sequence[Term]) -> Iterator[None]:
-        """Bind the arguments of a call to one row after the other."""
+    def solutions(self, m: Machine, args: Sequence[Term]) -> Iterator[Source | None]:
+        """Bind the arguments of a call to one row after the other; yield where it was found."""
         given = tuple(_given(arg) for arg in args)
         bound = {number for number, value in enumerate(given, 1) if value is not None}
         if self.needs and not any(needed <= bound for needed in self.needs):
             raise self._unbounded(args)
         mark = len(m.trail)
-        for row in self.solve(given):
+        for found in self.solve(given):
+            row, source = found if isinstance(found, Sourced) else (found, None)
             if len(row) != self.arity:
                 raise RuleFault(f"a row for {show_key(self.key)} has {len(row)} values")
             if all(m.unify(arg, to_term(part)) for arg, part in zip(args, row, strict=True)):
-                yield
+                yield source
             undo(m.trail, mark)
 
     def _unbounded(self, args: Sequence[Term]) -> RuleFault:
