@@ -179,7 +179,7 @@ def _speed(text: str) -> float | None:
 
 def _sayer(args: argparse.Namespace) -> Say:
     """Return what prints a finding: as the journal has it, or for a person what has changed."""
-    from amberbox.core.types import Status
+    from amberbox.monitoring.engine.findings import AlarmChange, Transition
     from amberbox.monitoring.messages.records import encoded
 
     def as_json(finding: Finding) -> None:
@@ -189,7 +189,7 @@ def _sayer(args: argparse.Namespace) -> Say:
     told: set[tuple[int, str, str]] = set()
 
     def as_text(finding: Finding) -> None:
-        if not isinstance(finding, Status):
+        if isinstance(finding, Transition | AlarmChange):
             print(_line(finding, told), flush=True)
 
     def silently(_: Finding) -> None:

@@ -13,6 +13,7 @@ from amberbox.monitoring.engine.findings import (
     Finding,
     Found,
     Status,
+    Symptom,
     Transition,
     What,
 )
@@ -160,6 +161,11 @@ def statuses(findings: Iterable[Finding]) -> list[Status]:
 def alarms(findings: Iterable[Finding]) -> list[AlarmChange]:
     """Pick what happened to alarms."""
     return [finding for finding in findings if isinstance(finding, AlarmChange)]
+
+
+def symptoms(findings: Iterable[Finding]) -> list[Symptom]:
+    """Pick the symptoms."""
+    return [finding for finding in findings if isinstance(finding, Symptom)]
 
 
 def seconds(time_ns: int) -> float:

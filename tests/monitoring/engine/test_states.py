@@ -12,7 +12,15 @@ from hypothesis import strategies as st
 
 from amberbox.core.expression import parse
 from amberbox.monitoring.engine.alarms import Action
-from amberbox.monitoring.engine.findings import TICK_NS, Finding, Found, Status, Transition, What
+from amberbox.monitoring.engine.findings import (
+    TICK_NS,
+    Finding,
+    Found,
+    Status,
+    Symptom,
+    Transition,
+    What,
+)
 from amberbox.monitoring.engine.states import States, outputs_of
 from amberbox.monitoring.plan import (
     ComponentPlan,
@@ -34,6 +42,7 @@ from tests.monitoring.engine.stand import (
     plan,
     seconds,
     statuses,
+    symptoms,
     transitions,
 )
 
@@ -347,6 +356,7 @@ def test_what_is_told_holds_together(story: Story) -> None:
     _transitions_follow_one_another(findings)
     _blocked_by_what_is_below(story.plan, findings)
     _alarms_are_of_roots(findings)
+    _symptoms_are_what_statuses_say(story.plan, findings)
 
 
 def _each_once(story: Story, findings: Sequence[Finding]) -> None:
@@ -406,3 +416,37 @@ def _alarms_are_of_roots(findings: Sequence[Finding]) -> None:
         ]  # fmt: skip
         assert at_that_time[-1].blocked_by == ()
         assert alarm.level in ("warn", "stale", "error")
+
+
+SAYS = {"ok": "absent", "warn": "present", "error": "present"}
+
+
+def _symptoms_are_what_statuses_say(drawn: Plan, findings: Sequence[Finding]) -> None:
+    """Compare each with the statuses of its instant; none is told twice, none is left out."""
+    of_mode = _expected_alone(drawn)
+    last: dict[str, tuple[str, tuple[str, ...]]] = {}
+    for place, finding in enumerate(findings):
+        if isinstance(finding, Symptom):
+            said: tuple[str, tuple[str, ...]] = finding.state, finding.blocked_by
+            assert said != last.get(finding.id, ("unknown", finding.blocked_by))
+            assert (finding.onset_ns is not None) == (finding.state == "present")
+            last[finding.id] = said
+        elif isinstance(finding, Status) and (finding.component, finding.mode) in of_mode:
+            name = of_mode[finding.component, finding.mode]
+            said = SAYS.get(finding.level, "unknown"), finding.blocked_by
+            assert last.get(name, ("unknown", finding.blocked_by)) == said, place
+    known = {s.id for s in symptoms(findings)}
+    expected = {f"{p.component}/{p.mode}/{p.output.name}" for p in outputs_of(drawn)
+                if p.output.expectation.value is not None}  # fmt: skip
+    assert known <= expected
+
+
+def _expected_alone(drawn: Plan) -> dict[tuple[str, str], str]:
+    """Return the modes of one output of which something is expected, and the output's address."""
+    alone = {}
+    for place in outputs_of(drawn):
+        key = place.component, place.mode
+        of_same = [p for p in outputs_of(drawn) if (p.component, p.mode) == key]
+        if len(of_same) == 1 and place.output.expectation.value is not None:
+            alone[key] = f"{place.component}/{place.mode}/{place.output.name}"
+    return alone

@@ -18,7 +18,17 @@ from amberbox.blackbox.journal import reserved
 from amberbox.blackbox.keeper.ownjournal import OwnJournal
 from amberbox.blackbox.query.tabletext import plain
 from amberbox.blackbox.store import create_store
-from amberbox.core.types import Batch, Level, Status
+from amberbox.core.types import (
+    AmbiguityGroup,
+    Batch,
+    Diagnosis,
+    Hypothesis,
+    Level,
+    Status,
+    Symptom,
+    SymptomState,
+)
+from amberbox.core.types import Test as Proposal
 from amberbox.monitoring.engine.findings import (
     AlarmChange,
     AlarmState,
@@ -49,6 +59,31 @@ ALARMS = st.builds(
     *(TEXT, TEXT, TEXT, st.sampled_from(get_args(Severity)), st.sampled_from(get_args(AlarmState))),
     *(LEVELS, TEXT, TIMES, TIMES, st.integers(0, 9), TEXT, st.none() | TIMES, TEXT, st.booleans()),
 )
+TEXTS = st.lists(TEXT, max_size=3).map(tuple)
+NUMBERS = st.floats(allow_nan=False, allow_infinity=False)
+SYMPTOMS = st.builds(
+    Symptom,
+    *(TEXT, st.sampled_from(get_args(SymptomState)), TEXT, st.none() | TIMES, st.none() | TIMES),
+    *(NUMBERS, TEXT, st.lists(st.tuples(TEXT, TIMES, TIMES), max_size=3).map(tuple), TEXTS),
+)
+HYPOTHESES = st.builds(
+    Hypothesis,
+    *(TEXT, st.frozensets(TEXT, max_size=3), NUMBERS, TEXTS, TEXTS, TEXTS, TEXTS, TEXT, NUMBERS),
+)
+KINDS = ("read", "question", "check", "experiment", "unit_test")
+TESTS = st.builds(
+    Proposal,
+    *(TEXT, st.sampled_from(KINDS), TEXT, TEXT, NUMBERS, NUMBERS, NUMBERS),
+    st.dictionaries(TEXT, NUMBERS, max_size=3),
+)
+GROUPS = st.builds(AmbiguityGroup, TEXTS, NUMBERS, TEXTS, TEXT)
+DIAGNOSES = st.builds(
+    Diagnosis,
+    *(TEXT, st.integers(0, 99), TEXT, TIMES, TEXT, st.lists(HYPOTHESES, max_size=3).map(tuple)),
+    *(NUMBERS, TEXT, TEXTS, st.lists(TESTS, max_size=2).map(tuple)),
+    *(st.lists(GROUPS, max_size=2).map(tuple), TEXTS, st.sampled_from(["open", "healed"])),
+    st.booleans(),
+)
 STATUS = Status(
     *("ropod_001", "laser", "laser_device", "error", "front_laser_working"),
     {"front_laser_working": False, "rate": 12.5, "count": 3, "mode": "auto", "seen": None},
@@ -57,16 +92,19 @@ STATUS = Status(
 )
 
 
-@given(STATUSES | TRANSITIONS | ALARMS)
+@given(STATUSES | TRANSITIONS | ALARMS | SYMPTOMS | DIAGNOSES)
 def test_finding_comes_back_as_it_was(finding: Finding) -> None:
     channel, data = encoded(finding)
     values = msgspec.json.decode(data)
     again = finding_of(channel, values)
-    assert repr(again) == repr(finding)  # NaN equals NaN in text
+    if isinstance(finding, Diagnosis | Symptom):
+        assert again == finding
+    else:
+        assert repr(again) == repr(finding)  # NaN equals NaN in text
     assert encoded(again or finding) == (channel, data)
 
 
-@given(STATUSES | TRANSITIONS | ALARMS)
+@given(STATUSES | TRANSITIONS | ALARMS | SYMPTOMS | DIAGNOSES)
 def test_record_has_the_keys_of_the_published_schema(finding: Finding) -> None:
     channel, data = encoded(finding)
     schema = msgspec.json.decode(reserved.schema_of(channel).data)
@@ -121,6 +159,45 @@ def test_journal_gives_back_what_was_written(tmp_path: Path) -> None:
     assert plain(batch.columns["level"]) == ["error"]
     assert plain(outputs["name"]) == list(STATUS.outputs)
     assert plain(outputs["value"])[:3] == [0.0, 12.5, 3.0]
+
+
+SYMPTOM = Symptom(
+    *("laser/device/working", "present", "laser/device/working", 1_000_000_000, 2_000_000_000),
+    evidence=(("ros_scan.ranges[17]", 1_000_000_000, 2_000_000_000), ("ros_odom", 1, 2)),
+    blocked_by=("bus",),
+)
+DIAGNOSIS = Diagnosis(
+    *("ropod-20260101t000000", 3, "ropod_001", 2_000_000_000, "abc"),
+    (Hypothesis("h1", frozenset({"laser#dead", "bus#cut"}), 0.75, explains=(SYMPTOM.id,)),),
+    *(0.99, "", ("wheel#odd",)),
+    (Proposal("look", "check", "Look at it", outcomes={"yes": 0.75, "no": 0.25}),),
+    (AmbiguityGroup(("h1", "h2"), 0.9, split_by="look"),),
+    (SYMPTOM.id,),
+)
+
+
+def test_symptom_and_diagnosis_are_rows_of_the_journal(tmp_path: Path) -> None:
+    store = create_store(tmp_path / "store")
+    journal = OwnJournal(store, "watch")
+    journal.write([record_of(SYMPTOM), record_of(DIAGNOSIS)])
+    journal.close()
+    items = ["amberbox_symptom", "amberbox_diagnosis"]
+    found = follow(store.path, items, live=False, writers=["watch"])
+    batches = {d.item: d for d in found if isinstance(d, Batch)}
+    symptom, diagnosis = (batches[item] for item in items)
+    assert plain(symptom.columns["state"]) == ["present"]
+    assert plain(symptom.columns["onset_ns"]) == [1_000_000_000]
+    evidence = symptom.children["evidence"].columns
+    assert plain(evidence["address"]) == ["ros_scan.ranges[17]", "ros_odom"]
+    assert plain(diagnosis.columns["state"]) == ["open"]
+    assert plain(diagnosis.children["hypotheses"].columns["probability"]) == [0.75]
+    outcomes = diagnosis.children["next_tests"].children["outcomes"].columns
+    assert plain(outcomes["answer"]) == ["yes", "no"]
+
+
+def test_failure_modes_of_a_hypothesis_are_written_in_order() -> None:
+    _, values = record_of(DIAGNOSIS)
+    assert values["hypotheses"][0]["faults"] == ["bus#cut", "laser#dead"]
 
 
 def test_writing_a_status_costs_little() -> None:

@@ -19,11 +19,22 @@ INCIDENT = "amberbox/incident"
 MISSION = "amberbox/mission"
 STATUS = "amberbox/status"
 ALARM = "amberbox/alarm"
+SYMPTOM = "amberbox/symptom"
+DIAGNOSIS = "amberbox/diagnosis"
 CURSOR = "amberbox/cursor"
 """How far the writer of a journal had read others when it wrote what stands beside it."""
 
-_TEXT = {"type": "string"}
-_COUNT = {"type": "integer"}
+_TEXT: dict[str, object] = {"type": "string"}
+_COUNT: dict[str, object] = {"type": "integer"}
+_NUMBER: dict[str, object] = {"type": "number"}
+_COUNT_IF_ANY: dict[str, object] = {"type": ["integer", "null"]}
+
+
+def _list_of(**fields: dict[str, object]) -> dict[str, object]:
+    return {"type": "array", "items": {"type": "object", "properties": fields}}
+
+
+_TEXTS: dict[str, object] = {"type": "array", "items": _TEXT}
 _FIELDS: dict[str, dict[str, object]] = {
     RUN: {
         "writer": _TEXT,
@@ -39,7 +50,7 @@ _FIELDS: dict[str, dict[str, object]] = {
     CLOCK: {
         "offset_ns": _COUNT,
         "synchronised": {"type": ["boolean", "null"]},
-        "boot_ns": {"type": ["integer", "null"]},
+        "boot_ns": _COUNT_IF_ANY,
     },
     COUNTERS: {
         "items": {
@@ -64,9 +75,9 @@ _FIELDS: dict[str, dict[str, object]] = {
         "item": _TEXT,
         "peer": _TEXT,
         "from_ns": _COUNT,
-        "to_ns": {"type": ["integer", "null"]},
+        "to_ns": _COUNT_IF_ANY,
         "reason": _TEXT,
-        "count": {"type": ["integer", "null"]},
+        "count": _COUNT_IF_ANY,
     },
     INCIDENT: {
         "id": _TEXT,
@@ -83,7 +94,7 @@ _FIELDS: dict[str, dict[str, object]] = {
         "state": _TEXT,
         "outcome": _TEXT,
         "from_ns": _COUNT,
-        "to_ns": {"type": ["integer", "null"]},
+        "to_ns": _COUNT_IF_ANY,
         "who": _TEXT,
         "details": _TEXT,
     },
@@ -105,7 +116,7 @@ _FIELDS: dict[str, dict[str, object]] = {
                 },
             },
         },
-        "blocked_by": {"type": "array", "items": _TEXT},
+        "blocked_by": _TEXTS,
         "measured_ns": _COUNT,
         "since_ns": _COUNT,
         "reason": _TEXT,
@@ -124,7 +135,55 @@ _FIELDS: dict[str, dict[str, object]] = {
         "changed_ns": _COUNT,
         "count": _COUNT,
         "who": _TEXT,
-        "until_ns": {"type": ["integer", "null"]},
+        "until_ns": _COUNT_IF_ANY,
+        "cause": _TEXT,
+        "diagnosis": _TEXT,
+        "config_hash": _TEXT,
+        "live_only": {"type": "boolean"},
+    },
+    SYMPTOM: {
+        "id": _TEXT,
+        "state": _TEXT,
+        "address": _TEXT,
+        "onset_ns": _COUNT_IF_ANY,
+        "confirmed_ns": _COUNT_IF_ANY,
+        "strength": _NUMBER,
+        "source": _TEXT,
+        "evidence": _list_of(address=_TEXT, from_ns=_COUNT, to_ns=_COUNT),
+        "blocked_by": _TEXTS,
+    },
+    DIAGNOSIS: {
+        "id": _TEXT,
+        "revision": _COUNT,
+        "robot": _TEXT,
+        "at_ns": _COUNT,
+        "state": _TEXT,
+        "symptoms": _TEXTS,
+        "hypotheses": _list_of(
+            id=_TEXT,
+            faults=_TEXTS,
+            probability=_NUMBER,
+            explains=_TEXTS,
+            unexplained=_TEXTS,
+            contradicted=_TEXTS,
+            ambiguity=_TEXTS,
+            proof=_TEXT,
+            criticality=_NUMBER,
+        ),
+        "groups": _list_of(members=_TEXTS, probability=_NUMBER, wider=_TEXTS, split_by=_TEXT),
+        "mass_covered": _NUMBER,
+        "incomplete": _TEXT,
+        "findings": _TEXTS,
+        "next_tests": _list_of(
+            id=_TEXT,
+            kind=_TEXT,
+            text=_TEXT,
+            role=_TEXT,
+            cost_s=_NUMBER,
+            risk=_NUMBER,
+            gain_bits=_NUMBER,
+            outcomes=_list_of(answer=_TEXT, probability=_NUMBER),
+        ),
         "config_hash": _TEXT,
         "live_only": {"type": "boolean"},
     },

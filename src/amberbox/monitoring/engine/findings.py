@@ -1,4 +1,4 @@
-"""What the engine finds: statuses, transitions and alarms; and what it finds them from."""
+"""What is found of a robot: statuses, transitions, alarms, symptoms; and what it is found from."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from typing import Literal, NamedTuple, Protocol, TypeAlias
 
 from amberbox.core.clock import NS
-from amberbox.core.types import Level, Output, Status
+from amberbox.core.types import Diagnosis, Level, Output, Status, Symptom
 from amberbox.monitoring.plan import Severity
 
 __all__ = [
-    "NS", "TICK_NS", "AlarmChange", "AlarmState", "Condition", "Finding", "Found", "Level",
-    "Output", "Status", "Transition", "View", "What",
+    "NS", "TICK_NS", "AlarmChange", "AlarmState", "Condition", "Diagnosis", "Finding", "Found",
+    "Level", "Output", "Status", "Symptom", "Transition", "View", "What", "is_live_only",
 ]  # fmt: skip
 
 TICK_NS = NS // 20
@@ -87,7 +87,8 @@ class AlarmChange:
     """An alarm as it is after a change.
 
     ``count`` is how often it has opened. ``who`` acknowledged or shelved it, ``until_ns`` is when
-    a shelved one comes back.
+    a shelved one comes back. ``cause`` is the leading answer of the ``diagnosis`` (its id) that
+    the component is part of, both empty while there is none.
     """
 
     robot: str
@@ -104,6 +105,14 @@ class AlarmChange:
     until_ns: int | None
     config_hash: str
     live_only: bool = False
+    cause: str = ""
+    diagnosis: str = ""
 
 
-Finding: TypeAlias = "Status | Transition | AlarmChange"
+Finding: TypeAlias = "Status | Transition | AlarmChange | Symptom | Diagnosis"
+"""The engine finds all but diagnoses: these are made of what it finds."""
+
+
+def is_live_only(finding: Finding) -> bool:
+    """Tell whether a replay of the record cannot find it too."""
+    return not isinstance(finding, Symptom) and finding.live_only

@@ -19,7 +19,7 @@ NOT_MEASURED: Final = "not measured yet"
 News: TypeAlias = Literal["none", "other", "value"]
 """What is new of an output: nothing, another value of a bool or a text, or something else."""
 _CODES: Final[tuple[What, ...]] = ("ok", "bad", "unknown", "stale")
-_PLAIN: Final[tuple[Any, ...]] = (0, None, "", False, True, None, 1, [], None)
+_PLAIN: Final[tuple[Any, ...]] = (0, None, "", False, True, None, 1, [], None, None)
 """Snapshot of an output that is ok and has been for long."""
 
 
@@ -27,10 +27,11 @@ class OutputState:
     """What counts of an output: what is found of it, once that has lasted long enough.
 
     ``due_ns`` is when what is found will count, ``calm_ns`` when flapping ends; None for never.
+    ``onset_ns`` is when it began to be bad, whether that counted at once or not.
     """
 
     __slots__ = (
-        *("plan", "mode", "level", "shown", "due_ns", "calm_ns", "_for_ns", "_heal_ns"),
+        *("plan", "mode", "level", "shown", "due_ns", "calm_ns", "onset_ns", "_for_ns", "_heal_ns"),
         *("_flap_ns", "_discrete", "_raw", "_value", "_why", "_fault", "_good", "_ill", "_flips"),
     )
 
@@ -49,6 +50,7 @@ class OutputState:
         self.shown: What = "unknown"
         self.due_ns: int | None = None
         self.calm_ns: int | None = None
+        self.onset_ns: int | None = None
         self._raw: What = "unknown"
         self._value: Output = None
         self._why = NOT_MEASURED
@@ -81,6 +83,8 @@ class OutputState:
 
     def _turn(self, what: What, at_ns: int) -> None:
         self.due_ns = None
+        if what == "bad" and self.shown != "bad":
+            self.onset_ns = at_ns
         if what == "bad" and self._fault is not True:
             self.due_ns = _tick(at_ns + self._for_ns)
         elif what == "ok" and self._fault is not False:
@@ -141,16 +145,21 @@ class OutputState:
         entry = [
             _CODES.index(self._raw), self._value, why, self._fault, self._good,
             self.due_ns, _CODES.index(self._ill), flips, self.calm_ns,
+            self.onset_ns if self._may_be_bad() else None,
         ]  # fmt: skip
         while entry and entry[-1] == _PLAIN[len(entry) - 1]:
             entry.pop()
         return entry
 
+    def _may_be_bad(self) -> bool:
+        """Tell whether it can be shown as bad without being found so once more."""
+        return "bad" in (self._raw, self.shown) or self._fault is True
+
     def resume(self, entry: Sequence[Any], now_ns: int) -> None:
         """Go on from what ``snapshot`` returned at ``now_ns``."""
         full = [*entry, *_PLAIN[len(entry) :]]
         raw, self._value, why, self._fault, self._good = full[:5]
-        self.due_ns, ill, flips, self.calm_ns = full[5:]
+        self.due_ns, ill, flips, self.calm_ns, self.onset_ns = full[5:]
         self._raw, self._ill = _CODES[raw], _CODES[ill]
         self._why = NOT_MEASURED if why is None else why
         self._flips = list(flips)

@@ -1,9 +1,9 @@
-"""From what is found of outputs to statuses, transitions and alarms, instant by instant."""
+"""From what is found of outputs to statuses, symptoms and alarms, instant by instant."""
 
 from __future__ import annotations
 
 import heapq
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any, Final, NamedTuple
@@ -22,6 +22,7 @@ from amberbox.monitoring.engine.findings import (
 )
 from amberbox.monitoring.engine.modestate import ModeState
 from amberbox.monitoring.engine.outputs import OutputState
+from amberbox.monitoring.engine.symptoms import Symptoms
 from amberbox.monitoring.engine.wording import Words
 from amberbox.monitoring.plan import OutputPlan, Plan
 
@@ -61,6 +62,7 @@ class States:
         self._modes: list[ModeState] = []
         self._components: list[ComponentState] = []
         self._build()
+        self._symptoms = Symptoms(self._components)
         self._alarms = Alarms(plan.robot, plan.config_hash)
         self._timers: list[tuple[int, int]] = []
         self._named: set[int] = set()
@@ -125,6 +127,7 @@ class States:
             findings += self._alarms.update(name, at_ns, component.own, component.waits)
         transitions = (self._words.component_transition(c, at_ns) for c in self._components)
         findings += [transition for transition in transitions if transition is not None]
+        findings += self._symptoms.tell_all(at_ns)
         self._tell_all(at_ns, None, findings)
         return findings
 
@@ -170,6 +173,7 @@ class States:
             self._judge_components(now_ns, again, changes)
             out += self._transitions(now_ns, changes)
         out += changes.alarms
+        out += self._symptoms.tell(changes.outputs, changes.blocked, now_ns)
         if full:
             self._tell_all(now_ns, view, out)
         elif changes.modes or changes.components:
@@ -190,6 +194,7 @@ class States:
             output = self._outputs[number]
             if due_ns in (output.due_ns, output.calm_ns):
                 touched[number] = output
+        changes.outputs = touched.keys()
         for number, output in touched.items():
             output.settle(now_ns)
             self._await(number, output)
@@ -248,6 +253,7 @@ class States:
         if (component.level, component.state) != condition:
             component.since_ns = now_ns
         if component.blocked_by != blocked_by:
+            changes.blocked.add(place)
             changes.modes.update(mode.number for mode in component.modes)
         if component.own != own or component.waits != waits:
             alarming.discard(component.plan.id)
@@ -325,6 +331,7 @@ class States:
             "modes": [mode.snapshot(began_ns) for mode in self._modes],
             "components": [component.snapshot(began_ns) for component in self._components],
             "alarms": self._alarms.snapshot(done_ns),
+            "symptoms": self._symptoms.snapshot(),
         }
 
     def resume(self, snapshot: Mapping[str, Any]) -> bool:
@@ -349,6 +356,7 @@ class States:
         for place in self._order:
             entry = snapshot["components"][place]
             self._components[place].resume(entry, self._began_ns, self._components)
+        self._symptoms.resume(snapshot.get("symptoms", ()))
         return True
 
 
@@ -357,9 +365,12 @@ class _Changes:
     """What has changed at an instant.
 
     ``modes`` (numbers) and ``components`` (places) are to be told; ``places`` are components of
-    which modes have changed, ``looked_at`` those whose modes were looked at.
+    which modes have changed, ``looked_at`` those whose modes were looked at, ``blocked`` those
+    that something else blocks than before. ``outputs`` (numbers) were settled.
     """
 
+    outputs: Collection[int] = ()
+    blocked: set[int] = field(default_factory=set)
     modes: set[int] = field(default_factory=set)
     components: set[int] = field(default_factory=set)
     places: set[int] = field(default_factory=set)

@@ -1,4 +1,4 @@
-"""What the engine finds, as records of the watcher's journal, and back.
+"""What is found of a robot, as records of the watcher's journal, and back.
 
 The bytes are canonical: the same finding gives the same bytes, keys in the order of
 ``docs/format.md``. JSON has no NaN and no infinity, so such a number stands as a word in ``text``.
@@ -13,8 +13,14 @@ from typing import Any
 import msgspec
 
 from amberbox.blackbox.journal import reserved
-from amberbox.core.types import Output, Status
+from amberbox.core.types import Diagnosis, Output, Status, Symptom
 from amberbox.monitoring.engine.findings import AlarmChange, Condition, Finding, Transition
+from amberbox.monitoring.messages.diagnoses import (
+    diagnosis_of,
+    diagnosis_values,
+    symptom_of,
+    symptom_values,
+)
 
 COMPONENT_STATE = "component_state"
 """Kind of the events that transitions are."""
@@ -30,6 +36,10 @@ def record_of(finding: Finding) -> tuple[str, Values]:
         return reserved.STATUS, status_values(finding)
     if isinstance(finding, Transition):
         return reserved.EVENT, transition_values(finding)
+    if isinstance(finding, Symptom):
+        return reserved.SYMPTOM, symptom_values(finding)
+    if isinstance(finding, Diagnosis):
+        return reserved.DIAGNOSIS, diagnosis_values(finding)
     return reserved.ALARM, alarm_values(finding)
 
 
@@ -45,6 +55,10 @@ def finding_of(channel: str, values: Values) -> Finding | None:
         return status_of(values)
     if channel == reserved.ALARM:
         return alarm_of(values)
+    if channel == reserved.SYMPTOM:
+        return symptom_of(values)
+    if channel == reserved.DIAGNOSIS:
+        return diagnosis_of(values)
     if channel == reserved.EVENT and values["kind"] == COMPONENT_STATE:
         return transition_of(values)
     return None
@@ -197,6 +211,8 @@ def alarm_values(alarm: AlarmChange) -> Values:
         "count": alarm.count,
         "who": alarm.who,
         "until_ns": alarm.until_ns,
+        "cause": alarm.cause,
+        "diagnosis": alarm.diagnosis,
         "config_hash": alarm.config_hash,
         "live_only": alarm.live_only,
     }
@@ -205,6 +221,7 @@ def alarm_values(alarm: AlarmChange) -> Values:
 def alarm_of(values: Values) -> AlarmChange:
     """Return the alarm that a record says."""
     until_ns = values["until_ns"]
+    cause, diagnosis = values.get("cause", ""), values.get("diagnosis", "")  # not in older records
     return AlarmChange(
         id=values["id"],
         robot=values["robot"],
@@ -220,4 +237,6 @@ def alarm_of(values: Values) -> AlarmChange:
         until_ns=None if until_ns is None else int(until_ns),
         config_hash=values["config_hash"],
         live_only=bool(values["live_only"]),
+        cause=cause,
+        diagnosis=diagnosis,
     )

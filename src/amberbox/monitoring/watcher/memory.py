@@ -17,12 +17,16 @@ from amberbox.blackbox.journal.chunk import Chunk
 from amberbox.blackbox.keeper.ownjournal import Progress
 from amberbox.blackbox.store import Store
 from amberbox.core.types import Cursor, WriterCursor
+from amberbox.monitoring.engine.findings import is_live_only
 from amberbox.monitoring.messages.records import finding_of
 from amberbox.monitoring.watcher.epoch import Epoch, epoch_of
 
 EVALUATED = "evaluated"
 CHECKPOINT = "checkpoint"
-_FINDINGS = (reserved.STATUS, reserved.EVENT, reserved.ALARM)
+_FINDINGS = (
+    *(reserved.STATUS, reserved.EVENT, reserved.ALARM),
+    *(reserved.SYMPTOM, reserved.DIAGNOSIS),
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,7 +127,7 @@ def _take(memory: Memory, store_id: str, topic: str, values: Mapping[str, Any]) 
     if topic != reserved.CURSOR:
         if memory.place is None:
             finding = finding_of(topic, values)
-            memory.more += finding is not None and not finding.live_only
+            memory.more += finding is not None and not is_live_only(finding)
         return
     state = msgspec.json.decode(values["state"] or "{}")
     epoch = epoch_of(str(state.get("epoch", "")))

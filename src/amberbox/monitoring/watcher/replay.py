@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from amberbox.blackbox.store import Store
 from amberbox.core.clock import NS
-from amberbox.core.types import Status, WriterCursor
+from amberbox.core.types import Diagnosis, Status, WriterCursor
 from amberbox.monitoring.engine.engine import Engine
-from amberbox.monitoring.engine.findings import AlarmChange, Finding
+from amberbox.monitoring.engine.findings import Finding
 from amberbox.monitoring.plan import Plan
-from amberbox.monitoring.watcher.evaluation import Evaluation
+from amberbox.monitoring.watcher.diagnosing import Diagnosing, MakeDiagnoser
+from amberbox.monitoring.watcher.evaluation import Evaluates, Evaluation
 from amberbox.monitoring.watcher.guard import guarded
+from amberbox.monitoring.watcher.instants import instant_of
 from amberbox.monitoring.watcher.reader import Block, Positions, Reader
 from amberbox.monitoring.watcher.start import WRITERS, at_time, before_end
 
@@ -32,11 +35,26 @@ class Part:
     """None is as fast as it goes."""
 
 
+class Newest(NamedTuple):
+    """How everything is at the end of a record: statuses, when that is, what is diagnosed."""
+
+    statuses: Sequence[Status]
+    at_ns: int
+    diagnosis: Diagnosis | None = None
+
+
 def replay(
-    plan: Plan, store: Store, part: Part = Part(), stop: threading.Event | None = None
+    plan: Plan,
+    store: Store,
+    part: Part = Part(),
+    stop: threading.Event | None = None,
+    diagnoser: MakeDiagnoser | None = None,
 ) -> Iterator[Finding]:
-    """Yield what is found in a record, in order of time; statuses every second among it."""
-    engine = Engine(plan)
+    """Yield what is found in a record, in order of time; statuses every second among it.
+
+    ``diagnoser`` makes what diagnoses it.
+    """
+    engine = Diagnosing(Engine(plan), diagnoser)
     evaluation = Evaluation(engine)
     pace = Pace(part.speed, stop or threading.Event())
     with guarded(plan):
@@ -49,19 +67,20 @@ def replay(
                 return
 
 
-def newest(plan: Plan, store: Store) -> tuple[list[Status], int]:
-    """Return the statuses of all modes and components at the end of the record, and when it is."""
-    engine = Engine(plan)
+def newest(plan: Plan, store: Store, diagnoser: MakeDiagnoser | None = None) -> Newest:
+    """Return the statuses of all modes and components at the end of the record."""
+    engine = Diagnosing(Engine(plan), diagnoser)
     evaluation = Evaluation(engine)
     with guarded(plan):
         start = before_end(store, WARM_UP_S + engine.history_s)
         for block in _reader(plan, store, engine, start).step():
             for _ in evaluation.take(block):
                 pass  # only the last statuses count
-    return engine.statuses(), 0 if evaluation.place is None else evaluation.place.until_ns
+    at_ns = 0 if evaluation.place is None else evaluation.place.until_ns
+    return Newest(engine.statuses(), at_ns, engine.diagnosis)
 
 
-def blocks(plan: Plan, store: Store, engine: Engine, part: Part) -> Iterator[Block]:
+def blocks(plan: Plan, store: Store, engine: Evaluates, part: Part) -> Iterator[Block]:
     """Give what is recorded of a part of a record, and what the monitors need from before it."""
     start: dict[str, WriterCursor] = {}
     if part.from_ns is not None:
@@ -70,15 +89,8 @@ def blocks(plan: Plan, store: Store, engine: Engine, part: Part) -> Iterator[Blo
     return _reader(plan, store, engine, start).step()
 
 
-def _reader(plan: Plan, store: Store, engine: Engine, start: Positions) -> Reader:
+def _reader(plan: Plan, store: Store, engine: Evaluates, start: Positions) -> Reader:
     return Reader(store, engine.items, [order.item for order in plan.probes()], start)
-
-
-def instant_of(finding: Finding) -> int:
-    """Return when something was found, log time."""
-    if isinstance(finding, Status):
-        return finding.measured_ns
-    return finding.changed_ns if isinstance(finding, AlarmChange) else finding.at_ns
 
 
 def _is_inside(at_ns: int, part: Part) -> bool:
