@@ -36,6 +36,7 @@ from amberbox.monitoring.plan import (
     OutputPlan,
     Plan,
 )
+from amberbox.monitoring.watcher.diagnosing import MakeDiagnoser
 from amberbox.monitoring.watcher.replay import replay
 from amberbox.monitoring.watcher.watcher import Watch, Watcher
 from amberbox.testing.box import ManualBox
@@ -107,6 +108,7 @@ class Stand:
     path: Path
     seed: int = 0
     clock: ManualClock = field(default_factory=ManualClock)
+    diagnoser: MakeDiagnoser | None = None
 
     def __post_init__(self) -> None:
         self.random = random.Random(self.seed)
@@ -135,14 +137,17 @@ class Stand:
         return Watcher(self.watch(plan))
 
     def watch(self, plan: Plan | None = None) -> Watch:
-        store = open_store(self.path)
-        return Watch(plan or plan_of(), store, clock=self.clock, clock_s=self.clock_s)
+        store, diagnoser = open_store(self.path), self.diagnoser
+        return Watch(
+            plan or plan_of(), store, clock=self.clock, clock_s=self.clock_s, diagnoser=diagnoser
+        )
 
     def clock_s(self) -> float:
         return self.clock.boot / NS
 
     def replayed(self, plan: Plan | None = None) -> list[bytes]:
-        return [line_of(f) for f in replay(plan or plan_of(), open_store(self.path))]
+        store, diagnoser = open_store(self.path), self.diagnoser
+        return [line_of(f) for f in replay(plan or plan_of(), store, diagnoser=diagnoser)]
 
 
 def kill(watcher: Watcher) -> None:
@@ -161,7 +166,10 @@ def written(store: Path, *, live_only: bool = False) -> list[bytes]:
 
 
 def _written(store: Path) -> Iterator[tuple[bytes, bool]]:
-    channels = (reserved.STATUS, reserved.EVENT, reserved.ALARM)
+    channels = (
+        *(reserved.STATUS, reserved.EVENT, reserved.ALARM),
+        *(reserved.SYMPTOM, reserved.DIAGNOSIS),
+    )
     for journal in read.files_of(open_store(store), "watch"):
         names = {n: s.topic.name for n, s in journal.streams.items()}
         wanted = [number for number, name in names.items() if name in channels]
