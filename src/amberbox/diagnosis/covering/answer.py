@@ -80,9 +80,14 @@ class Known:
     def of(cls, model: Model, evidence: Evidence) -> Known:
         """Take the symptoms that the model knows."""
         places = model.sign_places
-        states = {n: o.state for n, o in evidence.observations.items() if n in places}
-        present = tuple((n, places[n]) for n, state in states.items() if state == "present")
-        return cls(present, frozenset(places[n] for n, s in states.items() if s == "absent"))
+        present, absent = [], []
+        for name, observation in evidence.observations.items():
+            place = places.get(name)
+            if place is not None and observation.state == "present":
+                present.append((name, place))
+            elif place is not None and observation.state == "absent":
+                absent.append(place)
+        return cls(tuple(present), frozenset(absent))
 
     def hypothesis(
         self, model: Model, faults: frozenset[str], probability: float, prediction: Prediction

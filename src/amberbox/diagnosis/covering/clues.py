@@ -46,16 +46,17 @@ class Folded:
 def folded(model: Model, evidence: Evidence) -> Folded:
     """Turn evidence into weights and clues; symptoms that the model lacks are left out."""
     tables = model.tables
-    absent = np.zeros(len(model.signs), np.bool_)
-    clues = []
+    places, gone, clues = model.sign_places, [], []
     for name, observation in evidence.observations.items():
-        place = model.sign_places.get(name)
+        place = places.get(name)
         if place is None or observation.state == "unknown":
             continue
         if observation.state == "absent" and observation.strength == 1.0:
-            absent[place] = True
+            gone.append(place)
         else:
             clues.append(_clue(model, place, observation))
+    absent = np.zeros(len(model.signs), np.bool_)
+    absent[gone] = True
     log_weight = tables.log_odds + tables.modes.folded(absent, len(model.mode_ids))
     log_loss = tables.functions.folded(absent, len(model.functions))
     if model.unknown is not None:
