@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from amberbox.diagnosis.covering.check import Check, Sight
 from amberbox.diagnosis.covering.model import Function, Link, Mode, Model, Sign, Unknown
 from amberbox.diagnosis.fmea.criticality import mode_criticality
+from amberbox.diagnosis.fmea.findings import finding_signs
 from amberbox.diagnosis.fmea.model import Fmea
 
 
@@ -25,9 +26,10 @@ def compile_model(fmea: Fmea, exposure_h: float | None = None) -> Model:
         for mode in fmea.modes.values()
     )
     signs = tuple(Sign(symptom.id, symptom.leak) for symptom in fmea.symptoms.values())
+    found, found_links = finding_signs(fmea)
     functions = tuple(Function(name, needs) for name, needs in fmea.needs().items())
     other = Unknown(fmea.other.probability, fmea.other.detects)
-    return Model(modes, signs, tuple(_links(fmea)), functions, other)
+    return Model(modes, signs + found, (*_links(fmea), *found_links), functions, other)
 
 
 def _links(fmea: Fmea) -> Iterator[Link]:

@@ -223,6 +223,30 @@ class FunctionFile:
 
 
 @dataclass(frozen=True)
+class FindingFile:
+    """What another engine finds, and the failure modes that it speaks for."""
+
+    rule: str = option("", "a goal of rules/*.pl; each answer is a finding")
+    finding: str = option("", "a detector's finding instead, by its id")
+    maps_to: Sequence[str] = option((), "failure modes; <Variable> stands for its value")
+    detects: float | None = option(None, "how probable it is found when one of them is there")
+    leak: float | None = option(None, "how probable it is found although none of them is there")
+    proves: bool = option(False, "whether at least one of them is there for sure")
+    description: str = option("", "what it means, for a technician")
+
+    def check(self) -> Iterator[Finding]:
+        """Yield what is wrong."""
+        if bool(self.rule) == bool(self.finding):
+            yield "give either 'rule' or 'finding'"
+        yield from _shares(self, "detects", "leak")
+        if self.proves and not self.maps_to:
+            yield "proves", "what does it prove? give maps_to: [component#mode, ...]"
+        for key in ("detects", "leak") if self.proves else ():
+            if getattr(self, key) is not None:
+                yield key, "what is proven has no probability"
+
+
+@dataclass(frozen=True)
 class MemberFunctionFile:
     """A function of a robot as its team sees it."""
 
@@ -257,6 +281,7 @@ class FmeaFile:
     symptoms: Any = option(None, "conditions with a name; leaks of outputs")
     tests: Any = option(None, "tests of no component in particular")
     robots: Any = option(None, "members of the team, one level down")
+    findings: Any = option(None, "what other engines find, and what it speaks for")
 
     def check(self) -> Iterator[Finding]:
         """Yield what is wrong."""

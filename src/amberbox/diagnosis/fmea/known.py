@@ -16,9 +16,13 @@ class Known:
     ``watched`` those of which something is expected: only they can be symptoms. ``needs`` is what
     component files say that a component needs; it counts where the failure modes' file says
     nothing. ``addresses`` is what conditions may read besides, None if that is not known.
+    ``predicates`` are the names that a finding's goal may have, None if the rules are not known;
+    ``heads`` those of rules that no other rule calls, with file and line.
     """
 
     outputs: Collection[str] = ()
     watched: Collection[str] = ()
     needs: Mapping[str, Needs] = field(default_factory=dict)
     addresses: Collection[str] | None = None
+    predicates: Collection[tuple[str, int]] | None = None
+    heads: Mapping[tuple[str, int], tuple[str, int]] = field(default_factory=dict)

@@ -10,6 +10,7 @@ from amberbox.core.errors import Problem
 from amberbox.core.nodes import Node, load_yaml
 from amberbox.diagnosis.fmea.checking import check
 from amberbox.diagnosis.fmea.entries import Scope, component_of, function_of, mode_of
+from amberbox.diagnosis.fmea.findings import mapped
 from amberbox.diagnosis.fmea.known import Known
 from amberbox.diagnosis.fmea.members import members
 from amberbox.diagnosis.fmea.model import Fmea, FmeaTest, Other
@@ -64,7 +65,7 @@ def _made(root: Node, known: Known | None, problems: list[Problem], folder: Path
     other = Other(sheet.file.other.probability, sheet.file.other.detects)
     fmea = Fmea(
         sheet.file.description, scope.modes, components, functions, symptoms.found, scope.tests,
-        other, sheet.file.exposure_h,
+        other, sheet.file.exposure_h, mapped(sheet, scope.modes, known, problems),
     )  # fmt: skip
     return check(fmea, sheet, problems)
 

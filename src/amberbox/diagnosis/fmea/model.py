@@ -162,6 +162,23 @@ class FmeaTest:
 
 
 @dataclass(frozen=True, slots=True)
+class Mapped:
+    """What another engine finds: answers of a ``goal`` of rules, or a ``finding`` by its id.
+
+    ``maps_to`` are failure modes that it speaks for, in which ``<Variable>`` stands for a value;
+    none: it is only shown. ``proves``: at least one of them is there, so that it is no symptom.
+    """
+
+    goal: str = ""
+    finding: str = ""
+    maps_to: tuple[str, ...] = ()
+    detects: float = 0.99
+    leak: float = 1e-4
+    proves: bool = False
+    description: str = ""
+
+
+@dataclass(frozen=True, slots=True)
 class Other:
     """Something that is not in this analysis: how probable, and what it shows of anything."""
 
@@ -181,6 +198,7 @@ class Fmea:
     tests: Mapping[str, FmeaTest] = field(default_factory=dict)
     other: Other = Other()
     exposure_h: float = 24.0
+    findings: tuple[Mapped, ...] = ()
 
     def needs(self) -> dict[str, Needs]:
         """Return what each component and function needs."""

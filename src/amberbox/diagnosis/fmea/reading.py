@@ -11,6 +11,7 @@ from amberbox.core.errors import Problem
 from amberbox.core.needs import NOTHING, Needs, parse_needs
 from amberbox.core.nodes import Node
 from amberbox.diagnosis.fmea.file import (
+    FindingFile,
     FmeaFile,
     FunctionFile,
     MemberFile,
@@ -56,6 +57,7 @@ class Sheet:
     symptoms: Mapping[str, SymptomFile]
     robots: Mapping[str, MemberFile]
     names: frozenset[str]
+    findings: Sequence[tuple[Node, FindingFile]] = ()
 
 
 def read(root: Node, known: Known | None, problems: list[Problem]) -> Sheet:
@@ -72,6 +74,7 @@ def read(root: Node, known: Known | None, problems: list[Problem]) -> Sheet:
         dict(_entries(SymptomFile, root, "symptoms", problems)),
         dict(_entries(MemberFile, root, "robots", problems)),
         frozenset(names),
+        list(_findings(root, problems)),
     )
 
 
@@ -136,6 +139,21 @@ def _entries(
         built = build(cls, entry, problems, f"{where}.{name}")
         if built is not None:
             yield name, built
+
+
+def _findings(root: Node, problems: list[Problem]) -> Iterator[tuple[Node, FindingFile]]:
+    """Yield what other engines find, each with its place."""
+    place = (root.mapping or {}).get("findings")
+    if place is None or place.value is None:
+        return
+    if place.items is None:
+        problems.append(
+            place.problem("findings", f"expected a list (- rule: ...), got {place.kind}")
+        )
+    for number, entry in enumerate(place.items or ()):
+        built = build(FindingFile, entry, problems, f"findings[{number}]")
+        if built is not None:
+            yield entry, built
 
 
 def _ratio_problems(

@@ -72,8 +72,9 @@ def _rows(of: Intervals, args: tuple[Term | None, ...]) -> Iterator[Sourced]:
         return
     for found in of.find(tuple(keys), both):
         if _fits(found, from_ns, to_ns, throughout=of.throughout):
-            ends = since or found.from_ns, until or found.to_ns
-            yield Sourced((*found.values, *ends), found.source)
+            first = found.from_ns if since is None else since
+            last = found.to_ns if until is None else until
+            yield Sourced((*found.values, first, last), found.source)
 
 
 def _time(given: Term | None, of: Intervals) -> int | None:

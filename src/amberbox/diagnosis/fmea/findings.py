@@ -1,0 +1,201 @@
+"""Findings of other engines: which failure modes they speak for, in every instance of the file."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from itertools import product
+
+from amberbox.core.config import did_you_mean
+from amberbox.core.errors import Problem
+from amberbox.core.nodes import Node
+from amberbox.diagnosis.covering.model import Link, Sign
+from amberbox.diagnosis.fmea.file import DefaultsFile, FindingFile
+from amberbox.diagnosis.fmea.known import Known
+from amberbox.diagnosis.fmea.model import Fmea, Mapped
+from amberbox.diagnosis.fmea.places import child
+from amberbox.diagnosis.fmea.reading import Sheet
+from amberbox.diagnosis.rules.faults import RuleFault
+from amberbox.diagnosis.rules.reader import Sentence, read_goal
+from amberbox.diagnosis.rules.terms import Key, key_of, show_key
+from amberbox.diagnosis.rules.writer import write
+
+_VARIABLE = re.compile(r"<(\w+)>")
+_MOST = 5_000
+"""Most instances of one finding; more are a mistake in ``maps_to``."""
+
+Values = Mapping[str, str]
+"""Values of variables by name."""
+
+
+def mapped(
+    sheet: Sheet, modes: Collection[str], known: Known | None, problems: list[Problem]
+) -> tuple[Mapped, ...]:
+    """Return the findings of the file; tell what is wrong with them, and what nothing maps."""
+    found = [_mapped(entry, sheet.file.defaults) for _, entry in sheet.findings]
+    for number, (node, _) in enumerate(sheet.findings):
+        problems.extend(_problems(found[number], node, f"findings[{number}]", modes, known))
+    problems.extend(_unmapped(found, known))
+    return tuple(found)
+
+
+def _mapped(entry: FindingFile, defaults: DefaultsFile) -> Mapped:
+    return Mapped(
+        entry.rule,
+        entry.finding,
+        tuple(entry.maps_to),
+        defaults.detects if entry.detects is None else entry.detects,
+        defaults.leak if entry.leak is None else entry.leak,
+        entry.proves,
+        entry.description,
+    )
+
+
+def _problems(
+    of: Mapped, node: Node, where: str, modes: Collection[str], known: Known | None
+) -> Iterator[Problem]:
+    variables: Collection[str] = _VARIABLE.findall(of.finding)
+    if of.goal:
+        place = child(node, "rule")
+        try:
+            sentence = read_goal(of.goal)
+        except RuleFault as fault:
+            yield place.problem(f"{where}.rule", fault.what, fault.hint)
+            return
+        yield from _goal_problems(sentence, place, where, known)
+        variables = sentence.names
+    for number, pattern in enumerate(of.maps_to):
+        at = child(node, "maps_to", number)
+        yield from _pattern_problems(pattern, at, f"{where}.maps_to[{number}]", variables, modes)
+    count = _count(of, modes)
+    if count > _MOST:
+        what = f"stands for {count:,} findings, more than {_MOST:,}"
+        yield child(node, "maps_to").problem(f"{where}.maps_to", what, "use fewer variables")
+
+
+def _goal_problems(
+    sentence: Sentence, place: Node, where: str, known: Known | None
+) -> Iterator[Problem]:
+    key = key_of(sentence.term)
+    if key is None or key[0] in (",", ";", "->", "\\+"):
+        what = "is not one goal: write a rule for it and name its head here"
+        yield place.problem(f"{where}.rule", what)
+    elif known is not None and known.predicates is not None and key not in known.predicates:
+        names = sorted({name for name, count in known.predicates if count == key[1]})
+        what = f"there is no rule {show_key(key)}{did_you_mean(key[0], names)}"
+        hint = "the rules are read from rules/*.pl in the robot's folder"
+        yield place.problem(f"{where}.rule", what, hint)
+
+
+def _pattern_problems(
+    pattern: str, node: Node, where: str, variables: Collection[str], modes: Collection[str]
+) -> Iterator[Problem]:
+    strange = [name for name in _VARIABLE.findall(pattern) if name not in variables]
+    for name in strange:
+        what = f"<{name}> is no variable of it{did_you_mean(name, variables)}"
+        yield node.problem(where, what)
+    if not strange and not any(_expression(pattern).fullmatch(mode) for mode in modes):
+        what = f"there is no failure mode '{pattern}'{did_you_mean(pattern, modes)}"
+        yield node.problem(where, what, "write COMPONENT#MODE, or <Variable>#MODE")
+
+
+def _unmapped(found: Sequence[Mapped], known: Known | None) -> Iterator[Problem]:
+    """Tell which heads of rules lead to no finding."""
+    named = {key for of in found if of.goal and (key := _key(of.goal)) is not None}
+    for key, (file, line) in (known.heads if known is not None else {}).items():
+        if key not in named:
+            what = "no finding of fmea.yaml names it: its answers are not used in a diagnosis"
+            yield Problem(file, line, show_key(key), what, is_error=False)
+
+
+def _key(goal: str) -> Key | None:
+    try:
+        return key_of(read_goal(goal).term)
+    except RuleFault:
+        return None
+
+
+def _expression(pattern: str) -> re.Pattern[str]:
+    """Turn a pattern of addresses into a regular expression with a group for each variable."""
+    parts, known = [], set[str]()
+    for text, name in _pieces(pattern):
+        parts.append(re.escape(text))
+        if name:
+            parts.append(f"(?P={name})" if name in known else f"(?P<{name}>[^#]+)")
+            known.add(name)
+    return re.compile("".join(parts))
+
+
+def _pieces(pattern: str) -> Iterator[tuple[str, str]]:
+    pieces = [*_VARIABLE.split(pattern), ""]
+    yield from zip(pieces[::2], pieces[1::2], strict=True)
+
+
+def _options(of: Mapped, modes: Collection[str]) -> dict[str, list[str]]:
+    """Return the values that each variable of ``maps_to`` may have."""
+    found: dict[str, dict[str, None]] = {}
+    for pattern in of.maps_to:
+        for name in _VARIABLE.findall(pattern):
+            found.setdefault(name, {})
+        expression = _expression(pattern)
+        for match in filter(None, map(expression.fullmatch, modes)):
+            for name, value in match.groupdict().items():
+                found[name][value] = None
+    return {name: list(values) for name, values in found.items()}
+
+
+def _count(of: Mapped, modes: Collection[str]) -> int:
+    count = 1
+    for values in _options(of, modes).values():
+        count *= len(values)
+    return count
+
+
+def instances(of: Mapped, modes: Collection[str]) -> Iterator[tuple[str, tuple[str, ...]]]:
+    """Yield the symptom and the failure modes of each instance that the analysis can name."""
+    options = _options(of, modes)
+    for values in product(*options.values()):
+        named = dict(zip(options, values, strict=True))
+        faults = faults_of(of, named, modes)
+        if faults:
+            yield symptom_of(of, named), faults
+
+
+def faults_of(of: Mapped, values: Values, modes: Collection[str]) -> tuple[str, ...]:
+    """Return the failure modes that a finding speaks for, given the values of its variables."""
+    names = (_filled(pattern, values) for pattern in of.maps_to)
+    return tuple(dict.fromkeys(name for name in names if name in modes))
+
+
+def symptom_of(of: Mapped, values: Values) -> str:
+    """Return the id of the symptom: ``rule:GOAL``, or that of the detector's finding.
+
+    Variables that ``maps_to`` does not name stand as ``_``: whatever their values, it is one.
+    """
+    if not of.goal:
+        return _filled(of.finding, values)
+    named = {name for pattern in of.maps_to for name in _VARIABLE.findall(pattern)}
+    sentence = read_goal(of.goal)
+    for name in named & sentence.names.keys() & values.keys():
+        sentence.names[name].ref = values[name]
+    return f"rule:{write(sentence.term)}"
+
+
+def _filled(pattern: str, values: Values) -> str:
+    return _VARIABLE.sub(lambda match: values.get(match[1], match[0]), pattern)
+
+
+def finding_signs(fmea: Fmea) -> tuple[tuple[Sign, ...], tuple[Link, ...]]:
+    """Return the symptoms that findings are, and what causes them. Nobody can read them off."""
+    signs = {name: Sign(name, of.leak, None) for name, of, _ in _symptoms(fmea)}
+    new = [sign for name, sign in signs.items() if name not in fmea.symptoms]
+    links = [
+        Link(mode, name, of.detects) for name, of, faults in _symptoms(fmea) for mode in faults
+    ]
+    return tuple(new), tuple(links)
+
+
+def _symptoms(fmea: Fmea) -> Iterator[tuple[str, Mapped, tuple[str, ...]]]:
+    for of in fmea.findings:
+        for name, faults in instances(of, fmea.modes) if not of.proves else ():
+            yield name, of, faults
