@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from amberbox.core.config import did_you_mean
 from amberbox.core.errors import UsageError
@@ -21,12 +21,14 @@ class Situation:
     A symptom that is unknown, or blocked by something that its component depends on, is no
     evidence. ``answers`` are what tests gave, by the test's id (``cannot check`` is one).
     ``conflicts`` are sets of failure modes of which other engines proved that at least one is
-    there.
+    there. ``watched`` says that the symptoms come from a watcher, which reads them all as soon as
+    they can be read: reading them is no test.
     """
 
     symptoms: tuple[Symptom, ...] = ()
     answers: Mapping[str, str] = field(default_factory=dict)
     conflicts: tuple[frozenset[str], ...] = ()
+    watched: bool = False
 
     def present(self) -> tuple[Symptom, ...]:
         """Return the symptoms that are there and count, in order of onset."""
@@ -39,11 +41,22 @@ def evidence(knowledge: Knowledge, situation: Situation) -> Evidence:
 
     Raises UsageError for an answer to a test that there is not, or that the test does not give.
     """
-    counting = (symptom for symptom in situation.symptoms if not symptom.blocked_by)
+    counting = (_asked(symptom) for symptom in situation.symptoms if not symptom.blocked_by)
     found = evidence_of(counting, situation.conflicts)
+    if situation.watched:
+        read = frozenset(f"read:{sign.id}" for sign in knowledge.model.signs)
+        found = replace(found, asked=found.asked | read)
     for test, answer in situation.answers.items():
         found = with_answer(found, check_named(knowledge, test), answer)
     return found
+
+
+def _asked(symptom: Symptom) -> Symptom:
+    """Take the FMEA's own conditions for what monitors say: both are questions of one author.
+
+    The author has given both a ``detects``, knowing that they look at the same measurement.
+    """
+    return replace(symptom, source="monitor") if symptom.source == "condition" else symptom
 
 
 def check_named(knowledge: Knowledge, test: str) -> Check:

@@ -1,0 +1,1 @@
+"""Symptoms over time become diagnoses: one at a time, revised as more is known."""

@@ -1,0 +1,162 @@
+"""What was told of each symptom, and what of it counts: present, remembered, absent, nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Literal, TypeAlias
+
+import msgspec
+
+from amberbox.core.clock import NS
+from amberbox.core.types import Symptom
+from amberbox.diagnosis.fmea.model import Fmea
+
+Counts: TypeAlias = Literal["present", "absent", ""]
+"""What a symptom counts as; empty if it is no evidence."""
+
+
+@dataclass(slots=True)
+class Presence:
+    """One symptom: what was told last, and when it came and went.
+
+    ``seen`` is what was told when it came, ``gone_ns`` when it went: for ``hold_ns`` it is
+    remembered, and only ``within_ns`` later it can count as absent.
+    """
+
+    told: Symptom
+    hold_ns: int = 0
+    within_ns: int = 0
+    seen: Symptom | None = None
+    gone_ns: int | None = None
+
+    @property
+    def is_there(self) -> bool:
+        """Tell whether it is there now, and nothing blocks it."""
+        return self.seen is not None and self.gone_ns is None
+
+    def take(self, told: Symptom, at_ns: int) -> None:
+        """Take what is told of it at an instant; what comes back in time never went."""
+        was_present = self.counts_present(at_ns)
+        self.told = told
+        if told.state == "present" and not told.blocked_by:
+            self.seen = self.seen if was_present else told
+            self.gone_ns = None
+        elif self.is_there:
+            self.gone_ns = at_ns
+
+    def counts_present(self, at_ns: int) -> bool:
+        """Tell whether it is there, or went so short ago that it is remembered."""
+        return self.is_there or (self.gone_ns is not None and at_ns < self.gone_ns + self.hold_ns)
+
+    @property
+    def is_absent(self) -> bool:
+        """Tell whether it is known not to be there, whether that counts or not."""
+        return self.told.state == "absent" and not self.told.blocked_by
+
+    @property
+    def may_be_absent_ns(self) -> int:
+        """From when on its absence can count: what takes long to come takes long to go."""
+        return 0 if self.gone_ns is None else self.gone_ns + self.hold_ns + self.within_ns
+
+    @property
+    def onset_ns(self) -> int:
+        """When it began to be there, this time."""
+        seen = self.seen or self.told
+        return _time(seen.confirmed_ns if seen.onset_ns is None else seen.onset_ns)
+
+    def shown(self, counts: Counts) -> Symptom:
+        """Return it as evidence: what does not count is unknown, or blocked."""
+        if counts == "present":
+            return replace(self.seen or self.told, state="present", blocked_by=())
+        if counts == "absent" or self.told.blocked_by:
+            return self.told
+        return replace(self.told, state="unknown")
+
+
+class Presences:
+    """All symptoms that were told of in this epoch, by id."""
+
+    def __init__(self, fmea: Fmea) -> None:
+        self._symptoms = fmea.symptoms
+        self._all: dict[str, Presence] = {}
+
+    def begin(self) -> None:
+        """Begin an epoch: nothing is known."""
+        self._all.clear()
+
+    def knows(self, name: str) -> bool:
+        """Tell whether the analysis has a symptom."""
+        return name in self._symptoms
+
+    def take(self, told: Symptom, at_ns: int) -> None:
+        """Take what is told of a symptom at an instant."""
+        presence = self._all.get(told.id)
+        if presence is None:
+            presence = self._all[told.id] = Presence(told, *self._times_ns(told.id))
+        presence.take(told, at_ns)
+
+    def _times_ns(self, name: str) -> tuple[int, int]:
+        """Return how long a symptom is remembered, and how long it may take to come."""
+        symptom = self._symptoms.get(name)
+        if symptom is None:
+            return 0, 0
+        return round(symptom.hold_s * NS), round(symptom.within_s * NS)
+
+    def __iter__(self) -> Iterator[tuple[str, Presence]]:
+        return iter(self._all.items())
+
+    def __getitem__(self, name: str) -> Presence:
+        return self._all[name]
+
+    def onsets(self, at_ns: int) -> dict[str, int]:
+        """Return the symptoms that count as present, the analysis' own, with their onsets."""
+        return {
+            name: one.onset_ns
+            for name, one in self._all.items()
+            if self.knows(name) and one.counts_present(at_ns)
+        }
+
+    def counting(self, at_ns: int, waits_ns: Mapping[str, int]) -> dict[str, Counts]:
+        """Return what each symptom counts as at an instant.
+
+        Absence counts from the instant in ``waits_ns`` on. What the analysis does not have
+        counts only while it is there.
+        """
+        return {name: self._counts(name, one, at_ns, waits_ns) for name, one in self}
+
+    def _counts(self, name: str, one: Presence, at_ns: int, waits_ns: Mapping[str, int]) -> Counts:
+        if one.counts_present(at_ns):
+            return "present"
+        since_ns = max(one.may_be_absent_ns, waits_ns.get(name, 0))
+        return "absent" if one.is_absent and self.knows(name) and at_ns >= since_ns else ""
+
+    def next_ns(self, at_ns: int, waits_ns: Mapping[str, int]) -> int | None:
+        """Return when something else counts next without anything told; None for never."""
+        times = (time for name, one in self for time in self._turns(name, one, waits_ns))
+        return min((time for time in times if time > at_ns), default=None)
+
+    def _turns(self, name: str, one: Presence, waits_ns: Mapping[str, int]) -> Iterator[int]:
+        if one.gone_ns is not None:
+            yield one.gone_ns + one.hold_ns
+        if one.is_absent:
+            yield max(one.may_be_absent_ns, waits_ns.get(name, 0))
+
+    def snapshot(self) -> dict[str, Any]:
+        """Return all of it as JSON."""
+        plain: Any = msgspec.to_builtins
+        return {n: [plain(one.told), plain(one.seen), one.gone_ns] for n, one in self}
+
+    def resume(self, snapshot: Mapping[str, Any]) -> None:
+        """Go on from what ``snapshot`` returned."""
+        self._all = {
+            name: Presence(
+                msgspec.convert(told, Symptom), *self._times_ns(name),
+                msgspec.convert(seen, Symptom | None), gone_ns,
+            )
+            for name, (told, seen, gone_ns) in snapshot.items()
+        }  # fmt: skip
+
+
+def _time(at_ns: int | None) -> int:
+    return 0 if at_ns is None else at_ns
