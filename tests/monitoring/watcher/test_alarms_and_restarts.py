@@ -67,7 +67,7 @@ def states(stand: Stand) -> dict[str, str]:
     alarms = [*values(written(stand.path), "amberbox/alarm")]
     alarms += values(written(stand.path, live_only=True), "amberbox/alarm")
     newest = {str(a["component"]): a for a in sorted(alarms, key=lambda a: str(a["changed_ns"]))}
-    lasting = {a.component: a.state for a in standing_in(open_store(stand.path)).values()}
+    lasting = {a.component: a.state for a in standing_in(open_store(stand.path)).alarms.values()}
     return {name: lasting.get(name, "healed") for name in newest}
 
 
@@ -127,7 +127,7 @@ def test_a_new_file_has_the_alarms_that_last(
     assert len(old) > 1
     for path in old:
         path.unlink()
-    (before,) = standing_in(store).values()
+    (before,) = standing_in(store).alarms.values()
     assert (before.component, before.state) == ("base", "open")
     for leave in (Watcher.close, kill):
         leave(watcher)
@@ -135,7 +135,7 @@ def test_a_new_file_has_the_alarms_that_last(
         live(stand, watcher, 5, -1.0)
     watcher.close()
     newest.unlink()
-    assert standing_in(store) == {before.id: before}
+    assert standing_in(store).alarms == {before.id: before}
 
 
 class Ear:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 from amberbox.core.types import Batch, Status
-from amberbox.monitoring.engine.findings import Finding
+from amberbox.monitoring.engine.findings import Finding, is_live_only
 from amberbox.monitoring.engine.states import States
 from amberbox.monitoring.watcher.epoch import Epoch
 from amberbox.monitoring.watcher.memory import Memory, Place
@@ -16,6 +16,14 @@ from amberbox.monitoring.watcher.reader import Block
 
 class Evaluates(Protocol):
     """What is asked of the engine."""
+
+    @property
+    def items(self) -> frozenset[str]:
+        """Names of the items that are wanted from the record."""
+
+    @property
+    def history_s(self) -> float:
+        """How far it looks back."""
 
     def begin(self, at_ns: int) -> None:
         """Begin an epoch."""
@@ -74,8 +82,15 @@ class Evaluation:
         if self._known is None and (self.place is None or block.until_ns > self.place.until_ns):
             found = list(self.engine.advance(block.until_ns))
             self.place = Place(block.epoch, block.until_ns)
-            found, self._more = found[self._more :], max(self._more - len(found), 0)
-            yield found
+            yield self._new(found)
+
+    def _new(self, found: list[Finding]) -> list[Finding]:
+        """Leave out what was written before; a replay's findings alone were counted there."""
+        for place, finding in enumerate(found):
+            if not self._more:
+                return found[place:]
+            self._more -= not is_live_only(finding)
+        return []
 
     def _enter(self, epoch: Epoch, start_ns: int) -> bool:
         """Go over to an epoch; False for one that lies before what is remembered."""

@@ -28,6 +28,7 @@ from amberbox.monitoring.messages.publisher import Publisher
 from amberbox.monitoring.plan import Plan
 from amberbox.monitoring.probing.runner import ProbeRunner
 from amberbox.monitoring.watcher import commands
+from amberbox.monitoring.watcher.diagnosing import Diagnosing, MakeDiagnoser
 from amberbox.monitoring.watcher.evaluation import Evaluation
 from amberbox.monitoring.watcher.guard import guarded
 from amberbox.monitoring.watcher.memory import Checkpoint, Memory, Place, recall
@@ -58,11 +59,17 @@ class Watch:
     folder: RobotFolder | None = None
     clock: Clock = field(default_factory=SystemClock)
     clock_s: Callable[[], float] = time.monotonic
+    diagnoser: MakeDiagnoser | None = None
+    """Makes what diagnoses what the monitors find."""
 
     @property
     def monitors(self) -> str:
-        """State which monitors these are: what was known of others says nothing about them."""
-        return f"{self.plan.config_hash} {__version__}"
+        """State which monitors these are: what was known of others says nothing about them.
+
+        What the diagnosis knows of faults is part of the configuration.
+        """
+        monitors = f"{self.plan.config_hash} {__version__}"
+        return monitors if self.diagnoser is None else f"{monitors} diagnosed"
 
 
 class Watcher:
@@ -75,8 +82,8 @@ class Watcher:
         self._watch = watch
         self._tell = tell or _tell_nobody
         self._lock = WriterLock(watch.store, WATCH)
-        self._engine = Engine(watch.plan)
-        self._standing = Standing(standing_in(watch.store), self._engine.states.alarms)
+        self._engine = Diagnosing(Engine(watch.plan), watch.diagnoser)
+        self._standing = Standing(standing_in(watch.store), self._engine)
         self._journal = Journal(
             watch.store, watch.plan.robot, watch.plan.config_hash, watch.clock, self._standing.again
         )
@@ -237,9 +244,8 @@ class Watcher:
 
     def _carry_out(self, request: Request, place: Place, shift_ns: int) -> None:
         """Do what a request says; what cannot be done is said in an event."""
-        command = self._engine.states.command
         try:
-            changes = commands.carry_out(request, command, place.until_ns, shift_ns)
+            changes = commands.carry_out(request, self._engine.command, place.until_ns, shift_ns)
         except UsageError as error:  # healed meanwhile, or acknowledged twice
             self._journal.told("alarm_refused", f"request refused: {error.what}")
         except ValueError as error:

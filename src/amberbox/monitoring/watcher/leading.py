@@ -1,0 +1,77 @@
+"""The leading answer of a diagnosis in a line: which failure mode, or one of which, how sure."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+from amberbox.core.types import AmbiguityGroup, Diagnosis, Hypothesis
+
+OTHER: Final = "unknown#other"
+"""The failure mode that stands for everything that is not in the FMEA."""
+_NAMED: Final = 3
+"""So many of those that nothing tells apart are named; of the others it is said how many."""
+_WORDS: Final = (
+    (0.95, "almost certain"),
+    (0.8, "very likely"),
+    (0.5, "likely"),
+    (0.2, "possible"),
+    (0.0, "only a guess"),
+)
+"""The words that an explanation uses."""
+_ALSO: Final = 0.05
+"""What is less probable than this is not worth a line."""
+
+
+def leading(diagnosis: Diagnosis) -> tuple[Hypothesis, ...]:
+    """Return the most probable hypothesis, and those that nothing known tells from it."""
+    if not diagnosis.groups:
+        return diagnosis.hypotheses[:1]
+    return _members(diagnosis, diagnosis.groups[0])
+
+
+def cause(diagnosis: Diagnosis) -> str:
+    """Say the leading answer, and how sure it is in a word: ``laser#no_power (very likely)``."""
+    first = leading(diagnosis)
+    if not first:
+        return ""
+    probability = _probability(diagnosis, first)
+    word = next(word for least, word in _WORDS if probability >= least)
+    return f"{either(first)} ({word})"
+
+
+def in_words(diagnosis: Diagnosis) -> str:
+    """Say the leading answer, what else is worth a thought, and what to do next."""
+    if diagnosis.state == "healed":
+        return "healed"
+    groups = [(_members(diagnosis, g), g.probability) for g in diagnosis.groups]
+    worth = [f"{either(m)} ({_percent(p)})" for m, p in groups[:1]]
+    worth += [f"{either(m)} ({_percent(p)})" for m, p in groups[1:3] if p >= _ALSO]
+    tests = diagnosis.next_tests
+    next_test = f"; next: {tests[0].text or tests[0].id}" if tests else ""
+    return (", or ".join(worth) or "no answer") + next_test
+
+
+def either(hypotheses: Sequence[Hypothesis]) -> str:
+    """Name hypotheses of which one is meant."""
+    names = [_name(hypothesis) for hypothesis in hypotheses[:_NAMED]]
+    more = len(hypotheses) - len(names)
+    return " or ".join([*names, f"one of {more} more"] if more else names)
+
+
+def _members(diagnosis: Diagnosis, group: AmbiguityGroup) -> tuple[Hypothesis, ...]:
+    by_id = {hypothesis.id: hypothesis for hypothesis in diagnosis.hypotheses}
+    return tuple(by_id[name] for name in group.members if name in by_id)
+
+
+def _probability(diagnosis: Diagnosis, first: Sequence[Hypothesis]) -> float:
+    return diagnosis.groups[0].probability if diagnosis.groups else first[0].probability
+
+
+def _name(hypothesis: Hypothesis) -> str:
+    faults = ("not in the FMEA" if fault == OTHER else fault for fault in sorted(hypothesis.faults))
+    return " + ".join(faults) or "a false alarm"
+
+
+def _percent(probability: float) -> str:
+    return f"{min(max(round(100 * probability), 1), 99)} %"

@@ -1,0 +1,271 @@
+"""Monitors and diagnosis together: however calls are split, wherever it is killed, the same."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from amberbox.blackbox.journal.writer import JournalOptions
+from amberbox.blackbox.requests import submit
+from amberbox.blackbox.store import open_store
+from amberbox.core.clock import NS
+from amberbox.core.types import Diagnosis, Symptom
+from amberbox.monitoring.engine.engine import Engine
+from amberbox.monitoring.engine.findings import AlarmChange
+from amberbox.monitoring.plan import Plan
+from amberbox.monitoring.watcher.diagnosing import PART, Diagnosing
+from amberbox.monitoring.watcher.evaluation import Evaluation
+from amberbox.monitoring.watcher.instants import instant_of
+from amberbox.monitoring.watcher.reader import Block
+from amberbox.monitoring.watcher.replay import Part, blocks, newest, replay
+from amberbox.monitoring.watcher.standing import standing_in
+from amberbox.monitoring.watcher.watcher import Watcher
+from tests.monitoring.watcher.diagnoser import ITEM, NEGATIVE, PlainDiagnoser
+from tests.monitoring.watcher.stand import (
+    NUMBERS,
+    PROBE,
+    Stand,
+    component,
+    kill,
+    line_of,
+    plan_of,
+    positive,
+    variable,
+    written,
+)
+from tests.monitoring.watcher.test_trouble import values
+
+
+def stand_of(path: Path, seed: int) -> Stand:
+    return Stand(path / "store", seed, diagnoser=PlainDiagnoser)
+
+
+def base_only(config_hash: str = "hash") -> Plan:
+    return Plan("robot", config_hash, [component("base", positive, variable("ros_main"))])
+
+
+def say(stand: Stand, ticks: int, main: float, bulk: float = 1.0) -> None:
+    for _ in range(ticks):
+        stand.box.hear(NUMBERS["main"], struct.pack("<d", main))
+        stand.box.hear(NUMBERS["bulk"], struct.pack("<d", bulk))
+        stand.box.write(0.1)
+
+
+def live(stand: Stand, watcher: Watcher, ticks: int, main: float) -> None:
+    for _ in range(ticks):
+        say(stand, 1, main)
+        watcher.step()
+
+
+def channel(stand: Stand, name: str, *, live_only: bool = False) -> list[Mapping[str, Any]]:
+    return values(written(stand.path, live_only=live_only), f"amberbox/{name}")
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_killed_at_any_moment_no_diagnosis_is_lost_or_doubled(tmp_path: Path, seed: int) -> None:
+    """The recorder restarts, its clock is set; the watcher is killed amid all this."""
+    stand = stand_of(tmp_path, 30 + seed)
+    rng = stand.random
+    stand.tick()
+    watcher = stand.watcher()
+    watcher.step()
+    for _ in range(120):
+        what = rng.random()
+        if what < 0.02:
+            stand.restart(clean=rng.random() < 0.5)
+        elif what < 0.03:
+            stand.clock.step(rng.choice([-3600, 2, 3600]) + rng.uniform(0, 0.01))
+        elif what < 0.07:
+            kill(watcher)
+            watcher = stand.watcher()
+        elif what < 0.09:
+            watcher.close()
+            watcher = stand.watcher()
+        elif what < 0.15:
+            watcher.measured(PROBE, {"subject": PROBE.subject, "ok": rng.random() < 0.7})
+        stand.tick()
+        if rng.random() < 0.5:
+            watcher.step()
+    stand.box.close()
+    watcher.step()
+    watcher.close()
+    found, replayed = written(stand.path), stand.replayed()
+    assert len(channel(stand, "diagnosis")) > 10
+    assert any(symptom["id"] == NEGATIVE for symptom in channel(stand, "symptom"))
+    assert any(alarm["cause"] for alarm in channel(stand, "alarm"))
+    assert found == replayed
+
+
+def test_items_that_only_conditions_read_are_read(tmp_path: Path) -> None:
+    stand = stand_of(tmp_path, 1)
+    say(stand, 10, 1.0, 1.0)
+    say(stand, 10, 1.0, -1.0)
+    stand.box.close()
+    found = list(replay(base_only(), open_store(stand.path), diagnoser=PlainDiagnoser))
+    assert ITEM not in Engine(base_only()).items
+    (negative,) = [one for one in found if isinstance(one, Symptom) and one.id == NEGATIVE]
+    assert negative.state == "present"
+    assert list(map(instant_of, found)) == sorted(map(instant_of, found))
+    last = newest(base_only(), open_store(stand.path), PlainDiagnoser)
+    assert last.diagnosis is not None
+    assert last.diagnosis.symptoms == (NEGATIVE,)
+    assert newest(base_only(), open_store(stand.path)).diagnosis is None
+
+
+def pieces_of(block: Block, stand: Stand) -> list[Block]:
+    """Cut a block into some: the rows come with the first."""
+    cuts = sorted(stand.random.uniform(block.start_ns, block.until_ns) for _ in range(4))
+    ends = [*(round(cut) for cut in cuts), block.until_ns]
+    first, *others = ends
+    head = Block(block.epoch, block.start_ns, block.batches, first)
+    return [head, *(Block(block.epoch, block.start_ns, [], end) for end in others)]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_how_calls_are_split_does_not_matter(tmp_path: Path, seed: int) -> None:
+    stand = stand_of(tmp_path, 40 + seed)
+    for _ in range(100):
+        stand.tick()
+    stand.box.close()
+    store = open_store(stand.path)
+    engine = Diagnosing(Engine(plan_of()), PlainDiagnoser)
+    evaluation, found = Evaluation(engine), []
+    for block in blocks(plan_of(), store, engine, Part()):
+        for piece in pieces_of(block, stand):
+            found += [line_of(f) for new in evaluation.take(piece) for f in new]
+    assert any(b"amberbox/diagnosis" in line for line in found)
+    assert found == stand.replayed()
+
+
+def test_an_alarm_gets_its_cause_and_loses_it_again(tmp_path: Path) -> None:
+    stand = stand_of(tmp_path, 1)
+    say(stand, 20, 1.0)
+    say(stand, 20, -1.0)
+    say(stand, 20, -1.0, -1.0)
+    say(stand, 20, 1.0)
+    stand.box.close()
+    found = list(replay(base_only(), open_store(stand.path), diagnoser=PlainDiagnoser))
+    alarms = [one for one in found if isinstance(one, AlarmChange)]
+    diagnoses = [one for one in found if isinstance(one, Diagnosis)]
+    assert [(a.state, a.cause) for a in alarms] == [
+        ("open", ""),
+        ("open", "base#broken (very likely)"),
+        ("open", "base#broken + bulk.negative#broken (very likely)"),
+        ("healed", "base#broken + bulk.negative#broken (very likely)"),
+    ]
+    assert {a.id for a in alarms} == {alarms[0].id}
+    assert [a.changed_ns for a in alarms[1:3]] == [d.at_ns for d in diagnoses[:2]]
+    assert {a.diagnosis for a in alarms[1:]} == {diagnoses[0].id}
+    assert [d.state for d in diagnoses] == ["open", "open", "healed"]
+
+
+def test_a_snapshot_without_diagnosis_begins_it_anew(tmp_path: Path) -> None:
+    stand = stand_of(tmp_path, 1)
+    say(stand, 20, -1.0)
+    stand.box.close()
+    engine = Diagnosing(Engine(base_only()), PlainDiagnoser)
+    evaluation = Evaluation(engine)
+    for block in blocks(base_only(), open_store(stand.path), engine, Part()):
+        assert list(evaluation.take(block))
+    assert engine.diagnosis is not None
+    held = engine.snapshot()
+    again = Diagnosing(Engine(base_only()), PlainDiagnoser)
+    again.resume(held)
+    assert again.snapshot() == held
+    del held[PART]
+    older = Diagnosing(Engine(base_only()), PlainDiagnoser)
+    older.resume(held)
+    assert older.diagnosis is None
+    assert [alarm.cause for alarm in older.alarms()] == [""]
+    assert [alarm.cause for alarm in again.alarms()] == ["base#broken (very likely)"]
+
+
+def test_other_monitors_close_what_the_ones_before_left_open(tmp_path: Path) -> None:
+    """With the configuration changed nobody goes on with it: it is said to be over."""
+    stand = stand_of(tmp_path, 1)
+    say(stand, 1, 1.0)
+    watcher = stand.watcher(base_only())
+    live(stand, watcher, 20, -1.0)
+    watcher.close()
+    (opened,) = channel(stand, "diagnosis")
+    assert opened["state"] == "open"
+    stand.diagnoser = None
+    watcher = stand.watcher(base_only("other"))
+    live(stand, watcher, 5, -1.0)
+    watcher.close()
+    (over,) = channel(stand, "diagnosis", live_only=True)
+    assert (over["id"], over["state"], over["revision"]) == (opened["id"], "healed", 2)
+    assert over["at_ns"] > opened["at_ns"]
+    (alarm,) = standing_in(open_store(stand.path)).alarms.values()
+    assert (alarm.state, alarm.cause, alarm.diagnosis) == ("open", "", "")
+
+
+def test_a_diagnosis_that_new_monitors_make_in_silence_is_written(tmp_path: Path) -> None:
+    stand = stand_of(tmp_path, 1)
+    stand.diagnoser = None
+    say(stand, 1, 1.0)
+    watcher = stand.watcher(base_only())
+    live(stand, watcher, 20, -1.0)
+    watcher.close()
+    stand.diagnoser = PlainDiagnoser
+    watcher = stand.watcher(base_only())
+    live(stand, watcher, 5, -1.0)
+    watcher.close()
+    *_, now = channel(stand, "diagnosis", live_only=True)
+    assert now["state"] == "open"
+    assert now["hypotheses"][0]["faults"] == ["base#broken"]
+    (alarm,) = standing_in(open_store(stand.path)).alarms.values()
+    assert (alarm.state, alarm.diagnosis) == ("open", now["id"])
+
+
+def test_each_file_begins_with_the_open_diagnosis_and_the_causes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    options = partial(JournalOptions, rotate_ns=2 * NS)
+    monkeypatch.setattr("amberbox.blackbox.keeper.ownjournal.JournalOptions", options)
+    stand = stand_of(tmp_path, 1)
+    say(stand, 1, 1.0)
+    watcher = stand.watcher(base_only())
+    live(stand, watcher, 60, -1.0)
+    store = open_store(stand.path)
+    *old, _ = store.journal_files("watch")
+    assert len(old) > 1
+    for path in old:
+        path.unlink()
+    before = standing_in(store)
+    (diagnosis,) = before.diagnoses.values()
+    (alarm,) = before.alarms.values()
+    assert (alarm.cause, alarm.diagnosis) == ("base#broken (very likely)", diagnosis.id)
+    kill(watcher)
+    watcher = stand.watcher(base_only())
+    live(stand, watcher, 5, -1.0)
+    live(stand, watcher, 10, 1.0)
+    watcher.close()
+    assert standing_in(store).diagnoses == {}
+    assert channel(stand, "diagnosis")[-1]["state"] == "healed"
+
+
+def test_what_people_said_stays_when_the_cause_comes(tmp_path: Path) -> None:
+    stand = stand_of(tmp_path, 1)
+    say(stand, 1, 1.0)
+    watcher = stand.watcher(base_only())
+    live(stand, watcher, 20, -1.0)
+    (known,) = standing_in(open_store(stand.path)).alarms.values()
+    request = {"action": "acknowledge", "id": known.id, "who": "anna"}
+    submit(open_store(stand.path), "alarm", request)
+    live(stand, watcher, 5, -1.0)
+    for _ in range(10):
+        say(stand, 1, -1.0, -1.0)
+        watcher.step()
+    (alarm,) = standing_in(open_store(stand.path)).alarms.values()
+    assert (alarm.state, alarm.who) == ("acknowledged", "anna")
+    assert alarm.cause == "base#broken + bulk.negative#broken (very likely)"
+    stand.box.close()
+    watcher.step()
+    watcher.close()
+    assert written(stand.path) == stand.replayed(base_only())
