@@ -56,7 +56,7 @@ def answer(
         found.hypotheses,
         found.mass_covered,
         found.incomplete,
-        found.findings,
+        (*found.findings, *situation.findings),
         tuple(proposal.test for proposal in tests),
         _groups(knowledge, known, found),
         tuple(symptom.id for symptom in situation.present()),

@@ -22,13 +22,15 @@ class Situation:
     evidence. ``answers`` are what tests gave, by the test's id (``cannot check`` is one).
     ``conflicts`` are sets of failure modes of which other engines proved that at least one is
     there. ``watched`` says that the symptoms come from a watcher, which reads them all as soon as
-    they can be read: reading them is no test.
+    they can be read: reading them is no test. ``findings`` are texts of what other engines found
+    that speaks for no failure mode.
     """
 
     symptoms: tuple[Symptom, ...] = ()
     answers: Mapping[str, str] = field(default_factory=dict)
     conflicts: tuple[frozenset[str], ...] = ()
     watched: bool = False
+    findings: tuple[str, ...] = ()
 
     def present(self) -> tuple[Symptom, ...]:
         """Return the symptoms that are there and count, in order of onset."""

@@ -58,6 +58,24 @@ class Program:
         )
 
     @cached_property
+    def heads(self) -> Mapping[Key, Place]:
+        """Names of rules that no other rule calls: what the program concludes, with places."""
+        rules = {
+            key: clause.place
+            for key, predicate in self.predicates.items()
+            for clause in reversed(predicate.clauses)
+            if clause.body is not None
+        }
+        used = {
+            called_key
+            for key, predicate in self.predicates.items()
+            for clause in predicate.clauses
+            for called_key in called(clause.goals)
+            if called_key != key
+        }
+        return {key: place for key, place in rules.items() if key not in used}
+
+    @cached_property
     def database(self) -> Database:
         """The relations that were filled from the facts upwards."""
         return Database(self.known)

@@ -1,0 +1,1 @@
+"""What other engines find, made ready for the one answer."""
