@@ -422,19 +422,25 @@ SAYS = {"ok": "absent", "warn": "present", "error": "present"}
 
 
 def _symptoms_are_what_statuses_say(drawn: Plan, findings: Sequence[Finding]) -> None:
-    """Compare each with the statuses of its instant; none is told twice, none is left out."""
+    """Compare each with the statuses of its instant; none is told twice, none is left out.
+
+    Only what speaks neither for nor against a fault may stay untold after unknown.
+    """
     of_mode = _expected_alone(drawn)
     last: dict[str, tuple[str, tuple[str, ...]]] = {}
-    for place, finding in enumerate(findings):
+    for finding in findings:
         if isinstance(finding, Symptom):
             said: tuple[str, tuple[str, ...]] = finding.state, finding.blocked_by
             assert said != last.get(finding.id, ("unknown", finding.blocked_by))
+            assert finding.id in last or said[0] == "present" or said == ("absent", ())
             assert (finding.onset_ns is not None) == (finding.state == "present")
             last[finding.id] = said
         elif isinstance(finding, Status) and (finding.component, finding.mode) in of_mode:
             name = of_mode[finding.component, finding.mode]
             said = SAYS.get(finding.level, "unknown"), finding.blocked_by
-            assert last.get(name, ("unknown", finding.blocked_by)) == said, place
+            counts = said[0] == "present" or said == ("absent", ())
+            before = last.get(name, ("unknown", ()))
+            assert before == said or (before[0] == "unknown" and not counts)
     known = {s.id for s in symptoms(findings)}
     expected = {f"{p.component}/{p.mode}/{p.output.name}" for p in outputs_of(drawn)
                 if p.output.expectation.value is not None}  # fmt: skip

@@ -74,6 +74,28 @@ def test_an_output_that_was_never_known_says_nothing() -> None:
     assert told(stand.until(3)) == [(2, "bus", "present", ())]
 
 
+def test_a_robot_that_starts_says_each_thing_once() -> None:
+    stand = Stand(
+        laser("bus", name="scan"), laser("bus"), laser("host", name="bus"), laser(name="host")
+    )
+    stand.ok(0.1, "scan", "laser")
+    stand.ok(0.5, "bus")
+    stand.ok(0.7, "host")
+    assert sorted(told(stand.until(1))) == [
+        (0.7, n, "absent", ()) for n in ("bus", "host", "laser", "scan")
+    ]
+    stand.begin(2)
+    stand.ok(2.1, "scan", "laser", "bus")
+    stand.until(2.5)
+    _leave_and_go_on(stand)
+    stand.bad(3, "scan")
+    stand.ok(4, "scan", "host")
+    assert told(stand.until(5)) == [
+        (3, "scan", "present", ("bus",)),  # speaks for a fault, blocked or not
+        *((4, name, "absent", ()) for name in ("scan", "laser", "bus", "host")),
+    ]
+
+
 def test_an_output_of_which_nothing_is_expected_says_nothing() -> None:
     free = output("speed", type="float")
     stand = Stand(component("laser", modes=[mode("device", free, expected())]))

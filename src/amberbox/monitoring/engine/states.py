@@ -127,7 +127,7 @@ class States:
             findings += self._alarms.update(name, at_ns, component.own, component.waits)
         transitions = (self._words.component_transition(c, at_ns) for c in self._components)
         findings += [transition for transition in transitions if transition is not None]
-        findings += self._symptoms.tell_all(at_ns)
+        findings += self._symptoms.begin(at_ns)
         self._tell_all(at_ns, None, findings)
         return findings
 

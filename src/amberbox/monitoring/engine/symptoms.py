@@ -1,4 +1,8 @@
-"""Symptoms: what each output says for or against faults, told when that changes."""
+"""Symptoms: what each output says for or against faults, told when that changes.
+
+The first word of an epoch on an output is one that counts: what is unknown, or in order while
+something blocks it, is not told then. So a robot that starts says each thing once.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +25,7 @@ Said: TypeAlias = tuple[SymptomState, tuple[str, ...]]
 
 
 class _Watched:
-    """An output of which something is expected; ``said`` is None until something is known."""
+    """An output of which something is expected; ``said`` is None until something was told."""
 
     __slots__ = ("address", "component", "measured", "output", "said")
 
@@ -41,7 +45,7 @@ class _Watched:
     def tell(self, now_ns: int) -> Symptom | None:
         """Return the symptom if it differs from what was told last."""
         now = self.now()
-        if now == self.said or (self.said is None and now[0] == "unknown"):
+        if now == self.said or (self.said is None and not _is_word(now)):
             return None
         self.said = now
         state, blocked_by = now
@@ -82,25 +86,33 @@ class Symptoms:
         told = (self._watched[number].tell(now_ns) for number in sorted(numbers))
         return [symptom for symptom in told if symptom is not None]
 
-    def tell_all(self, now_ns: int) -> list[Symptom]:
-        """Return what is new of all outputs."""
-        return self.tell(self._watched, (), now_ns)
+    def begin(self, at_ns: int) -> list[Symptom]:
+        """Begin an epoch, in which nothing is known yet; return what was known before."""
+        told = self.tell(self._watched, (), at_ns)
+        for watched in self._watched.values():
+            watched.said = None
+        return told
 
     def snapshot(self) -> list[int]:
-        """Return the outputs that were known and are so no more: the others tell it themselves."""
+        """Return the outputs that would not be a first word, and had one: of others one sees."""
         return [
             number
             for number, watched in self._watched.items()
-            if watched.said is not None and watched.said[0] == "unknown"
+            if watched.said is not None and not _is_word(watched.said)
         ]
 
     def resume(self, held: Iterable[int]) -> None:
         """Go on from what ``snapshot`` returned; outputs and components have been resumed."""
-        were_known = set(held)
+        had_one = set(held)
         for number, watched in self._watched.items():
             now = watched.now()
-            is_known = now[0] != "unknown" or number in were_known
-            watched.said = now if is_known else None
+            watched.said = now if _is_word(now) or number in had_one else None
+
+
+def _is_word(said: Said) -> bool:
+    """Tell whether an epoch may begin with it: it speaks for or against a fault."""
+    state, blocked_by = said
+    return state == "present" or (state == "absent" and not blocked_by)
 
 
 def _measured_by(mappings: Iterable[MappingPlan]) -> list[list[str]]:
