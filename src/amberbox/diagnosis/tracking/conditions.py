@@ -86,7 +86,8 @@ class Conditions:
     def _block(self, instants: IntArray) -> list[Symptom]:
         if not len(instants):
             return []
-        found = [symptom for one in self._all for symptom in one.look(instants)]
+        fresh = Fresh(instants)
+        found = [symptom for one in self._all for symptom in one.look(instants, fresh)]
         found.sort(key=lambda symptom: symptom.confirmed_ns or 0)
         return found
 
@@ -107,7 +108,7 @@ class Condition:
     """One condition as time goes by; unknown also while it reads what is no longer fresh."""
 
     __slots__ = (
-        "_delay_ns", "_expression", "_fresh", "_looked_ns", "_samples", "_timed", "id", "state",
+        "_delay_ns", "_expression", "_looked_ns", "_samples", "_timed", "_wanted", "id", "state",
         "trouble",
     )  # fmt: skip
 
@@ -118,7 +119,7 @@ class Condition:
         self._expression = expression
         self._samples = {address: samples[address] for address in expression.addresses()}
         wanted = dict.fromkeys(_must_be_fresh(expression.tree))
-        self._fresh = [samples[address] for address in wanted]
+        self._wanted = {_clock(address): samples[address] for address in wanted}
         self._timed = expression.needs_history
         self._delay_ns = expression.tree.for_ns if isinstance(expression.tree, Held) else 0
         self._looked_ns: int | None = None
@@ -132,9 +133,9 @@ class Condition:
         """Go on from a state."""
         self.state, self._looked_ns = state, None
 
-    def look(self, instants: IntArray) -> Iterator[Symptom]:
+    def look(self, instants: IntArray, known: Fresh) -> Iterator[Symptom]:
         """Tell how it changes at instants, which are in order."""
-        fresh = self._is_fresh(instants)
+        fresh = known.all_of(self._wanted)
         if self._stays(fresh):
             return
         states = np.full(len(instants), 2)
@@ -144,16 +145,6 @@ class Condition:
         changed = np.flatnonzero(states != np.concatenate([[before], states[:-1]]))
         for place in changed.tolist():
             yield from self._become(_STATES[states[place]], int(instants[place]))
-
-    def _is_fresh(self, instants: IntArray) -> Any:
-        fresh = np.ones(len(instants), bool)
-        for samples in self._fresh:
-            times_ns = samples.times_ns
-            if not len(times_ns):
-                return np.zeros(len(instants), bool)
-            last = times_ns.searchsorted(instants, "right") - 1
-            fresh &= (last >= 0) & (instants - times_ns[last] <= FRESH_NS)
-        return fresh
 
     def _stays(self, fresh: Any) -> bool:
         """Tell whether it cannot have changed since it was looked at last."""
@@ -198,6 +189,37 @@ class Condition:
         onset_ns = at_ns - self._delay_ns
         evidence = tuple((address, onset_ns, at_ns) for address in reads)
         yield Symptom(self.id, state, first, onset_ns, at_ns, 1.0, "condition", evidence)
+
+
+class Fresh:
+    """Where samples are fresh enough to count, worked out once for all that share their times."""
+
+    def __init__(self, instants: IntArray) -> None:
+        self._instants = instants
+        self._always = np.ones(len(instants), bool)
+        self._of: dict[str, Any] = {}
+
+    def all_of(self, wanted: Mapping[str, Samples]) -> Any:
+        """Return at which instants all samples are fresh; they are named by what times them."""
+        found = self._always
+        for clock, samples in wanted.items():
+            fresh = self._of.get(clock)
+            if fresh is None:
+                fresh = self._of[clock] = self._fresh(samples.times_ns)
+            found = found & fresh
+        return found
+
+    def _fresh(self, times_ns: IntArray) -> Any:
+        if not len(times_ns):
+            return ~self._always
+        last = times_ns.searchsorted(self._instants, "right") - 1
+        return (last >= 0) & (self._instants - times_ns[last] <= FRESH_NS)
+
+
+def _clock(address: str) -> str:
+    """Name what times an address: columns of an item come together, all else by itself."""
+    is_column = "/" not in address and "[" not in address
+    return address.partition(".")[0] if is_column else address
 
 
 def _must_be_fresh(tree: Tree) -> Iterator[str]:
