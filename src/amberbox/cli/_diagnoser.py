@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from functools import partial
+from typing import TYPE_CHECKING
+
 from amberbox.blackbox.folder.folder import RobotFolder
 from amberbox.cli._known import known_of
 from amberbox.core.errors import ConfigurationError, Problem
@@ -9,6 +12,9 @@ from amberbox.diagnosis.fmea.load import FILE, load_fmea
 from amberbox.diagnosis.knowledge import Knowledge
 from amberbox.diagnosis.rules import read_rules
 from amberbox.monitoring.plan import Plan
+
+if TYPE_CHECKING:
+    from amberbox.monitoring.watcher.diagnosing import MakeDiagnoser
 
 RULES = "rules"
 """The folder of a robot folder that rule files lie in."""
@@ -25,6 +31,14 @@ def knowledge_of(
     if fmea is None:
         return None, problems
     return Knowledge(folder.robot.id, fmea, plan.config_hash, exposure_h), problems
+
+
+def diagnoser_of(folder: RobotFolder, plan: Plan) -> tuple[MakeDiagnoser | None, list[Problem]]:
+    """Return what makes a tracker of a folder's faults; None without failure modes to go by."""
+    from amberbox.diagnosis.tracking.tracker import Tracker
+
+    knowledge, problems = knowledge_of(folder, plan)
+    return (None if knowledge is None else partial(Tracker, knowledge)), problems
 
 
 def rule_problems(folder: RobotFolder) -> list[Problem]:

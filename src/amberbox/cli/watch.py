@@ -1,4 +1,4 @@
-"""Watch a robot's record: monitor its components live, once, or over what is recorded."""
+"""Watch a robot's record: monitor and diagnose it live, once, or over what is recorded."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from typing import TYPE_CHECKING
 
 from amberbox.cli._output import accept_relative_times, tell
 from amberbox.core.errors import UsageError
-from amberbox.core.timetext import format_time
 
 if TYPE_CHECKING:
     from amberbox.blackbox.folder.folder import RobotFolder
     from amberbox.blackbox.store import Store
     from amberbox.core.types import Status
-    from amberbox.monitoring.engine.findings import AlarmChange, Finding, Transition
+    from amberbox.monitoring.engine.findings import Finding
     from amberbox.monitoring.plan import Plan
+    from amberbox.monitoring.watcher.diagnosing import MakeDiagnoser
     from amberbox.monitoring.watcher.replay import Part
 
 Say = Callable[["Finding"], None]
@@ -51,11 +51,12 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError("--from, --to and --speed are about a replay", "add --replay")
     folder = _folder(args)
     plan = _plan(folder)
+    diagnoser = _diagnoser(folder, plan)
     if args.replay:
-        return _replay(args, plan)
+        return _replay(args, plan, diagnoser)
     if args.once:
-        return _once(args, plan)
-    return _live(args, plan, folder)
+        return _once(args, plan, diagnoser)
+    return _live(args, plan, folder, diagnoser)
 
 
 def _folder(args: argparse.Namespace) -> RobotFolder:
@@ -86,7 +87,23 @@ def _plan(folder: RobotFolder) -> Plan:
     return plan
 
 
-def _live(args: argparse.Namespace, plan: Plan, folder: RobotFolder) -> int:
+def _diagnoser(folder: RobotFolder, plan: Plan) -> MakeDiagnoser | None:
+    """Return what makes diagnoses by the folder's failure modes; with errors in them nothing."""
+    from amberbox.cli._diagnoser import diagnoser_of
+    from amberbox.diagnosis.fmea.load import FILE
+
+    make, problems = diagnoser_of(folder, plan)
+    count = sum(problem.is_error for problem in problems)
+    if count:
+        errors = f"{count} error{'' if count == 1 else 's'} in {folder.path / FILE}"
+        hint = f"amberbox fmea check {folder.path}"
+        tell([f"{errors}: goes on without diagnosis; see {hint}"])
+    return make
+
+
+def _live(
+    args: argparse.Namespace, plan: Plan, folder: RobotFolder, diagnoser: MakeDiagnoser | None
+) -> int:
     from amberbox.blackbox.store import create_store
     from amberbox.monitoring.configuration.summary import in_words
     from amberbox.monitoring.watcher.watcher import Watch, Watcher
@@ -99,7 +116,8 @@ def _live(args: argparse.Namespace, plan: Plan, folder: RobotFolder) -> int:
         for finding in found:
             say(finding)
 
-    watcher = Watcher(Watch(plan, create_store(folder.store_path), folder), hear)
+    store = create_store(folder.store_path)
+    watcher = Watcher(Watch(plan, store, folder, diagnoser=diagnoser), hear)
     if not args.quiet and not args.json:
         print(f"watching {plan.robot}: {in_words(plan)}", flush=True)
     with _stoppable() as stop:
@@ -107,42 +125,46 @@ def _live(args: argparse.Namespace, plan: Plan, folder: RobotFolder) -> int:
     return 0
 
 
-def _once(args: argparse.Namespace, plan: Plan) -> int:
+def _once(args: argparse.Namespace, plan: Plan, diagnoser: MakeDiagnoser | None) -> int:
     from amberbox.blackbox.store import is_locked
+    from amberbox.cli._watchlines import shown
     from amberbox.monitoring.watcher.replay import newest
 
     with _record(args.where) as store:
-        statuses, at_ns = newest(plan, store)
+        statuses, at_ns, diagnosis = newest(plan, store, diagnoser)
         if not is_locked(store, "main"):
-            tell([f"nothing is being recorded; this is as of {_time(at_ns)}"])
+            tell([f"nothing is being recorded; this is as of {shown(at_ns)}"])
     say = _sayer(args)
     for status in statuses:
         if args.json:
             say(status)
         elif not args.quiet:
             print(_status_line(status))
+    if diagnosis is not None:
+        say(diagnosis)
     return int(any(status.level == "error" for status in statuses))
 
 
-def _replay(args: argparse.Namespace, plan: Plan) -> int:
+def _replay(args: argparse.Namespace, plan: Plan, diagnoser: MakeDiagnoser | None) -> int:
     from amberbox.monitoring.watcher.replay import replay
 
     say = _sayer(args)
     with _record(args.where) as store, _stoppable() as stop:
         part = _part(args, store)
         if part.from_ns is not None and not args.json:
-            _tell_lead(plan)
-        for finding in replay(plan, store, part, stop):
+            _tell_lead(plan, diagnoser)
+        for finding in replay(plan, store, part, stop, diagnoser):
             say(finding)
     return 0
 
 
-def _tell_lead(plan: Plan) -> None:
+def _tell_lead(plan: Plan, diagnoser: MakeDiagnoser | None) -> None:
     """Say why it takes a while until the first finding of a part comes."""
     from amberbox.monitoring.engine.engine import Engine
+    from amberbox.monitoring.watcher.diagnosing import Diagnosing
     from amberbox.monitoring.watcher.replay import WARM_UP_S
 
-    minutes = (WARM_UP_S + Engine(plan).history_s) / 60
+    minutes = (WARM_UP_S + Diagnosing(Engine(plan), diagnoser).history_s) / 60
     tell([f"monitors look back: begins {minutes:.0f} min before --from, if there is a record"])
 
 
@@ -179,71 +201,30 @@ def _speed(text: str) -> float | None:
 
 def _sayer(args: argparse.Namespace) -> Say:
     """Return what prints a finding: as the journal has it, or for a person what has changed."""
-    from amberbox.monitoring.engine.findings import AlarmChange, Transition
+    from amberbox.cli._watchlines import Lines
     from amberbox.monitoring.messages.records import encoded
+
+    lines = Lines()
 
     def as_json(finding: Finding) -> None:
         _, data = encoded(finding)
         print(data.decode(), flush=True)
 
-    told: set[tuple[int, str, str]] = set()
-
     def as_text(finding: Finding) -> None:
-        if isinstance(finding, Transition | AlarmChange):
-            print(_line(finding, told), flush=True)
+        line = lines.line(finding)
+        if line is not None:
+            print(line, flush=True)
 
     def silently(_: Finding) -> None:
         pass
 
-    return silently if args.quiet else as_json if args.json else _with_silence(as_text)
-
-
-def _with_silence(say: Say) -> Say:
-    """Say once when the recorder has fallen silent, and once when it goes on."""
-    from amberbox.core.types import Status
-
-    silent = False
-
-    def hear(finding: Finding) -> None:
-        nonlocal silent
-        if isinstance(finding, Status) and finding.live_only != silent:
-            silent = finding.live_only
-            text = f"everything is unknown: {finding.reason}" if silent else "the record goes on"
-            print(f"{_time(finding.measured_ns)} {text}", flush=True)
-        say(finding)
-
-    return hear
-
-
-def _line(finding: Transition | AlarmChange, told: set[tuple[int, str, str]]) -> str:
-    """Write a finding; the reason of an instant is told once, by whom it concerns first."""
-    from amberbox.monitoring.engine.findings import Transition
-
-    if isinstance(finding, Transition):
-        at_ns, text = finding.at_ns, finding.text.removesuffix(f": {finding.reason}")
-        hint = f" (hint: {finding.hint})" if finding.hint else ""
-    else:
-        at_ns, hint = finding.changed_ns, ""
-        times = f", {finding.count} times" if finding.count > 1 else ""
-        text = f"{finding.component}: alarm {finding.id} {finding.state}"
-        text += f" ({finding.severity}{times})" if finding.state != "healed" else ""
-    said = (at_ns, finding.component, finding.reason)
-    if not finding.reason or said in told or text.endswith("healed"):
-        return f"{_time(at_ns)} {text}"
-    if not any(entry[0] == at_ns for entry in told):
-        told.clear()
-    told.add(said)
-    return f"{_time(at_ns)} {text}: {finding.reason}{hint}"
+    return silently if args.quiet else as_json if args.json else as_text
 
 
 def _status_line(status: Status) -> str:
     name = f"  {status.component}/{status.mode}" if status.mode else status.component
     state = f" {status.state}" if status.state not in ("nominal", status.level) else ""
     return f"{status.level:<7} {name}{state}" + (f": {status.reason}" if status.reason else "")
-
-
-def _time(at_ns: int) -> str:
-    return format_time(at_ns)[:23]
 
 
 @contextmanager
