@@ -1,0 +1,81 @@
+"""From a diagnosis to its explanation: a pure function of what is given."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Sequence
+
+from amberbox.core.types import Diagnosis, Hypothesis, Symptom
+from amberbox.diagnosis.explanation.details import details_of
+from amberbox.diagnosis.explanation.explanation import Explanation, Seen
+from amberbox.diagnosis.explanation.graph import graph_of
+from amberbox.diagnosis.explanation.grouping import described, groups_of
+from amberbox.diagnosis.explanation.headline import headline
+from amberbox.diagnosis.explanation.names import Names
+from amberbox.diagnosis.explanation.seen import Sights
+from amberbox.diagnosis.explanation.step import step_of
+from amberbox.diagnosis.explanation.sureness import sureness
+from amberbox.diagnosis.explanation.use import use_of
+from amberbox.diagnosis.knowledge import Knowledge
+
+OTHERS = 3
+"""How many groups are told besides the leading one."""
+
+
+def explain(diagnosis: Diagnosis, knowledge: Knowledge, symptoms: Iterable[Symptom]) -> Explanation:
+    """Tell a diagnosis in words.
+
+    ``symptoms`` are those it was made of, with their times and what they were measured from;
+    what is not among them is told without. Failure modes and tests that the knowledge does not
+    have are called by their ids.
+    """
+    names, symptoms = Names(knowledge.fmea), tuple(symptoms)
+    sights = Sights.of(names, diagnosis, symptoms)
+    found = groups_of(diagnosis)
+    members = found[0][1] if found else ()
+    groups = [described(names, *group) for group in found[: 1 + OTHERS]]
+    broken, others = (groups[0] if groups else None), groups[1:]
+    others_with = list(zip(others, (group[1] for group in found[1:]), strict=False))
+    sure = sureness(diagnosis, broken)
+    use = use_of(sights.ways, members, others_with)
+    explained, missed = _explained(members), _missed(diagnosis, members)
+    return Explanation(
+        diagnosis.id,
+        diagnosis.revision,
+        diagnosis.robot,
+        diagnosis.at_ns,
+        diagnosis.state,
+        headline(diagnosis, broken, sure, symptoms),
+        broken,
+        sure,
+        sights.in_time(explained, members),
+        sights.in_time(missed, ()),
+        sights.in_time((name for h in members for name in h.contradicted), members),
+        diagnosis.findings,
+        _blocked(sights, symptoms, {*explained, *missed}),
+        tuple(others),
+        use,
+        step_of(knowledge, names, diagnosis, found[0] if found else None),
+        details_of(diagnosis, found),
+        graph_of(sights, found[: 1 + OTHERS]),
+    )
+
+
+def _explained(members: Sequence[Hypothesis]) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(name for h in members for name in h.explains))
+
+
+def _missed(diagnosis: Diagnosis, members: Sequence[Hypothesis]) -> tuple[str, ...]:
+    """Return what was seen and does not follow from what leads."""
+    explained = _explained(members)
+    missed = [name for h in members for name in h.unexplained]
+    if not members:
+        missed = [name for name in diagnosis.symptoms if name not in diagnosis.findings]
+    return tuple(dict.fromkeys(name for name in missed if name not in explained))
+
+
+def _blocked(
+    sights: Sights, symptoms: Sequence[Symptom], counted: Collection[str]
+) -> tuple[Seen, ...]:
+    """Return what shows and does not count, as something that it depends on is not well."""
+    blocked = (s.id for s in symptoms if s.state == "present" and s.blocked_by)
+    return sights.in_time((name for name in blocked if name not in counted), ())

@@ -1,0 +1,191 @@
+"""What is told of a diagnosis: plain texts, numbers and ids, ready to be shown anywhere."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, TypeAlias
+
+Severity: TypeAlias = Literal["", "warning", "urgent", "critical", "fatal"]
+"""What the robot can still do (VDA 5050); empty where nobody knows."""
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """A failure mode in words; ``cause`` is how it may come about, ``remedy`` what helps."""
+
+    id: str
+    text: str
+    severity: Severity = ""
+    cause: str = ""
+    remedy: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Possibility:
+    """One hypothesis in words, with its failure modes (none: a false alarm)."""
+
+    id: str
+    text: str
+    probability: float
+    faults: tuple[Fault, ...]
+    criticality: float = 0.0
+    proof: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Group:
+    """What nothing known tells apart: in one text, and each by itself."""
+
+    text: str
+    probability: float
+    members: tuple[Possibility, ...]
+    wider: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Sureness:
+    """How sure: a word, the probability, and the least it can be if not all was looked at."""
+
+    word: str
+    probability: float
+    at_least: float
+    note: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Way:
+    """How a failure mode shows a symptom: directly, or by what is lost (``via``, in order).
+
+    ``text`` is what is lost on the way in words, or the failure mode itself if it is direct.
+    ``detects`` is how probable it shows when the cause at the end of the way is there.
+    """
+
+    fault: str
+    via: tuple[str, ...]
+    text: str
+    detects: float
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """A symptom in words: where it is read, when it began, what it was measured from, and why.
+
+    ``after_s`` counts from the first symptom; times are None where nobody knows them.
+    """
+
+    id: str
+    text: str
+    address: str
+    onset_ns: int | None = None
+    after_s: float | None = None
+    measured_from: tuple[str, ...] = ()
+    ways: tuple[Way, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Lost:
+    """Something that the robot cannot do any more."""
+
+    id: str
+    text: str
+    severity: Severity
+
+
+@dataclass(frozen=True, slots=True)
+class Use:
+    """Whether the robot can be used: the worst of the leading possibilities."""
+
+    severity: Severity
+    text: str
+    lost: tuple[Lost, ...] = ()
+    careful: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Branch:
+    """What an answer to a test would mean: how probable it is, and what would lead then."""
+
+    answer: str
+    probability: float
+    leads: str
+    then: float
+    remedy: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """What to do next: a test with its answers, empty if there is none, and remedies."""
+
+    text: str
+    test: str = ""
+    by: str = ""
+    takes: str = ""
+    risk: str = ""
+    answers: tuple[Branch, ...] = ()
+    splits: bool = False
+    remedies: tuple[str, ...] = ()
+
+
+NodeKind: TypeAlias = Literal["cause", "lost", "symptom"]
+Mark: TypeAlias = Literal["", "leading", "present", "contradicted", "unexplained"]
+
+
+@dataclass(frozen=True, slots=True)
+class Node:
+    """A box of the graph; ``small`` is its id, ``probability`` that of a failure mode."""
+
+    id: str
+    kind: NodeKind
+    text: str
+    small: str
+    mark: Mark = ""
+    probability: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Edge:
+    """From a cause to what it makes; ``missing`` if that should show and does not."""
+
+    start: str
+    end: str
+    missing: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Graph:
+    """Causes, what they cost and what is seen; how many causes and symptoms are left out."""
+
+    nodes: tuple[Node, ...]
+    edges: tuple[Edge, ...]
+    more_causes: int = 0
+    more_symptoms: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Explanation:
+    """A diagnosis for people: each question has an answer, ``details`` are for experts.
+
+    ``headline`` is the answer in one or two sentences. ``broken`` is the leading group (None if
+    nothing explains what is seen), ``others`` what follows it. ``unexplained`` was seen and does
+    not follow from what leads, ``against`` should show and does not, ``unknown`` was seen and the
+    FMEA does not know it, ``blocked`` was seen and does not count.
+    """
+
+    diagnosis: str
+    revision: int
+    robot: str
+    at_ns: int
+    state: Literal["open", "healed"]
+    headline: str
+    broken: Group | None
+    sure: Sureness
+    because: tuple[Seen, ...]
+    unexplained: tuple[Seen, ...]
+    against: tuple[Seen, ...]
+    unknown: tuple[str, ...]
+    blocked: tuple[Seen, ...]
+    others: tuple[Group, ...]
+    use: Use
+    next: Step
+    details: tuple[str, ...]
+    graph: Graph
