@@ -47,7 +47,7 @@ def fmeas(draw: st.DrawFn) -> Fmea:
             mode = f"{name}#m{place}"
             modes[mode] = FailureMode(mode, name, f"m{place}", probability=draw(CHANCES),
                                       beta=0.5, takes_down=draw(st.integers(0, 3)) > 0)  # fmt: skip
-        needed = draw(needs_of([*components])) if components and draw(st.booleans()) else NOTHING
+        needed = draw(st.just(NOTHING) | needs_of([*components])) if components else NOTHING
         own = tuple(mode for mode in modes if mode.startswith(f"{name}#"))
         components[name] = Component(name, "part", needs=needed, modes=own)
     for number in range(draw(st.integers(1, 3))):

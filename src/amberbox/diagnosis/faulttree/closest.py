@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from itertools import islice
 from typing import TypeAlias
@@ -42,16 +42,24 @@ def closest(
     give it when asking again and again. Raises AmberboxError when the budget did not suffice.
     """
     analysis = tree if isinstance(tree, Analysis) else analyse(tree, budget=budget)
+    chances = _chances(analysis, state)
+    return [_closeness(events, chances) for events in islice(ranked(analysis, chances), n)]
+
+
+def ranked(analysis: Analysis, chances: Mapping[str, float | None]) -> Iterator[frozenset[str]]:
+    """Yield the minimal cut sets, the most probable first, by the probability of every event.
+
+    If an event has none, the sets with the fewest events first. Sets that cannot be are left
+    out. Raises AmberboxError when the cut sets are not known.
+    """
     if analysis.cut_sets is None:
         raise AmberboxError(f"the cut sets are not known: {analysis.incomplete}")
-    chances = _chances(analysis, state)
     cost = _by_count if None in chances.values() else _by_probability
     found = cheapest(
         analysis.cut_sets.leaves, analysis.cut_sets.sets, lambda event: cost(chances[event])
     )
     limit = analysis.truncated_at
-    sets = (events for _, events in found if limit is None or len(events) <= limit)
-    return [_closeness(events, chances) for events in islice(sets, n)]
+    return (events for _, events in found if limit is None or len(events) <= limit)
 
 
 def _chances(analysis: Analysis, state: State) -> dict[str, float | None]:
