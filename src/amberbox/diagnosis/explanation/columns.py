@@ -17,6 +17,7 @@ class Slot:
 
     id: str
     lane: bool = False
+    leading: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,6 +27,7 @@ class Link:
     start: str
     end: str
     missing: bool = False
+    leading: bool = False
     into_lane: bool = False
 
 
@@ -68,24 +70,26 @@ def _levels(graph: Graph) -> dict[str, int]:
 def _links(graph: Graph, levels: Mapping[str, int], stacks: Sequence[list[Slot]]) -> Iterator[Link]:
     """Yield lines between neighbouring columns; lanes that they need are added to the stacks."""
     lanes: set[str] = set()
+    leading = {edge.start for edge in graph.edges if edge.leading}
     for edge in graph.edges:
-        start = edge.start
+        start, leads = edge.start, edge.start in leading
         for level in range(levels[edge.start] + 1, levels[edge.end]):
             lane = f"lane:{level}:{edge.start}"
             if lane not in lanes:
                 lanes.add(lane)
-                stacks[level].append(Slot(lane, lane=True))
-            yield Link(start, lane, into_lane=True)
+                stacks[level].append(Slot(lane, lane=True, leading=leads))
+            yield Link(start, lane, leading=leads, into_lane=True)
             start = lane
-        yield Link(start, edge.end, edge.missing)
+        yield Link(start, edge.end, edge.missing, edge.leading)
 
 
 def _sort(stacks: Sequence[list[Slot]], links: Sequence[Link], *, forward: bool) -> None:
     """Put each column in the order of the middles of its neighbours (barycentres).
 
-    The first column keeps its order: the most probable causes stand at the top.
+    The first column keeps its order, the most probable causes first, and so does the last, what
+    was seen first.
     """
-    order = range(1, len(stacks)) if forward else range(len(stacks) - 2, 0, -1)
+    order = range(1, len(stacks) - 1) if forward else range(len(stacks) - 2, 0, -1)
     for level in order:
         places = {slot.id: place for stack in stacks for place, slot in enumerate(stack)}
         near = _neighbours(links, forward=forward)

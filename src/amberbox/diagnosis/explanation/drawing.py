@@ -8,14 +8,14 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
-from amberbox.diagnosis.explanation.columns import Columns, Slot, columns_of
+from amberbox.diagnosis.explanation.columns import Columns, Link, Slot, columns_of
 from amberbox.diagnosis.explanation.explanation import Explanation, Graph, Node
 from amberbox.diagnosis.explanation.lettering import SIZE, SMALL, width, wrapped
 from amberbox.diagnosis.explanation.words import date_and_clock, percent
 
 MARGIN = 16.0
 PAD = 8.0
-BOX = 236.0
+BOX = 280.0
 BETWEEN = 76.0
 APART = 12.0
 LANE = 4.0
@@ -53,6 +53,7 @@ class Stroke:
 
     path: str
     missing: bool = False
+    leading: bool = False
     tip: tuple[float, float] | None = None
 
 
@@ -73,9 +74,9 @@ def drawn(explanation: Explanation) -> Drawing:
     columns = columns_of(graph)
     wide = 2 * MARGIN + len(columns.slots) * BOX + (len(columns.slots) - 1) * BETWEEN
     head = list(_head(explanation, wide - 2 * MARGIN))
-    top = max((line.y for line in head), default=0.0) + LINE
+    top = max((line.y for line in head), default=0.0) + 1.6 * LINE
     letters = {node.id: lettered(node) for node in graph.nodes}
-    places = _places(columns, letters, top + LINE)
+    places = _places(columns, letters, top + LINE / 2)
     boxes = [_box(node, letters[node.id], places) for node in graph.nodes]
     lines = [line for node in graph.nodes for line in _letters(letters[node.id], places[node.id])]
     bottom = max((box.y + box.height for box in boxes), default=top)
@@ -164,7 +165,8 @@ def _head(explanation: Explanation, most: float) -> Iterator[Line]:
 
 def _column_heads(columns: Columns, y: float) -> Iterator[Line]:
     for number, kind in enumerate(columns.kinds):
-        yield Line("note", HEADS[kind], MARGIN + number * (BOX + BETWEEN), y)
+        if kind not in columns.kinds[:number]:
+            yield Line("note", HEADS[kind], MARGIN + number * (BOX + BETWEEN), y)
 
 
 def _notes(graph: Graph, columns: Columns, y: float) -> Iterator[Line]:
@@ -175,23 +177,31 @@ def _notes(graph: Graph, columns: Columns, y: float) -> Iterator[Line]:
 
 
 def _strokes(columns: Columns, places: Mapping[str, Place]) -> Iterator[Stroke]:
-    for lane in (slot for slots in columns.slots for slot in slots if slot.lane):
-        x, y, height = places[lane.id]
-        yield Stroke(f"M{x:g} {y + height / 2:.1f}h{BOX:g}")
-    fan_in: dict[str, Sequence[str]] = {}
-    for link in columns.links:
-        fan_in[link.end] = (*fan_in.get(link.end, ()), link.start)
-    for link in columns.links:
+    """Yield the lines, those of what leads last, so that they lie above the others."""
+    for slot in (slot for slots in columns.slots for slot in slots if slot.lane):
+        x, y, height = places[slot.id]
+        yield Stroke(f"M{x:g} {y + height / 2:.1f}h{BOX:g}", leading=slot.leading)
+    entries = _entries(columns.links, places)
+    for link in sorted(columns.links, key=lambda link: link.leading):
         x, y, height = places[link.start]
         end_x, end_y, end_height = places[link.end]
-        starts = sorted(fan_in[link.end], key=lambda name: places[name][1])
-        share = (starts.index(link.start) + 1) / (len(starts) + 1)
-        x, y = x + BOX, y + height / 2
-        end_y += end_height * (share if not link.into_lane else 0.5)
+        x, y, end_y = x + BOX, y + height / 2, end_y + end_height * entries[link]
         bend = BETWEEN / 2
-        tip = None if link.into_lane else (end_x, end_y)
         curve = f"C{x + bend:g} {y:.1f} {end_x - bend:g} {end_y:.1f} {end_x:g} {end_y:.1f}"
-        yield Stroke(f"M{x:g} {y:.1f}{curve}", link.missing, tip)
+        tip = None if link.into_lane else (end_x, end_y)
+        yield Stroke(f"M{x:g} {y:.1f}{curve}", link.missing, link.leading, tip)
+
+
+def _entries(links: Sequence[Link], places: Mapping[str, Place]) -> dict[Link, float]:
+    """Return at what share of a box's height each line enters it, in the order they come."""
+    into: dict[str, list[Link]] = {}
+    for link in links:
+        into.setdefault(link.end, []).append(link)
+    entries = {}
+    for of in into.values():
+        for place, link in enumerate(sorted(of, key=lambda link: places[link.start][1]), 1):
+            entries[link] = place / (len(of) + 1)
+    return entries
 
 
 def text_width(line: Line) -> float:

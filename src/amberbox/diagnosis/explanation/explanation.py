@@ -144,11 +144,15 @@ class Node:
 
 @dataclass(frozen=True, slots=True)
 class Edge:
-    """From a cause to what it makes; ``missing`` if that should show and does not."""
+    """From a cause to what it makes; ``missing`` if that should show and does not.
+
+    ``leading``: it belongs to what leads.
+    """
 
     start: str
     end: str
     missing: bool = False
+    leading: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,7 +9,7 @@ from amberbox.diagnosis.covering.answer import NO_FAULT
 from amberbox.diagnosis.explanation.explanation import Edge, Graph, Mark, Node, Way
 from amberbox.diagnosis.explanation.names import FALSE_ALARM, in_order
 from amberbox.diagnosis.explanation.seen import Sights
-from amberbox.diagnosis.explanation.words import clock
+from amberbox.diagnosis.explanation.words import WORTH_TELLING, clock
 
 CAUSES = 12
 SYMPTOMS = 30
@@ -19,12 +19,13 @@ Groups = Sequence[tuple[AmbiguityGroup, Sequence[Hypothesis]]]
 
 def graph_of(sights: Sights, groups: Groups) -> Graph:
     """Return the boxes and arrows of the leading groups; at most 12 causes and 30 symptoms."""
-    hypotheses = [hypothesis for _, members in groups for hypothesis in members]
     leading = list(groups[0][1]) if groups else []
+    others = (members for group, members in groups[1:] if group.probability >= WORTH_TELLING)
+    hypotheses = [*leading, *(hypothesis for members in others for hypothesis in members)]
     marks = _marks(leading, hypotheses)
-    causes, symptoms = _causes(hypotheses), list(marks)
+    causes, symptoms = _causes(hypotheses), _in_time(sights, marks)
     shown_causes, shown = causes[:CAUSES], symptoms[:SYMPTOMS]
-    edges = tuple(dict.fromkeys(_edges(sights, hypotheses, leading, shown_causes, shown)))
+    edges = _edges(sights, hypotheses, leading, shown_causes, shown)
     lost = dict.fromkeys(n for e in edges for n in (e.start, e.end) if n.startswith("lost:"))
     nodes = (
         *(_cause(sights, name, hypotheses, leading) for name in shown_causes),
@@ -50,6 +51,13 @@ def _marks(leading: Sequence[Hypothesis], hypotheses: Sequence[Hypothesis]) -> d
         for name in hypothesis.contradicted:
             marks.setdefault(name, "contradicted")
     return marks
+
+
+def _in_time(sights: Sights, marks: Mapping[str, Mark]) -> list[str]:
+    """Put what is seen in order of onset, what does not show last."""
+    seen = sights.in_time((name for name, mark in marks.items() if mark != "contradicted"), ())
+    missing = (name for name, mark in marks.items() if mark == "contradicted")
+    return [*(symptom.id for symptom in seen), *missing]
 
 
 def _cause(
@@ -80,29 +88,22 @@ def _edges(
     leading: Sequence[Hypothesis],
     causes: Sequence[str],
     symptoms: Sequence[str],
-) -> Iterator[Edge]:
-    for hypothesis in hypotheses:
+) -> tuple[Edge, ...]:
+    """Return every arrow once; those of leading hypotheses are marked."""
+    edges: dict[tuple[str, str], Edge] = {}
+    for hypothesis in sorted(hypotheses, key=lambda h: h not in leading):
+        leads = hypothesis in leading
         shows = dict.fromkeys(hypothesis.explains, False)
-        if hypothesis in leading:
-            shows |= dict.fromkeys(hypothesis.contradicted, True)
-        yield from _of(sights, hypothesis, shows, causes, symptoms)
+        shows |= dict.fromkeys(hypothesis.contradicted if leads else (), True)
+        for symptom, missing in shows.items():
+            for way in sights.ways.to(symptom, hypothesis.faults) if symptom in symptoms else ():
+                for edge in _along(way, symptom, missing, leads) if way.fault in causes else ():
+                    edges.setdefault((edge.start, edge.end), edge)
+    return tuple(edges.values())
 
 
-def _of(
-    sights: Sights,
-    hypothesis: Hypothesis,
-    shows: Mapping[str, bool],
-    causes: Sequence[str],
-    symptoms: Sequence[str],
-) -> Iterator[Edge]:
-    for symptom, missing in shows.items():
-        for way in sights.ways.to(symptom, hypothesis.faults) if symptom in symptoms else ():
-            if way.fault in causes:
-                yield from _along(way, symptom, missing)
-
-
-def _along(way: Way, symptom: str, missing: bool) -> Iterator[Edge]:
+def _along(way: Way, symptom: str, missing: bool, leads: bool) -> Iterator[Edge]:
     stops = [f"cause:{way.fault}", *(f"lost:{name}" for name in way.via), f"symptom:{symptom}"]
     for place, start in enumerate(stops[:-1]):
         last = place == len(stops) - 2
-        yield Edge(start, stops[place + 1], missing and last)
+        yield Edge(start, stops[place + 1], missing and last, leads)

@@ -59,7 +59,8 @@ def wrapped(text: str, most: float, size: float = SIZE) -> list[str]:
 
 def _pieces(text: str, most: float, size: float) -> Iterator[str]:
     """Yield words with the blank before them; words too wide for a line in parts."""
-    for word in re.findall(r"\s*\S+", re.sub(r"\s+", " ", text)):
+    plain = re.sub(r"(?<=\d) %", "\u00a0%", " ".join(text.split()))
+    for word in re.findall(" *[^ ]+", plain):
         if width(word.strip(), size) <= most:
             yield word
             continue

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import textwrap
 from collections.abc import Iterator, Sequence
 
@@ -17,6 +18,7 @@ from amberbox.diagnosis.explanation.headline import NOTHING, chance
 from amberbox.diagnosis.explanation.names import together
 from amberbox.diagnosis.explanation.why import by_reasons
 from amberbox.diagnosis.explanation.words import (
+    WORTH_TELLING,
     capital,
     clock,
     count,
@@ -29,9 +31,6 @@ from amberbox.diagnosis.explanation.words import (
 WIDTH = 88
 MEASURED = 3
 """How many addresses are told of what one symptom was measured from."""
-
-WORTH_TELLING = 0.005
-"""From which probability on another possibility is told."""
 
 SURE_ENOUGH = 0.8
 """How sure an answer to a test must make a fault for its remedy to be told."""
@@ -220,7 +219,13 @@ def _line(text: str, indent: str) -> str:
 
 
 def _wrapped(text: str, first: str = "", further: str = "") -> list[str]:
-    return textwrap.wrap(
-        text, WIDTH, initial_indent=first, subsequent_indent=further,
-        break_long_words=False, break_on_hyphens=False,
-    )  # fmt: skip
+    """Break text into lines, but not between a number and its percent sign."""
+    lines = textwrap.wrap(
+        re.sub(r"(?<=\d) %", "\u00a0%", text),
+        WIDTH,
+        initial_indent=first,
+        subsequent_indent=further,
+        break_long_words=False,
+        break_on_hyphens=False,
+    )
+    return [line.replace("\u00a0", " ") for line in lines]

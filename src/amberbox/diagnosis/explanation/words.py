@@ -18,6 +18,9 @@ SURE_WORDS: tuple[tuple[float, str], ...] = (
 )
 """From which probability on each word is used."""
 
+WORTH_TELLING = 0.005
+"""From which probability on another possibility is told."""
+
 MANY = ("no", "one", "two", "three", "four", "five", "six")
 
 
