@@ -1,0 +1,60 @@
+from __future__ import annotations
+
+import json
+
+from amberbox.diagnosis.tracking.presence import Presence, Presences
+from tests.diagnosis.tracking.robot import At, gone, knowledge, seconds
+
+NAME = "laser/scan/clear"
+
+
+def presence(*happens: At) -> Presence:
+    """Return a symptom (2 s of hold, within 10 s) to which this happened."""
+    presences = Presences(knowledge().fmea)
+    for at in happens:
+        presences.take(at.symptom(), seconds(at.at_s))
+    return presences[NAME]
+
+
+def test_counts_while_present_and_for_its_hold_after() -> None:
+    one = presence(At(1, NAME), gone(5, NAME))
+    assert not one.is_there
+    assert [one.counts_present(seconds(at)) for at in (5, 6.9, 7, 8)] == [True, True, False, False]
+    assert one.may_be_absent_ns == seconds(17)
+
+
+def test_keeps_its_onset_when_it_comes_back_in_time() -> None:
+    assert presence(At(1, NAME), gone(5, NAME), At(6.9, NAME)).onset_ns == seconds(1)
+    assert presence(At(1, NAME), gone(5, NAME), At(7, NAME)).onset_ns == seconds(7)
+    assert presence(At(3, NAME, onset_s=1.5)).onset_ns == seconds(1.5)
+
+
+def test_what_becomes_unknown_or_blocked_is_remembered_as_long() -> None:
+    for change in (At(5, NAME, "unknown"), At(5, NAME, blocked_by=("bus",))):
+        one = presence(At(1, NAME), change)
+        assert one.counts_present(seconds(6.9)) and not one.counts_present(seconds(7))
+        assert not one.is_absent
+
+
+def test_what_is_blocked_never_counts() -> None:
+    one = presence(At(1, NAME, blocked_by=("bus",)))
+    assert not one.counts_present(seconds(1)) and not one.is_absent
+    assert not presence(At(1, NAME, "absent", ("bus",))).is_absent
+
+
+def test_is_shown_as_what_it_counts_as() -> None:
+    one = presence(At(1, NAME), gone(5, NAME))
+    held = one.shown("present")
+    assert (held.state, held.onset_ns, held.confirmed_ns) == ("present", seconds(1), seconds(1))
+    assert one.shown("").state == "unknown" and one.shown("absent") == one.told
+    blocked = presence(At(1, NAME, blocked_by=("bus",)))
+    assert blocked.shown("") == blocked.told and blocked.told.blocked_by == ("bus",)
+
+
+def test_is_kept_as_json() -> None:
+    presences = Presences(knowledge().fmea)
+    for at in (At(1, NAME), gone(5, NAME), At(6, "motor.hot"), At(7, "other/one/here", "unknown")):
+        presences.take(at.symptom(), seconds(at.at_s))
+    other = Presences(knowledge().fmea)
+    other.resume(json.loads(json.dumps(presences.snapshot())))
+    assert dict(other) == dict(presences)
