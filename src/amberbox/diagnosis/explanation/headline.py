@@ -19,15 +19,14 @@ def headline(
     """Say what is broken and how sure that is; of what has healed, what it was."""
     if broken is None:
         return sentence(NOTHING)
-    number = chance(sure)
-    if [member.id for member in broken.members] == [NO_FAULT]:
-        what, how = f"{broken.text} ({number})", ""
-    else:
-        what, how = _what(broken), f" {capital(sure.word)} ({number})."
+    ids = [member.id for member in broken.members]
+    what, how = broken.text, f" {capital(sure.word)} ({chance(sure)})."
+    if ids == [NO_FAULT]:
+        what, how = f"{broken.text} ({chance(sure)})", ""
     if diagnosis.state == "healed":
-        healed = f"All symptoms have healed since {clock(_healed_ns(diagnosis, symptoms))}."
-        return f"It was: {what}.{how} {healed}"
-    return f"{sentence(what)}{how}"
+        healed = f"all symptoms have healed since {clock(_healed_ns(diagnosis, symptoms))}"
+        return f"It was: {what}.{how} {sentence(healed)}"
+    return f"{sentence(f'{what} is broken' if ids == [UNKNOWN] else what)}{how}"
 
 
 def chance(sure: Sureness) -> str:
@@ -35,12 +34,6 @@ def chance(sure: Sureness) -> str:
     if percent(sure.at_least) == percent(sure.probability):
         return percent(sure.probability)
     return f"{percent(sure.at_least)} to {percent(sure.probability)}"
-
-
-def _what(broken: Group) -> str:
-    if [member.id for member in broken.members] == [UNKNOWN]:
-        return f"{broken.text} is broken"
-    return broken.text
 
 
 def _healed_ns(diagnosis: Diagnosis, symptoms: Iterable[Symptom]) -> int:

@@ -9,13 +9,13 @@ from collections.abc import Iterator, Sequence
 from amberbox.diagnosis.explanation.explanation import (
     Branch,
     Explanation,
+    Fault,
     Group,
     Possibility,
     Seen,
     Step,
 )
 from amberbox.diagnosis.explanation.headline import NOTHING, chance
-from amberbox.diagnosis.explanation.names import together
 from amberbox.diagnosis.explanation.why import by_reasons
 from amberbox.diagnosis.explanation.words import (
     WORTH_TELLING,
@@ -83,12 +83,17 @@ def _broken(explanation: Explanation) -> Iterator[str]:
 def _possibility(member: Possibility, number: str) -> Iterator[str]:
     if not member.faults:
         yield from _item(f"{capital(member.text)}: what was seen needs no fault{number}")
-    for place, fault in enumerate(member.faults, 1):
-        last = place == len(member.faults)
-        tail = f"{together(len(member.faults))}{number}" if last else " and"
-        yield from _item(f"{capital(fault.text)} ({fault.id}){tail}")
-        if fault.cause:
-            yield _line(f"may come from: {fault.cause}", "    ")
+    elif len(member.faults) == 1:
+        yield from _item(f"{capital(member.text)} ({member.faults[0].id}){number}")
+        yield from _cause(member.faults[0], "may come from:")
+    else:
+        yield from _item(f"{capital(member.text)}{number}")
+        for fault in member.faults:
+            yield from _cause(fault, f"{fault.id} may come from:") or [_line(fault.id, "    ")]
+
+
+def _cause(fault: Fault, title: str) -> list[str]:
+    return [_line(f"{title} {fault.cause}", "    ")] if fault.cause else []
 
 
 def _sure(explanation: Explanation) -> Iterator[str]:

@@ -79,13 +79,14 @@ def _gone(ways: Ways, hypothesis: Hypothesis) -> Iterable[str]:
 def _careful(
     ways: Ways, severity: Severity, others: Sequence[tuple[Group, Sequence[Hypothesis]]]
 ) -> str:
-    """Warn of something graver that is less probable, but not out of the question."""
+    """Warn of something less probable with which the robot must not go on."""
     graver = [
         (worst(_severity(ways, hypothesis) for hypothesis in members), group)
         for group, members in others
         if group.probability >= WORTH_A_WORD
     ]
-    graver = [found for found in graver if _rank(found[0]) > _rank(severity)]
+    most = max(_rank(severity), _rank("urgent"))
+    graver = [found for found in graver if _rank(found[0]) > most]
     if not graver:
         return ""
     of, group = max(graver, key=lambda found: (_rank(found[0]), found[1].probability))

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 
 from amberbox.diagnosis.covering.model import UNKNOWN
 from amberbox.diagnosis.explanation.explanation import Group, Seen, Way
+from amberbox.diagnosis.explanation.words import either
 
 DIRECT = "this is how the fault shows"
 EACH = "this is how each of them shows"
@@ -36,8 +37,9 @@ def _direct(direct: set[str], faults: Mapping[str, str]) -> Iterator[str]:
         yield OTHER
     elif direct and direct == faults.keys():
         yield DIRECT if len(faults) == 1 else EACH
-    else:
-        yield from (f"this is how it shows: {faults[name]}" for name in faults if name in direct)
+    elif direct:
+        texts = [text for name, text in faults.items() if name in direct]
+        yield f"this is how it shows: {either(texts, len(texts))}"
 
 
 def _by_loss(ways: Sequence[Way], faults: Mapping[str, str]) -> Iterator[str]:
