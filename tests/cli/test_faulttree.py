@@ -113,6 +113,8 @@ def test_one_gate_of_many_and_export(
         (["--cut-sets", "0"], "--cut-sets must be 1 or more"),
         (["--seconds", "nan"], "--seconds must be a number, 0 or more"),
         (["--effect", "strandet"], "did you mean 'stranded'"),
+        (["--exposure", "3"], "a file has its own probabilities"),
+        (["--closest"], "only of a robot folder"),
     ],
 )
 def test_wrong_usage(
@@ -120,11 +122,6 @@ def test_wrong_usage(
 ) -> None:
     assert main(["faulttree", file, *more]) == 2
     assert what in capsys.readouterr().err
-
-
-def test_only_xml_files_are_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["faulttree", str(tmp_path)]) == 2
-    assert "is no .xml file" in capsys.readouterr().err
 
 
 def test_a_file_that_is_wrong_is_refused_with_the_line(

@@ -60,10 +60,10 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError(f"there is no action '{args.action}'{near}", _USAGE)
     if args.exposure is not None and not args.exposure >= 0:
         raise UsageError(f"an exposure of {args.exposure:g} h cannot be", "give hours from 0")
-    path = _path(args.where)
+    path = fmea_path(args.where)
     if args.import_:
         _import(Path(args.import_), path)
-    fmea, known, problems = _loaded(path)
+    fmea, known, problems = loaded(path)
     rules: list[Rule] = []
     if args.priorities:
         rules = load_priorities(Path(args.priorities), problems)
@@ -81,12 +81,13 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _path(where: str) -> Path:
+def fmea_path(where: str) -> Path:
+    """Return the file that a robot folder, or the path of a file itself, means."""
     path = Path(where)
     return path / FILE if path.is_dir() else path
 
 
-def _loaded(path: Path) -> tuple[Fmea | None, Known | None, list[Problem]]:
+def loaded(path: Path) -> tuple[Fmea | None, Known | None, list[Problem]]:
     """Read the file; symptoms are compared with the monitors of the robot folder it lies in."""
     if not path.exists():
         hint = f"write one (docs/fmea.md), or: amberbox fmea check {path.parent} --import FILE.csv"

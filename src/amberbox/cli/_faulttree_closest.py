@@ -1,0 +1,148 @@
+"""Which cut sets of a robot are closest to complete, by the diagnosis that stands."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from amberbox.cli._faulttree_answer import limit_note
+from amberbox.cli._faulttree_effects import analysed, description
+from amberbox.cli._output import opened, print_grid, print_json
+from amberbox.core.errors import UsageError
+from amberbox.core.timetext import format_time
+from amberbox.diagnosis.faulttree import Analysis, Budget
+from amberbox.diagnosis.faulttree.nearest import Near, nearest
+from amberbox.diagnosis.fmea.model import Fmea
+from amberbox.diagnosis.fmea.trees import effects
+
+if TYPE_CHECKING:
+    from amberbox.blackbox.folder.folder import RobotFolder
+    from amberbox.cli._diagnosis_case import Case
+    from amberbox.core.types import Diagnosis
+
+_LISTED = 3
+_LOOKBACK_S = 600.0
+
+
+@dataclass(frozen=True, slots=True)
+class _Outlook:
+    """An effect on the system and the cut sets that are closest to bringing it about."""
+
+    analysis: Analysis
+    near: list[Near]
+
+    @property
+    def probability(self) -> float:
+        """Return that of the closest cut set."""
+        return self.near[0].probability if self.near else 0.0
+
+
+def show_closest(fmea: Fmea, args: argparse.Namespace, budget: Budget) -> None:
+    """Show the closest cut sets of each effect, the effect that is closest first."""
+    names = (args.effect,) if args.effect else effects(fmea)
+    solved = [analysed(fmea, name, args, budget) for name in names]
+    at_ns, diagnosis = _standing(args)
+    count = args.cut_sets or _LISTED
+    found = [_Outlook(analysis, nearest(analysis, diagnosis, count)) for analysis in solved]
+    found.sort(key=lambda outlook: -outlook.probability)
+    if args.json:
+        print_json(_as_json(fmea, args, at_ns, diagnosis, found))
+        return
+    print(_heading(at_ns, diagnosis))
+    header = ("effect", "probability", "happened", "missing")
+    print_grid(header, [row for outlook in found for row in _rows(outlook)])
+    if args.order is not None:
+        print(f"cut sets{limit_note(args.order)}")
+
+
+def _standing(args: argparse.Namespace) -> tuple[int | None, Diagnosis | None]:
+    """Return the instant it is about and the open diagnosis of then; None without a record."""
+    from amberbox.blackbox.folder.folder import load_folder, store_of
+    from amberbox.blackbox.store import is_store
+
+    store = store_of(Path(args.where)) if Path(args.where).is_dir() else None
+    if store is None or not is_store(store):
+        if args.at:
+            raise UsageError(f"there is no record in {args.where}", "leave out --at")
+        return None, None
+    folder = load_folder(args.where)
+    with opened(args.where) as record:
+        at_ns = record.time_ns(args.at)
+        if at_ns is None:
+            at_ns = record.last_ns()
+    if at_ns is None:
+        return None, None
+    case = _case(folder, at_ns, args.exposure)
+    return at_ns, None if case.is_over else case.standing
+
+
+def _case(folder: RobotFolder, at_ns: int, exposure_h: float | None) -> Case:
+    """Return what was known then: by the watcher's journal, else by evaluating the record."""
+    from amberbox.blackbox.store import open_store
+    from amberbox.cli._diagnoser import knowledge_of
+    from amberbox.cli._diagnosis_journal import was_watched
+    from amberbox.cli._diagnosis_read import evaluated, watched
+    from amberbox.monitoring.configuration import load_plan
+
+    plan, _ = load_plan(folder)
+    knowledge, _ = knowledge_of(folder, plan, exposure_h)
+    assert knowledge is not None, "the failure modes have been read before"
+    store = open_store(folder.store_path)
+    if was_watched(store, knowledge.config_hash, at_ns):
+        return watched(knowledge, store, at_ns)
+    return evaluated(knowledge, plan, store, at_ns, _LOOKBACK_S)
+
+
+def _heading(at_ns: int | None, diagnosis: Diagnosis | None) -> str:
+    if at_ns is None:
+        return "nothing is recorded: only what is known beforehand counts"
+    if diagnosis is None:
+        return f"no diagnosis at {format_time(at_ns)}: only what is known beforehand counts"
+    leading = diagnosis.hypotheses[:1]
+    names = [f"{entry.id} ({entry.probability:.0%})" for entry in leading]
+    return f"{format_time(at_ns)}, {diagnosis.id}: {', '.join(names) or 'no hypothesis'}"
+
+
+def _rows(outlook: _Outlook) -> Iterator[tuple[str, ...]]:
+    for place, near in enumerate(outlook.near):
+        effect = "" if place else outlook.analysis.tree.top
+        yield (effect, f"{near.probability:.3g}", _named(near, near.happened),
+               _named(near, near.missing))  # fmt: skip
+    if not outlook.near:
+        yield (outlook.analysis.tree.top, "0", "-", "-")
+
+
+def _named(near: Near, events: tuple[str, ...]) -> str:
+    return ", ".join(f"{name} ({near.events[name]:.2g})" for name in events) or "-"
+
+
+def _as_json(
+    fmea: Fmea, args: argparse.Namespace, at_ns: int | None, diagnosis: Diagnosis | None,
+    found: list[_Outlook],
+) -> dict[str, Any]:  # fmt: skip
+    return {
+        "file": args.where,
+        "at_ns": at_ns,
+        "diagnosis": diagnosis.id if diagnosis else None,
+        "effects": [
+            {
+                "effect": outlook.analysis.tree.top,
+                **description(fmea, outlook.analysis),
+                "truncated_at": outlook.analysis.truncated_at,
+                "closest": [_near_json(near) for near in outlook.near],
+            }
+            for outlook in found
+        ],
+    }
+
+
+def _near_json(near: Near) -> dict[str, Any]:
+    return {
+        "probability": near.probability,
+        "happened": list(near.happened),
+        "missing": list(near.missing),
+        "events": dict(near.events),
+    }
