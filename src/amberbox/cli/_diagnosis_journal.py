@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from amberbox.blackbox.follow.newest import Written, records_of
+from amberbox.blackbox.follow.newest import Written, newest_records, records_of
 from amberbox.blackbox.follow.read import newest_first, sound_chunks
 from amberbox.blackbox.follow.records import OwnRecords
 from amberbox.blackbox.journal import reserved
@@ -17,6 +17,8 @@ from amberbox.monitoring.messages.board import SILENT_NS, WRITER
 from amberbox.monitoring.messages.records import finding_of
 
 CHANNELS = (reserved.SYMPTOM, reserved.DIAGNOSIS)
+_STATUS = (reserved.STATUS,)
+_END_S = 2 * SILENT_NS / NS
 _LATE_NS = 5 * NS
 """So long after an instant its statuses have been written, unless the watcher was behind."""
 
@@ -30,15 +32,20 @@ class Said:
     """Each id's revisions; the last one stood at the instant."""
 
 
+def end_ns(store: Store) -> int | None:
+    """Return up to when a recorder has written, log time, by the end of its journal alone."""
+    written = newest_records(store, "main", {reserved.COUNTERS}, 0.0)
+    return written[-1].log_ns if written else None
+
+
 def was_watched(store: Store, config_hash: str, at_ns: int) -> bool:
     """Tell whether a watcher with these monitors has judged what was recorded at an instant."""
-    from_ns, to_ns = at_ns - SILENT_NS, at_ns + _LATE_NS
-    said = _statuses(store, from_ns, to_ns)
+    from_ns = at_ns - SILENT_NS
     return any(
         record.values["config_hash"] == config_hash
         and not record.values["live_only"]
         and from_ns <= record.values["measured_ns"] <= at_ns
-        for record in said
+        for record in _statuses(store, from_ns, at_ns + _LATE_NS)
     )
 
 
@@ -64,13 +71,16 @@ def findings(records: Iterable[Written]) -> Iterable[Symptom | Diagnosis]:
 
 def _statuses(store: Store, from_ns: int, to_ns: int) -> Iterable[Written]:
     """Yield the statuses that were written in a span of log time."""
+    newest = newest_records(store, WRITER, _STATUS, _END_S)
+    if not newest or newest[0].log_ns <= from_ns:
+        yield from newest
+        return
 
     def overlaps(place: ChunkPlace) -> bool:
         return place.end_ns >= from_ns and place.start_ns <= to_ns
 
-    wanted: Collection[str] = (reserved.STATUS,)
     for journal in newest_first(store, WRITER):
         if journal.start_ns <= to_ns:
-            yield from records_of(sound_chunks(journal, overlaps), wanted)
+            yield from records_of(sound_chunks(journal, overlaps), _STATUS)
         if journal.start_ns < from_ns:
             return

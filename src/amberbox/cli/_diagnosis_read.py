@@ -50,7 +50,7 @@ def evaluated(
 ) -> Case:
     """Evaluate the record before an instant; nothing is written."""
     tracker, heard = Tracker(knowledge), _Heard()
-    engine = Diagnosing(Engine(plan), lambda: tracker)
+    engine = Diagnosing(Engine(plan), tracker)
     evaluation = Evaluation(engine)
     part = Part(at_ns - round(lookback_s * NS))
     with guarded(plan):

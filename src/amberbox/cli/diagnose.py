@@ -131,7 +131,7 @@ def _record(where: str) -> Iterator[Record | None]:
         return
     with open_record(where) as record:
         tell(record.notes)
-        yield record if record.last_ns() is not None else None
+        yield record
 
 
 def _case(args: argparse.Namespace, subject: Subject, record: Record | None) -> Case:
@@ -153,14 +153,15 @@ def _case(args: argparse.Namespace, subject: Subject, record: Record | None) -> 
 def _read(args: argparse.Namespace, subject: Subject, record: Record) -> Case:
     """Read what was known at an instant: by the watcher's journal, else by evaluating."""
     from amberbox.blackbox.store import open_store
-    from amberbox.cli._diagnosis_journal import was_watched
+    from amberbox.cli._diagnosis_case import Case
+    from amberbox.cli._diagnosis_journal import end_ns, was_watched
     from amberbox.cli._diagnosis_read import evaluated, watched
 
     store, knowledge = open_store(record.path), subject.knowledge
-    at_ns = record.time_ns(args.at)
+    at_ns = end_ns(store) if args.at is None else record.time_ns(args.at)
+    at_ns = record.last_ns() if at_ns is None else at_ns
     if at_ns is None:
-        at_ns = record.last_ns()
-    assert at_ns is not None  # a record without rows is none
+        return Case(time.time_ns())  # a record without rows
     if was_watched(store, knowledge.config_hash, at_ns):
         return watched(knowledge, store, at_ns)
     lookback_s = parse_duration(args.lookback) / NS
