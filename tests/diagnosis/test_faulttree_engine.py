@@ -9,6 +9,7 @@ import pytest
 from amberbox.core.errors import UsageError
 from amberbox.core.types import Diagnosis, Symptom, SymptomState
 from amberbox.diagnosis.answering import Effort, Heading, answer
+from amberbox.diagnosis.covering.budget import Budget
 from amberbox.diagnosis.covering.prediction import predict
 from amberbox.diagnosis.faulttree_engine import conclude
 from amberbox.diagnosis.knowledge import Knowledge
@@ -96,6 +97,11 @@ def test_a_component_with_a_symptom_that_nobody_linked_counts_as_lost() -> None:
     assert found.hypotheses[0].proof == "laser_front/scan/rate: laser_front#dead"
 
 
+def test_what_other_engines_found_is_handed_on() -> None:
+    told = Situation(seen(FRONT, "nobody/is/this").symptoms, findings=("it smells",))
+    assert of(told).findings == ("nobody/is/this", "it smells")
+
+
 def test_nothing_seen_is_no_fault() -> None:
     found = of(seen(absent=(FRONT,)))
     assert [(h.id, h.probability) for h in found.hypotheses] == [("no fault", 1.0)]
@@ -103,11 +109,17 @@ def test_nothing_seen_is_no_fault() -> None:
 
 
 def test_what_is_cut_off_is_said() -> None:
-    found = of(seen(GIVEN_UP), effort=Effort(hypotheses=1))
+    found = of(seen(GIVEN_UP), Effort(hypotheses=1))
     assert len(found.hypotheses) == 1
     assert found.incomplete == "the 1 most probable of 3 minimal cut sets"
     assert found.hypotheses[0].faults == {"hook#bent"}
     assert 0.9 < found.mass_covered < 0.99
+
+
+def test_time_that_runs_out_is_said() -> None:
+    found = of(seen(GIVEN_UP), Effort(budget=Budget(deadline=lambda: True)))
+    assert found.hypotheses == () and found.mass_covered == 0.0
+    assert "the time was up" in found.incomplete
 
 
 def test_a_symptom_that_is_hardly_believed_needs_no_cause() -> None:

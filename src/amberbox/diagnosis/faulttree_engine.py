@@ -35,8 +35,6 @@ TOP = "all that is seen"
 _NODES = 300_000
 _BELIEVED = 0.5
 _MOST_LOOKED_AT = 2_000
-_LARGEST = 4
-"""How many faults at a time are looked for when all cut sets are too many to find."""
 
 
 def conclude(
@@ -65,11 +63,16 @@ def conclude(
         hypotheses,
         found.covered,
         found.incomplete,
-        tuple(name for name in known.observations if name not in knowledge.model.sign_places),
+        (*_unknown(knowledge, known), *situation.findings),
         tuple(proposal.test for proposal in tests),
         tuple(_split(knowledge, known, hypotheses, group) for group in groups),
         tuple(symptom.id for symptom in situation.present()),
     )
+
+
+def _unknown(knowledge: Knowledge, known: Evidence) -> Iterator[str]:
+    """Yield what was seen that the FMEA does not know."""
+    return (name for name in known.observations if name not in knowledge.model.sign_places)
 
 
 def _causes(knowledge: Knowledge, known: Evidence) -> dict[str, tuple[str, ...]]:
@@ -136,7 +139,7 @@ def _best(knowledge: Knowledge, known: Evidence, tree: FaultTree, effort: Effort
     They are looked at in order of the most that each can come to, so that nothing that follows
     can be better than what the next one could be.
     """
-    analysis, cut = _analysed(tree, effort)
+    analysis = analyse(tree, budget=Budget(_NODES, effort.budget.deadline))
     if analysis.cut_sets is None:
         return _Found(incomplete=analysis.incomplete)
     priors = {name: tree.events[name].probability or 0.0 for name in analysis.events}
@@ -155,7 +158,7 @@ def _best(knowledge: Knowledge, known: Evidence, tree: FaultTree, effort: Effort
         if full:
             heapq.heappop(best)
     rest = max(0.0, analysis.cut_sets.rare_event_sum(at_most) - spent)
-    return _shares(sorted(best, reverse=True), total, rest, analysis, cut, effort)
+    return _shares(sorted(best, reverse=True), total, rest, analysis, effort)
 
 
 def _weighed(model: Model, known: Evidence, priors: Mapping[str, float]) -> dict[str, float]:
@@ -170,24 +173,14 @@ def _weighed(model: Model, known: Evidence, priors: Mapping[str, float]) -> dict
 
 def _shares(
     best: list[tuple[float, int, frozenset[str]]], total: float, rest: float,
-    analysis: Analysis, cut: str, effort: Effort,
+    analysis: Analysis, effort: Effort,
 ) -> _Found:  # fmt: skip
-    listed = sum(weight for weight, _, _ in best)
-    covered = listed / (total + rest) if total > 0.0 else 0.0
-    if covered < effort.mass and len(best) < (analysis.minimal_cut_sets or 0):
-        what = f"the {len(best)} most probable of {analysis.minimal_cut_sets:,} minimal cut sets"
-        cut = "; ".join(filter(None, (what, cut)))
     sets = tuple((faults, weight / total) for weight, _, faults in best if weight > 0.0)
+    covered = sum(weight for weight, _, _ in best) / (total + rest) if sets else 0.0
+    every = analysis.minimal_cut_sets or 0
+    is_cut = covered < effort.mass and len(best) < every
+    cut = f"the {len(best)} most probable of {every:,} minimal cut sets" if is_cut else ""
     return _Found(sets, covered, cut)
-
-
-def _analysed(tree: FaultTree, effort: Effort) -> tuple[Analysis, str]:
-    budget = Budget(_NODES, effort.budget.deadline)
-    analysis = analyse(tree, budget=budget)
-    if analysis.cut_sets is not None or analysis.top_probability is None:
-        return analysis, ""
-    limited = analyse(tree, _LARGEST, budget=budget)
-    return limited, f"only sets of up to {_LARGEST} faults" if limited.cut_sets else ""
 
 
 def _product(chances: Mapping[str, float], faults: Iterable[str]) -> float:
