@@ -164,7 +164,7 @@ def _tell_lead(plan: Plan, diagnoser: MakeDiagnoser | None) -> None:
     from amberbox.monitoring.watcher.diagnosing import Diagnosing
     from amberbox.monitoring.watcher.replay import WARM_UP_S
 
-    minutes = (WARM_UP_S + Diagnosing(Engine(plan), diagnoser).history_s) / 60
+    minutes = (WARM_UP_S + Diagnosing(Engine(plan), diagnoser and diagnoser()).history_s) / 60
     tell([f"monitors look back: begins {minutes:.0f} min before --from, if there is a record"])
 
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
+import numpy as np
+
 from amberbox.core.clock import NS
 from amberbox.core.types import (
     AmbiguityGroup,
@@ -56,7 +58,9 @@ class PlainDiagnoser:
     def feed(self, batch: Batch) -> None:
         """Take the rows of the one item."""
         if batch.item == ITEM:
-            times, values = batch.log_time_ns.tolist(), batch.columns["data"].tolist()
+            column = batch.columns["data"]
+            assert isinstance(column, np.ndarray)
+            times, values = batch.log_time_ns.tolist(), column.tolist()
             self.rows += [row for row in zip(times, values, strict=True) if row[0] > self.until_ns]
 
     def advance(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -23,8 +23,9 @@ from amberbox.monitoring.watcher.evaluation import Evaluation
 from amberbox.monitoring.watcher.instants import instant_of
 from amberbox.monitoring.watcher.reader import Block
 from amberbox.monitoring.watcher.replay import Part, blocks, newest, replay
-from amberbox.monitoring.watcher.standing import standing_in
+from amberbox.monitoring.watcher.standing import Left, standing_in
 from amberbox.monitoring.watcher.watcher import Watcher
+from amberbox.testing.box import events
 from tests.monitoring.watcher.diagnoser import ITEM, NEGATIVE, PlainDiagnoser
 from tests.monitoring.watcher.stand import (
     NUMBERS,
@@ -62,7 +63,7 @@ def live(stand: Stand, watcher: Watcher, ticks: int, main: float) -> None:
         watcher.step()
 
 
-def channel(stand: Stand, name: str, *, live_only: bool = False) -> list[Mapping[str, Any]]:
+def channel(stand: Stand, name: str, *, live_only: bool = False) -> Sequence[Mapping[str, Any]]:
     return values(written(stand.path, live_only=live_only), f"amberbox/{name}")
 
 
@@ -133,7 +134,7 @@ def test_how_calls_are_split_does_not_matter(tmp_path: Path, seed: int) -> None:
         stand.tick()
     stand.box.close()
     store = open_store(stand.path)
-    engine = Diagnosing(Engine(plan_of()), PlainDiagnoser)
+    engine = Diagnosing(Engine(plan_of()), PlainDiagnoser())
     evaluation, found = Evaluation(engine), []
     for block in blocks(plan_of(), store, engine, Part()):
         for piece in pieces_of(block, stand):
@@ -168,17 +169,17 @@ def test_a_snapshot_without_diagnosis_begins_it_anew(tmp_path: Path) -> None:
     stand = stand_of(tmp_path, 1)
     say(stand, 20, -1.0)
     stand.box.close()
-    engine = Diagnosing(Engine(base_only()), PlainDiagnoser)
+    engine = Diagnosing(Engine(base_only()), PlainDiagnoser())
     evaluation = Evaluation(engine)
     for block in blocks(base_only(), open_store(stand.path), engine, Part()):
         assert list(evaluation.take(block))
     assert engine.diagnosis is not None
     held = engine.snapshot()
-    again = Diagnosing(Engine(base_only()), PlainDiagnoser)
+    again = Diagnosing(Engine(base_only()), PlainDiagnoser())
     again.resume(held)
     assert again.snapshot() == held
     del held[PART]
-    older = Diagnosing(Engine(base_only()), PlainDiagnoser)
+    older = Diagnosing(Engine(base_only()), PlainDiagnoser())
     older.resume(held)
     assert older.diagnosis is None
     assert [alarm.cause for alarm in older.alarms()] == [""]
@@ -269,3 +270,36 @@ def test_what_people_said_stays_when_the_cause_comes(tmp_path: Path) -> None:
     watcher.step()
     watcher.close()
     assert written(stand.path) == stand.replayed(base_only())
+
+
+class Failing(PlainDiagnoser):
+    """Makes a diagnosis and fails at the next."""
+
+    def _diagnosis(self, at_ns: int, *, new: bool) -> Diagnosis:
+        if not new:
+            raise ZeroDivisionError("by nothing")
+        return super()._diagnosis(at_ns, new=new)
+
+
+def test_a_diagnosis_that_fails_is_over_and_the_monitors_go_on(tmp_path: Path) -> None:
+    stand = stand_of(tmp_path, 1)
+    stand.diagnoser = Failing
+    say(stand, 1, 1.0)
+    watcher = stand.watcher(base_only())
+    live(stand, watcher, 20, -1.0)
+    for _ in range(10):
+        say(stand, 1, -1.0, -1.0)
+        watcher.step()
+    kill(watcher)
+    watcher = stand.watcher(base_only())
+    live(stand, watcher, 20, 1.0)
+    watcher.close()
+    assert {e["text"] for e in events(stand.path, "diagnosis_failed")} == {
+        "goes on without diagnosis, which has failed: ZeroDivisionError: by nothing"
+    }
+    (first,) = channel(stand, "diagnosis")
+    assert channel(stand, "diagnosis", live_only=True)[-1]["id"] == first["id"]
+    assert standing_in(open_store(stand.path)) == Left()
+    assert channel(stand, "alarm")[-1]["state"] == "healed"
+    with pytest.raises(ZeroDivisionError):
+        stand.replayed(base_only())

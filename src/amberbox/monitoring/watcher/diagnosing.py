@@ -57,9 +57,9 @@ MakeDiagnoser: TypeAlias = Callable[[], Diagnoser]
 class Diagnosing:
     """An engine whose findings are diagnosed; without a diagnoser it is the engine alone."""
 
-    def __init__(self, engine: Evaluates, make: MakeDiagnoser | None = None) -> None:
+    def __init__(self, engine: Evaluates, diagnoser: Diagnoser | None = None) -> None:
         self._engine = engine
-        self._diagnoser: Diagnoser = _Nobody() if make is None else make()
+        self._diagnoser: Diagnoser = _Nobody() if diagnoser is None else diagnoser
         self._causes = Causes()
 
     @property

@@ -54,7 +54,7 @@ def replay(
 
     ``diagnoser`` makes what diagnoses it.
     """
-    engine = Diagnosing(Engine(plan), diagnoser)
+    engine = Diagnosing(Engine(plan), diagnoser and diagnoser())
     evaluation = Evaluation(engine)
     pace = Pace(part.speed, stop or threading.Event())
     with guarded(plan):
@@ -69,7 +69,7 @@ def replay(
 
 def newest(plan: Plan, store: Store, diagnoser: MakeDiagnoser | None = None) -> Newest:
     """Return the statuses of all modes and components at the end of the record."""
-    engine = Diagnosing(Engine(plan), diagnoser)
+    engine = Diagnosing(Engine(plan), diagnoser and diagnoser())
     evaluation = Evaluation(engine)
     with guarded(plan):
         start = before_end(store, WARM_UP_S + engine.history_s)

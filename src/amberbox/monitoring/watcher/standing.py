@@ -79,7 +79,7 @@ class Standing:
         now = self.engine.diagnosis
         said = {finding.id for finding in found if isinstance(finding, Diagnosis)}
         own = said if now is None else {now.id, *said}
-        gone = [_closed(d, at_ns) for key, d in self.left.diagnoses.items() if key not in own]
+        gone = [closed(d, at_ns) for key, d in self.left.diagnoses.items() if key not in own]
         if now is None or now.id in said:
             return gone
         return [*gone, replace(now, live_only=True)]
@@ -138,7 +138,7 @@ def _over(alarm: AlarmChange, at_ns: int) -> AlarmChange:
     )  # fmt: skip
 
 
-def _closed(diagnosis: Diagnosis, at_ns: int) -> Diagnosis:
+def closed(diagnosis: Diagnosis, at_ns: int) -> Diagnosis:
     """Return the last revision of a diagnosis that nobody goes on with."""
     return replace(
         diagnosis, state="healed", revision=diagnosis.revision + 1,

@@ -36,6 +36,7 @@ from amberbox.monitoring.watcher.reader import Reader
 from amberbox.monitoring.watcher.silence import Silence, silent, unknown
 from amberbox.monitoring.watcher.standing import Standing, standing_in
 from amberbox.monitoring.watcher.start import WATCH, before_checkpoint, before_end
+from amberbox.monitoring.watcher.surviving import Surviving
 from amberbox.monitoring.watcher.writing import Journal
 
 POLL_S = 0.02
@@ -82,7 +83,8 @@ class Watcher:
         self._watch = watch
         self._tell = tell or _tell_nobody
         self._lock = WriterLock(watch.store, WATCH)
-        self._engine = Diagnosing(Engine(watch.plan), watch.diagnoser)
+        self._diagnoser = None if watch.diagnoser is None else Surviving(watch.diagnoser)
+        self._engine = Diagnosing(Engine(watch.plan), self._diagnoser)
         self._standing = Standing(standing_in(watch.store), self._engine)
         self._journal = Journal(
             watch.store, watch.plan.robot, watch.plan.config_hash, watch.clock, self._standing.again
@@ -184,6 +186,10 @@ class Watcher:
             text = f"begins anew, what was remembered is of no use: {self._evaluation.trouble}"
             self._journal.told("watch_anew", text)
             self._evaluation.trouble = ""
+        if self._diagnoser is not None and self._diagnoser.trouble:
+            text = f"goes on without diagnosis, which has failed: {self._diagnoser.trouble}"
+            self._journal.told("diagnosis_failed", text)
+            self._diagnoser.trouble = ""
         notes = [place.note(self._watch.store.id)]
         if self._watch.clock_s() - self._noted_s >= CHECKPOINT_S:
             notes.append(self._checkpoint(place))
