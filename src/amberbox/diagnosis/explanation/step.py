@@ -44,7 +44,7 @@ def step_of(
         asked = [test for test in asked if test.may_change_mind(names.faults(members[0].faults))]
     if not asked:
         return Step(_without_test(names, members, remedies), remedies=remedies)
-    check, first = asked[0].check, both(list(remedies))
+    check, first = asked[0].check, "; and ".join(remedies)
     text = f"{first}; or make sure before: {asked[0].text}" if certain and first else asked[0].text
     return Step(
         capital(text),
@@ -92,7 +92,7 @@ def _without_test(names: Names, members: Sequence[Hypothesis], remedies: Sequenc
     if len(members) > 1 and remedies:
         return f"{capital(NO_TEST_STEP)}. Try in this order: {'; then '.join(remedies)}"
     if remedies:
-        return capital(both(list(remedies)))
+        return capital("; and ".join(remedies))
     unknown = not members or any(UNKNOWN in hypothesis.faults for hypothesis in members)
     if not unknown:
         return capital(f"{NO_TEST_STEP}, and it names no remedy")
@@ -132,7 +132,7 @@ def _answers(
 
 
 def _branch(names: Names, answer: str, chance: float, leads: Hypothesis, then: float) -> Branch:
-    remedy = both(list(_remedies(names, [leads])))
+    remedy = "; and ".join(_remedies(names, [leads]))
     return Branch(answer, chance, names.faults(leads.faults), then, remedy)
 
 

@@ -31,8 +31,6 @@ def sure_word(probability: float) -> str:
 
 def percent(probability: float) -> str:
     """Write a probability in whole percent; what is not quite sure is never 0 or 100 %."""
-    if probability >= 1.0:
-        return "100 %"
     if probability >= 0.995:
         return "over 99 %"
     return "under 1 %" if probability < 0.005 else f"{probability:.0%}".replace("%", " %")

@@ -1,0 +1,62 @@
+from __future__ import annotations
+
+import pytest
+
+from amberbox.diagnosis.explanation.words import (
+    SURE_WORDS,
+    both,
+    clock,
+    date_and_clock,
+    duration,
+    either,
+    later,
+    percent,
+    sentence,
+    sure_word,
+)
+from tests.diagnosis.explanation.robot import START_NS
+
+
+@pytest.mark.parametrize(
+    ("probability", "text"),
+    [
+        (1.0, "over 99 %"),
+        (0.9951, "over 99 %"),
+        (0.97, "97 %"),
+        (0.004, "under 1 %"),
+        (0.01, "1 %"),
+    ],
+)
+def test_percent_is_never_all_or_nothing(probability: float, text: str) -> None:
+    assert percent(probability) == text
+
+
+def test_each_word_begins_at_its_threshold() -> None:
+    for least, word in SURE_WORDS:
+        assert sure_word(least) == word
+    assert [sure_word(least - 1e-9) for least, _ in SURE_WORDS[:-1]] == [
+        w for _, w in SURE_WORDS[1:]
+    ]
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [(30, "30 s"), (60, "1 min"), (900, "15 min"), (7200, "2 h"), (9000, "2.5 h"), (86400, "24 h")],
+)
+def test_durations(seconds: float, text: str) -> None:
+    assert duration(seconds) == text
+
+
+def test_times() -> None:
+    assert clock(START_NS + 61 * 10**9) == "00:01:01 UTC"
+    assert date_and_clock(START_NS) == "2026-11-22 00:00:00 UTC"
+    assert [later(s) for s in (0, 0.01, 2.5, 600)] == [
+        "first", "at once", "2.5 s later", "10 min later",
+    ]  # fmt: skip
+
+
+def test_lists_and_sentences() -> None:
+    assert (both(["a"]), both(["a", "b"]), both(["a", "b", "c"])) == ("a", "a and b", "a, b and c")
+    assert (either(["a"]), either(["a", "b"])) == ("a", "a; or b")
+    assert either(["a", "b", "c", "d", "e"]) == "a; b; or 3 more"
+    assert (sentence("is it so?"), sentence("it is"), sentence("")) == ("Is it so?", "It is.", "")
