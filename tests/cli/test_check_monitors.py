@@ -110,6 +110,22 @@ def test_as_data(laser: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert heartbeat["outputs"][0]["expected"] == "true"
 
 
+def test_what_a_component_can_do_without_is_shown(
+    laser: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("bus", "spare"):
+        (laser / "components" / f"{name}.yaml").write_text(f"component_name: {name}\n")
+    component = laser / "components" / "laser.yaml"
+    component.write_text(component.read_text().replace("[]", "{any: [bus, spare]}"))
+    assert main(["check", str(laser), "--modes"]) == 0
+    assert "  laser: needs bus or spare\n" in capsys.readouterr().out
+    assert main(["check", str(laser), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)["monitoring"]["components"]
+    assert {entry["id"]: entry["needs"] for entry in found} == {
+        "laser": "bus or spare", "bus": "", "spare": "",
+    }  # fmt: skip
+
+
 def test_what_is_wrong(laser: Path, capsys: pytest.CaptureFixture[str]) -> None:
     heartbeat = laser / "components" / "laser" / "heartbeat.yaml"
     heartbeat.write_text(heartbeat.read_text().replace("expected: true", "expected: 0.9"))

@@ -16,6 +16,7 @@ import pytest
 from amberbox.cli.main import main
 from amberbox.core.clock import NS
 from amberbox.core.mode import Result
+from amberbox.core.needs import any_of
 from amberbox.core.types import Level, Output, Status
 from amberbox.monitoring.engine.findings import AlarmChange, Finding
 from amberbox.monitoring.messages.records import record_of
@@ -179,6 +180,19 @@ def test_what_it_needs_is_told_by_what_judges_it(
         "needs: Front Laser (error), scanner (error), laser (not monitored), "
         "roscore (not monitored)" in capsys.readouterr().out.splitlines()
     )
+
+
+def test_what_it_can_do_without_is_told(
+    store: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    edges = [DependencyPlan(name, component=name) for name in ("laser", "camera")]
+    user = replace(PLAN.components[0], dependencies=edges, needs=any_of("laser", "camera"))
+    plan = replace(PLAN, components=(user,))
+    monkeypatch.setattr("amberbox.cli.status._plan_of", lambda where: plan)
+    say(store, *statuses("error"))
+    main(["status", str(store), "navigation"])
+    lines = capsys.readouterr().out.splitlines()
+    assert "needs laser or camera: laser (error), camera (not monitored)" in lines
 
 
 def test_unknown_component_is_wrong_usage(store: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from amberbox.blackbox.folder.folder import RobotFolder
-from amberbox.core.needs import Needs
+from amberbox.cli._rulefiles import with_rules
+from amberbox.core.needs import Needs, all_of
 from amberbox.diagnosis.fmea.known import Known
 from amberbox.monitoring.configuration import load_plan
 from amberbox.monitoring.configuration.recorded import Recorded
@@ -15,7 +17,7 @@ from amberbox.monitoring.plan import ComponentPlan, OutputPlan, Plan
 
 def known_of(folder: RobotFolder, plan: Plan | None = None) -> Known:
     """Return the outputs of a folder's monitors, what its components need, what is recorded."""
-    known = known_of_plan(plan or load_plan(folder)[0])
+    known = with_rules(known_of_plan(plan or load_plan(folder)[0]), folder.path)
     variables = _variables(Recorded(folder))
     return known if variables is None else replace(known, addresses={*variables, *known.outputs})
 
@@ -37,7 +39,9 @@ def known_of_plan(plan: Plan) -> Known:
         for output in mapping.outputs
     }
     watched = [address for address, output in outputs.items() if _watched(output)]
-    needs = {component.id: _needs(component) for component in plan.components}
+    ids = {component.name: component.id for component in plan.components}
+    ids |= {component.id: component.id for component in plan.components}
+    needs = {component.id: _needs(component, ids) for component in plan.components}
     return Known(frozenset(outputs), frozenset(watched), needs)
 
 
@@ -46,7 +50,27 @@ def _watched(output: OutputPlan) -> bool:
     return output.expectation.value is not None
 
 
-def _needs(component: ComponentPlan) -> Needs:
-    names = (edge.component for edge in component.dependencies)
-    needed = tuple(dict.fromkeys(name for name in names if name is not None))
-    return Needs(len(needed), needed)
+def _needs(component: ComponentPlan, ids: Mapping[str, str]) -> Needs:
+    """Return what a component needs, by ids of components; what is no component is left out.
+
+    Where a monitor of another component speaks for one, that one is needed all the same.
+    """
+    by_name: dict[str, list[str]] = {}
+    for edge in component.dependencies:
+        target = ids.get(edge.name, edge.component)
+        if target is not None and not edge.problem:
+            by_name.setdefault(edge.name, []).append(target)
+    if component.needs is None:
+        return all_of(*dict.fromkeys(name for names in by_name.values() for name in names))
+    return _renamed(component.needs.restricted(by_name.__contains__), by_name)
+
+
+def _renamed(needs: Needs, by_name: Mapping[str, Sequence[str]]) -> Needs:
+    return Needs(needs.at_least, tuple(_part(part, by_name) for part in needs.parts))
+
+
+def _part(part: Needs | str, by_name: Mapping[str, Sequence[str]]) -> Needs | str:
+    if isinstance(part, Needs):
+        return _renamed(part, by_name)
+    names = tuple(dict.fromkeys(by_name[part]))
+    return names[0] if len(names) == 1 else all_of(*names)

@@ -6,7 +6,12 @@ import textwrap
 from collections.abc import Iterable, Iterator, Sequence
 
 from amberbox.cli._text import in_columns
-from amberbox.monitoring.configuration.summary import monitor_of, outputs_of, short_table
+from amberbox.monitoring.configuration.summary import (
+    monitor_of,
+    needs_text,
+    outputs_of,
+    short_table,
+)
 from amberbox.monitoring.plan import ComponentPlan, Plan
 
 _LEAST = 24
@@ -32,7 +37,7 @@ def in_full(plan: Plan, width: int) -> Iterator[str]:
 
 
 def _head(component: ComponentPlan, width: int) -> list[str]:
-    needs = ", ".join(dict.fromkeys(edge.name for edge in component.dependencies))
+    needs = needs_text(component, ", ")
     about = "" if component.modes else " (nothing monitors it)"
     line = f"  {component.id}{about}{': needs ' if needs else ''}{needs}"
     return textwrap.wrap(line, width, subsequent_indent=" " * 6, break_long_words=False)

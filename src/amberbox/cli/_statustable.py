@@ -153,7 +153,8 @@ def _needs(board: Board, component: str, view: View) -> Iterator[str]:
         if plan.part_of:
             yield f"part of: {plan.part_of}"
         if needs:
-            yield f"needs: {', '.join(needs)}"
+            which = "" if plan.needs is None else f" {plan.needs}"
+            yield f"needs{which}: {', '.join(needs)}"
         if plan.recovery_actions:
             yield f"recovery actions (not carried out): {', '.join(plan.recovery_actions)}"
 

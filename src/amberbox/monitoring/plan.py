@@ -13,6 +13,7 @@ from typing import Any, Literal
 
 from amberbox.core.expression import Expression
 from amberbox.core.mode import Result
+from amberbox.core.needs import Needs
 from amberbox.core.probe import ProbeOrder
 
 Severity = Literal["warning", "urgent", "critical", "fatal"]
@@ -124,7 +125,11 @@ class DependencyPlan:
 
 @dataclass(frozen=True, slots=True)
 class ComponentPlan:
-    """One component file; ``part_of`` is the component above it in the tree."""
+    """One component file; ``part_of`` is the component above it in the tree.
+
+    ``needs`` says which of the dependencies, by their names, it can do without; None if it needs
+    all of them.
+    """
 
     id: str
     name: str
@@ -134,6 +139,7 @@ class ComponentPlan:
     part_of: str = ""
     description: str = ""
     recovery_actions: Sequence[str] = ()
+    needs: Needs | None = None
 
 
 @dataclass(frozen=True, slots=True)

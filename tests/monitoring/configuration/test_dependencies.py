@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from amberbox.core.errors import Problem
+from amberbox.core.needs import Needs, all_of, any_of, at_least
 from amberbox.monitoring.plan import DependencyPlan, Plan
 from tests.monitoring.configuration.folders import component, errors, notes, plan_of
 
@@ -180,6 +181,92 @@ def test_a_circle_that_a_mode_judges_is_told_and_stays(tmp_path: Path) -> None:
     assert errors(problems) == ["x.yaml:2: dependencies: needs itself: planner -> x -> planner"]
     (edge,) = component(plan, "x").dependencies
     assert (edge.component, edge.output, edge.problem) == ("ros", "planner", "")
+
+
+def _needing(path: Path, text: str) -> tuple[Plan, list[Problem]]:
+    """Load a component ``x`` that needs something beside ``ros``, a, b, c and d."""
+    files = {f"{name}.yaml": f"component_name: {name}\n" for name in "abcd"}
+    return plan_of(path, ROS | files | {"x.yaml": f"component_name: x\ndependencies:{text}\n"})
+
+
+@pytest.mark.parametrize(
+    ("text", "names", "needs"),
+    [
+        (" [a, b, a]", "ab", None),
+        (" {all: [b, a]}", "ba", None),
+        (" {any: [a, b]}", "ab", any_of("a", "b")),
+        (" {at_least: 2, of: [a, b, c]}", "abc", at_least(2, "a", "b", "c")),
+        (" [a, {any: [b, {all: [c, a]}]}]", "abc", all_of("a", any_of("b", all_of("c", "a")))),
+        ("\n  any:\n    - a\n    - {at_least: 1, of: [d, c]}", "adc",
+         any_of("a", at_least(1, "d", "c"))),
+        (" {any: [a]}", "a", None),
+        (" []", "", None),
+    ],
+)  # fmt: skip
+def test_what_is_needed_may_be_nested(
+    tmp_path: Path, text: str, names: str, needs: Needs | None
+) -> None:
+    plan, problems = _needing(tmp_path, text)
+    assert problems == []
+    x = component(plan, "x")
+    assert [(edge.name, edge.component) for edge in x.dependencies] == [(n, n) for n in names]
+    assert x.needs == needs
+
+
+def test_monitors_speak_for_what_one_can_do_without(tmp_path: Path) -> None:
+    text = """ {any: [planner, {all: [ros, a]}]}
+dependency_monitors:
+    heartbeat: {planner: ros/ros_master_monitor}
+    functional: {planner: ros/nodes, ros: ros/nodes/floor_detection, a: none}"""
+    plan, problems = _needing(tmp_path, text)
+    assert errors(problems) == []
+    x = component(plan, "x")
+    assert x.needs == any_of("planner", all_of("ros", "a"))
+    assert [(e.name, e.kind, e.mode, e.output, e.judged) for e in x.dependencies] == [
+        ("planner", "heartbeat", "ros_master_monitor", "", True),
+        ("planner", "functional", "ros_node_monitor", "planner", True),
+        ("ros", "functional", "ros_node_monitor", "floor_detection", True),
+        ("a", "functional", "", "", False),
+    ]
+
+
+def test_what_one_can_do_without_has_to_be_there(tmp_path: Path) -> None:
+    plan, problems = _needing(tmp_path, "\n  - a\n  - any:\n      - b\n      - rso")
+    assert errors(problems) == [
+        "x.yaml:6: dependencies: there is no component 'rso'; did you mean 'ros'?"
+    ]
+    assert component(plan, "x").dependencies[2].problem
+
+
+@pytest.mark.parametrize(
+    ("text", "error"),
+    [
+        ("\n  any: []", "3: dependencies.any: nothing is named: a gate without input"),
+        ("\n  at_least: 3\n  of: [a, b]", "3: dependencies.at_least: 3 of 2 can never be up"),
+        ("\n  at_leats: 1\n  of: [a, b]",
+         "3: dependencies: unknown key 'at_leats'; did you mean 'at_least'?"),
+        ("\n  any:\n    - a\n    - a", "5: dependencies.any[1]: 'a' comes twice"),
+        (" [a, [b]]", "2: dependencies[1]: expected a name, got a list"),
+        (" a", "2: dependencies: expected a list, got text 'a'"),
+        ("", "2: dependencies: expected what is needed, got nothing"),
+    ],
+)  # fmt: skip
+def test_what_is_wrong_with_needs(tmp_path: Path, text: str, error: str) -> None:
+    plan, problems = _needing(tmp_path, text)
+    assert errors(problems) == [f"x.yaml:{error}"]
+    (broken,) = component(plan, "x").modes
+    assert broken.problem.startswith(error.partition(": ")[2]), "its status is unknown"
+
+
+def test_a_circle_through_what_one_can_do_without(tmp_path: Path) -> None:
+    files = {
+        "a.yaml": "component_name: a\ndependencies: {any: [b, c]}\n",
+        "b.yaml": "component_name: b\ndependencies: [a]\n",
+        "c.yaml": "component_name: c\n",
+    }
+    plan, problems = plan_of(tmp_path, files)
+    assert errors(problems) == ["b.yaml:2: dependencies: needs itself: a -> b -> a"]
+    assert component(plan, "a").needs == any_of("b", "c")
 
 
 def test_parts(tmp_path: Path) -> None:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
 from amberbox.core.expression import parse
+from amberbox.core.needs import all_of, any_of, at_least
 from amberbox.monitoring.engine.edges import in_order
 from amberbox.monitoring.engine.findings import What
 from amberbox.monitoring.plan import DependencyPlan, Expectation, Policy
@@ -321,3 +324,111 @@ def test_dependencies_come_first_and_cycles_end() -> None:
     stand.ok(1, "a", "b", "c", "d")
     stand.until(2)
     assert {status.level for status in statuses(stand.findings[-8:])} == {"ok"}
+
+
+EITHER = component("see", "front", "rear", needs=any_of("front", "rear"))
+LASERS = (EITHER, component("front"), component("rear"))
+
+
+def test_one_of_two_is_enough() -> None:
+    stand = Stand(*LASERS)
+    stand.ok(1, "see", "front")
+    stand.until(1)  # nothing is known of rear
+    assert stand.now("see") == ("ok", "nominal")
+    stand.ok(2, "rear")
+    stand.bad(3, "front")
+    stand.until(3)
+    assert (stand.now("see"), stand.status("see").blocked_by) == (("ok", "nominal"), ())
+    stand.bad(4, "rear")
+    stand.until(4)
+    assert stand.status("see").blocked_by == ("front", "rear")
+    stand.ok(5, "front")
+    stand.until(5)
+    assert stand.status("see").blocked_by == ()
+
+
+def test_without_either_it_is_not_initialised_and_waits_for_both() -> None:
+    stand = Stand(*LASERS)
+    stand.ok(1, "see")
+    stand.bad(1, "front", why="no answer")
+    stand.until(1)
+    assert stand.now("see") == ("unknown", "not_initialised")
+    assert stand.status("see").reason == (
+        "waits for front: working is false, expected true: no answer, "
+        "and for rear: not measured yet"
+    )
+    stand.ok(2, "rear")
+    stand.until(2)
+    assert stand.now("see") == ("ok", "nominal")
+
+
+def test_an_alarm_is_of_what_one_can_do_without_too_and_not_of_who_does() -> None:
+    stand = Stand(*LASERS)
+    stand.ok(1, "see", "front", "rear")
+    stand.bad(2, "front")
+    stand.until(3)
+    stand.bad(4, "see")  # front does not excuse it
+    stand.until(5)
+    assert [alarm.component for alarm in stand.states.alarms()] == ["front", "see"]
+
+
+def test_needs_may_be_nested() -> None:
+    needs = all_of("bus", at_least(2, "a", "b", any_of("c", all_of("d", "e"))))
+    names = ("bus", "a", "b", "c", "d", "e")
+    stand = Stand(component("top", *names, needs=needs), *(component(name) for name in names))
+    stand.ok(1, "top", *names)
+    stand.bad(2, "a", "c")
+    stand.until(2)
+    assert stand.status("top").blocked_by == ()
+    stand.bad(3, "e")
+    stand.until(3)
+    assert stand.status("top").blocked_by == ("a", "c", "e")  # b and d are not in the way
+    stand.bad(4, "bus")
+    stand.ok(4, "a")
+    stand.until(4)
+    assert stand.status("top").blocked_by == ("bus",)
+
+
+def test_what_one_can_do_without_may_be_judged_by_modes_outputs_and_nobody() -> None:
+    two = mode("m", output("left"), output("right"))
+    edges = (
+        judged_by("laser", "m", "left"),
+        DependencyPlan("laser", "heartbeat", "bus"),  # both of them must be right
+        judged_by("camera", "eye"),
+    )
+    top = component("top", *edges, needs=any_of("laser", "camera"))
+    parts = (
+        component("laser", modes=[two]),
+        component("bus"),
+        component("camera", modes=[mode("eye")]),
+    )
+    stand = Stand(top, *parts)
+    stand.ok(1, "top", "laser/m/left", "laser/m/right", "bus", "camera")
+    stand.bad(2, "laser/m/right", "camera")
+    stand.until(2)
+    assert stand.status("top").blocked_by == ()
+    stand.bad(3, "bus")
+    stand.until(3)
+    assert stand.status("top").blocked_by == ("bus", "camera/eye")
+    stand.ok(4, "bus")
+    stand.bad(4, "laser/m/left")
+    stand.until(4)
+    assert stand.status("top").blocked_by == ("laser/m", "camera/eye")
+    free = replace(edges[2], judged=False)
+    stand = Stand(component("top", *edges[:2], free, needs=any_of("laser", "camera")), *parts)
+    stand.ok(1, "top")
+    stand.bad(1, "bus")
+    stand.until(1)
+    assert stand.status("top").blocked_by == ()  # nobody says that the camera does not work
+    assert stand.status("top").reason == "dependency camera is not monitored"
+
+
+def test_of_what_has_no_monitor_what_it_needs_counts_with_any_too() -> None:
+    through = component("bus", "power", "battery", needs=any_of("power", "battery"), modes=[])
+    stand = Stand(component("nav", "bus"), through, component("power"), component("battery"))
+    stand.ok(1, "nav", "power")
+    stand.until(1)
+    assert stand.now("nav") == ("ok", "nominal")
+    stand.bad(2, "power", "battery")
+    stand.until(2)
+    assert stand.status("nav").blocked_by == ("power", "battery")

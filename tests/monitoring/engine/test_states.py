@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from amberbox.core.expression import parse
+from amberbox.core.needs import Needs, all_of
 from amberbox.monitoring.engine.alarms import Action
 from amberbox.monitoring.engine.findings import (
     TICK_NS,
@@ -251,8 +252,20 @@ def plans(draw: st.DrawFn) -> Plan:
         modes = [draw(mode_plans(f"m{n}")) for n in range(draw(st.integers(0, 2)))]
         needs = [draw(edges(other)) for other in made if draw(st.booleans())]
         policy = draw(st.sampled_from(["all", "any", "majority"]))
-        made.append(component(f"c{number}", *needs, modes=modes, policy=policy))
+        gates = draw(st.none() | some_of([edge.name for edge in needs])) if needs else None
+        made.append(component(f"c{number}", *needs, modes=modes, policy=policy, needs=gates))
     return plan(*draw(st.permutations(made)))
+
+
+@st.composite
+def some_of(draw: st.DrawFn, names: Sequence[str]) -> Needs:
+    """Draw needs of some of the names, perhaps of two gates."""
+    cut = draw(st.integers(0, len(names) - 1))
+    inner = names[cut:]
+    gate = Needs(draw(st.integers(1, len(inner))), tuple(inner))
+    if not cut:
+        return gate
+    return Needs(draw(st.integers(1, cut + 1)), (*names[:cut], gate))
 
 
 @st.composite
@@ -387,7 +400,13 @@ def _blocked_by_what_is_below(drawn: Plan, findings: Sequence[Finding]) -> None:
     functional = ("ok", "warn")
 
     def blockers(name: str) -> set[str]:
-        return {found for edge in known[name].dependencies for found in blocking(edge)}
+        edges = {edge.name: blocking(edge) for edge in known[name].dependencies}
+        return in_the_way(known[name].needs or all_of(*edges), edges)
+
+    def in_the_way(needs: Needs, edges: Mapping[str, set[str]]) -> set[str]:
+        parts = [edges[p] if isinstance(p, str) else in_the_way(p, edges) for p in needs.parts]
+        is_met = parts.count(set()) >= needs.at_least
+        return set() if is_met else set().union(*parts)
 
     def blocking(edge: DependencyPlan) -> set[str]:
         other = edge.component or ""

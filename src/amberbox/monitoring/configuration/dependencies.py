@@ -3,15 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 from amberbox.core.config import did_you_mean
 from amberbox.core.errors import Problem
+from amberbox.core.needs import Needs, all_of, parse_needs
 from amberbox.core.nodes import Node
 from amberbox.monitoring.configuration.files import ComponentFile
 from amberbox.monitoring.plan import ComponentPlan, DependencyPlan, ModePlan
 
 NOBODY = "none"
+_KEY = "dependencies"
+
+
+@dataclass(frozen=True)
+class Dependencies:
+    """What a file says that a component needs: where each name stands, and how many of them.
+
+    ``needs`` is None where all are needed.
+    """
+
+    nodes: Mapping[str, Node] = field(default_factory=dict)
+    needs: Needs | None = None
 
 
 @dataclass(frozen=True)
@@ -22,6 +35,48 @@ class Named:
     file: ComponentFile | None
     node: Node
     stems: tuple[str, ...] = ()
+    dependencies: Dependencies = Dependencies()
+
+
+def read_dependencies(file: Node, problems: list[Problem]) -> Dependencies | None:
+    """Read the dependencies of a component file; None if something is wrong with them."""
+    node = (file.mapping or {}).get(_KEY)
+    if node is None:
+        return Dependencies()
+    if node.items is not None and all(_is_name(entry) for entry in node.items):
+        return Dependencies(_by_name(node))
+    if _is_name(node):
+        what = f"expected a list, got {node.kind} '{node.text}'"
+        problems.append(node.problem(_KEY, what, f"write it as a list: [{node.text}]"))
+        return None
+    needs = parse_needs(node, problems, _KEY)
+    if needs is None:
+        return None
+    needs_all = needs == all_of(*needs.names())
+    return Dependencies(_by_name(node), None if needs_all else needs)
+
+
+def _is_name(node: Node) -> bool:
+    return node.mapping is None and node.items is None and node.value is not None
+
+
+def _by_name(node: Node) -> dict[str, Node]:
+    """Return the names in order, each with the entry where it stands first."""
+    found: dict[str, Node] = {}
+    for entry in _names_in(node):
+        found.setdefault(entry.text, entry)
+    return found
+
+
+def _names_in(node: Node) -> Iterator[Node]:
+    for key, value in (node.mapping or {}).items():
+        if key != "at_least":
+            yield from _names_in(value)
+    for entry in node.items or ():
+        if _is_name(entry):
+            yield entry
+        else:
+            yield from _names_in(entry)
 
 
 @dataclass(frozen=True)
@@ -78,7 +133,11 @@ def with_dependencies(components: Sequence[Named], problems: list[Problem]) -> l
     """Return the components with their edges; what dangles or goes in a circle is told."""
     names = Names(components)
     plans = [
-        replace(entry.plan, dependencies=tuple(_edges(entry, names, problems)))
+        replace(
+            entry.plan,
+            dependencies=tuple(_edges(entry, names, problems)),
+            needs=entry.dependencies.needs,
+        )
         for entry in components
     ]
     return _without_cycles(plans, components, problems)
@@ -89,11 +148,8 @@ def _edges(entry: Named, names: Names, problems: list[Problem]) -> Iterator[Depe
         return
     monitors = entry.file.dependency_monitors
     by_kind = {"heartbeat": monitors.heartbeat, "functional": monitors.functional}
-    keys = entry.node.mapping or {}
-    nodes = dict(
-        zip(entry.file.dependencies, keys.get("dependencies", entry.node).items or (), strict=False)
-    )
-    for name in dict.fromkeys(entry.file.dependencies):
+    nodes = entry.dependencies.nodes
+    for name in nodes:
         judged = [(kind, of[name]) for kind, of in by_kind.items() if name in of]
         if not judged:
             yield _plain_edge(name, nodes[name], names, problems)

@@ -117,7 +117,7 @@ class ComponentFile:
     component_name: str = option(doc="name of the component", aliases=["name"])
     description: str = option("", "what it is, for people")
     modes: Sequence[str] = option((), "mode files, seen from this file, then from components/")
-    dependencies: Sequence[str] = option((), "components that it needs")
+    dependencies: Any = option((), "components that it needs: a list, or {any: [...]} and so on")
     dependency_monitors: DependencyMonitors = option(
         DependencyMonitors(), "which monitor speaks for a dependency"
     )

@@ -9,7 +9,11 @@ from amberbox.blackbox.folder.folder import RobotFolder
 from amberbox.core.config import build
 from amberbox.core.errors import Problem
 from amberbox.core.ids import derive_id
-from amberbox.monitoring.configuration.dependencies import Named, with_dependencies
+from amberbox.monitoring.configuration.dependencies import (
+    Named,
+    read_dependencies,
+    with_dependencies,
+)
 from amberbox.monitoring.configuration.files import ComponentFile, legacy_note
 from amberbox.monitoring.configuration.functions import find_functions
 from amberbox.monitoring.configuration.inputs import Inputs
@@ -66,6 +70,7 @@ def _components(tree: Tree, bench: Bench) -> list[Named]:
 def _component(source: ComponentSource, bench: Bench) -> Named:
     own: list[Problem] = []
     file = build(ComponentFile, source.node, own, "", legacy_note)
+    dependencies = read_dependencies(source.node, own)
     bench.problems.extend(own)
     modes = tuple(_modes(source, bench))
     plan = ComponentPlan(derive_id(source.name), source.name, modes)
@@ -73,7 +78,7 @@ def _component(source: ComponentSource, bench: Bench) -> Named:
         what = f"is '{plan.id}' in addresses"
         problem = source.node.problem("component_name", what, is_error=False)
         bench.problems.append(problem)
-    if file is None:
+    if file is None or dependencies is None:
         first = next(problem for problem in own if problem.is_error)
         what = f"{first.where}: {first.what} ({first.file}:{first.line})"
         broken = ModePlan(BROKEN, BROKEN, None, problem=what)
@@ -86,7 +91,8 @@ def _component(source: ComponentSource, bench: Bench) -> Named:
         description=file.description,
         recovery_actions=tuple(file.recovery_actions),
     )
-    return Named(plan, file, source.node, tuple(mode.path.stem for mode in source.modes))
+    stems = tuple(mode.path.stem for mode in source.modes)
+    return Named(plan, file, source.node, stems, dependencies)
 
 
 def _modes(source: ComponentSource, bench: Bench) -> Iterator[ModePlan]:

@@ -61,8 +61,14 @@ def short_table(plan: Plan) -> Iterator[tuple[str, ...]]:
         broken = sum(bool(mode.problem) for mode in component.modes)
         modes = f"{len(component.modes)} ({broken} cannot run)" if broken else len(component.modes)
         outputs = sum(len(outputs_of(mode)) for mode in component.modes)
-        needs = " ".join(dict.fromkeys(edge.name for edge in component.dependencies)) or "-"
-        yield component.id, str(modes), str(outputs), needs
+        yield component.id, str(modes), str(outputs), needs_text(component, " ") or "-"
+
+
+def needs_text(component: ComponentPlan, joint: str) -> str:
+    """Say what a component needs: names, or how many of which."""
+    if component.needs is not None:
+        return str(component.needs)
+    return joint.join(dict.fromkeys(edge.name for edge in component.dependencies))
 
 
 def actions(plan: Plan) -> Iterator[tuple[str, str]]:
@@ -96,6 +102,7 @@ def _component(plan: ComponentPlan) -> dict[str, Any]:
         "part_of": plan.part_of,
         "policy": plan.policy,
         "dependencies": [_dependency(edge) for edge in plan.dependencies],
+        "needs": needs_text(plan, " and "),
         "recovery_actions": list(plan.recovery_actions),
         "modes": [_mode(mode) for mode in plan.modes],
     }

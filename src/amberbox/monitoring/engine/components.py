@@ -78,11 +78,9 @@ class ComponentState:
         return before != (self.level, self.state, self.reason, self.blocked_by)
 
     def _look_at_edges(self, components: Sequence[ComponentState]) -> None:
-        edges = self.edges
-        if not edges.sources:
+        if not self.edges.sources:
             return
-        found = [b for place in edges.components for b in components[place].passed]
-        found += [b for judge in edges.modes for b in judge.blocking()]
+        found = self.edges.needs.blocking(lambda place: components[place].passed)
         by_label = {b.label: b for b in reversed(found)}
         labels = tuple(dict.fromkeys(b.label for b in found))
         self.waits, self.blocked_by = tuple(by_label[label] for label in labels), labels

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import heapq
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import NamedTuple
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple, TypeAlias
 
+from amberbox.core.needs import Needs
 from amberbox.monitoring.engine.modestate import ModeState
 from amberbox.monitoring.engine.outputs import FUNCTIONAL, OutputState
 from amberbox.monitoring.plan import ComponentPlan, DependencyPlan, Plan
@@ -59,15 +60,48 @@ class JudgedByMode:
         return (blocker(self.label, level, self.mode.reason, level in ("error", "stale"), ()),)
 
 
+Passed: TypeAlias = Callable[[int], Sequence[Blocker]]
+"""Answers what the component at a place blocks others with."""
+
+
+@dataclass(slots=True)
+class Judges:
+    """What speaks for dependencies all of which are needed: components (by place), and modes."""
+
+    components: list[int] = field(default_factory=list)
+    modes: list[JudgedByMode] = field(default_factory=list)
+
+    def blocking(self, passed: Passed) -> list[Blocker]:
+        """Return all that is not ok."""
+        found = [b for place in dict.fromkeys(self.components) for b in passed(place)]
+        return found + [b for judge in dict.fromkeys(self.modes) for b in judge.blocking()]
+
+
+@dataclass(frozen=True, slots=True)
+class Gate:
+    """Some dependencies of which at least so many are needed."""
+
+    at_least: int
+    parts: tuple[Gate | Judges, ...]
+
+    def blocking(self, passed: Passed) -> list[Blocker]:
+        """Return what is not ok of all parts if too few of them are ok."""
+        found = [part.blocking(passed) for part in self.parts]
+        if sum(not blockers for blockers in found) >= self.at_least:
+            return []
+        return [b for blockers in found for b in blockers]
+
+
 @dataclass(frozen=True, slots=True)
 class Edges:
-    """What a component depends on: components (by place), and modes of them.
+    """What a component depends on: ``sources`` are the components (places) that matter for it.
 
-    ``notes`` name the dependencies that nothing judges.
+    Of ``components`` among them it matters what blocks them. ``notes`` name the dependencies that
+    nothing judges: they never block.
     """
 
-    components: tuple[int, ...]
-    modes: tuple[JudgedByMode, ...]
+    needs: Gate | Judges
+    components: frozenset[int]
     sources: frozenset[int]
     notes: tuple[str, ...]
 
@@ -79,25 +113,36 @@ def edges_of(
     allowed: frozenset[int],
 ) -> Edges:
     """Find what a component depends on, among the components that it may depend on."""
-    components: list[int] = []
-    judges: list[JudgedByMode] = []
-    sources, open_names, judged_names = set(), [], set()
+    by_name: dict[str, Judges] = {}
+    components, sources, open_names = set(), set(), []
+    whole = Judges()
     for dependency in component.dependencies:
         place = _place(dependency, places)
         mode = modes.get((dependency.component or "", dependency.mode))
         if place is None or (dependency.mode and mode is None):
             open_names.append(dependency.name)
         elif place in allowed:
-            judged_names.add(dependency.name)
+            own = whole if component.needs is None else Judges()
+            judges = by_name.setdefault(dependency.name, own)
             sources.add(place)
             if mode is None:
-                components.append(place)
+                components.add(place)
+                judges.components.append(place)
             else:
-                judges.append(_judge(dependency, mode))
-    names = dict.fromkeys(name for name in open_names if name not in judged_names)
+                judges.modes.append(_judge(dependency, mode))
+    names = dict.fromkeys(name for name in open_names if name not in by_name)
     notes = tuple(f"dependency {name} is not monitored" for name in names)
-    unique = tuple(dict.fromkeys(components))
-    return Edges(unique, tuple(dict.fromkeys(judges)), frozenset(sources), notes)
+    needs = whole if component.needs is None else _gate(component.needs, by_name)
+    return Edges(needs, frozenset(components), frozenset(sources), notes)
+
+
+def _gate(needs: Needs, by_name: Mapping[str, Judges]) -> Gate:
+    """Put judges in the place of names; what nothing judges is taken to be ok."""
+    parts = (
+        by_name.get(part, Judges()) if isinstance(part, str) else _gate(part, by_name)
+        for part in needs.parts
+    )
+    return Gate(needs.at_least, tuple(parts))
 
 
 def _place(dependency: DependencyPlan, places: Mapping[str, int]) -> int | None:

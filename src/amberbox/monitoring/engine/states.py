@@ -101,7 +101,7 @@ class States:
             self._components.append(ComponentState(component, own, edges))
             for other in edges.components:
                 self._users[other].append(self._rank[place])
-            for other in edges.sources - set(edges.components):
+            for other in edges.sources - edges.components:
                 self._watchers[other].append(self._rank[place])
 
     def _judge_all(self) -> None:
