@@ -58,9 +58,8 @@ class Lines:
         if alarm.state == "healed":
             return f"{shown(alarm.changed_ns)} {text}"
         times = f", {alarm.count} times" if alarm.count > 1 else ""
-        text += f" ({alarm.severity}{times})" + (
-            f" because of {alarm.cause}" if alarm.cause else ""
-        )
+        cause = f" because of {alarm.cause}" if alarm.cause else ""
+        text += f" ({alarm.severity}{times}){cause}"
         return self._once(alarm.changed_ns, alarm.component, text, alarm.reason)
 
     def _once(self, at_ns: int, component: str, text: str, reason: str, hint: str = "") -> str:
