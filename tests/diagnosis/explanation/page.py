@@ -1,4 +1,4 @@
-"""What the page on explanations shows: written by ``python -m tests.diagnosis.explanation.page``."""
+"""The outputs on the page: ``python -m tests.diagnosis.explanation.page`` writes them anew."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from tests.diagnosis.explanation.robot import STOPPED, WINDOW, explained
 ROOT = Path(__file__).resolve().parents[3]
 PAGE = ROOT / "docs" / "explanations.md"
 FOLDER = ROOT / "src" / "amberbox" / "sim" / "folder"
-BLOCK = re.compile(r"(?<=```text\n).*?(?=```)", re.DOTALL)
+BLOCK = re.compile(r"```text\n.*?```", re.DOTALL)
 
 
 def outputs() -> tuple[str, str]:
@@ -22,7 +22,7 @@ def outputs() -> tuple[str, str]:
 def written(page: str) -> str:
     """Return the page with its outputs as they are now."""
     made = iter(outputs())
-    return BLOCK.sub(lambda _: f"{next(made).rstrip()}\n", page)
+    return BLOCK.sub(lambda _: f"```text\n{next(made).rstrip()}\n```", page)
 
 
 if __name__ == "__main__":

@@ -6,7 +6,7 @@ import re
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
-from itertools import combinations
+from itertools import combinations, pairwise
 
 import pytest
 
@@ -141,7 +141,7 @@ def test_several_ways_through_the_columns() -> None:
         *(Node(name, "lost", "something", name) for name in names),
         *(Node(f"symptom:{n}", "symptom", "a symptom", f"s{n}", "present") for n in range(5)),
     )
-    chain = [Edge(start, end) for start, end in zip(names, names[1:], strict=False)]
+    chain = [Edge(start, end) for start, end in pairwise(names)]
     starts = [Edge(f"cause:{n}", names[n]) for n in range(3)]
     ends = [Edge(start, f"symptom:{n}") for start in (*names, "cause:1") for n in range(5)]
     graph = Graph(nodes, (*starts, *ends, *reversed(chain)))
@@ -169,8 +169,8 @@ def check_geometry(drawing: Drawing) -> None:
     for box in drawing.boxes:
         assert box.x >= 0 and box.y >= 0
         assert box.x + box.width <= drawing.width and box.y + box.height <= drawing.height
-    for one, other in combinations(drawing.boxes, 2):
-        assert not overlap(edges_of(one), edges_of(other))
+    for one, other in combinations(map(edges_of, drawing.boxes), 2):
+        assert not overlap(one, other)
     texts = [(line, room(line)) for line in drawing.lines]
     for line, (left, top, right, bottom) in texts:
         assert left >= 0 and top >= 0 and right <= drawing.width and bottom <= drawing.height
@@ -180,8 +180,8 @@ def check_geometry(drawing: Drawing) -> None:
             assert box.x <= left and right <= box.x + box.width
             low = box.y + box.height - (0 if box.share is None else 12)
             assert box.y <= top and bottom <= low
-    for (_, one), (_, other) in combinations(texts, 2):
-        assert not overlap(one, other)
+    for (_, upper), (_, lower) in combinations(texts, 2):
+        assert not overlap(upper, lower)
     for stroke in drawing.strokes:
         for point in points(stroke.path):
             assert not any(inside(point, edges_of(box)) for box in drawing.boxes)
@@ -228,7 +228,7 @@ def colours(dark: bool) -> Mapping[str, dict[str, str]]:
     of: dict[str, dict[str, str]] = {}
     for names, body in (*LIGHT, *(DARK if dark else ())):
         for name in names.split(","):
-            of.setdefault(name, {}).update(part.split(":", 1) for part in body.split(";"))  # type: ignore[misc]
+            of.setdefault(name, {}).update(part.split(":", 1) for part in body.split(";"))
     return of
 
 

@@ -154,7 +154,7 @@ def _letters(letters: Lettered, place: Place) -> Iterator[Line]:
 
 def _head(explanation: Explanation, most: float) -> Iterator[Line]:
     y = MARGIN
-    for text in wrapped(explanation.headline, most, SIZE):
+    for text in wrapped(explanation.headline, most, SIZE, bold=True):
         y += LINE
         yield Line("title", text, MARGIN, y - 4)
     when = f"{explanation.robot}, {date_and_clock(explanation.at_ns)}"
@@ -206,4 +206,5 @@ def _entries(links: Sequence[Link], places: Mapping[str, Place]) -> dict[Link, f
 
 def text_width(line: Line) -> float:
     """Return how wide a line of text is at most."""
-    return width(line.text, SMALL if line.kind == "small" else SIZE)
+    size = SMALL if line.kind == "small" else SIZE
+    return width(line.text, size, bold=line.kind == "title")

@@ -10,10 +10,18 @@ from html import escape
 SIZE = 13
 SMALL = 11
 
-NARROW = frozenset("iIjl.,:;'|!")
-SLIM = frozenset('frt()[]{}-/\\" ')
-BROAD = frozenset("mwMW%@&#")
-"""Characters by their width: 0.39, 0.47, 0.7 and 1.05 of the font's size, bold included."""
+BOLDER = 1.13
+"""How much wider bold text is."""
+
+SHARES: tuple[tuple[str, float], ...] = (
+    ("iIjl.,:;'|!", 0.41),
+    ('frt()[]-/\\" ', 0.47),
+    ("+<=>^~", 0.84),
+    ("mwMW%@&#", 1.0),
+)
+"""How wide characters are in the widest of the common fonts, in parts of the font's size."""
+
+OF_CHARACTER = {character: share for characters, share in SHARES for character in characters}
 
 _FORBIDDEN = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 _BREAKS = re.compile(r"(?<=[/_#.+\-])")
@@ -24,29 +32,25 @@ def escaped(text: str) -> str:
     return escape(_FORBIDDEN.sub("\ufffd", text))
 
 
-def width(text: str, size: float = SIZE) -> float:
+def width(text: str, size: float = SIZE, *, bold: bool = False) -> float:
     """Return an upper estimate of the width of a line, in pixels."""
-    return size * sum(map(_share, text))
+    return size * sum(map(_share, text)) * (BOLDER if bold else 1.0)
 
 
 def _share(character: str) -> float:
+    known = OF_CHARACTER.get(character)
+    if known is not None:
+        return known
     if unicodedata.combining(character):
         return 0.0
-    if unicodedata.east_asian_width(character) in "WF" or ord(character) > 0xFFFF:
-        return 1.15
-    if character in BROAD:
-        return 1.05
-    if character in NARROW:
-        return 0.39
-    if character in SLIM:
-        return 0.47
     if ord(character) > 0x2FF:
-        return 1.0
-    return 0.85 if character.isupper() else 0.7
+        return 1.15
+    return 0.8 if character.isupper() else 0.66
 
 
-def wrapped(text: str, most: float, size: float = SIZE) -> list[str]:
+def wrapped(text: str, most: float, size: float = SIZE, *, bold: bool = False) -> list[str]:
     """Break text into lines no wider than ``most`` pixels, within a word if it must be."""
+    most = most / BOLDER if bold else most
     lines = [""]
     for piece in _pieces(text, most, size):
         together = f"{lines[-1]}{piece}"

@@ -15,7 +15,6 @@ from amberbox.diagnosis.explanation.explanation import Branch, Step
 from amberbox.diagnosis.explanation.names import Names, in_order
 from amberbox.diagnosis.explanation.words import (
     SURE_WORDS,
-    both,
     capital,
     duration,
     either,
