@@ -185,6 +185,8 @@ def test_a_diagnosis_brings_cut_sets_close(
     assert first["probability"] == pytest.approx(first["events"]["motor#worn"], rel=0.2)
     capsys.readouterr()
     assert main(["faulttree", str(bench.folder), "--closest"]) == 0
-    assert "fan#stuck (9" in capsys.readouterr().out
+    text = capsys.readouterr().out
+    assert "\ndrive\n" in text and "happened: fan#stuck (0.9" in text
+    assert "; missing: motor#worn (0.00" in text
     before = printed(capsys, bench.folder, "--closest", "--at", "-6s")
     assert before["diagnosis"] is None and before["effects"][0]["closest"][0]["happened"] == []

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from amberbox.cli._faulttree_answer import limit_note
+from amberbox.cli._faulttree_answer import called, limit_note
 from amberbox.cli._faulttree_effects import analysed, description
-from amberbox.cli._output import opened, print_grid, print_json
+from amberbox.cli._output import opened, print_json
 from amberbox.core.errors import UsageError
 from amberbox.core.timetext import format_time
 from amberbox.diagnosis.faulttree import Analysis, Budget
@@ -35,9 +35,10 @@ class _Outlook:
     near: list[Near]
 
     @property
-    def probability(self) -> float:
-        """Return that of the closest cut set."""
-        return self.near[0].probability if self.near else 0.0
+    def rank(self) -> tuple[bool, float]:
+        """Sort effects: first those that something that has happened leads to."""
+        has_begun = any(near.happened for near in self.near)
+        return not has_begun, -self.near[0].probability if self.near else 0.0
 
 
 def show_closest(fmea: Fmea, args: argparse.Namespace, budget: Budget) -> None:
@@ -47,15 +48,15 @@ def show_closest(fmea: Fmea, args: argparse.Namespace, budget: Budget) -> None:
     at_ns, diagnosis = _standing(args)
     count = args.cut_sets or _LISTED
     found = [_Outlook(analysis, nearest(analysis, diagnosis, count)) for analysis in solved]
-    found.sort(key=lambda outlook: -outlook.probability)
+    found.sort(key=lambda outlook: outlook.rank)
     if args.json:
         print_json(_as_json(fmea, args, at_ns, diagnosis, found))
         return
     print(_heading(at_ns, diagnosis))
-    header = ("effect", "probability", "happened", "missing")
-    print_grid(header, [row for outlook in found for row in _rows(outlook)])
+    for outlook in found:
+        print("\n".join(_lines(outlook)))
     if args.order is not None:
-        print(f"cut sets{limit_note(args.order)}")
+        print(f"\ncut sets{limit_note(args.order)}")
 
 
 def _standing(args: argparse.Namespace) -> tuple[int | None, Diagnosis | None]:
@@ -106,17 +107,18 @@ def _heading(at_ns: int | None, diagnosis: Diagnosis | None) -> str:
     return f"{format_time(at_ns)}, {diagnosis.id}: {', '.join(names) or 'no hypothesis'}"
 
 
-def _rows(outlook: _Outlook) -> Iterator[tuple[str, ...]]:
-    for place, near in enumerate(outlook.near):
-        effect = "" if place else outlook.analysis.tree.top
-        yield (effect, f"{near.probability:.3g}", _named(near, near.happened),
-               _named(near, near.missing))  # fmt: skip
+def _lines(outlook: _Outlook) -> Iterator[str]:
+    yield f"\n{called(outlook.analysis.tree, outlook.analysis.tree.top)}"
+    for near in outlook.near:
+        parts = (("happened", near.happened), ("missing", near.missing))
+        named = (f"{what}: {_named(near, events)}" for what, events in parts if events)
+        yield f"  {near.probability:.3g}  {'; '.join(named)}"
     if not outlook.near:
-        yield (outlook.analysis.tree.top, "0", "-", "-")
+        yield "  nothing can lead to it"
 
 
 def _named(near: Near, events: tuple[str, ...]) -> str:
-    return ", ".join(f"{name} ({near.events[name]:.2g})" for name in events) or "-"
+    return ", ".join(f"{name} ({near.events[name]:.2g})" for name in events)
 
 
 def _as_json(
