@@ -83,7 +83,8 @@ def _files(folder: Path, source: str) -> dict[str, str]:
 
 def _texts(folder: Path) -> dict[str, str]:
     """Return the files that come with a source, such as its monitors, by their paths."""
-    paths = sorted(path for path in folder.rglob("*.yaml") if path.is_file())
+    kinds = {".yaml", ".pl"}
+    paths = sorted(path for path in folder.rglob("*") if path.suffix in kinds and path.is_file())
     return {path.relative_to(folder).as_posix(): path.read_text(encoding="utf-8") for path in paths}
 
 

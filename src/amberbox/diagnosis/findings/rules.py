@@ -62,8 +62,10 @@ def rule_findings(
     facts: Facts,
     at_ns: int | None = None,
     budget: Budget | None = None,
+    *,
+    all_heads: bool = False,
 ) -> RuleFindings:
-    """Ask the rules that ``findings:`` of the FMEA names, and heads that it does not name.
+    """Ask the rules that ``findings:`` of the FMEA names; ``all_heads``: others, too.
 
     A rule that gives no answer says nothing. A goal that cannot be answered, or not within the
     budget, is named among the findings. Raises ConfigurationError for rules that call what there
@@ -74,7 +76,7 @@ def rule_findings(
     for of in fmea.findings:
         if of.goal:
             collected.take(of, asked, budget)
-    for goal in _heads(program, fmea):
+    for goal in _heads(program, fmea) if all_heads else ():
         collected.take(Mapped(goal), asked, budget)
     return collected.findings()
 
@@ -96,7 +98,7 @@ def conclude(knowledge: Knowledge, program: Program, facts: Facts, heading: Head
     The hypotheses are failure modes that answers speak for, each with the proof; what speaks for
     none is in ``findings``. Probabilities come of the FMEA's, given nothing but the answers.
     """
-    found = rule_findings(program, knowledge.fmea, facts, heading.at_ns)
+    found = rule_findings(program, knowledge.fmea, facts, heading.at_ns, all_heads=True)
     alone = Situation(found.symptoms, conflicts=found.conflicts, findings=found.findings)
     diagnosis = answer(knowledge, alone, heading)
     proofs = found.faults(knowledge.fmea)

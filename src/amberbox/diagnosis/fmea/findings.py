@@ -67,6 +67,9 @@ def _problems(
     for number, pattern in enumerate(of.maps_to):
         at = child(node, "maps_to", number)
         yield from _pattern_problems(pattern, at, f"{where}.maps_to[{number}]", variables, modes)
+    if not of.maps_to:
+        what = "speaks for no failure mode: it is shown, but moves nothing"
+        yield node.problem(where, what, is_error=False)
     count = _count(of, modes)
     if count > _MOST:
         what = f"stands for {count:,} findings, more than {_MOST:,}"
@@ -100,12 +103,16 @@ def _pattern_problems(
 
 
 def _unmapped(found: Sequence[Mapped], known: Known | None) -> Iterator[Problem]:
-    """Tell which heads of rules lead to no finding."""
+    """Tell which heads of rules lead to no finding, in one note for each file."""
     named = {key for of in found if of.goal and (key := _key(of.goal)) is not None}
+    left: dict[str, list[tuple[int, Key]]] = {}
     for key, (file, line) in (known.heads if known is not None else {}).items():
         if key not in named:
-            what = "no finding of fmea.yaml names it: its answers are not used in a diagnosis"
-            yield Problem(file, line, show_key(key), what, is_error=False)
+            left.setdefault(file, []).append((line, key))
+    for file, heads in left.items():
+        names = ", ".join(show_key(key) for _, key in sorted(heads))
+        what = f"answers of {names} are not used in a diagnosis: no finding of fmea.yaml names them"
+        yield Problem(file, min(heads)[0], "findings", what, is_error=False)
 
 
 def _key(goal: str) -> Key | None:

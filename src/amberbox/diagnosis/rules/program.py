@@ -59,12 +59,15 @@ class Program:
 
     @cached_property
     def heads(self) -> Mapping[Key, Place]:
-        """Names of rules that no other rule calls: what the program concludes, with places."""
+        """Names of rules that no other rule calls: what the program concludes, with places.
+
+        Those of files called ``questions*.pl`` are for people to ask.
+        """
         rules = {
             key: clause.place
             for key, predicate in self.predicates.items()
             for clause in reversed(predicate.clauses)
-            if clause.body is not None
+            if clause.body is not None and not _is_of_questions(clause.place)
         }
         used = {
             called_key
@@ -114,6 +117,10 @@ class Program:
         if key in FIXED:
             raise RuleFault(f"{show_key(key)} is built in and cannot have facts")
         return self.predicates.get(key) or Predicate(key, origin="facts")
+
+
+def _is_of_questions(place: Place) -> bool:
+    return Path(place.file).name.startswith("questions")
 
 
 def _fact(name: str, values: list[Term], place: Place) -> Clause:

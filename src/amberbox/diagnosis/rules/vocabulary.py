@@ -28,6 +28,7 @@ VOCABULARY: Mapping[Key, str] = {
     ("present", 1): "a symptom that is there now",
     ("absent", 1): "a symptom that is known not to be there",
     ("unknown", 1): "a symptom of which nothing is known",
+    ("now", 1): "the instant that is asked about: the end of the record, or --at, --to",
     ("status", 4): "component, level, from, to: what monitors said",
     ("state", 4): "component, state, from, to: nominal, not_initialised or a fault state",
     ("mission", 4): "mission, outcome, from, to",
