@@ -144,3 +144,18 @@ def test_options_may_stand_between_words(store: Path, capsys: pytest.CaptureFixt
     assert json.loads(capsys.readouterr().out)["id"] == LASER
     assert main(["alarm", "--who", "bo", str(store), "shelve", "--for", "2h", LASER]) == 0
     assert main(["alarm", str(store), "--no-such", "ack", LASER]) == 2
+
+
+def test_the_cause_stands_after_the_reason(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = FakeRun(tmp_path / "store", "watch")
+    run.start(T0_NS)
+    values = alarm(LASER, 0, cause="laser#dead (likely)", diagnosis="r1-1")
+    run.own(ALARM, T0_NS + 3 * NS, values)
+    run.close()
+    assert main(["alarm", str(tmp_path / "store")]) == 0
+    assert "reason 0; because of laser#dead (likely)" in capsys.readouterr().out
+    assert main(["alarm", str(tmp_path / "store"), "list", "--json"]) == 0
+    (row,) = json.loads(capsys.readouterr().out)
+    assert (row["cause"], row["diagnosis"]) == ("laser#dead (likely)", "r1-1")

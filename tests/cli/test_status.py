@@ -253,6 +253,12 @@ def test_alarms_are_shown(store: Path, capsys: pytest.CaptureFixture[str]) -> No
         "1 alarm:",
         f"  laser-1 (critical, acknowledged by ada, for 5 s, 3 times): {GONE}",
     ]
+    say(store, replace(alarm, cause="laser#dead (likely)", diagnosis="robot-1"))
+    main(["status", str(store)])
+    assert capsys.readouterr().out.endswith(f": {GONE}; because of laser#dead (likely)\n")
+    main(["status", str(store), "--json"])
+    (shown,) = json.loads(capsys.readouterr().out)["alarms"]
+    assert (shown["cause"], shown["diagnosis"]) == ("laser#dead (likely)", "robot-1")
 
 
 def test_json_has_everything(store: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -16,6 +16,7 @@ import pytest
 
 from amberbox.blackbox.folder.folder import load_folder
 from amberbox.blackbox.store import WriterLock, create_store, open_store
+from amberbox.cli._diagnoser import diagnoser_of
 from amberbox.cli.main import main
 from amberbox.core.types import Schema, Topic
 from amberbox.monitoring.configuration import load_plan
@@ -39,6 +40,13 @@ mappings:
       outputs:
         - output: {name: cool, type: bool, expected: true, hint: let it cool down}
 arguments: {max: 80}
+"""
+FMEA = """\
+types:
+  motor:
+    symptoms: {very_hot: {when: ros_temperature.data > 85}}
+    failure_modes:
+      fan_stuck: {rate: 1.0e-4, symptoms: [motor/temperature/cool, very_hot]}
 """
 CHANGES = [
     "motor: not_initialised -> nominal",
@@ -188,6 +196,7 @@ def watching(folder: Path) -> subprocess.Popen[str]:
 
 
 def test_watchers_killed_at_random_lose_and_double_nothing(folder: Path) -> None:
+    (folder / "fmea.yaml").write_text(FMEA)
     recording = Recording(folder)
     store = load_folder(folder).store_path
     try:
@@ -206,6 +215,9 @@ def test_watchers_killed_at_random_lose_and_double_nothing(folder: Path) -> None
     output, _ = process.communicate(timeout=10)
     assert process.returncode == 0, output
     live = written(store)
-    plan, _ = load_plan(load_folder(folder))
-    assert len(live) > 10
-    assert live == [line_of(finding) for finding in replay(plan, open_store(store))]
+    loaded = load_folder(folder)
+    plan, _ = load_plan(loaded)
+    diagnoser, _ = diagnoser_of(loaded, plan)
+    assert sum(line.startswith(b"amberbox/diagnosis ") for line in live) > 0
+    found = replay(plan, open_store(store), diagnoser=diagnoser)
+    assert live == [line_of(finding) for finding in found]

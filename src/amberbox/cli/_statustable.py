@@ -177,4 +177,5 @@ def _alarms(alarms: Sequence[AlarmChange], now_ns: int, view: View) -> Iterator[
         said = f" by {alarm.who}" if alarm.who else ""
         lasts = f"for {duration(now_ns - alarm.opened_ns)}"
         about = f"{alarm.severity}, {alarm.state}{said}, {lasts}{times}"
-        yield f"  {view.paint(alarm.id, alarm.level)} ({about}): {alarm.reason}"
+        cause = f"; because of {alarm.cause}" if alarm.cause else ""
+        yield f"  {view.paint(alarm.id, alarm.level)} ({about}): {alarm.reason}{cause}"

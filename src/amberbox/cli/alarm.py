@@ -93,9 +93,10 @@ def _shown(row: Row) -> tuple[object, ...]:
     if row["until_ns"] is not None:
         state += f" until {format_time(row['until_ns'])[:16]}"
     opened_at = format_time(row["opened_ns"])[:19]
+    cause = f"; because of {row['cause']}" if row.get("cause") else ""
     return (
         row["id"], state, row["level"], row["severity"], opened_at, row["count"], row["who"],
-        row["reason"],
+        row["reason"] + cause,
     )  # fmt: skip
 
 

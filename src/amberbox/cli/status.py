@@ -211,6 +211,8 @@ def _as_json(board: Board) -> dict[str, Any]:
                 "component": alarm.component,
                 "severity": alarm.severity,
                 "state": alarm.state,
+                "cause": alarm.cause,
+                "diagnosis": alarm.diagnosis,
                 "reason": alarm.reason,
                 "opened": format_time(alarm.opened_ns),
                 "count": alarm.count,
