@@ -203,3 +203,61 @@ def test_it_is_drawn(folder: Path, capsys: pytest.CaptureFixture[str], tmp_path:
     assert main([*given, "--svg", "-"]) == 1
     assert capsys.readouterr().out.startswith("<svg")
     assert "both print" in refused(capsys, folder, "--symptom", TURNS, "--svg", "-", "--json")
+
+
+RULES = "installed(motor, 2009).\nold(M) :- installed(M, Year), Year < 2015.\n"
+FINDINGS = 'findings:\n  - {rule: old(M), maps_to: ["<M>#short"], detects: 0.9, leak: 0.001}\n'
+
+
+@pytest.fixture
+def ruled(folder: Path) -> Path:
+    """Make a robot folder with a rule that speaks for a failure mode."""
+    (folder / "rules").mkdir()
+    (folder / "rules" / "age.pl").write_text(RULES)
+    (folder / "fmea.yaml").write_text(FMEA + FINDINGS)
+    return folder
+
+
+def test_what_rules_find_is_weighed_with_all_else(
+    ruled: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    made = found(capsys, ruled, "--symptom", TURNS, "--symptom", HOT)
+    assert leading(made) == ["motor#short"]
+    rule = next(s for s in made["symptoms"] if s["source"] == "rules")
+    assert rule["id"] == "rule:old(motor)" and rule["counted"]
+    (ruled / "fmea.yaml").write_text(FMEA)
+    made = found(capsys, ruled, "--symptom", TURNS, "--symptom", HOT)
+    assert leading(made) == ["motor#worn"], "nobody said what the rule speaks for"
+    alone = found(capsys, ruled, "--symptom", TURNS, "--engine", "rules")
+    assert alone["hypotheses"] == [] and alone["findings"] == ["rule:old(motor)"]
+
+
+def test_rules_alone_conclude_with_proof(ruled: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    given = (ruled, "--symptom", TURNS, "--symptom", HOT, "--engine", "rules")
+    made = found(capsys, *given)
+    assert made["engine"] == "rules" and leading(made) == ["motor#short"]
+    assert "installed(motor,2009)" in made["hypotheses"][0]["proof"]
+    assert main(["diagnose", *map(str, given)]) == 1
+    assert capsys.readouterr().out.startswith("By the rules alone")
+    (ruled / "rules" / "age.pl").write_text("old(M) :- instaled(M, 2009).\ninstalled(a, 1).\n")
+    assert "age.pl:1" in refused(capsys, *given)
+    (ruled / "rules" / "age.pl").unlink()
+    (ruled / "fmea.yaml").write_text(FMEA)
+    assert "no rules/*.pl" in refused(capsys, *given)
+
+
+def test_fault_trees_alone_conclude_with_cut_sets(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    given = (folder, "--symptom", TURNS, "--symptom", HOT, "--engine", "faulttree")
+    made = found(capsys, *given)
+    sets = [h["faults"] for h in made["hypotheses"]]
+    assert sets[:2] == [["motor#worn"], ["motor#short"]] and [] not in sets
+    assert made["engine"] == "faulttree" and made["hypotheses"][0]["proof"]
+    assert sum(h["probability"] for h in made["hypotheses"]) == pytest.approx(1.0)
+    answered = found(capsys, *given, "--answer", "sound=smooth", "--answer", "ohms=low")
+    assert leading(answered) == ["motor#short"]
+    assert main(["diagnose", *map(str, given)]) == 1
+    assert capsys.readouterr().out.startswith("By the fault trees alone")
+    nothing = (folder, "--symptom", f"{HOT}=absent", "--engine", "faulttree")
+    assert found(capsys, *nothing, status=0)["state"] == "none"

@@ -21,6 +21,7 @@ class Case:
     """What is known at an instant, and the last revision of a diagnosis up to then, if any.
 
     ``seen`` are the symptoms of that diagnosis as they were; they need not be there any more.
+    ``has_more`` tells that more is known than what that diagnosis was made of.
     """
 
     at_ns: int
@@ -28,6 +29,7 @@ class Case:
     standing: Diagnosis | None = None
     origin: Origin = "given"
     seen: tuple[Symptom, ...] = ()
+    has_more: bool = False
 
     @property
     def is_over(self) -> bool:
@@ -48,12 +50,18 @@ class Case:
             symptoms=(*read, *said.values()),
             answers={**self.situation.answers, **answers},
         )
-        return replace(self, situation=situation, standing=standing, seen=())
+        return replace(self, situation=situation, standing=standing, seen=(), has_more=True)
 
 
 def answered(knowledge: Knowledge, case: Case) -> Diagnosis | None:
-    """Return the diagnosis of a case; None where nothing speaks for a fault."""
-    if not case.situation.present() and not case.situation.answers:
+    """Return the diagnosis of a case; None where nothing speaks for a fault.
+
+    What stood stays as it is where nothing more is known.
+    """
+    if case.standing is not None and not case.has_more:
+        return case.standing
+    situation = case.situation
+    if not (situation.present() or situation.answers or situation.conflicts):
         return None
     made = answer(knowledge, case.situation, heading_of(knowledge, case))
     if case.standing is None or not case.is_over:

@@ -16,7 +16,6 @@ from amberbox.diagnosis.knowledge import Knowledge
 from amberbox.diagnosis.situation import Situation, evidence
 from amberbox.monitoring.messages.board import duration
 
-COVERING = "covering"
 _NONE = "none"
 """The state of a robot of which there is no diagnosis."""
 
@@ -44,7 +43,10 @@ def nothing_wrong(case: Case) -> str:
     looked = f"of {count} none is there"
     rest = f"; {unknown} are not known" if unknown else ""
     at = format_time(case.at_ns)[:19]
-    return f"nothing is wrong at {at}: {looked}{rest}"
+    found = "".join(
+        f"\n  found, and no failure mode explains it: {f}" for f in case.situation.findings
+    )
+    return f"nothing is wrong at {at}: {looked}{rest}{found}"
 
 
 def json_of(
@@ -57,7 +59,6 @@ def json_of(
         "symptoms": symptoms_json(case.situation.symptoms, counted),
         "answers": dict(case.situation.answers),
         "explanation": explanation,
-        "engine": COVERING,
         "origin": case.origin,
     }
     return {key: plain(value) for key, value in (shown | more).items()}
@@ -76,7 +77,8 @@ def line_of(knowledge: Knowledge, diagnosis: Diagnosis, symptoms: Known) -> str:
     """Return a revision as one line of JSON."""
     case = Case(diagnosis.at_ns, Situation(tuple(symptoms.values())), diagnosis, "watcher")
     explanation = explain(diagnosis, knowledge, symptoms.values())
-    return json.dumps(json_of(knowledge, case, diagnosis, explanation), ensure_ascii=False)
+    made = json_of(knowledge, case, diagnosis, explanation) | {"engine": "covering"}
+    return json.dumps(made, ensure_ascii=False)
 
 
 def _seen(case: Case) -> Sequence[Symptom]:
@@ -88,7 +90,8 @@ def _seen(case: Case) -> Sequence[Symptom]:
 
 
 def _no_diagnosis(knowledge: Knowledge, case: Case) -> dict[str, Any]:
-    nothing = Diagnosis("", 0, knowledge.robot, case.at_ns, knowledge.config_hash, (), 1.0)
+    of = "", 0, knowledge.robot, case.at_ns, knowledge.config_hash
+    nothing = Diagnosis(*of, (), 1.0, findings=case.situation.findings)
     return diagnosis_json(nothing) | {"state": _NONE}
 
 

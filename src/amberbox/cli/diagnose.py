@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from amberbox.blackbox.folder.folder import RobotFolder
     from amberbox.blackbox.query.record import Record
     from amberbox.cli._diagnosis_case import Case
+    from amberbox.core.types import Diagnosis
     from amberbox.diagnosis.explanation import Explanation
     from amberbox.diagnosis.knowledge import Knowledge
     from amberbox.monitoring.plan import Plan
@@ -29,6 +30,12 @@ _USAGE = (
     "amberbox diagnose WHERE [--at T] [--symptom ID[=absent|unknown]]... [--answer TEST=VALUE]... "
     "[--engine covering|rules|faulttree] [--follow] [--json] [--svg FILE]"
 )
+RULES = "rules"
+ENGINES = ("covering", RULES, "faulttree")
+_ALONE = {
+    RULES: "By the rules alone, which weigh nothing else",
+    "faulttree": "By the fault trees alone, which know of no false alarm",
+}
 _LOOKBACK = "10m"
 _TIMES = "ISO (UTC), epoch, -10m before the last record, now or now-10m"
 
@@ -45,6 +52,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
                         help="take a symptom for present, or for absent or unknown")  # fmt: skip
     parser.add_argument("--answer", action="append", default=[], metavar="TEST=VALUE",
                         help="what a test gave; 'cannot' if it cannot be done")  # fmt: skip
+    parser.add_argument("--engine", choices=ENGINES, default=ENGINES[0],
+                        help="who answers: all together (covering), or one alone")  # fmt: skip
     parser.add_argument("--lookback", default=_LOOKBACK, metavar="TIME", help="evaluate so much of "
                         "the record where no watcher has (default: 10m)")  # fmt: skip
     parser.add_argument("--exposure", type=float, metavar="H", help="hours since all was known to "
@@ -64,7 +73,8 @@ def run(args: argparse.Namespace) -> int:
         if args.follow:
             return _follow(args, subject, record)
         case = _case(args, subject, record)
-    return _show(args, subject, case)
+        case, diagnosis = _diagnosed(args, subject, case, record)
+    return _show(args, subject, case, diagnosis)
 
 
 @dataclass(frozen=True, slots=True)
@@ -186,18 +196,34 @@ def _follow(args: argparse.Namespace, subject: Subject, record: Record | None) -
     return 0
 
 
-def _show(args: argparse.Namespace, subject: Subject, case: Case) -> int:
-    from amberbox.cli._diagnosis_case import answered, is_wrong
+def _diagnosed(
+    args: argparse.Namespace, subject: Subject, case: Case, record: Record | None
+) -> tuple[Case, Diagnosis | None]:
+    """Let the engine answer; what rules find is known to all of them."""
+    from amberbox.cli._diagnosis_engines import Ground, diagnosis_by, with_findings
+
+    lookback_ns = parse_duration(args.lookback)
+    ground = Ground(subject.knowledge, subject.folder.path, record, lookback_ns)
+    if args.engine != RULES:
+        case = with_findings(ground, case)
+    return case, diagnosis_by(args.engine, ground, case)
+
+
+def _show(
+    args: argparse.Namespace, subject: Subject, case: Case, diagnosis: Diagnosis | None
+) -> int:
+    from amberbox.cli._diagnosis_case import is_wrong
     from amberbox.cli._diagnosis_show import explained, json_of, text_of
 
-    is_told = args.symptom or args.answer or case.standing is None
-    diagnosis = answered(subject.knowledge, case) if is_told else case.standing
     explanation = explained(subject.knowledge, case, diagnosis)
     if args.svg:
         _draw(args.svg, explanation)
     if args.json:
-        print_json(json_of(subject.knowledge, case, diagnosis, explanation))
+        made = json_of(subject.knowledge, case, diagnosis, explanation)
+        print_json({**made, "engine": args.engine})
     elif args.svg != "-":
+        alone = args.engine != ENGINES[0] and diagnosis is not None
+        print(f"{_ALONE[args.engine]}:\n\n" if alone else "", end="")
         print(text_of(case, diagnosis, explanation))
     return int(is_wrong(case, diagnosis))
 
