@@ -1,7 +1,8 @@
 """Fault trees: probability and all minimal cut sets, beside SCRAM where it is installed.
 
 The trees of the Aralia benchmark are measured where they lie beside the project; the others are
-made here: robots whose functions share power, network and computers.
+made here: robots whose functions share power, network and computers. Trees that are compiled from
+failure modes are those of all functions of the simulated robot, and of a random one.
 """
 
 from __future__ import annotations
@@ -13,6 +14,8 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
+import amberbox.sim
+from amberbox.core.needs import Needs
 from amberbox.diagnosis.faulttree import (
     FaultTree,
     analyse,
@@ -22,9 +25,14 @@ from amberbox.diagnosis.faulttree import (
     write_mef,
 )
 from amberbox.diagnosis.faulttree.formula import Formula, all_of, any_of, at_least, names
+from amberbox.diagnosis.fmea import load_fmea
+from amberbox.diagnosis.fmea.model import Component, FailureMode, Fmea, Function
+from amberbox.diagnosis.fmea.trees import effects, fault_tree_of
 from benchmarks.common import Row, wall_s
+from benchmarks.covering import random_robot
 
 ARALIA = Path(__file__).resolve().parents[2] / "shared" / "data" / "diagnosis" / "fault_trees"
+SIMULATED = Path(amberbox.sim.__file__).parent / "folder" / "fmea.yaml"
 TARGETS = {"baobab1": "to be <= 1 s"}
 
 
@@ -32,7 +40,48 @@ def measure() -> list[Row]:
     """Measure seconds from the file to probability and number of cut sets."""
     with tempfile.TemporaryDirectory() as folder:
         files = [*sorted(ARALIA.glob("*.xml")), *_made(Path(folder))]
-        return [row for path in files for row in _of_file(path)]
+        rows = [row for path in files for row in _of_file(path)]
+    rows += _of_failure_modes("simulated robot", _simulated())
+    rows += _of_failure_modes("200 components, 500 failure modes", random_fmea(200, 500))
+    return rows
+
+
+def _of_failure_modes(name: str, fmea: Fmea) -> Iterator[Row]:
+    """Measure all effects together: from failure modes to trees, from trees to answers."""
+    trees = [fault_tree_of(fmea, effect) for effect in effects(fmea)]
+    count = sum(analyse(tree).minimal_cut_sets or 0 for tree in trees)
+    note = f"{len(trees)} effects, {len(fmea.modes)} failure modes"
+    taken = wall_s(lambda: [fault_tree_of(fmea, effect) for effect in effects(fmea)], 3)
+    yield Row(f"{name}: compile all trees", taken * 1e3, "ms", note=note)
+    taken = wall_s(lambda: [analyse(tree).by_order for tree in trees], 3)
+    yield Row(f"{name}: solve them", taken * 1e3, "ms", note=f"{count:,} cut sets")
+
+
+def _simulated() -> Fmea:
+    fmea, problems = load_fmea(SIMULATED)
+    assert fmea is not None, problems
+    return fmea
+
+
+def random_fmea(components: int, modes: int) -> Fmea:
+    """Make a robot of the covering benchmark with ten functions that have spares."""
+    model = random_robot(components, modes, components)
+    failures = {
+        mode.id: FailureMode(mode.id, mode.component, mode.id.partition("#")[2],
+                             probability=mode.prior, takes_down=mode.takes_down)
+        for mode in model.modes
+    }  # fmt: skip
+    parts = {
+        part.id: Component(part.id, "part", needs=part.needs,
+                           modes=tuple(m for m in failures if failures[m].component == part.id))
+        for part in model.functions
+    }  # fmt: skip
+    rng = random.Random(modes)
+    functions = {}
+    for number in range(10):
+        spares = tuple(rng.sample(list(parts), 5))
+        functions[f"f{number}"] = Function(f"f{number}", Needs(rng.choice((1, 2, 3)), spares))
+    return Fmea("random", failures, parts, functions, {})
 
 
 def _of_file(path: Path) -> Iterator[Row]:
