@@ -29,11 +29,18 @@ def test_keeps_its_onset_when_it_comes_back_in_time() -> None:
     assert presence(At(3, NAME, onset_s=1.5)).onset_ns == seconds(1.5)
 
 
-def test_what_becomes_unknown_or_blocked_is_remembered_as_long() -> None:
-    for change in (At(5, NAME, "unknown"), At(5, NAME, blocked_by=("bus",))):
-        one = presence(At(1, NAME), change)
-        assert one.counts_present(seconds(6.9)) and not one.counts_present(seconds(7))
-        assert not one.is_absent
+def test_what_becomes_unknown_is_remembered_as_long() -> None:
+    one = presence(At(1, NAME), At(5, NAME, "unknown"))
+    assert one.counts_present(seconds(6.9)) and not one.counts_present(seconds(7))
+    assert not one.is_absent
+
+
+def test_what_was_there_before_it_was_blocked_counts_while_it_lasts() -> None:
+    happens = [At(1, NAME), At(5, NAME, blocked_by=("bus",))]
+    assert presence(*happens).counts_present(seconds(60))
+    one = presence(*happens, At(60, NAME, "absent", ("bus",)))
+    assert one.counts_present(seconds(61.9)) and not one.counts_present(seconds(62))
+    assert not one.is_absent
 
 
 def test_what_is_blocked_never_counts() -> None:

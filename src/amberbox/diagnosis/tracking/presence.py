@@ -36,13 +36,17 @@ class Presence:
         return self.seen is not None and self.gone_ns is None
 
     def take(self, told: Symptom, at_ns: int) -> None:
-        """Take what is told of it at an instant; what comes back in time never went."""
+        """Take what is told of it at an instant; what comes back in time never went.
+
+        What was there before its component was blocked goes on to count while it lasts: it
+        cannot follow from what has blocked the component since.
+        """
         was_present = self.counts_present(at_ns)
         self.told = told
         if told.state == "present" and not told.blocked_by:
             self.seen = self.seen if was_present else told
             self.gone_ns = None
-        elif self.is_there:
+        elif self.is_there and told.state != "present":
             self.gone_ns = at_ns
 
     def counts_present(self, at_ns: int) -> bool:
