@@ -136,6 +136,22 @@ def test_what_the_fmea_does_not_know() -> None:
     assert (told.use.severity, told.use.text) == ("", NOBODY_KNOWS)
 
 
+def test_what_is_known_to_be_lost_counts_beside_what_is_not_known() -> None:
+    of, faults = knowledge(), frozenset({"safety#pressed", "unknown#other"})
+    both = Hypothesis(" + ".join(sorted(faults)), faults, 0.9)
+    made = Diagnosis("d", 1, "ropod_001", START_NS, "", (both,), 1.0)
+    assert explain(made, of, ()).use.text == ANSWERS["fatal"]
+
+
+def test_a_reading_that_may_be_taken_names_the_symptom_and_its_answers() -> None:
+    of = knowledge()
+    seen = symptoms(of, [ENCODER[1]], rest=False)
+    step = explain(diagnosis(of, seen), of, seen).next
+    assert step.test.startswith("read:wheel_left")
+    assert step.text.startswith("Find out whether this shows: the left wheel unit")
+    assert [branch.answer for branch in step.answers] == ["absent", "present"]
+
+
 def test_a_false_alarm() -> None:
     told = explained(*SCANS)
     assert told.headline == "Probably a false alarm (over 99 %)."
@@ -196,7 +212,7 @@ def test_faults_and_tests_of_others_are_called_by_their_ids() -> None:
     told = explain(made, knowledge(), ())
     assert told.headline.startswith("Arm: bent hard.")
     assert any("proof: rule 7" in line for line in told.details)
-    assert told.next.test == ""
+    assert told.next.test == "" and told.use.text == NOBODY_KNOWS
 
 
 def test_details_have_every_hypothesis_with_its_criticality() -> None:

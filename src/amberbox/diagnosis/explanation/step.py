@@ -125,17 +125,10 @@ def _answers(
         if given <= 0:
             continue
         best = max(range(len(listed)), key=lambda place: joint[place])
-        said = _said(check, answer)
-        found.append(_branch(names, said, given / total, listed[best], joint[best] / given))
+        found.append(_branch(names, answer, given / total, listed[best], joint[best] / given))
     return tuple(found)
 
 
 def _branch(names: Names, answer: str, chance: float, leads: Hypothesis, then: float) -> Branch:
     remedy = "; and ".join(_remedies(names, [leads]))
     return Branch(answer, chance, names.faults(leads.faults), then, remedy)
-
-
-def _said(check: Check, answer: str) -> str:
-    if not check.reads:
-        return answer
-    return "it shows" if check.level(answer) else "it does not show"

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 from amberbox.core.types import Hypothesis
-from amberbox.diagnosis.covering.model import UNKNOWN
 from amberbox.diagnosis.explanation.explanation import Group, Lost, Severity, Use
 from amberbox.diagnosis.explanation.ways import Ways
 from amberbox.diagnosis.explanation.words import percent
@@ -29,7 +28,8 @@ def use_of(
     """Say what the robot can still do: the worst over the members of the leading group."""
     lost = _lost(ways, members)
     severity = worst(_severity(ways, hypothesis) for hypothesis in members)
-    if not members or any(UNKNOWN in hypothesis.faults for hypothesis in members):
+    faults = {fault for hypothesis in members for fault in hypothesis.faults}
+    if not members or faults - ways.names.fmea.modes.keys():
         text = NOBODY_KNOWS if severity in ("", "warning", "urgent") else ANSWERS[severity]
     else:
         text = ANSWERS[severity]
