@@ -10,7 +10,9 @@ from tools.findings import ROOT, Finding, report
 from tools.import_graph import Import, imports, modules
 
 OURS = "amberbox"
-_UPPER = frozenset({"core", "blackbox", "monitoring", "detection", "diagnosis", "experiments"})
+_UPPER = frozenset(
+    {"core", "blackbox", "monitoring", "detection", "diagnosis", "experiments", "link"}
+)
 ALLOWED: Mapping[str, frozenset[str]] = {
     "core": frozenset(),
     "blackbox": frozenset({"core"}),
@@ -20,6 +22,7 @@ ALLOWED: Mapping[str, frozenset[str]] = {
     "monitoring": frozenset({"core", "blackbox"}),
     "detection": frozenset({"core", "blackbox"}),
     "experiments": frozenset({"core", "blackbox"}),
+    "link": frozenset({"core", "blackbox"}),
     "robot": _UPPER,
     "fleet": _UPPER,
     "cli": _UPPER | {"sim", "testing", "robot", "fleet"},
