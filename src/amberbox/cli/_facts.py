@@ -88,6 +88,7 @@ def lookups(window: Window) -> list[Virtual]:
     )
     return [
         *(of.virtual() for of in found),
+        _table("now", 1, lambda _: [(window.span[1] - 1,)]),
         _table("mission_name", 2, missions.names),
         _table("mission_parameter", 3, missions.parameters),
     ]
@@ -108,8 +109,7 @@ def facts_of(place: Place, record: Record | None, span: tuple[int | None, int | 
     known = tuple(known_facts(robot, place.fmea))
     if record is None:
         return Facts(known)
-    window = Window(record, *span)
-    return Facts((*known, ("now", window.span[1] - 1)), (), tuple(lookups(window)))
+    return Facts(known, (), tuple(lookups(Window(record, *span))))
 
 
 def _robot_of(record: Record | None) -> str:
