@@ -204,7 +204,8 @@ def test_an_epoch_makes_unknown_what_was_known() -> None:
 
 
 @pytest.mark.parametrize("value", [9.0, float("nan"), float("inf"), 3, True, "text", None])
-def test_goes_on_from_a_snapshot_with_rows_fed_again(value: Any) -> None:
+@pytest.mark.parametrize("more_s", [0.0, 7.0])
+def test_goes_on_from_a_snapshot_with_rows_fed_again(value: Any, more_s: float) -> None:
     text = "(known(x.a) and (y.b > 5 for 3s)) or motor/drive/warm"
     array = np.array([value], object if value is None or isinstance(value, str) else None)
     one, other = conditions(text), conditions(text)
@@ -218,7 +219,18 @@ def test_goes_on_from_a_snapshot_with_rows_fed_again(value: Any) -> None:
     assert one.advance(T0_NS, seconds(21)) == other.advance(T0_NS, seconds(21))
     again = conditions(text)
     again.resume(json.loads(json.dumps(other.snapshot(seconds(21)), allow_nan=False)), seconds(21))
-    since = [at for at in times(30) if at >= 21 - other.history_s]
+    since = [at for at in times(30) if at >= 21 - other.history_s - more_s]
     again.feed(rows("y", since, b=[9.0 if at > 20 else 0.0 for at in since]))
     later = one.advance(seconds(21), seconds(30))
     assert again.advance(seconds(21), seconds(30)) == later != []
+
+
+def test_rows_that_are_held_already_are_not_taken_twice() -> None:
+    made = conditions("count(x.a over 6s) > 60")
+    made.feed(rows("x", times(20), a=np.zeros(200)))
+    assert advance(made, 20) == [(0.25, "absent")]
+    again = conditions("count(x.a over 6s) > 60")
+    again.resume(made.snapshot(seconds(20)), seconds(20))
+    again.feed(rows("x", times(30), a=np.zeros(300)))
+    assert again.snapshot(seconds(20))["columns"] == made.snapshot(seconds(20))["columns"]
+    assert again.advance(seconds(20), seconds(30)) == []

@@ -212,6 +212,15 @@ def test_an_hour_without_any_symptom_ends_a_diagnosis_that_nothing_denies() -> N
     assert tracker.current() is None
 
 
+def test_an_hour_counts_anew_in_a_new_epoch() -> None:
+    tracker = begun()
+    run(tracker, [*WELL, At(20, CLEAR), At(40, CLEAR, "unknown")], 3000)
+    tracker.begin(seconds(5000))
+    assert run(tracker, [], 8599.9) == []
+    found = diagnoses(run(tracker, [], 8700))
+    assert [(one.at_ns, one.state) for one in found] == [(seconds(8600), "healed")]
+
+
 def test_readings_that_the_watcher_makes_itself_are_no_tests() -> None:
     tracker = begun()
     run(tracker, [At(20, FOLLOWS)], 21)
