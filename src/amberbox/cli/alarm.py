@@ -76,7 +76,12 @@ def _list(args: argparse.Namespace) -> None:
     if args.json:
         print_json([_document(row) for row in rows])
     elif rows:
-        print_grid(_HEADER, map(_shown, rows))
+        causes = [row.get("cause", "") for row in rows]
+        if any(causes):
+            shown = [(*_shown(row), cause) for row, cause in zip(rows, causes, strict=True)]
+            print_grid((*_HEADER, "cause"), shown)
+        else:
+            print_grid(_HEADER, map(_shown, rows))
     else:
         print("no alarms" if args.all else "no alarms now")
 
@@ -93,10 +98,9 @@ def _shown(row: Row) -> tuple[object, ...]:
     if row["until_ns"] is not None:
         state += f" until {format_time(row['until_ns'])[:16]}"
     opened_at = format_time(row["opened_ns"])[:19]
-    cause = f"; because of {row['cause']}" if row.get("cause") else ""
     return (
         row["id"], state, row["level"], row["severity"], opened_at, row["count"], row["who"],
-        row["reason"] + cause,
+        row["reason"],
     )  # fmt: skip
 
 
