@@ -1,0 +1,94 @@
+"""``findings:`` of fmea.yaml: what it may say, what is wrong, what the model gets of it."""
+
+from __future__ import annotations
+
+import pytest
+
+from amberbox.diagnosis.fmea.compile import compile_model
+from amberbox.diagnosis.fmea.findings import instances
+from amberbox.diagnosis.fmea.known import Known
+from amberbox.diagnosis.fmea.load import read_fmea
+
+TEXT = """\
+instances: {base: [ropod1, ropod-2], motor: [m1, m2]}
+types:
+  base: {modes: {short_circuit: {probability: 0.001, unobservable: no sensor}}}
+  motor: {modes: {burnt: {probability: 0.01, unobservable: no sensor}}}
+findings:
+"""
+KNOWN = Known(predicates=[("short_circuit", 1), ("broken", 2)])
+
+
+def errors(finding: str) -> str:
+    _, problems = read_fmea(TEXT + finding, KNOWN)
+    return "\n".join(map(str, problems))
+
+
+def test_every_instance_is_a_symptom_with_its_causes() -> None:
+    text = "  - {rule: short_circuit(R), maps_to: [<R>#short_circuit], detects: 0.9, leak: 0.01}"
+    fmea, problems = read_fmea(TEXT + text, KNOWN)
+    assert fmea is not None
+    assert problems == []
+    model = compile_model(fmea)
+    assert [(sign.id, sign.leak, sign.read_cost_s) for sign in model.signs] == [
+        ("rule:short_circuit(ropod1)", 0.01, None),
+        ("rule:short_circuit('ropod-2')", 0.01, None),
+    ]
+    assert [(link.cause, link.symptom, link.detects) for link in model.links] == [
+        ("ropod1#short_circuit", "rule:short_circuit(ropod1)", 0.9),
+        ("ropod-2#short_circuit", "rule:short_circuit('ropod-2')", 0.9),
+    ]
+
+
+def test_variables_that_map_to_nothing_do_not_make_more_symptoms() -> None:
+    text = "  - {rule: 'broken(M, _Why)', maps_to: [<M>#burnt, ropod1#short_circuit]}"
+    fmea, _ = read_fmea(TEXT + text, KNOWN)
+    assert fmea is not None
+    assert dict(instances(fmea.findings[0], fmea.modes)) == {
+        "rule:broken(m1,_)": ("m1#burnt", "ropod1#short_circuit"),
+        "rule:broken(m2,_)": ("m2#burnt", "ropod1#short_circuit"),
+    }
+
+
+def test_a_detectors_finding_and_a_proof() -> None:
+    text = """\
+  - {finding: flow.unlikely.<M>, maps_to: [<M>#burnt], detects: 0.7}
+  - {rule: 'broken(X, Y)', maps_to: [<X>#burnt], proves: true}
+"""
+    fmea, problems = read_fmea(TEXT + text, KNOWN)
+    assert fmea is not None
+    assert problems == []
+    model = compile_model(fmea)
+    assert [sign.id for sign in model.signs] == ["flow.unlikely.m1", "flow.unlikely.m2"]
+
+
+@pytest.mark.parametrize(
+    ("finding", "message"),
+    [
+        ("  - {rule: short_circut(X), maps_to: [<X>#short_circuit]}",
+         "fmea.yaml:6: findings[0].rule: there is no rule short_circut/1; did you mean"),
+        ("  - {rule: short_circuit(X), maps_to: [m1#brunt]}", "did you mean 'm1#burnt'?"),
+        ("  - {rule: short_circuit(X), maps_to: [<X>#burned]}", "no failure mode '<X>#burned'"),
+        ("  - {rule: short_circuit(Robot), maps_to: [<Robt>#burnt]}", "did you mean 'Robot'?"),
+        ("  - {rule: 'short_circuit(X), x(X)', maps_to: [m1#burnt]}", "is not one goal"),
+        ("  - {rule: 'short_circuit(', maps_to: [m1#burnt]}", "findings[0].rule: "),
+        ("  - {rule: short_circuit(X), finding: x, maps_to: [m1#burnt]}", "either 'rule' or"),
+        ("  - {rule: short_circuit(X), maps_to: [m1#burnt], detects: 2}", "2 is above 1"),
+        ("  - {rule: short_circuit(X), proves: true}", "what does it prove?"),
+        ("  - {rule: short_circuit(X), maps_to: [m1#burnt], proves: true, detects: 1}",
+         "what is proven has no probability"),
+        ("  - {rule: short_circuit(X), map_to: [m1#burnt]}", "did you mean 'maps_to'?"),
+        ("  {rule: short_circuit(X)}", "findings: expected a list"),
+    ],
+)  # fmt: skip
+def test_what_is_wrong(finding: str, message: str) -> None:
+    assert message in errors(finding)
+
+
+def test_notes_name_what_moves_nothing() -> None:
+    known = Known(predicates=[("p", 0)], heads={("q", 1): ("rules/a.pl", 7), ("p", 0): ("b", 1)})
+    fmea, problems = read_fmea(TEXT + "  - {rule: p}", known)
+    assert fmea is not None
+    notes = [str(problem) for problem in problems]
+    assert notes[0].startswith("fmea.yaml:6: note: findings[0]: speaks for no failure mode")
+    assert notes[1].startswith("rules/a.pl:7: note: findings: answers of q/1 are not used")
