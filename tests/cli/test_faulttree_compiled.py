@@ -141,6 +141,7 @@ def test_wrong_usage(small: Path, tmp_path: Path, capsys: pytest.CaptureFixture[
     assert "--at is for --closest" in refused(capsys, small, "--at", "-1m")
     assert "there is no record" in refused(capsys, small, "--closest", "--at", "-1m")
     assert "shows no importance" in refused(capsys, small, "--closest", "--importance")
+    assert "--mission-time is for" in refused(capsys, small, "--mission-time", "9")
     assert "--exposure must be a number" in refused(capsys, small, "--exposure", "nan")
     assert "there is no" in refused(capsys, tmp_path / "nowhere")
 

@@ -40,6 +40,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="which cut sets the robot's diagnosis brings closest to complete",
     )  # fmt: skip
     parser.add_argument("--at", metavar="T", help="with --closest: as it was then")
+    _configure_solving(parser)
+    parser.add_argument("--json", action="store_true", help="one object")
+
+
+def _configure_solving(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--mission-time", type=float, default=DEFAULT_MISSION_TIME_H, metavar="H",
         help="hours, for expressions of a file that use it (default: a year)",
@@ -52,7 +57,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--nodes", type=int, default=Budget().nodes, metavar="N",
         help="give up at N nodes, about 200 bytes each (default %(default)s)",
     )  # fmt: skip
-    parser.add_argument("--json", action="store_true", help="one object")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -137,5 +141,7 @@ def _check_compiled(args: argparse.Namespace) -> None:
         raise UsageError("one tree can be exported at a time", "name it: --effect NAME")
     if args.at and not args.closest:
         raise UsageError("--at is for --closest", "amberbox faulttree WHERE --closest --at T")
+    if args.mission_time != DEFAULT_MISSION_TIME_H:
+        raise UsageError("--mission-time is for expressions of a file", "--exposure H")
     if args.closest and args.importance:
         raise UsageError("--closest shows no importance", "leave out one of them")
