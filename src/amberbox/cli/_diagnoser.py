@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from amberbox.blackbox.folder.folder import RobotFolder
 from amberbox.cli._known import known_of
+from amberbox.cli._rulefiles import rule_files
 from amberbox.core.errors import ConfigurationError, Problem
 from amberbox.diagnosis.fmea.load import FILE, load_fmea
 from amberbox.diagnosis.knowledge import Knowledge
@@ -15,9 +16,6 @@ from amberbox.monitoring.plan import Plan
 
 if TYPE_CHECKING:
     from amberbox.monitoring.watcher.diagnosing import MakeDiagnoser
-
-RULES = "rules"
-"""The folder of a robot folder that rule files lie in."""
 
 
 def knowledge_of(
@@ -43,9 +41,8 @@ def diagnoser_of(folder: RobotFolder, plan: Plan) -> tuple[MakeDiagnoser | None,
 
 def rule_problems(folder: RobotFolder) -> list[Problem]:
     """Judge the rule files of a folder, read as one program."""
-    files = sorted((folder.path / RULES).glob("*.pl"))
     try:
-        program = read_rules(files)
+        program = read_rules(rule_files(folder.path))
     except ConfigurationError as error:
         return list(error.problems)
     return [*program.notes, *program.problems()]
