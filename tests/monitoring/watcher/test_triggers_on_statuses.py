@@ -13,6 +13,7 @@ from amberbox.blackbox.keeper.options import KeeperOptions, Trigger
 from amberbox.blackbox.keeper.ownjournal import OwnJournal
 from amberbox.blackbox.store import open_store
 from amberbox.core.clock import NS
+from tests.monitoring.watcher.diagnoser import PlainDiagnoser
 from tests.monitoring.watcher.stand import NUMBERS, Stand, plan_of
 
 ALARM = Trigger(
@@ -21,6 +22,13 @@ ALARM = Trigger(
     before_s=1,
     after_s=0.5,
 )
+OPENED = Trigger(
+    "opened",
+    when=f"{ALARM.when} and amberbox_alarm.changed_ns == amberbox_alarm.opened_ns",
+    before_s=1,
+    after_s=0.5,
+)
+DIAGNOSED = Trigger("diagnosed", when="amberbox_diagnosis.state == 'open'", before_s=1, after_s=0.5)
 STATUS = Trigger(
     "status", when="amberbox_status.level == 'error'", before_s=1, after_s=0.5, hold_off_s=600
 )
@@ -28,13 +36,14 @@ TRANSITION = Trigger("transition", event="component_state", before_s=1, after_s=
 
 
 @pytest.mark.parametrize(
-    ("trigger", "killed"), [(ALARM, True), (STATUS, False), (TRANSITION, False)]
+    ("trigger", "killed"),
+    [(ALARM, True), (OPENED, False), (DIAGNOSED, False), (STATUS, False), (TRANSITION, False)],
 )
 def test_a_trigger_on_a_status_makes_an_incident(
     tmp_path: Path, trigger: Trigger, killed: bool
 ) -> None:
     """The keeper has always read the recorder's rows long before the watcher says anything."""
-    stand = Stand(tmp_path / "store")
+    stand = Stand(tmp_path / "store", diagnoser=PlainDiagnoser)
     options = KeeperOptions(triggers=(trigger,))
     store = open_store(stand.path)
     stand.box.write()

@@ -20,7 +20,10 @@ EVENTS = identifier(reserved.EVENT)
 COUNTERS = identifier(reserved.COUNTERS)
 _COUNTS = f"{COUNTERS}__items"
 _HEARD = "heard"
-_WATCHED = (identifier(reserved.STATUS), identifier(reserved.ALARM))
+_WATCHED = tuple(
+    identifier(channel)
+    for channel in (reserved.STATUS, reserved.ALARM, reserved.SYMPTOM, reserved.DIAGNOSIS)
+)
 _PROBE = "probe_"
 _TRANSITION = "component_state"
 """Kind of the events by which the watcher says that a component has changed."""
