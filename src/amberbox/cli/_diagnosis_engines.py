@@ -10,7 +10,7 @@ from amberbox.blackbox.query.record import Record
 from amberbox.cli._diagnosis_case import Case, answered, heading_of
 from amberbox.cli._facts import known_facts, lookups
 from amberbox.cli._rulefiles import rule_files
-from amberbox.cli._rulespan import Window
+from amberbox.cli._rulespan import DAY_NS, Window
 from amberbox.core.config import refuse
 from amberbox.core.errors import UsageError
 from amberbox.core.types import Diagnosis
@@ -46,7 +46,7 @@ class Ground:
         seen = tuple(seen_facts(case.situation.symptoms, self.knowledge.fmea))
         if self.record is None:
             return Facts(tuple(known), seen)
-        span = case.at_ns - self.lookback_ns, case.at_ns + 1
+        span = case.at_ns - max(self.lookback_ns, DAY_NS), case.at_ns + 1
         return Facts(tuple(known), seen, tuple(lookups(Window(self.record, *span))))
 
 

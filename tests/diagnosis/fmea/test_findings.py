@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from amberbox.diagnosis.fmea.compile import compile_model
-from amberbox.diagnosis.fmea.findings import instances
+from amberbox.diagnosis.fmea.findings import causes_of, instances, text_of
 from amberbox.diagnosis.fmea.known import Known
 from amberbox.diagnosis.fmea.load import read_fmea
 
@@ -48,6 +48,20 @@ def test_variables_that_map_to_nothing_do_not_make_more_symptoms() -> None:
         "rule:broken(m1,_)": ("m1#burnt", "ropod1#short_circuit"),
         "rule:broken(m2,_)": ("m2#burnt", "ropod1#short_circuit"),
     }
+
+
+def test_findings_are_described_by_their_symptoms() -> None:
+    text = """\
+  - {rule: short_circuit(R), maps_to: [<R>#short_circuit], detects: 0.9, description: a short}
+  - {finding: flow.unlikely.<M>, maps_to: [<M>#burnt]}
+"""
+    fmea, _ = read_fmea(TEXT + text, KNOWN)
+    assert fmea is not None
+    assert text_of(fmea, "rule:short_circuit(ropod1)") == "a short (rule short_circuit(ropod1))"
+    assert text_of(fmea, "flow.unlikely.m1") == "finding flow.unlikely.m1"
+    assert text_of(fmea, "a/b/c") == ""
+    assert causes_of(fmea, "rule:short_circuit(ropod1)") == {"ropod1#short_circuit": 0.9}
+    assert causes_of(fmea, "a/b/c") == {}
 
 
 def test_a_detectors_finding_and_a_proof() -> None:

@@ -9,6 +9,7 @@ from amberbox.core.types import Hypothesis
 from amberbox.diagnosis.covering.model import UNKNOWN
 from amberbox.diagnosis.explanation.explanation import Fault, Possibility
 from amberbox.diagnosis.explanation.words import both, count, readable
+from amberbox.diagnosis.fmea.findings import text_of as finding_text
 from amberbox.diagnosis.fmea.model import Fmea
 
 OTHER = "something that the FMEA does not know"
@@ -52,6 +53,9 @@ class Names:
         symptom = self.fmea.symptoms.get(symptom_id)
         if symptom is not None and symptom.description:
             return symptom.description
+        finding = finding_text(self.fmea, symptom_id)
+        if finding:
+            return finding
         parts = symptom_id.split("/")
         if len(parts) == 3:
             return f'{self.component(parts[0])}: the self-check "{_check(*parts[1:])}" fails'

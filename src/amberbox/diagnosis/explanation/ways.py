@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from amberbox.diagnosis.covering.model import UNKNOWN
 from amberbox.diagnosis.explanation.explanation import Way
 from amberbox.diagnosis.explanation.names import Names, in_order
+from amberbox.diagnosis.fmea.findings import causes_of
 from amberbox.diagnosis.fmea.model import Fmea, Link
 from amberbox.diagnosis.fmea.propagation import Structure
 
@@ -80,6 +81,7 @@ class Ways:
         return (*self._direct(symptom, faults), *self._by_loss(symptom, faults))
 
     def _direct(self, symptom: str, faults: Collection[str]) -> Iterator[Way]:
+        found = causes_of(self.names.fmea, symptom)
         for fault in in_order(faults):
             if fault == UNKNOWN:
                 other = self.names.fmea.other.detects
@@ -88,6 +90,8 @@ class Ways:
             link = _link(mode.symptoms if mode else (), symptom)
             if link is not None:
                 yield Way(fault, (), self.names.mode(fault), link.detects)
+            elif fault in found:
+                yield Way(fault, (), self.names.mode(fault), found[fault])
 
     def _by_loss(self, symptom: str, faults: Collection[str]) -> Iterator[Way]:
         losses = self.losses(faults)

@@ -18,6 +18,7 @@ from amberbox.diagnosis.fmea.reading import Sheet
 from amberbox.diagnosis.rules.faults import RuleFault
 from amberbox.diagnosis.rules.reader import Sentence, read_goal
 from amberbox.diagnosis.rules.terms import Key, key_of, show_key
+from amberbox.diagnosis.rules.unify import unify
 from amberbox.diagnosis.rules.writer import write
 
 _VARIABLE = re.compile(r"<(\w+)>")
@@ -186,6 +187,31 @@ def symptom_of(of: Mapped, values: Values) -> str:
     for name in named & sentence.names.keys() & values.keys():
         sentence.names[name].ref = values[name]
     return f"rule:{write(sentence.term)}"
+
+
+def text_of(fmea: Fmea, symptom: str) -> str:
+    """Describe a symptom that is a finding; empty for any other."""
+    for of in fmea.findings:
+        if _is_of(of, symptom):
+            said = f"rule {symptom.removeprefix('rule:')}" if of.goal else f"finding {symptom}"
+            return f"{of.description} ({said})" if of.description else said
+    return ""
+
+
+def causes_of(fmea: Fmea, symptom: str) -> dict[str, float]:
+    """Return the failure modes that a finding speaks for, with how probable each shows it."""
+    if symptom in fmea.symptoms or not any(_is_of(of, symptom) for of in fmea.findings):
+        return {}
+    return {link.cause: link.detects for link in finding_signs(fmea)[1] if link.symptom == symptom}
+
+
+def _is_of(of: Mapped, symptom: str) -> bool:
+    """Tell whether a symptom is an instance of a finding."""
+    if not of.goal:
+        return _expression(of.finding).fullmatch(symptom) is not None
+    if not symptom.startswith("rule:"):
+        return False
+    return unify(read_goal(of.goal).term, read_goal(symptom.removeprefix("rule:")).term, [])
 
 
 def _filled(pattern: str, values: Values) -> str:
