@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from amberbox.core.plugins import find as find_plugins
-from amberbox.core.types import Status
+from amberbox.core.types import Status, Symptom
 from amberbox.monitoring.plan import Plan
 from amberbox.sim import Robot, catalogue
 from tests.sim.monitored import FAULT_S, alarms, failures, find, plan_of, with_fault
@@ -77,6 +77,9 @@ def test_nothing_is_wrong_with_a_sound_robot(
     statuses = {s.component: s for s in findings if isinstance(s, Status) and not s.mode}
     assert {s.level for s in statuses.values()} == {"ok"} and len(statuses) == len(plan.components)
     assert all(s.since_ns - messages[0][1] <= INITIALISED_S * 1e9 for s in statuses.values())
+    symptoms = [s for s in findings if isinstance(s, Symptom)]
+    assert len({s.id for s in symptoms}) == len(symptoms) > 100, "each says once that all is well"
+    assert {(s.state, s.blocked_by) for s in symptoms} == {("absent", ())}
 
 
 @pytest.mark.parametrize("fault", SAMPLE)
