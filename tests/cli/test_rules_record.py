@@ -214,6 +214,24 @@ def test_a_long_record_is_not_looked_through_by_accident(
     assert f"T = {at(2 * 86_400) + 1}" in capsys.readouterr().out
 
 
+def test_an_interval_is_one_over_hours_and_in_all_its_parts(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = FakeRun(tmp_path / "store", items=[BATTERY])
+    charges = [9.0] + [5.0] * 299 + [9.0]
+    run.write([(at(n * 60), BATTERY, {"charge": c, "mode": ""}) for n, c in enumerate(charges)])
+    run.close()
+    low = "'battery.charge < 8'"
+    parts = f"{at(60)}, {at(300 * 60)}), \\+ holds_throughout({low}, {at(59)}, {at(600)}"
+    for goal, answer in (
+        (f"holds({low}, F, T)", f"F = {at(60)}, T = {at(300 * 60)}"),
+        (f"holds({low}, {at(9000)}, {at(9001)}), holds({low}, F, {at(9000)})", f"F = {at(60)}"),
+        (f"holds_throughout({low}, {parts})", "yes"),
+    ):
+        assert main(["rules", "--where", str(tmp_path / "store"), "--ask", goal]) == 0
+        assert capsys.readouterr().out == f"{answer}\n"
+
+
 def test_without_a_record_nothing_is_known_of_the_past(
     robot: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -74,7 +74,7 @@ def _refuse(args: argparse.Namespace) -> None:
 def _read(args: argparse.Namespace, place: Place | None) -> Program:
     """Read the files that are named, else those of the folder."""
     files = [Path(name) for name in args.files] or (place.rules if place is not None else [])
-    if not files and args.ask is None:
+    if not files and args.ask is None and args.export is None:
         raise UsageError(f"there are no rules/*.pl in {args.where}", "name files, or --ask GOAL")
     return read_rules(files)
 
