@@ -41,7 +41,8 @@ TRIGGER = f"""triggers:
   reason: a wheel draws more current than its neighbour
 """
 PASSENGER = "recording_odom"
-MONITORS = FOLDER / "components"
+SUSPECT = "laser_rear#silent"
+"""What is to be blamed for it, among others that look alike."""
 _LOST_AT_KILL_S = 0.15
 
 
@@ -64,7 +65,8 @@ def run(args: argparse.Namespace) -> int:
     if any(place.iterdir()):
         raise UsageError(f"{place} is not empty", "name a new folder, or none")
     demo = Demo(place, args.seconds)
-    for step in (demo.prepare, demo.record, demo.tell, demo.account, demo.show, demo.defend):
+    steps = (demo.prepare, demo.record, demo.tell, demo.diagnose, demo.account, demo.show)
+    for step in (*steps, demo.defend):
         step()
     print(f"\nEverything is in {place}. Go on with:")
     for verb in (
@@ -124,7 +126,7 @@ class Demo:
         )
         with robot(self.truth) as (process, endpoint):
             write_folder(self.folder, "demo_robot", self._blocks(endpoint), TRIGGER)
-            write_components(self.folder)
+            write_knowledge(self.folder)
             box = start_box(self.folder)
             watcher = start_watcher(self.folder, self.watched)
             time.sleep(self.seconds * 0.3)
@@ -164,6 +166,15 @@ class Demo:
         say("What the monitors said of the second fault, as it came:")
         print("\n".join(f"  {line}" for line in self.failures()))
         check(bool(self.failures()), f"the monitors saw that {SILENT} has fallen silent")
+
+    def diagnose(self) -> None:
+        """Show what is broken, why, and what to do next."""
+        say("What is broken? One answer from all that was seen, by the robot's failure modes:")
+        amberbox_verb("diagnose", str(self.folder), expected=1)
+        command = [sys.executable, "-m", "amberbox", "diagnose", str(self.folder), "--json"]
+        answer = json.loads(subprocess.run(command, stdout=subprocess.PIPE, check=False).stdout)
+        blamed = [faults for group in answer["groups"] for faults in group["faults"]]
+        check(any(SUSPECT in faults for faults in blamed), f"{SUSPECT} is among what may be broken")
 
     def _blocks(self, endpoint: str) -> str:
         return (
@@ -245,10 +256,11 @@ def write_folder(folder: Path, name: str, blocks: str, more: str = "") -> None:
     (folder / "black_box.yaml").write_text(blocks)
 
 
-def write_components(folder: Path) -> None:
-    """Give a robot the monitors of the simulated one, whose messages come by ZMQ here."""
-    for path in MONITORS.rglob("*.yaml"):
-        target = folder / path.relative_to(MONITORS.parent)
+def write_knowledge(folder: Path) -> None:
+    """Give a robot what the simulated one has, whose messages come by ZMQ here."""
+    rooms = ("components/**/*.yaml", "rules/*.pl")
+    for path in (FOLDER / "fmea.yaml", *(path for room in rooms for path in FOLDER.glob(room))):
+        target = folder / path.relative_to(FOLDER)
         target.parent.mkdir(parents=True, exist_ok=True)
         target.write_text(path.read_text().replace("sim_", "zmq_"))
 
