@@ -194,6 +194,15 @@ def test_little_lookback_sees_little(recorded: Path, capsys: pytest.CaptureFixtu
     assert "too short" in refused(capsys, recorded, "--lookback", "0s")
 
 
+def test_where_nothing_was_recorded_nothing_is_known(
+    recorded: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    said = refused(capsys, recorded, "--at", "2023-11-14T23:13:20Z")
+    assert "nothing was recorded in the 10 min before 2023-11-14T23:13:20" in said
+    assert main(["diagnose", str(recorded), "--at", "2023-11-14T22:14Z"]) == 0
+    assert "nothing was recorded after 2023-11-14T22:13:3" in capsys.readouterr().err
+
+
 def test_it_is_drawn(folder: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     target = tmp_path / "why.svg"
     given = ["diagnose", str(folder), "--symptom", TURNS]

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 
 from amberbox.blackbox.store import Store
 from amberbox.cli._diagnosis_case import Case
 from amberbox.cli._diagnosis_journal import said_until
 from amberbox.core.clock import NS
+from amberbox.core.errors import UsageError
+from amberbox.core.timetext import format_time
 from amberbox.core.types import Diagnosis, Symptom
 from amberbox.diagnosis.knowledge import Knowledge
 from amberbox.diagnosis.situation import Situation
@@ -17,11 +19,13 @@ from amberbox.diagnosis.tracking.presence import Presences
 from amberbox.diagnosis.tracking.tracker import Tracker
 from amberbox.monitoring.engine.engine import Engine
 from amberbox.monitoring.engine.findings import Finding
+from amberbox.monitoring.messages.board import duration
 from amberbox.monitoring.plan import Plan
 from amberbox.monitoring.watcher.diagnosing import Diagnosing
 from amberbox.monitoring.watcher.evaluation import Evaluation
 from amberbox.monitoring.watcher.guard import guarded
-from amberbox.monitoring.watcher.replay import Part, blocks
+from amberbox.monitoring.watcher.reader import Block
+from amberbox.monitoring.watcher.replay import WARM_UP_S, Part, blocks
 
 
 @dataclass(slots=True)
@@ -48,21 +52,39 @@ class _Heard:
 def evaluated(
     knowledge: Knowledge, plan: Plan, store: Store, at_ns: int, lookback_s: float
 ) -> Case:
-    """Evaluate the record before an instant; nothing is written."""
+    """Evaluate the record before an instant, and a minute before that; nothing is written.
+
+    Raises UsageError where nothing was recorded.
+    """
     tracker, heard = Tracker(knowledge), _Heard()
     engine = Diagnosing(Engine(plan), tracker)
     evaluation = Evaluation(engine)
-    part = Part(at_ns - round(lookback_s * NS))
     with guarded(plan):
-        for block in blocks(plan, store, engine, part):
-            until_ns = min(block.until_ns, at_ns)
-            for found in evaluation.take(replace(block, until_ns=until_ns)):
+        for block in _between(plan, store, engine, at_ns - round(lookback_s * NS), at_ns):
+            for found in evaluation.take(block):
                 heard.hear(found)
-            if block.until_ns >= at_ns:
-                break
-    place = evaluation.place
-    reached_ns = at_ns if place is None else min(place.until_ns, at_ns)
+    if evaluation.place is None:
+        raise UsageError(
+            f"nothing was recorded in the {duration(round(lookback_s * NS))} before "
+            f"{format_time(at_ns)[:19]}",
+            "amberbox gaps shows what is missing; give another --at or a longer --lookback",
+        )
+    reached_ns = evaluation.place.until_ns
     return replace(heard.case(reached_ns, tracker.situation()), origin="record")
+
+
+def _between(
+    plan: Plan, store: Store, engine: Diagnosing, from_ns: int, to_ns: int
+) -> Iterator[Block]:
+    """Give what is recorded of a span, and of the time in which monitors warm up before it."""
+    start_ns = from_ns - round(WARM_UP_S * NS)
+    part = Part(from_ns + round(engine.history_s * NS))  # windows fill within the span
+    for block in blocks(plan, store, engine, part):
+        if block.until_ns >= start_ns:
+            until_ns = min(block.until_ns, to_ns)
+            yield replace(block, start_ns=max(block.start_ns, start_ns), until_ns=until_ns)
+        if block.until_ns >= to_ns:
+            return
 
 
 def watched(knowledge: Knowledge, store: Store, at_ns: int) -> Case:

@@ -27,6 +27,15 @@ def explained(knowledge: Knowledge, case: Case, diagnosis: Diagnosis | None) -> 
     return explain(diagnosis, knowledge, _seen(case))
 
 
+def alone_text(engine: str, text: str) -> str:
+    """Put on top of a text that one engine alone says so."""
+    what = {
+        "rules": "By the rules alone, which weigh nothing else:",
+        "faulttree": "By the fault trees alone, which know of no false alarm:",
+    }
+    return f"{what[engine]}\n\n{text}" if engine in what else text
+
+
 def text_of(case: Case, diagnosis: Diagnosis | None, explanation: Explanation | None) -> str:
     """Write for a person what is broken, or that nothing is."""
     if diagnosis is None or explanation is None:

@@ -6,7 +6,7 @@ import argparse
 import math
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,7 +15,7 @@ from amberbox.cli._output import accept_relative_times, print_json, tell, text_o
 from amberbox.core.clock import NS
 from amberbox.core.config import refuse
 from amberbox.core.errors import UsageError
-from amberbox.core.timetext import parse_duration
+from amberbox.core.timetext import format_time, parse_duration
 
 if TYPE_CHECKING:
     from amberbox.blackbox.folder.folder import RobotFolder
@@ -32,11 +32,8 @@ _USAGE = (
 )
 RULES = "rules"
 ENGINES = ("covering", RULES, "faulttree")
-_ALONE = {
-    RULES: "By the rules alone, which weigh nothing else",
-    "faulttree": "By the fault trees alone, which know of no false alarm",
-}
 _LOOKBACK = "10m"
+_LATE_NS = 3 * NS
 _TIMES = "ISO (UTC), epoch, -10m before the last record, now or now-10m"
 
 
@@ -175,7 +172,10 @@ def _read(args: argparse.Namespace, subject: Subject, record: Record) -> Case:
     if was_watched(store, knowledge.config_hash, at_ns):
         return watched(knowledge, store, at_ns)
     lookback_s = parse_duration(args.lookback) / NS
-    return evaluated(knowledge, subject.plan, store, at_ns, lookback_s)
+    case = evaluated(knowledge, subject.plan, store, at_ns, lookback_s)
+    if at_ns - case.at_ns > _LATE_NS:
+        tell([f"nothing was recorded after {format_time(case.at_ns)[:19]}; this is as of then"])
+    return case
 
 
 def _follow(args: argparse.Namespace, subject: Subject, record: Record | None) -> int:
@@ -190,10 +190,12 @@ def _follow(args: argparse.Namespace, subject: Subject, record: Record | None) -
     store = open_store(record.path)
     if not is_locked(store, WRITER):
         tell([f"nobody watches, so nothing new will come: amberbox watch {subject.folder.path}"])
-    for diagnosis, symptoms in revisions(store):
-        show = line_of if args.json else revision_text
-        print(show(subject.knowledge, diagnosis, symptoms), flush=True)
-    return 0
+    show, is_open = line_of if args.json else revision_text, False
+    with suppress(KeyboardInterrupt):
+        for diagnosis, symptoms in revisions(store):
+            print(show(subject.knowledge, diagnosis, symptoms), flush=True)
+            is_open = diagnosis.state == "open"
+    return int(is_open)
 
 
 def _diagnosed(
@@ -213,7 +215,7 @@ def _show(
     args: argparse.Namespace, subject: Subject, case: Case, diagnosis: Diagnosis | None
 ) -> int:
     from amberbox.cli._diagnosis_case import is_wrong
-    from amberbox.cli._diagnosis_show import explained, json_of, text_of
+    from amberbox.cli._diagnosis_show import alone_text, explained, json_of, text_of
 
     explanation = explained(subject.knowledge, case, diagnosis)
     if args.svg:
@@ -222,9 +224,10 @@ def _show(
         made = json_of(subject.knowledge, case, diagnosis, explanation)
         print_json({**made, "engine": args.engine})
     elif args.svg != "-":
-        alone = args.engine != ENGINES[0] and diagnosis is not None
-        print(f"{_ALONE[args.engine]}:\n\n" if alone else "", end="")
-        print(text_of(case, diagnosis, explanation))
+        text = text_of(case, diagnosis, explanation)
+        if diagnosis is None and args.engine == RULES:
+            text = "nothing follows from them"
+        print(alone_text(args.engine, text))
     return int(is_wrong(case, diagnosis))
 
 
