@@ -1,0 +1,1 @@
+"""The server's database: tables of all rooms, transactions, versions, one server per folder."""

@@ -1,0 +1,148 @@
+"""The server's database: one SQLite file that survives power cuts, and its transactions."""
+
+from __future__ import annotations
+
+import os
+import sqlite3
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+from sqlalchemy import Connection, Engine, MetaData, QueuePool, create_engine, event
+from sqlalchemy.exc import DatabaseError, OperationalError
+
+from amberbox.core.clock import Clock, SystemClock
+from amberbox.core.errors import AmberboxError
+from amberbox.fleet.database.metadata import complete
+from amberbox.fleet.database.schema import MIGRATIONS, Migration, check_version, prepare
+
+FILE = "server.db"
+BUSY_S = 10.0
+_BEGIN = "amberbox_begin"
+
+
+class DatabaseBusyError(AmberboxError):
+    """The database cannot do this now: somebody else writes, or the disk is full or failing."""
+
+
+class Database:
+    """The tables of the server, in one file; threads may share it.
+
+    ``begin`` writes: one writer at a time, in all processes together, so keep what is slow (hashing
+    a password, the network) outside of it, and never open one inside another. ``reading`` sees the
+    database as it was when it began, and holds nobody up. Other processes open the same file, with
+    ``read_only`` if they only look; after a fork a process needs a Database of its own.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        clock: Clock | None = None,
+        *,
+        read_only: bool = False,
+        metadata: MetaData | None = None,
+        migrations: Sequence[Migration] = MIGRATIONS,
+    ) -> None:
+        self.path = path
+        self._writing = threading.Lock()
+        if not read_only:
+            _make_private(path)
+        self.engine = _engine(path, read_only)
+        try:
+            if read_only:
+                with self.reading() as connection:
+                    check_version(connection, migrations)
+            else:
+                now_ns = (clock or SystemClock()).wall_ns()
+                with self.begin() as connection:
+                    prepare(connection, metadata or complete(), migrations, now_ns)
+        except BaseException:
+            self.close()
+            raise
+
+    @contextmanager
+    def begin(self) -> Iterator[Connection]:
+        """Open a transaction that writes: all of it is kept, or nothing when it raises.
+
+        Raises DatabaseBusyError after 10 s behind another writer, or when the disk is full.
+        """
+        if not self._writing.acquire(timeout=BUSY_S):
+            raise DatabaseBusyError(f"{self.path} is being written for {BUSY_S:.0f} s", "try again")
+        try:
+            with self._transaction("IMMEDIATE") as connection:
+                yield connection
+        finally:
+            self._writing.release()
+
+    @contextmanager
+    def reading(self) -> Iterator[Connection]:
+        """Open a transaction that only reads; all its statements see the same moment."""
+        with self._transaction("DEFERRED") as connection:
+            yield connection
+
+    @contextmanager
+    def _transaction(self, kind: str) -> Iterator[Connection]:
+        try:
+            with (
+                self.engine.connect().execution_options(**{_BEGIN: kind}) as connection,
+                connection.begin(),
+            ):
+                yield connection
+        except OperationalError as error:
+            hint = "look at the disk: is it full, or read-only? then try again"
+            raise DatabaseBusyError(f"{self.path}: {error.orig}", hint) from error
+        except DatabaseError as error:
+            if type(error) is not DatabaseError:
+                raise
+            hint = "restore the file from a copy"
+            raise AmberboxError(f"{self.path} is damaged: {error.orig}", hint) from error
+
+    def close(self) -> None:
+        """Close all connections."""
+        self.engine.dispose()
+
+
+def _make_private(path: Path) -> None:
+    """Make the file before SQLite does: it holds hashes of passwords, nobody else reads it."""
+    try:
+        os.close(os.open(path, os.O_RDWR | os.O_CREAT, 0o600))
+    except OSError as error:
+        raise AmberboxError(
+            f"cannot write {path}: {error.strerror}", "name a folder that the server may write"
+        ) from error
+
+
+def _engine(path: Path, read_only: bool) -> Engine:
+    address = f"file:{quote(str(path.absolute()))}?mode={'ro' if read_only else 'rw'}"
+    connect = partial(sqlite3.connect, address, uri=True, check_same_thread=False)
+    engine = create_engine("sqlite://", creator=connect, poolclass=QueuePool, pool_size=16)
+    event.listen(engine, "connect", _configure_reader if read_only else _configure)
+    event.listen(engine, "begin", _begin)
+    return engine
+
+
+def _configure(connection: Any, _record: object) -> None:
+    """Set what SQLite keeps per connection: durable commits, foreign keys, patience."""
+    connection.isolation_level = None  # the driver's own BEGIN comes too late for DDL and reads
+    for pragma in (
+        f"busy_timeout={BUSY_S * 1000:.0f}",
+        "journal_mode=WAL",
+        "synchronous=FULL",
+        "foreign_keys=ON",
+    ):
+        connection.execute(f"PRAGMA {pragma}").close()
+
+
+def _configure_reader(connection: Any, _record: object) -> None:
+    connection.isolation_level = None
+    connection.execute(f"PRAGMA busy_timeout={BUSY_S * 1000:.0f}").close()
+    connection.execute("PRAGMA query_only=ON").close()
+
+
+def _begin(connection: Connection) -> None:
+    kind = connection.get_execution_options().get(_BEGIN, "DEFERRED")
+    connection.exec_driver_sql(f"BEGIN {kind}")

@@ -1,0 +1,290 @@
+"""The database: durable, private, one writer, several readers, versions, two dialects."""
+
+from __future__ import annotations
+
+import stat
+import subprocess
+import sys
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from sqlalchemy import (
+    Column,
+    Connection,
+    Integer,
+    MetaData,
+    String,
+    Table,
+    func,
+    insert,
+    inspect,
+    select,
+    text,
+)
+from sqlalchemy.exc import IntegrityError
+from sqlalchemy.schema import CreateIndex, CreateTable
+
+from amberbox.core.errors import AmberboxError, UsageError
+from amberbox.fleet.database.database import Database, DatabaseBusyError
+from amberbox.fleet.database.metadata import METADATA, complete
+from amberbox.fleet.database.schema import SCHEMA_VERSION, Migration, version
+from amberbox.fleet.database.upsert import upsert
+from amberbox.testing.clock import ManualClock
+from tests.fleet.database.portable import POSTGRESQL
+
+
+def _things() -> tuple[MetaData, Table]:
+    metadata = MetaData()
+    SCHEMA_VERSION.to_metadata(metadata)
+    things = Table(
+        "things",
+        metadata,
+        Column("name", String(8), primary_key=True),
+        Column("number", Integer, nullable=False),
+    )
+    return metadata, things
+
+
+def _rows(database: Database, table: Table) -> list[tuple[object, ...]]:
+    with database.reading() as connection:
+        return [tuple(row) for row in connection.execute(select(table).order_by(table.c.name))]
+
+
+@pytest.fixture
+def metadata() -> MetaData:
+    return _things()[0]
+
+
+@pytest.fixture
+def things(metadata: MetaData) -> Table:
+    return metadata.tables["things"]
+
+
+@pytest.fixture
+def database(tmp_path: Path, metadata: MetaData) -> Database:
+    return Database(tmp_path / "server.db", ManualClock(), metadata=metadata)
+
+
+def test_commits_are_durable_and_foreign_keys_hold(database: Database) -> None:
+    with database.reading() as connection:
+        asked = ("journal_mode", "synchronous", "foreign_keys", "busy_timeout")
+        found = {name: connection.execute(text(f"PRAGMA {name}")).scalar() for name in asked}
+    assert found == {
+        "journal_mode": "wal",
+        "synchronous": 2,
+        "foreign_keys": 1,
+        "busy_timeout": 10_000,
+    }
+
+
+def test_nobody_else_reads_the_files(database: Database, things: Table) -> None:
+    with database.begin() as connection:
+        connection.execute(insert(things), [{"name": "a", "number": 1}])
+    files = sorted(database.path.parent.iterdir())
+    assert [file.name for file in files] == ["server.db", "server.db-shm", "server.db-wal"]
+    assert {stat.S_IMODE(file.stat().st_mode) for file in files} == {0o600}
+
+
+def test_a_transaction_that_raises_leaves_nothing(database: Database, things: Table) -> None:
+    with pytest.raises(RuntimeError), database.begin() as connection:
+        connection.execute(insert(things), [{"name": "a", "number": 1}])
+        raise RuntimeError("the power goes")
+    assert _rows(database, things) == []
+
+
+def test_a_reader_sees_one_moment(database: Database, things: Table) -> None:
+    count = select(func.count()).select_from(things)
+    with database.reading() as reader:
+        before = reader.execute(count).scalar()
+        with database.begin() as connection:
+            connection.execute(insert(things), [{"name": "a", "number": 1}])
+        assert (before, reader.execute(count).scalar()) == (0, 0)
+    assert len(_rows(database, things)) == 1
+
+
+def test_a_reader_cannot_write(database: Database, things: Table) -> None:
+    other = Database(database.path, read_only=True)
+    with pytest.raises(DatabaseBusyError, match="readonly"), other.reading() as connection:
+        connection.execute(insert(things), [{"name": "a", "number": 1}])
+
+
+def test_another_process_reads_what_is_committed(database: Database, things: Table) -> None:
+    with database.begin() as connection:
+        connection.execute(insert(things), [{"name": "a", "number": 7}])
+    program = (
+        "import sys; from pathlib import Path\n"
+        "from sqlalchemy import text\n"
+        "from amberbox.fleet.database.database import Database\n"
+        "with Database(Path(sys.argv[1]), read_only=True).reading() as connection:\n"
+        "    print(connection.execute(text('SELECT number FROM things')).scalar())\n"
+    )
+    command = [sys.executable, "-c", program, str(database.path)]
+    assert subprocess.run(command, capture_output=True, text=True, check=True).stdout == "7\n"
+
+
+def test_threads_that_count_together_lose_nothing(database: Database, things: Table) -> None:
+    with database.begin() as connection:
+        connection.execute(insert(things), [{"name": "a", "number": 0}])
+
+    def count(own: Database) -> None:
+        for _ in range(10):
+            with own.begin() as connection:
+                held = connection.execute(select(things.c.number)).scalar_one()
+                connection.execute(things.update().values(number=held + 1))
+
+    second = Database(database.path, ManualClock(), metadata=things.metadata)
+    threads = [threading.Thread(target=count, args=(one,)) for one in (database, second) * 2]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert _rows(database, things) == [("a", 40)]
+
+
+def test_a_file_that_is_no_database_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "server.db"
+    path.write_bytes(b"no database, but long enough to be looked at" * 100)
+    with pytest.raises(AmberboxError, match=r"server\.db is damaged: file is not a database"):
+        Database(path, ManualClock())
+
+
+def test_a_folder_that_is_not_there_is_named(tmp_path: Path) -> None:
+    with pytest.raises(AmberboxError, match=r"cannot write .*server\.db: No such file"):
+        Database(tmp_path / "nowhere" / "server.db", ManualClock())
+
+
+def test_names_with_odd_characters(tmp_path: Path, metadata: MetaData) -> None:
+    folder = tmp_path / "the server's 50% data? #1"
+    folder.mkdir()
+    Database(folder / "server.db", ManualClock(), metadata=metadata).close()
+    assert (folder / "server.db").stat().st_size > 0
+
+
+def _add_colour(connection: Connection) -> None:
+    connection.execute(text("ALTER TABLE things ADD COLUMN colour VARCHAR(8)"))
+
+
+def _fail_half_way(connection: Connection) -> None:
+    _add_colour(connection)
+    raise RuntimeError("the power goes")
+
+
+def _reopened(
+    database: Database, apply: Callable[[Connection], None], metadata: MetaData
+) -> Database:
+    database.close()
+    migrations = [Migration(2, "colours", apply)]
+    return Database(database.path, ManualClock(), metadata=metadata, migrations=migrations)
+
+
+def _coloured() -> MetaData:
+    metadata, things = _things()
+    things.append_column(Column("colour", String(8)))
+    return metadata
+
+
+def test_a_migration_changes_what_is_there(database: Database, things: Table) -> None:
+    with database.begin() as connection:
+        connection.execute(insert(things), [{"name": "a", "number": 1}])
+    coloured = _coloured()
+    newer = _reopened(database, _add_colour, coloured)
+    assert _rows(newer, coloured.tables["things"]) == [("a", 1, None)]
+    with newer.reading() as connection:
+        assert version(connection) == 2
+    again = _reopened(newer, _fail_half_way, coloured)  # it is not applied a second time
+    assert _rows(again, things) == [("a", 1)]
+
+
+def test_a_migration_is_done_whole_or_not_at_all(database: Database, metadata: MetaData) -> None:
+    with pytest.raises(RuntimeError):
+        _reopened(database, _fail_half_way, metadata)
+    same = Database(database.path, ManualClock(), metadata=metadata)
+    with same.reading() as connection:
+        columns = [column["name"] for column in inspect(connection).get_columns("things")]
+        assert (version(connection), columns) == (1, ["name", "number"])
+
+
+def test_a_newer_database_is_refused(database: Database, metadata: MetaData) -> None:
+    newer = _reopened(database, _add_colour, _coloured())
+    newer.close()
+    with pytest.raises(UsageError, match="version 2, this Amberbox knows 1"):
+        Database(database.path, ManualClock(), metadata=metadata)
+    with pytest.raises(UsageError, match="version 2, this Amberbox reads 1"):
+        Database(database.path, read_only=True)
+
+
+def test_a_new_table_needs_no_migration(database: Database) -> None:
+    more, _ = _things()
+    Table("others", more, Column("name", String(8), primary_key=True))
+    database.close()
+    again = Database(database.path, ManualClock(), metadata=more)
+    assert _rows(again, more.tables["others"]) == []
+
+
+def test_a_column_without_migration_is_named(database: Database) -> None:
+    database.close()
+    with pytest.raises(AmberboxError, match="the table things of the database has no column col"):
+        Database(database.path, ManualClock(), metadata=_coloured())
+
+
+def test_holes_in_the_numbers_are_a_mistake(database: Database, metadata: MetaData) -> None:
+    database.close()
+    with pytest.raises(ValueError, match="without holes"):
+        Database(
+            database.path,
+            ManualClock(),
+            metadata=metadata,
+            migrations=[Migration(3, "colours", _add_colour)],
+        )
+
+
+def test_upsert_changes_what_it_is_told(database: Database, things: Table) -> None:
+    with database.begin() as connection:
+        change = upsert(connection.dialect, things, ("name",), ("number",))
+        connection.execute(change, [{"name": "a", "number": 1}, {"name": "b", "number": 5}])
+        connection.execute(change, [{"name": "a", "number": 2}])
+        keep = upsert(connection.dialect, things, ("name",), ())
+        connection.execute(keep, [{"name": "a", "number": 9}, {"name": "c", "number": 9}])
+        newer = upsert(
+            connection.dialect,
+            things,
+            ("name",),
+            ("number",),
+            when=lambda new: new.number > things.c.number,
+        )
+        connection.execute(newer, [{"name": "b", "number": 4}, {"name": "c", "number": 10}])
+    assert _rows(database, things) == [("a", 2), ("b", 5), ("c", 10)]
+
+
+@pytest.mark.parametrize("change", [(), ("number",)])
+def test_upsert_compiles_for_postgresql(change: tuple[str, ...], things: Table) -> None:
+    statement = upsert(POSTGRESQL, things, ("name",), change)
+    wanted = "DO UPDATE SET number = excluded.number" if change else "DO NOTHING"
+    assert f"ON CONFLICT (name) {wanted}" in str(statement.compile(dialect=POSTGRESQL))
+
+
+def test_upsert_refuses_a_column_that_is_not_there(things: Table) -> None:
+    with pytest.raises(ValueError, match="has no column nmae"):
+        upsert(POSTGRESQL, things, ("nmae",), ())
+
+
+def test_every_table_compiles_for_postgresql() -> None:
+    tables = complete().sorted_tables
+    assert {"users", "sessions", "robots", "audit"} <= {table.name for table in tables}
+    for table in tables:
+        assert str(CreateTable(table).compile(dialect=POSTGRESQL))
+        for index in table.indexes:
+            assert str(CreateIndex(index).compile(dialect=POSTGRESQL))
+
+
+def test_all_tables_of_the_server_are_made(tmp_path: Path) -> None:
+    database = Database(tmp_path / "server.db", ManualClock())
+    with database.reading() as connection:
+        assert set(inspect(connection).get_table_names()) == set(METADATA.tables)
+
+
+def test_an_integrity_error_is_the_callers(database: Database, things: Table) -> None:
+    with pytest.raises(IntegrityError), database.begin() as connection:
+        connection.execute(insert(things), [{"name": "a", "number": None}])
