@@ -99,6 +99,14 @@ def test_what_is_wrong(finding: str, message: str) -> None:
     assert message in errors(finding)
 
 
+def test_a_finding_is_enough_to_show_a_failure_mode() -> None:
+    text = TEXT.replace(", unobservable: no sensor", "", 1)
+    finding = "  - {rule: short_circuit(R), maps_to: [<R>#short_circuit]}"
+    assert read_fmea(text + finding)[1] == []
+    told = read_fmea(text + finding.replace("<R>", "ropod1"))[1]
+    assert [problem.where for problem in told] == ["short_circuit"]
+
+
 def test_notes_name_what_moves_nothing() -> None:
     known = Known(predicates=[("p", 0)], heads={("q", 1): ("rules/a.pl", 7), ("p", 0): ("b", 1)})
     fmea, problems = read_fmea(TEXT + "  - {rule: p}", known)

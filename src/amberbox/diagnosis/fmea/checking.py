@@ -9,6 +9,7 @@ from amberbox.core.config import did_you_mean
 from amberbox.core.errors import Problem
 from amberbox.core.needs import cycles
 from amberbox.core.nodes import Node
+from amberbox.diagnosis.fmea.findings import named_by_findings
 from amberbox.diagnosis.fmea.model import Effects, FailureMode, Fmea
 from amberbox.diagnosis.fmea.places import child
 from amberbox.diagnosis.fmea.propagation import Structure, links_by_mode
@@ -83,11 +84,13 @@ def _mode_problems(
     fmea: Fmea, reach: _Reach, places: Mapping[str, Node], sheet: Sheet
 ) -> Iterator[Problem]:
     links = links_by_mode(fmea)
+    found = named_by_findings(fmea)
     for mode in fmea.modes.values():
         node = places.get(mode.id) or _member_node(mode, sheet)
         yield from _effect_problems(fmea, reach, mode, node, sheet)
         has_none = child(node, "symptoms") is node  # wrong ones have been told
-        if has_none and not mode.unobservable and not links[mode.id]:
+        shows = links[mode.id] or mode.id in found
+        if has_none and not mode.unobservable and not shows:
             what = "nothing shows it: give symptoms, or 'unobservable:' with the reason"
             yield node.problem(mode.name, what)
 

@@ -228,6 +228,12 @@ def finding_signs(fmea: Fmea) -> tuple[tuple[Sign, ...], tuple[Link, ...]]:
     return tuple(new), tuple(links)
 
 
+def named_by_findings(fmea: Fmea) -> frozenset[str]:
+    """Return the failure modes that some finding speaks for."""
+    patterns = [_expression(pattern) for of in fmea.findings for pattern in of.maps_to]
+    return frozenset(mode for mode in fmea.modes if any(p.fullmatch(mode) for p in patterns))
+
+
 def _symptoms(fmea: Fmea) -> Iterator[tuple[str, Mapped, tuple[str, ...]]]:
     for of in fmea.findings:
         for name, faults in instances(of, fmea.modes) if not of.proves else ():
