@@ -14,7 +14,7 @@ from amberbox.blackbox.store import Store, open_store
 from amberbox.cli import _diagnosis_read
 from amberbox.cli._diagnoser import knowledge_of
 from amberbox.cli._diagnosis_follow import revisions
-from amberbox.cli._diagnosis_journal import said_until
+from amberbox.cli._diagnosis_journal import Said, said_until
 from amberbox.cli._diagnosis_read import counting
 from amberbox.cli.main import main
 from amberbox.core.clock import NS
@@ -109,6 +109,25 @@ def test_what_counts_is_what_the_tracker_counts(watched: Path) -> None:
         tracker.advance(told, at_ns)
         expected = {s.id: s.state for s in tracker.situation().symptoms}
         assert {s.id: s.state for s in counting(knowledge, told, at_ns).symptoms} == expected
+
+
+def test_symptoms_of_deleted_files_are_there_still(
+    watched: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    during = (watched, "--at", DURING)
+    asked = (*during, "--answer", "sound=smooth")
+    before = found(capsys, *asked)
+
+    def left(store: Store, at_ns: int) -> Said:
+        said = said_until(store, at_ns)
+        return replace(said, symptoms=[s for s in said.symptoms if s.id not in gone])
+
+    monkeypatch.setattr(_diagnosis_read, "said_until", left)
+    gone = {HOT}
+    after = found(capsys, *asked)
+    assert after["origin"] == "watcher" and after["hypotheses"] == before["hypotheses"]
+    gone = {HOT, TURNS, "noisy"}
+    assert found(capsys, *during)["origin"] == "record", "such a watcher told of no symptom"
 
 
 def test_other_monitors_say_nothing_of_these(

@@ -87,13 +87,30 @@ def _between(
             return
 
 
-def watched(knowledge: Knowledge, store: Store, at_ns: int) -> Case:
-    """Return what a watcher has found of the record up to an instant, by its journal."""
+def watched(knowledge: Knowledge, store: Store, at_ns: int) -> Case | None:
+    """Return what a watcher has found of the record up to an instant, by its journal.
+
+    None if it told of no symptom: it was of a version that did not, or had nothing to go by.
+    """
     said, heard = said_until(store, at_ns), _Heard()
+    if not said.symptoms:
+        return None
     heard.hear(said.symptoms)
     heard.hear(said.diagnoses)
-    situation = counting(knowledge, said.symptoms, at_ns)
-    return replace(heard.case(at_ns, situation), origin="watcher")
+    symptoms = [*_told_before(heard.diagnosis, said.symptoms), *said.symptoms]
+    return replace(heard.case(at_ns, counting(knowledge, symptoms, at_ns)), origin="watcher")
+
+
+def _told_before(standing: Diagnosis | None, told: Iterable[Symptom]) -> Iterator[Symptom]:
+    """Yield the symptoms of an open diagnosis that are told of in deleted files alone.
+
+    Nothing was told of them since, so they are there still.
+    """
+    known = {symptom.id for symptom in told}
+    if standing is not None and standing.state == "open":
+        for name in standing.symptoms:
+            if name not in known:
+                yield Symptom(name, "present", name)
 
 
 def counting(knowledge: Knowledge, symptoms: Iterable[Symptom], at_ns: int) -> Situation:

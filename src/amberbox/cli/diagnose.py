@@ -170,7 +170,9 @@ def _read(args: argparse.Namespace, subject: Subject, record: Record) -> Case:
     if at_ns is None:
         return Case(time.time_ns())  # a record without rows
     if was_watched(store, knowledge.config_hash, at_ns):
-        return watched(knowledge, store, at_ns)
+        found = watched(knowledge, store, at_ns)
+        if found is not None:
+            return found
     lookback_s = parse_duration(args.lookback) / NS
     case = evaluated(knowledge, subject.plan, store, at_ns, lookback_s)
     if at_ns - case.at_ns > _LATE_NS:
@@ -204,6 +206,8 @@ def _diagnosed(
     """Let the engine answer; what rules find is known to all of them."""
     from amberbox.cli._diagnosis_engines import Ground, diagnosis_by, with_findings
 
+    if args.engine == RULES and args.answer:
+        tell(["answers to tests count for nothing where the rules alone are asked"])
     lookback_ns = parse_duration(args.lookback)
     ground = Ground(subject.knowledge, subject.folder.path, record, lookback_ns)
     if args.engine != RULES:
