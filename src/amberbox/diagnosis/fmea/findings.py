@@ -220,11 +220,10 @@ def _filled(pattern: str, values: Values) -> str:
 
 def finding_signs(fmea: Fmea) -> tuple[tuple[Sign, ...], tuple[Link, ...]]:
     """Return the symptoms that findings are, and what causes them. Nobody can read them off."""
-    signs = {name: Sign(name, of.leak, None) for name, of, _ in _symptoms(fmea)}
+    found = list(_symptoms(fmea))
+    signs = {name: Sign(name, of.leak, None) for name, of, _ in found}
     new = [sign for name, sign in signs.items() if name not in fmea.symptoms]
-    links = [
-        Link(mode, name, of.detects) for name, of, faults in _symptoms(fmea) for mode in faults
-    ]
+    links = [Link(mode, name, of.detects) for name, of, faults in found for mode in faults]
     return tuple(new), tuple(links)
 
 
