@@ -15,11 +15,15 @@ from pathlib import Path
 import pytest
 
 from amberbox.blackbox.folder.folder import load_folder
-from amberbox.blackbox.store import WriterLock, create_store, open_store
+from amberbox.blackbox.store import Store, WriterLock, create_store, open_store
 from amberbox.cli._diagnoser import diagnoser_of
 from amberbox.cli.main import main
 from amberbox.core.types import Schema, Topic
 from amberbox.monitoring.configuration import load_plan
+from amberbox.monitoring.engine.engine import Engine
+from amberbox.monitoring.plan import Plan
+from amberbox.monitoring.watcher.memory import Place, recall
+from amberbox.monitoring.watcher.reader import Reader
 from amberbox.monitoring.watcher.replay import replay
 from amberbox.testing.box import ManualBox
 from tests.monitoring.watcher.stand import line_of, written
@@ -195,6 +199,15 @@ def watching(folder: Path) -> subprocess.Popen[str]:
     return process
 
 
+def wait_until_evaluated(plan: Plan, store: Store) -> None:
+    """Wait until the watcher has noted that it is at the end of a record that has ended."""
+    *_, last = Reader(store, Engine(plan).items).step()
+    end, deadline_s = Place(last.epoch, last.until_ns), time.monotonic() + 30.0
+    while (reached := recall(store).place) != end:
+        assert time.monotonic() < deadline_s, f"evaluated up to {reached}, recorded up to {end}"
+        time.sleep(0.05)
+
+
 def test_watchers_killed_at_random_lose_and_double_nothing(folder: Path) -> None:
     (folder / "fmea.yaml").write_text(FMEA)
     recording = Recording(folder)
@@ -210,13 +223,13 @@ def test_watchers_killed_at_random_lose_and_double_nothing(folder: Path) -> None
         time.sleep(0.6)
     finally:
         recording.end()
-    time.sleep(0.3)
-    process.send_signal(signal.SIGTERM)
-    output, _ = process.communicate(timeout=10)
-    assert process.returncode == 0, output
-    live = written(store)
     loaded = load_folder(folder)
     plan, _ = load_plan(loaded)
+    wait_until_evaluated(plan, open_store(store))
+    process.send_signal(signal.SIGTERM)
+    output, _ = process.communicate(timeout=30)
+    assert process.returncode == 0, output
+    live = written(store)
     diagnoser, _ = diagnoser_of(loaded, plan)
     assert sum(line.startswith(b"amberbox/diagnosis ") for line in live) > 0
     found = replay(plan, open_store(store), diagnoser=diagnoser)
