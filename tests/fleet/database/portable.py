@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from sqlalchemy import ClauseElement, Dialect, event
+from sqlalchemy.dialects import sqlite
 from sqlalchemy.dialects.postgresql.base import PGDialect
 
 from amberbox.fleet.database.database import FILE, Database
@@ -32,4 +33,7 @@ def refuse_what_is_not_portable(
 ) -> None:
     """Raise CompileError or AssertionError for what only SQLite understands."""
     assert isinstance(statement, ClauseElement), f"not made by SQLAlchemy: {statement!r}"
+    if isinstance(statement, sqlite.Insert) and statement._post_values_clause is not None:
+        # What ``upsert`` makes for PostgreSQL may name a constraint; here it names columns.
+        statement._post_values_clause.constraint_target = None  # type: ignore[attr-defined] # see above
     assert str(statement.compile(dialect=POSTGRESQL))
