@@ -21,6 +21,7 @@ from amberbox.blackbox.segments.columns import wider
 from amberbox.blackbox.segments.entries import Sealed
 from amberbox.blackbox.segments.flat import TableSchema, tables_of
 from amberbox.blackbox.segments.manifest import Manifest, Part, Segment
+from amberbox.blackbox.segments.parquet import stored_name
 from amberbox.blackbox.store import Store, open_store
 from amberbox.core.errors import AmberboxError, UsageError
 from amberbox.core.types import Column
@@ -34,7 +35,8 @@ class Catalogue:
     """One look at a store: its manifest and its journal files.
 
     ``with_segments`` is false where segments cannot be read (no pyarrow): then all rows come
-    from journals, as far as these are still there.
+    from journals, as far as these are still there. ``stored`` says how a variable is called in
+    the segments.
     """
 
     store: Path
@@ -42,6 +44,7 @@ class Catalogue:
     with_segments: bool = True
     existing: tuple[str, ...] = ()
     book: ClockBook = field(default_factory=ClockBook)
+    stored: Callable[[str], str] = stored_name
 
     def journals(self, skip: Container[str]) -> Iterator[JournalFile]:
         """Open the journal files that are not named in ``skip``, in the order of writing.

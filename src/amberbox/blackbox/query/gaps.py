@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -28,10 +28,18 @@ _FIELDS = ("item", "peer", "from_ns", "to_ns", "reason", "count")
 
 def gaps(catalogue: Catalogue, item: str | None, span: Span) -> list[Gap]:
     """List gaps that meet ``[from, to)``, in order of time, of one item or of all."""
-    then = [*_holes(catalogue), *_deleted(catalogue)]
-    known = [*_recorded(catalogue), *(_as_known_now(gap, catalogue) for gap in then)]
-    chosen = [gap for gap in _joined(known) if _concerns(gap, item, span)]
-    return sorted(chosen, key=lambda gap: (gap.from_ns, gap.to_ns, gap.item))
+    return chosen(known(catalogue, [*_holes(catalogue), *_deleted(catalogue)]), item, span)
+
+
+def known(catalogue: Catalogue, then: Iterable[Gap]) -> list[Gap]:
+    """Return the recorded gaps and others whose times are as they were known ``then``."""
+    return [*_recorded(catalogue), *(_as_known_now(gap, catalogue) for gap in then)]
+
+
+def chosen(found: Sequence[Gap], item: str | None, span: Span) -> list[Gap]:
+    """Join gaps that go on from each other; keep those of a range, in order of time."""
+    kept = [gap for gap in _joined(found) if _concerns(gap, item, span)]
+    return sorted(kept, key=lambda gap: (gap.from_ns, gap.to_ns, gap.item))
 
 
 def _as_known_now(gap: Gap, catalogue: Catalogue) -> Gap:

@@ -72,8 +72,9 @@ def _segment_rows(catalogue: Catalogue, request: Request) -> Iterator[Flat]:
         schema = catalogue.manifest.schemas[segment.schema]
         with noticing_damage(segment):
             flats = read_segment(
-                catalogue.store, segment, schema, request.names, request.span, request.by
-            )
+                catalogue.store, segment, schema, request.names, request.span, request.by,
+                catalogue.stored,
+            )  # fmt: skip
         yield from flats
 
 

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 import numpy as np
 
@@ -16,7 +17,7 @@ from amberbox.blackbox.query import gaps as gap_list
 from amberbox.blackbox.query.catalogue import Answer, Catalogue, ask
 from amberbox.blackbox.query.clockbook import ClockBook
 from amberbox.blackbox.query.downsample import downsample
-from amberbox.blackbox.query.gather import Merged, Request, gather, merge
+from amberbox.blackbox.query.gather import Gathered, Merged, Request, gather, merge
 from amberbox.blackbox.query.overview import ItemInfo, overview
 from amberbox.blackbox.query.table import Table
 from amberbox.blackbox.query.variables import Wanted, resolve, select
@@ -107,7 +108,7 @@ class Record:
                 missions, lambda start, end: self.query(item, variables, start, end, by, points)
             )
         span = self.time_ns(from_), self.time_ns(to)
-        return self._ask(lambda c: _query(c, item, variables, span, by, points))
+        return self._ask(lambda c: query_tables(c, item, variables, span, by, points))
 
     def time_ns(self, moment: Time) -> int | None:
         """Read a time as ``query`` does; ``-10m`` counts from the last record."""
@@ -181,7 +182,18 @@ def _import(path: Path) -> Record:
     return Record(store, folder, (*(f"damaged: {text}" for text in report.damage), *report.notes))
 
 
-def _query(
+class Tables(Protocol):
+    """What a query asks before it reads rows: a catalogue of one store, or of several."""
+
+    def schema(self, table: str) -> TableSchema:
+        """Return a table's columns; raises UsageError for one that is not there."""
+
+    @property
+    def selection(self) -> Mapping[str, Sequence[str]]:
+        """Return the variables configured for each item."""
+
+
+def query_tables(
     catalogue: Catalogue,
     item: str,
     names: Sequence[str] | None,
@@ -189,6 +201,20 @@ def _query(
     by: By,
     points: int | None,
 ) -> Table:
+    """Answer a query from one store (see ``Record.query``)."""
+    return answer(catalogue, partial(gather, catalogue), item, names, span, by, points)
+
+
+def answer(
+    catalogue: Tables,
+    read: Callable[[Request], Gathered],
+    item: str,
+    names: Sequence[str] | None,
+    span: tuple[int | None, int | None],
+    by: By,
+    points: int | None,
+) -> Table:
+    """Answer a query with the rows that ``read`` gives."""
     if by not in ("received", "timestamp"):
         raise UsageError(f"rows are ordered by received or timestamp, not by {by!r}")
     if points is not None and points < 1:
@@ -196,7 +222,7 @@ def _query(
     schema = catalogue.schema(item)
     wanted = wanted_columns(catalogue, schema, names)
     needed = needed_columns(wanted)
-    found = gather(catalogue, Request(schema.item, needed, span, by))
+    found = read(Request(schema.item, needed, span, by))
     notes = [*found.notes, *(f"{gap.item or gap.writer}: {gap.reason}" for gap in found.gaps)]
     table = make_table(schema, wanted, merge(found.pieces, schema, needed, by), notes)
     return table if points is None else _thinned(table, points)
@@ -208,7 +234,7 @@ def needed_columns(wanted: Sequence[Wanted]) -> list[str]:
 
 
 def wanted_columns(
-    catalogue: Catalogue, schema: TableSchema, names: Sequence[str] | None
+    catalogue: Tables, schema: TableSchema, names: Sequence[str] | None
 ) -> list[Wanted]:
     """Say which columns to show: timestamp first, then what was named or configured."""
     keys = {name: Wanted(name, Column(name, name, kind)) for name, kind in _KEYS.items()}
@@ -226,7 +252,7 @@ def wanted_columns(
     return list(found.values())
 
 
-def _configured(catalogue: Catalogue, schema: TableSchema) -> Sequence[Column]:
+def _configured(catalogue: Tables, schema: TableSchema) -> Sequence[Column]:
     if schema.parent:
         return schema.columns
     chosen = catalogue.selection.get(schema.item, [])

@@ -53,7 +53,7 @@ class _TableBuilder:
         self.waiting.append(flat)
         self.rows += len(flat)
         self.bytes += sum(_size(column) for column in flat.columns.values())
-        self.bounds.append(_bounds(flat))
+        self.bounds.append(bounds_of(flat))
         if flat.schema.stamp:
             self.ages.append(flat.received_ns - flat.timestamp_ns)
         if self.rows >= GROUP_ROWS or self.bytes >= _GROUP_BYTES:
@@ -81,7 +81,8 @@ def median(ages: Sequence[IntArray]) -> int | None:
     return int(np.median(np.concatenate(ages))) if ages else None
 
 
-def _bounds(flat: Flat) -> tuple[int, ...]:
+def bounds_of(flat: Flat) -> tuple[int, ...]:
+    """Return least and most of ``seq``, log time and stamp, in this order."""
     keys = (flat.seq, flat.log_time_ns, flat.timestamp_ns)
     return tuple(int(edge) for key in keys for edge in (key.min(), key.max()))
 

@@ -87,10 +87,12 @@ def _from_chunk(array: pa.Array, column_type: str) -> ColumnData:
         return np.asarray(array.to_numpy(zero_copy_only=False), object)
     if pa.types.is_timestamp(array.type):
         array = array.view(pa.int64())
+    kind = col.numpy_type(column_type)  # an archive holds unsigned numbers as signed ones
     if array.null_count == 0:
-        return _numbers(array)
+        return _numbers(array).astype(kind, copy=False)
     filled = array.fill_null(False if column_type == "bool" else 0)
-    return np.ma.masked_array(_numbers(filled), mask=~_numbers(array.is_valid()))
+    values = _numbers(filled).astype(kind, copy=False)
+    return np.ma.masked_array(values, mask=~_numbers(array.is_valid()))
 
 
 def _numbers(array: pa.Array) -> NDArray[Any]:

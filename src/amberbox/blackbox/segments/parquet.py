@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -65,7 +65,7 @@ class TableFile:
         """Write rows as one row group; the first one decides the encodings."""
         import pyarrow as pa
 
-        names, types, columns = self._layout(flat)
+        names, types, columns = self.layout(flat)
         arrays = [to_arrow(column, kind) for column, kind in zip(columns, types, strict=True)]
         table = pa.Table.from_arrays(arrays, names=names)
         if self._writer is None:
@@ -77,7 +77,8 @@ class TableFile:
         self._writer.write_table(table, row_group_size=len(flat))
         self.rows += len(flat)
 
-    def _layout(self, flat: Flat) -> tuple[list[str], list[str], list[Any]]:
+    def layout(self, flat: Flat) -> tuple[list[str], list[str], list[Any]]:
+        """Return names, types and contents of the columns of the file, the keys first."""
         names = [*key_names(self.schema), *(stored_name(c.name) for c in self.schema.columns)]
         types = ["int64", "int64", "time", *(column.type for column in self.schema.columns)]
         own = [flat.columns[column.name] for column in self.schema.columns]
@@ -159,16 +160,17 @@ def read_segment(
     names: Collection[str],
     span: tuple[int | None, int | None] = (None, None),
     by: str = "received",
+    stored: Callable[[str], str] = stored_name,
 ) -> list[Flat]:
     """Read the named columns of the row groups that may hold rows of ``[from, to)``.
 
     Row groups are chosen by their statistics: rows outside of the range may come along. Gives
-    one ``Flat`` per part of the segment.
+    one ``Flat`` per part of the segment. ``stored`` says how a variable is called in the file.
     """
     with _opened(store / segment.path) as file:
         found = _row_groups(file.metadata, schema, segment, by)
         chosen = [group for group in found if overlaps(group.low_ns, group.high_ns, span)]
-        return _read(file, segment, schema, names, [group.number for group in chosen])
+        return _read(file, segment, schema, names, [group.number for group in chosen], stored)
 
 
 @dataclass(frozen=True, slots=True)
@@ -206,15 +208,17 @@ def _read(
     schema: TableSchema,
     names: Collection[str],
     groups: Sequence[int],
+    stored: Callable[[str], str] = stored_name,
 ) -> list[Flat]:
     wanted = [column for column in schema.columns if column.name in names]
-    columns = [*key_names(schema), *(stored_name(column.name) for column in wanted)]
+    columns = [*key_names(schema), *(stored(column.name) for column in wanted)]
     table = file.read_row_groups(groups, columns=columns, use_threads=len(columns) > 8)
     first_rows = _first_rows(file.metadata)
     starts = np.concatenate(
         [np.arange(first_rows[g], first_rows[g + 1]) for g in groups] or [np.empty(0, np.int64)]
     )
-    whole = _to_flat(table, segment, schema, [column.name for column in wanted])
+    named = {column.name: stored(column.name) for column in wanted}
+    whole = _to_flat(table, segment, schema, named)
     return _split_parts(whole, segment.parts, starts)
 
 
@@ -243,12 +247,14 @@ def overlaps(low: int, high: int, span: tuple[int | None, int | None]) -> bool:
     return (from_ns is None or high >= from_ns) and (to_ns is None or low < to_ns)
 
 
-def _to_flat(table: pa.Table, segment: Segment, schema: TableSchema, names: list[str]) -> Flat:
+def _to_flat(
+    table: pa.Table, segment: Segment, schema: TableSchema, names: Mapping[str, str]
+) -> Flat:
     types = {column.name: column.type for column in schema.columns}
     log_time = _integers(table[_KEYS[0]])
     stamps = _integers(table.column("timestamp")) if schema.stamp else log_time
     part = segment.parts[0]
-    columns = {name: from_arrow(table[stored_name(name)], types[name]) for name in names}
+    columns = {name: from_arrow(table[place], types[name]) for name, place in names.items()}
     seq = _integers(table[seq_name(schema)])
     return Flat(schema, part.writer, part.run, seq, log_time, log_time, stamps, columns)
 
