@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin
 
 from amberbox.core.errors import AmberboxError, ConfigurationError, Problem
+from amberbox.core.fieldtypes import field_types
 from amberbox.core.nodes import Node, load_yaml, parse_yaml, scalar
 from amberbox.core.standins import Finding, Unread, certain_findings, findings, stand_ins
 from amberbox.core.units import in_unit, known_units
@@ -113,7 +114,7 @@ def _dataclass(ctx: _Context, cls: type[Any], node: Node, where: str) -> Any:
     if entries is None:
         return ctx.fail(node, where, f"expected a mapping (key: value), got {node.kind}")
     fields = [field for field in dataclasses.fields(cls) if field.init]
-    kinds = typing.get_type_hints(cls)
+    kinds = field_types(cls)
     known = [key for field in fields for key in field_keys(field)]
     unknown = _unknown_keys(ctx, known, entries, where)
     values: dict[str, Any] = {}

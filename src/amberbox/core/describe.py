@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import types
-import typing
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Union, get_args, get_origin
 
 from amberbox.core.config import type_text
+from amberbox.core.fieldtypes import field_types
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,7 +27,7 @@ class OptionRow:
 
 def describe(cls: type[Any], prefix: str = "") -> Iterator[OptionRow]:
     """Yield every key, keys of nested classes as ``topics[].name``."""
-    kinds = typing.get_type_hints(cls)
+    kinds = field_types(cls)
     for field in dataclasses.fields(cls):
         kind = kinds[field.name]
         inner, step = _nested(kind)

@@ -5,12 +5,12 @@ from __future__ import annotations
 import dataclasses
 import re
 import types
-import typing
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Union, get_args, get_origin
 
 from amberbox.core.config import WRAPPERS, field_keys
+from amberbox.core.fieldtypes import field_types
 from amberbox.core.nodes import Node
 
 MASK = "***"
@@ -19,7 +19,7 @@ _TELLTALES = ("password", "passwd", "secret", "token", "passphrase", "private_ke
 
 def secrets(cls: type[Any], node: Node) -> Iterator[Node]:
     """Yield the values in a file that the configuration class marks as secret."""
-    kinds = typing.get_type_hints(cls)
+    kinds = field_types(cls)
     for field in dataclasses.fields(cls):
         for key in field_keys(field):
             value = (node.mapping or {}).get(key)
