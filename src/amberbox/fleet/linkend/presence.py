@@ -1,0 +1,78 @@
+"""Who is there: last seen, backlog, clock; and who is not any more."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+
+from sqlalchemy import Connection, select, update
+
+from amberbox.fleet.database.upsert import upsert
+from amberbox.fleet.linkend.tables import BOOT, HEADS, ROBOT
+from amberbox.link.frames import Beat
+
+
+@dataclass(frozen=True, slots=True)
+class Presence:
+    """A robot as it was seen last; times by the server's clock."""
+
+    robot: str
+    connected: bool
+    last_seen_ns: int
+    connected_ns: int
+    store_id: str
+    boot_id: str
+    config_hash: str
+    version: str
+    backlog: int
+    backlog_bytes: int
+
+
+def presences(connection: Connection) -> list[Presence]:
+    """Return all robots that have ever connected, by name."""
+    rows = connection.execute(select(ROBOT).order_by(ROBOT.c.robot))
+    return [
+        Presence(
+            row.robot, row.connected, row.last_seen_ns, row.connected_ns, row.store_id,
+            row.boot_id, row.config_hash, row.version, row.backlog, row.backlog_bytes,
+        )
+        for row in rows
+    ]  # fmt: skip
+
+
+def seen(connection: Connection, robot: str, epoch: int, beat: Beat, boot: str, at_ns: int) -> None:
+    """Note a heartbeat; one of an older epoch changes nothing."""
+    mine = (ROBOT.c.robot == robot, ROBOT.c.epoch == epoch)
+    values = {"last_seen_ns": at_ns, "backlog": beat.backlog, "backlog_bytes": beat.backlog_bytes}
+    connection.execute(update(ROBOT).where(*mine).values(**values))
+    if beat.offset_ns is not None and beat.round_ns is not None:
+        row = {"robot": robot, "boot_id": boot, "offset_ns": beat.offset_ns,
+               "round_ns": beat.round_ns, "at_ns": at_ns}  # fmt: skip
+        change = ("offset_ns", "round_ns", "at_ns")
+        connection.execute(upsert(connection.dialect, BOOT, ("robot", "boot_id"), change), [row])
+
+
+def gone(connection: Connection, robot: str, epoch: int, last_seen_ns: int) -> None:
+    """Note that a connection has ended, unless the robot is there again already."""
+    mine = (ROBOT.c.robot == robot, ROBOT.c.epoch == epoch)
+    values = {"connected": False, "last_seen_ns": last_seen_ns}
+    connection.execute(update(ROBOT).where(*mine).values(**values))
+
+
+def nobody_connected(connection: Connection) -> None:
+    """Begin anew after a restart of the server: no connection has survived it."""
+    connection.execute(update(ROBOT).values(connected=False))
+
+
+def keep_heads(connection: Connection, robot: str, store_id: str, heads: bytes, at_ns: int) -> None:
+    """Keep a robot's statement of how far its record reaches."""
+    digest = hashlib.sha256(heads).hexdigest()
+    row = {"robot": robot, "store_id": store_id, "sha256": digest, "at_ns": at_ns, "heads": heads}
+    key = ("robot", "store_id", "sha256")
+    connection.execute(upsert(connection.dialect, HEADS, key, ()), [row])
+
+
+def offset_ns(connection: Connection, robot: str, boot: str) -> int | None:
+    """Return how far the server's clock was ahead of the robot's in a boot, if that is known."""
+    wanted = select(BOOT.c.offset_ns).where(BOOT.c.robot == robot, BOOT.c.boot_id == boot)
+    return connection.execute(wanted).scalar()

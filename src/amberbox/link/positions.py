@@ -1,0 +1,60 @@
+"""Positions in a writer's journal, and how far it reaches as its robot states it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import NamedTuple
+
+import msgspec
+
+
+class Place(NamedTuple):
+    """A place in a writer's journal: everything before ``(run, seq)``."""
+
+    run: int = 0
+    seq: int = 0
+
+
+START = Place()
+
+
+class RunEnd(msgspec.Struct, frozen=True, array_like=True):
+    """One run of a writer on the robot's disk: which boot wrote it, and where it ends now.
+
+    ``closed`` says that nobody writes it any more, and that its end survives a power cut.
+    """
+
+    run: int
+    boot: str
+    end_seq: int
+    closed: bool = True
+
+
+class Reach(msgspec.Struct, frozen=True, array_like=True):
+    """How far a writer's journal reaches: its oldest row, its end, and what a power cut leaves."""
+
+    oldest: Place
+    end: Place
+    durable: Place
+    runs: tuple[RunEnd, ...] = ()
+
+    def problem(self) -> str:
+        """Say what cannot be true in it; empty where all can."""
+        if min(*self.oldest, *self.end, *self.durable) < 0:
+            return "a position below 0"
+        if self.durable > self.end:
+            return "more is durable than was written"
+        numbers = [run.run for run in self.runs]
+        if numbers != sorted(set(numbers)):
+            return "runs out of order"
+        return "a run that ends below 0" if any(run.end_seq < 0 for run in self.runs) else ""
+
+
+def earliest(places: Iterable[Place], other: Place) -> Place:
+    """Return the first of some places, or ``other`` if that lies before them."""
+    return min([*places, other])
+
+
+def durable_part(upto: Mapping[str, Place], reaches: Mapping[str, Reach]) -> dict[str, Place]:
+    """Cut what has been received back to what its robot said is durable."""
+    return {w: min(at, reaches[w].durable) for w, at in upto.items() if w in reaches}

@@ -1,0 +1,168 @@
+"""The server's end of one connection: what a robot may say when, and what is done about it.
+
+No input or output, no clock: frames go in, and what is to be done comes out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import TypeAlias
+
+from amberbox.link import limits
+from amberbox.link.frames import (
+    Ack,
+    Beat,
+    Bye,
+    Durable,
+    Has,
+    Heads,
+    Hello,
+    Live,
+    Pong,
+    RobotFrame,
+    Row,
+    Rows,
+    ServerFrame,
+    Welcome,
+)
+from amberbox.link.ledger import Admission, Stored
+from amberbox.link.positions import Place, Reach
+
+
+@dataclass(frozen=True, slots=True)
+class Admit:
+    """Begin a new epoch for this robot, then call ``admitted``."""
+
+    hello: Hello
+
+
+@dataclass(frozen=True, slots=True)
+class Keep:
+    """Store rows and how far they reach, then call ``stored``."""
+
+    epoch: int
+    store_id: str
+    number: int
+    rows: Sequence[Row]
+    upto: dict[str, Place]
+    reaches: dict[str, Reach]
+
+
+@dataclass(frozen=True, slots=True)
+class Say:
+    """Send frames; with ``ends`` the connection is closed behind them."""
+
+    frames: tuple[ServerFrame, ...] = ()
+    ends: bool = False
+
+
+Told: TypeAlias = Live | Beat | Heads | Has
+Deed: TypeAlias = Admit | Keep | Say | Told
+
+
+@dataclass(slots=True)
+class ServerEnd:
+    """One connection of one robot, which was authenticated as ``robot``."""
+
+    robot: str
+    epoch: int | None = None
+    hello: Hello | None = None
+    closed: bool = False
+    next_number: int = 1
+    reaches: dict[str, Reach] = field(default_factory=dict)
+
+    def receive(self, frame: RobotFrame) -> list[Deed]:
+        """Take a frame; return what is to be done, in order."""
+        if self.closed:
+            return []
+        if isinstance(frame, Hello):
+            return self._hello(frame)
+        if isinstance(frame, Bye):
+            return self._end(frame.reason)
+        if self.epoch is None:
+            return self._end("say hello first")
+        if frame.epoch != self.epoch:
+            return self._end(f"epoch {frame.epoch} is over, this is {self.epoch}")
+        if isinstance(frame, Rows):
+            return self._rows(frame)
+        if isinstance(frame, Durable):
+            return self._durable(frame)
+        return [frame]
+
+    def admitted(
+        self, admission: Admission, wall_ns: int, *, wants_folder: bool, watch: Sequence[str]
+    ) -> Welcome:
+        """Note the epoch; return the answer to Hello."""
+        assert self.hello is not None
+        self.epoch = admission.epoch
+        self.reaches = dict(self.hello.writers)
+        return Welcome(admission.epoch, admission.cursor, wall_ns, wants_folder, list(watch))
+
+    def stored(self, number: int, stored: Stored) -> Ack:
+        """Return what the robot is told once rows are safe."""
+        return Ack(number, stored.cursor)
+
+    def overtaken(self) -> Say:
+        """Close: the robot has connected again."""
+        self.closed = True
+        return Say((Bye("this robot has connected again"),), ends=True)
+
+    def pong(self, beat: Beat, wall_ns: int) -> Pong:
+        """Answer a heartbeat."""
+        return Pong(wall_ns, beat.mono_ns)
+
+    def _hello(self, hello: Hello) -> list[Deed]:
+        if self.hello is not None:
+            return self._end("hello was said already")
+        if hello.protocol != limits.PROTOCOL:
+            text = f"protocol {hello.protocol} is not spoken here, but {limits.PROTOCOL}"
+            return self._end(text, for_good=True)
+        if hello.robot != self.robot:
+            return self._end(f"the key is not that of {hello.robot}", for_good=True)
+        wrong = _wrong(hello.writers)
+        if wrong:
+            return self._end(wrong)
+        self.hello = hello
+        return [Admit(hello)]
+
+    def _rows(self, frame: Rows) -> list[Deed]:
+        if frame.number < self.next_number:
+            return []  # twice: it was taken the first time
+        if frame.number > self.next_number:
+            return self._end(f"frame {self.next_number} is missing")
+        for row in frame.rows:
+            if row.writer not in self.reaches or row.channel not in limits.CHANNELS:
+                return self._end(f"no rows of {row.writer}/{row.channel} are taken")
+        if not set(frame.upto) <= set(self.reaches) or any(
+            min(at) < 0 for at in frame.upto.values()
+        ):
+            return self._end("it reaches where nothing is")
+        self.next_number += 1
+        return [self._keep(frame.number, frame.rows, dict(frame.upto))]
+
+    def _durable(self, frame: Durable) -> list[Deed]:
+        wrong = _wrong(frame.writers)
+        if wrong:
+            return self._end(wrong)
+        for writer, reach in frame.writers.items():
+            known = self.reaches.get(writer)
+            if known is None or reach.end >= known.end:  # else it is late
+                self.reaches[writer] = reach
+        return [self._keep(self.next_number - 1, (), {})]
+
+    def _keep(self, number: int, rows: Sequence[Row], upto: dict[str, Place]) -> Keep:
+        assert self.hello is not None and self.epoch is not None
+        return Keep(self.epoch, self.hello.store_id, number, rows, upto, dict(self.reaches))
+
+    def _end(self, reason: str, *, for_good: bool = False) -> list[Deed]:
+        self.closed = True
+        return [Say((Bye(reason[: limits.TEXT_BYTES], for_good),), ends=True)]
+
+
+def _wrong(writers: dict[str, Reach]) -> str:
+    unknown = set(writers) - set(limits.WRITERS)
+    if unknown:
+        return f"no rows of {min(unknown)} are taken"
+    wrong = next((p for p in (reach.problem() for reach in writers.values()) if p), "")
+    return f"what it holds cannot be: {wrong}" if wrong else ""
