@@ -56,6 +56,15 @@ def test_newest_of_a_file(store: Store, is_finished: bool) -> None:
     assert numbers(store, 1000) == list(range(300))
 
 
+@pytest.mark.parametrize("lookback_s", [0, 0.0])
+def test_newest_alone_is_found_at_any_instant(store: Store, lookback_s: float) -> None:
+    """Instants are counted in whole ns, more of them than a float can tell apart."""
+    run = FakeRun(store.path, "watch")
+    for number in range(100):
+        run.own(reserved.STATUS, T0_NS + number * 10_000_001, {"reason": f"{number}"})
+        assert numbers(store, lookback_s) == [number]
+
+
 def test_newest_go_over_files_and_runs(store: Store) -> None:
     run = FakeRun(store.path, "watch")
     fill(run, 0, 10)

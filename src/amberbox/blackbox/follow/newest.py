@@ -47,7 +47,7 @@ def newest_records(
             found = [*_of_file(path, channels, lookback_s), *found]
         if found and _reaches(found, lookback_s):
             break
-    start_ns = found[-1].log_ns - lookback_s * NS if found else 0
+    start_ns = found[-1].log_ns - round(lookback_s * NS) if found else 0
     return [record for record in found if record.log_ns >= start_ns]
 
 
