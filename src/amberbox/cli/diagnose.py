@@ -219,9 +219,11 @@ def _show(
     args: argparse.Namespace, subject: Subject, case: Case, diagnosis: Diagnosis | None
 ) -> int:
     from amberbox.cli._diagnosis_case import is_wrong
+    from amberbox.cli._diagnosis_members import with_members
     from amberbox.cli._diagnosis_show import alone_text, explained, json_of, text_of
 
     explanation = explained(subject.knowledge, case, diagnosis)
+    explanation = with_members(subject.knowledge, case, explanation)
     if args.svg:
         _draw(args.svg, explanation)
     if args.json:

@@ -28,7 +28,7 @@ functions:
 """
 ROBOT = """\
 types: {hook: {failure_modes: {bent: {probability: 0.1, unobservable: x}}}}
-functions: {carry: {needs: [hook]}}
+functions: {carry: {needs: [hook], description: carry carts}}
 """
 
 
@@ -50,6 +50,9 @@ def test_functions_of_robots_fail_one_level_up(tmp_path: Path) -> None:
     assert fmea.modes[first].effects.system == ("carry_carts",)
     assert "carry_carts" not in lost(fmea, [first])
     assert "carry_carts" in lost(fmea, [first, second])
+    assert fmea.modes[first].description == "the robot ropod_001 cannot: carry carts"
+    assert fmea.modes[second].description == "the robot ropod_002 cannot: carry"
+    assert fmea.members == {name: str(tmp_path / name) for name in ("ropod_001", "ropod_002")}
 
 
 def test_what_is_wrong_with_members_is_told(tmp_path: Path) -> None:

@@ -126,6 +126,29 @@ class Step:
     remedies: tuple[str, ...] = ()
 
 
+State: TypeAlias = Literal["open", "healed", "none", "unknown"]
+"""How it is with a robot by its own diagnosis."""
+
+
+@dataclass(frozen=True, slots=True)
+class Member:
+    """What the own diagnosis of a robot says of which its team has lost something.
+
+    ``where`` is its folder, ``text`` the answer in one or two sentences. ``state`` is that of the
+    diagnosis: none if nothing is wrong there, unknown if nobody can tell; then ``text`` says why.
+    """
+
+    name: str
+    where: str
+    state: State
+    text: str
+    at_ns: int | None = None
+    diagnosis: str = ""
+    probability: float | None = None
+    use: str = ""
+    next: str = ""
+
+
 NodeKind: TypeAlias = Literal["cause", "lost", "symptom"]
 Mark: TypeAlias = Literal["", "leading", "present", "contradicted", "unexplained"]
 
@@ -172,7 +195,8 @@ class Explanation:
     ``headline`` is the answer in one or two sentences. ``broken`` is the leading group (None if
     nothing explains what is seen), ``others`` what follows it. ``unexplained`` was seen and does
     not follow from what leads, ``against`` should show and does not, ``unknown`` was seen and the
-    FMEA does not know it, ``blocked`` was seen and does not count.
+    FMEA does not know it, ``blocked`` was seen and does not count. ``members`` are the robots that
+    lead on, if it is the diagnosis of their team.
     """
 
     diagnosis: str
@@ -193,3 +217,4 @@ class Explanation:
     next: Step
     details: tuple[str, ...]
     graph: Graph
+    members: tuple[Member, ...] = ()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 import textwrap
 from collections.abc import Iterator, Sequence
 
@@ -11,6 +12,7 @@ from amberbox.diagnosis.explanation.explanation import (
     Explanation,
     Fault,
     Group,
+    Member,
     Possibility,
     Seen,
     Step,
@@ -52,13 +54,17 @@ def _first_paragraph(explanation: Explanation) -> str:
     """Say in a few sentences what is broken, whether the robot can be used, what to do."""
     if explanation.state == "healed":
         return explanation.headline
+    said = (f"{m.name} says: {m.text}" for m in explanation.members if m.state == "open")
     use = f"Can the robot be used? {sentence(explanation.use.text)}"
-    return f"{explanation.headline} {use} Next: {sentence(explanation.next.text)}"
+    next_step = f"Next: {sentence(explanation.next.text)}"
+    return " ".join((explanation.headline, *said, use, next_step))
 
 
 def _sections(explanation: Explanation) -> Iterator[tuple[str, list[str]]]:
     was = explanation.state == "healed"
     yield "What was broken" if was else "What is broken", list(_broken(explanation))
+    if explanation.members:
+        yield "What the robots say themselves", list(_members(explanation.members))
     yield "How sure", list(_sure(explanation))
     yield "Why", list(_why(explanation))
     yield "What speaks against it", list(_against(explanation))
@@ -94,6 +100,14 @@ def _possibility(member: Possibility, number: str) -> Iterator[str]:
 
 def _cause(fault: Fault, title: str) -> list[str]:
     return [_line(f"{title} {fault.cause}", "    ")] if fault.cause else []
+
+
+def _members(members: Sequence[Member]) -> Iterator[str]:
+    for member in members:
+        use = f" Can it be used? {sentence(member.use)}" if member.use else ""
+        after = f" Next: {sentence(member.next)}" if member.next else ""
+        yield from _item(f"{member.name}: {member.text}{use}{after}")
+        yield _line(f"more: amberbox diagnose {shlex.quote(member.where)}", "    ")
 
 
 def _sure(explanation: Explanation) -> Iterator[str]:

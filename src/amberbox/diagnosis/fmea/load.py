@@ -12,7 +12,7 @@ from amberbox.diagnosis.fmea.checking import check
 from amberbox.diagnosis.fmea.entries import Scope, component_of, function_of, mode_of
 from amberbox.diagnosis.fmea.findings import mapped
 from amberbox.diagnosis.fmea.known import Known
-from amberbox.diagnosis.fmea.members import members
+from amberbox.diagnosis.fmea.members import folders, members
 from amberbox.diagnosis.fmea.model import Fmea, FmeaTest, Other
 from amberbox.diagnosis.fmea.places import child
 from amberbox.diagnosis.fmea.reading import Sheet, read
@@ -66,6 +66,7 @@ def _made(root: Node, known: Known | None, problems: list[Problem], folder: Path
     fmea = Fmea(
         sheet.file.description, scope.modes, components, functions, symptoms.found, scope.tests,
         other, sheet.file.exposure_h, mapped(sheet, scope.modes, known, problems),
+        folders(sheet.robots, folder),
     )  # fmt: skip
     return check(fmea, sheet, problems)
 

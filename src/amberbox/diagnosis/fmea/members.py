@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -14,6 +15,13 @@ from amberbox.diagnosis.fmea.places import child
 
 LOST = "lost"
 """Name of the failure mode of a member's function."""
+
+
+def folders(robots: Mapping[str, MemberFile], folder: Path) -> dict[str, str]:
+    """Return where each robot's folder is, for those of which the file says it."""
+    paths = {robot: folder / member.where for robot, member in robots.items() if member.where}
+    places = {name: p.parent if p.suffix == ".yaml" else p for name, p in paths.items()}
+    return {name: os.path.normpath(place) for name, place in places.items()}
 
 
 def members(
@@ -30,14 +38,15 @@ def members(
             if offered is not None and name not in offered:
                 what = f"{robot} has no function '{name}'{did_you_mean(name, offered)}"
                 scope.problems.append(place.problem(where, what))
-            component = f"{robot}:{name}"
-            _lost(component, entry, place, where, scope)
+            component, words = f"{robot}:{name}", (offered or {}).get(name) or name
+            text = f"the robot {robot} cannot: {words}"
+            _lost(component, text, entry, place, where, scope)
             found[component] = Component(component, "robot", modes=(f"{component}#{LOST}",))
     return found
 
 
-def _offered(member: MemberFile, node: Node, scope: Scope, folder: Path) -> list[str] | None:
-    """Return the functions in the robot's own file; None if that is not there (yet)."""
+def _offered(member: MemberFile, node: Node, scope: Scope, folder: Path) -> dict[str, str] | None:
+    """Return the functions in the robot's own file, described; None if that is not there (yet)."""
     path = folder / member.where
     path = path / "fmea.yaml" if path.is_dir() else path
     if not member.where or not path.is_file():
@@ -47,10 +56,23 @@ def _offered(member: MemberFile, node: Node, scope: Scope, folder: Path) -> list
         return None
     root = load_yaml(path, scope.problems)
     functions = (root.mapping or {}).get("functions") if root else None
-    return list(functions.mapping or ()) if functions else []
+    found = (functions.mapping or {}) if functions else {}
+    return {name: _description(function) for name, function in found.items()}
 
 
-def _lost(component: str, entry: MemberFunctionFile, node: Node, where: str, scope: Scope) -> None:
+def _description(function: Node) -> str:
+    described = (function.mapping or {}).get("description")
+    return str(described.value) if described else ""
+
+
+def _lost(
+    component: str,
+    text: str,
+    entry: MemberFunctionFile,
+    node: Node,
+    where: str,
+    scope: Scope,
+) -> None:
     mode_id = f"{component}#{LOST}"
     place = child(node, "symptoms")
     links = scope.symptoms.links(entry.symptoms, place, f"{where}.symptoms", mode_id)
@@ -61,7 +83,7 @@ def _lost(component: str, entry: MemberFunctionFile, node: Node, where: str, sco
             what = f"{value:g} is {'below 0' if value < 0 else 'above 1'}"
             scope.problems.append(child(node, key).problem(f"{where}.{key}", what))
     mode = FailureMode(
-        mode_id, component, LOST, component.replace(":", " cannot: "),
+        mode_id, component, LOST, text,
         severity=entry.severity, rate=entry.rate, probability=entry.probability,
         exposure_h=scope.file.exposure_h, symptoms=links, unobservable=entry.unobservable,
         remedy=entry.remedy, line=node.line,

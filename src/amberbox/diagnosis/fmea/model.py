@@ -188,7 +188,7 @@ class Other:
 
 @dataclass(frozen=True, slots=True)
 class Fmea:
-    """Everything, by id. ``scales`` are rows of the file's S-O-D tables, for documents."""
+    """Everything, by id. ``members`` are the robots of a team with their folders, where named."""
 
     name: str
     modes: Mapping[str, FailureMode]
@@ -199,6 +199,7 @@ class Fmea:
     other: Other = Other()
     exposure_h: float = 24.0
     findings: tuple[Mapped, ...] = ()
+    members: Mapping[str, str] = field(default_factory=dict)
 
     def needs(self) -> dict[str, Needs]:
         """Return what each component and function needs."""
