@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from amberbox.blackbox.journal.clocktable import ClockTable, Piece
@@ -54,18 +54,31 @@ def run_sql(catalogue: Catalogue, statement: str) -> Table:
     Raises AmberboxError when DuckDB refuses the statement, UsageError without DuckDB or when the
     statement is not a single SELECT, DESCRIBE, SHOW or EXPLAIN.
     """
-    duckdb = _duckdb()
-    with duckdb.connect(":memory:") as connection:
-        connection.execute("SET TimeZone = 'UTC'")
+
+    def create(connection: duckdb.DuckDBPyConnection) -> list[str]:
         files: list[str] = []
         for table in sorted(catalogue.schemas):
             _create_view(connection, catalogue, table, files)
-        _shut_off(connection, files)
+        return files
+
+    return run_views(create, sorted(catalogue.schemas), statement)
+
+
+def run_views(
+    create: Callable[[duckdb.DuckDBPyConnection], Sequence[str]],
+    names: Sequence[str],
+    statement: str,
+) -> Table:
+    """Answer a SELECT over views that ``create`` makes; it returns the files that they read."""
+    duckdb = _duckdb()
+    with duckdb.connect(":memory:") as connection:
+        connection.execute("SET TimeZone = 'UTC'")
+        _shut_off(connection, create(connection))
         try:
             _refuse_all_but_questions(connection, statement)
             return _to_table(connection.sql(statement).to_arrow_table())
         except duckdb.Error as error:
-            raise AmberboxError(f"SQL: {error}", _hint(catalogue)) from error
+            raise AmberboxError(f"SQL: {error}", _hint(names)) from error
 
 
 def _refuse_all_but_questions(connection: duckdb.DuckDBPyConnection, statement: str) -> None:
@@ -85,15 +98,15 @@ def _duckdb() -> Any:
     return duckdb
 
 
-def _hint(catalogue: Catalogue) -> str:
-    return "views: " + ", ".join(sorted(catalogue.schemas))
+def _hint(names: Sequence[str]) -> str:
+    return "views: " + ", ".join(names)
 
 
 def _shut_off(connection: duckdb.DuckDBPyConnection, files: Sequence[str]) -> None:
     connection.execute("SET autoinstall_known_extensions = false")
     connection.execute("SET autoload_known_extensions = false")
     connection.execute("SET python_enable_replacements = false")
-    connection.execute(f"SET allowed_paths = [{', '.join(map(_quoted, files))}]")
+    connection.execute(f"SET allowed_paths = [{', '.join(map(quoted, files))}]")
     connection.execute("SET enable_external_access = false")
     connection.execute("SET lock_configuration = true")
 
@@ -110,7 +123,7 @@ def _create_view(
     rest = _journal_rows(catalogue, schema, also_segments=not groups)
     if rest is not None:
         selects.append(f"SELECT * FROM {_beside(connection, table, rest)}")
-    connection.execute(f"CREATE VIEW {_name(table)} AS {' UNION ALL '.join(selects)}")
+    connection.execute(f"CREATE VIEW {quoted_name(table)} AS {' UNION ALL '.join(selects)}")
 
 
 def _beside(connection: duckdb.DuckDBPyConnection, table: str, rows: pa.Table) -> str:
@@ -118,7 +131,7 @@ def _beside(connection: duckdb.DuckDBPyConnection, table: str, rows: pa.Table) -
     connection.execute(f"CREATE SCHEMA IF NOT EXISTS {_JOURNALS}; USE {_JOURNALS}")
     connection.from_arrow(rows).create_view(table)
     connection.execute("USE main")
-    return f"{_JOURNALS}.{_name(table)}"
+    return f"{_JOURNALS}.{quoted_name(table)}"
 
 
 def _groups(catalogue: Catalogue, table: str) -> dict[tuple[TableSchema, Pieces], list[str]]:
@@ -133,7 +146,7 @@ def _groups(catalogue: Catalogue, table: str) -> dict[tuple[TableSchema, Pieces]
 
 def _select(schema: TableSchema, version: TableSchema, pieces: Pieces, paths: Sequence[str]) -> str:
     columns = ", ".join(_columns(schema, version, pieces))
-    return f"SELECT {columns} FROM read_parquet([{', '.join(map(_quoted, paths))}])"
+    return f"SELECT {columns} FROM read_parquet([{', '.join(map(quoted, paths))}])"
 
 
 def _needs_text(catalogue: Catalogue, schema: TableSchema) -> bool:
@@ -165,7 +178,7 @@ def _columns(schema: TableSchema, version: TableSchema, pieces: Pieces) -> list[
         f'{stamp} AS "timestamp"',
         *(_column(column, version) for column in schema.columns),
         f'{received} AS "received"',
-        _name(seq_name(schema)),
+        quoted_name(seq_name(schema)),
     ]
 
 
@@ -188,25 +201,28 @@ def _offset_of(piece: Piece) -> str:
 def _column(column: Column, version: TableSchema) -> str:
     known = version.column(column.name)
     if known is None:
-        return f"NULL::{_sql_type(column.type)} AS {_name(column.name)}"
-    stored = _name(stored_name(column.name))
+        return f"NULL::{sql_type(column.type)} AS {quoted_name(column.name)}"
+    stored = quoted_name(stored_name(column.name))
     if known.type != column.type:
-        stored = f"{stored}::{_sql_type(column.type)}"
-    return f"{stored} AS {_name(column.name)}"
+        stored = f"{stored}::{sql_type(column.type)}"
+    return f"{stored} AS {quoted_name(column.name)}"
 
 
-def _sql_type(column_type: str) -> str:
+def sql_type(column_type: str) -> str:
+    """Name the type in DuckDB that holds a column."""
     inner = element_type(column_type)
     if inner is not None:
-        return f"{_sql_type(inner)}[]"
+        return f"{sql_type(inner)}[]"
     return _TYPES.get(column_type, "TIMESTAMP_NS")
 
 
-def _name(name: str) -> str:
+def quoted_name(name: str) -> str:
+    """Quote a name for SQL."""
     return '"' + name.replace('"', '""') + '"'
 
 
-def _quoted(text: str) -> str:
+def quoted(text: str) -> str:
+    """Quote a text for SQL."""
     return "'" + text.replace("'", "''") + "'"
 
 

@@ -1,0 +1,1 @@
+"""The archive: what robots have recorded, kept on the server; journals, columns, and queries."""

@@ -1,0 +1,132 @@
+"""What an archive can be asked to do: the contract behind which journals and tables lie."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, Protocol
+
+from amberbox.blackbox.query.record import Record
+
+OWN = "own"
+"""Keeping class of what the box itself says: statuses, events, gaps, incidents, runs."""
+
+LOST = "lost_at_power_cut"
+DELETED = "deleted_before_copy"
+Kind = Literal["lost_at_power_cut", "deleted_before_copy"]
+
+
+@dataclass(frozen=True, slots=True)
+class JournalKey:
+    """Which journal: ``file`` is ``folder/name.mcap`` as on the robot, ``sha256`` its content."""
+
+    robot: str
+    store_id: str
+    file: str
+    sha256: str
+
+
+@dataclass(frozen=True, slots=True)
+class Missing:
+    """Rows ``[from_seq, to_seq)`` of a writer's run that will not come, and why.
+
+    ``lost_at_power_cut``: the server had seen them, the robot has lost them.
+    ``deleted_before_copy``: the robot deleted them; ``reason`` is that of its tombstone.
+    """
+
+    writer: str
+    run: int
+    from_seq: int
+    to_seq: int
+    from_ns: int
+    to_ns: int
+    kind: Kind
+    reason: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Retention:
+    """How long data are kept, in seconds since they came; None is for ever.
+
+    ``robot`` and ``keeping`` (``main``, ``bulk``, ``ring``, ``watch``, ``keep``, ``kept``) choose;
+    ``*`` is every robot, or the classes ``main``, ``bulk`` and ``ring``. What the box itself says
+    goes only by a rule for ``own``, journals of ``watch``, ``keep`` and ``kept`` only by a rule
+    that names them. What a pinned incident covers stays.
+    """
+
+    robot: str = "*"
+    keeping: str = "*"
+    journals_s: float | None = None
+    columns_s: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Stored:
+    """What ``put`` did: whether the journal is new here, and where it lies now."""
+
+    is_new: bool
+    path: Path
+
+
+@dataclass(frozen=True, slots=True)
+class Committed:
+    """What one commit added, or how long to wait until the next one is due."""
+
+    journals: int = 0
+    rows: int = 0
+    tables: int = 0
+    refused: int = 0
+    waiting: int = 0
+    next_in_s: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class RobotStats:
+    """How much of one robot is here: journals by state, bytes, recorded time."""
+
+    robot: str
+    journals: int
+    journal_bytes: int
+    waiting: int
+    rows: int
+    first_ns: int
+    last_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class Stats:
+    """How much is in the archive; ``table_bytes`` are the live files of all tables."""
+
+    robots: Sequence[RobotStats]
+    tables: int
+    table_files: int
+    table_bytes: int
+
+
+class ArchiveStore(Protocol):
+    """Keeps what robots have recorded. One process works on it at a time; many may ask."""
+
+    def put(self, key: JournalKey, path: Path) -> Stored:
+        """Take over a verified journal file, durably; one that is here already changes nothing.
+
+        Raises AmberboxError for a file that does not hold, or is not the one the key says.
+        """
+
+    def note_missing(self, robot: str, store_id: str, ranges: Sequence[Missing]) -> None:
+        """Remember what will not come; saying it twice changes nothing."""
+
+    def commit(self, every_s: float = 60.0) -> Committed:
+        """Turn the journals that wait into columns, one commit per table, every ``every_s``."""
+
+    def compact(self) -> int:
+        """Join small files of the tables; return how many files went."""
+
+    def retain(self, rules: Sequence[Retention]) -> int:
+        """Delete what is older than the rules say; return how many journals it concerned."""
+
+    def robot(self, *robots: str) -> Record:
+        """Open the record of one robot, or of several (all without a name) for queries."""
+
+    def stats(self) -> Stats:
+        """Tell how much is here."""
