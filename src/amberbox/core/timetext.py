@@ -23,6 +23,8 @@ _UNITS_NS = {
     "h": 3600 * NS,
     "d": 86_400 * NS,
 }
+_BEYOND_NS = 2**63
+"""Times are 64 bits."""
 _DURATION_PART = re.compile(r"(\d+(?:\.\d+)?)(ns|us|ms|min|s|m|h|d)")
 _ISO = re.compile(
     r"(\d{4}-\d{2}-\d{2})"
@@ -51,6 +53,13 @@ def parse_time(text: str, now_ns: Callable[[], int], last_ns: Callable[[], int |
     microseconds or nanoseconds, told apart by magnitude. ``-10m`` is that long before the last
     record (``last_ns``), ``now`` and ``now-10m`` go by the clock (``now_ns``).
     """
+    time_ns = _read(text, now_ns, last_ns)
+    if abs(time_ns) >= _BEYOND_NS:
+        raise UsageError(f"not a time between the years 1678 and 2262: {text!r}", _HINT)
+    return time_ns
+
+
+def _read(text: str, now_ns: Callable[[], int], last_ns: Callable[[], int | None]) -> int:
     compact = text.strip()
     if compact.startswith("now"):
         return now_ns() + _shift(compact[3:], text)

@@ -92,6 +92,7 @@ def test_a_detectors_finding_and_a_proof() -> None:
         ("  - {rule: short_circuit(X), maps_to: [m1#burnt], proves: true, detects: 1}",
          "what is proven has no probability"),
         ("  - {rule: short_circuit(X), map_to: [m1#burnt]}", "did you mean 'maps_to'?"),
+        ("  - {finding: flow/<1>, maps_to: [<1>#burnt]}", "no failure mode '<1>#burnt'"),
         ("  {rule: short_circuit(X)}", "findings: expected a list"),
     ],
 )  # fmt: skip

@@ -240,6 +240,12 @@ WRONG = [
         "occurrence: {11",
         "'11' is no rank from 1 to 10",
     ),
+    (
+        "outcomes: [clean, dirty, wet]",
+        "minutes: .inf",
+        "minutes: .inf",
+        "inf is more than 1,000,000,000",
+    ),
 ]
 
 

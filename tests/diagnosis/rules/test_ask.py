@@ -131,6 +131,7 @@ def test_why_not_of_what_nobody_knows_and_of_loops() -> None:
         ("brokn_drive(X)", "there is no predicate brokn_drive/1; did you mean 'broken_drive'?"),
         ("drive(X, Y)", "there is no drive/2, but drive/1"),
         ("drive(X), assertz(p(X))", "assertz/1 is not supported"),
+        ("", "goal, column 1: "),
         ("drive(X", "goal, column 8: the text ends in the middle of a sentence"),
         ("drive(X), X < 3", "'d1' is no number"),
         ("call(drve, X)", "there is no predicate drve/1; did you mean 'drive'?"),

@@ -11,6 +11,8 @@ from amberbox.core.options import option
 from amberbox.diagnosis.fmea.model import Severity
 
 Finding = str | tuple[str, str]
+_MOST = 1e9
+"""No time, rate or exposure is larger; sums of times stay within 64 bits of nanoseconds."""
 
 
 @dataclass(frozen=True)
@@ -302,3 +304,5 @@ def _not_below_zero(entry: object, *keys: str) -> Iterator[Finding]:
         value = getattr(entry, key)
         if value is not None and value < 0:
             yield key, f"{value:g} lies below 0"
+        elif value is not None and value > _MOST:
+            yield key, f"{value:g} is more than {_MOST:,.0f}"

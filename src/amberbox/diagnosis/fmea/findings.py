@@ -21,7 +21,7 @@ from amberbox.diagnosis.rules.terms import Key, key_of, show_key
 from amberbox.diagnosis.rules.unify import unify
 from amberbox.diagnosis.rules.writer import write
 
-_VARIABLE = re.compile(r"<(\w+)>")
+_VARIABLE = re.compile(r"<([A-Za-z_]\w*)>", re.ASCII)
 _MOST = 5_000
 """Most instances of one finding; more are a mistake in ``maps_to``."""
 

@@ -36,6 +36,8 @@ class SourceText:
 
     def picture(self, place: Place) -> str:
         """Return the line of a place with a mark below its column."""
+        if not self.text:
+            return ""
         start, end = self.starts[place.line - 1], self.starts[place.line]
         line = self.text[start:end].rstrip().expandtabs(1)
         left = max(0, place.column - _WIDEST)
