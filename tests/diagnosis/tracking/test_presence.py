@@ -35,18 +35,16 @@ def test_what_becomes_unknown_is_remembered_as_long() -> None:
     assert not one.is_absent
 
 
-def test_what_was_there_before_it_was_blocked_counts_while_it_lasts() -> None:
-    happens = [At(1, NAME), At(5, NAME, blocked_by=("bus",))]
-    assert presence(*happens).counts_present(seconds(60))
-    one = presence(*happens, At(60, NAME, "absent", ("bus",)))
-    assert one.counts_present(seconds(61.9)) and not one.counts_present(seconds(62))
-    assert not one.is_absent
-
-
-def test_what_is_blocked_never_counts() -> None:
+def test_what_is_there_counts_although_it_is_blocked() -> None:
     one = presence(At(1, NAME, blocked_by=("bus",)))
-    assert not one.counts_present(seconds(1)) and not one.is_absent
-    assert not presence(At(1, NAME, "absent", ("bus",))).is_absent
+    assert one.counts_present(seconds(60)) and not one.is_absent
+    assert one.shown("present").blocked_by == ()
+
+
+def test_what_is_blocked_is_never_seen_absent() -> None:
+    one = presence(At(1, NAME), At(5, NAME, "absent", ("bus",)))
+    assert one.counts_present(seconds(6.9)) and not one.counts_present(seconds(7))
+    assert not one.is_absent
 
 
 def test_is_shown_as_what_it_counts_as() -> None:

@@ -32,21 +32,21 @@ class Presence:
 
     @property
     def is_there(self) -> bool:
-        """Tell whether it is there now, and nothing blocks it."""
+        """Tell whether it is there now."""
         return self.seen is not None and self.gone_ns is None
 
     def take(self, told: Symptom, at_ns: int) -> None:
         """Take what is told of it at an instant; what comes back in time never went.
 
-        What was there before its component was blocked goes on to count while it lasts: it
-        cannot follow from what has blocked the component since.
+        What is there counts although its component is blocked: the analysis says what may
+        show it, and what blocks may be among that. Its absence says nothing then.
         """
         was_present = self.counts_present(at_ns)
         self.told = told
-        if told.state == "present" and not told.blocked_by:
+        if told.state == "present":
             self.seen = self.seen if was_present else told
             self.gone_ns = None
-        elif self.is_there and told.state != "present":
+        elif self.is_there:
             self.gone_ns = at_ns
 
     def counts_present(self, at_ns: int) -> bool:
