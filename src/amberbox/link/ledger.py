@@ -78,13 +78,16 @@ class MemoryLedger:
         rows: Sequence[Row],
         upto: Mapping[str, Place],
         reaches: Mapping[str, Reach],
+        *,
+        compare: bool = True,
     ) -> Stored:
         """Take rows once each; raises StaleEpochError in an older epoch."""
         if epoch != self.epoch:
             raise StaleEpochError
         store = self._stores[store_id]
-        found = self._compare(store_id, reaches, is_hello=False)
-        self._note_boots(store, reaches)
+        news = reaches if compare else {}
+        found = self._compare(store_id, news, is_hello=False)
+        self._note_boots(store, news)
         new, conflicts = [], []
         for row in rows:
             key = (store_id, row.writer, row.run, row.seq)

@@ -47,6 +47,8 @@ class Keep:
     rows: Sequence[Row]
     upto: dict[str, Place]
     reaches: dict[str, Reach]
+    compare: bool = False
+    """Whether how far the robot reaches is news."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,11 +151,14 @@ class ServerEnd:
             known = self.reaches.get(writer)
             if known is None or reach.end >= known.end:  # else it is late
                 self.reaches[writer] = reach
-        return [self._keep(self.next_number - 1, (), {})]
+        return [self._keep(self.next_number - 1, (), {}, compare=True)]
 
-    def _keep(self, number: int, rows: Sequence[Row], upto: dict[str, Place]) -> Keep:
+    def _keep(
+        self, number: int, rows: Sequence[Row], upto: dict[str, Place], *, compare: bool = False
+    ) -> Keep:
         assert self.hello is not None and self.epoch is not None
-        return Keep(self.epoch, self.hello.store_id, number, rows, upto, dict(self.reaches))
+        store_id, reaches = self.hello.store_id, dict(self.reaches)
+        return Keep(self.epoch, store_id, number, rows, upto, reaches, compare)
 
     def _end(self, reason: str, *, for_good: bool = False) -> list[Deed]:
         self.closed = True

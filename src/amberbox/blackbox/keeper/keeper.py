@@ -18,6 +18,7 @@ from amberbox.blackbox.deletion.limit import NO_ROOM, with_reserve
 from amberbox.blackbox.deletion.roomthread import RoomThread
 from amberbox.blackbox.follow.chain import previous_chain
 from amberbox.blackbox.follow.read import journal_file
+from amberbox.blackbox.keeper import remarks
 from amberbox.blackbox.keeper.options import KeeperOptions
 from amberbox.blackbox.keeper.ownjournal import OwnJournal
 from amberbox.blackbox.keeper.situation import Situations
@@ -79,6 +80,7 @@ class Keeper:
         self._missions.step()
         self._make_room()
         confirm.take_requests(self._store)
+        remarks.take_requests(self._store, self.journal)
         if self._situations.changed(self._deleter.is_full):
             self.build(stop)
         self._deleter.trim_ring()

@@ -46,13 +46,16 @@ def store(
     upto: Mapping[str, Place],
     reaches: Mapping[str, Reach],
     now_ns: int,
+    *,
+    compare: bool = True,
 ) -> Stored:
     """Take rows once each; raises StaleEpochError when the robot has connected again since."""
     keys = robot, store_id
     _fence(connection, robot, epoch)
     cursor, received = _cursors(connection, *keys)
-    found = _compare(connection, keys, cursor, reaches, now_ns, is_hello=False)
-    _note_runs(connection, keys, reaches)
+    news = reaches if compare else {}
+    found = _compare(connection, keys, cursor, news, now_ns, is_hello=False)
+    _note_runs(connection, keys, news)
     new, conflicts = _take(connection, keys, rows, now_ns)
     board.show(connection, robot, store_id, new, now_ns)
     received = set_back({**received, **upto}, found)
@@ -125,16 +128,23 @@ def _write_cursors(
 
 
 def _note_runs(connection: Connection, keys: tuple[str, str], reaches: Mapping[str, Reach]) -> None:
-    known = {(row.writer, row.run) for row in connection.execute(select(RUN).where(_of(RUN, keys)))}
+    """Note which boot wrote each run, where that is not known yet."""
+    if not reaches:
+        return
+    runs = connection.execute(select(RUN).where(_of(RUN, keys), RUN.c.boot != ""))
+    known = {(row.writer, row.run) for row in runs}
     values = [
-        {"robot": keys[0], "store_id": keys[1], "writer": writer, "run": run.run,
-         "boot": run.boot, "end_seq": 0}
+        {
+            "robot": keys[0], "store_id": keys[1], "writer": writer, "run": run.run,
+            "boot": run.boot, "end_seq": 0,
+        }
         for writer, reach in reaches.items()
         for run in reach.runs
         if (writer, run.run) not in known
     ]  # fmt: skip
     if values:
-        connection.execute(RUN.insert(), values)
+        key = ("robot", "store_id", "writer", "run")
+        connection.execute(upsert(connection.dialect, RUN, key, ("boot",)), values)
 
 
 def _held(connection: Connection, keys: tuple[str, str], cursor: Upto) -> dict[str, list[Held]]:
@@ -158,7 +168,7 @@ def _compare(
     is_hello: bool,
 ) -> list[Aside]:
     """Put aside what the robot has no more; tell of it."""
-    held = _held(connection, keys, cursor)
+    held = _held(connection, keys, cursor) if reaches else {}
     found = [
         one
         for writer, reach in reaches.items()

@@ -187,6 +187,7 @@ class LinkServer:
         work = partial(
             ledger.store, robot=one.robot, epoch=deed.epoch, store_id=deed.store_id,
             rows=deed.rows, upto=deed.upto, reaches=deed.reaches, now_ns=now_ns,
+            compare=deed.compare,
         )  # fmt: skip
         stored = asyncio.wrap_future(self._writes.submit(work))
         return asyncio.create_task(self._kept(one, deed, stored))

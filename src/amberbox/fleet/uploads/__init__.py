@@ -1,0 +1,1 @@
+"""Journals that robots copy to the server: in pieces, resumable, verified, then confirmed."""

@@ -1,0 +1,157 @@
+"""Verification of a journal that has come: hash, chain and signature, in a process of its own."""
+
+from __future__ import annotations
+
+import hashlib
+import multiprocessing
+import os
+import resource
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
+from pathlib import Path
+
+from amberbox.blackbox.follow.read import journal_file
+from amberbox.blackbox.journal.clocktable import ClockTable
+from amberbox.blackbox.segments.entries import Sealed
+from amberbox.blackbox.store import FOLDERS, run_and_number
+from amberbox.blackbox.verify.block import Identity
+from amberbox.blackbox.verify.findings import BAD
+from amberbox.blackbox.verify.journal import Checked, Target, check_journal
+from amberbox.link.proof import ProofError, Proven, prove
+from amberbox.link.uploads import Proof
+
+_FIRST_CHAIN = "0" * 64
+_WRITER_OF = {folder: writer for writer, folder in FOLDERS.items()}
+_MEMORY_BYTES = 8 << 30
+_READ_BYTES = 1 << 20
+_NICE = 5
+
+
+@dataclass(frozen=True, slots=True)
+class Claim:
+    """A file that has come, and what its robot says it is."""
+
+    path: Path
+    robot: str
+    store_id: str
+    journal: str
+    sha256: str
+    proof: Proof | None
+    public_key: str
+
+
+@dataclass(frozen=True, slots=True)
+class Result:
+    """What a journal turned out to be; ``reason`` is empty when all of it holds.
+
+    ``unread`` says that the file is not the one that was sent: sending it again may help.
+    """
+
+    reason: str = ""
+    unread: bool = False
+    signed: bool = False
+    writer: str = ""
+    run: int = 0
+    number: int = 0
+    first_seq: int = 0
+    end_seq: int = 0
+    start_ns: int = 0
+    end_ns: int = 0
+
+
+def verify(claim: Claim) -> Result:
+    """Check a file against what its robot has sealed and signed; any kind of damage is a reason."""
+    if _sha256(claim.path) != claim.sha256:
+        return Result("it did not arrive as it was sent", unread=True)
+    try:
+        proven = _proven(claim)
+        sealed = proven.sealed if proven is not None else None
+        checked = check_journal(_target(claim, sealed))
+        return _judged(claim, checked, proven)
+    except ProofError as error:
+        return Result(f"its proof does not hold: {error}")
+    except Exception as error:  # whatever bytes do to a reader: it is told, and not taken
+        return Result(f"it cannot be read: {type(error).__name__}: {error}")
+
+
+def _proven(claim: Claim) -> Proven | None:
+    """Check what the robot says of the file; only the ring's journals come without a seal."""
+    if claim.proof is not None and claim.proof.lines:
+        return prove(claim.proof, claim.store_id, claim.journal, claim.public_key)
+    if _folder(claim) != FOLDERS["ring"]:
+        raise ProofError("it was not sealed")
+    return None
+
+
+def _folder(claim: Claim) -> str:
+    return claim.journal.partition("/")[0]
+
+
+def _target(claim: Claim, sealed: Sealed | None) -> Target:
+    run, number = run_and_number(Path(claim.journal))
+    chains = tuple(c for c in (sealed.start_chain if sealed else "", _FIRST_CHAIN) if c)
+    identity = Identity(claim.store_id, _WRITER_OF[_folder(claim)], run, number, chains)
+    return Target(claim.journal, claim.path, identity, False, sealed)
+
+
+def _judged(claim: Claim, checked: Checked, proven: Proven | None) -> Result:
+    bad = [finding for finding in checked.findings if finding.state in BAD]
+    identity = checked.target.identity
+    if proven is not None:
+        known = proven.sealed
+        edges = known.start_ns, known.end_ns
+        first, end = known.first_seq, known.end_seq
+    else:
+        journal = journal_file(claim.path, claim.journal)
+        edges = ClockTable(journal.clock).bounds()
+        edges = journal.start_ns + edges[0], journal.end_ns + edges[1]
+        first, end = journal.first_seq, journal.end_seq
+    return Result(
+        "; ".join(f"{finding.state}: {finding.text}" for finding in bad[:5]),
+        False, proven is not None and proven.signed, identity.writer, identity.run,
+        identity.number, first, end, *edges,
+    )  # fmt: skip
+
+
+def _sha256(path: Path) -> str:
+    digest = hashlib.sha256()
+    with path.open("rb") as file:
+        while part := file.read(_READ_BYTES):
+            digest.update(part)
+    return digest.hexdigest()
+
+
+class Verifier:
+    """A worker process for verification; one that dies (a bomb, no memory) is replaced."""
+
+    def __init__(self) -> None:
+        self._pool: ProcessPoolExecutor | None = None
+
+    def check(self, claim: Claim) -> Result | None:
+        """Verify a file; None when the worker died over it. Blocks: call it in a thread."""
+        pool = self._pool = self._pool or _new_pool()
+        try:
+            return pool.submit(verify, claim).result()
+        except BrokenProcessPool:
+            if self._pool is pool:
+                self._pool = None
+            return None
+
+    def close(self) -> None:
+        """End the worker."""
+        if self._pool is not None:
+            self._pool.shutdown(cancel_futures=True)
+            self._pool = None
+
+
+def _new_pool() -> ProcessPoolExecutor:
+    return ProcessPoolExecutor(
+        1, mp_context=multiprocessing.get_context("spawn"), initializer=_limit
+    )
+
+
+def _limit() -> None:
+    """Keep the worker from taking the server's memory or time."""
+    os.nice(_NICE)
+    resource.setrlimit(resource.RLIMIT_AS, (_MEMORY_BYTES, _MEMORY_BYTES))

@@ -1,0 +1,173 @@
+"""The link of a robot: connects, tells, is acknowledged; and when it breaks, begins again.
+
+It only reads the journals. Whatever happens to it or to the network, recording goes on.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import ssl
+from collections.abc import Awaitable, Callable, Sequence
+from dataclasses import dataclass, field
+
+from amberbox import __version__
+from amberbox.blackbox.signing.keys import public_key
+from amberbox.blackbox.store import Store
+from amberbox.core.clock import Clock, SystemClock
+from amberbox.core.errors import AmberboxError
+from amberbox.link import limits
+from amberbox.link.backoff import Backoff
+from amberbox.link.bucket import TokenBucket
+from amberbox.link.frames import (
+    Bye,
+    Confirm,
+    Fetch,
+    FrameError,
+    Hello,
+    Welcome,
+    encode,
+    from_server,
+)
+from amberbox.link.offset import OffsetEstimate
+from amberbox.link.robotend import OutOfStepError
+from amberbox.robot.link.dialing import Line, LinkDownError, RefusedError, dial
+from amberbox.robot.link.live import LiveValues
+from amberbox.robot.link.network import Network, current_network
+from amberbox.robot.link.options import LinkOptions
+from amberbox.robot.link.reaching import Reaches
+from amberbox.robot.link.remarks import Remarks
+from amberbox.robot.link.session import Session
+from amberbox.robot.link.tls import PinError, context_for
+
+_EARLIEST_NS = 1_704_067_200 * 1_000_000_000
+"""2024-01-01: a clock that says less has not been set."""
+
+Dial = Callable[[LinkOptions, ssl.SSLContext | None], Awaitable[Line]]
+
+
+@dataclass(slots=True)
+class Asked:
+    """What the server wants of the rest of the robot's agent; called in the event loop."""
+
+    fetch: Callable[[Fetch], None] = lambda frame: None
+    confirm: Callable[[Sequence[str]], None] = lambda files: None
+    folder: Callable[[str], None] = lambda config_hash: None
+
+
+@dataclass(slots=True)
+class Progress:
+    """How the link is doing, for whoever wants to show it."""
+
+    connected: bool = False
+    trouble: str = ""
+    attempts: int = 0
+    backlog: int = 0
+    rows_sent: int = 0
+    bytes_sent: int = 0
+    offset: OffsetEstimate = field(default_factory=OffsetEstimate)
+
+
+class LinkClient:
+    """Keeps one store linked to one server; ``run`` until ``stop`` is set."""
+
+    def __init__(
+        self,
+        store: Store,
+        options: LinkOptions,
+        *,
+        asked: Asked | None = None,
+        clock: Clock | None = None,
+        network: Callable[[], Network] = current_network,
+        dialer: Dial = dial,
+        backoff: Backoff | None = None,
+    ) -> None:
+        self.store = store
+        self.options = options
+        self.asked = asked or Asked()
+        self.clock = clock or SystemClock()
+        self.network = network
+        self.progress = Progress()
+        self.bucket = TokenBucket(options.rate)
+        self.live = LiveValues(store)
+        self._dial = dialer
+        self._backoff = backoff or Backoff()
+        self._reaches = Reaches(store)
+        self._remarks = Remarks(store)
+
+    async def run(self, stop: asyncio.Event) -> None:
+        """Connect again and again until ``stop``; then send what is durable, and end."""
+        while not stop.is_set():
+            self.progress.attempts += 1
+            try:
+                await self._once(stop)
+                continue
+            except (LinkDownError, FrameError, OutOfStepError, AmberboxError, OSError) as error:
+                self._failed(error)
+            with contextlib.suppress(asyncio.TimeoutError):
+                await asyncio.wait_for(stop.wait(), self._backoff.failed())
+        await asyncio.to_thread(self.live.close)
+
+    def _failed(self, error: Exception) -> None:
+        self.progress.connected = False
+        self.progress.trouble = str(error)
+        if isinstance(error, (RefusedError, PinError)):
+            self._remarks.say("link_refused", str(error))
+
+    async def _once(self, stop: asyncio.Event) -> None:
+        """Hold one connection from its beginning to its end."""
+        self._look_at_clock()
+        context = await asyncio.to_thread(
+            context_for, self.options.url, self.options.ca, self.store.path
+        )
+        line = await self._dial(self.options, context)
+        try:
+            session = await self._greet(line)
+            self._backoff.succeeded()
+            self._remarks.over("link_refused")
+            self.progress.connected, self.progress.trouble = True, ""
+            await session.run(stop)
+        finally:
+            self.progress.connected = False
+            await line.close()
+
+    def _look_at_clock(self) -> None:
+        """Say that the clock was not set: the server is verified by its chain alone."""
+        if self.clock.wall_ns() < _EARLIEST_NS:
+            text = "the clock was not set: the server is verified by its authority, not by dates"
+            self._remarks.say("clock_not_set", text)
+        else:
+            self._remarks.over("clock_not_set")
+
+    async def _greet(self, line: Line) -> Session:
+        """Say hello; raises RefusedError when the server sends the robot away."""
+        reaches = await asyncio.to_thread(self._reaches.state)
+        hello = Hello(
+            self.options.robot, self.store.id, self.clock.boot_id(), reaches,
+            self.options.config_hash, self.clock.wall_ns(), self.clock.boot_ns(), __version__,
+            public_key=public_key(self.store.path) or "",
+        )  # fmt: skip
+        await line.send(encode(hello))
+        answer = from_server(await _soon(line.receive()))
+        if isinstance(answer, Bye):
+            raise (RefusedError if answer.for_good else LinkDownError)(answer.reason)
+        if not isinstance(answer, Welcome):
+            raise LinkDownError("the server did not say welcome")
+        if answer.wants_folder:
+            self.asked.folder(self.options.config_hash)
+        self.live.watch(answer.watch)
+        return Session(self, line, answer, self._reaches, reaches)
+
+    def hear(self, frame: Fetch | Confirm) -> None:
+        """Pass on what the server wants of others."""
+        if isinstance(frame, Fetch):
+            self.asked.fetch(frame)
+        else:
+            self.asked.confirm(frame.files)
+
+
+async def _soon(waiting: Awaitable[bytes]) -> bytes:
+    try:
+        return await asyncio.wait_for(waiting, limits.SILENT_S)
+    except TimeoutError:
+        raise LinkDownError(f"nothing was heard for {limits.SILENT_S:g} s") from None

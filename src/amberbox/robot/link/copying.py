@@ -1,0 +1,235 @@
+"""Copy sealed journals to the server in pieces, resumable; confirmed once it has verified them.
+
+A file is confirmed in the store only after the server has checked its hash, chain and signature.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import http.client
+import os
+import ssl
+import threading
+import time
+import zlib
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Protocol
+from urllib.parse import urlsplit
+
+import msgspec
+
+from amberbox.blackbox.deletion.confirm import confirm
+from amberbox.blackbox.incidents.incident import Incident, load_all
+from amberbox.blackbox.segments import manifest
+from amberbox.blackbox.segments.entries import Sealed
+from amberbox.blackbox.store import Store
+from amberbox.link import uploads
+from amberbox.link.bucket import TokenBucket
+from amberbox.link.limits import PIECE_BYTES
+from amberbox.link.proof import proof_of
+from amberbox.link.uploads import Proof, Verdict
+from amberbox.robot.link.copyrule import Situation, due
+from amberbox.robot.link.dialing import authorization
+from amberbox.robot.link.options import LinkOptions
+from amberbox.robot.link.remarks import Remarks
+
+_TIMEOUT_S = 30.0
+_VERIFY_S = 300.0
+_READ_BYTES = 1 << 20
+_TRIES = 5
+"""How often one piece is begun anew before the file waits for another time."""
+
+
+class CopyError(Exception):
+    """The copy did not work out this time; what was sent stays on the server."""
+
+
+@dataclass(frozen=True, slots=True)
+class Reply:
+    """What the server answered."""
+
+    status: int
+    offset: int
+    state: str
+    body: bytes
+
+
+class Sending(Protocol):
+    """Sends one request about a journal to the server; raises CopyError when it cannot."""
+
+    def __call__(
+        self, method: str, path: str, headers: dict[str, str], body: bytes | memoryview
+    ) -> Reply: ...
+
+
+@dataclass(slots=True)
+class HttpSending:
+    """Requests over one connection that is kept open, and made anew after trouble."""
+
+    options: LinkOptions
+    context: Callable[[], ssl.SSLContext | None]
+    _connection: http.client.HTTPConnection | None = None
+
+    def __call__(
+        self, method: str, path: str, headers: dict[str, str], body: bytes | memoryview
+    ) -> Reply:
+        """Send a request and read the whole answer."""
+        base = urlsplit(self.options.url).path.rstrip("/")
+        length = {"Content-Length": str(len(body))} if method != "HEAD" else {}
+        try:
+            connection = self._connection = self._connection or self._connect()
+            if connection.sock is not None:
+                connection.sock.settimeout(_VERIFY_S if method == "POST" else _TIMEOUT_S)
+            everything = authorization(self.options) | headers | length
+            connection.request(method, base + path, body or None, everything)
+            answer = connection.getresponse()
+            content = answer.read(1 << 20)
+            offset = int(answer.headers.get(uploads.OFFSET) or 0)
+        except (OSError, http.client.HTTPException, ValueError) as error:
+            self.close()
+            raise CopyError(f"{type(error).__name__}: {error}") from error
+        return Reply(answer.status, offset, answer.headers.get(uploads.STATE, ""), content)
+
+    def close(self) -> None:
+        """Close the connection."""
+        if self._connection is not None:
+            self._connection.close()
+            self._connection = None
+
+    def _connect(self) -> http.client.HTTPConnection:
+        parts = urlsplit(self.options.url)
+        host, context = parts.hostname or "", self.context()
+        if context is None:
+            return http.client.HTTPConnection(host, parts.port or 80, timeout=_TIMEOUT_S)
+        return http.client.HTTPSConnection(
+            host, parts.port or 443, timeout=_TIMEOUT_S, context=context
+        )
+
+
+@dataclass(slots=True)
+class Copier:
+    """Copies what the rule names, one journal after another; blocks, for a thread of its own."""
+
+    store: Store
+    options: LinkOptions
+    send: Sending
+    situation: Callable[[], Situation] = Situation
+    bucket: TokenBucket = field(default_factory=lambda: TokenBucket(0.0))
+    stop: threading.Event = field(default_factory=threading.Event)
+    remarks: Remarks | None = None
+    _refused: set[str] = field(default_factory=set)
+
+    def waiting(self) -> list[str]:
+        """Name the journals that the rule wants copied now, in order."""
+        found = manifest.read(self.store.path)
+        pins = [incident for incident in load_all(self.store) if incident.is_pinned]
+        sealed = [s for s in found.sealed.values() if s.journal not in found.raw_gone]
+        rule = self.options.copy
+        ordered = due(sealed, found.confirmed, pins, rule, self.situation())
+        held = _held_by(self.store, pins) if any(_is_first(s, pins) for s in ordered) else []
+        names = [s.journal for s in ordered]
+        known = {*names, *found.confirmed}
+        names = [*(name for name in held if name not in known), *names]
+        return [name for name in names if name not in self._refused]
+
+    def step(self) -> bool:
+        """Copy the next journal; tell whether there was one. Raises CopyError for another time."""
+        name = next(iter(self.waiting()), None)
+        if name is None or self.stop.is_set():
+            return False
+        verdict = self.copy(name)
+        if verdict is None:
+            self._refused.add(name)  # it is gone meanwhile
+        elif verdict.state == "quarantined":
+            self._refused.add(name)
+            if self.remarks is not None:
+                self.remarks.say("copy_refused", f"the server refuses {name}: {verdict.reason}")
+        else:
+            self._confirm(name)
+        return True
+
+    def copy(self, name: str) -> Verdict | None:
+        """Send a journal, or the rest of it; return the server's verdict, None if it is gone."""
+        path = self.store.journal_path(name)
+        try:
+            about = _about(path)
+        except FileNotFoundError:
+            return None
+        proof = proof_of(self.store.path, name) or Proof()
+        address = uploads.address(self.store.id, name)
+        for _ in range(_TRIES):
+            self._pieces(path, address, about)
+            reply = self.send("POST", address, about, msgspec.json.encode(proof))
+            if reply.status == 200:
+                return _verdict(reply)
+            if reply.status != 409:
+                raise CopyError(f"the server answers {reply.status} {reply.body[:200]!r}")
+        raise CopyError("the file does not arrive as it is sent")
+
+    def _pieces(self, path: Path, address: str, about: dict[str, str]) -> None:
+        """Send what the server has not got yet."""
+        reply = self.send("HEAD", address, about, b"")
+        at, end, tries = reply.offset, int(about[uploads.BYTES]), 0
+        if reply.status != 200:
+            raise CopyError(f"the server answers {reply.status}")
+        if reply.state not in ("", "incoming"):
+            return  # its fate is known: the end of it is asked for
+        with path.open("rb") as file:
+            while at < end:
+                piece = self._next(file.fileno(), at)
+                headers = {**about, uploads.OFFSET: str(at), uploads.CRC: str(zlib.crc32(piece))}
+                reply = self.send("PATCH", address, headers, piece)
+                if reply.status not in (200, 204, 409):
+                    raise CopyError(f"the server answers {reply.status} {reply.body[:200]!r}")
+                tries = tries + 1 if reply.offset <= at else 0
+                if tries >= _TRIES:
+                    raise CopyError("pieces do not arrive as they are sent")
+                at = reply.offset
+
+    def _next(self, descriptor: int, at: int) -> bytes:
+        """Read a piece when it is its turn; raises CopyError when the copy is to end."""
+        piece = os.pread(descriptor, PIECE_BYTES, at)
+        if self.stop.wait(self.bucket.take(len(piece), time.monotonic())) or self.stop.is_set():
+            raise CopyError("the copy was stopped")
+        return piece
+
+    def _confirm(self, name: str) -> None:
+        """Note that the server holds a journal: it is the first to go when room is needed."""
+        host = urlsplit(self.options.url).netloc
+        confirm(self.store, [name], host)
+        self._refused.add(name)  # the keeper may take a while to write it down
+
+
+def _verdict(reply: Reply) -> Verdict:
+    try:
+        return msgspec.json.decode(reply.body, type=Verdict)
+    except msgspec.DecodeError as error:
+        raise CopyError(f"the server's verdict cannot be read: {error}") from error
+
+
+def _about(path: Path) -> dict[str, str]:
+    """Return what tells a file from every other: its size and hash."""
+    digest, size = hashlib.sha256(), 0
+    with path.open("rb") as file:
+        while part := file.read(_READ_BYTES):
+            digest.update(part)
+            size += len(part)
+    return {uploads.BYTES: str(size), uploads.SHA256: digest.hexdigest()}
+
+
+def _is_first(journal: Sealed, pins: Sequence[Incident]) -> bool:
+    return any(pin.holds_received(journal.run, journal.start_ns, journal.end_ns) for pin in pins)
+
+
+def _held_by(store: Store, pins: Sequence[Incident]) -> list[str]:
+    """Name the journals of the ring that incidents hold whole; they are not sealed."""
+    done = {pin.id for pin in pins if pin.state == "complete"}
+    return [name for name, incident in _ring_files(store) if incident in done]
+
+
+def _ring_files(store: Store) -> Iterator[tuple[str, str]]:
+    for path in store.journal_files("ring"):
+        if path.parent.parent.parent.name == "incidents":
+            yield f"{path.parent.name}/{path.name}", path.parent.parent.name

@@ -1,0 +1,96 @@
+"""Connections to the server: the WebSocket of the link."""
+
+from __future__ import annotations
+
+import ssl
+from typing import Any, Protocol
+from urllib.parse import urlsplit, urlunsplit
+
+from amberbox.link import limits
+from amberbox.robot.link.options import LinkOptions
+
+_OPEN_S = 10.0
+_SCHEMES = {"https": "wss", "http": "ws", "wss": "wss", "ws": "ws"}
+
+
+class LinkDownError(Exception):
+    """There is no connection, or no longer; trying again may help."""
+
+
+class RefusedError(LinkDownError):
+    """The server is there and does not want this robot."""
+
+
+class Line(Protocol):
+    """One connection to the server; frames are whole binary messages."""
+
+    async def receive(self) -> bytes:
+        """Wait for the next frame; raises LinkDownError at the end."""
+
+    async def send(self, data: bytes) -> None:
+        """Send a frame; raises LinkDownError when nobody is there any more."""
+
+    async def close(self) -> None:
+        """End the connection."""
+
+
+class _WebSocketLine:
+    def __init__(self, connection: Any) -> None:
+        self._connection = connection
+
+    async def receive(self) -> bytes:
+        from websockets.exceptions import ConnectionClosed
+
+        try:
+            data = await self._connection.recv()
+        except (ConnectionClosed, OSError) as error:
+            raise LinkDownError(str(error)) from error
+        return data if isinstance(data, bytes) else b""
+
+    async def send(self, data: bytes) -> None:
+        from websockets.exceptions import ConnectionClosed
+
+        try:
+            await self._connection.send(data)
+        except (ConnectionClosed, OSError) as error:
+            raise LinkDownError(str(error)) from error
+
+    async def close(self) -> None:
+        await self._connection.close()
+
+
+def socket_url(url: str) -> str:
+    """Return the address of the link's socket on a server."""
+    parts = urlsplit(url)
+    return urlunsplit((_SCHEMES[parts.scheme], parts.netloc, parts.path.rstrip("/") + limits.PATH,
+                       "", ""))  # fmt: skip
+
+
+def authorization(options: LinkOptions) -> dict[str, str]:
+    """Return the header by which the server knows the robot."""
+    return {"Authorization": f"Robot {options.robot}:{options.key}"}
+
+
+async def dial(options: LinkOptions, context: ssl.SSLContext | None) -> Line:
+    """Connect to the server.
+
+    Raises RefusedError when it does not let the robot in, LinkDownError when there is no way.
+    """
+    from websockets.asyncio.client import connect
+    from websockets.exceptions import InvalidStatus, WebSocketException
+
+    try:
+        return _WebSocketLine(
+            await connect(
+                socket_url(options.url), ssl=context, additional_headers=authorization(options),
+                compression=None, max_size=limits.FRAME_BYTES, ping_interval=None,
+                open_timeout=_OPEN_S, close_timeout=1.0,
+            )
+        )  # fmt: skip
+    except InvalidStatus as error:
+        status = error.response.status_code
+        if status in (401, 403):
+            raise RefusedError(f"the server refuses this robot's key ({status})") from error
+        raise LinkDownError(f"the server answers {status}") from error
+    except (OSError, WebSocketException, TimeoutError) as error:
+        raise LinkDownError(f"no connection: {error}") from error
