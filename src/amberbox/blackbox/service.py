@@ -10,6 +10,8 @@ from collections.abc import Callable, Mapping
 _STATUS_S = 5.0
 """How often the status is told where no watchdog waits for it."""
 _START_PATIENCE_USEC = 30_000_000
+SPENT = "all inputs have ended, writing the rest"
+"""Status of a recorder that ends by itself and has nothing to do when it is started again."""
 
 
 def notify(message: str, environ: Mapping[str, str] = os.environ) -> bool:
@@ -77,7 +79,7 @@ class Notifier:
         if notify(f"{sign}\nSTATUS={status()}", self._environ):
             self._due = now + self._period_s
 
-    def stopping(self) -> None:
+    def stopping(self, status: str = "writing the rest") -> None:
         """Say that the end of the run has begun."""
         if self._listens:
-            notify("STOPPING=1\nSTATUS=writing the rest", self._environ)
+            notify(f"STOPPING=1\nSTATUS={status}", self._environ)

@@ -20,7 +20,7 @@ from amberbox.blackbox.recorder.ringfolder import place_ring, writers_elsewhere
 from amberbox.blackbox.recorder.room import Room
 from amberbox.blackbox.recorder.supervisor import Supervisor
 from amberbox.blackbox.recorder.syncer import Syncer
-from amberbox.blackbox.service import Notifier
+from amberbox.blackbox.service import SPENT, Notifier
 from amberbox.blackbox.store import Store, create_store, is_locked
 from amberbox.core.clock import NS, Clock, RunClock, SystemClock
 from amberbox.core.errors import AmberboxError, UsageError
@@ -121,7 +121,8 @@ class Recorder:
                 break
 
     def _finish(self, syncer: Syncer, keeper: KeeperProcess | None) -> None:
-        self._notifier.stopping()
+        is_spent = not self._ended_by and not self.stop.is_set()
+        self._notifier.stopping(*((SPENT,) if is_spent else ()))
         self.stop.set()
         self.pipeline.intake.wait_no_more()
         stuck = self._join_sources()

@@ -17,6 +17,7 @@ from amberbox.blackbox.folder.folder import RobotFolder
 from amberbox.blackbox.keeper.ownjournal import Progress
 from amberbox.blackbox.keeper.ownstreams import Row
 from amberbox.blackbox.requests import Request
+from amberbox.blackbox.service import Notifier
 from amberbox.blackbox.store import Store, WriterLock
 from amberbox.core.clock import NS, Clock, SystemClock
 from amberbox.core.errors import UsageError
@@ -110,6 +111,7 @@ class Watcher:
         self._measured_lock = threading.Lock()
         options = () if watch.folder is None else watch.folder.robot.monitoring.publish
         self._publisher = Publisher(options, watch.plan, watch.clock_s)
+        self._notifier = Notifier(monotonic=watch.clock_s)
         if memory.place is not None:
             self._journal.passed(memory.place)
 
@@ -123,8 +125,11 @@ class Watcher:
             with guarded(self._watch.plan):
                 while not stop.is_set():
                     self.step()
+                    self._notifier.ready()
+                    self._notifier.alive(self._told)
                     stop.wait(POLL_S)
         finally:
+            self._notifier.stopping()
             if runner is not None:
                 runner.close()
             self.close()
@@ -138,6 +143,7 @@ class Watcher:
         self._write_measured()
         for block in self._reader.step():
             self._silence.heard()
+            self._notifier.alive(self._told)
             for found in self._evaluation.take(block):
                 self._write(found)
         self._settle()
@@ -224,6 +230,11 @@ class Watcher:
             return statuses
         reason = f"evaluated up to {late_s:.0f} s ago only"
         return list(unknown(statuses, now_ns, late_s, reason))
+
+    def _told(self) -> str:
+        """Say in one line what is being watched, for whoever looks after this process."""
+        behind = "; catching up with the record" if self._evaluation.is_behind else ""
+        return f"{len(self._watch.plan.components)} components{behind}"
 
     def _first(self, place: Place) -> Progress:
         """Say where the reading began: whoever is killed before the next note begins there."""

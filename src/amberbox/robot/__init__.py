@@ -1,0 +1,1 @@
+"""The agent on the robot: keeps everything running that records, monitors and reports."""
