@@ -22,7 +22,7 @@ ONSET_S = (25.0, 60.0)
 """When the first fault begins; before, the robot drives and the windows of monitors fill."""
 LATER_S = (0.0, 40.0)
 """How much later the second fault begins."""
-AFTER_S = 120.0
+AFTER_S = 90.0
 """How long a mission goes on after its last fault has begun."""
 CHUNK_S = 30.0
 NAMES = {
@@ -46,8 +46,7 @@ class Planted:
 class Mission:
     """What happens on a mission: it follows from the seed alone.
 
-    ``seed`` makes the route and the noise, ``cart`` is whether the robot starts with a cart of
-    180 kg.
+    ``seed`` makes the route and the noise, ``cart`` is whether the robot starts with a cart.
     """
 
     seed: int
@@ -83,6 +82,12 @@ def with_faults(seed: int, faults: Sequence[Fault], chance: random.Random) -> Mi
     scenario = next((f.scenario for f in faults if f.scenario != "transport"), "transport")
     cart = scenario == "transport" and chance.random() < 0.5
     return Mission(seed, scenario, cart, tuple(planted), planted[-1].at_s + AFTER_S)
+
+
+def nominal(seed: int, seconds: float) -> Mission:
+    """Draw a mission without any fault: most of them transport, some charge, some stand."""
+    scenario = ("transport", "transport", "transport", "charging", "standing")[seed % 5]
+    return Mission(seed, scenario, scenario == "transport" and seed % 2 == 0, (), seconds)
 
 
 def magnitude(fault: Fault, chance: random.Random) -> float:

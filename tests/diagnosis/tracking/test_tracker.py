@@ -59,13 +59,14 @@ def test_unknown_outputs_and_those_never_told_are_no_evidence() -> None:
     assert states(tracker) == {CLEAR: "present"}
 
 
-def test_a_blocked_symptom_opens_nothing_until_it_is_free() -> None:
+def test_a_blocked_symptom_counts_and_its_absence_does_not() -> None:
     tracker = begun()
-    assert run(tracker, [*WELL, At(5, CLEAR, blocked_by=("bus",))], 30) == []
-    assert CLEAR not in states(tracker)
-    assert [one.at_ns for one in diagnoses(run(tracker, [At(31.1, CLEAR)], 31.2))] == [
-        seconds(31.1)
-    ]
+    found = run(tracker, [*WELL, At(5, CLEAR, blocked_by=("bus",))], 30)
+    assert [one.at_ns for one in diagnoses(found)][0] == seconds(5)
+    assert states(tracker)[CLEAR] == "present"
+    tracker = begun()
+    run(tracker, [At(1, ALIVE, "absent", ("bus",)), At(5, CLEAR)], 60)
+    assert ALIVE not in states(tracker)
 
 
 def test_absence_counts_only_after_the_time_a_cause_may_take() -> None:
