@@ -146,11 +146,17 @@ def test_missions(asked: Any) -> None:
     assert asked(f"mission(M, _, {at(39)}, {at(40)})") == [{"M": "m1"}]
 
 
+def test_what_the_watcher_said_last_is_so_now(asked: Any) -> None:
+    goal = "now(T), status(laser, ok, T, T)"  # it wrote last at 59 s
+    assert asked(goal, "--to", str(at(60))) == [{"T": at(60) - 1}]
+    assert asked(goal, "--to", str(at(70))) == []
+
+
 def test_statuses_are_intervals_between_changes(asked: Any) -> None:
     assert asked("status(laser, L, F, T)") == [
         {"L": "ok", "F": at(1), "T": at(20)},
         {"L": "error", "F": at(20), "T": at(40)},
-        {"L": "ok", "F": at(40), "T": at(59) + 1},
+        {"L": "ok", "F": at(40), "T": at(62) + 1},  # silent for 3 s
     ]
     assert [a["S"] for a in asked("state(laser, S, From, _)")] == [
         "nominal", "alive", "clear", "nominal",

@@ -80,7 +80,7 @@ def _between(
     start_ns = from_ns - round(WARM_UP_S * NS)
     part = Part(from_ns + round(engine.history_s * NS))  # windows fill within the span
     for block in blocks(plan, store, engine, part):
-        if block.until_ns >= start_ns:
+        if block.until_ns >= start_ns and block.start_ns <= to_ns:
             until_ns = min(block.until_ns, to_ns)
             yield replace(block, start_ns=max(block.start_ns, start_ns), until_ns=until_ns)
         if block.until_ns >= to_ns:

@@ -18,6 +18,7 @@ from amberbox.diagnosis.rules.intervals import Interval, Keys, Span
 from amberbox.diagnosis.rules.proof import Source
 from amberbox.diagnosis.rules.terms import Term
 from amberbox.monitoring.engine.findings import Condition
+from amberbox.monitoring.messages.board import SILENT_NS
 from amberbox.monitoring.messages.records import COMPONENT_STATE
 
 LASTS = "lasts"
@@ -99,8 +100,18 @@ class Statuses:
     @cached_property
     def said(self) -> list[_Said]:
         """Conditions of components in order of time, run by run of the watcher."""
-        runs = (self.window.cut(run) for run in self.window.watched)
+        runs = (self.window.cut(run) for run in self._heard())
         return [said for run in runs if run[0] < run[1] for said in self._in_run(run)]
+
+    def _heard(self) -> Iterator[Span]:
+        """Yield the watcher's runs; each counts until its silence would be noticed.
+
+        Otherwise nothing would be so now: a watcher writes a little behind the recorder.
+        """
+        runs = self.window.watched
+        ends = (*(run[0] for run in runs[1:]), self.window.span[1])
+        for (first, last), end in zip(runs, ends, strict=True):
+            yield first, max(last, min(last + SILENT_NS, end))
 
     def levels(self, keys: Keys, span: Span | None) -> Iterator[Interval]:
         """Yield the levels of components: ok, warn, error, stale, unknown."""
