@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import stat
 import subprocess
 import sys
@@ -26,6 +27,7 @@ from sqlalchemy import (
 from sqlalchemy.exc import IntegrityError
 from sqlalchemy.schema import CreateIndex, CreateTable
 
+import amberbox.fleet
 from amberbox.core.errors import AmberboxError, UsageError
 from amberbox.fleet.database.database import Database, DatabaseBusyError
 from amberbox.fleet.database.metadata import METADATA, complete
@@ -277,6 +279,29 @@ def test_every_table_compiles_for_postgresql() -> None:
         assert str(CreateTable(table).compile(dialect=POSTGRESQL))
         for index in table.indexes:
             assert str(CreateIndex(index).compile(dialect=POSTGRESQL))
+
+
+@pytest.mark.parametrize("room", ["accounts", "audit"])
+def test_rooms_write_no_sql_by_hand(room: str) -> None:
+    """What is made by SQLAlchemy is compiled for PostgreSQL, too, in every test of the room."""
+    folder = Path(amberbox.fleet.__path__[0]) / room
+    sources = {path.name: path.read_text() for path in folder.glob("*.py")}
+    assert sources
+    by_hand = re.compile(r"exec_driver_sql|\btext\(\"|import.*\btext\b|executescript")
+    assert [name for name, source in sources.items() if by_hand.search(source)] == []
+
+
+def test_processes_that_start_together_make_one_database(tmp_path: Path) -> None:
+    program = (
+        "import sys; from pathlib import Path\n"
+        "from amberbox.fleet.database.database import Database\n"
+        "Database(Path(sys.argv[1])).close()\n"
+    )
+    command = [sys.executable, "-c", program, str(tmp_path / "server.db")]
+    running = [subprocess.Popen(command, stderr=subprocess.PIPE, text=True) for _ in range(3)]
+    assert [process.communicate(timeout=60)[1] for process in running] == [""] * 3
+    with Database(tmp_path / "server.db", read_only=True).reading() as connection:
+        assert connection.execute(select(SCHEMA_VERSION.c.what)).scalars().all() == ["made"]
 
 
 def test_all_tables_of_the_server_are_made(tmp_path: Path) -> None:

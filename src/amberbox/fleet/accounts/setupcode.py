@@ -59,7 +59,7 @@ class SetupCode:
     def text(self, url: str) -> str:
         """Return what is said on stderr."""
         return (
-            f"Nobody can administer this server yet. Open {url} and enter this code:\n\n"
+            f"To become an admin of this server, open {url} and enter this code:\n\n"
             f"    {self.code}\n\n"
             f"It holds for {LASTS_NS // (60 * NS)} minutes and once. It is also in {self.path}.\n"
         )

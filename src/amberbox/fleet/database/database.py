@@ -22,6 +22,7 @@ from amberbox.fleet.database.schema import MIGRATIONS, Migration, check_version,
 
 FILE = "server.db"
 BUSY_S = 10.0
+_READERS = 48
 _BEGIN = "amberbox_begin"
 
 
@@ -119,7 +120,7 @@ def _make_private(path: Path) -> None:
 def _engine(path: Path, read_only: bool) -> Engine:
     address = f"file:{quote(str(path.absolute()))}?mode={'ro' if read_only else 'rw'}"
     connect = partial(sqlite3.connect, address, uri=True, check_same_thread=False)
-    engine = create_engine("sqlite://", creator=connect, poolclass=QueuePool, pool_size=16)
+    engine = create_engine("sqlite://", creator=connect, poolclass=QueuePool, pool_size=_READERS)
     event.listen(engine, "connect", _configure_reader if read_only else _configure)
     event.listen(engine, "begin", _begin)
     return engine
