@@ -3,6 +3,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from amberbox.diagnosis.explanation import as_text, explain
+from amberbox.diagnosis.explanation.explanation import Member
 from tests.diagnosis.explanation.robot import (
     BLIND,
     ENCODER,
@@ -84,3 +85,16 @@ def test_remedies_stand_by_the_answers_that_make_them_sure() -> None:
     text = " ".join(as_text(explained(*STOPPED)).split())
     assert "over 99 %; then: turn the button until it is out" in text
     assert "What helps, once it is sure: fasten the terminals." in text
+
+
+def test_what_robots_of_a_team_say_is_told_early_and_where_there_is_more() -> None:
+    says = Member("r2", "../my r2", "open", "It is flat.", use="no", next="charge it")
+    silent = Member("r3", "r3", "unknown", "Nothing is known of it.")
+    text = as_text(replace(explained(*ENCODER), members=(says, silent)))
+    first, _, rest = " ".join(text.split()).partition(" What is broken ")
+    assert "r2 says: It is flat. Can the robot be used?" in first
+    assert "r3" not in first, "who has nothing to say is no news"
+    assert rest.index("r3: Nothing is known of it.") < rest.index("How sure")
+    assert "r2: It is flat. Can it be used? No. Next: Charge it." in rest
+    assert "more: amberbox diagnose '../my r2'" in rest
+    assert "say themselves" not in as_text(explained(*ENCODER))
