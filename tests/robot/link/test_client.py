@@ -1,0 +1,107 @@
+"""The link from end to end: what the journals say is on the server, once each."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from amberbox.blackbox.journal import reserved
+from amberbox.blackbox.store import open_store
+from amberbox.fleet.database.database import Database
+from amberbox.fleet.linkend.board import board
+from amberbox.fleet.linkend.presence import presences
+from amberbox.fleet.linkend.server import Hooks
+from amberbox.link.frames import Row
+from amberbox.robot.link.remembered import recall
+from tests.robot.link.rig import (
+    Watcher,
+    client_of,
+    held,
+    linked,
+    put_aside,
+    recorded,
+    serving,
+    until,
+)
+
+
+@pytest.fixture
+def database(tmp_path: Path) -> Iterator[Database]:
+    found = Database(tmp_path / "server.db")
+    yield found
+    found.close()
+
+
+def test_rows_arrive_once_and_are_acknowledged(tmp_path: Path, database: Database) -> None:
+    async def scene() -> None:
+        watcher = Watcher(tmp_path / "store")
+        watcher.write(500, 3)
+        async with serving(database) as (_, port):
+            client = client_of(watcher.store, port)
+            async with linked(client):
+                await until(lambda: len(held(database)) == 503)
+                for _ in range(20):
+                    watcher.write(5, 1)
+                await until(lambda: held(database) == recorded(tmp_path / "store"))
+                await until(lambda: client.progress.offset.offset_ns is not None)
+        watcher.close()
+        remembered = recall(watcher.store)
+        assert remembered is not None and remembered.cursor["watch"].seq > 600
+
+    asyncio.run(scene())
+    with database.reading() as connection:
+        assert [s["component"] for s in board(connection, "r1")] == ["c0", "c1", "c2", "c3", "c4"]
+        [seen] = presences(connection)
+    assert not seen.connected and seen.store_id == open_store(tmp_path / "store").id
+    assert not put_aside(database)
+
+
+def test_an_alarm_does_not_wait_behind_the_backlog(tmp_path: Path, database: Database) -> None:
+    arrived: list[Row] = []
+
+    async def scene() -> None:
+        watcher = Watcher(tmp_path / "store")
+        for _ in range(10):
+            watcher.write(500)
+        hooks = Hooks(rows=lambda robot, store_id, rows: arrived.extend(rows))
+        async with serving(database, hooks) as (_, port):
+            async with linked(client_of(watcher.store, port, rate=400_000)):
+                await until(lambda: len(arrived) > 100)
+                watcher.write(0, 1)
+                await until(lambda: any(row.channel == reserved.EVENT for row in arrived))
+                await until(lambda: held(database) == recorded(tmp_path / "store"))
+        watcher.close()
+
+    asyncio.run(scene())
+    [place] = [n for n, row in enumerate(arrived) if row.channel == reserved.EVENT]
+    assert place < 4000 < len(arrived)
+
+
+def test_a_writer_that_begins_later_is_told_of(tmp_path: Path, database: Database) -> None:
+    async def scene() -> None:
+        watcher = Watcher(tmp_path / "store")
+        async with serving(database) as (_, port), linked(client_of(watcher.store, port)):
+            await asyncio.sleep(0.3)
+            watcher.write(3)
+            await until(lambda: len(held(database)) == 3)
+        watcher.close()
+
+    asyncio.run(scene())
+
+
+def test_a_wrong_key_is_refused_and_said_once(tmp_path: Path, database: Database) -> None:
+    async def scene() -> None:
+        watcher = Watcher(tmp_path / "store")
+        watcher.write(3)
+        async with serving(database) as (_, port):
+            client = client_of(watcher.store, port)
+            client.options = type(client.options)(client.options.url, "r1", "wrong")
+            async with linked(client):
+                await until(lambda: client.progress.attempts > 2)
+        watcher.close()
+
+    asyncio.run(scene())
+    assert not held(database)
