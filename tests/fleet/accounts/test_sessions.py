@@ -37,7 +37,7 @@ from amberbox.fleet.accounts.sessions import (
     touch_session,
 )
 from amberbox.fleet.accounts.tables import SESSIONS
-from amberbox.fleet.accounts.users import User, add_user
+from amberbox.fleet.accounts.users import User, add_user, disable_user
 from amberbox.fleet.database.database import Database
 from amberbox.testing.clock import ManualClock
 from tests.fleet.accounts.stand import EVIL, HOME, Stand
@@ -132,6 +132,11 @@ def test_sessions_are_listed_and_revoked_one_by_one(stand: Stand) -> None:
         listed = list_sessions(connection, stand.now_ns, anna.user_id)
         assert [one.address for one in listed] == ["10.0.0.8", HOME]
         assert [one.agent for one in listed] == ["Firefox", "Firefox"]
+        touch_session(connection, stand.now_ns + NS, first.session_id)
+        listed = list_sessions(connection, stand.now_ns, anna.user_id)
+        times = [(one.created_ns, one.seen_ns) for one in listed]
+        start_ns = stand.now_ns - 60 * NS
+        assert times == [(stand.now_ns, stand.now_ns), (start_ns, stand.now_ns + NS)]
         assert not revoke_session(connection, bert.user_id, first.session_id)
         assert revoke_session(connection, anna.user_id, first.session_id)
         assert not revoke_session(connection, anna.user_id, first.session_id)
@@ -145,6 +150,16 @@ def test_all_sessions_but_this_one_are_revoked(stand: Stand) -> None:
     with stand.database.begin() as connection:
         assert revoke_sessions(connection, user.user_id, but=sessions[1].session_id) == 2
     assert [stand.whose(one.secret) is not None for one in sessions] == [False, True, False]
+
+
+def test_a_session_of_a_closed_account_opens_nothing(stand: Stand) -> None:
+    """Also one that was begun in the same moment as the account was closed."""
+    stand.add_user("root.one", Role.ADMIN)
+    user = stand.add_user("anna")
+    with stand.database.begin() as connection:
+        disable_user(connection, stand.now_ns, "anna")
+        session = begin_session(connection, stand.now_ns, user.user_id, HOME)
+    assert stand.whose(session.secret) is None
 
 
 def test_a_request_is_noted_every_half_minute(stand: Stand) -> None:

@@ -65,6 +65,8 @@ def test_it_is_never_said_what_was_wrong(stand: Stand) -> None:
             stand.sign_in(name, password)
         said.add(str(refused.value))
     assert len(said) == 1
+    told = [(row.object, row.result, row.details) for row in stand.log()]
+    assert told == [(name, "refused", '{"why": "wrong login"}') for name in ("anna", "?", "gone")]
 
 
 def test_twenty_wrong_logins(stand: Stand) -> None:
