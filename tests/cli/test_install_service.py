@@ -103,6 +103,19 @@ def test_words_are_quoted_for_systemd(word: str, quoted: str) -> None:
     assert argument(word) == quoted
 
 
+def test_a_robot_with_monitors_is_supervised(
+    service: Service, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert "ExecReload" not in unit_text(service)
+    assert " record --quiet " in command_line(service)
+    (folder / "components").mkdir()
+    (folder / "components" / "motor.yaml").write_text("component_name: motor\n")
+    assert main(["install-service", str(folder), "--name", "amberbox-test"]) == 0
+    shown = capsys.readouterr().out
+    assert f" -m amberbox run --quiet {folder}\n" in shown
+    assert "  ExecReload=/bin/kill -HUP $MAINPID\n" in shown
+
+
 def test_a_dollar_is_no_variable(service: Service) -> None:
     assert command_line(replace(service, folder=Path("/data/a$b"))).endswith(" /data/a$$b")
 
@@ -113,7 +126,7 @@ def test_a_dollar_is_no_variable(service: Service) -> None:
 )
 def test_systemd_finds_nothing_wrong_with_it(service: Service, tmp_path: Path) -> None:
     odd = replace(service, folder=tmp_path / "my 100% robot", store=tmp_path / "a b")
-    for number, one in enumerate((service, odd)):
+    for number, one in enumerate((service, odd, replace(service, verb="run"))):
         path = tmp_path / f"amberbox-test{number}.service"
         path.write_text(unit_text(one))
         done = subprocess.run(["systemd-analyze", "verify", path], capture_output=True, text=True)

@@ -1,4 +1,4 @@
-"""The systemd unit that makes a computer record a robot folder from its start on."""
+"""The systemd unit that makes a computer record, and watch, a robot from its start on."""
 
 from __future__ import annotations
 
@@ -31,6 +31,8 @@ class Service:
     write_s: float
     python: Path = Path(sys.executable)
     ring: Path | None = None
+    verb: str = "record"
+    """What runs: the recorder alone, or ``run`` that supervises it and what monitors."""
 
     @property
     def unit(self) -> str:
@@ -43,14 +45,15 @@ class Service:
         return UNITS / self.unit
 
 
-def service_of(folder: RobotFolder, name: str, user: str) -> Service:
+def service_of(folder: RobotFolder, name: str, user: str, verb: str = "record") -> Service:
     """Describe the service of a robot folder; raise UsageError for a name systemd cannot use."""
     if not is_id(name):
         raise UsageError(f"'{name}' is no name for a service", f"--name {derive_id(name)}")
     path, store = folder.path.resolve(), folder.store_path.resolve()
     options = folder.robot.store
     ring = (path / options.ring_path).resolve() if options.ring_path else None
-    return Service(name, user, folder.robot.id, path, store, options.write_s, ring=ring)
+    about = name, user, folder.robot.id, path, store, options.write_s
+    return Service(*about, ring=ring, verb=verb)
 
 
 def unit_text(service: Service) -> str:
@@ -78,6 +81,7 @@ def _service(service: Service) -> Sequence[str]:
         "[Service]",
         "Type=notify",
         f"ExecStart={command_line(service)}",
+        *_reloading(service),
         f"User={_plain(service.user)}",
         f"RuntimeDirectory={service.name}",
         f"WatchdogSec={watchdog_s}",
@@ -94,6 +98,10 @@ def _service(service: Service) -> Sequence[str]:
         "NoNewPrivileges=yes",
         *_protection(service),
     )
+
+
+def _reloading(service: Service) -> Sequence[str]:
+    return ("ExecReload=/bin/kill -HUP $MAINPID",) if service.verb == "run" else ()
 
 
 def _protection(service: Service) -> Sequence[str]:
@@ -126,8 +134,8 @@ def _lies_in(path: Path, places: Sequence[str]) -> bool:
 
 
 def command_line(service: Service) -> str:
-    """Return the command that records, quoted for systemd."""
-    words = (service.python, "-m", "amberbox", "record", "--quiet", service.folder)
+    """Return the command that records, or runs everything, quoted for systemd."""
+    words = (service.python, "-m", "amberbox", service.verb, "--quiet", service.folder)
     return " ".join(argument(word).replace("$", "$$") for word in words)
 
 

@@ -17,6 +17,7 @@ from amberbox.blackbox.folder.folder import load_folder
 from amberbox.blackbox.store import replace_file, sync_folder
 from amberbox.blackbox.unitfile import MARK, Service, service_of, unit_text
 from amberbox.core.errors import AmberboxError, UsageError
+from amberbox.robot.supervisor.child import has_components
 
 Run = Callable[[Sequence[str]], None]
 
@@ -39,7 +40,8 @@ def run(args: argparse.Namespace) -> int:
     if not Path(args.folder).is_dir():
         raise UsageError(f"'{args.folder}' is no folder", "a service records a robot folder")
     folder = load_folder(args.folder)
-    service = service_of(folder, args.name, args.user or owner(folder.path))
+    verb = "run" if has_components(folder.path) else "record"
+    service = service_of(folder, args.name, args.user or owner(folder.path), verb)
     plan = removal(service) if args.uninstall else installation(service)
     if not args.apply:
         print("\n".join(plan.lines()))
@@ -154,7 +156,7 @@ def _run(command: Sequence[str]) -> None:
     except FileNotFoundError:
         raise AmberboxError(
             "there is no systemctl: this computer does not use systemd",
-            "start 'amberbox record' with what starts services here",
+            "start 'amberbox run' with what starts services here",
         ) from None
     if done.returncode:
         said = done.stderr.strip().splitlines() or [f"exit status {done.returncode}"]

@@ -256,6 +256,7 @@ def test_keys(folder: Path, host: Host) -> None:
 
 
 def test_the_unit_that_records_this_folder(folder: Path, host: Host) -> None:
+    run = service_of(load_folder(folder), "box", "root", "run")
     text = unit_text(service_of(load_folder(folder), "box", "root"))
     write(host, {
         "/etc/systemd/system/a.service": "[Service]\nExecStart=/usr/bin/true\n",
@@ -268,6 +269,8 @@ def test_the_unit_that_records_this_folder(folder: Path, host: Host) -> None:
     assert unit is not None and (unit.name, unit.enabled, unit.watchdog) == (
         "box.service", False, "10"
     )  # fmt: skip
+    write(host, {"/etc/systemd/system/box.service": unit_text(run)})
+    assert find_unit(folder, host) == unit, "one that supervises the recorder records, too"
     link(host, "/etc/systemd/system/multi-user.target.wants/box.service",
          "/etc/systemd/system/box.service")  # fmt: skip
     box = record(folder)

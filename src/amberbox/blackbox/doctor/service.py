@@ -95,7 +95,7 @@ def find_unit(folder: Path, host: Host) -> Unit | None:
     wanted = argument(folder.resolve()).replace("$", "$$")
     for path in sorted(units.glob("*.service")):
         text = host.text(f"{UNITS}/{path.name}")
-        command = re.search(r"^ExecStart=.*amberbox.* record(.*)$", text, re.M)
+        command = re.search(r"^ExecStart=.*amberbox.* (?:record|run)(.*)$", text, re.M)
         if command and command[1].endswith(f" {wanted}"):
             watchdog = re.search(r"^WatchdogSec=(\S+)", text, re.M)
             enabled = any(units.glob(f"*.wants/{path.name}"))

@@ -41,7 +41,7 @@ def children_of(folder: Path, write_s: float, *, quiet: bool = True) -> list[Chi
     One that talks to a server joins here, at the last stage: it has what all others have written.
     """
     recorder = Child(
-        RECORD, amberbox(RECORD, "--quiet", str(folder)), stage=1, end_s=9.5,
+        RECORD, amberbox(RECORD, "--quiet", str(folder)), stage=1, end_s=9.0,
         watchdog_s=max(10.0, 4 * write_s), outlives=True,
     )  # fmt: skip
     words = ("--quiet",) if quiet else ()

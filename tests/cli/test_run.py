@@ -1,0 +1,160 @@
+"""``amberbox run``: a whole box whose parts are killed, and that ends in order."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import amberbox
+from amberbox.blackbox.journal.head import read_head
+from amberbox.blackbox.store import is_locked, open_store
+from amberbox.cli.main import main
+from amberbox.robot.supervisor.notes import STATE_FILE
+
+SIM = "- sim:\n    seed: 1\n    topics: [{name: odom}]\n"
+BASE = "component_name: base\nmodes: [base/driving.yaml]\n"
+DRIVING = """\
+name: driving
+monitor: range
+mappings:
+  - mapping:
+      inputs: [sim_odom.twist_linear_x]
+      outputs:
+        - output: {name: slow, type: bool, expected: true}
+arguments: {max: 80}
+"""
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    made = tmp_path / "robot"
+    (made / "components" / "base").mkdir(parents=True)
+    (made / "robot.yaml").write_text("id: r\nstore: {min_free: 0, quota_percent: 100}\n")
+    (made / "black_box.yaml").write_text(SIM)
+    (made / "components" / "base.yaml").write_text(BASE)
+    (made / "components" / "base" / "driving.yaml").write_text(DRIVING)
+    return made
+
+
+class Box:
+    """Runs ``amberbox run``; its children are known by what it writes down."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.log = folder, folder.parent / "log"
+        command = [sys.executable, "-m", "amberbox", "run", "--quiet", str(folder)]
+        with self.log.open("ab") as log:
+            self.process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stderr=log)
+
+    def child(self, name: str) -> dict[str, Any]:
+        try:
+            state = json.loads((self.folder / "store" / STATE_FILE).read_text())
+        except FileNotFoundError:
+            return {}
+        own = state["pid"] == self.process.pid
+        return dict(state["children"].get(name, {})) if own else {}
+
+    def wait_for(self, name: str, state: str = "running", other_than: int | None = None) -> int:
+        """Wait until a child is as said, and another one than before; return its process."""
+
+        def is_there() -> bool:
+            child = self.child(name)
+            return child.get("state") == state and child["pid"] != other_than
+
+        wait_until(is_there, self.log)
+        return int(self.child(name)["pid"])
+
+
+def wait_until(is_so: Callable[[], bool], log: Path, most_s: float = 30.0) -> None:
+    end_s = time.monotonic() + most_s
+    while not is_so():
+        assert time.monotonic() < end_s, log.read_text()
+        time.sleep(0.02)
+
+
+@pytest.fixture
+def boxes() -> Iterator[list[Box]]:
+    begun: list[Box] = []
+    yield begun
+    for box in begun:
+        if box.process.poll() is None:
+            box.process.terminate()
+            box.process.wait(20)
+
+
+def events(folder: Path, kind: str) -> list[str]:
+    with amberbox.open(folder / "store") as record:
+        return [row["text"] for row in record.events().rows() if row["kind"] == kind]
+
+
+def test_whatever_is_killed_recording_goes_on(folder: Path, boxes: list[Box]) -> None:
+    box = Box(folder)
+    boxes.append(box)
+    recorder, watcher = box.wait_for("record"), box.wait_for("watch")
+    os.kill(watcher, signal.SIGKILL)
+    os.kill(recorder, signal.SIGKILL)
+    recorder = box.wait_for("record", other_than=recorder)
+    box.wait_for("watch", "starting", other_than=watcher)
+
+    box.process.kill()  # the supervisor itself: its recorder goes on
+    box.process.wait()
+    store = open_store(folder / "store")
+    before = read_head(store.folder("main"))
+
+    def goes_on() -> bool:
+        head = read_head(store.folder("main"))
+        return bool(head and before and head.watermark_ns > before.watermark_ns)
+
+    wait_until(goes_on, box.log)
+    again = Box(folder)
+    boxes.append(again)
+    assert again.wait_for("record") != recorder
+    again.wait_for("watch", "starting")
+    wait_until(lambda: bool(events(folder, "process_taken_over")), box.log)
+
+    began_s = time.monotonic()
+    again.process.send_signal(signal.SIGTERM)
+    assert again.process.wait(20) == 0
+    assert time.monotonic() - began_s < 10
+    assert not is_locked(store, "main") and not is_locked(store, "watch")
+    assert again.child("record")["state"] == "off"
+    died = events(folder, "process_died")
+    assert any("watch was killed by SIGKILL" in text for text in died)
+    assert any("record was killed by SIGKILL" in text for text in died)
+    assert "was killed by SIGKILL; it starts again in 0.5 s" in again.log.read_text()
+    assert events(folder, "stopped")[-1] == "recording stopped"
+
+
+def test_it_ends_with_inputs_that_end(folder: Path) -> None:
+    (folder / "black_box.yaml").write_text(f"{SIM}    speed: max\n    duration_s: 5\n")
+    command = [sys.executable, "-m", "amberbox", "run", "--quiet", str(folder)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    assert done.stderr.splitlines()[-1] == "all inputs have ended"
+    assert len(events(folder, "started")) == 1
+
+
+@pytest.mark.parametrize(
+    ("black_box", "words"),
+    [("- sim: {sed: 1}\n", "did you mean 'seed'"), ("[]\n", "lists nothing to record")],
+)
+def test_a_folder_that_cannot_be_recorded_is_refused_at_the_start(
+    folder: Path, black_box: str, words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (folder / "black_box.yaml").write_text(black_box)
+    assert main(["run", str(folder)]) == 2
+    assert words in capsys.readouterr().err
+    assert not (folder / "store").exists()
+
+
+def test_a_file_is_no_folder(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["run", str(folder / "black_box.yaml")]) == 2
+    assert "is no folder" in capsys.readouterr().err
