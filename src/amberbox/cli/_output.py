@@ -16,6 +16,7 @@ from typing import IO, TYPE_CHECKING, Any
 from amberbox.blackbox.query.fitting import Room
 from amberbox.blackbox.query.tabletext import grid
 from amberbox.core.errors import UsageError
+from amberbox.fleet.archive.where import archive_in
 
 if TYPE_CHECKING:
     from amberbox.blackbox.query.record import Record
@@ -47,12 +48,19 @@ def tell(notes: Iterable[str]) -> None:
 
 @contextmanager
 def opened(where: str) -> Iterator[Record]:
-    """Open a record and say what of it cannot be read."""
+    """Open a record, or a server's archive of many, and say what of it cannot be read."""
     from amberbox.blackbox.query.record import open as open_record
 
-    with open_record(where) as record:
+    archive = archive_in(where)
+    with open_record(where) if archive is None else _opened_archive(*archive) as record:
         tell(record.notes)
         yield record
+
+
+def _opened_archive(folder: Path, robots: Sequence[str]) -> Record:
+    from amberbox.fleet.archive.record import open_archive  # needs what servers have installed
+
+    return open_archive(folder, robots)
 
 
 @contextmanager

@@ -6,12 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from amberbox.blackbox.segments.flat import TableSchema
-from amberbox.fleet.archive.layout import FOLDER
 from amberbox.fleet.archive.log import Snapshot, snapshot
 from amberbox.fleet.archive.pyramid import LEVELS, has_levels, level_schema
-from amberbox.fleet.database.database import FILE
-
-JOURNALS = "journals"
+from amberbox.fleet.archive.where import JOURNALS, TABLES
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,7 +20,7 @@ class Layout:
     @property
     def tables(self) -> Path:
         """Folder of the Delta tables."""
-        return self.folder / FOLDER
+        return self.folder / TABLES
 
     @property
     def journals(self) -> Path:
@@ -49,8 +46,3 @@ def tables_of(schema: TableSchema) -> list[tuple[str, TableSchema]]:
     levels = LEVELS if has_levels(schema) else ()
     raised = [(table_of(schema, level), level_schema(schema, level)) for level in levels]
     return [(table_of(schema), schema), *raised]
-
-
-def is_archive(folder: Path) -> bool:
-    """Tell whether a folder is a server's data folder with an archive in it."""
-    return (folder / FILE).is_file() and (folder / FOLDER).is_dir()

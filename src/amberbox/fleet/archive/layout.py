@@ -20,7 +20,6 @@ from amberbox.core.types import ColumnData, Ragged
 if TYPE_CHECKING:
     import pyarrow as pa
 
-FOLDER = "tables"
 PARTITIONS = ("robot", "day")
 OURS = ("received", "store_id", "writer", "run")
 _TAKEN = frozenset({"log_time", *PARTITIONS, *OURS})

@@ -20,7 +20,7 @@ from amberbox.core.names import identifier
 from amberbox.core.types import Column, Gap, ItemSchema
 from amberbox.fleet.archive.catalogue import Catalogue, Source
 from amberbox.fleet.archive.envelope import envelope
-from amberbox.fleet.archive.files import JOURNALS, Layout, is_archive
+from amberbox.fleet.archive.files import Layout
 from amberbox.fleet.archive.gaps import gaps_of
 from amberbox.fleet.archive.reading import Reader
 from amberbox.fleet.archive.views import run_sql
@@ -151,22 +151,10 @@ class ArchiveRecord(Record):
         )
 
 
-def open_archive(where: str | Path) -> ArchiveRecord | None:
-    """Open an archive for reading; None where there is none.
-
-    ``where`` is a server's data folder, or ``journals/ROBOT`` in it for one robot.
-    """
-    path = Path(where)
-    if is_archive(path):
-        return _opened(path)
-    if path.parent.name == JOURNALS and is_archive(path.parent.parent):
-        return _opened(path.parent.parent, path.name)
-    return None
-
-
-def _opened(folder: Path, *robots: str) -> ArchiveRecord:
+def open_archive(folder: Path, robots: Sequence[str] = ()) -> ArchiveRecord:
+    """Open the archive in a server's data folder for reading: robots by name, else all."""
     database = Database(folder / FILE, read_only=True)
-    return ArchiveRecord(folder, robots=robots, catalogue=Catalogue(database))
+    return ArchiveRecord(folder, robots=tuple(robots), catalogue=Catalogue(database))
 
 
 def _query(

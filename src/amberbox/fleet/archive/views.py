@@ -73,12 +73,14 @@ def _column(column: Column, version: TableSchema) -> str:
 
 
 def _value(stored: str, known: str, wanted: str) -> str:
+    """Undo what the files do to types that Delta does not have."""
+    inner, target = element_type(known), element_type(wanted)
+    if inner in ("time", "uint64") and target is not None:
+        return f"[{_value('x', inner, target)} for x in {stored}]"
     if known == wanted == "time":
         return f"make_timestamp_ns({stored})"
-    if (element_type(known), element_type(wanted)) == ("time", "time"):
-        return f"list_transform({stored}, x -> make_timestamp_ns(x))"
     if known == "uint64":  # stored with the same bits
-        stored = f"({stored}::HUGEINT & 18446744073709551615::HUGEINT)::UBIGINT"
+        stored = f"({stored}::HUGEINT & {2**64 - 1}::HUGEINT)::UBIGINT"
     return f"{stored}::{sql.sql_type(wanted)}"
 
 
