@@ -15,7 +15,6 @@ from pathlib import Path
 
 import pytest
 
-from amberbox.blackbox.folder.folder import load_folder
 from amberbox.blackbox.store import is_store, open_store
 from amberbox.cli._diagnosis_journal import said_until
 from amberbox.cli.main import main
@@ -132,7 +131,7 @@ def world(root: Path, port: int) -> None:
 
 def standing(folder: Path) -> Diagnosis | None:
     """Return the last diagnosis that the watcher of a folder has written."""
-    path = load_folder(folder).store_path
+    path = folder / "store"
     found = said_until(open_store(path), 1 << 62).diagnoses if is_store(path) else ()
     return found[-1] if found else None
 
@@ -141,7 +140,7 @@ def wait_for(folder: Path, is_it: Callable[[Diagnosis], bool]) -> None:
     deadline_s = time.monotonic() + DEADLINE_S
     while (found := standing(folder)) is None or not is_it(found):
         assert time.monotonic() < deadline_s, f"{folder.name}: {found}"
-        time.sleep(0.2)
+        time.sleep(0.5)
 
 
 def names(fault: str) -> Callable[[Diagnosis], bool]:
