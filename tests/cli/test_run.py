@@ -15,10 +15,10 @@ from typing import Any
 import pytest
 
 import amberbox
+from amberbox.blackbox.doctor.supervised import STATE_FILE
 from amberbox.blackbox.journal.head import read_head
 from amberbox.blackbox.store import is_locked, open_store
 from amberbox.cli.main import main
-from amberbox.robot.supervisor.notes import STATE_FILE
 
 SIM = "- sim:\n    seed: 1\n    topics: [{name: odom}]\n"
 BASE = "component_name: base\nmodes: [base/driving.yaml]\n"

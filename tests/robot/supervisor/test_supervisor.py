@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from amberbox.blackbox.doctor.supervised import STATE_FILE
 from amberbox.blackbox.keeper.remarks import KIND
 from amberbox.blackbox.requests import pending
 from amberbox.blackbox.service import SPENT
@@ -18,7 +19,6 @@ from amberbox.core.errors import UsageError
 from amberbox.robot.supervisor import changes
 from amberbox.robot.supervisor.child import children_of
 from amberbox.robot.supervisor.judgement import Judgement
-from amberbox.robot.supervisor.notes import STATE_FILE
 from amberbox.robot.supervisor.supervisor import Box, Supervisor
 from tests.robot.supervisor.puppet import Theatre
 

@@ -16,6 +16,7 @@ from amberbox.blackbox.doctor.latency import latency
 from amberbox.blackbox.doctor.power import power
 from amberbox.blackbox.doctor.service import recorder, service
 from amberbox.blackbox.doctor.subject import Subject, subject
+from amberbox.blackbox.doctor.supervised import supervisor
 from amberbox.blackbox.doctor.versions import versions
 from amberbox.blackbox.doctor.wear import wear
 from amberbox.core.errors import AmberboxError
@@ -23,7 +24,7 @@ from amberbox.core.errors import AmberboxError
 Check: TypeAlias = Callable[[Subject, Host], Iterable[Finding]]
 
 CHECKS: Sequence[Check] = (
-    *(configuration, passivity, recorder, service, power),
+    *(configuration, passivity, recorder, supervisor, service, power),
     *(clock, rtc, space, file_system, root, wear, latency),
     *(keys, versions),
 )

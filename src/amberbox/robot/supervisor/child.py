@@ -28,7 +28,7 @@ class Child:
     stage: int = 0
     end_s: float = 3.0
     watchdog_s: float = 60.0
-    start_s: float = 60.0
+    start_s: float = 300.0
     nice: int = 0
     outlives: bool = False
     """It goes on when the supervisor is killed."""

@@ -10,12 +10,11 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from amberbox.blackbox import requests
+from amberbox.blackbox.doctor.supervised import STATE_FILE
 from amberbox.blackbox.keeper.remarks import KIND
 from amberbox.blackbox.store import Store, replace_file
 from amberbox.robot.supervisor.output import say
 
-STATE_FILE = "run.json"
-"""In the store: what the supervisor knows of its children."""
 _MOST = 1000
 _AGAIN_S = 5.0
 _END_S = 2.0

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from amberbox.blackbox.doctor.supervised import LOCK
 from amberbox.blackbox.service import Notifier
 from amberbox.blackbox.store import Store, WriterLock
 from amberbox.robot.supervisor.changes import Changes
@@ -22,7 +23,6 @@ from amberbox.robot.supervisor.orphans import WRITER_OF, end_orphan
 from amberbox.robot.supervisor.output import Voice, say
 from amberbox.robot.supervisor.process import Launch, Process, RealProcess
 
-LOCK = "run"
 _TICK_S = 0.2
 _RESTART_S = 9.0
 """How long a child may take to end that is to begin anew."""
