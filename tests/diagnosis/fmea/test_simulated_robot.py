@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from amberbox.cli._known import known_of
 from amberbox.cli.main import main
 from amberbox.core.clock import NS
 from amberbox.core.expression import Expression
-from amberbox.core.types import Batch
+from amberbox.core.types import Batch, IntArray, Ragged
 from amberbox.diagnosis.fmea import Fmea, Known
 from amberbox.diagnosis.fmea.coverage import coverage
 from amberbox.diagnosis.fmea.load import load_fmea
@@ -134,12 +135,18 @@ def test_conditions_show_what_they_are_for(fmea: Fmea, fault: str) -> None:
 
 def _shows(condition: Expression, record: Mapping[str, Batch]) -> bool:
     """Tell whether a condition is true soon after a fault."""
-    series = {}
-    for name in condition.addresses():
-        item, _, column = name.partition(".")
-        series[name] = (record[item].log_time_ns, record[item].columns[column])
+    series = {name: _series(name, record) for name in condition.addresses()}
     at_ns = START_NS + np.arange(round(FAULT_S), round(FAULT_S) + LATEST_S) * NS
     return bool(np.ma.filled(condition.evaluate_series(series, at_ns), False).any())
+
+
+def _series(address: str, record: Mapping[str, Batch]) -> tuple[IntArray, Any]:
+    item, _, column = address.partition(".")
+    name, bracket, place = column.partition("[")
+    values = record[item].columns[name]
+    if isinstance(values, Ragged) and bracket:
+        values = values.values.reshape(len(values), -1)[:, int(place.rstrip("]"))]
+    return record[item].log_time_ns, values
 
 
 @pytest.mark.parametrize("fault", REACTIONS)
