@@ -66,6 +66,10 @@ def test_what_is_known_first_is_told_and_then_what_changes() -> None:
     ]
 
 
+def test_an_output_whose_input_is_not_there_says_nothing() -> None:
+    assert told(Stand(laser(place=0)).until(1)) == []
+
+
 def test_an_output_that_was_never_known_says_nothing() -> None:
     stand = Stand(laser("bus"), laser(name="bus"))
     stand.find(0.5, "laser", "unknown", None, "not in the message")
