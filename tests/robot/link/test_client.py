@@ -67,12 +67,14 @@ def test_an_alarm_does_not_wait_behind_the_backlog(tmp_path: Path, database: Dat
         for _ in range(10):
             watcher.write(500)
         hooks = Hooks(rows=lambda robot, store_id, rows: arrived.extend(rows))
-        async with serving(database, hooks) as (_, port):
-            async with linked(client_of(watcher.store, port, rate=400_000)):
-                await until(lambda: len(arrived) > 100)
-                watcher.write(0, 1)
-                await until(lambda: any(row.channel == reserved.EVENT for row in arrived))
-                await until(lambda: held(database) == recorded(tmp_path / "store"))
+        async with (
+            serving(database, hooks) as (_, port),
+            linked(client_of(watcher.store, port, rate=400_000)),
+        ):
+            await until(lambda: len(arrived) > 100)
+            watcher.write(0, 1)
+            await until(lambda: any(row.channel == reserved.EVENT for row in arrived))
+            await until(lambda: held(database) == recorded(tmp_path / "store"))
         watcher.close()
 
     asyncio.run(scene())

@@ -42,6 +42,10 @@ _TRIES = 5
 """How often one piece is begun anew before the file waits for another time."""
 
 
+LEAST_BYTES = 16 << 10
+"""Pieces get no smaller than this, however bad the network is."""
+
+
 class CopyError(Exception):
     """The copy did not work out this time; what was sent stays on the server."""
 
@@ -120,6 +124,7 @@ class Copier:
     stop: threading.Event = field(default_factory=threading.Event)
     remarks: Remarks | None = None
     _refused: set[str] = field(default_factory=set)
+    _piece_bytes: int = PIECE_BYTES
 
     def waiting(self) -> list[str]:
         """Name the journals that the rule wants copied now, in order."""
@@ -180,7 +185,7 @@ class Copier:
             while at < end:
                 piece = self._next(file.fileno(), at)
                 headers = {**about, uploads.OFFSET: str(at), uploads.CRC: str(zlib.crc32(piece))}
-                reply = self.send("PATCH", address, headers, piece)
+                reply = self._patch(address, headers, piece)
                 if reply.status not in (200, 204, 409):
                     raise CopyError(f"the server answers {reply.status} {reply.body[:200]!r}")
                 tries = tries + 1 if reply.offset <= at else 0
@@ -188,9 +193,19 @@ class Copier:
                     raise CopyError("pieces do not arrive as they are sent")
                 at = reply.offset
 
+    def _patch(self, address: str, headers: dict[str, str], piece: bytes) -> Reply:
+        """Send a piece; after trouble the next ones are smaller, so that some get through."""
+        try:
+            reply = self.send("PATCH", address, headers, piece)
+        except CopyError:
+            self._piece_bytes = max(self._piece_bytes // 4, LEAST_BYTES)
+            raise
+        self._piece_bytes = min(self._piece_bytes * 2, PIECE_BYTES)
+        return reply
+
     def _next(self, descriptor: int, at: int) -> bytes:
         """Read a piece when it is its turn; raises CopyError when the copy is to end."""
-        piece = os.pread(descriptor, PIECE_BYTES, at)
+        piece = os.pread(descriptor, self._piece_bytes, at)
         if self.stop.wait(self.bucket.take(len(piece), time.monotonic())) or self.stop.is_set():
             raise CopyError("the copy was stopped")
         return piece

@@ -1,0 +1,227 @@
+"""Journals come in pieces over bad networks; what is confirmed is here, byte for byte."""
+
+from __future__ import annotations
+
+import hashlib
+import shutil
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from sqlalchemy import select
+
+from amberbox.blackbox.keeper.keeper import seal
+from amberbox.blackbox.segments import manifest
+from amberbox.blackbox.signing.keys import public_key
+from amberbox.blackbox.store import Store, open_store
+from amberbox.fleet.database.database import Database
+from amberbox.fleet.linkend.events import link_events
+from amberbox.fleet.uploads.desk import Desk
+from amberbox.fleet.uploads.pieces import Incoming
+from amberbox.fleet.uploads.tables import UPLOAD
+from amberbox.link.limits import PIECE_BYTES
+from amberbox.link.proof import proof_of
+from amberbox.link.uploads import Proof, is_journal_name
+from amberbox.robot.link.copying import Copier, CopyError, HttpSending
+from amberbox.robot.link.copyrule import Situation
+from amberbox.robot.link.options import LinkOptions
+from amberbox.testing.proxy import Faults, Proxy
+from amberbox.testing.records import T0_NS, FakeRun, pose_rows
+from tests.fleet.uploads.served import served
+
+
+@pytest.fixture(scope="module")
+def original(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A store with three sealed and signed journals."""
+    path = tmp_path_factory.mktemp("original") / "store"
+    run = FakeRun(path)
+    run.start(T0_NS - 1)
+    for start in (0, 1000, 2000):
+        run.write(pose_rows(start, start + 1000))
+        run.rotate()
+    run.close()
+    seal(open_store(path))
+    return path
+
+
+@pytest.fixture
+def store(tmp_path: Path, original: Path) -> Store:
+    """A copy of it, for one test."""
+    shutil.copytree(original, tmp_path / "store")
+    return open_store(tmp_path / "store")
+
+
+@pytest.fixture
+def desk(tmp_path: Path, store: Store) -> Iterator[Desk]:
+    database = Database(tmp_path / "server.db")
+    yield Desk(tmp_path / "server", database, lambda robot, store_id: public_key(store.path) or "")
+    database.close()
+
+
+def copier_of(store: Store, port: int, copy: str = "always") -> Copier:
+    options = LinkOptions(f"http://127.0.0.1:{port}", "r1", "key-r1", copy=copy)
+    return Copier(store, options, HttpSending(options, lambda: None))
+
+
+def incoming_of(store: Store, name: str, content: bytes | None = None) -> Incoming:
+    content = (store.path / name).read_bytes() if content is None else content
+    return Incoming("r1", store.id, name, hashlib.sha256(content).hexdigest(), len(content))
+
+
+def states(desk: Desk) -> dict[str, str]:
+    with desk.database.reading() as connection:
+        return {row.journal: row.state for row in connection.execute(select(UPLOAD))}
+
+
+def bring(desk: Desk, incoming: Incoming, content: bytes, proof: Proof | None) -> tuple[str, str]:
+    """Bring a file in one piece."""
+    assert desk.patch(incoming, 0, content, zlib.crc32(content)).status == 204
+    answer = desk.post(incoming, proof)
+    return answer.state, answer.text
+
+
+def test_journals_are_copied_verified_and_confirmed(store: Store, desk: Desk) -> None:
+    with served(desk) as port:
+        copier = copier_of(store, port)
+        names = copier.waiting()
+        while copier.step():
+            pass
+    assert len(names) >= 3 and set(states(desk).values()) == {"verified"}
+    for name in names:
+        here = desk.root / "journals" / "r1" / store.id / name
+        assert here.read_bytes() == (store.path / name).read_bytes()
+    assert set(manifest.read(store.path).confirmed) >= set(names)
+    assert not list((desk.root / "incoming").rglob("*.part"))
+    assert not copier_of(store, 1).waiting()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_bad_network_only_takes_longer(store: Store, desk: Desk, seed: int) -> None:
+    faults = Faults(("cut", "mid_frame"), after_bytes=(200, 100_000))
+    with served(desk) as port, Proxy(port, faults, seed) as proxy:
+        copier = copier_of(store, proxy.port)
+        names, tries = copier.waiting(), 0
+        while copier.waiting():
+            tries += 1
+            assert tries < 200
+            try:
+                copier.step()
+            except CopyError:
+                continue
+    assert proxy.struck
+    for name in names:
+        here = desk.root / "journals" / "r1" / store.id / name
+        assert here.read_bytes() == (store.path / name).read_bytes()
+
+
+def test_a_file_that_was_changed_on_the_robot_is_quarantined(store: Store, desk: Desk) -> None:
+    name = store.journal_files("main")[0].relative_to(store.path).as_posix()
+    path = store.path / name
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 1
+    path.write_bytes(content)
+    with served(desk) as port:
+        copier = copier_of(store, port)
+        while copier.step():
+            pass
+    assert states(desk)[name] == "quarantined"
+    assert name not in manifest.read(store.path).confirmed
+    with desk.database.reading() as connection:
+        [told] = link_events(connection, "r1")
+    assert told.kind == "quarantined" and name in told.text
+    [kept] = (desk.root / "quarantine").rglob("*.mcap")
+    assert kept.read_bytes() == bytes(content)
+
+
+def test_a_seal_that_was_written_anew_is_no_proof(store: Store, desk: Desk) -> None:
+    name = store.journal_files("main")[0].relative_to(store.path).as_posix()
+    content = (store.path / name).read_bytes()
+    proof = proof_of(store.path, name)
+    assert proof is not None
+    incoming = incoming_of(store, name)
+    forged = Proof(proof.lines.replace('"bytes":', '"bytes": '))
+    assert bring(desk, incoming, content, forged)[0] == "quarantined"
+
+
+def test_another_key_and_no_proof_are_refused(store: Store, desk: Desk, tmp_path: Path) -> None:
+    first, second = (p.relative_to(store.path).as_posix() for p in store.journal_files("main")[:2])
+    desk.public_key = lambda robot, store_id: "00" * 32
+    content = (store.path / first).read_bytes()
+    state, why = bring(desk, incoming_of(store, first), content, proof_of(store.path, first))
+    assert state == "quarantined" and "another key" in why
+    content = (store.path / second).read_bytes()
+    state, why = bring(desk, incoming_of(store, second), content, None)
+    assert state == "quarantined" and "not sealed" in why
+
+
+def test_an_old_image_that_went_on_is_kept_aside(store: Store, desk: Desk, tmp_path: Path) -> None:
+    """The card is restored from an image; the run that follows has the same number again."""
+    image = tmp_path / "image"
+    shutil.copytree(store.path, image)
+    for path, start in ((store.path, 3000), (image, 5000)):
+        run = FakeRun(path)
+        run.write(pose_rows(start, start + 50))
+        run.close()
+        seal(open_store(path))
+    with served(desk) as port:
+        for path in (store.path, image):
+            copier = copier_of(open_store(path), port)
+            while copier.step():
+                pass
+    with desk.database.reading() as connection:
+        rows = connection.execute(select(UPLOAD).where(UPLOAD.c.writer == "main")).all()
+        kinds = {told.kind for told in link_events(connection, "r1")}
+    assert sorted(row.state for row in rows).count("aside") == 1
+    assert kinds == {"aside"}
+    for row in rows:
+        found = hashlib.sha256((desk.root / row.path).read_bytes()).hexdigest()
+        assert found == row.sha256
+
+
+def test_pieces_out_of_place_change_nothing(store: Store, desk: Desk) -> None:
+    name = store.journal_files("main")[0].relative_to(store.path).as_posix()
+    content = (store.path / name).read_bytes()
+    incoming = incoming_of(store, name)
+    half = content[: len(content) // 2]
+    assert desk.patch(incoming, 5, half, zlib.crc32(half)).status == 409
+    assert desk.patch(incoming, 0, half, zlib.crc32(half) ^ 1).status == 409
+    assert desk.patch(incoming, 0, half, zlib.crc32(half)).offset == len(half)
+    again = desk.patch(incoming, 0, half, zlib.crc32(half))
+    assert (again.status, again.offset) == (409, len(half))
+    assert desk.post(incoming, None).status == 409
+    long = content + b"x"
+    assert desk.patch(incoming, len(half), long, zlib.crc32(long)).status == 409
+    big = bytes(PIECE_BYTES + 1)
+    assert desk.patch(incoming, len(half), big, zlib.crc32(big)).status == 413
+    assert desk.head(incoming).offset == len(half)
+
+
+def test_another_content_than_was_announced_begins_anew(store: Store, desk: Desk) -> None:
+    name = store.journal_files("main")[0].relative_to(store.path).as_posix()
+    content = (store.path / name).read_bytes()
+    incoming = incoming_of(store, name)
+    wrong = bytes(len(content))
+    desk.patch(incoming, 0, wrong, zlib.crc32(wrong))
+    assert (desk.post(incoming, None).status, desk.head(incoming).offset) == (409, 0)
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["../../etc/passwd", "journal/../../x.mcap", "journal/1-a-0.mcap\n", "journal//1-a-0.mcap",
+     "other/1-a-0.mcap", "journal/1-a-0.mcap.part", "/journal/1-a-0.mcap", ""],
+)  # fmt: skip
+def test_no_path_leads_elsewhere(desk: Desk, store: Store, name: str) -> None:
+    assert not is_journal_name(name)
+    assert desk.head(Incoming("r1", store.id, name, "0" * 64, 5)).status == 400
+    assert desk.head(Incoming("r1", "../..", "journal/1-a-0.mcap", "0" * 64, 5)).status == 400
+
+
+def test_what_nobody_asked_for_waits_for_the_dock(store: Store) -> None:
+    copier = copier_of(store, 1, "docked")
+    assert not copier.waiting()
+    copier.situation = lambda: Situation(docked=True)
+    assert len(copier.waiting()) >= 3
+    wanted = store.journal_files("main")[1].relative_to(store.path).as_posix()
+    copier.situation = lambda: Situation(requested=frozenset({wanted}))
+    assert copier.waiting() == [wanted]
