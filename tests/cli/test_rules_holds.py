@@ -12,6 +12,7 @@ import pytest
 
 from amberbox.blackbox.query.record import Record
 from amberbox.cli import _ruleholds
+from amberbox.cli._rulehistory import Statuses
 from amberbox.cli._ruleholds import Conditions
 from amberbox.cli._rulespan import Window
 from amberbox.core.clock import NS
@@ -76,3 +77,8 @@ def test_intervals_say_what_single_instants_say(
                 assert any(first <= at_ns < last for first, last in spans) == wanted
                 near = Conditions(window).find((text,), (at_ns, at_ns))
                 assert any(of.from_ns <= at_ns < of.to_ns for of in near) == wanted
+
+
+def test_nobody_was_well_or_ill_where_nobody_watched(tmp_path: Path) -> None:
+    runs_of(tmp_path / "store", random.Random(1))
+    assert Statuses(Window(Record(tmp_path / "store"))).said == []

@@ -109,8 +109,8 @@ class Statuses:
         Otherwise nothing would be so now: a watcher writes a little behind the recorder.
         """
         runs = self.window.watched
-        ends = (*(run[0] for run in runs[1:]), self.window.span[1])
-        for (first, last), end in zip(runs, ends, strict=True):
+        ends = [run[0] for run in runs[1:]]
+        for (first, last), end in zip(runs, [*ends, self.window.span[1]], strict=False):
             yield first, max(last, min(last + SILENT_NS, end))
 
     def levels(self, keys: Keys, span: Span | None) -> Iterator[Interval]:
