@@ -99,7 +99,7 @@ def attempt(where: Path, fate: Fate | None) -> int:
         finally:
             sys.stderr.flush()
             if code:
-                sys.excepthook(*sys.exc_info())  # type: ignore[arg-type]  # there is an error here
+                sys.excepthook(*sys.exc_info())
             os._exit(code)
     return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from amberbox.core.clock import NS
 from amberbox.core.errors import UsageError
@@ -19,9 +20,9 @@ _START_NS = (T0_NS // (3600 * NS) + 1) * 3600 * NS
 
 
 @pytest.fixture
-def values(archive: FolderArchive, tmp_path: Path) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+def values(archive: FolderArchive, tmp_path: Path) -> NDArray[np.float64]:
     """Two hours of a wave with holes, one row each 2 s, in files of 10 minutes, committed."""
-    a = np.sin(np.arange(3600) / 50) * np.arange(3600)
+    a: NDArray[np.float64] = np.sin(np.arange(3600) / 50) * np.arange(3600)
     a[100:140] = np.nan
     robot = Robot("r1", tmp_path)
     run = FakeRun(robot.store, items=[_ITEM])
@@ -43,7 +44,7 @@ def values(archive: FolderArchive, tmp_path: Path) -> np.ndarray[tuple[int], np.
 @pytest.mark.parametrize(("points", "width_s"), [(2, 3600), (10, 720), (120, 60), (1800, 4)])
 def test_steps_say_what_their_rows_say(
     archive: FolderArchive,
-    values: np.ndarray[tuple[int], np.dtype[np.float64]],
+    values: NDArray[np.float64],
     points: int,
     width_s: int,
 ) -> None:

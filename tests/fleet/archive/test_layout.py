@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from sqlalchemy import select
+import sqlalchemy as sa
 
 from amberbox.blackbox.query.record import Record
 from amberbox.blackbox.store import create_store
@@ -87,8 +87,8 @@ def test_every_type_comes_back(archive: FolderArchive, robot: Robot) -> None:
 def test_sql_gives_the_same_values(archive: FolderArchive, robot: Robot) -> None:
     names = ["u8", "u64", "i64", "f32", "robot", "day", "run", "times", "many", "store_id"]
     shown = ", ".join(f'"{name}"' for name in names)
-    theirs = Record(robot.store).query("all", names)
-    ours = archive.robot().sql(f'select {shown} from "all" order by seq')
+    select = f'select {shown} from "all" order by seq'
+    theirs, ours = Record(robot.store).sql(select), archive.robot().sql(select)
     for name in names:
         assert list(map(_plain, ours.values(name))) == list(map(_plain, theirs.values(name))), name
 
@@ -108,5 +108,5 @@ def test_the_catalogue_speaks_what_other_databases_speak(tmp_path: Path) -> None
         assert catalogue.revision() == 1
         assert archive.stats().robots[0].journals == 2
         with database.reading() as connection:
-            states = connection.scalars(select(JOURNALS.c.state)).all()
+            states = connection.scalars(sa.select(JOURNALS.c.state)).all()
         assert states == ["committed", "committed"]

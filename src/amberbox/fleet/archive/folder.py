@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
-from amberbox.blackbox.query.record import Record
 from amberbox.blackbox.store import sync_folder
 from amberbox.core.clock import Clock, SystemClock
 from amberbox.core.errors import AmberboxError
@@ -89,7 +88,7 @@ class FolderArchive:
                 removed += 1
         return removed + retaining.remove_journals(self.layout, self.catalogue)
 
-    def robot(self, *robots: str) -> Record:
+    def robot(self, *robots: str) -> ArchiveRecord:
         """Open the record of one robot, or of several (all without a name) for queries."""
         return ArchiveRecord(self.layout.folder, robots=robots, catalogue=self.catalogue)
 

@@ -12,9 +12,9 @@ from amberbox.blackbox.query.record import Record
 OWN = "own"
 """Keeping class of what the box itself says: statuses, events, gaps, incidents, runs."""
 
-LOST = "lost_at_power_cut"
-DELETED = "deleted_before_copy"
 Kind = Literal["lost_at_power_cut", "deleted_before_copy"]
+LOST: Kind = "lost_at_power_cut"
+DELETED: Kind = "deleted_before_copy"
 
 
 @dataclass(frozen=True, slots=True)
