@@ -111,10 +111,7 @@ def test_redundancy_gives_cut_sets_of_higher_order(fmea: Fmea) -> None:
 CONDITIONS = {  # fault: the condition that shows it, beside the monitors
     "wheel_rear_left_bearing_drag": "wheel_rear_left.pulls_harder",
     "wheel_front_left_bus_disconnected": "wheel_front_left.frame_stays",
-    "wheel_front_right_encoder_noisy": "wheel_front_right.encoder_1_noisy",
     "wheel_front_right_encoder_slips": "wheel_front_right.encoder_1_short",
-    "wheel_front_left_encoder_stuck": "wheel_front_left.encoder_1_still",
-    "wheel_rear_right_motor_weak": "wheel_rear_right.drive_1_weak",
     "wheel_rear_left_winding_hot": "wheel_rear_left.winding_1_heats",
 }
 LATEST_S = 20

@@ -62,7 +62,7 @@ def test_unknown_outputs_and_those_never_told_are_no_evidence() -> None:
 def test_a_blocked_symptom_counts_and_its_absence_does_not() -> None:
     tracker = begun()
     found = run(tracker, [*WELL, At(5, CLEAR, blocked_by=("bus",))], 30)
-    assert [one.at_ns for one in diagnoses(found)][0] == seconds(5)
+    assert next(iter(diagnoses(found))).at_ns == seconds(5)
     assert states(tracker)[CLEAR] == "present"
     tracker = begun()
     run(tracker, [At(1, ALIVE, "absent", ("bus",)), At(5, CLEAR)], 60)
