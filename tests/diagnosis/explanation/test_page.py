@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import re
 
+from amberbox.core.sureness import SURE_WORDS
 from amberbox.diagnosis.explanation.graph import CAUSES, SYMPTOMS
 from amberbox.diagnosis.explanation.sureness import COVERED
 from amberbox.diagnosis.explanation.text import SURE_ENOUGH
 from amberbox.diagnosis.explanation.use import ANSWERS, NOBODY_KNOWS
-from amberbox.diagnosis.explanation.words import SURE_WORDS
 from tests.diagnosis.explanation.page import BLOCK, PAGE, outputs, written
 
 

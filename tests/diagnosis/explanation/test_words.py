@@ -3,40 +3,15 @@ from __future__ import annotations
 import pytest
 
 from amberbox.diagnosis.explanation.words import (
-    SURE_WORDS,
     both,
     clock,
     date_and_clock,
     duration,
     either,
     later,
-    percent,
     sentence,
-    sure_word,
 )
 from tests.diagnosis.explanation.robot import START_NS
-
-
-@pytest.mark.parametrize(
-    ("probability", "text"),
-    [
-        (1.0, "over 99 %"),
-        (0.9951, "over 99 %"),
-        (0.97, "97 %"),
-        (0.004, "under 1 %"),
-        (0.01, "1 %"),
-    ],
-)
-def test_percent_is_never_all_or_nothing(probability: float, text: str) -> None:
-    assert percent(probability) == text
-
-
-def test_each_word_begins_at_its_threshold() -> None:
-    for least, word in SURE_WORDS:
-        assert sure_word(least) == word
-    assert [sure_word(least - 1e-9) for least, _ in SURE_WORDS[:-1]] == [
-        w for _, w in SURE_WORDS[1:]
-    ]
 
 
 @pytest.mark.parametrize(

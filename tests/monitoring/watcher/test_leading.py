@@ -57,6 +57,6 @@ def test_what_else_and_what_next_are_said() -> None:
     )  # fmt: skip
     expected = "laser#dead or laser#dirty (62 %), or host#off (30 %); next: Is it dirty?"
     assert in_words(said) == expected
-    assert in_words(diagnosis((0.999, [ONE]))) == "laser#dead (99 %)"
+    assert in_words(diagnosis((0.999, [ONE]))) == "laser#dead (over 99 %)"
     assert in_words(diagnosis((0.6, [ONE]), state="healed")) == "healed"
     assert in_words(diagnosis()) == "no answer"

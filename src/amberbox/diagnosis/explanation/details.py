@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
+from amberbox.core.sureness import percent
 from amberbox.core.timetext import format_time
 from amberbox.core.types import AmbiguityGroup, Diagnosis, Hypothesis
-from amberbox.diagnosis.explanation.words import percent
 
 
 def details_of(

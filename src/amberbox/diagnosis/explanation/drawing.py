@@ -8,10 +8,11 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
+from amberbox.core.sureness import percent
 from amberbox.diagnosis.explanation.columns import Columns, Link, Slot, columns_of
 from amberbox.diagnosis.explanation.explanation import Explanation, Graph, Node
 from amberbox.diagnosis.explanation.lettering import SIZE, SMALL, width, wrapped
-from amberbox.diagnosis.explanation.words import date_and_clock, percent
+from amberbox.diagnosis.explanation.words import date_and_clock
 
 MARGIN = 16.0
 PAD = 8.0

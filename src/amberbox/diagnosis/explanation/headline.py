@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
+from amberbox.core.sureness import percent
 from amberbox.core.types import Diagnosis, Symptom
 from amberbox.diagnosis.covering.answer import NO_FAULT
 from amberbox.diagnosis.covering.model import UNKNOWN
 from amberbox.diagnosis.explanation.explanation import Group, Sureness
-from amberbox.diagnosis.explanation.words import capital, clock, percent, sentence
+from amberbox.diagnosis.explanation.words import capital, clock, sentence
 
 NOTHING = "nothing that is known explains what was seen"
 

@@ -7,19 +7,14 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from amberbox.core.errors import UsageError
+from amberbox.core.sureness import SURE_WORDS, percent
 from amberbox.core.types import AmbiguityGroup, Diagnosis, Hypothesis
 from amberbox.diagnosis.covering.check import Check
 from amberbox.diagnosis.covering.model import UNKNOWN
 from amberbox.diagnosis.covering.prediction import outcomes, predict
 from amberbox.diagnosis.explanation.explanation import Branch, Step
 from amberbox.diagnosis.explanation.names import Names, in_order
-from amberbox.diagnosis.explanation.words import (
-    SURE_WORDS,
-    capital,
-    duration,
-    either,
-    percent,
-)
+from amberbox.diagnosis.explanation.words import capital, duration, either
 from amberbox.diagnosis.knowledge import Knowledge
 from amberbox.diagnosis.situation import check_named
 

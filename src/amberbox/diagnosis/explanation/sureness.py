@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from amberbox.core.sureness import percent, sure_word
 from amberbox.core.types import Diagnosis
 from amberbox.diagnosis.explanation.explanation import Group, Sureness
-from amberbox.diagnosis.explanation.words import percent, sure_word
 
 COVERED = 0.98
 """What share of all probability must have been looked at to say nothing of the rest."""

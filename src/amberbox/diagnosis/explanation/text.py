@@ -7,6 +7,7 @@ import shlex
 import textwrap
 from collections.abc import Iterator, Sequence
 
+from amberbox.core.sureness import percent
 from amberbox.diagnosis.explanation.explanation import (
     Branch,
     Explanation,
@@ -26,7 +27,6 @@ from amberbox.diagnosis.explanation.words import (
     count,
     date_and_clock,
     later,
-    percent,
     sentence,
 )
 

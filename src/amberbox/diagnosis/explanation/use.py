@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
+from amberbox.core.sureness import percent
 from amberbox.core.types import Hypothesis
 from amberbox.diagnosis.explanation.explanation import Group, Lost, Severity, Use
 from amberbox.diagnosis.explanation.ways import Ways
-from amberbox.diagnosis.explanation.words import percent
 from amberbox.diagnosis.fmea.model import SEVERITIES
 
 ANSWERS: dict[Severity, str] = {

@@ -5,20 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Final
 
+from amberbox.core.sureness import percent, sure_word
 from amberbox.core.types import AmbiguityGroup, Diagnosis, Hypothesis
 
 OTHER: Final = "unknown#other"
 """The failure mode that stands for everything that is not in the FMEA."""
 _NAMED: Final = 3
 """So many of those that nothing tells apart are named; of the others it is said how many."""
-_WORDS: Final = (
-    (0.95, "almost certain"),
-    (0.8, "very likely"),
-    (0.5, "likely"),
-    (0.2, "possible"),
-    (0.0, "only a guess"),
-)
-"""The words that an explanation uses."""
 _ALSO: Final = 0.05
 """What is less probable than this is not worth a line."""
 
@@ -36,8 +29,7 @@ def cause(diagnosis: Diagnosis) -> str:
     if not first:
         return ""
     probability = _probability(diagnosis, first)
-    word = next(word for least, word in _WORDS if probability >= least)
-    return f"{either(first)} ({word})"
+    return f"{either(first)} ({sure_word(probability)})"
 
 
 def in_words(diagnosis: Diagnosis) -> str:
@@ -45,8 +37,8 @@ def in_words(diagnosis: Diagnosis) -> str:
     if diagnosis.state == "healed":
         return "healed"
     groups = [(_members(diagnosis, g), g.probability) for g in diagnosis.groups]
-    worth = [f"{either(m)} ({_percent(p)})" for m, p in groups[:1]]
-    worth += [f"{either(m)} ({_percent(p)})" for m, p in groups[1:3] if p >= _ALSO]
+    worth = [f"{either(m)} ({percent(p)})" for m, p in groups[:1]]
+    worth += [f"{either(m)} ({percent(p)})" for m, p in groups[1:3] if p >= _ALSO]
     tests = diagnosis.next_tests
     next_test = f"; next: {tests[0].text or tests[0].id}" if tests else ""
     return (", or ".join(worth) or "no answer") + next_test
@@ -71,7 +63,3 @@ def _probability(diagnosis: Diagnosis, first: Sequence[Hypothesis]) -> float:
 def _name(hypothesis: Hypothesis) -> str:
     faults = ("not in the FMEA" if fault == OTHER else fault for fault in sorted(hypothesis.faults))
     return " + ".join(faults) or "a false alarm"
-
-
-def _percent(probability: float) -> str:
-    return f"{min(max(round(100 * probability), 1), 99)} %"
