@@ -10,6 +10,7 @@ import pytest
 
 from amberbox.core.errors import Problem
 from amberbox.diagnosis.fmea import Fmea
+from amberbox.diagnosis.fmea.criticality import mode_criticality
 from amberbox.diagnosis.fmea.load import read_fmea
 from amberbox.diagnosis.fmea.sheet import COLUMNS, write_sheet
 from amberbox.diagnosis.fmea.sheet_reading import read_sheet
@@ -65,6 +66,26 @@ def test_a_sheet_of_others_is_read(tmp_path: Path) -> None:
     assert fmea.modes["left_pump#leaks"].unobservable == "look every week"
 
 
+def test_ranks_under_the_words_that_many_sheets_have(tmp_path: Path) -> None:
+    text = "Item,Failure Mode,Severity,Occurrence,Detection,RPN\npump,leaks,8,3,5,120\n"
+    fmea, problems = from_sheet(tmp_path / "a.csv", text)
+    assert fmea is not None
+    ranks = fmea.modes["pump#leaks"].ranks
+    assert (ranks.severity, ranks.occurrence, ranks.detection) == (8, 3, 5)
+    assert not [problem for problem in problems if problem.is_error]
+
+
+def test_a_criticality_sheet_with_ratios_of_the_components_rate(tmp_path: Path) -> None:
+    text = (
+        "Item,Failure mode,Mode ratio,Failure rate,Effect probability,Operating time (h)\n"
+        "pump,leaks,0.3,1e-4,0.5,100\npump,seized,0.7,1e-4,1,100\n"
+    )
+    fmea, _ = from_sheet(tmp_path / "a.csv", text)
+    assert fmea is not None
+    of = {mode.name: mode_criticality(mode) for mode in fmea.modes.values()}
+    assert of == pytest.approx({"leaks": 0.5 * 0.3 * 1e-4 * 100, "seized": 0.7 * 1e-4 * 100})
+
+
 def test_a_text_that_looks_like_a_formula_is_kept_from_spreadsheets() -> None:
     fmea = small("    description: the <side> laser\n", "    description: =1+1\n")
     assert "'=1+1" in write_sheet(fmea)
@@ -76,6 +97,9 @@ def test_a_text_that_looks_like_a_formula_is_kept_from_spreadsheets() -> None:
         ("Part,Failure mode,O\n,breaks,3\n", 2, "a line needs an item and a failure mode"),
         ("Part,Failure mode,O\na,breaks,3\na,breaks,4\n", 3, "a has 'breaks' twice"),
         ("Part,Failure mode,O\na,breaks,often\n", 2, "'often' is no number"),
+        ("Part,Failure mode,O\na,breaks,nan\n", 2, "'nan' is no number"),
+        ("Part,Failure mode,O\na,breaks,2.5\n", 2, "2.5 is no whole number"),
+        ("Part,Failure mode,Rate,Alpha\na,breaks,1e-4,3\n", 2, "3 is no share from 0 to 1"),
         ("Part,Failure mode,O\na,breaks,\n", 2, "how probable is it?"),
         ("Part,Failure mode,O,Severity\na,b,3,bad\n", 2, "'bad' is none of warning"),
         ("Part,O\na,3\n", 1, "the first line must name at least the columns Item"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import math
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -25,13 +26,17 @@ _ALIASES = {
     "potential effect": "Local effect", "potential effects": "Local effect",
     "potential effect(s)": "Local effect", "next higher effect": "Next effect",
     "next level effect": "Next effect", "system effect": "End effect", "end effects": "End effect",
-    "sev": "S", "occ": "O", "det": "D", "rate": "Rate (1/h)", "failure rate": "Rate (1/h)",
+    "sev": "S", "occ": "O", "det": "D", "occurrence": "O", "detectability": "D",
+    "rate": "Rate (1/h)", "failure rate": "Rate (1/h)", "mode ratio": "Ratio", "alpha": "Ratio",
+    "failure mode ratio": "Ratio", "effect probability": "Beta",
+    "failure effect probability": "Beta", "operating time": "Exposure (h)",
+    "operating time (h)": "Exposure (h)",
     "current controls": "Detection", "controls": "Detection", "detection method": "Detection",
     "recommended action": "Action", "recommended actions": "Action", "remedy": "Action",
     "recommended action(s)": "Action",
 }  # fmt: skip
+_WHOLE = re.compile(r"\d+(\.0*)?")
 _ADDRESS = re.compile(r"[^\s/;]+/[^\s/;]+/[^\s/;]+")
-_COMPUTED = frozenset({"RPN", "Priority", "Cm", "Function"})
 
 Row = dict[str, str]
 
@@ -107,6 +112,7 @@ class _Content:
         if name in component["failure_modes"]:
             self._tell(line, "Failure mode", f"{item} has '{row['Failure mode']}' twice")
             return
+        _take_ranks(row)
         component["failure_modes"][name] = dict(self._mode(row, name, line))
         self._use(item, row)
 
@@ -133,9 +139,7 @@ class _Content:
 
     def _severity(self, row: Row, line: int) -> Iterator[tuple[str, Any]]:
         word = row.get("Severity", "").lower()
-        if word.isdigit():
-            row.setdefault("S", word)
-        elif word in SEVERITIES:
+        if word in SEVERITIES:
             yield "severity", word
         elif word:
             near = did_you_mean(word, SEVERITIES)
@@ -143,6 +147,7 @@ class _Content:
 
     def _chance(self, row: Row, line: int) -> Iterator[tuple[str, Any]]:
         numbers = {key: self._number(row, key, line) for key in _NUMBERS}
+        numbers["Rate (1/h)"] = self._rate(row, numbers["Rate (1/h)"], line)
         for key, name in _NUMBERS.items():
             if numbers[key] is not None and name in ("rate", "probability", "exposure_h"):
                 yield name, numbers[key]
@@ -158,10 +163,25 @@ class _Content:
         if not text:
             return None
         try:
-            return float(text)
+            number = float(text)
         except ValueError:
+            number = math.nan
+        if not math.isfinite(number):
             self._tell(line, key, f"'{text}' is no number")
             return None
+        if key in _RANKS and number != int(number):
+            self._tell(line, key, f"{text} is no whole number")
+            return None
+        return number
+
+    def _rate(self, row: Row, rate: float | None, line: int) -> float | None:
+        """Return the mode's share of a rate that is its component's, where the sheet says one."""
+        ratio = self._number(row, "Ratio", line)
+        if ratio is None or rate is None:
+            return rate
+        if not 0 <= ratio <= 1:
+            self._tell(line, "Ratio", f"{ratio:g} is no share from 0 to 1")
+        return rate * ratio
 
     def _detection(self, row: Row) -> Iterator[tuple[str, Any]]:
         entries = _entries(row.get("Detection", ""))
@@ -190,9 +210,7 @@ class _Content:
     def text(self) -> str:
         """Return everything as YAML."""
         functions = {
-            name: dict(
-                _given(description=self._word(name), needs=users, system=name in self._system)
-            )
+            name: dict(self._function(name, users))
             for name, users in self._functions.items()
             if name not in self._types
         }
@@ -223,6 +241,14 @@ _NUMBERS = {
 }  # fmt: skip
 _RANKS = {"S": "s", "O": "o", "D": "d"}
 _OCCURRENCE = {str(rank): float(f"1e-{11 - rank}") for rank in range(1, 11)}
+
+
+def _take_ranks(row: Row) -> None:
+    """Take numbers that stand under Severity and Detection for the ranks that they are."""
+    for name, rank in (("Severity", "S"), ("Detection", "D")):
+        if _WHOLE.fullmatch(row.get(name, "")):
+            number = row.pop(name)
+            row[rank] = row.get(rank) or number
 
 
 def _entries(cell: str) -> list[str]:
