@@ -112,11 +112,13 @@ class Watcher:
         options = () if watch.folder is None else watch.folder.robot.monitoring.publish
         self._publisher = Publisher(options, watch.plan, watch.clock_s)
         self._notifier = Notifier(monotonic=watch.clock_s)
+        self._stop = threading.Event()
         if memory.place is not None:
             self._journal.passed(memory.place)
 
     def run(self, stop: threading.Event) -> None:
         """Watch until told to stop; probes run meanwhile."""
+        self._stop = stop
         runner = self._probes()
         self._publisher.open()
         try:
@@ -146,6 +148,8 @@ class Watcher:
             self._notifier.alive(self._told)
             for found in self._evaluation.take(block):
                 self._write(found)
+            if self._stop.is_set():  # amid much that is behind: the next one goes on from here
+                return
         self._settle()
         self._carry_out_requests()
         self._say_silence()

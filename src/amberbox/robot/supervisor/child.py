@@ -45,7 +45,7 @@ def children_of(folder: Path, write_s: float, *, quiet: bool = True) -> list[Chi
         watchdog_s=max(10.0, 4 * write_s), outlives=True,
     )  # fmt: skip
     words = ("--quiet",) if quiet else ()
-    watcher = Child(WATCH, amberbox(WATCH, *words, str(folder)), end_s=4.0, nice=10, follows=RECORD)
+    watcher = Child(WATCH, amberbox(WATCH, *words, str(folder)), end_s=4.0, nice=5, follows=RECORD)
     return [recorder, watcher]
 
 
