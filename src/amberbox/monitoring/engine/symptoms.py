@@ -121,7 +121,7 @@ def _measured_by(mappings: Iterable[MappingPlan]) -> list[list[str]]:
 
 
 def _addresses(mapping: MappingPlan, output: OutputPlan) -> list[str]:
-    own = mapping.inputs if output.place is None else mapping.inputs[output.place:][:1]
+    own = mapping.inputs if output.place is None else mapping.inputs[output.place :][:1]
     return list(dict.fromkeys(_address(entry) for entry in (*own, *mapping.reads)))
 
 
