@@ -140,7 +140,10 @@ def test_ten_minutes_of_a_month_open_one_file(
 ) -> None:
     robot = Robot("r1", tmp_path)
     for day in range(30):
-        robot.record(day * 100, files=1, rows=20, at_ns=T0_NS + day * DAY_NS)
+        run = FakeRun(robot.store, items=[BATTERY])
+        start_ns = T0_NS + day * DAY_NS
+        run.write([(start_ns + n * NS, BATTERY, {"volts": day + n / 100}) for n in range(20)])
+        run.close()
     robot.hand_in_all(archive)
     archive.commit()
     opened: list[str] = []
@@ -150,9 +153,9 @@ def test_ten_minutes_of_a_month_open_one_file(
         return segment_at(tables, path)
 
     monkeypatch.setattr("amberbox.fleet.archive.reading.segment_at", counting)
-    start = T0_NS + 17 * DAY_NS + 1700 * NS // 100 - NS
-    table = archive.robot("r1").query("odom", ["pose_x"], start, start + 600 * NS)
-    assert table.values("pose_x") == [float(x) for x in range(1700, 1720)]
+    start = T0_NS + 17 * DAY_NS
+    table = archive.robot("r1").query("battery", ["volts"], start + NS, start + 600 * NS)
+    assert table.values("volts") == [17 + n / 100 for n in range(1, 20)]
     assert len(opened) == 1
     assert "/robot=r1/day=2026-10-08/" in opened[0]
 

@@ -287,6 +287,8 @@ def _known(array: pa.ChunkedArray) -> tuple[str, pa.ChunkedArray]:
         return _decimal(array)
     if pa.types.is_list(kind):
         inner, _ = _known(pa.chunked_array([], kind.value_type))
+        if inner == "time":  # in the views times are plain UTC
+            return "list<time>", array.cast(arrow_type("list<time>"))
         if array.type == arrow_type(f"list<{inner}>"):
             return f"list<{inner}>", array
     for name in (*NUMPY_TYPES, "string", "binary"):
