@@ -87,7 +87,7 @@ def test_the_record_evaluated_says_the_same(
         status = 1 if options else 0
         journal = found(capsys, watched, *options, status=status)
         with monkeypatch.context() as patch:
-            patch.setattr("amberbox.cli._diagnosis_journal.was_watched", lambda *_: False)
+            patch.setattr("amberbox.cli._diagnosis_read.was_watched", lambda *_: False)
             record = found(capsys, watched, *options, status=status)
         assert record["origin"] == "record" and journal["origin"] == "watcher"
         assert record["hypotheses"] == journal["hypotheses"]

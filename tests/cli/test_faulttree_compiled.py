@@ -165,7 +165,10 @@ def test_what_is_closest_without_a_record_is_what_is_most_probable(
 
 @pytest.mark.parametrize("watched", [True, False])
 def test_a_diagnosis_brings_cut_sets_close(
-    tmp_path: Path, watched: bool, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path,
+    watched: bool,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     bench = Bench(write_folder(tmp_path / "robot"))
     (bench.folder / "fmea.yaml").write_text(FMEA.replace("[motor]", "{any: [motor, fan]}"))
@@ -189,5 +192,8 @@ def test_a_diagnosis_brings_cut_sets_close(
     text = capsys.readouterr().out
     assert "\ndrive\n" in text and "happened: fan#stuck (0.9" in text
     assert "; missing: motor#worn (0.00" in text
+    with monkeypatch.context() as patch:
+        patch.setattr("amberbox.cli._diagnosis_read.watched", lambda *_: None)
+        assert printed(capsys, bench.folder, "--closest")["diagnosis"] == found["diagnosis"]
     before = printed(capsys, bench.folder, "--closest", "--at", "-6s")
     assert before["diagnosis"] is None and before["effects"][0]["closest"][0]["happened"] == []

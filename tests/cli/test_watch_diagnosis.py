@@ -91,7 +91,7 @@ def test_json_has_symptoms_diagnoses_and_causes(
     assert alarms[-1]["cause"].startswith("motor#fan_stuck (")
     assert alarms[-1]["diagnosis"] == diagnoses[-1]["id"]
     assert main(["watch", str(diagnosed), "--once"]) == 1
-    assert ": motor#fan_stuck (99 %)" in capsys.readouterr().out.splitlines()[-1]
+    assert ": motor#fan_stuck (over 99 %)" in capsys.readouterr().out.splitlines()[-1]
 
 
 def test_errors_in_the_failure_modes_stop_nothing_but_the_diagnosis(

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 
 from amberbox.blackbox.store import Store
 from amberbox.cli._diagnosis_case import Case
-from amberbox.cli._diagnosis_journal import said_until
+from amberbox.cli._diagnosis_journal import said_until, was_watched
 from amberbox.core.clock import NS
 from amberbox.core.errors import UsageError
 from amberbox.core.timetext import format_time
@@ -47,6 +47,18 @@ class _Heard:
         names = () if self.diagnosis is None else self.diagnosis.symptoms
         seen = tuple(self.present[name] for name in names if name in self.present)
         return Case(at_ns, situation, self.diagnosis, seen=seen)
+
+
+def known_at(knowledge: Knowledge, plan: Plan, store: Store, at_ns: int, lookback_s: float) -> Case:
+    """Return what was known at an instant: by the watcher's journal, else by evaluating.
+
+    Raises UsageError where nothing was recorded.
+    """
+    if was_watched(store, knowledge.config_hash, at_ns):
+        found = watched(knowledge, store, at_ns)
+        if found is not None:
+            return found
+    return evaluated(knowledge, plan, store, at_ns, lookback_s)
 
 
 def evaluated(

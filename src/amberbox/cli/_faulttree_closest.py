@@ -81,20 +81,17 @@ def _standing(args: argparse.Namespace) -> tuple[int | None, Diagnosis | None]:
 
 
 def _case(folder: RobotFolder, at_ns: int, exposure_h: float | None) -> Case:
-    """Return what was known then: by the watcher's journal, else by evaluating the record."""
+    """Return what was known then."""
     from amberbox.blackbox.store import open_store
     from amberbox.cli._diagnoser import knowledge_of
-    from amberbox.cli._diagnosis_journal import was_watched
-    from amberbox.cli._diagnosis_read import evaluated, watched
+    from amberbox.cli._diagnosis_read import known_at
     from amberbox.monitoring.configuration import load_plan
 
     plan, _ = load_plan(folder)
     knowledge, _ = knowledge_of(folder, plan, exposure_h)
     assert knowledge is not None, "the failure modes have been read before"
     store = open_store(folder.store_path)
-    if was_watched(store, knowledge.config_hash, at_ns):
-        return watched(knowledge, store, at_ns)
-    return evaluated(knowledge, plan, store, at_ns, _LOOKBACK_S)
+    return known_at(knowledge, plan, store, at_ns, _LOOKBACK_S)
 
 
 def _heading(at_ns: int | None, diagnosis: Diagnosis | None) -> str:

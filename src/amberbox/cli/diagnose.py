@@ -161,20 +161,16 @@ def _read(args: argparse.Namespace, subject: Subject, record: Record) -> Case:
     """Read what was known at an instant: by the watcher's journal, else by evaluating."""
     from amberbox.blackbox.store import open_store
     from amberbox.cli._diagnosis_case import Case
-    from amberbox.cli._diagnosis_journal import end_ns, was_watched
-    from amberbox.cli._diagnosis_read import evaluated, watched
+    from amberbox.cli._diagnosis_journal import end_ns
+    from amberbox.cli._diagnosis_read import known_at
 
     store, knowledge = open_store(record.path), subject.knowledge
     at_ns = end_ns(store) if args.at is None else record.time_ns(args.at)
     at_ns = record.last_ns() if at_ns is None else at_ns
     if at_ns is None:
         return Case(time.time_ns())  # a record without rows
-    if was_watched(store, knowledge.config_hash, at_ns):
-        found = watched(knowledge, store, at_ns)
-        if found is not None:
-            return found
     lookback_s = parse_duration(args.lookback) / NS
-    case = evaluated(knowledge, subject.plan, store, at_ns, lookback_s)
+    case = known_at(knowledge, subject.plan, store, at_ns, lookback_s)
     if at_ns - case.at_ns > _LATE_NS:
         tell([f"nothing was recorded after {format_time(case.at_ns)[:19]}; this is as of then"])
     return case
