@@ -300,7 +300,7 @@ class World:
 
     def _keep(self, one: Connection, deed: Keep) -> Sequence[ServerFrame]:
         """Store rows in all ledgers; they have to agree."""
-        outcomes = []
+        outcomes: list[Stored | None] = []
         for ledger in (self.ledger, *self.others):
             try:
                 outcomes.append(

@@ -95,15 +95,22 @@ class RobotEnd:
         return self.next_number - 1 - self.acked < limits.WINDOW
 
     def next_rows(
-        self, allowed: Collection[Lane] = LANES, most_bytes: int = limits.ROWS_BYTES
+        self,
+        allowed: Collection[Lane] = LANES,
+        most_bytes: int = limits.ROWS_BYTES,
+        *,
+        bare: bool = True,
     ) -> Rows | None:
         """Return the frame to send next, the most urgent rows of it; None if there is nothing.
 
-        A frame has at least one row, whatever ``most_bytes`` says.
+        A frame has at least one row, whatever ``most_bytes`` says; or none, when ``bare``, where
+        only how far everything was sent is news.
         """
         if not self.window_open:
             return None
         rows = self._take(allowed, most_bytes)
+        if not rows and not bare:
+            return None
         upto = self._upto()
         news = {w: at for w, at in upto.items() if at > self.said.get(w, START)}
         if not rows and not news:

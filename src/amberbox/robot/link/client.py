@@ -43,6 +43,8 @@ from amberbox.robot.link.tls import PinError, context_for
 _EARLIEST_NS = 1_704_067_200 * 1_000_000_000
 """2024-01-01: a clock that says less has not been set."""
 
+_LEAST_FRAME = 2048
+
 Dial = Callable[[LinkOptions, ssl.SSLContext | None], Awaitable[Line]]
 
 
@@ -89,6 +91,8 @@ class LinkClient:
         self.network = network
         self.progress = Progress()
         self.bucket = TokenBucket(options.rate)
+        self.frame_bytes = limits.ROWS_BYTES
+        """How large frames of rows get: smaller after trouble, so that some get through."""
         self.live = LiveValues(store)
         self._dial = dialer
         self._backoff = backoff or Backoff()
@@ -111,6 +115,7 @@ class LinkClient:
     def _failed(self, error: Exception) -> None:
         self.progress.connected = False
         self.progress.trouble = str(error)
+        self.frame_bytes = max(self.frame_bytes // 4, _LEAST_FRAME)
         if isinstance(error, (RefusedError, PinError)):
             self._remarks.say("link_refused", str(error))
 

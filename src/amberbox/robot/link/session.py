@@ -77,6 +77,7 @@ class Session:
         self._allowed = Allowed()
         self._offered = asyncio.Event()
         self._beats = 0
+        self._told_at = -1
         self._heads = b""
 
     async def run(self, stop: asyncio.Event) -> None:
@@ -119,6 +120,8 @@ class Session:
 
     def _hear(self, frame: ServerFrame) -> None:
         if isinstance(frame, Ack):
+            if frame.number > self._end.acked:
+                self._client.frame_bytes = min(self._client.frame_bytes * 2, limits.ROWS_BYTES)
             self._end.acknowledged(frame)
             self._offered.set()
         elif isinstance(frame, Pong):
@@ -168,17 +171,19 @@ class Session:
 
     async def _send_rows(self) -> None:
         while True:
-            frame = self._end.next_rows(self._allowed.lanes, self._most_bytes())
+            bare = self._told_at != self._beats  # other rows of the journal move it all the time
+            frame = self._end.next_rows(self._allowed.lanes, self._most_bytes(), bare=bare)
             if frame is None:
                 self._offered.clear()
                 await self._offered.wait()
                 continue
+            self._told_at = self._beats
             await self._paced(frame)
 
     def _most_bytes(self) -> int:
         """Return how large frames get: half a second of the rate, so urgent rows get through."""
-        rate = self._client.bucket.rate
-        return int(min(limits.ROWS_BYTES, max(rate / 2, 1000))) if rate else limits.ROWS_BYTES
+        rate, most = self._client.bucket.rate, self._client.frame_bytes
+        return int(min(most, max(rate / 2, 1000))) if rate else most
 
     async def _paced(self, frame: Rows) -> None:
         """Send rows no faster than the bandwidth that the link may take."""
@@ -201,6 +206,7 @@ class Session:
             await self._send(self._heartbeat(reaches))
             await self._tell_heads()
             self._beats += 1
+            self._offered.set()
             if self._beats % _REMEMBER_BEATS == 0:
                 await asyncio.to_thread(self._remember)
             await asyncio.sleep(limits.BEAT_S)

@@ -1,0 +1,110 @@
+"""Robots and their server, killed at random moments: the rig of the short test and of the soak."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import socket
+import subprocess
+import sys
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from amberbox.fleet.database.database import Database
+from tests.robot.link.rig import held, put_aside, recorded
+
+ROOT = Path(__file__).parents[3]
+
+
+@dataclass
+class Result:
+    """What came of it: rows that were written, and how long the last ones took to arrive."""
+
+    rows: int = 0
+    kills: int = 0
+    caught_up_s: float = 0.0
+
+
+@dataclass
+class Field:
+    """Robots in the field and a server, each a process."""
+
+    folder: Path
+    robots: int
+    seed: int = 0
+    port: int = 0
+    processes: dict[str, subprocess.Popen[bytes]] = field(default_factory=dict)
+    starts: int = 0
+
+    def __post_init__(self) -> None:
+        with socket.create_server(("127.0.0.1", 0)) as free:
+            self.port = int(free.getsockname()[1])
+
+    @property
+    def names(self) -> list[str]:
+        return [f"r{number}" for number in range(self.robots)]
+
+    def start(self, name: str) -> None:
+        """Start a robot, or the server."""
+        self.starts += 1
+        words = ["tests.robot.link.serverprocess", str(self.folder / "server.db"), str(self.port)]
+        if name != "server":
+            path = self.folder / name
+            words = ["tests.robot.link.robotprocess", str(path), name, str(self.port),
+                     str(self.seed * 1000 + self.starts)]  # fmt: skip
+        environment = {**os.environ, "PYTHONPATH": f"{ROOT}:{ROOT / 'src'}"}
+        self.processes[name] = subprocess.Popen(
+            [sys.executable, "-m", *words], cwd=ROOT, env=environment
+        )
+
+    def kill(self, name: str) -> None:
+        """Kill a process without a word."""
+        process = self.processes.pop(name)
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+
+    def end(self) -> None:
+        """Kill whatever is left."""
+        for name in list(self.processes):
+            self.kill(name)
+
+
+def run(folder: Path, robots: int, kills: int, seconds: float, seed: int = 0) -> Result:
+    """Kill robots and server ``kills`` times in ``seconds``, then see that all has arrived once."""
+    chance = random.Random(seed)
+    world = Field(folder, robots, seed)
+    try:
+        for name in ("server", *world.names):
+            world.start(name)
+        for _ in range(kills):
+            time.sleep(chance.uniform(0.5, 1.5) * seconds / kills)
+            victim = chance.choice(["server", *world.names])
+            world.kill(victim)
+            time.sleep(chance.uniform(0.0, 0.3))
+            world.start(victim)
+        for name in world.names:
+            (folder / f"{name}.quiet").touch()
+        return _judged(world, folder, kills)
+    finally:
+        world.end()
+
+
+def _judged(world: Field, folder: Path, kills: int) -> Result:
+    """Wait for all that robots have written; nothing twice, nothing changed, nothing else."""
+    begin = time.monotonic()
+    for name in world.names:
+        process = world.processes[name]
+        assert process.wait(60) == 0
+    database = Database(folder / "server.db", read_only=True)
+    try:
+        rows = 0
+        for name in world.names:
+            wanted = recorded(folder / name)
+            assert held(database, name) == wanted
+            assert not put_aside(database, name)
+            rows += len(wanted)
+    finally:
+        database.close()
+    return Result(rows, kills, time.monotonic() - begin)
