@@ -72,6 +72,11 @@ def test_a_worker_that_is_killed_over_a_commit_is_started_again(
         assert worker.pid != first
         with pytest.raises(AmberboxError, match="knows no 'dance'"):
             worker.ask("dance")
+        with (
+            Worker(archive.layout.folder) as second,
+            pytest.raises(AmberboxError, match="ended with 2"),
+        ):
+            second.commit()
     ours = archive.robot("r1").query("odom", _KEYS)
     assert positions(ours) == positions(Record(robot.store).query("odom", _KEYS))
     assert len(ours) == 1200

@@ -19,12 +19,18 @@ _ITEM = FakeItem("wave", [{"a": 1.5, "n": 1, "on": True, "text": "x"}, {"n": 1}]
 _START_NS = (T0_NS // (3600 * NS) + 1) * 3600 * NS
 
 
-@pytest.fixture
-def values(archive: FolderArchive, tmp_path: Path) -> NDArray[np.float64]:
+@pytest.fixture(scope="module")
+def archive(tmp_path_factory: pytest.TempPathFactory) -> FolderArchive:
+    """An archive that all tests here share."""
+    return FolderArchive(tmp_path_factory.mktemp("archive") / "server")
+
+
+@pytest.fixture(scope="module")
+def values(archive: FolderArchive, tmp_path_factory: pytest.TempPathFactory) -> NDArray[np.float64]:
     """Two hours of a wave with holes, one row each 2 s, in files of 10 minutes, committed."""
     a: NDArray[np.float64] = np.sin(np.arange(3600) / 50) * np.arange(3600)
     a[100:140] = np.nan
-    robot = Robot("r1", tmp_path)
+    robot = Robot("r1", tmp_path_factory.mktemp("robot"))
     run = FakeRun(robot.store, items=[_ITEM])
     for start in range(0, 3600, 300):
         rows = []
@@ -79,3 +85,19 @@ def test_texts_have_no_envelope(archive: FolderArchive, values: object) -> None:
     del values
     with pytest.raises(UsageError, match="text is no number"):
         archive.robot("r1").envelope("wave", ["text"])
+
+
+def test_several_robots_have_their_own_steps(
+    archive: FolderArchive, values: object, tmp_path: Path
+) -> None:
+    del values
+    other = Robot("r2", tmp_path)
+    run = FakeRun(other.store, items=[_ITEM])
+    run.write([(_START_NS + n * NS, _ITEM, {"n": -n}) for n in range(10)])
+    run.close()
+    other.hand_in_all(archive)
+    archive.commit(0.0)
+    span = _START_NS, _START_NS + 20 * NS
+    table = archive.robot().envelope("wave", ["n"], *span, points=2)
+    told = [(r["robot"], r["n:min"], r["n:max"], r["n:count"]) for r in table.rows()]
+    assert sorted(told) == [("r1", 0, 4, 5), ("r1", 5, 9, 5), ("r2", -9, 0, 10)]

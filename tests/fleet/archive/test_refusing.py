@@ -87,6 +87,10 @@ def test_a_journal_that_rots_on_the_server_is_left_out_and_said(
     (gap,) = archive.robot().gaps()
     assert gap.reason == "refused: the file changed after it was verified"
     assert gap.count == 81  # 40 poses, 40 batteries, what the run is
+    assert robot.hand_in(archive, robot.files()[0]).is_new
+    assert archive.commit(0.0).journals == 1
+    assert len(archive.robot().query("odom")) == 80
+    assert archive.robot().gaps() == []
 
 
 def test_a_robot_that_is_not_here_is_named(archive: FolderArchive, tmp_path: Path) -> None:

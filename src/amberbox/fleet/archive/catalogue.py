@@ -146,6 +146,15 @@ class Catalogue:
                 statement = statement.where(JOURNALS.c.robot.in_(robots))
             return [Source(*row) for row in connection.execute(statement.order_by(*_KEY[:2]))]
 
+    def last_ns(self, robots: Sequence[str] = ()) -> int | None:
+        """Return when the newest record was received that is in the tables."""
+        with self.database.reading() as connection:
+            statement = select(func.max(JOURNALS.c.end_ns)).where(JOURNALS.c.state == COMMITTED)
+            if robots:
+                statement = statement.where(JOURNALS.c.robot.in_(robots))
+            found = connection.scalar(statement)
+            return None if found is None else int(found)
+
     def journals(self, source: Source | None = None) -> list[Row[Any]]:
         """Return the journals of a store in the order of writing, or all."""
         with self.database.reading() as connection:

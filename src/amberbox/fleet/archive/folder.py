@@ -12,7 +12,7 @@ from amberbox.blackbox.store import sync_folder
 from amberbox.core.clock import Clock, SystemClock
 from amberbox.core.errors import AmberboxError
 from amberbox.fleet.archive import committing, compacting, retaining
-from amberbox.fleet.archive.catalogue import Catalogue, Source
+from amberbox.fleet.archive.catalogue import PUT, REFUSED, Catalogue, Source
 from amberbox.fleet.archive.files import Layout
 from amberbox.fleet.archive.journal import checked_key, inspect
 from amberbox.fleet.archive.record import ArchiveRecord
@@ -58,9 +58,13 @@ class FolderArchive:
                     f"{key.file} of {key.robot} is here already, with other content",
                     "a sealed journal never changes: compare both before you delete one",
                 )
-            return Stored(False, place)
+            if known.state != REFUSED:
+                return Stored(False, place)
         arrived = inspect(key, path, self.clock.wall_ns())
         _move(path, place)
+        if known is not None:  # what had changed here is replaced by what the robot has
+            self.catalogue.change([known], state=PUT, facts=arrived.row["facts"])
+            return Stored(True, place)
         return Stored(self.catalogue.add(arrived.row), place)
 
     def note_missing(self, robot: str, store_id: str, ranges: Sequence[Missing]) -> None:

@@ -157,7 +157,9 @@ def _may_hold(file: LiveFile, schema: TableSchema, request: Request, offsets: Of
     if request.by == "timestamp" and schema.stamp:
         return overlaps(file.low["timestamp"], file.high["timestamp"], request.span)
     known = [offsets[run] for run in range(file.low["run"], file.high["run"] + 1) if run in offsets]
-    least, most = min((low for low, _ in known), default=0), max((h for _, h in known), default=0)
+    if not known:  # its batch is being committed right now
+        return overlaps(file.low["received"], file.high["received"], request.span)
+    least, most = min(low for low, _ in known), max(high for _, high in known)
     return overlaps(file.low["log_time"] + least, file.high["log_time"] + most, request.span)
 
 

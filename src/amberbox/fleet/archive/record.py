@@ -93,9 +93,8 @@ class ArchiveRecord(Record):
         return self._look(lambda reader: envelope(reader, item, variables, span, points))
 
     def last_ns(self) -> int | None:
-        """Return when the newest record here was received."""
-        ends = (row.end_ns for source in self._sources() for row in self.catalogue.journals(source))
-        return max(ends, default=None)
+        """Return when the newest record in the tables was received."""
+        return self.catalogue.last_ns(self.robots)
 
     def gaps(self, item: str | None = None, from_: Time = None, to: Time = None) -> list[Gap]:
         """Return what is missing in ``[from_, to)`` and why, also what never came here."""

@@ -7,10 +7,12 @@ is started again and finishes what it had begun.
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 import subprocess
 import sys
+import time
 from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
@@ -18,9 +20,13 @@ from typing import IO, Any
 
 import msgspec
 
-from amberbox.core.errors import AmberboxError
+from amberbox.core.errors import AmberboxError, UsageError
 from amberbox.fleet.archive.folder import FolderArchive
 from amberbox.fleet.archive.store import Committed, Retention
+from amberbox.fleet.archive.where import TABLES
+
+_LOCK_TRIES = 40
+_LOCK_PAUSE_S = 0.05
 
 
 def handle(archive: FolderArchive, request: Mapping[str, Any]) -> Any:
@@ -43,13 +49,35 @@ def handle(archive: FolderArchive, request: Mapping[str, Any]) -> Any:
 def serve(folder: Path, requests: IO[str], answers: IO[str]) -> None:
     """Answer requests one after the other until there are no more."""
     archive = FolderArchive(folder)
+    held = _lock(folder)
     for line in requests:
         try:
             answer: dict[str, Any] = {"done": handle(archive, json.loads(line))}
         except AmberboxError as error:
             answer = {"error": error.what, "hint": error.hint}
+        except OSError as error:
+            hint = "look at the disk: is it full, or read-only? what was begun is done again"
+            answer = {"error": f"the archive: {error}", "hint": hint}
         answers.write(msgspec.json.encode(answer).decode() + "\n")
         answers.flush()
+    held.close()
+
+
+def _lock(folder: Path) -> IO[str]:
+    """Keep a second worker away; one that was just killed lets go in a moment.
+
+    Raises UsageError when another one works here.
+    """
+    file = (folder / TABLES / ".lock").open("a")
+    for _ in range(_LOCK_TRIES):
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            time.sleep(_LOCK_PAUSE_S)
+        else:
+            return file
+    file.close()
+    raise UsageError(f"another worker is at the archive {folder}", "there is one per server")
 
 
 class Worker:
@@ -134,9 +162,14 @@ class Worker:
 
 
 def main() -> None:
-    """Serve until stdin closes; leave without what libraries do at exit (deltalake aborts)."""
-    serve(Path(sys.argv[1]), sys.stdin, sys.stdout)
-    os._exit(0)
+    """Serve until stdin closes; leave without what libraries do at exit (deltalake may abort)."""
+    code = 0
+    try:
+        serve(Path(sys.argv[1]), sys.stdin, sys.stdout)
+    except AmberboxError as error:
+        print(f"error: {error}", file=sys.stderr, flush=True)
+        code = error.exit_code
+    os._exit(code)
 
 
 if __name__ == "__main__":
