@@ -236,7 +236,7 @@ def test_secret_values_are_not_shown() -> None:
 @pytest.mark.parametrize(
     ("word", "known", "suggestion"),
     [("topcs", ["topics", "hosts"], "; did you mean 'topics'?"), ("zzz", ["topics"], ""),
-     ("TOPICS", ["topics"], "; did you mean 'topics'?")],
+     ("TOPICS", ["topics"], "; did you mean 'topics'?"), ("topics", ["topics"], "")],
 )  # fmt: skip
 def test_did_you_mean(word: str, known: list[str], suggestion: str) -> None:
     assert did_you_mean(word, known) == suggestion

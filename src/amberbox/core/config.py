@@ -63,13 +63,13 @@ def refuse(problems: Sequence[Problem]) -> None:
 
 
 def did_you_mean(word: str, known: Collection[str]) -> str:
-    """Return ``; did you mean 'x'?`` for the nearest known word, or nothing."""
+    """Return ``; did you mean 'x'?`` for the nearest other word that is known, or nothing."""
     near = _nearest(word, known)
     return f"; did you mean '{near}'?" if near is not None else ""
 
 
 def _nearest(word: str, known: Collection[str]) -> str | None:
-    lower = {name.lower(): name for name in known}
+    lower = {name.lower(): name for name in known if name != word}
     near = difflib.get_close_matches(word.lower(), lower, n=1, cutoff=0.6)
     return lower[near[0]] if near else None
 

@@ -50,7 +50,10 @@ def conclude(
     effort = effort or Effort()
     known = evidence(knowledge, situation)
     causes = _causes(knowledge, known)
-    found = _best(knowledge, known, _tree(knowledge, known, causes), effort)
+    explains = causes or known.conflicts or not any(map(_believed, known.observations.values()))
+    found = _Found()  # of what the FMEA does not know there is no tree
+    if explains:
+        found = _best(knowledge, known, _tree(knowledge, known, causes), effort)
     hypotheses, groups = _hypotheses(knowledge, known, causes, found)
     checks = tuple(knowledge.checks.values())
     tests = next_tests(knowledge.model, known, hypotheses, checks, most=effort.tests)
