@@ -60,7 +60,7 @@ def test_no_fault_of_a_connection_loses_rows(
 ) -> None:
     monkeypatch.setattr(limits, "SILENT_S", 1.0)
     monkeypatch.setattr(limits, "BEAT_S", 0.2)
-    faults = Faults((kind,), after_bytes=(2_000, 60_000), stall_s=1.5, rate=100_000)
+    faults = Faults((kind,), after_bytes=(20_000, 120_000), stall_s=1.5, rate=100_000)
     proxy = asyncio.run(carry(tmp_path / "store", database, faults, 7))
     assert proxy.struck and set(proxy.struck) == {kind}
     assert not put_aside(database)

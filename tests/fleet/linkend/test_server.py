@@ -1,0 +1,201 @@
+"""The server's end: one connection per robot, silence noticed, the board, what is committed."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Iterator
+from pathlib import Path
+
+import msgspec
+import pytest
+from sqlalchemy import select, text
+
+from amberbox.blackbox.journal import reserved
+from amberbox.fleet.database.database import Database
+from amberbox.fleet.linkend import ledger
+from amberbox.fleet.linkend.board import board
+from amberbox.fleet.linkend.committed import drop_committed
+from amberbox.fleet.linkend.grouped import GroupedWrites
+from amberbox.fleet.linkend.presence import offset_ns, presences
+from amberbox.fleet.linkend.server import LinkServer
+from amberbox.fleet.linkend.sockets import SocketClosedError
+from amberbox.fleet.linkend.tables import ROW
+from amberbox.link.frames import (
+    Ack,
+    Beat,
+    Bye,
+    Hello,
+    Live,
+    Pong,
+    RobotFrame,
+    Row,
+    Rows,
+    ServerFrame,
+    Watch,
+    Welcome,
+    encode,
+    from_server,
+)
+from amberbox.link.positions import Place, Reach, RunEnd
+
+REACH = Reach(Place(1, 0), Place(1, 9), Place(1, 5), (RunEnd(1, "b", 9, closed=False),))
+HELLO = Hello("r1", "s", "boot", {"watch": REACH}, "", 0, 0, "1")
+
+
+@pytest.fixture
+def database(tmp_path: Path) -> Iterator[Database]:
+    found = Database(tmp_path / "server.db")
+    yield found
+    found.close()
+
+
+class FakeSocket:
+    """Two queues that stand for a WebSocket."""
+
+    def __init__(self) -> None:
+        self.up: asyncio.Queue[bytes | None] = asyncio.Queue()
+        self.down: asyncio.Queue[bytes] = asyncio.Queue()
+        self.closed = False
+
+    async def receive(self) -> bytes:
+        data = await self.up.get()
+        if data is None:
+            raise SocketClosedError
+        return data
+
+    async def send(self, data: bytes) -> None:
+        if self.closed:
+            raise SocketClosedError
+        self.down.put_nowait(data)
+
+    async def close(self) -> None:
+        self.closed = True
+        self.up.put_nowait(None)
+
+    def say(self, *frames: RobotFrame) -> None:
+        for frame in frames:
+            self.up.put_nowait(encode(frame))
+
+    async def hear(self) -> ServerFrame:
+        return from_server(await asyncio.wait_for(self.down.get(), 5))
+
+
+def status(seq: int, component: str, level: str = "ok", log_ns: int = 0) -> Row:
+    data = msgspec.json.encode({"component": component, "mode": "", "level": level, "seq": seq})
+    return Row("watch", 1, seq, reserved.STATUS, log_ns, data)
+
+
+def test_a_robot_that_connects_again_ends_its_older_connection(database: Database) -> None:
+    async def scene() -> None:
+        link = LinkServer(database)
+        first, second = FakeSocket(), FakeSocket()
+        serving = [asyncio.create_task(link.serve(s, "r1")) for s in (first, second)]
+        first.say(HELLO)
+        old = await first.hear()
+        second.say(HELLO)
+        new = await second.hear()
+        assert isinstance(old, Welcome) and isinstance(new, Welcome) and new.epoch > old.epoch
+        await asyncio.wait_for(serving[0], 5)
+        assert first.closed and list(link.robots) == ["r1"]
+        second.say(Rows(old.epoch, 1, [status(1, "a")], {}))
+        assert isinstance(await second.hear(), Bye)
+        await asyncio.wait_for(serving[1], 5)
+        link.close()
+
+    asyncio.run(scene())
+    with database.reading() as connection:
+        assert connection.execute(select(ROW)).all() == []
+
+
+def test_acknowledged_is_what_is_durable_on_the_robot(database: Database) -> None:
+    async def scene() -> None:
+        link, socket = LinkServer(database), FakeSocket()
+        task = asyncio.create_task(link.serve(socket, "r1"))
+        socket.say(HELLO)
+        await socket.hear()
+        socket.say(Rows(1, 1, [status(n, "a") for n in range(9)], {"watch": Place(1, 9)}))
+        assert await socket.hear() == Ack(1, {"watch": Place(1, 5)})
+        await socket.close()
+        await task
+        link.close()
+
+    asyncio.run(scene())
+
+
+def test_silence_is_noticed_and_the_robot_is_offline(database: Database) -> None:
+    async def scene() -> None:
+        link, socket = LinkServer(database, silent_s=0.2), FakeSocket()
+        task = asyncio.create_task(link.serve(socket, "r1"))
+        socket.say(HELLO)
+        await socket.hear()
+        await asyncio.wait_for(task, 5)
+        assert socket.closed and not link.robots
+        link.close()
+
+    asyncio.run(scene())
+    with database.reading() as connection:
+        [seen] = presences(connection)
+    assert not seen.connected and seen.last_seen_ns > 0
+
+
+def test_heartbeats_tell_backlog_and_clock_and_live_values_stay_in_memory(
+    database: Database,
+) -> None:
+    async def scene() -> None:
+        link, socket = LinkServer(database), FakeSocket()
+        await link.watch("r1", ["odom.x"])
+        task = asyncio.create_task(link.serve(socket, "r1"))
+        socket.say(HELLO)
+        welcome = await socket.hear()
+        assert isinstance(welcome, Welcome) and welcome.watch == ["odom.x"]
+        socket.say(Live(1, {"odom.x": (5, 1.5)}), Beat(1, 7, 8, 12, 100, 10))
+        answer = await socket.hear()
+        assert isinstance(answer, Pong) and answer.mono_ns == 8
+        assert link.robots["r1"].live == {"odom.x": (5, 1.5)}
+        await link.watch("r1", [])
+        assert await socket.hear() == Watch([])
+        await socket.close()
+        await task
+        link.close()
+
+    asyncio.run(scene())
+    with database.reading() as connection:
+        assert presences(connection)[0].backlog == 12
+        assert offset_ns(connection, "r1", "boot") == 100
+
+
+def test_the_board_goes_by_position_not_by_clock_or_arrival(database: Database) -> None:
+    with database.begin() as connection:
+        ledger.admit(connection, HELLO, 1)
+        late = [status(2, "a", "ok", log_ns=900), Row("watch", 1, 4, reserved.STATUS, 0, b"no")]
+        for rows in ([status(5, "a", "error", log_ns=-5)], late, [status(3, "b", "warn")]):
+            ledger.store(connection, "r1", 1, "s", rows, {}, {"watch": REACH}, 2)
+        shown = {s["component"]: s["level"] for s in board(connection, "r1")}
+    assert shown == {"a": "error", "b": "warn"}
+
+
+def test_committed_rows_go_and_do_not_come_back(database: Database) -> None:
+    rows = [status(n, "a") for n in range(9)]
+    with database.begin() as connection:
+        ledger.admit(connection, HELLO, 1)
+        ledger.store(connection, "r1", 1, "s", rows[:6], {}, {"watch": REACH}, 2)
+        assert drop_committed(connection, "r1", "s", "watch", 1, 0, 3) == 3
+        assert drop_committed(connection, "r1", "s", "watch", 1, 3, 8) == 3
+        stored = ledger.store(connection, "r1", 1, "s", rows, {}, {"watch": REACH}, 2)
+        assert [row.seq for row in stored.new] == [8]
+        held = connection.execute(select(ROW.c.seq)).scalars().all()
+    assert held == [8]
+
+
+def test_work_that_fails_leaves_the_rest_of_its_group(database: Database) -> None:
+    writes = GroupedWrites(database)
+    good = [
+        writes.submit(lambda c, n=n: ledger.admit(c, HELLO, n).epoch)  # type: ignore[misc]  # n
+        for n in range(3)
+    ]
+    bad = writes.submit(lambda c: c.execute(text("select * from nothing")))
+    last = writes.submit(lambda c: ledger.admit(c, HELLO, 9).epoch)
+    writes.close()
+    assert [one.result() for one in good] == [1, 2, 3] and last.result() == 4
+    assert bad.exception() is not None
+    assert isinstance(writes.submit(lambda c: None).exception(), RuntimeError)

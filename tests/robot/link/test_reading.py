@@ -1,0 +1,101 @@
+"""What the link reads of a store: rows as they stand, how far journals reach, latest values."""
+
+from __future__ import annotations
+
+import json
+import threading
+from pathlib import Path
+
+from amberbox.blackbox.keeper.keeper import Keeper
+from amberbox.blackbox.keeper.options import KeeperOptions
+from amberbox.blackbox.store import create_store
+from amberbox.link.positions import Place
+from amberbox.robot.link.live import LiveValues
+from amberbox.robot.link.reaching import Reaches
+from amberbox.robot.link.remarks import Remarks
+from amberbox.robot.link.remembered import NAME, Remembered, recall, remember
+from amberbox.robot.link.tails import RawTail
+from amberbox.testing.box import events
+from amberbox.testing.records import BATTERY, POSE, T0_NS, FakeRun, pose_rows
+from tests.robot.link.rig import Watcher, recorded
+
+
+def test_rows_come_byte_for_byte_from_any_place_on(tmp_path: Path) -> None:
+    watcher = Watcher(tmp_path)
+    for _ in range(5):
+        watcher.write(7, 2)
+    wanted = recorded(tmp_path)
+    tail = RawTail(watcher.store, "watch", Place())
+    rows = [row for _ in range(8) for row in tail.pull(10)]
+    found = {
+        (watcher.store.id, row.writer, row.run, row.seq): (row.channel, row.log_ns, row.data)
+        for row in rows
+    }
+    assert found == wanted and len(rows) == 45
+    middle = rows[20].place
+    assert [row.place for row in RawTail(watcher.store, "watch", middle).pull(1000)] == [
+        row.place for row in rows[20:]
+    ]
+    watcher.close()
+
+
+def test_only_what_was_synced_is_durable_until_the_run_is_over(tmp_path: Path) -> None:
+    watcher = Watcher(tmp_path)
+    watcher.write(3)
+    reaches = Reaches(watcher.store)
+    synced = reaches.of("watch")
+    assert synced.durable == synced.end
+    watcher.write(4, sync=False)
+    now = reaches.of("watch")
+    assert now.durable == synced.durable < now.end and not now.runs[-1].closed
+    watcher.lock.release()
+    over = reaches.of("watch")
+    assert over.end == over.durable == now.end and over.runs[-1].closed
+    again = Watcher(tmp_path)
+    again.write(1)
+    both = reaches.of("watch")
+    assert [run.closed for run in both.runs] == [True, False]
+    assert both.durable.run > over.end.run and not both.problem()
+    again.close()
+
+
+def test_the_newest_value_of_each_watched_variable(tmp_path: Path) -> None:
+    run = FakeRun(tmp_path)
+    run.write(pose_rows(0, 200))
+    live = LiveValues(create_store(tmp_path))
+    live.watch([f"{POSE.name}.pose_x", f"{BATTERY.name}.volts", "nothing.here", "no address"])
+    waiting, found = threading.Event(), {}
+    for _ in range(100):
+        found |= live.take()
+        if len(found) == 2:
+            break
+        waiting.wait(0.05)
+    live.close()
+    run.close()
+    assert found[f"{POSE.name}.pose_x"] == (T0_NS + 1990 * 1_000_000, 199.0)
+    assert found[f"{BATTERY.name}.volts"][1] == 24.0 - 1.9
+
+
+def test_what_is_remembered_belongs_to_its_store(tmp_path: Path) -> None:
+    one, two = create_store(tmp_path / "one"), create_store(tmp_path / "two")
+    what = Remembered("https://fleet", {"watch": Place(3, 7)}, 4, 99)
+    remember(one, what)
+    assert recall(one) == what
+    (two.path / NAME).write_text((one.path / NAME).read_text())
+    assert recall(two) is None
+    (one.path / NAME).write_text("{")
+    assert recall(one) is None
+
+
+def test_a_remark_becomes_an_event_once(tmp_path: Path) -> None:
+    store = create_store(tmp_path)
+    remarks = Remarks(store)
+    for _ in range(3):
+        remarks.say("clock_not_set", "the clock was not set")
+    keeper = Keeper(store, KeeperOptions(quota_percent=100.0, min_free=0))
+    keeper.step(threading.Event())
+    keeper.close()
+    [told] = events(tmp_path, "clock_not_set")
+    assert told["source"] == "link" and told["text"] == "the clock was not set"
+    assert not list((tmp_path / "requests").glob("*.json"))
+    json.dumps(told)
