@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from amberbox.blackbox import requests
 from amberbox.blackbox.journal import reserved
 from amberbox.blackbox.store import open_store
 from amberbox.fleet.database.database import Database
@@ -16,6 +17,7 @@ from amberbox.fleet.linkend.presence import presences
 from amberbox.fleet.linkend.server import Hooks
 from amberbox.link.frames import Row
 from amberbox.robot.link.remembered import recall
+from amberbox.testing.clock import ManualClock
 from tests.robot.link.rig import (
     Watcher,
     client_of,
@@ -94,7 +96,7 @@ def test_a_writer_that_begins_later_is_told_of(tmp_path: Path, database: Databas
     asyncio.run(scene())
 
 
-def test_a_wrong_key_is_refused_and_said_once(tmp_path: Path, database: Database) -> None:
+def test_a_wrong_key_gives_nothing_away(tmp_path: Path, database: Database) -> None:
     async def scene() -> None:
         watcher = Watcher(tmp_path / "store")
         watcher.write(3)
@@ -104,6 +106,23 @@ def test_a_wrong_key_is_refused_and_said_once(tmp_path: Path, database: Database
             async with linked(client):
                 await until(lambda: client.progress.attempts > 2)
         watcher.close()
+        assert not client.progress.connected and client.progress.trouble
 
     asyncio.run(scene())
     assert not held(database)
+
+
+def test_a_robot_in_1970_connects_and_says_so(tmp_path: Path, database: Database) -> None:
+    async def scene() -> None:
+        watcher = Watcher(tmp_path / "store")
+        watcher.write(3)
+        async with serving(database) as (_, port):
+            client = client_of(watcher.store, port)
+            client.clock = ManualClock(wall=0)
+            async with linked(client):
+                await until(lambda: len(held(database)) == 3)
+        watcher.close()
+        [asked] = requests.pending(watcher.store)
+        assert (asked.kind, asked.values["kind"]) == ("event", "clock_not_set")
+
+    asyncio.run(scene())

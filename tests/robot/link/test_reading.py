@@ -64,7 +64,8 @@ def test_the_newest_value_of_each_watched_variable(tmp_path: Path) -> None:
     run.write(pose_rows(0, 200))
     live = LiveValues(create_store(tmp_path))
     live.watch([f"{POSE.name}.pose_x", f"{BATTERY.name}.volts", "nothing.here", "no address"])
-    waiting, found = threading.Event(), {}
+    waiting = threading.Event()
+    found: dict[str, tuple[int, float | str | None]] = {}
     for _ in range(100):
         found |= live.take()
         if len(found) == 2:

@@ -12,7 +12,7 @@ import ssl
 import threading
 import time
 import zlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
@@ -21,16 +21,16 @@ from urllib.parse import urlsplit
 import msgspec
 
 from amberbox.blackbox.deletion.confirm import confirm
+from amberbox.blackbox.follow.read import journal_file
 from amberbox.blackbox.incidents.incident import Incident, load_all
 from amberbox.blackbox.segments import manifest
-from amberbox.blackbox.segments.entries import Sealed
-from amberbox.blackbox.store import Store
+from amberbox.blackbox.store import FOLDERS, INCIDENTS, Store, is_locked, run_and_number
 from amberbox.link import uploads
 from amberbox.link.bucket import TokenBucket
 from amberbox.link.limits import PIECE_BYTES
 from amberbox.link.proof import proof_of
 from amberbox.link.uploads import Proof, Verdict
-from amberbox.robot.link.copyrule import Situation, due
+from amberbox.robot.link.copyrule import Situation, due, may_copy
 from amberbox.robot.link.dialing import authorization
 from amberbox.robot.link.options import LinkOptions
 from amberbox.robot.link.remarks import Remarks
@@ -133,7 +133,7 @@ class Copier:
         sealed = [s for s in found.sealed.values() if s.journal not in found.raw_gone]
         rule = self.options.copy
         ordered = due(sealed, found.confirmed, pins, rule, self.situation())
-        held = _held_by(self.store, pins) if any(_is_first(s, pins) for s in ordered) else []
+        held = _held_by(self.store, pins) if may_copy(rule, self.situation()) else []
         names = [s.journal for s in ordered]
         known = {*names, *found.confirmed}
         names = [*(name for name in held if name not in known), *names]
@@ -234,17 +234,13 @@ def _about(path: Path) -> dict[str, str]:
     return {uploads.BYTES: str(size), uploads.SHA256: digest.hexdigest()}
 
 
-def _is_first(journal: Sealed, pins: Sequence[Incident]) -> bool:
-    return any(pin.holds_received(journal.run, journal.start_ns, journal.end_ns) for pin in pins)
-
-
 def _held_by(store: Store, pins: Sequence[Incident]) -> list[str]:
-    """Name the journals of the ring that incidents hold whole; they are not sealed."""
-    done = {pin.id for pin in pins if pin.state == "complete"}
-    return [name for name, incident in _ring_files(store) if incident in done]
-
-
-def _ring_files(store: Store) -> Iterator[tuple[str, str]]:
-    for path in store.journal_files("ring"):
-        if path.parent.parent.parent.name == "incidents":
-            yield f"{path.parent.name}/{path.name}", path.parent.parent.name
+    """Name the journals of the ring that incidents hold and nobody writes; they are not sealed."""
+    names: dict[str, None] = {}
+    writing = is_locked(store, "main")  # the recorder's lock is for its ring, too
+    for incident in pins:
+        ring = store.path / INCIDENTS / incident.id / FOLDERS["ring"]
+        for path in sorted(ring.glob("*.mcap"), key=run_and_number):
+            if incident.state == "complete" and (not writing or journal_file(path).finished):
+                names[f"{path.parent.name}/{path.name}"] = None
+    return list(names)

@@ -1,0 +1,66 @@
+"""What incidents keep goes to the server first, the ring's files that only they hold included."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+
+from amberbox.blackbox.incidents.pin import Wish, pin
+from amberbox.blackbox.keeper.keeper import Keeper
+from amberbox.blackbox.keeper.options import KeeperOptions
+from amberbox.blackbox.recorder.pipeline import PipelineOptions
+from amberbox.blackbox.signing.keys import public_key
+from amberbox.blackbox.store import Store, open_store
+from amberbox.core.clock import NS
+from amberbox.core.source import TopicOptions
+from amberbox.core.types import Schema, Topic
+from amberbox.fleet.database.database import Database
+from amberbox.fleet.uploads.desk import Desk
+from amberbox.robot.link.copying import Copier, HttpSending
+from amberbox.robot.link.options import LinkOptions
+from amberbox.testing.box import COUNT, ManualBox, number
+from tests.fleet.uploads.served import served
+
+RING = Topic("/ring", "ros1", Schema("std_msgs/Int64", "ros1msg", b"int64 data\n"))
+OPTIONS = KeeperOptions(quota_percent=100.0, min_free=0)
+
+
+def recorded_with_incident(path: Path) -> Store:
+    """Record for 60 s in files of 10 s; mark the stretch from 25 s to 35 s."""
+    topics = [TopicOptions("/count"), TopicOptions("/ring", keep="ring")]
+    box = ManualBox(
+        path, topics, options=PipelineOptions(rotate_ns=10 * NS, ring_rotate_ns=10 * NS)
+    )
+    store = open_store(path)
+    for step in range(600):
+        box.hear(COUNT, number(step))
+        box.hear(RING, number(step))
+        box.write(0.1)
+        if step == 350:
+            pin(store, Wish(10.0, 0.0, "bump", "test"), OPTIONS)
+    box.close()
+    keeper = Keeper(store, OPTIONS)
+    keeper.step(threading.Event())
+    keeper.close()
+    return store
+
+
+def test_incidents_are_copied_first_and_the_ring_s_files_with_them(tmp_path: Path) -> None:
+    store = recorded_with_incident(tmp_path / "store")
+    database = Database(tmp_path / "server.db")
+    desk = Desk(tmp_path / "server", database, lambda r, s: public_key(store.path) or "")
+    with served(desk) as port:
+        options = LinkOptions(f"http://127.0.0.1:{port}", "r1", "key-r1")
+        copier = Copier(store, options, HttpSending(options, lambda: None))
+        order = copier.waiting()
+        while copier.step():
+            pass
+    main = [p.relative_to(store.path).as_posix() for p in store.journal_files("main")]
+    rings = [name for name in order if name.startswith("ring/")]
+    rest = [name for name in order if not name.startswith("ring/")]
+    assert rings and order[: len(rings)] == rings
+    assert set(rest[:2]) == set(main[2:4]) and set(main) <= set(rest)
+    for name in order:
+        here = tmp_path / "server" / "journals" / "r1" / store.id / name
+        assert here.read_bytes() == store.journal_path(name).read_bytes()
+    database.close()
