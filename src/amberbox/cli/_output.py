@@ -58,8 +58,11 @@ def opened(where: str) -> Iterator[Record]:
 
 
 def _opened_archive(folder: Path, robots: Sequence[str]) -> Record:
-    from amberbox.fleet.archive.record import open_archive  # needs what servers have installed
-
+    try:
+        from amberbox.fleet.archive.record import open_archive
+    except ImportError:
+        what = f"{folder} is a server's archive: reading it needs what servers have installed"
+        raise UsageError(what, "pip install 'amberbox[server]'") from None
     return open_archive(folder, robots)
 
 

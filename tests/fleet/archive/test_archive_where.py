@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 
 import pytest
@@ -50,3 +51,11 @@ def test_one_robot_of_a_folder(folder: Path, capsys: pytest.CaptureFixture[str])
 def test_a_robot_that_is_not_there(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["query", str(folder / "journals" / "r3"), "odom"]) == 2
     assert "there are: r1, r2" in capsys.readouterr().err
+
+
+def test_without_what_servers_have_installed_it_says_so(
+    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "amberbox.fleet.archive.record", None)
+    assert main(["query", str(folder), "odom"]) == 2
+    assert "pip install 'amberbox[server]'" in capsys.readouterr().err
