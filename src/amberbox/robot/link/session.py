@@ -40,6 +40,8 @@ if TYPE_CHECKING:
 
 READ_S = 0.05
 LIVE_S = 0.2
+IDLE_BEATS = 10
+"""How often a robot without news says how far its journals reach, in heartbeats."""
 _NETWORK_BEATS = 10
 """The network is asked for once in so many heartbeats."""
 _REMEMBER_BEATS = 5
@@ -78,6 +80,7 @@ class Session:
         self._offered = asyncio.Event()
         self._beats = 0
         self._told_at = -1
+        self._ending = False
         self._heads = b""
 
     async def run(self, stop: asyncio.Event) -> None:
@@ -100,7 +103,9 @@ class Session:
 
     async def _last(self, tasks: list[asyncio.Task[None]]) -> None:
         """Send what is left, wait for its acknowledgement for a while, and say goodbye."""
+        self._ending = True
         self._reaches = await asyncio.to_thread(self._looking.state)
+        self._offered.set()
         await self._send(Durable(self._end.epoch, self._reaches))
         until = asyncio.get_running_loop().time() + _LAST_S
         while asyncio.get_running_loop().time() < until and not any(t.done() for t in tasks):
@@ -171,13 +176,14 @@ class Session:
 
     async def _send_rows(self) -> None:
         while True:
-            bare = self._told_at != self._beats  # other rows of the journal move it all the time
+            now = self._beats // IDLE_BEATS
+            bare = self._ending or self._told_at != now  # other rows move it all the time
             frame = self._end.next_rows(self._allowed.lanes, self._most_bytes(), bare=bare)
             if frame is None:
                 self._offered.clear()
                 await self._offered.wait()
                 continue
-            self._told_at = self._beats
+            self._told_at = now
             await self._paced(frame)
 
     def _most_bytes(self) -> int:
@@ -200,7 +206,7 @@ class Session:
             if self._beats % _NETWORK_BEATS == 0:
                 await self._look_at_network()
             reaches = await asyncio.to_thread(self._looking.state)
-            if reaches != self._reaches:
+            if self._is_due(reaches):
                 await self._send(Durable(self._end.epoch, reaches))
                 self._reaches = reaches
             await self._send(self._heartbeat(reaches))
@@ -210,6 +216,15 @@ class Session:
             if self._beats % _REMEMBER_BEATS == 0:
                 await asyncio.to_thread(self._remember)
             await asyncio.sleep(limits.BEAT_S)
+
+    def _is_due(self, reaches: Mapping[str, Reach]) -> bool:
+        """Tell whether the server needs to know how far journals reach: for rows it waits with.
+
+        Else now and then, for a robot that concludes nothing new; and when a run is over.
+        """
+        end = self._end
+        waits = any(at > end.cursor.get(writer, START) for writer, at in end.said.items())
+        return waits or self._beats % IDLE_BEATS == 0 or _closed(reaches) != _closed(self._reaches)
 
     def _heartbeat(self, reaches: Mapping[str, Reach]) -> Beat:
         client, offset = self._client, self._client.progress.offset
@@ -258,3 +273,8 @@ class Session:
 
 async def _set(stop: asyncio.Event) -> None:
     await stop.wait()
+
+
+def _closed(reaches: Mapping[str, Reach]) -> dict[str, list[int]]:
+    """Return the runs of each writer that are over."""
+    return {w: [run.run for run in reach.runs if run.closed] for w, reach in reaches.items()}
