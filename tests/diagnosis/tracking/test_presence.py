@@ -35,10 +35,22 @@ def test_what_becomes_unknown_is_remembered_as_long() -> None:
     assert not one.is_absent
 
 
-def test_what_is_there_counts_although_it_is_blocked() -> None:
+def test_what_comes_while_it_is_blocked_is_no_evidence() -> None:
     one = presence(At(1, NAME, blocked_by=("bus",)))
-    assert one.counts_present(seconds(60)) and not one.is_absent
-    assert one.shown("present").blocked_by == ()
+    assert not one.counts_present(seconds(60)) and not one.is_absent
+    one.take(At(61, NAME).symptom(), seconds(61))
+    assert one.counts_present(seconds(61)), "nothing blocks it any more"
+
+
+def test_what_comes_while_it_is_blocked_counts_if_what_blocks_may_show_it() -> None:
+    one = presence(At(1, NAME, blocked_by=("laser/heartbeat",)))
+    assert one.counts_present(seconds(60)) and one.shown("present").blocked_by == ()
+
+
+def test_what_was_there_before_it_was_blocked_goes_on_to_count() -> None:
+    one = presence(At(1, NAME), At(5, NAME, blocked_by=("bus",)))
+    assert one.counts_present(seconds(60))
+    assert one.onset_ns == seconds(1)
 
 
 def test_what_is_blocked_is_never_seen_absent() -> None:

@@ -59,11 +59,16 @@ def test_unknown_outputs_and_those_never_told_are_no_evidence() -> None:
     assert states(tracker) == {CLEAR: "present"}
 
 
-def test_a_blocked_symptom_counts_and_its_absence_does_not() -> None:
+def test_a_blocked_symptom_is_no_evidence_unless_what_blocks_may_show_it() -> None:
     tracker = begun()
-    found = run(tracker, [*WELL, At(5, CLEAR, blocked_by=("bus",))], 30)
+    assert diagnoses(run(tracker, [*WELL, At(5, CLEAR, blocked_by=("bus",))], 30)) == []
+    tracker = begun()
+    found = run(tracker, [*WELL, At(5, FOLLOWS, blocked_by=("motor",))], 30)
     assert next(iter(diagnoses(found))).at_ns == seconds(5)
-    assert states(tracker)[CLEAR] == "present"
+    assert states(tracker)[FOLLOWS] == "present"
+
+
+def test_the_absence_of_a_blocked_symptom_is_no_evidence() -> None:
     tracker = begun()
     run(tracker, [At(1, ALIVE, "absent", ("bus",)), At(5, CLEAR)], 60)
     assert ALIVE not in states(tracker)

@@ -11,6 +11,7 @@ import msgspec
 from amberbox.core.clock import NS
 from amberbox.core.types import Symptom
 from amberbox.diagnosis.fmea.model import Fmea
+from amberbox.diagnosis.tracking.showing import showing
 
 Counts: TypeAlias = Literal["present", "absent", ""]
 """What a symptom counts as; empty if it is no evidence."""
@@ -21,12 +22,14 @@ class Presence:
     """One symptom: what was told last, and when it came and went.
 
     ``seen`` is what was told when it came, ``gone_ns`` when it went: for ``hold_ns`` it is
-    remembered, and only ``within_ns`` later it can count as absent.
+    remembered, and only ``within_ns`` later it can count as absent. ``shown_by`` are the
+    components whose failures may show it.
     """
 
     told: Symptom
     hold_ns: int = 0
     within_ns: int = 0
+    shown_by: frozenset[str] = frozenset()
     seen: Symptom | None = None
     gone_ns: int | None = None
 
@@ -38,16 +41,21 @@ class Presence:
     def take(self, told: Symptom, at_ns: int) -> None:
         """Take what is told of it at an instant; what comes back in time never went.
 
-        What is there counts although its component is blocked: the analysis says what may
-        show it, and what blocks may be among that. Its absence says nothing then.
+        What comes while its component is blocked counts only if the analysis says that what
+        blocks may show it. What was there before goes on to count: it has another cause.
         """
         was_present = self.counts_present(at_ns)
         self.told = told
-        if told.state == "present":
+        if told.state == "present" and (was_present or self._is_explained(told)):
             self.seen = self.seen if was_present else told
             self.gone_ns = None
-        elif self.is_there:
+        elif self.is_there and told.state != "present":
             self.gone_ns = at_ns
+
+    def _is_explained(self, told: Symptom) -> bool:
+        """Tell whether nothing blocks it, or something that the analysis knows to show it."""
+        blocking = {label.partition("/")[0] for label in told.blocked_by}
+        return not blocking or not blocking.isdisjoint(self.shown_by)
 
     def counts_present(self, at_ns: int) -> bool:
         """Tell whether it is there, or went so short ago that it is remembered."""
@@ -83,6 +91,7 @@ class Presences:
 
     def __init__(self, fmea: Fmea) -> None:
         self._symptoms = fmea.symptoms
+        self._shown_by = showing(fmea)
         self._all: dict[str, Presence] = {}
 
     def begin(self) -> None:
@@ -97,15 +106,16 @@ class Presences:
         """Take what is told of a symptom at an instant."""
         presence = self._all.get(told.id)
         if presence is None:
-            presence = self._all[told.id] = Presence(told, *self._times_ns(told.id))
+            presence = self._all[told.id] = self._made(told)
         presence.take(told, at_ns)
 
-    def _times_ns(self, name: str) -> tuple[int, int]:
-        """Return how long a symptom is remembered, and how long it may take to come."""
-        symptom = self._symptoms.get(name)
+    def _made(self, told: Symptom) -> Presence:
+        """Make the presence of a symptom: how long it is remembered and may take to come."""
+        symptom = self._symptoms.get(told.id)
         if symptom is None:
-            return 0, 0
-        return round(symptom.hold_s * NS), round(symptom.within_s * NS)
+            return Presence(told)
+        hold_ns, within_ns = round(symptom.hold_s * NS), round(symptom.within_s * NS)
+        return Presence(told, hold_ns, within_ns, self._shown_by.get(told.id, frozenset()))
 
     def __iter__(self) -> Iterator[tuple[str, Presence]]:
         return iter(self._all.items())
@@ -153,13 +163,11 @@ class Presences:
 
     def resume(self, snapshot: Mapping[str, Any]) -> None:
         """Go on from what ``snapshot`` returned."""
-        self._all = {
-            name: Presence(
-                msgspec.convert(told, Symptom), *self._times_ns(name),
-                msgspec.convert(seen, Symptom | None), gone_ns,
-            )
-            for name, (told, seen, gone_ns) in snapshot.items()
-        }  # fmt: skip
+        self._all.clear()
+        for name, (told, seen, gone_ns) in snapshot.items():
+            presence = self._all[name] = self._made(msgspec.convert(told, Symptom))
+            presence.seen = msgspec.convert(seen, Symptom | None)
+            presence.gone_ns = gone_ns
 
 
 def _time(at_ns: int | None) -> int:
