@@ -7,6 +7,7 @@ import hashlib
 import importlib
 import importlib.util
 import sys
+import threading
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points, metadata
@@ -85,8 +86,9 @@ def missing_packages(plugin: Plugin) -> list[str]:
     """Return the packages that a plugin's file imports, at any place, and that are not there."""
     if plugin.path is None:
         return []
-    tree = ast.parse(plugin.path.read_text(encoding="utf-8", errors="replace"))
-    imported = {name.partition(".")[0] for node in ast.walk(tree) for name in _imported(node)}
+    tree = _parsed(plugin.path.read_text(encoding="utf-8", errors="replace"))
+    nodes = ast.walk(tree) if tree else ()
+    imported = {name.partition(".")[0] for node in nodes for name in _imported(node)}
     return sorted(name for name in imported if importlib.util.find_spec(name) is None)
 
 
@@ -128,10 +130,15 @@ def _in_folder(folder: Path, package: str, defines: Collection[str]) -> Iterator
             yield Plugin(stem.rstrip("_"), _summary(tree), target, path)
 
 
+_PARSING = threading.Lock()
+"""Python 3.11 counts how deep it is in a syntax tree once for all threads, and raises."""
+
+
 def _parsed(text: str) -> ast.Module | None:
     """Read a module without running it; None if it has an error."""
     try:
-        return ast.parse(text)
+        with _PARSING:
+            return ast.parse(text)
     except (SyntaxError, ValueError):
         return None
 

@@ -53,13 +53,14 @@ def parse_time(text: str, now_ns: Callable[[], int], last_ns: Callable[[], int |
     microseconds or nanoseconds, told apart by magnitude. ``-10m`` is that long before the last
     record (``last_ns``), ``now`` and ``now-10m`` go by the clock (``now_ns``).
     """
-    time_ns = _read(text, now_ns, last_ns)
+    time_ns = any_time(text, now_ns, last_ns)
     if abs(time_ns) >= _BEYOND_NS:
         raise UsageError(f"not a time between the years 1678 and 2262: {text!r}", _HINT)
     return time_ns
 
 
-def _read(text: str, now_ns: Callable[[], int], last_ns: Callable[[], int | None]) -> int:
+def any_time(text: str, now_ns: Callable[[], int], last_ns: Callable[[], int | None]) -> int:
+    """Return what ``parse_time`` does of times that 64 bits cannot hold, too."""
     compact = text.strip()
     if compact.startswith("now"):
         return now_ns() + _shift(compact[3:], text)

@@ -277,6 +277,7 @@ open(f(_)).
 open(g(X, X)).
 open(h(X)) :- open(g(X, _)).
 unreached(X) :- edge(X, _), \+ path(X, d).
+reached(L) :- findall(Y, path(a, Y), L0), sort(L0, L).
 max(X, Y, X) :- X >= Y, !.
 max(_, Y, Y).
 first(X) :- member(X, [1, 2, 3]), X > 1, !.
@@ -335,7 +336,7 @@ include(big, [1, 2, 3, 4], L)
 exclude(big, [1, 2, 3, 4], L)
 any(X)
 pair(X, Y)
-findall(Y, path(a, Y), L0), sort(L0, L)
+reached(L)
 forall(edge(X, Y), path(X, Y))
 edge(X, Y), edge(Y, X)
 edge(X, Y), \+ edge(Y, _)

@@ -10,7 +10,7 @@ from decimal import Decimal, InvalidOperation
 import numpy as np
 
 from amberbox.core.errors import AmberboxError, UsageError
-from amberbox.core.timetext import parse_time
+from amberbox.core.timetext import any_time
 
 ISO = "ISO 8601"
 UNITS_NS = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
@@ -126,7 +126,7 @@ def _iso(cell: str) -> Decimal | None:
     if not _ISO_TEXT.fullmatch(text):
         return None
     try:
-        return Decimal(parse_time(text, lambda: 0, lambda: None))
+        return Decimal(any_time(text, lambda: 0, lambda: None))
     except (UsageError, ValueError):
         return None
 
