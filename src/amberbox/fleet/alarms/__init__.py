@@ -1,0 +1,1 @@
+"""Alarms: one per root, what people did about them, and who is told."""

@@ -1,0 +1,60 @@
+"""Errors as the API says them: ``{"error": {"what", "hint"}}`` with a status that fits."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse
+from starlette.exceptions import HTTPException
+
+from amberbox.core.errors import AmberboxError, UsageError
+from amberbox.fleet.accounts.passwords import TooManyError
+from amberbox.fleet.accounts.signin import MustWaitError, WrongLoginError
+from amberbox.fleet.database.database import DatabaseBusyError
+
+_STATUS: Mapping[type[AmberboxError], int] = {
+    MustWaitError: 429,
+    TooManyError: 503,
+    WrongLoginError: 401,
+    DatabaseBusyError: 503,
+    UsageError: 400,
+    AmberboxError: 422,
+}
+
+
+def add_handlers(app: FastAPI) -> None:
+    """Make an app answer errors in this form."""
+    app.add_exception_handler(AmberboxError, _known)
+    app.add_exception_handler(HTTPException, _http)
+    app.add_exception_handler(RequestValidationError, _invalid)
+
+
+def error(status: int, what: str, hint: str = "", headers: Any = None) -> JSONResponse:
+    """Return an error as a response."""
+    return JSONResponse({"error": {"what": what, "hint": hint}}, status, headers)
+
+
+def status_of(found: AmberboxError) -> int:
+    """Return the HTTP status of an error: that of the nearest of its classes."""
+    return next(_STATUS[cls] for cls in type(found).__mro__ if cls in _STATUS)
+
+
+async def _known(_: Request, found: Exception) -> JSONResponse:
+    assert isinstance(found, AmberboxError)
+    wait = {"Retry-After": str(found.seconds)} if isinstance(found, MustWaitError) else None
+    return error(status_of(found), found.what, found.hint, wait)
+
+
+async def _http(_: Request, found: Exception) -> JSONResponse:
+    assert isinstance(found, HTTPException)
+    return error(found.status_code, str(found.detail), "", found.headers)
+
+
+async def _invalid(_: Request, found: Exception) -> JSONResponse:
+    assert isinstance(found, RequestValidationError)
+    first = found.errors()[0]
+    place = ".".join(str(part) for part in first["loc"])
+    return error(422, f"{place}: {first['msg']}", "the page /api/docs shows what is expected")

@@ -1,0 +1,27 @@
+"""Answers questions in workers with limits."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+
+from amberbox.core.clock import Clock
+from amberbox.fleet.bus import Bus
+from amberbox.fleet.database.database import Database
+
+
+class Asking:
+    """Answers questions in workers with limits."""
+
+    def __init__(self, folder: Path, database: Database, bus: Bus, clock: Clock) -> None:
+        self._folder = folder
+        self._database = database
+        self._bus = bus
+        self._clock = clock
+
+    async def run(self) -> None:
+        """Work until cancelled."""
+        await asyncio.Event().wait()
+
+    def close(self) -> None:
+        """Let go of what is held."""

@@ -1,0 +1,80 @@
+"""What happens on the server, told to all of its parts: in memory, in the event loop.
+
+The bus keeps nothing: what must not be lost is in the database before it is told here.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal, TypeAlias, get_args
+
+Kind: TypeAlias = Literal[
+    "rows", "live", "connected", "gone", "journal", "committed", "robot", "alarm", "job", "asked",
+    "fetch", "account", "diagnosis",
+]  # fmt: skip
+"""What a change is about.
+
+``rows``: new rows of a robot, durable (data: store_id, rows: Sequence[Row]). ``live``: latest
+values (data: values). ``connected`` (data: hello, admission) and ``gone``: a robot's link.
+``journal``: one arrived, whatever became of it (data: store_id, journal, state). ``committed``:
+columns of journals are in the archive (data: robots). ``robot``: one was added, changed, given
+another folder. ``alarm`` (data: id), ``job`` (data: id, owner), ``asked`` (data: id), ``fetch``
+(data: id), ``account`` (data: name; its sessions may have ended), ``diagnosis`` (data: id).
+"""
+
+KINDS = frozenset(get_args(Kind))
+Listener: TypeAlias = "Callable[[Change], None]"
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """Something happened; ``robot`` is empty where it concerns none."""
+
+    kind: Kind
+    robot: str = ""
+    data: Mapping[str, Any] = field(default_factory=dict)
+
+
+class Bus:
+    """Hands changes to whoever wants to hear of their kind.
+
+    ``publish`` may be called in any thread; listeners are called in the event loop of ``attach``,
+    must not block, and one that fails disturbs neither the others nor who told.
+    """
+
+    def __init__(self) -> None:
+        self._listeners: dict[Kind, list[Listener]] = {}
+        self._loop: asyncio.AbstractEventLoop | None = None
+
+    def attach(self, loop: asyncio.AbstractEventLoop) -> None:
+        """Name the event loop in which listeners are called."""
+        self._loop = loop
+
+    def on(self, kind: Kind, listener: Listener) -> Callable[[], None]:
+        """Call a listener for each change of a kind; what is returned ends that."""
+        listeners = self._listeners.setdefault(kind, [])
+        listeners.append(listener)
+        return lambda: listeners.remove(listener) if listener in listeners else None
+
+    def publish(self, change: Change) -> None:
+        """Tell of a change, in any thread; without a loop (tools, tests) at once."""
+        if self._loop is None or self._is_in_loop():
+            self._tell(change)
+        elif not self._loop.is_closed():
+            self._loop.call_soon_threadsafe(self._tell, change)
+
+    def _is_in_loop(self) -> bool:
+        try:
+            return asyncio.get_running_loop() is self._loop
+        except RuntimeError:
+            return False
+
+    def _tell(self, change: Change) -> None:
+        for listener in tuple(self._listeners.get(change.kind, ())):
+            try:
+                listener(change)
+            except Exception:  # a listener's mistake must not take others down with it
+                logging.getLogger(__name__).exception("a listener failed over %s", change.kind)

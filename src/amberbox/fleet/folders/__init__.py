@@ -1,0 +1,1 @@
+"""Robots' folders as they were, by their hash, without secrets."""

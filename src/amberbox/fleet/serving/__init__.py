@@ -1,0 +1,1 @@
+"""The running server: its parts, its process, TLS, the first start."""

@@ -1,0 +1,38 @@
+"""The app: every room of the API, with its guards, around the parts of a server."""
+
+from __future__ import annotations
+
+import pkgutil
+from collections.abc import Mapping
+from importlib import import_module
+
+from fastapi import FastAPI
+
+from amberbox import __version__
+from amberbox.fleet.api.access import PREFIX, Routes, Rule
+from amberbox.fleet.api.errors import add_handlers
+from amberbox.fleet.services import Services
+
+
+def rooms() -> Mapping[str, Routes]:
+    """Return the routes of all rooms, found by file name: ``routes`` in ``fleet/api/*.py``."""
+    package = import_module("amberbox.fleet.api")
+    names = sorted(info.name for info in pkgutil.iter_modules(package.__path__))
+    found = ((name, import_module(f"{package.__name__}.{name}")) for name in names)
+    return {name: module.routes for name, module in found if hasattr(module, "routes")}
+
+
+def rules() -> dict[tuple[str, str], Rule]:
+    """Return what each route takes, by method and path."""
+    return {where: rule for routes in rooms().values() for where, rule in routes.rules.items()}
+
+
+def make_app(services: Services) -> FastAPI:
+    """Make the app of a server; its parts are not started."""
+    app = FastAPI(title="Amberbox", version=__version__, docs_url=None, redoc_url=None,
+                  openapi_url=f"{PREFIX}/openapi.json")  # fmt: skip
+    app.state.services = services
+    add_handlers(app)
+    for routes in rooms().values():
+        app.include_router(routes.router)
+    return app

@@ -1,0 +1,1 @@
+"""The level above robots: teams and the system, watched on the server."""

@@ -1,0 +1,97 @@
+"""A server in memory: its parts over a folder, people of every role, and clients that ask it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from starlette.testclient import TestClient
+
+from amberbox.core.clock import NS
+from amberbox.fleet.accounts.actions import SCOPES, Role
+from amberbox.fleet.accounts.groups import add_group
+from amberbox.fleet.accounts.passwords import Cost, Passwords
+from amberbox.fleet.accounts.robotkeys import add_robot
+from amberbox.fleet.accounts.sessions import begin_session, csrf_token
+from amberbox.fleet.accounts.tokens import add_token
+from amberbox.fleet.accounts.users import add_user, find_user
+from amberbox.fleet.api.who import COOKIE, CSRF_HEADER
+from amberbox.fleet.serving import assembly
+from amberbox.fleet.serving.app import make_app
+from amberbox.fleet.serving.settings import Settings
+from amberbox.testing.clock import ManualClock
+
+URL = "https://fleet.example"
+PASSWORD = "a long enough passphrase"
+ROBOTS = {"ropod_001": ("ward",), "ropod_002": ("ward",), "ropod_003": ("kitchen",)}
+START_NS = 1_800_000_000 * NS
+
+
+class House:
+    """A server without a network: ``client(name)`` is somebody who is signed in."""
+
+    def __init__(self, folder: Path) -> None:
+        self.clock = ManualClock(START_NS)
+        self.passwords = Passwords(Cost(1, 8, 1))
+        self.services = assembly.assemble(folder, Settings(URL), self.clock, self.passwords)
+        self.app = make_app(self.services)
+        self.keys: dict[str, str] = {}
+        self._people()
+
+    def _people(self) -> None:
+        """Add robots in two groups, one person of each role, and one who is for the ward only."""
+        hashed = self.passwords.hash(PASSWORD)
+        with self.services.database.begin() as connection:
+            now_ns = self.clock.wall_ns()
+            for group in ("ward", "kitchen"):
+                add_group(connection, now_ns, group)
+            for robot, groups in ROBOTS.items():
+                self.keys[robot] = add_robot(connection, now_ns, robot, groups).text
+            for role in Role:
+                add_user(connection, now_ns, str(role), role, hashed)
+            add_user(connection, now_ns, "nurse", Role.TECHNICIAN, hashed, groups=["ward"])
+
+    def client(self, name: str = "", **options: Any) -> TestClient:
+        """Return a client of somebody who is signed in; of nobody without a name."""
+        client = TestClient(self.app, base_url=URL, raise_server_exceptions=False, **options)
+        if name:
+            with self.services.database.begin() as connection:
+                user = find_user(connection, name)
+                session = begin_session(
+                    connection, self.clock.wall_ns(), user.user_id, "192.0.2.1", "tests"
+                )
+            client.cookies.set(COOKIE, session.secret)
+            client.headers[CSRF_HEADER] = csrf_token(session.secret)
+        return client
+
+    def token_client(self, owner: str = "technician", *scopes: str) -> TestClient:
+        """Return a client with a token of somebody; of all scopes if none is named."""
+        with self.services.database.begin() as connection:
+            user = find_user(connection, owner)
+            token = add_token(connection, self.clock.wall_ns(), user, "test", scopes or SCOPES)
+        client = self.client()
+        client.headers["Authorization"] = f"Bearer {token.text}"
+        return client
+
+    def robot_client(self, robot: str = "ropod_001") -> TestClient:
+        """Return a client with the key of a robot."""
+        client = self.client()
+        client.headers["Authorization"] = f"Robot {robot}:{self.keys[robot]}"
+        return client
+
+    def close(self) -> None:
+        """Let go of everything."""
+        assembly.close(self.services)
+
+
+@contextmanager
+def house(folder: Path) -> Iterator[House]:
+    """Keep a house for the time of a test."""
+    folder.mkdir(parents=True, exist_ok=True)
+    found = House(folder)
+    try:
+        yield found
+    finally:
+        found.close()
