@@ -1,0 +1,127 @@
+"""A robot's folder on its way to the server: files that declare, never files that run.
+
+Packed it is msgpack of contents by name, compressed with zstd. Both ends keep to the same limits.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection, Iterator, Mapping
+from pathlib import PurePosixPath
+
+import msgspec
+import zstandard
+
+from amberbox.core.errors import UsageError
+from amberbox.link.limits import PATH
+
+SUFFIXES = frozenset({".yaml", ".yml", ".pl", ".bpmn", ".md", ".txt", ".csv", ".xml"})
+"""Files of a folder that travel."""
+PACKED_BYTES = 8 << 20
+UNPACKED_BYTES = 32 << 20
+FILES = 2000
+_NAME_LENGTH = 512
+_PART_BYTES = 255
+_DEPTH = 16
+_WINDOW_BYTES = 64 << 20
+_UNSAFE = re.compile(r'[\x00-\x1f\x7f\\:*?"<>|]')
+_HASH = re.compile(r"[0-9a-f]{64}")
+_LEVEL = 9
+
+
+class FolderError(UsageError):
+    """This is no folder, or not one that is taken."""
+
+
+def is_config_hash(text: str) -> bool:
+    """Tell whether this is the hash of a folder, as a robot states it."""
+    return _HASH.fullmatch(text) is not None
+
+
+def address(config_hash: str) -> str:
+    """Return the path of a folder on the server."""
+    return f"{PATH}/folders/{config_hash}"
+
+
+def travels(name: str) -> bool:
+    """Tell whether a file of a folder goes to the server, by its name relative to the folder."""
+    path = PurePosixPath(name)
+    return path.suffix.lower() in SUFFIXES and not _complaint(name)
+
+
+def pack(files: Mapping[str, bytes]) -> bytes:
+    """Pack the files of a folder that travel; the others stay where they are.
+
+    Raises FolderError for more than the limits allow.
+    """
+    chosen = {name: files[name] for name in sorted(files) if travels(name)}
+    _check(chosen)
+    packed = zstandard.ZstdCompressor(level=_LEVEL).compress(msgspec.msgpack.encode(chosen))
+    if len(packed) > PACKED_BYTES:
+        raise FolderError(f"the folder has {len(packed)} bytes, packed: {PACKED_BYTES} are taken")
+    return packed
+
+
+def unpack(data: bytes) -> dict[str, bytes]:
+    """Return the files of a packed folder by their names, which are safe below any folder.
+
+    Raises FolderError for what is damaged, too large, or has a file that does not travel.
+    """
+    try:
+        files = msgspec.msgpack.decode(_decompressed(data), type=dict[str, bytes])
+    except (msgspec.MsgspecError, zstandard.ZstdError, RecursionError) as error:
+        raise FolderError("this is no packed folder, or it is damaged") from error
+    for name in files:
+        wrong = _complaint(name) or _no_declaration(name)
+        if wrong:
+            raise FolderError(f"the file {name[:80]!r} is not taken: {wrong}")
+    _check(files)
+    return files
+
+
+def _decompressed(data: bytes) -> bytes:
+    """Decompress what says beforehand how much it will be, and not too much."""
+    if len(data) > PACKED_BYTES:
+        raise FolderError(f"a packed folder has at most {PACKED_BYTES} bytes")
+    if not 0 <= zstandard.frame_content_size(data) <= UNPACKED_BYTES + (1 << 20):
+        raise FolderError(f"a folder has at most {UNPACKED_BYTES} bytes, and says how many")
+    opener = zstandard.ZstdDecompressor(max_window_size=_WINDOW_BYTES)
+    return opener.decompress(data, allow_extra_data=False)
+
+
+def _check(files: Mapping[str, bytes]) -> None:
+    if len(files) > FILES:
+        raise FolderError(f"the folder has {len(files)} files: {FILES} are taken")
+    total = sum(map(len, files.values()))
+    if total > UNPACKED_BYTES:
+        raise FolderError(f"the files have {total} bytes: {UNPACKED_BYTES} are taken")
+    for name in _in_the_way(files):
+        raise FolderError(f"{name!r} is a file, and a folder of others")
+
+
+def _complaint(name: str) -> str:
+    """Say why a name is no safe path below a folder."""
+    parts = name.split("/")
+    if len(name) > _NAME_LENGTH or len(parts) > _DEPTH:
+        return "its name is too long"
+    if _UNSAFE.search(name):
+        return "its name has signs that are not allowed"
+    if any(part in ("", "..") or part.startswith(".") for part in parts):
+        return "it is hidden, or not below the folder"
+    if any(len(part.encode("utf-8", "surrogatepass")) > _PART_BYTES for part in parts):
+        return "its name is too long"
+    if any(part != part.strip() or part.endswith(".") for part in parts):
+        return "its name begins or ends with a blank or a dot"
+    return ""
+
+
+def _no_declaration(name: str) -> str:
+    if PurePosixPath(name).suffix.lower() in SUFFIXES:
+        return ""
+    return f"only {', '.join(sorted(SUFFIXES))} travel"
+
+
+def _in_the_way(names: Collection[str]) -> Iterator[str]:
+    """Yield names that would have to be a file and a folder."""
+    above = {str(parent) for name in names for parent in PurePosixPath(name).parents}
+    yield from (name for name in names if name in above)

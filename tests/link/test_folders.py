@@ -1,0 +1,100 @@
+"""Folders on their way: what travels, what is refused."""
+
+from __future__ import annotations
+
+import msgspec
+import pytest
+import zstandard
+
+from amberbox.link import folders
+from amberbox.link.folders import FolderError, pack, travels, unpack
+
+
+def _packed(files: object) -> bytes:
+    """Pack anything, as somebody would who means harm."""
+    return zstandard.ZstdCompressor().compress(msgspec.msgpack.encode(files))
+
+
+def test_what_was_packed_is_unpacked() -> None:
+    files = {"robot.yaml": b"id: a\n", "components/laser/alive.yaml": b"name: x\n", "why.md": b""}
+    assert unpack(pack(files)) == files
+
+
+def test_what_runs_stays_at_home() -> None:
+    files = {
+        "robot.yaml": b"",
+        "modes/own.py": b"import os",
+        ".git/x.yaml": b"",
+        "store/a.mcap": b"",
+    }
+    assert list(unpack(pack(files))) == ["robot.yaml"]
+
+
+def test_names_that_travel() -> None:
+    assert all(map(travels, ("robot.yaml", "rules/a.pl", "maps/B.CSV", "mit umlaut ä.yml")))
+    assert not any(map(travels, ("a.py", "a.yaml.py", ".a.yaml", "../a.yaml", "a", "a.so")))
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["../robot.yaml", "/etc/robot.yaml", "a/../../b.yaml", "a//b.yaml", "", "a\\b.yaml", "./a.yaml",
+     "a\0.yaml", "a/.yaml", "..", "C:/a.yaml", "a" * 300 + ".yaml", "a /b.yaml",
+     "/".join("a" * 17)],
+)  # fmt: skip
+def test_names_that_lead_elsewhere_are_refused(name: str) -> None:
+    with pytest.raises(FolderError, match="is not taken"):
+        unpack(_packed({name: b""}))
+
+
+def test_python_is_refused_even_if_a_robot_sends_it() -> None:
+    with pytest.raises(FolderError, match=r"modes/evil.py.*only \.bpmn"):
+        unpack(_packed({"robot.yaml": b"", "modes/evil.py": b"import os"}))
+
+
+def test_a_file_is_no_folder_at_the_same_time() -> None:
+    with pytest.raises(FolderError, match="a folder of others"):
+        unpack(_packed({"a.yaml": b"", "a.yaml/b.yaml": b""}))
+
+
+def test_a_bomb_does_not_go_off() -> None:
+    bomb = _packed({"a.txt": bytes(64 << 20)})
+    assert len(bomb) < 100_000
+    with pytest.raises(FolderError, match="at most 33554432 bytes"):
+        unpack(bomb)
+
+
+def test_a_bomb_that_does_not_say_how_large_it_is_does_not_go_off() -> None:
+    writer = zstandard.ZstdCompressor(write_content_size=False).compressobj()
+    bomb = writer.compress(msgspec.msgpack.encode({"a.txt": bytes(64 << 20)})) + writer.flush()
+    with pytest.raises(FolderError, match="says how many"):
+        unpack(bomb)
+
+
+def test_files_are_counted() -> None:
+    files = {f"{number}.yaml": b"" for number in range(folders.FILES + 1)}
+    with pytest.raises(FolderError, match="2001 files"):
+        unpack(_packed(files))
+    with pytest.raises(FolderError, match="2001 files"):
+        pack(files)
+
+
+def test_too_much_is_refused_before_it_is_read() -> None:
+    with pytest.raises(FolderError, match="at most 8388608 bytes"):
+        unpack(bytes(folders.PACKED_BYTES + 1))
+
+
+_SOUND = _packed({"a.yaml": b""})
+
+
+@pytest.mark.parametrize(
+    "data", [b"", b"nonsense", _packed([1]), _packed({"a.yaml": 1}), _SOUND[:-3], _SOUND + b"x"]
+)
+def test_what_is_damaged_is_refused(data: bytes) -> None:
+    with pytest.raises(FolderError):
+        unpack(data)
+
+
+def test_a_hash_is_64_digits() -> None:
+    assert folders.is_config_hash("0123456789abcdef" * 4)
+    assert not folders.is_config_hash("../" + "a" * 61)
+    assert folders.address("ab") == "/link/v1/folders/ab"
