@@ -105,10 +105,14 @@ class Heads(Struct, frozen=True, tag="heads"):
 
 
 class Has(Struct, frozen=True, tag="has"):
-    """Journals that the robot holds and the server may fetch: name and bytes."""
+    """Journals that hold the window of a Fetch, which are copied now: name and bytes.
+
+    ``id`` is that of the Fetch; without files the robot holds nothing of the window.
+    """
 
     epoch: Count
-    files: Annotated[list[tuple[Text, Count]], Meta(max_length=2000)]
+    files: Annotated[list[tuple[Text, Count]], Meta(max_length=limits.FILES)]
+    id: Name = ""
 
 
 class Welcome(Struct, frozen=True, tag="welcome"):

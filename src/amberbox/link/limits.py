@@ -20,6 +20,8 @@ RUNS_STATED = 256
 """Runs of a writer that a robot tells of, the newest ones."""
 VARIABLES = 1000
 """Live values in one frame."""
+FILES = 2000
+"""Journals named in one frame."""
 TEXT_BYTES = 4096
 """Most that a reason or a name in a frame may have."""
 

@@ -57,7 +57,8 @@ class Hooks:
     admitted: Callable[[Hello, Admission], None] = _nothing
     gone: Callable[[str], None] = _nothing
     live: Callable[[str, Mapping[str, Value]], None] = _nothing
-    has: Callable[[str, str, Sequence[tuple[str, int]]], None] = _nothing
+    has: Callable[[str, str, Has], None] = _nothing
+    """(robot, store id, which journals hold a window that was asked for)."""
     wants_folder: Callable[[str], bool] = lambda config_hash: False
     """Whether the folder with this hash is not known yet."""
 
@@ -162,7 +163,7 @@ class LinkServer:
         elif isinstance(deed, Heads):
             self._heads(one, deed)
         elif isinstance(deed, Has):
-            self._hooks.has(one.robot, _store_of(one), deed.files)
+            self._hooks.has(one.robot, _store_of(one), deed)
 
     async def _admit(self, one: Connected, hello: Hello) -> None:
         """Let a robot in: from here on its older connection can write nothing any more."""

@@ -86,6 +86,9 @@ def _hooks(bus: Bus) -> Hooks:
         ),
         gone=lambda robot: bus.publish(Change("gone", robot)),
         live=lambda robot, values: bus.publish(Change("live", robot, {"values": values})),
+        has=lambda robot, store, has: bus.publish(
+            Change("has", robot, {"store_id": store, "id": has.id, "files": has.files})
+        ),
     )
 
 
