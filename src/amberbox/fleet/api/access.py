@@ -19,6 +19,7 @@ from amberbox.core.errors import UsageError
 from amberbox.fleet.accounts.actions import ACTIONS
 from amberbox.fleet.accounts.principal import Principal, Robot, UnknownActionError, allowed
 from amberbox.fleet.accounts.robots import KnownRobot, find_robot, list_robots
+from amberbox.fleet.api.errors import PROBLEMS
 from amberbox.fleet.audit.entry import Entry, Result
 from amberbox.fleet.audit.log import append
 from amberbox.fleet.services import Services
@@ -79,7 +80,8 @@ class Routes:
 
     def __init__(self, tag: str = "", prefix: str = PREFIX) -> None:
         self.prefix = prefix
-        self.router = APIRouter(tags=[tag] if tag else [], prefix=prefix)
+        tags: list[Any] = [tag] if tag else []
+        self.router = APIRouter(tags=tags, prefix=prefix, responses=PROBLEMS)
         self.rules: dict[tuple[str, str], Rule] = {}
 
     def get(self, path: str, action: str | Open, *, each: bool = False, **more: Any) -> Decorator:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 from fastapi import FastAPI, Request
@@ -14,6 +15,34 @@ from amberbox.core.errors import AmberboxError, UsageError
 from amberbox.fleet.accounts.passwords import TooManyError
 from amberbox.fleet.accounts.signin import MustWaitError, WrongLoginError
 from amberbox.fleet.database.database import DatabaseBusyError
+
+
+@dataclass(frozen=True, slots=True)
+class Problem:
+    """What went wrong, and what to do about it."""
+
+    what: str
+    hint: str
+
+
+@dataclass(frozen=True, slots=True)
+class ErrorBody:
+    """The body of every answer that is an error."""
+
+    error: Problem
+
+
+PROBLEMS: dict[int | str, dict[str, Any]] = {
+    400: {"model": ErrorBody, "description": "not understood, or not possible as things are"},
+    401: {"model": ErrorBody, "description": "nobody is signed in, or the key does not work"},
+    403: {"model": ErrorBody, "description": "not allowed"},
+    404: {"model": ErrorBody, "description": "not there, or not for you"},
+    413: {"model": ErrorBody, "description": "too large"},
+    422: {"model": ErrorBody, "description": "not of the form that is described here"},
+    429: {"model": ErrorBody, "description": "too often: wait as long as Retry-After says"},
+    503: {"model": ErrorBody, "description": "too busy at the moment: try again"},
+}
+"""What every route may answer; rooms declare only what they say beyond this."""
 
 _STATUS: Mapping[type[AmberboxError], int] = {
     MustWaitError: 429,

@@ -9,7 +9,7 @@ from importlib import import_module
 from fastapi import FastAPI
 
 from amberbox import __version__
-from amberbox.fleet.api.access import PREFIX, Routes, Rule
+from amberbox.fleet.api.access import Routes, Rule
 from amberbox.fleet.api.errors import add_handlers
 from amberbox.fleet.services import Services
 
@@ -30,7 +30,7 @@ def rules() -> dict[tuple[str, str], Rule]:
 def make_app(services: Services) -> FastAPI:
     """Make the app of a server; its parts are not started."""
     app = FastAPI(title="Amberbox", version=__version__, docs_url=None, redoc_url=None,
-                  openapi_url=f"{PREFIX}/openapi.json")  # fmt: skip
+                  openapi_url=None)  # fmt: skip
     app.state.services = services
     add_handlers(app)
     for routes in rooms().values():
