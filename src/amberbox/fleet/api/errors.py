@@ -14,6 +14,7 @@ from starlette.exceptions import HTTPException
 from amberbox.core.errors import AmberboxError, UsageError
 from amberbox.fleet.accounts.passwords import TooManyError
 from amberbox.fleet.accounts.signin import MustWaitError, WrongLoginError
+from amberbox.fleet.asking.errors import BrokenError, BusyError
 from amberbox.fleet.database.database import DatabaseBusyError
 
 
@@ -49,6 +50,8 @@ _STATUS: Mapping[type[AmberboxError], int] = {
     TooManyError: 503,
     WrongLoginError: 401,
     DatabaseBusyError: 503,
+    BusyError: 503,
+    BrokenError: 500,
     UsageError: 400,
     AmberboxError: 422,
 }

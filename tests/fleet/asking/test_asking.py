@@ -1,0 +1,214 @@
+"""Questions in workers: answered, limited, shared fairly, cancelled."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from amberbox.core.clock import SystemClock
+from amberbox.core.errors import AmberboxError, UsageError
+from amberbox.fleet.asking.asking import ANSWER_BYTES, Asking
+from amberbox.fleet.asking.errors import BrokenError, BusyError, LimitError
+from amberbox.fleet.asking.frames import Unpacker, packed
+from amberbox.fleet.asking.pool import Pool
+from amberbox.fleet.asking.question import Question
+from amberbox.fleet.asking.waiting import Waiting
+from amberbox.fleet.bus import Bus
+from amberbox.fleet.database.database import FILE, Database
+from tests.fleet.asking.program import MODULE
+
+PROGRAM = "tests.fleet.asking.program"
+
+
+@pytest.fixture(scope="module")
+def asking(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Asking]:
+    folder = tmp_path_factory.mktemp("server")
+    database = Database(folder / FILE, SystemClock())
+    pool = Pool(folder, most=6, each=3, program=PROGRAM)
+    found = Asking(folder, database, Bus(), SystemClock(), pool)
+    yield found
+    found.close()
+    database.close()
+
+
+def op(name: str) -> str:
+    return f"{MODULE}:{name}"
+
+
+def test_a_question_is_answered(asking: Asking) -> None:
+    assert asking.ask_now(op("echo"), {"text": "hello"}) == b"hello"
+    assert asyncio.run(asking.ask(op("echo"), {"text": "you"})) == b"you"
+
+
+def test_workers_stay(asking: Asking) -> None:
+    asking.ask_now(op("echo"), {"text": ""})
+    before = asking.pids
+    for _ in range(4):
+        asking.ask_now(op("echo"), {"text": ""})
+    assert set(before) <= set(asking.pids)
+    assert len(asking.pids) <= 2
+
+
+def test_what_is_printed_is_not_the_answer(asking: Asking) -> None:
+    assert asking.ask_now(op("talk"), {}) == b"the answer"
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "what"),
+    [
+        ("usage", UsageError, "there is no such thing"),
+        ("known", AmberboxError, "the data are bad"),
+        ("wrong", BrokenError, "could not be answered: KeyError"),
+        ("absent", BrokenError, "AttributeError"),
+    ],
+)
+def test_errors_come_back_as_they_are(
+    asking: Asking, name: str, kind: type[AmberboxError], what: str
+) -> None:
+    with pytest.raises(kind, match=what) as found:
+        asking.ask_now(op(name), {})
+    assert isinstance(found.value, UsageError) == (kind is UsageError)
+
+
+def test_who_thinks_too_long_is_replaced(asking: Asking) -> None:
+    before = time.monotonic()
+    with pytest.raises(LimitError, match=r"longer than 0\.3 s"):
+        asking.ask_now(op("spin"), {}, 0.3)
+    assert time.monotonic() - before < 2
+    assert asking.ask_now(op("echo"), {"text": "again"}) == b"again"
+
+
+def test_who_takes_too_much_memory_is_replaced(asking: Asking) -> None:
+    with pytest.raises(LimitError, match="more memory than 300 MB"):
+        asking.ask_now(op("hoard"), {}, memory_bytes=300 << 20)
+    assert asking.ask_now(op("echo"), {"text": "again"}) == b"again"
+
+
+def test_a_worker_that_was_killed_is_started_again(asking: Asking) -> None:
+    asking.ask_now(op("echo"), {"text": ""})
+    for pid in asking.pids:
+        os.kill(pid, signal.SIGKILL)
+    time.sleep(0.1)  # the kernel closes the pipe
+    assert asking.ask_now(op("echo"), {"text": "here"}) == b"here"
+    assert asking.ask_now(op("echo"), {"text": "here"}) == b"here"
+
+
+def test_only_workers_operations_can_be_asked(asking: Asking) -> None:
+    for bad in ("os:system", "amberbox.fleet.asking.asking:Asking", f"{MODULE}:_private", "x"):
+        with pytest.raises(ValueError, match="nothing that a worker does"):
+            asking.ask_now(bad, {})
+
+
+def test_a_long_answer_comes_as_a_file(asking: Asking, tmp_path: Path) -> None:
+    arguments = {"count": 9, "size": 3 << 20}
+    with asyncio.run(asking.ask_file(op("parts"), arguments)) as file:
+        for number in range(9):
+            assert file.read(3 << 20) == bytes([number]) * (3 << 20)
+        assert file.read() == b""
+    with pytest.raises(LimitError, match="longer than 4 MB"):
+        asyncio.run(asking.ask_file(op("parts"), arguments, most_bytes=4 << 20))
+
+
+def test_an_answer_in_memory_has_an_end(asking: Asking) -> None:
+    arguments = {"count": (ANSWER_BYTES >> 20) + 1, "size": 1 << 20}
+    with pytest.raises(LimitError, match="longer than 64 MB"):
+        asking.ask_now(op("parts"), arguments)
+
+
+def test_who_goes_away_stops_the_worker(asking: Asking) -> None:
+    async def leave() -> None:
+        with pytest.raises(TimeoutError):
+            await asyncio.wait_for(asking.ask(op("spin"), {}, 30), 0.2)
+        before = time.monotonic()
+        both = (asking.ask(op("echo"), {"text": str(n)}) for n in range(2))
+        assert await asyncio.gather(*both) == [b"0", b"1"]
+        assert time.monotonic() - before < 3
+
+    asyncio.run(leave())
+
+
+def test_too_many_questions_are_refused(asking: Asking) -> None:
+    async def crowd() -> list[Any]:
+        slow = [
+            asking.ask(op("echo"), {"text": "", "wait_s": 0.2}, asker=f"user:{n}")
+            for n in range(12)
+        ]
+        return await asyncio.gather(*slow, return_exceptions=True)
+
+    found = asyncio.run(crowd())
+    refused = [one for one in found if isinstance(one, BusyError)]
+    assert refused
+    assert found.count(b"") + len(refused) == 12
+    assert found.count(b"") >= 6
+
+
+def test_one_asker_cannot_fill_the_queue() -> None:
+    waiting = Waiting(most=6, each=2)
+    for _ in range(2):
+        waiting.add(_question("user:a"))
+    with pytest.raises(BusyError, match="2 of your questions"):
+        waiting.add(_question("user:a"))
+    waiting.add(_question("user:b"))
+
+
+def test_askers_take_turns() -> None:
+    waiting = Waiting(most=99, each=99)
+    for asker in "aaabbc":
+        waiting.add(_question(asker))
+    taken = [waiting.take() for _ in range(6)]
+    assert "".join(one.asker for one in taken if one) == "abcaba"
+
+
+def test_closing_lets_go_of_those_who_wait(tmp_path: Path) -> None:
+    pool = Pool(tmp_path, 1, program=PROGRAM)
+    questions = [_question("", op("spin")) for _ in range(3)]
+    for question in questions:
+        pool.put(question)
+    while not pool.pids:
+        time.sleep(0.01)  # until the first question is at work
+    (pid,) = pool.pids
+    pool.close()
+    assert all(isinstance(one.done.exception(), AmberboxError) for one in questions)
+    with pytest.raises(ProcessLookupError):
+        os.kill(pid, 0)
+    with pytest.raises(BusyError):
+        pool.put(_question(""))
+
+
+def test_a_worker_without_its_server_ends(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", PROGRAM, str(tmp_path)]
+    worker = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    assert worker.stdin is not None
+    worker.stdin.write(packed({"op": op("echo"), "arguments": {}})[:-3])
+    worker.stdin.close()
+    assert worker.wait(10) == 0
+
+
+def test_frames_come_in_pieces() -> None:
+    sent = packed({"part": b"abc"}) + packed({"error": "x"})
+    unpacker, found = Unpacker(), []
+    for number in range(len(sent)):
+        found += list(unpacker.feed(sent[number : number + 1]))
+    assert found == [{"part": b"abc"}, {"error": "x"}]
+    with pytest.raises(ValueError, match="a frame of"):
+        list(Unpacker().feed(b"\xff\xff\xff\xff"))
+
+
+def test_many_threads_ask_at_once(asking: Asking) -> None:
+    with ThreadPoolExecutor(4) as threads:
+        found = threads.map(lambda n: asking.ask_now(op("echo"), {"text": str(n)}), range(4))
+    assert sorted(found) == [b"0", b"1", b"2", b"3"]
+
+
+def _question(asker: str, operation: str = f"{MODULE}:echo") -> Question:
+    return Question(operation, {"text": ""}, lambda part: None, 20.0, 1 << 30, asker)
