@@ -40,8 +40,10 @@ class Caller:
     secret: str = field(default="", repr=False)
 
     def may(self, action: str, robot: KnownRobot | Robot | None = None) -> bool:
-        """Tell whether an action is allowed, to a robot or to all of them."""
+        """Tell whether an action is allowed, to a robot or to all of them; robots: to itself."""
         seen = robot.robot if isinstance(robot, KnownRobot) else robot
+        if seen is None and self.principal.kind == "robot":
+            seen = Robot(self.principal.id)
         return allowed(self.principal, action, seen)
 
     def robots(self, connection: Connection, action: str = "status.read") -> list[KnownRobot]:
@@ -95,6 +97,10 @@ class Routes:
     def put(self, path: str, action: str | Open, *, each: bool = False, **more: Any) -> Decorator:
         """Add a route that replaces something."""
         return self._add("PUT", path, Rule(action, each), more)
+
+    def head(self, path: str, action: str | Open, *, each: bool = False, **more: Any) -> Decorator:
+        """Add a route that tells about something."""
+        return self._add("HEAD", path, Rule(action, each), more)
 
     def patch(self, path: str, action: str | Open, *, each: bool = False, **more: Any) -> Decorator:
         """Add a route that changes a part of something."""
