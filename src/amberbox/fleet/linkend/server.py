@@ -16,6 +16,7 @@ from amberbox.fleet.linkend import ledger, presence
 from amberbox.fleet.linkend.grouped import GroupedWrites
 from amberbox.fleet.linkend.sockets import Socket, SocketClosedError
 from amberbox.link import limits
+from amberbox.link.folders import is_config_hash
 from amberbox.link.frames import (
     Beat,
     Bye,
@@ -59,8 +60,8 @@ class Hooks:
     live: Callable[[str, Mapping[str, Value]], None] = _nothing
     has: Callable[[str, str, Has], None] = _nothing
     """(robot, store id, which journals hold a window that was asked for)."""
-    wants_folder: Callable[[str], bool] = lambda config_hash: False
-    """Whether the folder with this hash is not known yet."""
+    wants_folder: Callable[[str, str], bool] = lambda robot, config_hash: False
+    """Whether the folder of a robot with this hash is not known yet."""
 
 
 @dataclass(slots=True, eq=False)
@@ -172,7 +173,7 @@ class LinkServer:
         admission = await asyncio.wrap_future(self._writes.submit(work))
         known = self.robots.get(one.robot)
         self.robots[one.robot] = one
-        wants = bool(hello.config_hash) and self._hooks.wants_folder(hello.config_hash)
+        wants = self._wants_folder(hello)
         watch = self._watched.get(one.robot, ())
         welcome = one.end.admitted(
             admission, self._clock.wall_ns(), wants_folder=wants, watch=watch
@@ -182,6 +183,10 @@ class LinkServer:
         if known is not None:
             known.end.closed = True
             await known.socket.close()
+
+    def _wants_folder(self, hello: Hello) -> bool:
+        known = is_config_hash(hello.config_hash)
+        return known and self._hooks.wants_folder(hello.robot, hello.config_hash)
 
     def _keep(self, one: Connected, deed: Keep) -> asyncio.Task[Sequence[ServerFrame]]:
         now_ns = self._clock.wall_ns()

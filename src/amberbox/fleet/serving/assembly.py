@@ -41,7 +41,9 @@ def assemble(
     database = Database(folder / FILE, clock)
     bus = Bus()
     archive = FolderArchive(folder, database, clock)
-    links = LinkServer(database, _hooks(bus), clock)
+    asking = Asking(folder, database, bus, clock)
+    folders = Folders(folder, database, bus, clock, asking)
+    links = LinkServer(database, _hooks(bus, folders), clock)
     desk = Desk(
         folder,
         database,
@@ -52,7 +54,7 @@ def assemble(
     return Services(
         folder=folder, settings=settings, clock=clock, database=database,
         passwords=passwords or Passwords(), bus=bus, archive=archive, links=links, desk=desk,
-        folders=Folders(folder, database, bus, clock), asking=Asking(folder, database, bus, clock),
+        folders=folders, asking=asking,
         jobs=Jobs(folder, database, bus, clock), alarms=Alarms(database, bus, clock),
         feed=Feed(database, bus, clock, links), system=SystemLevel(folder, database, bus, clock),
     )  # fmt: skip
@@ -76,7 +78,7 @@ def close(services: Services) -> None:
     services.database.close()
 
 
-def _hooks(bus: Bus) -> Hooks:
+def _hooks(bus: Bus, folders: Folders) -> Hooks:
     return Hooks(
         rows=lambda robot, store, rows: bus.publish(
             Change("rows", robot, {"store_id": store, "rows": rows})
@@ -89,6 +91,7 @@ def _hooks(bus: Bus) -> Hooks:
         has=lambda robot, store, has: bus.publish(
             Change("has", robot, {"store_id": store, "id": has.id, "files": has.files})
         ),
+        wants_folder=folders.wants,
     )
 
 

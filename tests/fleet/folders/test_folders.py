@@ -1,0 +1,120 @@
+"""Folders on the server: whole or not at all, masked, bounded, wanted once."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from amberbox.core.clock import NS
+from amberbox.core.errors import UsageError
+from amberbox.fleet.folders import folders
+from amberbox.fleet.folders.folders import Folders
+from amberbox.fleet.folders.masking import masked
+from amberbox.fleet.folders.shelf import Shelf
+from amberbox.link.folders import pack
+from amberbox.link.frames import Hello
+from tests.fleet.house import House, house
+
+A, B, C = "a" * 64, "b" * 64, "c" * 64
+SECRET = "hunter2-tr0ub4dor"
+
+
+@pytest.fixture
+def home(tmp_path: Path) -> Iterator[House]:
+    with house(tmp_path / "server") as found:
+        yield found
+
+
+def _hello(config_hash: str) -> Hello:
+    return Hello("ropod_001", "s", "b", {}, config_hash, 0, 0, "1")
+
+
+def test_a_folder_is_wanted_until_it_is_here(home: House) -> None:
+    links, kept = home.services.links, home.services.folders
+    assert links._wants_folder(_hello(A))
+    assert not links._wants_folder(_hello(""))
+    assert not links._wants_folder(_hello("../etc"))
+    assert kept.keep("ropod_001", A, pack({"robot.yaml": b""}))
+    assert not links._wants_folder(_hello(A))
+    assert kept.wants("ropod_002", A)
+
+
+def test_what_is_here_is_known_after_a_restart(home: House) -> None:
+    of = home.services
+    of.folders.keep("ropod_001", A, pack({"robot.yaml": b""}))
+    again = Folders(of.folder, of.database, of.bus, of.clock, of.asking)
+    assert not again.wants("ropod_001", A)
+
+
+def test_a_folder_written_before_a_crash_is_taken_up_again(home: House) -> None:
+    kept = home.services.folders
+    kept.shelf.keep("ropod_001", A, {"robot.yaml": b"id: first\n"})  # and the server dies here
+    assert kept.keep("ropod_001", A, pack({"robot.yaml": b"id: second\n"}))
+    assert kept.read("ropod_001", A, "robot.yaml") == b"id: first\n"
+
+
+def test_what_was_on_its_way_is_removed(tmp_path: Path) -> None:
+    left = tmp_path / "folders" / "ropod_001" / "coming-x1"
+    left.mkdir(parents=True)
+    Shelf(tmp_path).tidy()
+    assert not left.exists()
+
+
+def test_a_folder_that_cannot_be_written_leaves_nothing(tmp_path: Path) -> None:
+    shelf = Shelf(tmp_path)
+    with pytest.raises(OSError, match=r"Is a directory|Not a directory|File exists"):
+        shelf.keep("ropod_001", A, {"a.yaml": b"", "a.yaml/b.yaml": b""})
+    assert list((tmp_path / "folders" / "ropod_001").iterdir()) == []
+
+
+def test_a_robot_has_so_many_folders_at_most(home: House, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(folders, "MOST", 2)
+    kept = home.services.folders
+    for config_hash in (A, B, C):
+        kept.keep("ropod_001", config_hash, pack({"robot.yaml": b""}))
+        home.clock.advance(NS)
+    assert [folder.config_hash for folder in kept.kept("ropod_001")] == [C, B]
+    assert kept.wants("ropod_001", A)
+    assert not kept.shelf.place("ropod_001", A).exists()
+
+
+def test_the_folder_of_an_unknown_hash_is_not_here(home: House) -> None:
+    kept = home.services.folders
+    with pytest.raises(UsageError, match="the folder of ropod_001 is not here"):
+        kept.find("ropod_001")
+    kept.keep("ropod_001", A, pack({"robot.yaml": b""}))
+    assert kept.find("ropod_001") == kept.shelf.place("ropod_001", A)
+    with pytest.raises(UsageError, match="is not here: bbbb"):
+        kept.find("ropod_001", B)
+
+
+def test_secrets_that_a_robot_let_through_are_masked(home: House) -> None:
+    planted = {
+        "robot.yaml": f"server: {{url: 'https://x', token: {SECRET}}}\n",
+        "black_box.yaml": f"- zmq: {{url: 'tcp://me:{SECRET}@host:1', password: '{SECRET}'}}\n",
+        "components/broken.yaml": f"a: [\nmqtt_password: {SECRET}\n",
+        "readme.md": f"Router: http://admin:{SECRET}@10.0.0.1/\n  api_key = {SECRET}\n",
+        "keys.txt": f"-----BEGIN PRIVATE KEY-----\n{SECRET}\n-----END PRIVATE KEY-----\n",
+        "net.xml": f"<password>{SECRET}</password>\n",
+        "plain.yaml": "id: ropod_001\ndescription: no secret here\n",
+    }
+    kept = home.services.folders
+    kept.keep("ropod_001", A, pack({name: text.encode() for name, text in planted.items()}))
+    for name in planted:
+        text = kept.read("ropod_001", A, name)
+        assert text is not None
+        assert SECRET.encode() not in text, name
+    root = home.services.folder
+    everywhere = (path for path in root.rglob("*") if path.is_file())
+    assert [path for path in everywhere if SECRET.encode() in path.read_bytes()] == []
+    assert [folder.masked for folder in kept.kept("ropod_001")] == [6]
+    assert kept.read("ropod_001", A, "plain.yaml") == planted["plain.yaml"].encode()
+
+
+def test_masking_leaves_the_simulated_robot_alone() -> None:
+    root = Path(folders.__file__).parents[2] / "sim" / "folder"
+    files = {p.relative_to(root).as_posix(): p.read_bytes() for p in root.rglob("*.[yp]*l")}
+    assert len(files) > 50
+    assert masked(files) == (files, [])
