@@ -1,0 +1,42 @@
+"""Secrets in settings: shown as ``***``, and kept when ``***`` comes back."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+MASK = "***"
+_TELLTALES = ("password", "passwd", "secret", "token", "passphrase", "private_key", "api_key")
+
+
+def masked(value: Any) -> Any:
+    """Return what JSON can hold, with secrets masked that are not empty."""
+    if isinstance(value, Mapping):
+        return {key: _cover(key, inner) for key, inner in value.items()}
+    return [masked(inner) for inner in value] if isinstance(value, list | tuple) else value
+
+
+def unmasked(value: Any, before: Any) -> Any:
+    """Put secrets back where somebody returned the mask: those at the same place before."""
+    if isinstance(value, Mapping):
+        old = before if isinstance(before, Mapping) else {}
+        return {key: _uncover(key, inner, old.get(key)) for key, inner in value.items()}
+    if isinstance(value, list | tuple):
+        held = list(before) if isinstance(before, list | tuple) else []
+        held += [None] * (len(value) - len(held))
+        return [unmasked(inner, old) for inner, old in zip(value, held, strict=False)]
+    return value
+
+
+def _cover(key: str, value: Any) -> Any:
+    return MASK if _is_secret(key) and isinstance(value, str) and value else masked(value)
+
+
+def _uncover(key: str, value: Any, before: Any) -> Any:
+    if _is_secret(key) and value == MASK and isinstance(before, str):
+        return before
+    return unmasked(value, before)
+
+
+def _is_secret(key: str) -> bool:
+    return any(word in key.lower() for word in _TELLTALES)
