@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TypeVar
 
 import msgspec
 from sqlalchemy import Connection, select
 
+from amberbox.core.config import did_you_mean
 from amberbox.core.errors import UsageError
 from amberbox.fleet.database.upsert import upsert
 from amberbox.fleet.options.tables import OPTION
@@ -34,6 +36,21 @@ def write(connection: Connection, now_ns: int, name: str, value: object) -> None
 def parsed(value: object, kind: type[Kind]) -> Kind:
     """Make a setting of what somebody sent; raises UsageError that names the key."""
     try:
-        return msgspec.convert(value, kind, strict=False)
+        made = msgspec.convert(value, kind, strict=False)
     except (msgspec.ValidationError, ValueError) as error:
         raise UsageError(f"the setting is not right: {error}", "GET it to see its form") from error
+    _refuse_unknown(value, msgspec.to_builtins(made), "the setting")
+    return made
+
+
+def _refuse_unknown(sent: object, known: object, where: str) -> None:
+    """Raise UsageError for a key that was sent and means nothing: it would change nothing."""
+    if isinstance(sent, Mapping) and isinstance(known, Mapping):
+        for key, value in sent.items():
+            if key not in known:
+                near = did_you_mean(str(key), [str(one) for one in known])
+                raise UsageError(f"{where} has no key {key!r}{near}", f"keys: {', '.join(known)}")
+            _refuse_unknown(value, known[key], f"{where}: {key}")
+    elif isinstance(sent, list) and isinstance(known, list | tuple):
+        for number, (value, its) in enumerate(zip(sent, known, strict=False), 1):
+            _refuse_unknown(value, its, f"{where}: entry {number}")
