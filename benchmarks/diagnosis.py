@@ -25,8 +25,8 @@ from multiprocessing import get_context
 from pathlib import Path
 
 from amberbox.blackbox.folder.folder import load_folder
-from amberbox.cli._diagnoser import knowledge_of
 from amberbox.cli.main import main as amberbox
+from amberbox.consult.knowledge import knowledge_of
 from amberbox.core.clock import NS
 from amberbox.core.types import Diagnosis
 from amberbox.diagnosis.covering.model import UNKNOWN

@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 
 from amberbox.blackbox.folder.folder import load_folder
-from amberbox.cli._known import known_of
 from amberbox.cli.main import main
+from amberbox.consult.known import known_of
 from amberbox.core.clock import NS
 from amberbox.core.types import Batch, Column, ItemSchema, Symptom
 from amberbox.diagnosis.answering import Heading, answer

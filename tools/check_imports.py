@@ -11,7 +11,7 @@ from tools.import_graph import Import, imports, modules
 
 OURS = "amberbox"
 _UPPER = frozenset(
-    {"core", "blackbox", "monitoring", "detection", "diagnosis", "experiments", "link"}
+    {"core", "blackbox", "monitoring", "detection", "diagnosis", "consult", "experiments", "link"}
 )
 ALLOWED: Mapping[str, frozenset[str]] = {
     "core": frozenset(),
@@ -21,6 +21,7 @@ ALLOWED: Mapping[str, frozenset[str]] = {
     "diagnosis": frozenset({"core"}),
     "monitoring": frozenset({"core", "blackbox"}),
     "detection": frozenset({"core", "blackbox"}),
+    "consult": frozenset({"core", "blackbox", "monitoring", "diagnosis"}),
     "experiments": frozenset({"core", "blackbox"}),
     "link": frozenset({"core", "blackbox"}),
     "robot": _UPPER,

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from amberbox.blackbox.folder.folder import load_folder
 from amberbox.blackbox.store import open_store
-from amberbox.cli._diagnoser import diagnoser_of
+from amberbox.consult.knowledge import diagnoser_of
 from amberbox.core.clock import NS
 from amberbox.core.types import Schema, Topic
 from amberbox.monitoring.configuration import load_plan

@@ -10,10 +10,10 @@ import pytest
 
 from amberbox.blackbox.folder.folder import load_folder
 from amberbox.blackbox.store import open_store
-from amberbox.cli._diagnosis_case import Case, answered
-from amberbox.cli._diagnosis_journal import said_until
 from amberbox.cli._diagnosis_members import with_members
-from amberbox.cli._diagnosis_show import explained
+from amberbox.consult.case import Case, answered
+from amberbox.consult.journal import said_until
+from amberbox.consult.telling import explained
 from amberbox.core.clock import NS
 from amberbox.core.types import Symptom
 from amberbox.diagnosis.explanation.explanation import Member

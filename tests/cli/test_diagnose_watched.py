@@ -11,12 +11,12 @@ import pytest
 
 from amberbox.blackbox.folder.folder import load_folder
 from amberbox.blackbox.store import Store, open_store
-from amberbox.cli import _diagnosis_read
-from amberbox.cli._diagnoser import knowledge_of
 from amberbox.cli._diagnosis_follow import revisions
-from amberbox.cli._diagnosis_journal import Said, said_until
-from amberbox.cli._diagnosis_read import counting
 from amberbox.cli.main import main
+from amberbox.consult import reading
+from amberbox.consult.journal import Said, said_until
+from amberbox.consult.knowledge import knowledge_of
+from amberbox.consult.reading import counting
 from amberbox.core.clock import NS
 from amberbox.core.types import Diagnosis
 from amberbox.diagnosis.tracking.tracker import Tracker
@@ -46,7 +46,7 @@ def no_evaluation(monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*arguments: Any) -> None:
         raise AssertionError("the record was evaluated")
 
-    monkeypatch.setattr(_diagnosis_read, "evaluated", refuse)
+    monkeypatch.setattr(reading, "evaluated", refuse)
 
 
 def store_of(folder: Path) -> Store:
@@ -87,7 +87,7 @@ def test_the_record_evaluated_says_the_same(
         status = 1 if options else 0
         journal = found(capsys, watched, *options, status=status)
         with monkeypatch.context() as patch:
-            patch.setattr("amberbox.cli._diagnosis_read.was_watched", lambda *_: False)
+            patch.setattr("amberbox.consult.reading.was_watched", lambda *_: False)
             record = found(capsys, watched, *options, status=status)
         assert record["origin"] == "record" and journal["origin"] == "watcher"
         assert record["hypotheses"] == journal["hypotheses"]
@@ -122,7 +122,7 @@ def test_symptoms_of_deleted_files_are_there_still(
         said = said_until(store, at_ns)
         return replace(said, symptoms=[s for s in said.symptoms if s.id not in gone])
 
-    monkeypatch.setattr(_diagnosis_read, "said_until", left)
+    monkeypatch.setattr(reading, "said_until", left)
     gone = {HOT}
     after = found(capsys, *asked)
     assert after["origin"] == "watcher" and after["hypotheses"] == before["hypotheses"]

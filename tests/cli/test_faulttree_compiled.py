@@ -193,7 +193,7 @@ def test_a_diagnosis_brings_cut_sets_close(
     assert "\ndrive\n" in text and "happened: fan#stuck (0.9" in text
     assert "; missing: motor#worn (0.00" in text
     with monkeypatch.context() as patch:
-        patch.setattr("amberbox.cli._diagnosis_read.watched", lambda *_: None)
+        patch.setattr("amberbox.consult.reading.watched", lambda *_: None)
         assert printed(capsys, bench.folder, "--closest")["diagnosis"] == found["diagnosis"]
     before = printed(capsys, bench.folder, "--closest", "--at", "-6s")
     assert before["diagnosis"] is None and before["effects"][0]["closest"][0]["happened"] == []

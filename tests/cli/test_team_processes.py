@@ -16,8 +16,8 @@ from pathlib import Path
 import pytest
 
 from amberbox.blackbox.store import is_store, open_store
-from amberbox.cli._diagnosis_journal import said_until
 from amberbox.cli.main import main
+from amberbox.consult.journal import said_until
 from amberbox.core.types import Diagnosis
 from tests.monitoring.test_teams import files_of_the_page, write
 

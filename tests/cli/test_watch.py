@@ -16,8 +16,8 @@ import pytest
 
 from amberbox.blackbox.folder.folder import load_folder
 from amberbox.blackbox.store import Store, WriterLock, create_store, open_store
-from amberbox.cli._diagnoser import diagnoser_of
 from amberbox.cli.main import main
+from amberbox.consult.knowledge import diagnoser_of
 from amberbox.core.types import Schema, Topic
 from amberbox.monitoring.configuration import load_plan
 from amberbox.monitoring.engine.engine import Engine

@@ -10,8 +10,8 @@ import pytest
 
 from amberbox.blackbox.folder.folder import load_folder
 from amberbox.blackbox.store import open_store
-from amberbox.cli._diagnoser import diagnoser_of
 from amberbox.cli.main import main
+from amberbox.consult.knowledge import diagnoser_of
 from amberbox.core.types import Diagnosis
 from amberbox.diagnosis.fmea.load import read_fmea
 from amberbox.diagnosis.knowledge import Knowledge

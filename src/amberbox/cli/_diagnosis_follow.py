@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 
 from amberbox.blackbox.follow.records import OwnRecords
 from amberbox.blackbox.store import Store
-from amberbox.cli._diagnosis_journal import CHANNELS, findings
+from amberbox.consult.journal import CHANNELS, findings
 from amberbox.core.types import Diagnosis, Symptom
 from amberbox.monitoring.messages.board import WRITER
 

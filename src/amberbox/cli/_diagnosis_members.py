@@ -10,11 +10,11 @@ from amberbox.blackbox.folder.folder import load_folder
 from amberbox.blackbox.follow.newest import newest_records
 from amberbox.blackbox.journal import reserved
 from amberbox.blackbox.store import Store, is_store, open_store
-from amberbox.cli._diagnoser import knowledge_of
-from amberbox.cli._diagnosis_case import Case, answered
-from amberbox.cli._diagnosis_journal import was_watched
-from amberbox.cli._diagnosis_read import watched
-from amberbox.cli._diagnosis_show import explained
+from amberbox.consult.case import Case, answered
+from amberbox.consult.journal import was_watched
+from amberbox.consult.knowledge import knowledge_of
+from amberbox.consult.reading import watched
+from amberbox.consult.telling import explained
 from amberbox.core.clock import NS
 from amberbox.core.errors import AmberboxError
 from amberbox.diagnosis.explanation import Explanation

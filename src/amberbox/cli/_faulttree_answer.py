@@ -1,54 +1,13 @@
-"""What is known of one fault tree, as JSON and as text."""
+"""What is known of one fault tree, as text."""
 
 from __future__ import annotations
 
 import argparse
-import math
-from itertools import islice
-from typing import Any
 
 from amberbox.cli._output import print_grid
+from amberbox.consult.faulttrees import FACTORS, listed
 from amberbox.diagnosis.faulttree import Analysis, FaultTree
 from amberbox.diagnosis.faulttree.likelihood import Importance
-
-_FACTORS = ("mif", "cif", "dif", "raw", "rrw")
-
-
-def as_json(analysis: Analysis, args: argparse.Namespace) -> dict[str, Any]:
-    """Return all numbers; importance and cut sets where they were asked for."""
-    by_order = analysis.by_order
-    answer: dict[str, Any] = {
-        "top": analysis.tree.top,
-        "gates": len(analysis.gates),
-        "basic_events": len(analysis.events),
-        "coherent": analysis.coherent,
-        "minimal_cut_sets": analysis.minimal_cut_sets,
-        "by_order": None if by_order is None else list(by_order),
-        "truncated_at": analysis.truncated_at,
-        "top_probability": analysis.top_probability,
-        "rare_event_sum": analysis.rare_event_sum(),
-        "min_cut_upper_bound": analysis.upper_bound(),
-        "without_probability": list(analysis.without_probability),
-        "importance": None,
-        "incomplete": bool(analysis.incomplete),
-        "incomplete_because": analysis.incomplete,
-    }
-    if args.importance and analysis.top_probability is not None:
-        answer["importance"] = {
-            event: {name: _finite(getattr(entry, name)) for name in _FACTORS}
-            for event, entry in analysis.importance.items()
-        }
-    if args.cut_sets:
-        answer["cut_sets"] = [sorted(entry) for entry in _listed(analysis, args.cut_sets)]
-    return answer
-
-
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None
-
-
-def _listed(analysis: Analysis, count: int) -> list[frozenset[str]]:
-    return list(islice(analysis.cut_sets or (), count))
 
 
 def show(analysis: Analysis, args: argparse.Namespace) -> None:
@@ -63,7 +22,7 @@ def show(analysis: Analysis, args: argparse.Namespace) -> None:
     if analysis.importance:
         print()
         rows = [_row(tree, event, entry) for event, entry in analysis.importance.items()]
-        print_grid(("event", *(name.upper() for name in _FACTORS)), rows)
+        print_grid(("event", *(name.upper() for name in FACTORS)), rows)
 
 
 def _show_probability(analysis: Analysis) -> None:
@@ -87,7 +46,7 @@ def _show_cut_sets(analysis: Analysis, count: int) -> None:
     for order, number in enumerate(analysis.by_order):
         if number:
             print(f"  order {order}: {number:,}")
-    for entry in _listed(analysis, count):
+    for entry in listed(analysis, count):
         print("  {" + ", ".join(called(analysis.tree, event) for event in sorted(entry)) + "}")
 
 
@@ -103,5 +62,5 @@ def called(tree: FaultTree, name: str) -> str:
 
 
 def _row(tree: FaultTree, event: str, entry: Importance) -> tuple[str, ...]:
-    values = (getattr(entry, name) for name in _FACTORS)
+    values = (getattr(entry, name) for name in FACTORS)
     return (called(tree, event), *(f"{value:.6g}" for value in values))

@@ -4,41 +4,27 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from amberbox.cli._faulttree_answer import called, limit_note
-from amberbox.cli._faulttree_effects import analysed, description
+from amberbox.cli._faulttree_effects import analysed
 from amberbox.cli._output import opened, print_json
+from amberbox.consult.closest import Outlook, closest_json, outlooks
 from amberbox.core.errors import UsageError
 from amberbox.core.timetext import format_time
-from amberbox.diagnosis.faulttree import Analysis, Budget
-from amberbox.diagnosis.faulttree.nearest import Near, nearest
+from amberbox.diagnosis.faulttree import Budget
+from amberbox.diagnosis.faulttree.nearest import Near
 from amberbox.diagnosis.fmea.model import Fmea
 from amberbox.diagnosis.fmea.trees import effects
 
 if TYPE_CHECKING:
     from amberbox.blackbox.folder.folder import RobotFolder
-    from amberbox.cli._diagnosis_case import Case
+    from amberbox.consult.case import Case
     from amberbox.core.types import Diagnosis
 
 _LISTED = 3
 _LOOKBACK_S = 600.0
-
-
-@dataclass(frozen=True, slots=True)
-class _Outlook:
-    """An effect on the system and the cut sets that are closest to bringing it about."""
-
-    analysis: Analysis
-    near: list[Near]
-
-    @property
-    def rank(self) -> tuple[bool, float]:
-        """Sort effects: first those that something that has happened leads to."""
-        has_begun = any(near.happened for near in self.near)
-        return not has_begun, -self.near[0].probability if self.near else 0.0
 
 
 def show_closest(fmea: Fmea, args: argparse.Namespace, budget: Budget) -> None:
@@ -47,10 +33,9 @@ def show_closest(fmea: Fmea, args: argparse.Namespace, budget: Budget) -> None:
     solved = [analysed(fmea, name, args, budget) for name in names]
     at_ns, diagnosis = _standing(args)
     count = args.cut_sets or _LISTED
-    found = [_Outlook(analysis, nearest(analysis, diagnosis, count)) for analysis in solved]
-    found.sort(key=lambda outlook: outlook.rank)
+    found = outlooks(solved, diagnosis, count)
     if args.json:
-        print_json(_as_json(fmea, args, at_ns, diagnosis, found))
+        print_json({"file": args.where, **closest_json(fmea, at_ns, diagnosis, found)})
         return
     print(_heading(at_ns, diagnosis))
     for outlook in found:
@@ -76,15 +61,14 @@ def _standing(args: argparse.Namespace) -> tuple[int | None, Diagnosis | None]:
             at_ns = record.last_ns()
     if at_ns is None:
         return None, None
-    case = _case(folder, at_ns, args.exposure)
-    return at_ns, None if case.is_over else case.standing
+    return at_ns, _case(folder, at_ns, args.exposure).open
 
 
 def _case(folder: RobotFolder, at_ns: int, exposure_h: float | None) -> Case:
     """Return what was known then."""
     from amberbox.blackbox.store import open_store
-    from amberbox.cli._diagnoser import knowledge_of
-    from amberbox.cli._diagnosis_read import known_at
+    from amberbox.consult.knowledge import knowledge_of
+    from amberbox.consult.reading import known_at
     from amberbox.monitoring.configuration import load_plan
 
     plan, _ = load_plan(folder)
@@ -104,7 +88,7 @@ def _heading(at_ns: int | None, diagnosis: Diagnosis | None) -> str:
     return f"{format_time(at_ns)}, {diagnosis.id}: {', '.join(names) or 'no hypothesis'}"
 
 
-def _lines(outlook: _Outlook) -> Iterator[str]:
+def _lines(outlook: Outlook) -> Iterator[str]:
     yield f"\n{called(outlook.analysis.tree, outlook.analysis.tree.top)}"
     for near in outlook.near:
         parts = (("happened", near.happened), ("missing", near.missing))
@@ -116,32 +100,3 @@ def _lines(outlook: _Outlook) -> Iterator[str]:
 
 def _named(near: Near, events: tuple[str, ...]) -> str:
     return ", ".join(f"{name} ({near.events[name]:.2g})" for name in events)
-
-
-def _as_json(
-    fmea: Fmea, args: argparse.Namespace, at_ns: int | None, diagnosis: Diagnosis | None,
-    found: list[_Outlook],
-) -> dict[str, Any]:  # fmt: skip
-    return {
-        "file": args.where,
-        "at_ns": at_ns,
-        "diagnosis": diagnosis.id if diagnosis else None,
-        "effects": [
-            {
-                "effect": outlook.analysis.tree.top,
-                **description(fmea, outlook.analysis),
-                "truncated_at": outlook.analysis.truncated_at,
-                "closest": [_near_json(near) for near in outlook.near],
-            }
-            for outlook in found
-        ],
-    }
-
-
-def _near_json(near: Near) -> dict[str, Any]:
-    return {
-        "probability": near.probability,
-        "happened": list(near.happened),
-        "missing": list(near.missing),
-        "events": dict(near.events),
-    }

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import argparse
-from typing import Any
 
-from amberbox.cli._faulttree_answer import as_json, limit_note, show
+from amberbox.cli._faulttree_answer import limit_note, show
 from amberbox.cli._output import print_grid, print_json, tell
 from amberbox.cli.fmea import fmea_path, loaded
+from amberbox.consult.faulttrees import description, effects_json
 from amberbox.core.config import refuse
 from amberbox.diagnosis.faulttree import Analysis, Budget, analyse
 from amberbox.diagnosis.fmea.model import Fmea
@@ -34,7 +34,8 @@ def show_all(fmea: Fmea, args: argparse.Namespace, budget: Budget) -> bool:
     if not found:
         tell([f"{args.where} has no functions that could be lost; --effect takes components, too"])
     if args.json:
-        print_json(_all_as_json(fmea, found, args))
+        asked = args.exposure, args.importance, args.cut_sets or 0
+        print_json({"file": args.where, **effects_json(fmea, found, *asked)})
     elif args.importance or args.cut_sets:
         for place, analysis in enumerate(found):
             print("\n" * (place > 0), end="")
@@ -42,26 +43,6 @@ def show_all(fmea: Fmea, args: argparse.Namespace, budget: Budget) -> bool:
     else:
         _table(fmea, found, args)
     return not any(analysis.incomplete for analysis in found)
-
-
-def _all_as_json(fmea: Fmea, found: list[Analysis], args: argparse.Namespace) -> dict[str, Any]:
-    return {
-        "file": args.where,
-        "exposure_h": fmea.exposure_h if args.exposure is None else args.exposure,
-        "effects": [
-            {"effect": analysis.tree.top, **description(fmea, analysis), **as_json(analysis, args)}
-            for analysis in found
-        ],
-        "incomplete": any(analysis.incomplete for analysis in found),
-    }
-
-
-def description(fmea: Fmea, analysis: Analysis) -> dict[str, str]:
-    """Say what the top of a tree is, and how grave its loss."""
-    function = fmea.functions.get(analysis.tree.top)
-    if function is None:
-        return {"description": fmea.components[analysis.tree.top].description}
-    return {"description": function.description, "severity": function.severity}
 
 
 def _table(fmea: Fmea, found: list[Analysis], args: argparse.Namespace) -> None:

@@ -17,9 +17,9 @@ from amberbox.blackbox.folder.folder import (
 )
 from amberbox.blackbox.folder.plan import PlannedItem, planned_items
 from amberbox.blackbox.folder.triggers import trigger_problems
-from amberbox.cli._diagnoser import knowledge_of, rule_problems
 from amberbox.cli._plantext import in_full, in_short
 from amberbox.cli._text import in_columns
+from amberbox.consult.knowledge import knowledge_of, rule_problems
 from amberbox.core.config import load_yaml
 from amberbox.core.errors import ConfigurationError, Problem
 from amberbox.core.redaction import as_plain

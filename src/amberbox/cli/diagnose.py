@@ -20,7 +20,7 @@ from amberbox.core.timetext import format_time, parse_duration
 if TYPE_CHECKING:
     from amberbox.blackbox.folder.folder import RobotFolder
     from amberbox.blackbox.query.record import Record
-    from amberbox.cli._diagnosis_case import Case
+    from amberbox.consult.case import Case
     from amberbox.core.types import Diagnosis
     from amberbox.diagnosis.explanation import Explanation
     from amberbox.diagnosis.knowledge import Knowledge
@@ -108,7 +108,7 @@ def _folder(args: argparse.Namespace) -> RobotFolder:
 
 
 def _subject(args: argparse.Namespace, folder: RobotFolder) -> Subject:
-    from amberbox.cli._diagnoser import knowledge_of
+    from amberbox.consult.knowledge import knowledge_of
     from amberbox.monitoring.configuration import load_plan
 
     plan, problems = load_plan(folder)
@@ -143,8 +143,8 @@ def _record(where: str) -> Iterator[Record | None]:
 
 def _case(args: argparse.Namespace, subject: Subject, record: Record | None) -> Case:
     """Read what was known, and add what somebody says."""
-    from amberbox.cli._diagnosis_case import Case
-    from amberbox.cli._diagnosis_given import given_answers, given_symptoms
+    from amberbox.consult.case import Case
+    from amberbox.consult.given import given_answers, given_symptoms
 
     if record is None and (args.at is not None or not args.symptom):
         raise UsageError(
@@ -160,9 +160,9 @@ def _case(args: argparse.Namespace, subject: Subject, record: Record | None) -> 
 def _read(args: argparse.Namespace, subject: Subject, record: Record) -> Case:
     """Read what was known at an instant: by the watcher's journal, else by evaluating."""
     from amberbox.blackbox.store import open_store
-    from amberbox.cli._diagnosis_case import Case
-    from amberbox.cli._diagnosis_journal import end_ns
-    from amberbox.cli._diagnosis_read import known_at
+    from amberbox.consult.case import Case
+    from amberbox.consult.journal import end_ns
+    from amberbox.consult.reading import known_at
 
     store, knowledge = open_store(record.path), subject.knowledge
     at_ns = end_ns(store) if args.at is None else record.time_ns(args.at)
@@ -200,7 +200,7 @@ def _diagnosed(
     args: argparse.Namespace, subject: Subject, case: Case, record: Record | None
 ) -> tuple[Case, Diagnosis | None]:
     """Let the engine answer; what rules find is known to all of them."""
-    from amberbox.cli._diagnosis_engines import Ground, diagnosis_by, with_findings
+    from amberbox.consult.engines import Ground, diagnosis_by, with_findings
 
     if args.engine == RULES and args.answer:
         tell(["answers to tests count for nothing where the rules alone are asked"])
@@ -214,9 +214,10 @@ def _diagnosed(
 def _show(
     args: argparse.Namespace, subject: Subject, case: Case, diagnosis: Diagnosis | None
 ) -> int:
-    from amberbox.cli._diagnosis_case import is_wrong
     from amberbox.cli._diagnosis_members import with_members
-    from amberbox.cli._diagnosis_show import alone_text, explained, json_of, text_of
+    from amberbox.cli._diagnosis_show import alone_text, text_of
+    from amberbox.consult.case import is_wrong
+    from amberbox.consult.telling import explained, json_of
 
     explanation = explained(subject.knowledge, case, diagnosis)
     explanation = with_members(subject.knowledge, case, explanation)

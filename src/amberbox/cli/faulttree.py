@@ -7,8 +7,9 @@ import math
 import time
 from pathlib import Path
 
-from amberbox.cli._faulttree_answer import as_json, show
+from amberbox.cli._faulttree_answer import show
 from amberbox.cli._output import accept_relative_times, print_json, tell, text_output
+from amberbox.consult.faulttrees import analysis_json
 from amberbox.core.errors import UsageError
 from amberbox.diagnosis.faulttree import Analysis, Budget, FaultTree, analyse, read_mef, write_mef
 from amberbox.diagnosis.faulttree.tree import DEFAULT_MISSION_TIME_H
@@ -98,7 +99,8 @@ def _one(tree: FaultTree, args: argparse.Namespace, budget: Budget) -> int:
             file.write(write_mef(tree))
     analysis = analyse(tree, args.order, args.importance, budget)
     if args.json:
-        print_json({"file": args.where, **as_json(analysis, args)})
+        made = analysis_json(analysis, args.importance, args.cut_sets or 0)
+        print_json({"file": args.where, **made})
     else:
         show(analysis, args)
     return _finished(analysis)

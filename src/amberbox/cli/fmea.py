@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from amberbox.blackbox.folder.folder import inspect_folder
-from amberbox.cli._known import known_of
 from amberbox.cli._output import print_grid, print_json, tell, writable
+from amberbox.consult.known import known_of
+from amberbox.consult.sheets import coverage_json, criticality_json
 from amberbox.core.config import did_you_mean, refuse
 from amberbox.core.errors import ConfigurationError, Problem, UsageError
 from amberbox.core.redaction import as_plain
@@ -18,7 +19,6 @@ from amberbox.diagnosis.fmea.criticality import (
     Matrix,
     by_number,
     criticalities,
-    expected,
     matrix,
     mode_criticality,
 )
@@ -171,15 +171,7 @@ def _criticality(
     modes = sorted(_modes(fmea), key=lambda mode: -mode_criticality(mode, args.exposure))
     sums, cells = criticalities(fmea, args.exposure), matrix(fmea, args.exposure)
     if args.json:
-        print_json({
-            "exposure_h": fmea.exposure_h if args.exposure is None else args.exposure,
-            "modes": [_mode_json(mode, args.exposure, rules) for mode in modes],
-            "components": [{"component": name, "C_r": value} for name, value in sums.items()],
-            "matrix": [
-                {"occurrence": level, "severity": word, "modes": list(ids)}
-                for (level, word), ids in cells.cells.items()
-            ],
-        })  # fmt: skip
+        print_json(criticality_json(fmea, args.exposure, rules))
         return
     print_grid(("component", "C_r"), [(name, f"{value:.3g}") for name, value in sums.items()])
     print()
@@ -187,18 +179,6 @@ def _criticality(
     print_grid(header, [_mode_row(mode, args.exposure, rules) for mode in modes])
     print()
     print_grid(*_matrix_table(cells))
-
-
-def _mode_json(mode: FailureMode, exposure: float | None, rules: list[Rule]) -> dict[str, Any]:
-    return {
-        "mode": mode.id,
-        "severity": mode.severity,
-        "expected": expected(mode, exposure),
-        "beta": mode.beta,
-        "C_m": mode_criticality(mode, exposure),
-        "RPN": mode.ranks.number,
-        "priority": priority(mode.ranks, rules),
-    }
 
 
 def _mode_row(mode: FailureMode, exposure: float | None, rules: list[Rule]) -> list[str]:
@@ -219,20 +199,9 @@ def _coverage(args: argparse.Namespace, fmea: Fmea, known: Known | None, rules: 
     """Show what nobody sees, what nothing explains and what looks the same."""
     found = coverage(fmea, sorted(known.watched) if known else ())
     if args.json:
-        print_json(_coverage_json(found))
+        print_json(coverage_json(found))
     else:
         print("\n".join(_coverage_lines(found)))
-
-
-def _coverage_json(found: Coverage) -> dict[str, Any]:
-    return {
-        "modes": found.modes,
-        "distinct": found.distinct,
-        "unseen": found.unseen,
-        "unexplained": list(found.unexplained),
-        "alike": [as_plain(group) for group in found.alike],
-        "weak": found.weak,
-    }
 
 
 def _coverage_lines(found: Coverage) -> Iterator[str]:

@@ -10,8 +10,8 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from amberbox.blackbox.query.record import Record
-from amberbox.cli._facts import Place, facts_of, place_of
 from amberbox.cli._output import add_range_only, opened, print_json, tell, writable
+from amberbox.consult.facts import Place, facts_of, place_of
 from amberbox.core.config import refuse
 from amberbox.core.errors import UsageError
 from amberbox.diagnosis.rules import Answers, Budget, Program, ask, export, read_rules

@@ -89,7 +89,7 @@ def _plan(folder: RobotFolder) -> Plan:
 
 def _diagnoser(folder: RobotFolder, plan: Plan) -> MakeDiagnoser | None:
     """Return what makes diagnoses by the folder's failure modes; with errors in them nothing."""
-    from amberbox.cli._diagnoser import diagnoser_of
+    from amberbox.consult.knowledge import diagnoser_of
     from amberbox.diagnosis.fmea.load import FILE
 
     make, problems = diagnoser_of(folder, plan)

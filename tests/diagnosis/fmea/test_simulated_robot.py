@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from amberbox.blackbox.folder.folder import load_folder
-from amberbox.cli._known import known_of
 from amberbox.cli.main import main
+from amberbox.consult.known import known_of
 from amberbox.core.clock import NS
 from amberbox.core.expression import Expression
 from amberbox.core.types import Batch, IntArray, Ragged

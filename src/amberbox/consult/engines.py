@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from amberbox.blackbox.query.record import Record
-from amberbox.cli._diagnosis_case import Case, answered, heading_of
-from amberbox.cli._facts import known_facts, lookups
-from amberbox.cli._rulefiles import rule_files
-from amberbox.cli._rulespan import DAY_NS, Window
+from amberbox.consult.case import Case, answered, heading_of
+from amberbox.consult.facts import known_facts, lookups
+from amberbox.consult.rulefiles import rule_files
+from amberbox.consult.span import DAY_NS, Window
 from amberbox.core.config import refuse
 from amberbox.core.errors import UsageError
 from amberbox.core.types import Diagnosis

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from amberbox.blackbox.folder.folder import RobotFolder
-from amberbox.cli._rulefiles import with_rules
+from amberbox.consult.rulefiles import with_rules
 from amberbox.core.needs import Needs, all_of
 from amberbox.diagnosis.fmea.known import Known
 from amberbox.monitoring.configuration import load_plan

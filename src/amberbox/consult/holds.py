@@ -10,7 +10,7 @@ import numpy as np
 
 from amberbox.blackbox.keeper.conditions import condition_problem, instants_of
 from amberbox.blackbox.query.variables import resolve
-from amberbox.cli._rulespan import DAY_NS, Window, in_words, joined
+from amberbox.consult.span import DAY_NS, Window, in_words, joined
 from amberbox.core.clock import NS
 from amberbox.core.errors import AmberboxError, UsageError
 from amberbox.core.expression import Expression, parse

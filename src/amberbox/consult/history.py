@@ -11,7 +11,7 @@ import msgspec
 
 from amberbox.blackbox.journal import reserved
 from amberbox.blackbox.missions import Mission, choose
-from amberbox.cli._rulespan import Window, happened_ns, has_item, in_words
+from amberbox.consult.span import Window, happened_ns, has_item, in_words
 from amberbox.core.clock import NS
 from amberbox.core.names import identifier
 from amberbox.diagnosis.rules.intervals import Interval, Keys, Span

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from amberbox.blackbox.query.record import Record
-from amberbox.cli import _ruleholds
-from amberbox.cli._rulehistory import Statuses
-from amberbox.cli._ruleholds import Conditions
-from amberbox.cli._rulespan import Window
+from amberbox.consult import holds
+from amberbox.consult.history import Statuses
+from amberbox.consult.holds import Conditions
+from amberbox.consult.span import Window
 from amberbox.core.clock import NS
 from amberbox.core.expression import parse
 from amberbox.testing.records import T0_NS, FakeItem, FakeRun
@@ -56,7 +56,7 @@ def series_of(rows: Rows, addresses: Sequence[str]) -> dict[str, Any]:
 def test_intervals_say_what_single_instants_say(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, block_s: int
 ) -> None:
-    monkeypatch.setattr(_ruleholds, "_BLOCK_NS", block_s * NS)
+    monkeypatch.setattr(holds, "_BLOCK_NS", block_s * NS)
     chance = random.Random(block_s)
     runs = runs_of(tmp_path / "store", chance)
     window = Window(Record(tmp_path / "store"))

@@ -10,11 +10,11 @@ from pathlib import Path
 from amberbox.blackbox.folder.folder import ROBOT_FILE, RobotFolder, inspect_folder
 from amberbox.blackbox.query.record import Record
 from amberbox.blackbox.store import is_store
-from amberbox.cli._known import known_of
-from amberbox.cli._rulefiles import rule_files
-from amberbox.cli._rulehistory import Missions, Statuses
-from amberbox.cli._ruleholds import Conditions
-from amberbox.cli._rulespan import Window, has_item
+from amberbox.consult.history import Missions, Statuses
+from amberbox.consult.holds import Conditions
+from amberbox.consult.known import known_of
+from amberbox.consult.rulefiles import rule_files
+from amberbox.consult.span import Window, has_item
 from amberbox.core.config import refuse
 from amberbox.diagnosis.findings.facts import Facts, fmea_facts
 from amberbox.diagnosis.fmea.load import FILE, load_fmea

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from amberbox.blackbox.folder.folder import load_folder
-from amberbox.cli._known import known_of, known_of_plan
+from amberbox.consult.known import known_of, known_of_plan
 from amberbox.core.needs import Needs, all_of, any_of, at_least
 from amberbox.diagnosis.fmea.load import load_fmea
 from amberbox.diagnosis.fmea.propagation import lost

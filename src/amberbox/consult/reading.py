@@ -6,8 +6,8 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 
 from amberbox.blackbox.store import Store
-from amberbox.cli._diagnosis_case import Case
-from amberbox.cli._diagnosis_journal import said_until, was_watched
+from amberbox.consult.case import Case
+from amberbox.consult.journal import said_until, was_watched
 from amberbox.core.clock import NS
 from amberbox.core.errors import UsageError
 from amberbox.core.timetext import format_time

@@ -6,8 +6,8 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from amberbox.blackbox.folder.folder import RobotFolder
-from amberbox.cli._known import known_of
-from amberbox.cli._rulefiles import rule_files
+from amberbox.consult.known import known_of
+from amberbox.consult.rulefiles import rule_files
 from amberbox.core.errors import ConfigurationError, Problem
 from amberbox.diagnosis.fmea.load import FILE, load_fmea
 from amberbox.diagnosis.knowledge import Knowledge

@@ -36,6 +36,11 @@ class Case:
         """Tell whether the last diagnosis has healed, so that nothing is wrong now."""
         return self.standing is not None and self.standing.state == "healed"
 
+    @property
+    def open(self) -> Diagnosis | None:
+        """Return the diagnosis that stands, if one does that is not over."""
+        return None if self.is_over else self.standing
+
     def told(self, symptoms: Sequence[Symptom], answers: Mapping[str, str]) -> Case:
         """Return the case with what somebody says; it counts before what was read.
 
