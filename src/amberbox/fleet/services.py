@@ -9,6 +9,7 @@ from amberbox.core.clock import Clock
 from amberbox.fleet.accounts.passwords import Passwords
 from amberbox.fleet.alarms.alarms import Alarms
 from amberbox.fleet.archive.folder import FolderArchive
+from amberbox.fleet.archive.keeping import Keeping
 from amberbox.fleet.asking.asking import Asking
 from amberbox.fleet.bus import Bus
 from amberbox.fleet.database.database import Database
@@ -16,7 +17,9 @@ from amberbox.fleet.feed.feed import Feed
 from amberbox.fleet.folders.folders import Folders
 from amberbox.fleet.jobs.jobs import Jobs
 from amberbox.fleet.linkend.server import LinkServer
+from amberbox.fleet.serving.doorkeeper import Doorkeeper
 from amberbox.fleet.serving.settings import Settings
+from amberbox.fleet.serving.threads import Threads
 from amberbox.fleet.system.system import SystemLevel
 from amberbox.fleet.uploads.desk import Desk
 
@@ -40,3 +43,6 @@ class Services:
     alarms: Alarms
     feed: Feed
     system: SystemLevel
+    keeping: Keeping
+    doors: Doorkeeper
+    threads: Threads

@@ -1,23 +1,212 @@
-"""One's own session: sign in and out, who one is."""
+"""One's own session: sign in and out, change the password, see and end one's sessions."""
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import dataclass
+from typing import Annotated, Literal
 
-from amberbox.fleet.accounts.sessions import csrf_token
-from amberbox.fleet.api.access import Routes, Who
+from fastapi import Depends, HTTPException, Request, Response
+from pydantic import Field
+
+from amberbox.core.clock import NS
+from amberbox.core.timetext import format_time
+from amberbox.fleet.accounts import signin
+from amberbox.fleet.accounts.actions import Role
+from amberbox.fleet.accounts.principal import Principal
+from amberbox.fleet.accounts.sessions import (
+    LONGEST_NS,
+    NewSession,
+    csrf_token,
+    end_session,
+    list_sessions,
+    revoke_session,
+    revoke_sessions,
+)
+from amberbox.fleet.accounts.users import find_user
+from amberbox.fleet.api.access import Caller, Fleet, Open, Routes, Who
+from amberbox.fleet.api.errors import ErrorBody
+from amberbox.fleet.api.forms import Form
+from amberbox.fleet.api.origins import is_own_page
+from amberbox.fleet.api.who import COOKIE, address_of
+from amberbox.fleet.bus import Change
+from amberbox.fleet.services import Services
 
 routes = Routes("session")
 
+_MOST_PASSWORD = 1024
+Text = Annotated[str, Field(min_length=1, max_length=_MOST_PASSWORD)]
+
+
+class Login(Form):
+    """Name and password."""
+
+    name: Annotated[str, Field(min_length=1, max_length=200)]
+    password: Text
+
+
+class NewPassword(Form):
+    """The password as it is, and as it shall be."""
+
+    old: Text
+    new: Text
+
+
+@dataclass(frozen=True, slots=True)
+class Myself:
+    """Who asks; ``groups`` null is all robots, ``csrf`` what changes need in ``X-CSRF-Token``.
+
+    With ``must_change`` nothing but a new password is allowed.
+    """
+
+    kind: Literal["user", "token", "robot"]
+    name: str
+    role: Role | None
+    groups: list[str] | None
+    must_change: bool
+    csrf: str
+
+
+@dataclass(frozen=True, slots=True)
+class OneSession:
+    """A session of one's own; ``current`` is the one that asks."""
+
+    id: str
+    began: str
+    seen: str
+    ends: str
+    address: str
+    agent: str
+    current: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Ended:
+    """How many sessions were ended."""
+
+    ended: int
+
+
+def from_our_pages(request: Request, fleet: Fleet) -> None:
+    """Refuse a request that a page of somebody else may have sent: no session guards it yet."""
+    kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()
+    if kind != "application/json":
+        raise HTTPException(415, "send JSON, with Content-Type: application/json")
+    origin = request.headers.get("origin")
+    if origin is not None and not is_own_page(origin, request, fleet.settings):
+        raise HTTPException(403, "one signs in on pages of this server only")
+
+
+@routes.post(
+    "/session",
+    Open("to sign in; checks name and password, and makes wrong ones wait"),
+    responses={415: {"model": ErrorBody, "description": "not JSON"}},
+)
+async def begin(
+    login: Login,
+    request: Request,
+    response: Response,
+    fleet: Fleet,
+    _: Annotated[None, Depends(from_our_pages)],
+) -> Myself:
+    """Sign in: the session is in a cookie that no script can read."""
+    user, session = await fleet.passwords.apart(
+        signin.sign_in, fleet.database, fleet.clock, fleet.passwords, login.name, login.password,
+        _from(request),
+    )  # fmt: skip
+    _set_cookie(response, fleet, session)
+    return _myself(user.principal, session.secret)
+
 
 @routes.get("/session", "own.read")
-def read_session(who: Who) -> dict[str, Any]:
+def read_session(who: Who) -> Myself:
     """Return who asks, and the token that changes need."""
-    principal = who.principal
-    return {
-        "kind": principal.kind,
-        "name": principal.id,
-        "role": principal.role,
-        "groups": None if principal.groups is None else sorted(principal.groups),
-        "csrf": csrf_token(who.secret) if who.secret else "",
-    }
+    return _myself(who.principal, who.secret)
+
+
+@routes.delete("/session", "own.write", status_code=204)
+def end(who: Who, fleet: Fleet) -> Response:
+    """Sign out."""
+    with fleet.database.begin() as connection:
+        end_session(connection, who.secret)
+        who.note(connection, fleet.clock.wall_ns(), "logout", who.principal.id)
+    _tell(fleet, who)
+    response = Response(status_code=204)
+    response.delete_cookie(COOKIE, secure=fleet.settings.is_secure, httponly=True, samesite="lax")
+    return response
+
+
+@routes.put("/session/password", "own.write")
+async def change_password(
+    passwords: NewPassword, request: Request, response: Response, who: Who, fleet: Fleet
+) -> Myself:
+    """Change one's password: all sessions end, and a new one begins here."""
+    session = await fleet.passwords.apart(
+        signin.change_password, fleet.database, fleet.clock, fleet.passwords, who.principal.id,
+        passwords.old, passwords.new, _from(request),
+    )  # fmt: skip
+    _tell(fleet, who)
+    _set_cookie(response, fleet, session)
+    with fleet.database.reading() as connection:
+        user = find_user(connection, who.principal.id)
+    return _myself(user.principal, session.secret)
+
+
+@routes.get("/session/list", "own.read")
+def list_own(who: Who, fleet: Fleet) -> list[OneSession]:
+    """Return one's open sessions, newest first."""
+    with fleet.database.reading() as connection:
+        user = find_user(connection, who.principal.id)
+        found = list_sessions(connection, fleet.clock.wall_ns(), user.user_id)
+    return [
+        OneSession(
+            one.session_id, format_time(one.created_ns), format_time(one.seen_ns),
+            format_time(one.ends_ns), one.address, one.agent, one.session_id == who.session_id,
+        )
+        for one in found
+    ]  # fmt: skip
+
+
+@routes.delete("/session/list/{session_id}", "own.write", status_code=204)
+def revoke(session_id: str, who: Who, fleet: Fleet) -> Response:
+    """End one of one's sessions, for instance of a screen that was left open."""
+    with fleet.database.begin() as connection:
+        user = find_user(connection, who.principal.id)
+        if not revoke_session(connection, user.user_id, session_id):
+            raise HTTPException(404, "you have no such session")
+        who.note(connection, fleet.clock.wall_ns(), "session.revoke", session_id)
+    _tell(fleet, who)
+    return Response(status_code=204)
+
+
+@routes.delete("/session/others", "own.write")
+def revoke_others(who: Who, fleet: Fleet) -> Ended:
+    """End all of one's sessions but the one that asks."""
+    with fleet.database.begin() as connection:
+        user = find_user(connection, who.principal.id)
+        count = revoke_sessions(connection, user.user_id, but=who.session_id)
+        told = {"ended": count}
+        who.note(connection, fleet.clock.wall_ns(), "session.revoke", "others", details=told)
+    _tell(fleet, who)
+    return Ended(count)
+
+
+def _from(request: Request) -> signin.Caller:
+    agent = request.headers.get("user-agent", "")
+    return signin.Caller(address_of(request), agent, request.cookies.get(COOKIE))
+
+
+def _myself(who: Principal, secret: str) -> Myself:
+    groups = None if who.groups is None else sorted(who.groups)
+    csrf = csrf_token(secret) if secret else ""
+    return Myself(who.kind, who.id, who.role, groups, who.must_change, csrf)
+
+
+def _set_cookie(response: Response, fleet: Services, session: NewSession) -> None:
+    response.set_cookie(
+        COOKIE, session.secret, max_age=LONGEST_NS // NS, path="/",
+        secure=fleet.settings.is_secure, httponly=True, samesite="lax",
+    )  # fmt: skip
+
+
+def _tell(fleet: Services, who: Caller) -> None:
+    fleet.bus.publish(Change("account", data={"name": who.principal.id}))

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from urllib.parse import urlsplit
-
 from fastapi import HTTPException
 from starlette.requests import HTTPConnection
 
+from amberbox.core.clock import NS
 from amberbox.fleet.accounts.robotkeys import find_robot_key, read_authorization, touch_key
 from amberbox.fleet.accounts.sessions import (
     find_session,
@@ -15,8 +14,10 @@ from amberbox.fleet.accounts.sessions import (
     touch_session,
 )
 from amberbox.fleet.accounts.tokens import find_token, touch_token
-from amberbox.fleet.api.access import Caller
+from amberbox.fleet.api.access import Caller, services_of
+from amberbox.fleet.api.origins import is_own_page
 from amberbox.fleet.services import Services
+from amberbox.fleet.serving.forwarded import client_address
 
 COOKIE = "amberbox_session"
 CSRF_HEADER = "x-csrf-token"
@@ -39,7 +40,11 @@ def identify(connection: HTTPConnection, services: Services) -> Caller:
 
 def address_of(connection: HTTPConnection) -> str:
     """Return where a request comes from: behind a proxy that is trusted, what that one says."""
-    return connection.client.host if connection.client else ""
+    peer = connection.client.host if connection.client else ""
+    proxies = services_of(connection).settings.proxies
+    if not proxies:
+        return peer
+    return client_address(peer, connection.headers.getlist("x-forwarded-for"), proxies)
 
 
 def _by_header(connection: HTTPConnection, services: Services, header: str) -> Caller:
@@ -48,17 +53,24 @@ def _by_header(connection: HTTPConnection, services: Services, header: str) -> C
         with services.database.reading() as reading:
             use = find_token(reading, now_ns, header[len(_BEARER) :].strip())
         if use is not None:
-            with services.database.begin() as writing:
-                touch_token(writing, now_ns, use.token)
+            if is_minute_old(use.token.used_ns, now_ns):
+                with services.database.begin() as writing:
+                    touch_token(writing, now_ns, use.token)
             return Caller(use.principal, address)
     elif (claim := read_authorization(header)) is not None:
         with services.database.reading() as reading:
             robot = find_robot_key(reading, now_ns, *claim)
         if robot is not None:
-            with services.database.begin() as writing:
-                touch_key(writing, now_ns, robot.key)
+            if is_minute_old(robot.key.used_ns, now_ns):
+                with services.database.begin() as writing:
+                    touch_key(writing, now_ns, robot.key)
             return Caller(robot.principal, address, session_id=robot.key.key_id)
     raise HTTPException(401, "this key or token is unknown, or does not work any more")
+
+
+def is_minute_old(used_ns: int | None, now_ns: int) -> bool:
+    """Tell whether a use should be noted: not each, or every request would wait for writers."""
+    return used_ns is None or now_ns - used_ns >= 60 * NS
 
 
 def _by_cookie(connection: HTTPConnection, services: Services) -> Caller:
@@ -84,14 +96,5 @@ def _check_origin(connection: HTTPConnection, services: Services, *, has_header:
     if has_header:
         if origin is not None or COOKIE in connection.cookies:
             raise HTTPException(403, "a socket with a key has neither Origin nor cookie")
-    elif origin is None or _origin(origin) != _origin(services.settings.public_url):
+    elif origin is None or not is_own_page(origin, connection, services.settings):
         raise HTTPException(403, "this socket is for pages of this server")
-
-
-def _origin(url: str) -> tuple[str, str, int | None]:
-    parts = urlsplit(url)
-    default = {"https": 443, "http": 80}.get(parts.scheme)
-    try:
-        return parts.scheme, parts.hostname or "", parts.port or default
-    except ValueError:
-        return "", url, None

@@ -145,8 +145,9 @@ class Worker:
             self._close_pipes()
             command = [sys.executable, "-m", "amberbox.fleet.archive.worker", str(self.folder)]
             self._process = subprocess.Popen(
-                command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-            )
+                command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+                start_new_session=True,  # Ctrl-C is for the server, which ends it in order
+            )  # fmt: skip
         return self._process
 
     def close(self) -> None:
@@ -154,6 +155,19 @@ class Worker:
         self._close_pipes()
         if self._process is not None:
             self._process.wait()
+
+    def stop(self, within_s: float = 2.0) -> None:
+        """End the worker soon, in the middle of its work if need be; threads may call it."""
+        process = self._process
+        if process is None:
+            return
+        try:
+            if process.stdin is not None and not process.stdin.closed:
+                process.stdin.close()
+            process.wait(within_s)
+        except (subprocess.TimeoutExpired, BrokenPipeError):
+            process.kill()
+            process.wait()
 
     def _close_pipes(self) -> None:
         for pipe in (self._process.stdin, self._process.stdout) if self._process else ():

@@ -12,6 +12,7 @@ from amberbox.core.clock import Clock, SystemClock
 from amberbox.fleet.accounts.passwords import Passwords
 from amberbox.fleet.alarms.alarms import Alarms
 from amberbox.fleet.archive.folder import FolderArchive
+from amberbox.fleet.archive.keeping import Keeping
 from amberbox.fleet.archive.store import JournalKey
 from amberbox.fleet.asking.asking import Asking
 from amberbox.fleet.bus import Bus, Change
@@ -23,7 +24,9 @@ from amberbox.fleet.linkend.server import Hooks, LinkServer
 from amberbox.fleet.linkend.tables import STORE
 from amberbox.fleet.part import Part
 from amberbox.fleet.services import Services
+from amberbox.fleet.serving.doorkeeper import Doorkeeper
 from amberbox.fleet.serving.settings import Settings
+from amberbox.fleet.serving.threads import Threads
 from amberbox.fleet.system.system import SystemLevel
 from amberbox.fleet.uploads.desk import Desk
 from amberbox.fleet.uploads.pieces import Incoming
@@ -57,6 +60,8 @@ def assemble(
         folders=folders, asking=asking,
         jobs=Jobs(folder, database, bus, clock), alarms=Alarms(database, bus, clock),
         feed=Feed(database, bus, clock, links), system=SystemLevel(folder, database, bus, clock),
+        keeping=Keeping(folder, database, bus, clock, archive),
+        doors=Doorkeeper(database, bus, clock, links), threads=Threads(),
     )  # fmt: skip
 
 
@@ -64,7 +69,7 @@ def parts(services: Services) -> Sequence[Part]:
     """Return what works in the background."""
     return (
         services.folders, services.asking, services.jobs, services.alarms, services.feed,
-        services.system,
+        services.system, services.keeping, services.doors,
     )  # fmt: skip
 
 
@@ -73,6 +78,7 @@ def close(services: Services) -> None:
     for part in reversed(parts(services)):
         part.close()
     services.links.close()
+    services.threads.close()
     services.desk.close()
     services.passwords.close()
     services.database.close()

@@ -15,7 +15,7 @@ class Settings:
 
     ``public_url`` is what browsers and robots call it, without a slash at the end. ``proxies`` are
     the addresses whose ``X-Forwarded-*`` headers are believed. ``certificate`` and ``key`` are
-    there where the server speaks TLS itself.
+    there where the server speaks TLS itself; ``names`` are those of its certificate.
     """
 
     public_url: str
@@ -24,6 +24,7 @@ class Settings:
     proxies: tuple[Network, ...] = ()
     certificate: Path | None = None
     key: Path | None = None
+    names: tuple[str, ...] = ()
 
     @property
     def is_secure(self) -> bool:

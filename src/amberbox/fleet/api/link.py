@@ -1,0 +1,114 @@
+"""The robots' end of the server: the socket of the link, journals that come in, the authority."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Annotated
+
+import msgspec
+from fastapi import HTTPException, Path, Request, Response, WebSocket
+
+from amberbox.fleet.accounts.authority import CERTIFICATE
+from amberbox.fleet.api.access import Fleet, Open, Routes, Who
+from amberbox.fleet.linkend.sockets import StarletteSocket
+from amberbox.fleet.serving.doorkeeper import KeyedSocket
+from amberbox.fleet.uploads.desk import Answer, verdict
+from amberbox.fleet.uploads.pieces import Incoming
+from amberbox.link import limits, uploads
+from amberbox.link.uploads import Proof
+
+routes = Routes("link", prefix=limits.PATH)
+
+Store = Annotated[str, Path(pattern=r"^[0-9a-f-]{36}$")]
+Name = Annotated[str, Path(max_length=64)]
+
+
+@routes.socket("", "link.connect")
+async def connect(websocket: WebSocket, fleet: Fleet, who: Who) -> None:
+    """Talk to a robot for as long as it stays; which one it is its key says, and nothing else."""
+    if "cookie" in websocket.headers or "origin" in websocket.headers:
+        raise HTTPException(403, "robots come with a key, and with neither Origin nor cookie")
+    await websocket.accept()
+    socket = KeyedSocket(StarletteSocket(websocket), who.session_id)
+    await fleet.links.serve(socket, who.principal.id)
+
+
+@routes.get("/ca.pem", Open("the authority's certificate, which robots compare with their pin"))
+def authority(fleet: Fleet) -> Response:
+    """Give away the certificate of the server's own authority."""
+    path = fleet.folder / CERTIFICATE
+    if fleet.settings.certificate is None or not path.is_file():
+        raise HTTPException(404, "this server has no authority of its own")
+    return Response(path.read_bytes(), media_type="application/x-pem-file")
+
+
+@routes.head("/journals/{store_id}/{folder}/{file}", "journals.upload")
+async def look(
+    store_id: Store, folder: Name, file: Name, request: Request, fleet: Fleet, who: Who
+) -> Response:
+    """Tell how much of a journal is here."""
+    incoming = _incoming(who.principal.id, store_id, f"{folder}/{file}", request)
+    return _answered(await fleet.threads.piece(partial(fleet.desk.head, incoming)), with_body=False)
+
+
+@routes.patch("/journals/{store_id}/{folder}/{file}", "journals.upload")
+async def add(
+    store_id: Store, folder: Name, file: Name, request: Request, fleet: Fleet, who: Who
+) -> Response:
+    """Take a piece of a journal."""
+    incoming = _incoming(who.principal.id, store_id, f"{folder}/{file}", request)
+    offset, crc = _number(request, uploads.OFFSET), _number(request, uploads.CRC)
+    if fleet.keeping.is_full:
+        return _answered(Answer(507, text="the server's disk is full"))
+    piece = await _body(request, limits.PIECE_BYTES)
+    return _answered(
+        await fleet.threads.piece(lambda: fleet.desk.patch(incoming, offset, piece, crc))
+    )
+
+
+@routes.post("/journals/{store_id}/{folder}/{file}", "journals.upload")
+async def finish(
+    store_id: Store, folder: Name, file: Name, request: Request, fleet: Fleet, who: Who
+) -> Response:
+    """End a journal: it is verified, and what became of it is told."""
+    incoming = _incoming(who.principal.id, store_id, f"{folder}/{file}", request)
+    proof = _proof(await _body(request, uploads.PROOF_BYTES))
+    answer = await fleet.threads.end(partial(fleet.desk.post, incoming, proof))
+    if answer.state == "verified":
+        await fleet.threads.piece(partial(fleet.keeping.note_deleted, incoming, proof))
+    return _answered(answer)
+
+
+def _incoming(robot: str, store_id: str, journal: str, request: Request) -> Incoming:
+    digest = request.headers.get(uploads.SHA256, "")
+    return Incoming(robot, store_id, journal, digest, _number(request, uploads.BYTES))
+
+
+def _number(request: Request, name: str) -> int:
+    text = request.headers.get(name, "")
+    if not (text.isascii() and text.isdecimal() and len(text) < 19):
+        raise HTTPException(400, f"the header {name} has to be a number")
+    return int(text)
+
+
+async def _body(request: Request, most: int) -> bytes:
+    found = bytearray()
+    async for piece in request.stream():
+        found += piece
+        if len(found) > most:
+            raise HTTPException(413, f"{most} bytes at most")
+    return bytes(found)
+
+
+def _proof(body: bytes) -> Proof:
+    try:
+        return msgspec.json.decode(body, type=Proof)
+    except (msgspec.MsgspecError, UnicodeDecodeError) as error:
+        raise HTTPException(400, f"the proof cannot be read: {error}") from error
+
+
+def _answered(answer: Answer, *, with_body: bool = True) -> Response:
+    about = {uploads.OFFSET: str(answer.offset), uploads.STATE: answer.state}
+    has_body = with_body and answer.status != 204
+    content = msgspec.json.encode(verdict(answer)) if has_body else b""
+    return Response(content, answer.status, about, "application/json" if has_body else None)

@@ -1,0 +1,208 @@
+"""Keeps the archive going: commits what came, joins, sweeps and deletes, and watches the disk.
+
+The work is done by the archive's worker; one that dies is started again and finishes what was
+begun. Nothing of it holds up robots or people.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import shutil
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from pathlib import Path
+from typing import TypeVar
+
+from amberbox.core.clock import Clock
+from amberbox.core.errors import AmberboxError
+from amberbox.fleet.archive import settling
+from amberbox.fleet.archive.folder import FolderArchive
+from amberbox.fleet.archive.options import RETENTION, RetentionRules
+from amberbox.fleet.archive.room import Room, Usage, room_of
+from amberbox.fleet.archive.worker import Worker
+from amberbox.fleet.bus import Bus, Change
+from amberbox.fleet.database.database import Database
+from amberbox.fleet.linkend.events import note
+from amberbox.fleet.options import options
+from amberbox.fleet.uploads.pieces import Incoming
+from amberbox.link.backoff import Backoff
+from amberbox.link.uploads import Proof
+
+T = TypeVar("T")
+
+COMMIT_S = 60.0
+_GATHER_S = 1.0
+"""So long a first journal waits for others: robots come home together."""
+_HOUR_S = 3600.0
+_FIRST_S = 600.0
+"""When a server that was just started first tidies up."""
+_DISK_S = 10.0
+
+
+class Keeping:
+    """Has journals committed as they come, and the archive tidied; a part of the server."""
+
+    def __init__(
+        self, folder: Path, database: Database, bus: Bus, clock: Clock, archive: FolderArchive,
+        *, every_s: float = COMMIT_S, usage: Usage = shutil.disk_usage,
+    ) -> None:  # fmt: skip
+        self._folder = folder
+        self._database = database
+        self._bus = bus
+        self._clock = clock
+        self._archive = archive
+        self._every_s = every_s
+        self._usage = usage
+        self._worker = Worker(folder)
+        self._thread = ThreadPoolExecutor(1, "archive")  # one request at a time
+        self._woken = asyncio.Event()
+        self._room = room_of(folder, usage)
+        self._said = "disk_ok"
+        self._trouble = ""
+        bus.on("journal", self._hear)
+        bus.on("connected", self._hear_connected)
+
+    @property
+    def is_full(self) -> bool:
+        """Tell whether the disk has no room for what robots send."""
+        return self._room.is_full
+
+    @property
+    def room(self) -> Room:
+        """What was free on the disk when it was looked at last."""
+        return self._room
+
+    def troubles(self) -> list[str]:
+        """Say what is wrong with the archive and its disk; nothing when all is well."""
+        low = [f"the disk is nearly full: {self._room}"] if self._room.is_low else []
+        return [*low, *([self._trouble] if self._trouble else [])]
+
+    def note_deleted(self, incoming: Incoming, proof: Proof) -> None:
+        """Tell the archive what the robot says it deleted before it could be copied."""
+        missing = list(settling.deleted(proof))
+        if missing:
+            self._archive.note_missing(incoming.robot, incoming.store_id, missing)
+
+    async def run(self) -> None:
+        """Work until cancelled."""
+        await self._look_at_disk()
+        async with asyncio.TaskGroup() as group:
+            group.create_task(self._commit_always())
+            group.create_task(self._tidy_always())
+            group.create_task(self._watch_disk())
+
+    def close(self) -> None:
+        """End the worker; what it had begun it finishes after the next start."""
+        self._worker.stop()
+        self._thread.shutdown(cancel_futures=True)
+
+    def _hear(self, _: Change) -> None:
+        self._woken.set()
+
+    def _hear_connected(self, change: Change) -> None:
+        if getattr(change.data.get("admission"), "aside", ()):
+            self._woken.set()
+
+    async def _apart(self, work: Callable[[], T]) -> T:
+        return await asyncio.get_running_loop().run_in_executor(self._thread, work)
+
+    async def _commit_always(self) -> None:
+        backoff = Backoff(least_s=1.0, most_s=60.0)
+        await self._apart(partial(settling.take_over, self._archive, self._database, self._folder))
+        while True:
+            self._woken.clear()
+            try:
+                wait_s = await self._commit_once()
+            except AmberboxError as error:
+                self._failed(error)
+                wait_s = backoff.failed()
+            else:
+                self._trouble = ""
+                backoff.succeeded()
+            await self._wait(wait_s)
+
+    async def _commit_once(self) -> float | None:
+        """Commit what is due; return after how many seconds more is, None if nothing waits."""
+        await self._apart(partial(settling.note_lost, self._archive, self._database))
+        self._tell(await self._apart(partial(settling.settle, self._database, self._clock)))
+        if not await self._apart(self._has_work):
+            return None
+        done = await self._apart(partial(self._worker.commit, self._every_s))
+        self._tell(await self._apart(partial(settling.settle, self._database, self._clock)))
+        if done.journals:
+            return self._every_s if done.waiting else None
+        return done.next_in_s if done.waiting else None
+
+    def _has_work(self) -> bool:
+        """Look before the worker is woken: where nothing waits, none is started."""
+        catalogue = self._archive.catalogue
+        return catalogue.open_batch() is not None or bool(catalogue.waiting())
+
+    def _tell(self, robots: list[str]) -> None:
+        if robots:
+            self._bus.publish(Change("committed", data={"robots": robots}))
+
+    async def _wait(self, wait_s: float | None) -> None:
+        if wait_s is not None:
+            await asyncio.sleep(max(wait_s, 0.05))
+            return
+        await self._woken.wait()
+        await asyncio.sleep(min(_GATHER_S, self._every_s))
+
+    async def _tidy_always(self) -> None:
+        """Join and sweep every hour, delete what is too old once a day."""
+        await asyncio.sleep(_FIRST_S)
+        hours = 0
+        while True:
+            try:
+                await self._apart(partial(self.tidy, is_daily=hours % 24 == 0))
+            except AmberboxError as error:
+                self._failed(error)
+            hours += 1
+            await asyncio.sleep(_HOUR_S)
+
+    def tidy(self, *, is_daily: bool) -> None:
+        """Tidy the archive once; blocks. Raises AmberboxError when the worker could not."""
+        if not self._archive.catalogue.revision():
+            return
+        if is_daily:
+            with self._database.reading() as connection:
+                rules = options.read(connection, RETENTION, RetentionRules).rules
+            self._worker.retain(*rules)
+        self._worker.compact()
+        self._worker.sweep()
+
+    def _failed(self, error: AmberboxError) -> None:
+        self._trouble = f"the archive: {error.what}"
+        logging.getLogger(__name__).warning("%s (%s)", self._trouble, error.hint)
+
+    async def _watch_disk(self) -> None:
+        while True:
+            await asyncio.sleep(_DISK_S)
+            await self._look_at_disk()
+
+    async def _look_at_disk(self) -> None:
+        """Look at the disk; when its state changes an event says so."""
+        self._room = await asyncio.to_thread(room_of, self._folder, self._usage)
+        state = _state(self._room)
+        if state != self._said:
+            self._said = state
+            await asyncio.to_thread(self._note_disk, state)
+
+    def _note_disk(self, state: str) -> None:
+        text = _TEXTS[state].format(self._room)
+        with self._database.begin() as connection:
+            note(connection, "", self._clock.wall_ns(), state, text)
+
+
+_TEXTS = {
+    "disk_ok": "the server's disk has room again: {}",
+    "disk_low": "the server's disk is nearly full: {}",
+    "disk_full": "the server's disk is full, journals stay on the robots: {}",
+}
+
+
+def _state(room: Room) -> str:
+    return "disk_full" if room.is_full else "disk_low" if room.is_low else "disk_ok"
