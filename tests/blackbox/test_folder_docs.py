@@ -8,7 +8,7 @@ from pathlib import Path
 from amberbox.blackbox.folder.blocks import DefaultParameters
 from amberbox.blackbox.folder.folder import load_folder
 from amberbox.blackbox.folder.legacy import LEGACY_KEYS
-from amberbox.blackbox.folder.robot import NOT_USED_YET, RobotConfig
+from amberbox.blackbox.folder.robot import RobotConfig
 from amberbox.core.describe import describe
 from amberbox.core.source import TopicOptions
 
@@ -34,5 +34,5 @@ def test_examples_load(tmp_path: Path) -> None:
     (tmp_path / "black_box.yaml").write_text(black_box)
     built = load_folder(tmp_path)
     assert {note.where for note in built.notes} == {"server"}
-    assert all(NOT_USED_YET[note.where] in note.what for note in built.notes)
+    assert ["no key" in note.what for note in built.notes] == [True]
     assert [topic.max_frequency for topic in built.blocks[0].config.topics] == [5, 10]

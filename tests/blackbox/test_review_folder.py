@@ -1,4 +1,4 @@
-"""What a robot folder promises: paths, dead bands, and keys nobody acts on yet."""
+"""What a robot folder promises: paths, dead bands, and a server's key."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ def test_recordings_are_seen_from_the_folder(
     assert list(block.config.patterns) == ["robot/bags/*.bag", "/data/a.mcap", "robot/../b.bag"]
 
 
-def test_keys_that_nobody_acts_on_yet_are_noted(tmp_path: Path) -> None:
+def test_a_server_without_a_key_is_noted(tmp_path: Path) -> None:
     robot = "id: r1\nstore:\n  quota: 5 GB\n  write_s: 0.1\nserver: {url: https://fleet.example}\n"
     built = load_folder(folder(tmp_path, "- ros: {topics: [{name: /odom}]}\n", robot))
     notes = [(note.line, note.where) for note in built.notes]
     assert notes == [(5, "server")]
-    assert all("no effect in this version" in note.what for note in built.notes)
+    assert "no key" in built.notes[0].what and "amberbox join" in built.notes[0].what
 
 
 @pytest.mark.parametrize(

@@ -27,9 +27,11 @@ store:
   # keep_min: 24 h         # the newest data are not deleted for room
   # ring_s: 5 min          # how long topics with 'keep: ring' are kept
 
+# 'amberbox join' with the line that a fleet server printed writes the server here:
 # server:
-#   url: https://fleet.example.org
-#   token: ""              # stays in this folder, is never sent on
+#   url: https://fleet.example.org:8443
+#   copy: always           # when journals are copied: docked, on_request, network NAME
+#   rate: 0                # most bytes in a second; 0 for as fast as it goes
 """
 
 _BLACK_BOX = """\

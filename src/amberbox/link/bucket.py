@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import threading
+from dataclasses import dataclass, field
 
 
 @dataclass(slots=True)
@@ -13,6 +14,7 @@ class TokenBucket:
     burst: float = 0.0
     _tokens: float = 0.0
     _at_s: float | None = None
+    _lock: threading.Lock = field(default_factory=threading.Lock)
 
     def take(self, size: int, now_s: float) -> float:
         """Take bytes that are about to be sent; return the seconds to wait before.
@@ -22,8 +24,9 @@ class TokenBucket:
         if not self.rate:
             return 0.0
         burst = self.burst or self.rate / 4
-        elapsed = burst / self.rate if self._at_s is None else now_s - self._at_s
-        self._tokens = min(burst, self._tokens + max(elapsed, 0.0) * self.rate)
-        self._at_s = now_s
-        self._tokens -= size
-        return max(0.0, -self._tokens / self.rate)
+        with self._lock:  # rows and journals share one
+            elapsed = burst / self.rate if self._at_s is None else now_s - self._at_s
+            self._tokens = min(burst, self._tokens + max(elapsed, 0.0) * self.rate)
+            self._at_s = now_s
+            self._tokens -= size
+            return max(0.0, -self._tokens / self.rate)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from amberbox.robot.link.copyrule import Situation, may_copy, problem
+from amberbox.blackbox.folder.server import rule_problem as problem
+from amberbox.robot.link.copyrule import Situation, may_copy
 from amberbox.robot.link.network import Network, allowed, default_interface
 
 ROUTES = """Iface\tDestination\tGateway \tFlags\tRefCnt\tUse\tMetric\tMask\t\tMTU\tWindow\tIRTT

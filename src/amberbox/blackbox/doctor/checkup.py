@@ -13,6 +13,7 @@ from amberbox.blackbox.doctor.finding import Finding, warn
 from amberbox.blackbox.doctor.host import Host
 from amberbox.blackbox.doctor.keys import keys
 from amberbox.blackbox.doctor.latency import latency
+from amberbox.blackbox.doctor.linked import link
 from amberbox.blackbox.doctor.power import power
 from amberbox.blackbox.doctor.service import recorder, service
 from amberbox.blackbox.doctor.subject import Subject, subject
@@ -24,7 +25,7 @@ from amberbox.core.errors import AmberboxError
 Check: TypeAlias = Callable[[Subject, Host], Iterable[Finding]]
 
 CHECKS: Sequence[Check] = (
-    *(configuration, passivity, recorder, supervisor, service, power),
+    *(configuration, passivity, recorder, supervisor, link, service, power),
     *(clock, rtc, space, file_system, root, wear, latency),
     *(keys, versions),
 )

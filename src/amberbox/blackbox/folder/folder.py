@@ -10,11 +10,11 @@ from pathlib import Path
 
 from amberbox.blackbox.folder.blocks import Blocks, SourceBlock, read_blocks
 from amberbox.blackbox.folder.monitoring import disclosures
-from amberbox.blackbox.folder.robot import NOT_USED_YET, RobotConfig
+from amberbox.blackbox.folder.robot import RobotConfig
+from amberbox.blackbox.folder.server import KEY_FILE, key_notes
 from amberbox.core.config import build, load_yaml, refuse
 from amberbox.core.errors import Problem, UsageError
 from amberbox.core.ids import derive_id
-from amberbox.core.nodes import Node
 
 SOURCES = "amberbox.blackbox.sources"
 ROBOT_FILE = "robot.yaml"
@@ -89,6 +89,11 @@ def inspect_folder(
     return folder, problems
 
 
+def configuration_files(folder: RobotFolder) -> dict[str, Path]:
+    """Return the files that make a folder's ``config_hash``, by name relative to it."""
+    return {_relative(path, folder.path): path for path in _files(folder.path, folder.robot)}
+
+
 def hash_files(files: Mapping[str, Path]) -> str:
     """Return the SHA-256 over names and contents of files, sorted by name."""
     total = hashlib.sha256()
@@ -111,19 +116,11 @@ def _read_robot(place: Path, problems: list[Problem]) -> RobotConfig | None:
         return RobotConfig(id=derived)
     node = load_yaml(path, problems)
     robot = build(RobotConfig, node, problems) if node else None
-    problems.extend(_not_used_yet(node) if node else ())
     problems.extend(disclosures(node, robot.monitoring) if node and robot else ())
+    server = (node.mapping or {}).get("server") if node else None
+    if robot is not None and robot.server is not None and server is not None:
+        problems.extend(key_notes(server, place, robot.server))
     return dataclasses.replace(robot, id=robot.id or derived) if robot else None
-
-
-def _not_used_yet(root: Node) -> Iterator[Problem]:
-    """Note the keys that are set and that nobody acts on yet."""
-    for key, meaning in NOT_USED_YET.items():
-        node: Node | None = root
-        for part in key.split("."):
-            node = (node.mapping or {}).get(part) if node else None
-        if node is not None:
-            yield node.problem(key, f"has no effect in this version: {meaning}", is_error=False)
 
 
 def _read_black_box(path: Path, sources: str, problems: list[Problem]) -> Blocks:
@@ -136,9 +133,10 @@ def _read_black_box(path: Path, sources: str, problems: list[Problem]) -> Blocks
 
 
 def _files(place: Path, robot: RobotConfig) -> list[Path]:
-    """List the configuration: all files but the store's, hidden ones and compiled Python."""
+    """List the configuration: all files but the store's, hidden ones, compiled Python, the key."""
     store = (place / Path(robot.store.path).expanduser()).resolve()
-    return [path for path in _walk(place) if not path.resolve().is_relative_to(store)]
+    files = (path for path in _walk(place) if path != place / KEY_FILE)
+    return [path for path in files if not path.resolve().is_relative_to(store)]
 
 
 def _walk(place: Path) -> Iterator[Path]:

@@ -8,15 +8,10 @@ from typing import Literal
 
 from amberbox.blackbox.folder.missions import MissionOptions
 from amberbox.blackbox.folder.monitoring import MonitoringOptions
+from amberbox.blackbox.folder.server import ServerOptions
 from amberbox.blackbox.folder.triggers import IncidentOptions, TriggerOptions, repeated
 from amberbox.core.ids import derive_id, is_id
 from amberbox.core.options import option
-
-NOT_USED_YET = {
-    "server": "nothing leaves this computer yet",
-}
-"""Keys that are checked, but that nobody acts on in this version, and what that means."""
-
 
 WhenFull = Literal["overwrite", "stop"]
 _SHARE = 8
@@ -97,19 +92,6 @@ class StoreOptions:
             yield "quota_percent", "must be above 0 and at most 100"
         if self.sync_s < self.write_s:
             yield "sync_s", f"must not be below write_s ({self.write_s:g} s)"
-
-
-@dataclass(frozen=True)
-class ServerOptions:
-    """The fleet server this robot reports to."""
-
-    url: str = option(doc="address of the fleet server, https://...")
-    token: str = option("", "the robot's key to the server", secret=True)
-
-    def check(self) -> Iterator[tuple[str, str]]:
-        """Say what is wrong with the address."""
-        if not self.url.startswith(("https://", "http://")):
-            yield "url", "must start with https:// or http://"
 
 
 @dataclass(frozen=True)

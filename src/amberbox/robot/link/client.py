@@ -8,6 +8,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import ssl
+from collections import deque
 from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass, field
 
@@ -24,6 +25,7 @@ from amberbox.link.frames import (
     Confirm,
     Fetch,
     FrameError,
+    Has,
     Hello,
     Welcome,
     encode,
@@ -55,6 +57,18 @@ class Asked:
     fetch: Callable[[Fetch], None] = lambda frame: None
     confirm: Callable[[Sequence[str]], None] = lambda files: None
     folder: Callable[[str], None] = lambda config_hash: None
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """Journals that hold a window that was asked for: name and bytes."""
+
+    id: str
+    files: tuple[tuple[str, int], ...]
+
+    def of_epoch(self, epoch: int) -> Has:
+        """Return the frame that says so."""
+        return Has(epoch, list(self.files[: limits.FILES]), self.id)
 
 
 @dataclass(slots=True)
@@ -94,6 +108,8 @@ class LinkClient:
         self.frame_bytes = limits.ROWS_BYTES
         """How large frames of rows get: smaller after trouble, so that some get through."""
         self.live = LiveValues(store)
+        self.answers: deque[Found] = deque()
+        """What is to be said about journals that were asked for; it waits for a connection."""
         self._dial = dialer
         self._backoff = backoff or Backoff()
         self._reaches = Reaches(store)
@@ -153,15 +169,20 @@ class LinkClient:
             public_key=public_key(self.store.path) or "",
         )  # fmt: skip
         await line.send(encode(hello))
-        answer = from_server(await _soon(line.receive()))
+        answer = from_server(await soon(line.receive()))
         if isinstance(answer, Bye):
             raise (RefusedError if answer.for_good else LinkDownError)(answer.reason)
         if not isinstance(answer, Welcome):
             raise LinkDownError("the server did not say welcome")
         if answer.wants_folder:
             self.asked.folder(self.options.config_hash)
-        self.live.watch(answer.watch)
+        self.look_at(answer.watch)
         return Session(self, line, answer, self._reaches, reaches)
+
+    def look_at(self, variables: Sequence[str]) -> None:
+        """Tell the latest values of these from now on, if the robot's folder allows it."""
+        if self.options.live:
+            self.live.watch(variables)
 
     def hear(self, frame: Fetch | Confirm) -> None:
         """Pass on what the server wants of others."""
@@ -171,7 +192,8 @@ class LinkClient:
             self.asked.confirm(frame.files)
 
 
-async def _soon(waiting: Awaitable[bytes]) -> bytes:
+async def soon(waiting: Awaitable[bytes]) -> bytes:
+    """Wait for an answer; raises LinkDownError when none comes for too long."""
     try:
         return await asyncio.wait_for(waiting, limits.SILENT_S)
     except TimeoutError:

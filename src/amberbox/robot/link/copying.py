@@ -12,7 +12,7 @@ import ssl
 import threading
 import time
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
@@ -137,7 +137,13 @@ class Copier:
         names = [s.journal for s in ordered]
         known = {*names, *found.confirmed}
         names = [*(name for name in held if name not in known), *names]
+        asked = _of_ring(self.store, self.situation().requested - known)
+        names = [*asked, *(name for name in names if name not in asked)]
         return [name for name in names if name not in self._refused]
+
+    def is_settled(self, name: str) -> bool:
+        """Tell whether nothing more will be done about a journal by this copier."""
+        return name in self._refused
 
     def step(self) -> bool:
         """Copy the next journal; tell whether there was one. Raises CopyError for another time."""
@@ -205,7 +211,9 @@ class Copier:
 
     def _next(self, descriptor: int, at: int) -> bytes:
         """Read a piece when it is its turn; raises CopyError when the copy is to end."""
-        piece = os.pread(descriptor, self._piece_bytes, at)
+        rate = self.bucket.rate
+        most = min(self._piece_bytes, max(int(rate / 2), LEAST_BYTES)) if rate else PIECE_BYTES
+        piece = os.pread(descriptor, min(self._piece_bytes, most), at)
         if self.stop.wait(self.bucket.take(len(piece), time.monotonic())) or self.stop.is_set():
             raise CopyError("the copy was stopped")
         return piece
@@ -232,6 +240,14 @@ def _about(path: Path) -> dict[str, str]:
             digest.update(part)
             size += len(part)
     return {uploads.BYTES: str(size), uploads.SHA256: digest.hexdigest()}
+
+
+def _of_ring(store: Store, names: Collection[str]) -> list[str]:
+    """Return which of these are journals of the ring that nobody writes; they are not sealed."""
+    folder, writing = FOLDERS["ring"], is_locked(store, "main")
+    paths = {name: store.journal_path(name) for name in sorted(names) if name.startswith(folder)}
+    there = {name: path for name, path in paths.items() if path.exists()}
+    return [n for n, path in there.items() if not writing or journal_file(path).finished]
 
 
 def _held_by(store: Store, pins: Sequence[Incident]) -> list[str]:

@@ -6,11 +6,9 @@ from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
+from amberbox.blackbox.folder.server import NETWORK
 from amberbox.blackbox.segments.entries import Sealed
 from amberbox.robot.link.network import Network
-
-WORDS = ("always", "docked", "on_request")
-_NETWORK = "network "
 
 
 class Pinned(Protocol):
@@ -35,19 +33,12 @@ class Situation:
     requested: frozenset[str] = frozenset()
 
 
-def problem(when: str) -> str:
-    """Say what is wrong with a rule; empty when nothing is."""
-    if when in WORDS or (when.startswith(_NETWORK) and when[len(_NETWORK) :].strip()):
-        return ""
-    return f"'{when}' is not one of {', '.join(WORDS)}, network NAME"
-
-
 def may_copy(when: str, situation: Situation) -> bool:
     """Tell whether journals nobody has asked for are copied now."""
     if when == "docked":
         return bool(situation.docked)
-    if when.startswith(_NETWORK):
-        return situation.network.is_called(when[len(_NETWORK) :].strip())
+    if when.startswith(NETWORK):
+        return situation.network.is_called(when[len(NETWORK) :].strip())
     return when == "always"
 
 

@@ -135,7 +135,7 @@ class Session:
                 self._client.clock.wall_ns(),
             )  # fmt: skip
         elif isinstance(frame, Watch):
-            self._client.live.watch(frame.variables)
+            self._client.look_at(frame.variables)
         elif isinstance(frame, Fetch | Confirm):
             self._client.hear(frame)
         elif isinstance(frame, Bye):
@@ -256,6 +256,9 @@ class Session:
             values = self._client.live.take() if self._allowed.live else {}
             if values:
                 await self._send(Live(self._end.epoch, values))
+            while self._client.answers:
+                await self._send(self._client.answers[0].of_epoch(self._end.epoch))
+                self._client.answers.popleft()
 
     async def _send(self, frame: RobotFrame) -> None:
         await self._line.send(encode(frame))

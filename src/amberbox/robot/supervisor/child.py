@@ -7,9 +7,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from amberbox.blackbox.folder.folder import ROBOT_FILE
+from amberbox.blackbox.folder.server import KEY_FILE
+from amberbox.core.nodes import load_yaml
 from amberbox.monitoring.configuration.tree import FOLDER as COMPONENTS
 
-RECORD, WATCH = "record", "watch"
+RECORD, WATCH, LINK = "record", "watch", "link"
 REFUSED = 2
 """Exit status of a process that cannot work with its configuration."""
 
@@ -38,7 +41,7 @@ class Child:
 def children_of(folder: Path, write_s: float, *, quiet: bool = True) -> list[Child]:
     """Return what there is to run for a robot folder, the recorder first.
 
-    One that talks to a server joins here, at the last stage: it has what all others have written.
+    The link ends last: it sends what all others have written.
     """
     recorder = Child(
         RECORD, amberbox(RECORD, "--quiet", str(folder)), stage=1, end_s=9.0,
@@ -46,7 +49,10 @@ def children_of(folder: Path, write_s: float, *, quiet: bool = True) -> list[Chi
     )  # fmt: skip
     words = ("--quiet",) if quiet else ()
     watcher = Child(WATCH, amberbox(WATCH, *words, str(folder)), end_s=4.0, nice=5, follows=RECORD)
-    return [recorder, watcher]
+    linker = Child(
+        LINK, amberbox(LINK, *words, str(folder)), stage=2, end_s=10.0, nice=5, follows=RECORD
+    )
+    return [recorder, watcher, linker]
 
 
 def amberbox(*arguments: str) -> list[str]:
@@ -56,7 +62,17 @@ def amberbox(*arguments: str) -> list[str]:
 
 def is_wanted(child: Child, folder: Path) -> bool:
     """Tell whether a folder, as it is now, has work for a child."""
+    if child.name == LINK:
+        return has_server(folder)
     return child.name != WATCH or has_components(folder)
+
+
+def has_server(folder: Path) -> bool:
+    """Tell whether a robot folder names a server, and there is a key to it."""
+    root = load_yaml(folder / ROBOT_FILE, []) if (folder / ROBOT_FILE).exists() else None
+    server = (root.mapping or {}).get("server") if root is not None else None
+    keys = (server.mapping or {}) if server is not None else {}
+    return bool(keys) and ((folder / KEY_FILE).exists() or "token" in keys)
 
 
 def has_components(folder: Path) -> bool:

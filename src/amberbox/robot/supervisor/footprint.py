@@ -8,6 +8,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from amberbox.blackbox.folder.folder import BLACK_BOX_FILE, ROBOT_FILE
+from amberbox.blackbox.folder.server import KEY_FILE
 
 Footprint = frozenset[tuple[str, int, int]]
 
@@ -27,6 +28,13 @@ def _files(folder: Path, store: Path) -> Iterator[tuple[str, int, int]]:
             else:
                 about = path.stat()
                 yield str(path), about.st_size, about.st_mtime_ns
+
+
+def linked_by(folder: Path) -> bytes:
+    """Return the key to the server: it is no part of the configuration's hash."""
+    with suppress(OSError):
+        return (folder / KEY_FILE).read_bytes()
+    return b""
 
 
 def recorded_by(folder: Path) -> str:

@@ -9,11 +9,11 @@ from contextlib import suppress
 from pathlib import Path
 
 from amberbox.blackbox.store import Store, is_locked
-from amberbox.robot.supervisor.child import RECORD, WATCH
+from amberbox.robot.supervisor.child import LINK, RECORD, WATCH
 from amberbox.robot.supervisor.process import MARK
 
-WRITER_OF = {WATCH: "watch", RECORD: "main"}
-"""The journal that each child writes: its lock tells who does."""
+WRITER_OF = {WATCH: "watch", RECORD: "main", LINK: "link"}
+"""The lock that each child holds: it tells who does."""
 _END_S = 10.0
 
 

@@ -14,8 +14,8 @@ from amberbox.blackbox.doctor.supervised import LOCK
 from amberbox.blackbox.service import Notifier
 from amberbox.blackbox.store import Store, WriterLock
 from amberbox.robot.supervisor.changes import Changes
-from amberbox.robot.supervisor.child import RECORD, WATCH, Child, is_wanted
-from amberbox.robot.supervisor.footprint import recorded_by
+from amberbox.robot.supervisor.child import LINK, RECORD, WATCH, Child, is_wanted
+from amberbox.robot.supervisor.footprint import linked_by, recorded_by
 from amberbox.robot.supervisor.judgement import Judgement
 from amberbox.robot.supervisor.life import Life
 from amberbox.robot.supervisor.notes import Notes
@@ -65,6 +65,7 @@ class Supervisor:
         self._changes = Changes(box.folder, box.store.path)
         self._config_hash = box.config_hash
         self._recorded = recorded_by(box.folder)
+        self._linked = linked_by(box.folder)
         self._wanted = self._wishes()
         self._notifier = notifier or Notifier()
         self._stops = 0
@@ -178,7 +179,11 @@ class Supervisor:
         is_recorded_anew = recorded_by(self._box.folder) != self._recorded
         if is_recorded_anew and with_recorder:
             self._again(RECORD, now_s)
+        linked, self._linked = self._linked, linked_by(self._box.folder)
         if config_hash == self._config_hash:
+            if linked != self._linked:
+                self._wanted = self._wishes()
+                self._again(LINK, now_s)
             if with_recorder and not is_recorded_anew:
                 self._out("nothing has changed in the folder")
             return
@@ -188,6 +193,7 @@ class Supervisor:
         self._notes.tell("configuration_changed", text)
         self._wanted = self._wishes()
         self._again(WATCH, now_s)
+        self._again(LINK, now_s)
 
     def _again(self, name: str, now_s: float) -> None:
         for life in self.lives:
