@@ -138,14 +138,15 @@ def _load(catalogue: Catalogue) -> list[Mission]:
     pieces = gather(catalogue, Request(table, _FIELDS)).pieces
     for piece in sorted(pieces, key=lambda piece: (piece.run, int(piece.seq[0]))):
         for row in zip(*(plain(piece.columns[name]) for name in _FIELDS), strict=True):
-            mission = _mission(dict(zip(_FIELDS, row, strict=True)))
+            mission = of_record(dict(zip(_FIELDS, row, strict=True)))
             if mission.id not in found or found[mission.id].end is None:
                 found[mission.id] = mission
     corrected = (mission.corrected(catalogue.book) for mission in found.values())
     return sorted(corrected, key=lambda mission: (mission.from_ns, mission.id))
 
 
-def _mission(row: Mapping[str, Any]) -> Mission:
+def of_record(row: Mapping[str, Any]) -> Mission:
+    """Return the mission that a record of the keeper's journal tells of."""
     details = msgspec.json.decode(row["details"] or "{}")
     start = msgspec.convert(details.get("start") or {"received_ns": row["from_ns"]}, Moment)
     end = details.get("end")

@@ -1,0 +1,25 @@
+"""What is missing of a robot's record and why, as the API lists it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from amberbox.core.timetext import format_time
+from amberbox.core.types import Gap
+from amberbox.fleet.archive.gaps import gaps_of
+from amberbox.fleet.data.asked import Asked
+from amberbox.fleet.data.look import Look
+
+
+def gaps_json(look: Look, asked: Asked) -> dict[str, Any]:
+    """List gaps of an item (all without a name) that meet ``[from, to)``, in order of time."""
+    item = asked.item or None
+    found = gaps_of(look.reader, look.catalogue, item, (asked.from_ns, asked.to_ns))
+    return {"gaps": [_gap(gap) for gap in found[: asked.limit]], "more": len(found) > asked.limit}
+
+
+def _gap(gap: Gap) -> dict[str, Any]:
+    return {
+        "item": gap.item, "writer": gap.writer, "run": gap.run, "from": format_time(gap.from_ns),
+        "to": format_time(gap.to_ns), "reason": gap.reason, "count": gap.count,
+    }  # fmt: skip

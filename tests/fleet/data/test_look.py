@@ -1,0 +1,112 @@
+"""One look at a record: each row once, whatever is being committed meanwhile."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from amberbox.blackbox.query.gather import Request
+from amberbox.core.errors import UsageError
+from amberbox.fleet.archive.files import Layout
+from amberbox.fleet.archive.folder import FolderArchive
+from amberbox.fleet.archive.reading import Reader
+from amberbox.fleet.asking.errors import LimitError
+from amberbox.fleet.data import look as looking
+from amberbox.fleet.data import rows as reading
+from amberbox.fleet.data.asked import Asked
+from amberbox.fleet.data.look import Look, look
+from amberbox.fleet.data.rows import rows
+from amberbox.testing.clock import ManualClock
+from amberbox.testing.records import T0_NS
+from tests.fleet.archive.recordings import Robot
+
+_MS = 1_000_000
+
+
+@pytest.fixture
+def archive(tmp_path: Path) -> FolderArchive:
+    found = FolderArchive(tmp_path / "server", clock=ManualClock())
+    robot = Robot("r1", tmp_path)
+    robot.record(0)
+    robot.hand_in_all(found)
+    return found
+
+
+def xs(seen: Look) -> list[float]:
+    found = rows(seen, Asked("r1", "odom", ["pose_x"]))
+    return [float(value) for value in found.table.values("pose_x")]
+
+
+def test_rows_that_wait_are_there(archive: FolderArchive) -> None:
+    folder = archive.layout.folder
+    assert look(folder, "r1", xs) == list(range(120))
+    archive.commit(0)
+    assert look(folder, "r1", xs) == list(range(120))
+
+
+def test_a_journal_that_is_committed_during_the_look_counts_once(archive: FolderArchive) -> None:
+    catalogue, layout = archive.catalogue, Layout(archive.layout.folder)
+    waiting = looking._waiting(catalogue, layout, "r1")
+    archive.commit(0)
+    reader = Reader(layout, catalogue, catalogue.sources(["r1"]))
+    assert xs(Look(reader, catalogue, waiting)) == list(range(120))
+
+
+def test_what_is_too_much_to_read_is_said(
+    archive: FolderArchive, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    size = min(row.bytes for row in archive.catalogue.journals())
+    monkeypatch.setattr(looking, "READ_BYTES", 2.5 * size)
+
+    def incomplete(seen: Look) -> tuple[list[float], int | None]:
+        answer = rows(seen, Asked("r1", "odom", ["pose_x"]))
+        return answer.table.values("pose_x"), answer.about.complete_ns
+
+    found, complete_ns = look(archive.layout.folder, "r1", incomplete)
+    assert found == list(range(40, 120))
+    assert complete_ns is not None
+    assert complete_ns <= T0_NS
+
+
+def test_long_ranges_are_summed_up(archive: FolderArchive, monkeypatch: pytest.MonkeyPatch) -> None:
+    archive.commit(0)
+    monkeypatch.setattr(reading, "THINNED_ROWS", 50)
+    asked = Asked("r1", "odom", ["pose_x", "mode"], points=4)
+    answer = look(archive.layout.folder, "r1", lambda seen: rows(seen, asked))
+    assert answer.about.kind == "envelope"
+    assert "mode" in answer.about.notes[-1]
+    low, high = (answer.table.values(f"pose_x:{end}") for end in ("min", "max"))
+    assert (min(low), max(high)) == (0.0, 119.0)
+    with pytest.raises(LimitError, match="only numbers"):
+        only = Asked("r1", "odom", ["mode"], points=4)
+        look(archive.layout.folder, "r1", lambda seen: rows(seen, only))
+
+
+def test_rows_of_one_instant_are_not_torn_apart() -> None:
+    times = np.array([1, 2, 2, 2, 3])
+    assert reading._cut(times, 2) == (1, 2)
+    assert reading._cut(times[1:], 2) == (3, 3)
+    assert reading._cut(times[1:4], 2) == (3, None)
+    assert reading._cut(times, 5) == (5, None)
+
+
+def test_only_files_of_the_range_are_read(archive: FolderArchive) -> None:
+    archive.commit(0)
+    span = T0_NS + 200 * _MS, T0_NS + 300 * _MS
+    request = Request("odom", ("pose_x",), span)
+    late = Request("odom", ("pose_x",), (span[1] + 10**12, None))
+
+    def count(seen: Look) -> tuple[int, int]:
+        seen.rows(request)
+        first = seen.reader.files_read
+        seen.rows(late)
+        return first, seen.reader.files_read - first
+
+    assert look(archive.layout.folder, "r1", count) == (1, 0)
+
+
+def test_a_robot_without_data_has_no_items(archive: FolderArchive) -> None:
+    with pytest.raises(UsageError, match="no data item"):
+        look(archive.layout.folder, "r9", lambda seen: seen.schema("odom"))
