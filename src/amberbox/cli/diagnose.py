@@ -8,6 +8,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -201,11 +202,13 @@ def _diagnosed(
 ) -> tuple[Case, Diagnosis | None]:
     """Let the engine answer; what rules find is known to all of them."""
     from amberbox.consult.engines import Ground, diagnosis_by, with_findings
+    from amberbox.consult.span import Window
 
     if args.engine == RULES and args.answer:
         tell(["answers to tests count for nothing where the rules alone are asked"])
     lookback_ns = parse_duration(args.lookback)
-    ground = Ground(subject.knowledge, subject.folder.path, record, lookback_ns)
+    past = None if record is None else partial(Window, record)
+    ground = Ground(subject.knowledge, subject.folder.path, past, lookback_ns)
     if args.engine != RULES:
         case = with_findings(ground, case)
     return case, diagnosis_by(args.engine, ground, case)

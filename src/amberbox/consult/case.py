@@ -12,8 +12,9 @@ from amberbox.diagnosis.answering import Heading, answer
 from amberbox.diagnosis.knowledge import Knowledge
 from amberbox.diagnosis.situation import Situation
 
-Origin: TypeAlias = Literal["watcher", "record", "given"]
-"""Who says what the symptoms are: the watcher's journal, an evaluation, or the user alone."""
+Origin: TypeAlias = Literal["watcher", "record", "given", "status"]
+"""Who says what the symptoms are: the watcher's journal, an evaluation, the user alone; or only
+the watcher's statuses, which a server has of it (they say nothing of conditions)."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from amberbox.blackbox.query.record import Record
 from amberbox.consult.case import Case, answered, heading_of
 from amberbox.consult.facts import known_facts, lookups
 from amberbox.consult.rulefiles import rule_files
@@ -23,11 +22,14 @@ from amberbox.diagnosis.rules import Program, read_rules
 
 @dataclass(frozen=True, slots=True)
 class Ground:
-    """What rules can be asked about: the folder's rules, and the record before an instant."""
+    """What rules can be asked about: the folder's rules, and the record before an instant.
+
+    ``past`` opens a part of the record, by its first and last instant; None where there is none.
+    """
 
     knowledge: Knowledge
     folder: Path
-    record: Record | None
+    past: Callable[[int, int], Window] | None
     lookback_ns: int
 
     def files(self) -> list[Path]:
@@ -44,10 +46,10 @@ class Ground:
         """Return what is known of the robot, what was seen, and lookups in the record."""
         known = known_facts(self.knowledge.robot, self.knowledge.fmea, self.knowledge.exposure_h)
         seen = tuple(seen_facts(case.situation.symptoms, self.knowledge.fmea))
-        if self.record is None:
+        if self.past is None:
             return Facts(tuple(known), seen)
-        span = case.at_ns - max(self.lookback_ns, DAY_NS), case.at_ns + 1
-        return Facts(tuple(known), seen, tuple(lookups(Window(self.record, *span))))
+        window = self.past(case.at_ns - max(self.lookback_ns, DAY_NS), case.at_ns + 1)
+        return Facts(tuple(known), seen, tuple(lookups(window)))
 
 
 def with_findings(ground: Ground, case: Case) -> Case:

@@ -11,9 +11,8 @@ import msgspec
 
 from amberbox.blackbox.journal import reserved
 from amberbox.blackbox.missions import Mission, choose
-from amberbox.consult.span import Window, happened_ns, has_item, in_words
+from amberbox.consult.span import Window, happened_ns, in_words
 from amberbox.core.clock import NS
-from amberbox.core.names import identifier
 from amberbox.diagnosis.rules.intervals import Interval, Keys, Span
 from amberbox.diagnosis.rules.proof import Source
 from amberbox.diagnosis.rules.terms import Term
@@ -36,7 +35,7 @@ class Missions:
     @cached_property
     def known(self) -> list[Mission]:
         """All that meet the window."""
-        return choose(self.window.record.missions(), span=self.window.span)
+        return choose(self.window.missions(), span=self.window.span)
 
     def find(self, keys: Keys, span: Span | None) -> Iterator[Interval]:
         """Yield missions with each of their outcomes."""
@@ -145,7 +144,7 @@ class Statuses:
 
     def _changes(self, run: Span) -> Iterator[tuple[int, Mapping[str, Any]]]:
         """Yield changes of components, with their times."""
-        for row in self._rows(reserved.EVENT, ("kind", "details"), run):
+        for row in self.window.rows(reserved.EVENT, ("kind", "details"), run):
             if row["kind"] != COMPONENT_STATE:
                 continue
             change = msgspec.json.decode(row["details"])
@@ -157,7 +156,8 @@ class Statuses:
         """Return what was said of components when the run began."""
         for length_ns in _FIRST_NS:
             span = run[0], min(run[1], run[0] + length_ns)
-            rows = list(self._rows(reserved.STATUS, ("component", "mode", "level", "state"), span))
+            names = ("component", "mode", "level", "state")
+            rows = list(self.window.rows(reserved.STATUS, names, span))
             found = {
                 row["component"]: Condition(row["level"], row["state"])
                 for row in reversed(rows)
@@ -166,12 +166,6 @@ class Statuses:
             if found:
                 return found
         return {}
-
-    def _rows(self, topic: str, names: tuple[str, ...], span: Span) -> Iterable[Mapping[str, Any]]:
-        item = identifier(topic)
-        if not has_item(self.window.record, item):
-            return ()
-        return self.window.record.query(item, ["received", *names], *span).rows()
 
 
 def _joined(

@@ -17,9 +17,14 @@ from amberbox.monitoring.plan import ComponentPlan, OutputPlan, Plan
 
 def known_of(folder: RobotFolder, plan: Plan | None = None) -> Known:
     """Return the outputs of a folder's monitors, what its components need, what is recorded."""
-    known = with_rules(known_of_plan(plan or load_plan(folder)[0]), folder.path)
+    known = declared_of(folder, plan or load_plan(folder)[0])
     variables = _variables(Recorded(folder))
     return known if variables is None else replace(known, addresses={*variables, *known.outputs})
+
+
+def declared_of(folder: RobotFolder, plan: Plan) -> Known:
+    """Return the same without what is recorded, of which conditions may then read anything."""
+    return with_rules(known_of_plan(plan), folder.path)
 
 
 def _variables(recorded: Recorded) -> list[str] | None:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 
 from amberbox.blackbox.store import Store
 from amberbox.consult.case import Case
-from amberbox.consult.journal import said_until, was_watched
+from amberbox.consult.journal import Said, said_until, was_watched
 from amberbox.core.clock import NS
 from amberbox.core.errors import UsageError
 from amberbox.core.timetext import format_time
@@ -104,9 +104,14 @@ def watched(knowledge: Knowledge, store: Store, at_ns: int) -> Case | None:
 
     None if it told of no symptom: it was of a version that did not, or had nothing to go by.
     """
-    said, heard = said_until(store, at_ns), _Heard()
+    return case_of(knowledge, said_until(store, at_ns), at_ns)
+
+
+def case_of(knowledge: Knowledge, said: Said, at_ns: int) -> Case | None:
+    """Return what a watcher's words up to an instant make known; None if it told of no symptom."""
     if not said.symptoms:
         return None
+    heard = _Heard()
     heard.hear(said.symptoms)
     heard.hear(said.diagnoses)
     symptoms = [*_told_before(heard.diagnosis, said.symptoms), *said.symptoms]

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
 from amberbox.blackbox.follow.follow import RECORDED
 from amberbox.blackbox.journal.clocktable import ClockTable
+from amberbox.blackbox.missions import Mission
 from amberbox.blackbox.query.catalogue import Catalogue, ask
 from amberbox.blackbox.query.record import Record
 from amberbox.blackbox.segments.build import can_build
 from amberbox.core.clock import NS
+from amberbox.core.names import identifier
 from amberbox.core.timetext import format_time
 from amberbox.diagnosis.rules.intervals import Span
 
@@ -67,6 +70,17 @@ class Window:
         found = self.record.time_ns(text)
         assert found is not None  # a text is always a time, or an error
         return found
+
+    def rows(self, topic: str, names: Sequence[str], span: Span) -> Iterable[Mapping[str, Any]]:
+        """Yield what the box itself wrote on a channel, with when it was ``received``."""
+        item = identifier(topic)
+        if not has_item(self.record, item):
+            return ()
+        return self.record.query(item, ["received", *names], *span).rows()
+
+    def missions(self) -> list[Mission]:
+        """Return all missions of the record."""
+        return self.record.missions()
 
     def _runs(self, writers: Collection[str]) -> tuple[Span, ...]:
         return tuple(ask(self.record.path, _of(writers), with_segments=can_build()))

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
+from contextvars import ContextVar
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TypeAlias
@@ -14,6 +15,9 @@ import yaml
 from amberbox.core.errors import Problem
 
 Scalar: TypeAlias = "str | int | float | bool | None"
+
+_FENCE: ContextVar[Path | None] = ContextVar("fence", default=None)
+_OURS = Path(__file__).resolve().parents[1]
 
 _MOST_NODES = 200_000  # aliases can multiply a small file without end
 _DEEPEST = 60
@@ -70,12 +74,29 @@ class Node:
         return self.value
 
 
+@contextmanager
+def only_below(folder: Path) -> Iterator[None]:
+    """Read no YAML file but those below a folder and our own, whatever these files name.
+
+    For folders that came from elsewhere: what lies outside is told as if it could not be read.
+    """
+    token = _FENCE.set(folder.resolve())
+    try:
+        yield
+    finally:
+        _FENCE.reset(token)
+
+
 def load_yaml(path: Path, problems: list[Problem], name: str = "") -> Node | None:
     """Read a YAML file; add what is wrong with it to ``problems``.
 
     ``name`` is the file's name in messages. Returns None if the file cannot be read at all.
     """
     name = name or str(path)
+    fence = _FENCE.get()
+    if fence is not None and not any(map(path.resolve().is_relative_to, (fence, _OURS))):
+        problems.append(Problem(name, 1, "file", "lies outside of the folder, and is not read"))
+        return None
     try:
         text = path.read_bytes().decode("utf-8-sig")
     except OSError as error:

@@ -46,8 +46,14 @@ class Functions:
         return module
 
 
-def find_functions(folder: Path) -> Functions:
-    """Find the monitors and probes: those that come with Amberbox, then the folder's own."""
+def find_functions(folder: Path, *, own: bool = True) -> Functions:
+    """Find the monitors and probes: those that come with Amberbox, then the folder's own.
+
+    Without ``own``, Python of the folder is not even looked at.
+    """
+    if not own:
+        modes, probes = _shipped(MODES, MODE_DEFINES), _shipped(PROBES, PROBE_DEFINES)
+        return Functions(modes, frozenset(probes))
     modes = _found(MODES, folder / OWN_MODES, MODE_DEFINES)
     probes = _found(PROBES, folder / OWN_PROBES, PROBE_DEFINES)
     return Functions(modes, frozenset(probes))

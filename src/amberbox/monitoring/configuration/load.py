@@ -30,18 +30,19 @@ _SHOWN = 12
 """So many items are named in a note."""
 
 
-def load_plan(folder: RobotFolder) -> tuple[Plan, list[Problem]]:
+def load_plan(folder: RobotFolder, *, own: bool = True) -> tuple[Plan, list[Problem]]:
     """Return what is to be monitored of a robot, and all that is wrong with its files.
 
     What cannot run stays in the plan with its problem, so that its status is ``unknown``. Opens
-    no device and no socket; raises nothing for files that are wrong.
+    no device and no socket; raises nothing for files that are wrong. Without ``own``, monitors and
+    probes that the folder brings along are not imported: their modes cannot run, but have outputs.
     """
     problems: list[Problem] = []
     tree = read_tree(folder.path / FOLDER, problems)
     plan = Plan(folder.robot.id, folder.config_hash)
     if not tree.components and not tree.unlisted and tree.recovery is None:
         return plan, problems
-    functions = find_functions(folder.path)
+    functions = find_functions(folder.path, own=own)
     bench = Bench(functions, Inputs(Recorded(folder), functions), folder.robot, problems)
     components = _components(tree, bench)
     for mode in tree.unlisted:
