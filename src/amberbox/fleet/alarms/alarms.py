@@ -3,23 +3,164 @@
 from __future__ import annotations
 
 import asyncio
+import logging
+import threading
+from collections.abc import Callable
+from typing import Any, Final
 
 from amberbox.core.clock import Clock
-from amberbox.fleet.bus import Bus
+from amberbox.core.errors import AmberboxError
+from amberbox.fleet.alarms import inbox as boxes
+from amberbox.fleet.alarms.absence import Absence
+from amberbox.fleet.alarms.inbox import Came, Inbox, News, Went
+from amberbox.fleet.alarms.offline import absent_since_start, miss, returned
+from amberbox.fleet.alarms.register import Register
+from amberbox.fleet.alarms.reports import Received, is_of_interest, reports
+from amberbox.fleet.alarms.settings import NAME, AlarmSettings
+from amberbox.fleet.alarms.taking import take
+from amberbox.fleet.alarms.timing import Lateness, is_due, pass_time
+from amberbox.fleet.bus import Bus, Change
 from amberbox.fleet.database.database import Database
+from amberbox.fleet.notifying.sending import Sender
+from amberbox.fleet.options.options import read
+
+_TICK_S: Final = 1.0
 
 
 class Alarms:
-    """Opens, changes and closes alarms, and tells who has to know."""
+    """Listens to what robots say and to who is there; ``step`` does what follows from that.
 
-    def __init__(self, database: Database, bus: Bus, clock: Clock) -> None:
+    All of it happens in transactions: what was taken is taken once, whatever happens in between.
+    """
+
+    def __init__(self, database: Database, bus: Bus, clock: Clock, public_url: str = "") -> None:
         self._database = database
         self._bus = bus
         self._clock = clock
+        self._url = public_url
+        self._inbox = Inbox()
+        self._absence: Absence | None = None
+        self._late = Lateness()
+        self._offsets: dict[tuple[str, str], int] = {}
+        self._stepping = threading.Lock()
+        self.sender = Sender(database, clock)
+        self._forget: list[Callable[[], None]] = [
+            bus.on("rows", self._rows), bus.on("connected", self._connected),
+            bus.on("gone", self._gone),
+        ]  # fmt: skip
+
+    def _rows(self, change: Change) -> None:
+        now_ns = self._clock.wall_ns()
+        for row in change.data["rows"]:
+            if is_of_interest(row):
+                self._inbox.put(Received(change.robot, change.data["store_id"], row, now_ns))
+
+    def _connected(self, change: Change) -> None:
+        hello: Any = change.data["hello"]
+        now_ns = self._clock.wall_ns()
+        self._inbox.put(Came(change.robot, hello.boot_id, now_ns - hello.wall_ns, now_ns))
+
+    def _gone(self, change: Change) -> None:
+        self._inbox.put(Went(change.robot, self._clock.wall_ns()))
 
     async def run(self) -> None:
         """Work until cancelled."""
-        await asyncio.Event().wait()
+        sending = asyncio.create_task(self._send())
+        try:
+            while True:
+                await asyncio.to_thread(self.step)
+                await asyncio.sleep(_TICK_S)
+        finally:
+            sending.cancel()
+
+    async def _send(self) -> None:
+        while True:
+            try:
+                await asyncio.to_thread(self.sender.step)
+            except AmberboxError:  # the database is busy: the messages are still there
+                logging.getLogger(__name__).exception("the outbox could not be read")
+            await asyncio.sleep(_TICK_S)
+
+    def step(self) -> None:
+        """Take all that is new, and do what is due by now; publishes the alarms that changed."""
+        with self._stepping:
+            changed = self._start() if self._absence is None else set()
+            while news := self._inbox.next():
+                changed |= self._take(news)
+                self._inbox.done(len(news))
+            changed |= self._tick()
+        for number, robot in sorted(self._robots(changed)):
+            self._bus.publish(Change("alarm", robot, {"id": number}))
+
+    def _start(self) -> set[int]:
+        """Begin: nobody is missed yet; take what came while nobody looked."""
+        now_ns = self._clock.wall_ns()
+        with self._database.reading() as connection:
+            absence = absent_since_start(Register(connection), now_ns)
+            left: list[News] = list(boxes.missed_rows(connection))
+        self._absence = absence
+        return self._take(left) if left else set()
+
+    def _take(self, news: list[News]) -> set[int]:
+        """Take news in one transaction."""
+        assert self._absence is not None
+        now_ns = self._clock.wall_ns()
+        rows = [one for one in news if isinstance(one, Received)]
+        back = {one.robot for one in news if isinstance(one, Came)}
+        for one in news:
+            if isinstance(one, Came):
+                self._offsets[one.robot, one.boot_id] = one.offset_ns
+        with self._database.begin() as connection:
+            settings = read(connection, NAME, AlarmSettings)
+            register = Register(connection)
+            known = boxes.offsets(connection, rows, self._offsets)
+            told = list(reports(rows, known, settings.ns("late_s")))
+            take(register, told, now_ns, settings)
+            returned(register, back, now_ns)
+            if rows:
+                boxes.mark(connection, max(one.received_ns for one in rows))
+        self._late.note(told, now_ns)
+        self._move(news)
+        return register.touched
+
+    def _move(self, news: list[News]) -> None:
+        """Note who came and who went, in order."""
+        assert self._absence is not None
+        for one in news:
+            if isinstance(one, Came):
+                self._absence.back(one.robot)
+            elif isinstance(one, Went):
+                self._absence.gone(one.robot, one.at_ns)
+
+    def _tick(self) -> set[int]:
+        """Do what is due by now."""
+        absence, now_ns = self._absence, self._clock.wall_ns()
+        assert absence is not None
+        with self._database.reading() as connection:
+            settings = read(connection, NAME, AlarmSettings)
+            waits = is_due(connection, now_ns, settings)
+        if not waits and not absence.away.keys() - absence.settled:
+            return set()
+        before = set(absence.settled)
+        try:
+            with self._database.begin() as connection:
+                register = Register(connection)
+                miss(register, absence, now_ns, settings)
+                pass_time(register, self._late, now_ns, settings, self._url)
+        except BaseException:  # nothing of it is kept: it is decided again
+            absence.settled = before
+            raise
+        return register.touched
+
+    def _robots(self, numbers: set[int]) -> set[tuple[int, str]]:
+        if not numbers:
+            return set()
+        with self._database.reading() as connection:
+            register = Register(connection)
+            return {(n, alarm.robot) for n in numbers if (alarm := register.alarm(n)) is not None}
 
     def close(self) -> None:
         """Let go of what is held."""
+        for forget in self._forget:
+            forget()
+        self.sender.close()

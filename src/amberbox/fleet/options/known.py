@@ -12,7 +12,9 @@ import msgspec
 from amberbox.core.config import did_you_mean
 from amberbox.core.errors import UsageError
 from amberbox.core.ids import is_id
+from amberbox.fleet.alarms.settings import AlarmSettings
 from amberbox.fleet.archive.store import OWN, Retention
+from amberbox.fleet.notifying.settings import Notifications
 
 _CLASSES = ("*", OWN, "main", "bulk", "ring", "watch", "keep", "kept")
 
@@ -43,6 +45,8 @@ def known() -> Mapping[str, Known]:
             "retention.write",
             _refuse_retention,
         ),
+        "alarms": Known(AlarmSettings, "when alarms open, when they are over, who is missed"),
+        "notifications": Known(Notifications, "who is told of alarms, by mail and by webhook"),
     }
 
 

@@ -29,6 +29,8 @@ REOPEN_NS: Final = 60 * NS
 SETTLE_NS: Final = 5 * NS
 """So long a component has to recover after what blocked it has."""
 NEVER_NS: Final = 1 << 62
+FOLLOWS: Final = "follows from "
+"""Begins the reason of an alarm that is over since another component is to blame."""
 
 Action: TypeAlias = Literal["acknowledge", "shelve", "unshelve"]
 _RAISING: Final[frozenset[Level]] = frozenset(("warn", "stale", "error"))
@@ -101,7 +103,7 @@ class Alarms:
         if waits:
             origin = next((wait.label for wait in waits if wait.faulty), "")
             if alarm is not None and lasts and origin:
-                return self._heal(component, alarm, now_ns, f"follows from {origin}")
+                return self._heal(component, alarm, now_ns, FOLLOWS + origin)
             return []
         if alarm is not None and lasts:
             return self._worsen(component, alarm, now_ns, own)

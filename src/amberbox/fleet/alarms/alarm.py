@@ -1,0 +1,106 @@
+"""An alarm as it stands, and what it is made of."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final, Literal, TypeAlias
+
+from amberbox.core.types import Level
+from amberbox.monitoring.plan import Severity
+
+Kind: TypeAlias = Literal["robot", "offline"]
+State: TypeAlias = Literal["open", "acknowledged", "shelved", "resolved"]
+SEVERITIES: Final[tuple[Severity, ...]] = ("warning", "urgent", "critical", "fatal")
+"""From low to high, the words of VDA 5050 and of the mode files."""
+
+
+@dataclass(frozen=True, slots=True)
+class Alarm:
+    """An alarm; ``number`` is its id, which stays whatever becomes of it.
+
+    ``origin`` is the component that it comes from, or what offline robots share. ``active`` says
+    whether what it is about lasts, ``state`` what people made of it; neither decides the other.
+    ``severity`` is the worst it has had. ``late`` is one that was told long after
+    it happened. ``told`` is the highest severity that was notified, ``notify_ns`` when the next
+    notification is due. ``revision`` counts what people should know before they change it.
+    """
+
+    number: int
+    kind: Kind
+    robot: str
+    origin: str
+    severity: Severity
+    level: Level
+    reason: str
+    opened_ns: int
+    changed_ns: int
+    cause: str = ""
+    diagnosis: str = ""
+    active: bool = True
+    cleared_ns: int | None = None
+    count: int = 1
+    state: State = "open"
+    late: bool = False
+    acknowledged_by: str = ""
+    acknowledged_ns: int | None = None
+    shelved_by: str = ""
+    shelved_until_ns: int | None = None
+    owner: str = ""
+    resolved_by: str = ""
+    resolved_ns: int | None = None
+    resolution: str = ""
+    merged_into: int | None = None
+    told: Severity | Literal[""] = ""
+    notify_ns: int | None = None
+    revision: int = 1
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """An alarm of a robot (``source`` is its id there), which is all or a part of one of ours."""
+
+    robot: str
+    source: str
+    alarm: int
+    component: str
+    severity: Severity
+    level: Level
+    reason: str
+    cause: str
+    diagnosis: str
+    active: bool
+    opened_ns: int
+    changed_ns: int
+    count: int
+    store_id: str
+    run: int
+    seq: int
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """A line of an alarm's history; ``who`` is empty for the server itself."""
+
+    at_ns: int
+    what: str
+    text: str = ""
+    who: str = ""
+
+
+Step: TypeAlias = "tuple[Alarm, Sequence[Entry]]"
+"""An alarm after something happened to it, and what that adds to its history."""
+
+
+def is_worse(severity: str, than: str) -> bool:
+    """Tell whether a severity is higher than another; any is higher than none."""
+    return _rank(severity) > _rank(than)
+
+
+def worst(severities: Sequence[Severity]) -> Severity:
+    """Return the highest severity."""
+    return max(severities, key=_rank)
+
+
+def _rank(severity: str) -> int:
+    return SEVERITIES.index(severity) if severity in SEVERITIES else -1

@@ -1,0 +1,108 @@
+"""What suffers from the root of an alarm: components that are blocked by it, near or far."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from typing import Any
+
+from sqlalchemy import select
+
+from amberbox.fleet.alarms.alarm import Part
+from amberbox.fleet.alarms.register import Register
+from amberbox.fleet.alarms.reports import Report
+from amberbox.fleet.alarms.tables import ALARM, CONSEQUENCE
+from amberbox.fleet.database.upsert import upsert
+from amberbox.monitoring.engine.findings import Transition
+
+_MOST = 100
+"""Names in a list of what blocks something; more are not of use to anybody."""
+
+
+def note_blocked(register: Register, report: Report, told: Transition) -> None:
+    """Take a transition of a component, unless a later one is known."""
+    if told.mode:
+        return
+    component = told.component[:128]
+    known = register.blocked(report.robot).get(component)
+    same = known is not None and known["store_id"] == report.store_id
+    if known is not None and same and (report.run, report.seq) <= (known["run"], known["seq"]):
+        return
+    register.keep_blocked({
+        "robot": report.robot, "component": component, "level": told.after.level,
+        "blocked_by": json.dumps([name[:128] for name in told.blocked_by[:_MOST]]),
+        "reason": told.reason, "since_ns": min(max(told.at_ns + report.offset_ns, 0), 1 << 62),
+        "store_id": report.store_id, "run": report.run, "seq": report.seq,
+    })  # fmt: skip
+
+
+def root_of(register: Register, robot: str, origin: str) -> Part | None:
+    """Return the part that lasts of a component, or of what that one is blocked by."""
+    lasting = {part.component: part for part in register.lasting(robot)}
+    blocked = register.blocked(robot)
+    waiting, seen = [origin], {origin}
+    while waiting:
+        name = waiting.pop(0)
+        if name in lasting:
+            return lasting[name]
+        new = [by for by in _blockers(blocked, name) if by not in seen]
+        waiting += new
+        seen.update(new)
+    return None
+
+
+def _blockers(blocked: Mapping[str, Any], name: str) -> list[str]:
+    row = blocked.get(name)
+    return [] if row is None else list(json.loads(row["blocked_by"]))
+
+
+def show_consequences(register: Register, robot: str) -> None:
+    """List what suffers under the root of each alarm that lasts; note what suffers no more."""
+    blocked = register.blocked(robot)
+    open_ones = register.alarms(
+        ALARM.c.robot == robot, ALARM.c.state != "resolved", ALARM.c.kind == "robot"
+    )
+    for alarm in open_ones:
+        parts = register.parts(alarm.number)
+        own = {part.component for part in parts if part.component == alarm.origin}
+        found = _below(own, blocked) if alarm.active else {}
+        for part in parts:
+            if part.component not in own and part.active:
+                found[part.component] = (part.level, part.reason, part.opened_ns)
+        _keep(register, alarm.number, found, alarm.changed_ns)
+
+
+def _below(roots: set[str], blocked: Mapping[str, Any]) -> dict[str, tuple[str, str, int]]:
+    """Follow what is blocked from the roots on."""
+    found: dict[str, tuple[str, str, int]] = {}
+    grown = True
+    while grown:
+        grown = False
+        for name, row in blocked.items():
+            if name in found or name in roots or row["level"] == "ok":
+                continue
+            by = set(json.loads(row["blocked_by"]))
+            if by & (roots | found.keys()):
+                found[name] = (row["level"], row["reason"], row["since_ns"])
+                grown = True
+    return found
+
+
+def _keep(
+    register: Register, number: int, found: Mapping[str, tuple[str, str, int]], now_ns: int
+) -> None:
+    chosen = select(CONSEQUENCE).where(CONSEQUENCE.c.alarm == number)
+    known = {row["component"]: row for row in register.connection.execute(chosen).mappings()}
+    rows = [
+        {"alarm": number, "component": name, "level": level, "reason": reason[:2000],
+         "from_ns": from_ns, "to_ns": None}
+        for name, (level, reason, from_ns) in found.items()
+    ]  # fmt: skip
+    rows += [{**row, "to_ns": now_ns} for name, row in known.items()
+             if name not in found and row["to_ns"] is None]  # fmt: skip
+    changed = [row for row in rows if row != dict(known.get(row["component"], {}))]
+    if changed:
+        change = ("level", "reason", "from_ns", "to_ns")
+        statement = upsert(register.connection.dialect, CONSEQUENCE, ("alarm", "component"), change)
+        register.connection.execute(statement, changed)
+        register.touched.add(number)

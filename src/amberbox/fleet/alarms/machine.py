@@ -1,0 +1,200 @@
+"""How alarms change: pure functions of an alarm, of what was said, and of a time.
+
+``active`` follows what robots say; ``state`` is what people made of it. Each function returns the
+alarm as it is afterwards, and the lines for its history.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Final
+
+from amberbox.core.errors import AmberboxError
+from amberbox.core.timetext import format_time
+from amberbox.fleet.alarms.alarm import Alarm, Entry, Part, State, Step, is_worse, worst
+from amberbox.fleet.alarms.settings import AlarmSettings
+from amberbox.monitoring.engine.outputs import RANK
+from amberbox.monitoring.plan import Severity
+
+OVER: Final = "over"
+MERGED: Final = "merged"
+
+
+class AlarmStateError(AmberboxError):
+    """What was asked for makes no sense for an alarm as it stands now."""
+
+
+def judged(alarm: Alarm, parts: Sequence[Part], now_ns: int, settings: AlarmSettings) -> Step:
+    """Bring an alarm of a robot up to what its parts say."""
+    root = [part for part in parts if part.component == alarm.origin] or list(parts)
+    lasting = [part for part in parts if part.active]
+    speaking = root if any(part.active for part in root) else lasting or root
+    latest = max(speaking, key=lambda part: (part.active, part.changed_ns))
+    named = next((part for part in [latest, *lasting] if part.diagnosis), None)
+    count = max(1, sum(part.count for part in root))
+    came_back = count > alarm.count or (bool(lasting) and not alarm.active)
+    alarm, entries = _reopened(alarm, now_ns, settings) if came_back and lasting else (alarm, [])
+    severity = worst([alarm.severity, *(part.severity for part in lasting)])
+    changed = replace(
+        alarm, count=max(count, alarm.count), reason=latest.reason, active=bool(lasting),
+        level=max((part.level for part in lasting or root), key=lambda level: RANK[level]),
+        cleared_ns=None if lasting else max(part.changed_ns for part in parts),
+        changed_ns=max(alarm.changed_ns, *(part.changed_ns for part in parts)),
+        cause=alarm.cause if named is None else named.cause,
+        diagnosis=alarm.diagnosis if named is None else named.diagnosis,
+    )  # fmt: skip
+    if changed.cause != alarm.cause:
+        entries = [*entries, Entry(now_ns, "cause", changed.cause)]
+        changed = replace(changed, revision=changed.revision + 1)
+    worse, more = worsened(changed, severity, now_ns, settings)
+    return worse, [*entries, *more]
+
+
+def _reopened(alarm: Alarm, now_ns: int, settings: AlarmSettings) -> Step:
+    """Make an alarm that was resolved open again; one that was not stays as it is."""
+    if alarm.state != "resolved":
+        return alarm, []
+    notify_ns = None if alarm.told else now_ns + settings.ns("settle_s")
+    again = replace(
+        alarm, state="open", resolved_by="", resolved_ns=None, resolution="",
+        acknowledged_by="", acknowledged_ns=None, shelved_by="", shelved_until_ns=None,
+        notify_ns=notify_ns, revision=alarm.revision + 1,
+    )  # fmt: skip
+    return again, [Entry(now_ns, "reopened", "it came back")]
+
+
+def worsened(alarm: Alarm, severity: Severity, now_ns: int, settings: AlarmSettings) -> Step:
+    """Raise the severity: that is not what was acknowledged, and it is told again."""
+    if not is_worse(severity, alarm.severity):
+        return alarm, []
+    alarm, entries = _reopened(alarm, now_ns, settings)
+    worse = replace(
+        alarm, severity=severity, state="shelved" if alarm.state == "shelved" else "open",
+        acknowledged_by="", acknowledged_ns=None, revision=alarm.revision + 1,
+        notify_ns=alarm.notify_ns or now_ns + settings.ns("settle_s"),
+    )  # fmt: skip
+    return worse, [*entries, Entry(now_ns, "worse", f"{alarm.severity} -> {severity}")]
+
+
+def lost_again(alarm: Alarm, reason: str, now_ns: int, settings: AlarmSettings) -> Step:
+    """Bring an alarm of offline robots up to date: more are away, or they are away again."""
+    again, entries = _reopened(alarm, now_ns, settings)
+    changed = replace(again, active=True, cleared_ns=None, changed_ns=now_ns, reason=reason,
+                      count=again.count + 1)  # fmt: skip
+    return changed, [*entries, Entry(now_ns, "away", reason)]
+
+
+def settled(alarm: Alarm, now_ns: int, settings: AlarmSettings) -> Step:
+    """Resolve an alarm that is over, and take from the shelf what was there long enough."""
+    if alarm.state == "resolved":
+        return alarm, []
+    if not alarm.active and alarm.cleared_ns is not None:
+        over_ns = alarm.cleared_ns + settings.ns("quiet_s")
+        if now_ns >= over_ns:
+            times = "" if alarm.count == 1 else f", it came {alarm.count} times"
+            closed = replace(
+                alarm, state="resolved", resolved_ns=over_ns, resolution=OVER,
+                revision=alarm.revision + 1,
+            )  # fmt: skip
+            return closed, [Entry(over_ns, "resolved", OVER + times)]
+    until_ns = alarm.shelved_until_ns
+    if alarm.state == "shelved" and until_ns is not None and now_ns >= until_ns:
+        return _off_the_shelf(alarm, now_ns, ""), [Entry(now_ns, "unshelved", "its time is over")]
+    return alarm, []
+
+
+def merged(keep: Alarm, gone: Alarm, origin: str, now_ns: int) -> tuple[Step, Step]:
+    """Make one alarm of two with the same root: the older one stays, with what people said."""
+    told = keep.told if not is_worse(gone.told, keep.told) else gone.told
+    severity = worst([keep.severity, gone.severity])
+    one = replace(
+        keep, origin=origin, severity=severity, told=told, owner=keep.owner or gone.owner,
+        opened_ns=min(keep.opened_ns, gone.opened_ns), late=keep.late and gone.late,
+        revision=keep.revision + 1,
+    )  # fmt: skip
+    if not keep.told and told and not is_worse(severity, told):
+        one = replace(one, notify_ns=None)
+    other = replace(
+        gone, state="resolved", active=False, resolved_ns=now_ns, resolution=MERGED,
+        cleared_ns=gone.cleared_ns or now_ns, merged_into=keep.number, notify_ns=None,
+        revision=gone.revision + 1,
+    )  # fmt: skip
+    return (
+        (
+            one,
+            [Entry(now_ns, MERGED, f"{gone.origin} ({gone.number}) has the same root: {origin}")],
+        ),
+        (other, [Entry(now_ns, MERGED, f"part of {keep.number} now")]),
+    )
+
+
+def acknowledged(alarm: Alarm, who: str, now_ns: int, note: str = "") -> Step:
+    """Note that somebody sees to it; raises AlarmStateError when it is resolved."""
+    _refuse_resolved(alarm, "acknowledged")
+    state: State = "shelved" if alarm.state == "shelved" else "acknowledged"
+    changed = replace(alarm, state=state, acknowledged_by=who, acknowledged_ns=now_ns,
+                      notify_ns=None, revision=alarm.revision + 1)  # fmt: skip
+    return changed, [Entry(now_ns, "acknowledged", note, who)]
+
+
+def shelved(alarm: Alarm, who: str, now_ns: int, until_ns: int, reason: str) -> Step:
+    """Put an alarm aside until a time; raises AlarmStateError for a time that is over."""
+    _refuse_resolved(alarm, "shelved")
+    if until_ns <= now_ns:
+        raise AlarmStateError("an alarm is shelved until a time to come", "say for instance now+2h")
+    changed = replace(alarm, state="shelved", shelved_by=who, shelved_until_ns=until_ns,
+                      revision=alarm.revision + 1)  # fmt: skip
+    text = f"until {format_time(until_ns)[:19]}Z: {reason}"
+    return changed, [Entry(now_ns, "shelved", text, who)]
+
+
+def unshelved(alarm: Alarm, who: str, now_ns: int) -> Step:
+    """Take an alarm from the shelf; raises AlarmStateError when it is not there."""
+    if alarm.state != "shelved":
+        raise AlarmStateError(f"the alarm {alarm.number} is not shelved")
+    return _off_the_shelf(alarm, now_ns, who), [Entry(now_ns, "unshelved", "", who)]
+
+
+def _off_the_shelf(alarm: Alarm, now_ns: int, who: str) -> Alarm:
+    """Go back to what it was before; what nobody has been told of yet is due now."""
+    known = alarm.acknowledged_ns is not None
+    untold = not known and not who and is_worse(alarm.severity, alarm.told) and alarm.active
+    return replace(
+        alarm, state="acknowledged" if known else "open", shelved_by="", shelved_until_ns=None,
+        notify_ns=now_ns if untold else alarm.notify_ns, revision=alarm.revision + 1,
+    )  # fmt: skip
+
+
+def owned(alarm: Alarm, who: str, now_ns: int, owner: str) -> Step:
+    """Say whose business it is; nobody's with an empty name."""
+    _refuse_resolved(alarm, "given to somebody")
+    changed = replace(alarm, owner=owner, revision=alarm.revision + 1)
+    return changed, [Entry(now_ns, "owned", owner or "nobody", who)]
+
+
+def noted(alarm: Alarm, who: str, now_ns: int, text: str) -> Step:
+    """Add a note."""
+    return replace(alarm, revision=alarm.revision + 1), [Entry(now_ns, "note", text, who)]
+
+
+def resolved(alarm: Alarm, who: str, now_ns: int, reason: str) -> Step:
+    """Close an alarm for good; when the robot finds it anew it opens again."""
+    _refuse_resolved(alarm, "resolved")
+    changed = replace(
+        alarm, state="resolved", resolved_by=who, resolved_ns=now_ns, resolution=reason,
+        shelved_by="", shelved_until_ns=None, notify_ns=None, revision=alarm.revision + 1,
+    )  # fmt: skip
+    return changed, [Entry(now_ns, "resolved", reason, who)]
+
+
+def told(alarm: Alarm, now_ns: int) -> Step:
+    """Note that people were notified."""
+    changed = replace(alarm, told=alarm.severity, notify_ns=None)
+    return changed, [Entry(now_ns, "notified", alarm.severity)]
+
+
+def _refuse_resolved(alarm: Alarm, what: str) -> None:
+    if alarm.state == "resolved":
+        hint = f"look at alarm {alarm.merged_into}" if alarm.merged_into else "it opens by itself"
+        raise AlarmStateError(f"the alarm {alarm.number} is over: it cannot be {what}", hint)

@@ -1,0 +1,95 @@
+"""What happens to alarms as time goes by: they are over, leave the shelf, and people are told."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
+
+from sqlalchemy import ColumnElement, Connection, and_, or_, select
+
+from amberbox.fleet.accounts.tables import ROBOT_GROUPS
+from amberbox.fleet.alarms import machine
+from amberbox.fleet.alarms.alarm import Alarm, is_worse
+from amberbox.fleet.alarms.register import Register
+from amberbox.fleet.alarms.reports import Report
+from amberbox.fleet.alarms.settings import AlarmSettings
+from amberbox.fleet.alarms.tables import ALARM, ALARM_ROBOT
+from amberbox.fleet.notifying.outbox import Told, put
+from amberbox.fleet.notifying.settings import NAME, Notifications
+from amberbox.fleet.options.options import read
+
+
+@dataclass(slots=True)
+class Lateness:
+    """When robots last told what had happened long before: until that ends, more may come."""
+
+    until: dict[str, int] = field(default_factory=dict)
+
+    def note(self, told: Iterable[Report], now_ns: int) -> None:
+        """Note which robots speak of the past."""
+        for report in told:
+            if report.late:
+                self.until[report.robot] = now_ns
+
+
+def is_due(connection: Connection, now_ns: int, settings: AlarmSettings) -> bool:
+    """Tell whether something happens to an alarm by itself now."""
+    over = and_(ALARM.c.state != "resolved", _is_over(now_ns, settings))
+    chosen = select(ALARM.c.number).where(or_(over, _is_to_be_told(now_ns))).limit(1)
+    return connection.execute(chosen).first() is not None
+
+
+def _is_over(now_ns: int, settings: AlarmSettings) -> ColumnElement[bool]:
+    quiet_ns = now_ns - settings.ns("quiet_s")
+    return or_(ALARM.c.cleared_ns <= quiet_ns, ALARM.c.shelved_until_ns <= now_ns)
+
+
+def _is_to_be_told(now_ns: int) -> ColumnElement[bool]:
+    return and_(ALARM.c.notify_ns <= now_ns, ALARM.c.state != "shelved")
+
+
+def pass_time(
+    register: Register, late: Lateness, now_ns: int, settings: AlarmSettings, url: str
+) -> None:
+    """Do what is due by now with all alarms."""
+    for alarm in register.alarms(ALARM.c.state != "resolved", _is_over(now_ns, settings)):
+        register.keep(alarm, machine.settled(alarm, now_ns, settings))
+    for alarm in register.alarms(_is_to_be_told(now_ns)):
+        _tell(register, late, alarm, now_ns, settings, url)
+
+
+def _tell(
+    register: Register,
+    late: Lateness,
+    alarm: Alarm,
+    now_ns: int,
+    settings: AlarmSettings,
+    url: str,
+) -> None:
+    """Tell of an alarm, wait, or let it be: what was over before we heard of it is not news."""
+    if alarm.late and alarm.active:
+        ready_ns = late.until.get(alarm.robot, 0) + settings.ns("settle_s")
+        if now_ns < ready_ns:
+            register.keep(alarm, (replace(alarm, notify_ns=ready_ns), []))
+            return
+    old = alarm.late and not alarm.active
+    if old or alarm.merged_into is not None or not is_worse(alarm.severity, alarm.told):
+        register.keep(alarm, (replace(alarm, notify_ns=None), []))
+        return
+    setting = read(register.connection, NAME, Notifications)
+    robots = _robots(register, alarm.number)
+    put(register.connection, Told(alarm, robots), now_ns, setting, url)
+    register.keep(alarm, machine.told(alarm, now_ns))
+
+
+def _robots(register: Register, number: int) -> dict[str, frozenset[str]]:
+    """Return the robots of an alarm that are still concerned, with their groups."""
+    of = select(ALARM_ROBOT.c.robot).where(
+        ALARM_ROBOT.c.alarm == number, ALARM_ROBOT.c.to_ns.is_(None)
+    )
+    names = list(register.connection.execute(of).scalars())
+    groups: dict[str, set[str]] = {name: set() for name in names}
+    chosen = select(ROBOT_GROUPS.c.robot, ROBOT_GROUPS.c.group)
+    for robot, group in register.connection.execute(chosen.where(ROBOT_GROUPS.c.robot.in_(names))):
+        groups[robot].add(group)
+    return {name: frozenset(found) for name, found in groups.items()}
