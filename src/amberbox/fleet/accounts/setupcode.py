@@ -86,6 +86,12 @@ def needs_setup(connection: Connection) -> bool:
     return not has_admin(connection)
 
 
+def code_waits(connection: Connection, now_ns: int) -> bool:
+    """Tell whether a code was made that nobody has used, and that still holds."""
+    held = (SETUP_CODES.c.created_ns <= now_ns, SETUP_CODES.c.expires_ns > now_ns)
+    return connection.execute(select(SETUP_CODES.c.hash).where(*held)).first() is not None
+
+
 def use_setup_code(
     database: Database,
     clock: Clock,

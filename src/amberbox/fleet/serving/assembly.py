@@ -27,6 +27,7 @@ from amberbox.fleet.services import Services
 from amberbox.fleet.serving.doorkeeper import Doorkeeper
 from amberbox.fleet.serving.settings import Settings
 from amberbox.fleet.serving.threads import Threads
+from amberbox.fleet.state.state import State
 from amberbox.fleet.system.system import SystemLevel
 from amberbox.fleet.uploads.desk import Desk
 from amberbox.fleet.uploads.pieces import Incoming
@@ -47,6 +48,7 @@ def assemble(
     asking = Asking(folder, database, bus, clock)
     folders = Folders(folder, database, bus, clock, asking)
     links = LinkServer(database, _hooks(bus, folders), clock)
+    state = State(database, archive, bus, links, folders, asking)
     desk = Desk(
         folder,
         database,
@@ -60,7 +62,7 @@ def assemble(
         folders=folders, asking=asking,
         jobs=Jobs(folder, database, bus, clock),
         alarms=Alarms(database, bus, clock, settings.public_url),
-        feed=Feed(database, bus, clock, links), system=SystemLevel(folder, database, bus, clock),
+        feed=Feed(database, bus, clock, links, state), system=SystemLevel(folder, database, bus, clock),
         keeping=Keeping(folder, database, bus, clock, archive),
         doors=Doorkeeper(database, bus, clock, links), threads=Threads(),
     )  # fmt: skip

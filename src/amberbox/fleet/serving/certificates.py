@@ -31,8 +31,6 @@ _BEFORE = dt.timedelta(days=1)
 """Certificates hold from a day earlier on: clocks differ."""
 _LABEL = r"[a-z0-9](?:[a-z0-9-]{0,61}[a-z0-9])?"
 _NAME = re.compile(rf"(?=.{{1,253}}$){_LABEL}(?:\.{_LABEL})*")
-    r"(?=.{1,253}$)([a-z0-9]([a-z0-9-]{0,61}[a-z0-9])?)(\.[a-z0-9]([a-z0-9-]*[a-z0-9])?)*"
-)
 
 
 @dataclass(frozen=True, slots=True)

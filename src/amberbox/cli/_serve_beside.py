@@ -1,0 +1,92 @@
+"""What stands beside serving: certificates, robots, the audit log; also while the server runs."""
+
+from __future__ import annotations
+
+import getpass
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+from amberbox.core.clock import SystemClock
+from amberbox.core.errors import UsageError
+
+
+def make_certificate(folder: Path, names: Sequence[str]) -> int:
+    """Make the server's certificate, and the authority if there is none; print its fingerprint."""
+    from amberbox.fleet.accounts.authority import fingerprint
+    from amberbox.fleet.serving import certificates
+    from amberbox.fleet.serving.starting import make_folder
+
+    certificates.checked_names(names)
+    make_folder(folder)
+    files = certificates.Files(folder)
+    is_new = not files.authority.exists()
+    made = certificates.make(folder, names, SystemClock().wall_ns())
+    print(f"certificate for {', '.join(made)}: {files.server}")
+    print(f"authority ({'new' if is_new else 'as before'}): {files.authority}")
+    print(f"fingerprint: sha256:{fingerprint(folder)}")
+    print("a server that runs takes it at its next start; browsers trust it once they have "
+          f"{files.authority.name} among their authorities")  # fmt: skip
+    return 0
+
+
+def add_robot(folder: Path, robot: str, groups: Sequence[str]) -> int:
+    """Make a robot known; print the one line that is pasted on it."""
+    from amberbox.fleet.accounts import robotkeys
+    from amberbox.fleet.audit.entry import Entry
+    from amberbox.fleet.audit.log import append
+    from amberbox.fleet.database.database import Database
+    from amberbox.fleet.serving.reached import line_of
+
+    database = Database(_database(folder))
+    try:
+        with database.begin() as connection:
+            now_ns = SystemClock().wall_ns()
+            secret = robotkeys.add_robot(connection, now_ns, robot, groups)
+            line = line_of(connection, folder, robot, secret.text)
+            details = {"groups": sorted(groups), "key_id": secret.id}
+            entry = Entry(_who(), "", "robots.add", robot, details=details)
+            append(connection, now_ns, entry)
+    finally:
+        database.close()
+    print(str(line))
+    return 0
+
+
+def verify_audit(folder: Path, heads: Sequence[str]) -> int:
+    """Follow the audit log from its first row to its last; 1 when it does not hold."""
+    from amberbox.fleet.audit.log import Head
+    from amberbox.fleet.audit.verify import verify
+    from amberbox.fleet.database.database import Database
+
+    kept = [Head.from_text(text) for text in heads]
+    database = Database(_database(folder), read_only=True)
+    try:
+        with database.reading() as connection:
+            found = verify(connection, kept)
+    finally:
+        database.close()
+    if found.broken is not None:
+        print(f"the audit log does not hold: row {found.broken.seq} is {found.broken.what}")
+        return 1
+    print(f"{found.rows} rows hold; head to note elsewhere: {found.head}")
+    return 0
+
+
+def _who() -> str:
+    """Name who types, for the audit log."""
+    try:
+        return f"shell:{getpass.getuser()}"
+    except (OSError, KeyError):  # a user without a name
+        return f"shell:{os.getuid()}"
+
+
+def _database(folder: Path) -> Path:
+    from amberbox.fleet.database.database import FILE
+
+    path = folder / FILE
+    if not path.is_file():
+        raise UsageError(
+            f"{folder} is no data folder of a server", f"amberbox serve --data {folder} makes one"
+        )
+    return path

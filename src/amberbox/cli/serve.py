@@ -1,0 +1,126 @@
+"""Run the fleet's server: robots send it what they recorded, people see all of it."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from amberbox.core.errors import UsageError
+
+if TYPE_CHECKING:
+    from amberbox.fleet.serving.starting import Start
+
+_PORT = 8443
+_USAGE = """amberbox serve --data DIR [options]
+       amberbox serve cert --data DIR --host NAME...
+       amberbox serve add-robot ID --data DIR [--group GROUP]...
+       amberbox serve verify-audit --data DIR [--head "NUMBER HASH"]..."""
+_EXIT = "exit status: 0 after an orderly end, 1 it cannot go on, 2 wrong usage"
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the verb's arguments."""
+    parser.usage = _USAGE
+    parser.epilog = _EXIT
+    parser.add_argument("words", nargs="*", metavar="cert | add-robot ID | verify-audit",
+                        help="make a certificate, add a robot, verify the audit log")  # fmt: skip
+    parser.add_argument("--data", required=True, metavar="DIR", help="the server's data folder")
+    parser.add_argument("--host", action="append", metavar="NAME",
+                        help="address to listen at (127.0.0.1); cert: what the server is called, "
+                        "may be said several times")  # fmt: skip
+    parser.add_argument("--port", type=int, default=_PORT, help=f"port to listen at ({_PORT})")
+    parser.add_argument("--public-url", default="", metavar="URL",
+                        help="what robots and browsers call the server")  # fmt: skip
+    parser.add_argument("--behind-proxy", nargs="+", default=[], metavar="ADDR",
+                        help="proxies that speak TLS for it; it believes them")  # fmt: skip
+    parser.add_argument("--new-code", action="store_true",
+                        help="make a code that lets somebody become an admin")  # fmt: skip
+    parser.add_argument("--group", action="append", default=[], metavar="GROUP",
+                        help="add-robot: a group that the robot is in")  # fmt: skip
+    parser.add_argument("--head", action="append", default=[], metavar="HEAD",
+                        help="verify-audit: a head that was noted elsewhere")  # fmt: skip
+    parser.add_argument("--quiet", action="store_true", help="print troubles only")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Serve until SIGTERM or Ctrl-C, or do what stands beside serving."""
+    if not args.words:
+        return _serve(args)
+    do = _BESIDE.get(args.words[0])
+    if do is None:
+        raise UsageError(
+            f"serve knows no '{args.words[0]}'", f"it knows {', '.join(_BESIDE)}, and none of these"
+        )
+    return do(args)
+
+
+def _serve(args: argparse.Namespace) -> int:
+    if args.group or args.head:
+        raise UsageError("--group is for add-robot, --head for verify-audit", _USAGE)
+    if args.host is not None and len(args.host) > 1:
+        raise UsageError("a server listens at one address", "--host 0.0.0.0 for all of them")
+    _check_installed()
+    from amberbox.fleet.serving.binding import Wanted
+    from amberbox.fleet.serving.starting import run as start
+
+    host = args.host[0] if args.host else "127.0.0.1"
+    wanted = Wanted(host, args.port, args.public_url, tuple(args.behind_proxy))
+    told = _told(Path(args.data), quiet=args.quiet)
+    start(Path(args.data).resolve(), wanted, new_code=args.new_code, begun=told)
+    return 0
+
+
+def _told(folder: Path, *, quiet: bool) -> Callable[[Start], None]:
+    """Make what says that the server answers."""
+
+    def tell(start: Start) -> None:
+        url = start.settings.public_url
+        if not quiet:
+            if start.renewed:
+                print("the server's certificate was made anew, for a year", flush=True)
+            print(f"serving {folder} at {url}; Ctrl-C ends it", flush=True)
+        if start.code is not None:
+            print(start.code.text(f"{url}/setup"), file=sys.stderr, flush=True)
+
+    return tell
+
+
+def _check_installed() -> None:
+    from importlib.util import find_spec
+
+    missing = [name for name in ("fastapi", "uvicorn", "sqlalchemy", "deltalake", "argon2")
+               if find_spec(name) is None]  # fmt: skip
+    if missing:
+        raise UsageError(
+            f"a server needs {', '.join(missing)}", "pip install 'amberbox[server,keep,query]'"
+        )
+
+
+def _cert(args: argparse.Namespace) -> int:
+    from amberbox.cli._serve_beside import make_certificate
+
+    return make_certificate(Path(args.data), args.host or [])
+
+
+def _add_robot(args: argparse.Namespace) -> int:
+    from amberbox.cli._serve_beside import add_robot
+
+    if len(args.words) != 2:
+        raise UsageError("add-robot takes one ID", "amberbox serve add-robot ID --data DIR")
+    return add_robot(Path(args.data), args.words[1], args.group)
+
+
+def _verify_audit(args: argparse.Namespace) -> int:
+    from amberbox.cli._serve_beside import verify_audit
+
+    return verify_audit(Path(args.data), args.head)
+
+
+_BESIDE: Mapping[str, Callable[[argparse.Namespace], int]] = {
+    "cert": _cert,
+    "add-robot": _add_robot,
+    "verify-audit": _verify_audit,
+}

@@ -1,0 +1,36 @@
+"""As long as there is no admin, nothing answers but what makes one."""
+
+from __future__ import annotations
+
+import asyncio
+
+from amberbox.fleet.accounts.setupcode import needs_setup
+from amberbox.fleet.api.access import PREFIX
+from amberbox.fleet.database.database import Database
+from amberbox.fleet.serving.asgi import ASGIApp, Receive, Scope, Send, refuse
+from amberbox.link import limits
+
+OPEN = ("/setup", "/setup/style.css", f"{PREFIX}/health", f"{limits.PATH}/ca.pem")
+
+
+class WaitsForAdmin:
+    """Answers 503 until the first admin is made; there is always one from then on."""
+
+    def __init__(self, app: ASGIApp, database: Database) -> None:
+        self._app = app
+        self._database = database
+        self._is_ready = False
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass a request on if the server is set up, or if it helps to do that."""
+        if scope["type"] != "lifespan" and scope["path"] not in OPEN and not self._is_ready:
+            self._is_ready = await asyncio.to_thread(self._look)
+            if not self._is_ready:
+                hint = "open /setup on the server's machine, or with the code in its folder"
+                await refuse(scope, send, 503, "this server is not set up yet", hint)
+                return
+        await self._app(scope, receive, send)
+
+    def _look(self) -> bool:
+        with self._database.reading() as connection:
+            return not needs_setup(connection)
