@@ -3,25 +3,223 @@
 from __future__ import annotations
 
 import asyncio
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from typing import Any
 
 from amberbox.core.clock import Clock
-from amberbox.fleet.bus import Bus
+from amberbox.fleet.bus import Bus, Change
 from amberbox.fleet.database.database import Database
+from amberbox.fleet.feed.changes import (
+    StatusMemory,
+    diagnosis_data,
+    event_data,
+)
+from amberbox.fleet.feed.delta import Delta, Kind, Ring
+from amberbox.fleet.feed.gate import permission
+from amberbox.fleet.feed.listener import Filter, Listener
+from amberbox.fleet.feed.live import EVERY_S, Live
 from amberbox.fleet.linkend.server import LinkServer
+from amberbox.fleet.state.said import SaidStatus, status_data
+from amberbox.fleet.state.state import Snapshot, State
+
+GATHER_S = 0.04
+"""Changes of statuses are gathered for so long: many of one robot go as one."""
+CHECK_S = 30.0
+ENDED, FORBIDDEN = 4401, 4403
+MOST, MOST_EACH = 500, 8
+"""Listeners at a time, in all and of one person or token."""
+_MAKING = 2
+"""Snapshots that are made at a time."""
 
 
 class Feed:
-    """Tells browsers and programs what has changed."""
+    """Numbers changes, holds the newest, and wakes those who listen. All in the event loop."""
 
-    def __init__(self, database: Database, bus: Bus, clock: Clock, links: LinkServer) -> None:
+    def __init__(
+        self, database: Database, bus: Bus, clock: Clock, links: LinkServer, state: State
+    ) -> None:
+        self.state = state
+        self.ring = Ring(clock.wall_ns())
+        self.live = Live(links, lambda: [one.watch for one in self.listeners])
+        self.listeners: list[Listener] = []
         self._links = links
         self._database = database
         self._bus = bus
         self._clock = clock
+        self._memory = StatusMemory()
+        self._pending: dict[str, dict[tuple[str, str], SaidStatus]] = {}
+        self._is_due = False
+        self._last_s = 0.0
+        self._check = asyncio.Event()
+        self._making = asyncio.Semaphore(_MAKING)
+        self._joined: dict[tuple[Filter, int, int], tuple[int, str]] = {}
+        self._joined_at = 0
 
     async def run(self) -> None:
-        """Work until cancelled."""
-        await asyncio.Event().wait()
+        """Listen to what happens until cancelled."""
+        await asyncio.to_thread(self._load)
+        ends = [self._bus.on(kind, work) for kind, work in self._hears()]
+        try:
+            await asyncio.gather(self.state.run(), self.live.run(), self._checks(), self._lives())
+        finally:
+            for end in ends:
+                end()
 
     def close(self) -> None:
-        """Let go of what is held."""
+        """Send everybody away."""
+        for listener in self.listeners:
+            listener.end(1001, "the server stops")
+
+    def join(self, listener: Listener) -> bool:
+        """Let somebody listen; False when there are too many."""
+        own = sum(one.who == listener.who for one in self.listeners)
+        if len(self.listeners) >= MOST or own >= MOST_EACH:
+            return False
+        self.listeners.append(listener)
+        return True
+
+    def leave(self, listener: Listener) -> None:
+        """End listening."""
+        with suppress(ValueError):
+            self.listeners.remove(listener)
+        self.live.look_again()
+
+    def add(self, kind: Kind, robot: str, data: Any, owner: str = "") -> None:
+        """Hold a change and wake those who listen."""
+        self.ring.add(kind, robot, data, time.monotonic(), owner)
+        self._wake()
+
+    def _hears(self) -> Iterator[tuple[Any, Callable[[Change], None]]]:
+        yield from (("rows", self._rows), ("live", self._values))
+        yield from (("connected", self._connected), ("gone", self._gone))
+        yield from (("account", self._accounts), ("robot", self._accounts))
+        yield "alarm", lambda c: self.add("alarm", c.robot, dict(c.data))
+        yield "job", lambda c: self.add("job", c.robot, dict(c.data), str(c.data.get("owner", "")))
+        yield "diagnosis", lambda c: self.add("diagnosis", c.robot, [dict(c.data)])
+
+    def _load(self) -> None:
+        with self._database.reading() as connection:
+            self._memory.load(connection)
+
+    def _rows(self, change: Change) -> None:
+        robot, rows = change.robot, change.data["rows"]
+        for kind, data in (("event", event_data(rows)), ("diagnosis", diagnosis_data(rows))):
+            if data:
+                self.add(kind, robot, data)  # type: ignore[arg-type]  # one of two literals
+        changed = self._memory.changed(robot, change.data["store_id"], rows)
+        if changed:
+            pending = self._pending.setdefault(robot, {})
+            pending.update({(said.component, said.mode): said for said in changed})
+            self._plan()
+
+    def _plan(self) -> None:
+        """Send what is pending soon: at once, if nothing was sent for a while."""
+        if not self._is_due:
+            self._is_due = True
+            wait_s = max(self._last_s + GATHER_S - time.monotonic(), 0.0)
+            asyncio.get_running_loop().call_later(wait_s, self._flush)
+
+    def _flush(self) -> None:
+        self._is_due, self._last_s = False, time.monotonic()
+        pending, self._pending = self._pending, {}
+        for robot, statuses in pending.items():
+            data = [status_data(said) for said in statuses.values()]
+            self.ring.add("status", robot, data, self._last_s)
+        self._wake()
+
+    def _wake(self) -> None:
+        for listener in self.listeners:
+            listener.wake.set()
+
+    def _connected(self, change: Change) -> None:
+        self.add("presence", change.robot, {"online": True})
+
+    def _gone(self, change: Change) -> None:
+        self.add("presence", change.robot, {"online": False})
+
+    def _values(self, change: Change) -> None:
+        self.live.take(change.robot, change.data["values"])
+
+    async def _lives(self) -> None:
+        """Hand live values out, those of one set of variables written once."""
+        while True:
+            await asyncio.sleep(EVERY_S)
+            news = self.live.news()
+            texts: dict[tuple[str, tuple[str, ...]], str] = {}
+            for listener in self.listeners if news else ():
+                for robot, names in listener.watch.items():
+                    key = robot, tuple(names)
+                    if robot in news and key not in texts:
+                        texts[key] = self.live.text(self.ring.number, robot, names)
+                    if texts.get(key):
+                        listener.live[robot] = texts[key]
+                        listener.wake.set()
+
+    def _accounts(self, _: Change) -> None:
+        self._check.set()
+
+    async def _checks(self) -> None:
+        """Ask again who may hear what: when accounts or robots change, and every 30 s."""
+        while True:
+            with suppress(TimeoutError):
+                await asyncio.wait_for(self._check.wait(), CHECK_S)
+            self._check.clear()
+            for listener in tuple(self.listeners):
+                await self.check(listener)
+
+    async def check(self, listener: Listener) -> None:
+        """Ask again what somebody may hear; ends what is not allowed any more."""
+        found = await asyncio.to_thread(
+            permission, self._database, self._clock, listener.credential
+        )
+        if found is None:
+            listener.end(ENDED, "the session or token has ended")
+        elif not found.may_listen:
+            listener.end(FORBIDDEN, "this is not allowed any more")
+        elif found != listener.permission:
+            listener.permission, listener.needs_snapshot = found, True
+            listener.settle()
+            listener.wake.set()
+            self.live.look_again()
+
+    async def snapshot(self, listener: Listener) -> Snapshot:
+        """Return how everything is that somebody listens to; a few at a time are made."""
+        async with self._making:
+            return await asyncio.to_thread(self._snapshot, listener)
+
+    def _snapshot(self, listener: Listener) -> Snapshot:
+        robots, kinds = listener.robots, {kind for kind, _ in listener.filter.reach}
+        return self.state.snapshot(robots, self._clock.wall_ns(), with_statuses="status" in kinds)
+
+    def frame(self, listener: Listener, deltas: Sequence[Delta], most: int) -> str:
+        """Join changes for a listener, up to a size; equal listeners share what was joined."""
+        key = listener.filter, listener.number, self.ring.number
+        if key in self._joined:
+            listener.number, text = self._joined[key]
+            return text
+        if self._joined_at != self.ring.number:
+            self._joined, self._joined_at = {}, self.ring.number
+        texts, size, number = [], 0, listener.number
+        chosen = {delta.number for delta in listener.filter.chosen(deltas)}
+        for delta in deltas:
+            if size and delta.number in chosen and size + len(delta.text) > most:
+                break
+            number = delta.number
+            if number in chosen:
+                texts.append(delta.text)
+                size += len(delta.text)
+        text = ",".join(texts)
+        if not any(delta.kind == "job" for delta in deltas):
+            self._joined[key] = number, text
+        listener.number = number
+        return text
+
+    def show_live(self, listener: Listener) -> None:
+        """Ask for the live values that somebody looks at, and show those that are known."""
+        self.live.look_again()
+        for robot, names in listener.watch.items():
+            text = self.live.text(self.ring.number, robot, names)
+            if text:
+                listener.live[robot] = text

@@ -62,7 +62,8 @@ def assemble(
         folders=folders, asking=asking,
         jobs=Jobs(folder, database, bus, clock),
         alarms=Alarms(database, bus, clock, settings.public_url),
-        feed=Feed(database, bus, clock, links, state), system=SystemLevel(folder, database, bus, clock),
+        feed=Feed(database, bus, clock, links, state),
+        system=SystemLevel(folder, database, bus, clock),
         keeping=Keeping(folder, database, bus, clock, archive),
         doors=Doorkeeper(database, bus, clock, links), threads=Threads(),
     )  # fmt: skip

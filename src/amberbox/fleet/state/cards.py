@@ -1,0 +1,126 @@
+"""Robots at a glance: who is there, what is worst and why, what it is doing."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from sqlalchemy import Connection
+
+from amberbox.fleet.accounts.robots import KnownRobot
+from amberbox.fleet.linkend.presence import Presence, presences
+from amberbox.fleet.linkend.server import LinkServer
+from amberbox.fleet.state.facts import FactsBook
+from amberbox.fleet.state.latest import Latest, Recent
+from amberbox.fleet.state.said import SaidStatus, moment
+from amberbox.fleet.state.standing import Standing, silence, standings
+from amberbox.fleet.state.views import Battery, Card, Lead, MissionView
+from amberbox.monitoring.engine.outputs import SEVERITIES
+
+_CHARGES = ("percent", "charge", "soc", "state_of_charge", "level")
+"""Parts of the name of an output that says how full a battery is, the best first."""
+_FEW = 50
+"""Of so many robots the statuses are looked up by name; of more, all are read."""
+
+
+@dataclass(frozen=True, slots=True)
+class Cards:
+    """Makes cards of robots, in one look at the database."""
+
+    links: LinkServer
+    latest: Latest
+    facts: FactsBook
+
+    def of(
+        self,
+        connection: Connection,
+        robots: Sequence[KnownRobot],
+        now_ns: int,
+        alarms: Mapping[str, int] | None = None,
+    ) -> list[Card]:
+        """Return the cards of robots; ``alarms`` counts what is open, else the robots' own do."""
+        names = [robot.id for robot in robots]
+        statuses = standings(connection, names if len(names) <= _FEW else None)
+        seen = {presence.robot: presence for presence in presences(connection)}
+        return [
+            self._card(robot, seen.get(robot.id), statuses.get(robot.id, []), now_ns, alarms)
+            for robot in robots
+        ]
+
+    def _card(
+        self,
+        robot: KnownRobot,
+        presence: Presence | None,
+        statuses: Sequence[Standing],
+        now_ns: int,
+        alarms: Mapping[str, int] | None,
+    ) -> Card:
+        link = self.links.robots.get(robot.id)
+        online = link is not None
+        silent = silence(presence, online, statuses, now_ns)
+        components = [status.said for status in statuses if not status.said.mode]
+        worst = _worst(components)
+        last_level = worst.level if worst else "unknown"
+        recent = self.latest.of(robot.id)
+        config_hash = presence.config_hash if presence else ""
+        facts = self.facts.known(robot.id, config_hash)
+        last_seen = link.last_seen_ns if link else presence.last_seen_ns if presence else None
+        return Card(
+            robot.id, sorted(robot.groups), facts.model if facts else "",
+            robot.disabled_ns is not None, online, moment(last_seen),
+            moment(presence.connected_ns) if presence and online else None,
+            link.backlog if link else presence.backlog if presence else 0,
+            presence.backlog_bytes if presence else 0, presence.version if presence else "",
+            config_hash, "unknown" if silent else last_level, last_level, _severity(recent),
+            silent or _cause(worst), dict(Counter(status.level for status in components)),
+            len(recent.alarms) if alarms is None else alarms.get(robot.id, 0),
+            _battery(statuses), _mission(recent), _lead(recent),
+        )  # fmt: skip
+
+
+def _worst(components: Sequence[SaidStatus]) -> SaidStatus | None:
+    """Return what is worst; of those that are equally bad one that is not blocked by another."""
+    return max(components, key=lambda s: (s.rank, not s.blocked_by), default=None)
+
+
+def _cause(worst: SaidStatus | None) -> str:
+    if worst is None or worst.level == "ok":
+        return ""
+    what = worst.reason or worst.state.replace("_", " ") or worst.level
+    blocked = f" (blocked by {', '.join(worst.blocked_by)})" if worst.blocked_by else ""
+    return f"{worst.component}: {what}{blocked}"
+
+
+def _severity(recent: Recent) -> str:
+    found = {alarm.severity for alarm in recent.alarms}
+    return next((severity for severity in reversed(SEVERITIES) if severity in found), "")
+
+
+def _battery(statuses: Sequence[Standing]) -> Battery | None:
+    """Find how full the battery is: a number of a component that is called so."""
+    outputs = [
+        output
+        for status in statuses
+        if "battery" in status.said.component.casefold()
+        for output in status.said.outputs
+        if output.value is not None and output.type in ("int", "float")
+    ]
+    for word in _CHARGES:
+        for output in outputs:
+            if word in output.name.casefold() and output.value is not None:
+                return Battery(output.name, output.value)
+    return None
+
+
+def _mission(recent: Recent) -> MissionView | None:
+    found = recent.mission
+    return None if found is None else MissionView(found.id, found.name, moment(found.from_ns))
+
+
+def _lead(recent: Recent) -> Lead | None:
+    found = recent.diagnosis
+    if found is None:
+        return None
+    first = found.hypotheses[0]
+    return Lead(found.id, first.faults, first.probability, moment(found.at_ns))

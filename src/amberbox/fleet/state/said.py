@@ -1,0 +1,158 @@
+"""Records of robots as they are shown: what does not have this form is passed over.
+
+A robot may send anything. Nothing that it says can break an answer that is about others, too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, TypeVar
+
+import msgspec
+
+from amberbox.core.timetext import format_time
+from amberbox.monitoring.engine.outputs import RANK
+
+_FIRST_NS, _BEYOND_NS = 1, 2**63
+Kind = TypeVar("Kind", bound=msgspec.Struct)
+
+
+class SaidOutput(msgspec.Struct, frozen=True):
+    """One output of a mode."""
+
+    name: str
+    type: str = "null"
+    value: float | None = None
+    text: str | None = None
+
+    @property
+    def shown(self) -> bool | int | float | str | None:
+        """Return the value; not-a-number and infinity are words."""
+        if self.value is None:
+            return self.text
+        if self.type == "bool":
+            return bool(self.value)
+        return int(self.value) if self.type == "int" else self.value
+
+
+class SaidStatus(msgspec.Struct, frozen=True):
+    """One status."""
+
+    component: str
+    mode: str = ""
+    level: str = "unknown"
+    state: str = ""
+    outputs: list[SaidOutput] = []
+    blocked_by: list[str] = []
+    measured_ns: int = 0
+    since_ns: int = 0
+    reason: str = ""
+
+    @property
+    def rank(self) -> int:
+        """Return how bad it is."""
+        return RANK.get(self.level, RANK["unknown"])  # type: ignore[call-overload,no-any-return]  # any text may come
+
+
+class SaidMission(msgspec.Struct, frozen=True):
+    """The beginning or the end of a mission."""
+
+    id: str
+    name: str = ""
+    state: str = ""
+    outcome: str = ""
+    from_ns: int = 0
+    to_ns: int | None = None
+
+
+class SaidHypothesis(msgspec.Struct, frozen=True):
+    """One answer of a diagnosis."""
+
+    faults: list[str] = []
+    probability: float = 0.0
+
+
+class SaidDiagnosis(msgspec.Struct, frozen=True):
+    """A diagnosis, as far as cards show it."""
+
+    id: str
+    revision: int = 0
+    at_ns: int = 0
+    state: str = ""
+    hypotheses: list[SaidHypothesis] = []
+
+
+class SaidAlarm(msgspec.Struct, frozen=True):
+    """An alarm after a change."""
+
+    id: str
+    component: str = ""
+    severity: str = ""
+    state: str = ""
+    reason: str = ""
+    opened_ns: int = 0
+
+
+class SaidEvent(msgspec.Struct, frozen=True):
+    """An event; ``details`` is JSON."""
+
+    kind: str = ""
+    text: str = ""
+    source: str = ""
+    details: str = ""
+
+
+class SaidCondition(msgspec.Struct, frozen=True):
+    """Level and state."""
+
+    level: str = "unknown"
+    state: str = ""
+
+
+class SaidTransition(msgspec.Struct, frozen=True):
+    """The details of an event of kind ``component_state``."""
+
+    component: str
+    mode: str = ""
+    before: SaidCondition = SaidCondition()
+    after: SaidCondition = SaidCondition()
+    at_ns: int = 0
+    reason: str = ""
+
+
+def heard(data: bytes | str, kind: type[Kind]) -> Kind | None:
+    """Read a record; None where it does not have the form."""
+    try:
+        return msgspec.json.decode(data, type=kind)
+    except (msgspec.MsgspecError, ValueError, RecursionError):
+        return None
+
+
+def taken(values: Any, kind: type[Kind]) -> Kind | None:
+    """Read a record that is decoded already; None where it does not have the form."""
+    try:
+        return msgspec.convert(values, kind, strict=False)
+    except (msgspec.MsgspecError, ValueError):
+        return None
+
+
+def moment(time_ns: int | None) -> str | None:
+    """Write a time; None for none, and for a number that is no time."""
+    if time_ns is None or not _FIRST_NS <= time_ns < _BEYOND_NS:
+        return None
+    return format_time(time_ns)
+
+
+def status_data(said: SaidStatus) -> Mapping[str, Any]:
+    """Return a status as it is sent; times by the robot's clock."""
+    return {
+        "component": said.component,
+        "mode": said.mode,
+        "level": said.level,
+        "state": said.state,
+        "reason": said.reason,
+        "blocked_by": said.blocked_by,
+        "measured": moment(said.measured_ns),
+        "since": moment(said.since_ns),
+        "outputs": {output.name: output.shown for output in said.outputs},
+    }

@@ -1,0 +1,109 @@
+"""The tree of a robot's components: each with its modes, outputs, ages and what it needs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from amberbox.core.clock import NS
+from amberbox.fleet.state.facts import ComponentFacts, Facts, OutputFacts
+from amberbox.fleet.state.said import SaidOutput, moment
+from amberbox.fleet.state.standing import Standing
+from amberbox.fleet.state.views import (
+    ComponentView,
+    Condition,
+    ModeView,
+    NeedView,
+    OutputView,
+    StatusTree,
+)
+
+_NOTHING = OutputFacts("")
+
+
+@dataclass(frozen=True, slots=True)
+class Moment:
+    """Now by the server's clock, and how far that is ahead of the robot's, if it is known."""
+
+    now_ns: int
+    offset_ns: int | None
+
+    def age_s(self, status: Standing) -> float:
+        """Return how old a measurement is.
+
+        Differences of one clock each: since it came, from its writing to its coming, and on the
+        robot. Only the way over the link compares two clocks, by their offset.
+        """
+        since_ns = max(self.now_ns - status.received_ns, 0)
+        robot_ns = max(status.log_ns - status.said.measured_ns, 0)
+        way_ns = 0
+        if self.offset_ns is not None:
+            way_ns = max(status.received_ns - status.log_ns - self.offset_ns, 0)
+        return round((since_ns + way_ns + robot_ns) / NS, 3)
+
+    def at(self, robot_ns: int) -> str | None:
+        """Write a time of the robot by the server's clock."""
+        return moment(robot_ns + (self.offset_ns or 0)) if robot_ns else None
+
+
+def status_tree(
+    robot: str,
+    online: bool,
+    silence: str,
+    statuses: Sequence[Standing],
+    facts: Facts,
+    when: Moment,
+) -> StatusTree:
+    """Put statuses and what the folder says into a tree; what is in no folder stands at the end."""
+    by_name: dict[str, list[Standing]] = {}
+    for status in statuses:
+        by_name.setdefault(status.said.component, []).append(status)
+    known = {component.id for component in facts.components}
+    extra = [ComponentFacts(name, name) for name in by_name if name not in known]
+    levels = {(s.said.component, s.said.mode): s.said.level for s in statuses}
+    components = [
+        _component(one, by_name.get(one.id, ()), levels, when)
+        for one in (*facts.components, *extra)
+    ]
+    offset_s = None if when.offset_ns is None else round(when.offset_ns / NS, 6)
+    return StatusTree(robot, online, silence, facts.note, offset_s, components)
+
+
+def _component(
+    facts: ComponentFacts,
+    statuses: Sequence[Standing],
+    levels: Mapping[tuple[str, str], str],
+    when: Moment,
+) -> ComponentView:
+    own = next((status for status in statuses if not status.said.mode), None)
+    needs = [
+        NeedView(need.name, need.component, levels.get((need.component, need.mode), "unknown"))
+        for need in facts.needs
+    ]
+    return ComponentView(
+        facts.id, facts.name, facts.depth, facts.description, facts.part_of, needs, facts.rule,
+        facts.recovery_actions, None if own is None else _condition(own, when),
+        [_mode(status, facts, when) for status in statuses if status.said.mode],
+    )  # fmt: skip
+
+
+def _condition(status: Standing, when: Moment) -> Condition:
+    said = status.said
+    for_s = max(said.measured_ns - said.since_ns, 0) / NS if said.since_ns else 0.0
+    return Condition(
+        said.level, said.state, said.reason, said.blocked_by, when.at(said.measured_ns),
+        when.at(said.since_ns), when.age_s(status), round(for_s, 3),
+    )  # fmt: skip
+
+
+def _mode(status: Standing, facts: ComponentFacts, when: Moment) -> ModeView:
+    mode = status.said.mode
+    planned = {output.name: output for output in facts.outputs.get(mode, ())}
+    outputs = [_output(said, planned.get(said.name, _NOTHING)) for said in status.said.outputs]
+    return ModeView(mode, facts.names.get(mode, mode), _condition(status, when), outputs)
+
+
+def _output(said: SaidOutput, facts: OutputFacts) -> OutputView:
+    return OutputView(
+        said.name, said.type, said.shown, facts.expected, facts.severity, facts.description
+    )

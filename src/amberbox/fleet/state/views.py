@@ -1,0 +1,141 @@
+"""How robots are shown over the API. Times are RFC 3339, by the server's clock if it is known."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+Value = bool | int | float | str | None
+
+
+@dataclass(frozen=True, slots=True)
+class Battery:
+    """Charge of the battery, as an output of its component says."""
+
+    output: str
+    value: float
+
+
+@dataclass(frozen=True, slots=True)
+class MissionView:
+    """The mission that a robot is on."""
+
+    id: str
+    name: str
+    since: str | None
+
+
+@dataclass(frozen=True, slots=True)
+class Lead:
+    """The first answer of a robot's newest open diagnosis."""
+
+    id: str
+    faults: Sequence[str]
+    probability: float
+    at: str | None
+
+
+@dataclass(frozen=True, slots=True)
+class Card:
+    """A robot at a glance.
+
+    ``level`` is ``unknown`` where nobody can know; ``last_level`` is what it was then. ``cause``
+    says in words what is worst. ``severity`` is the highest of the alarms that it has open.
+    """
+
+    robot: str
+    groups: Sequence[str]
+    model: str
+    disabled: bool
+    online: bool
+    last_seen: str | None
+    connected_since: str | None
+    backlog_rows: int
+    backlog_bytes: int
+    version: str
+    config_hash: str
+    level: str
+    last_level: str
+    severity: str
+    cause: str
+    components: Mapping[str, int]
+    alarms: int
+    battery: Battery | None
+    mission: MissionView | None
+    diagnosis: Lead | None
+
+
+@dataclass(frozen=True, slots=True)
+class OutputView:
+    """An output of a mode, and what is expected of it (empty: nothing)."""
+
+    name: str
+    type: str
+    value: Value
+    expected: str
+    severity: str
+    description: str
+
+
+@dataclass(frozen=True, slots=True)
+class Condition:
+    """How a component or a mode is.
+
+    ``age_s`` is how old the measurement is, ``for_s`` how long it has been so when it was made.
+    """
+
+    level: str
+    state: str
+    reason: str
+    blocked_by: Sequence[str]
+    measured: str | None
+    since: str | None
+    age_s: float
+    for_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class ModeView:
+    """A mode of a component."""
+
+    mode: str
+    name: str
+    condition: Condition
+    outputs: Sequence[OutputView]
+
+
+@dataclass(frozen=True, slots=True)
+class NeedView:
+    """What a component needs, and how that is."""
+
+    name: str
+    component: str
+    level: str
+
+
+@dataclass(frozen=True, slots=True)
+class ComponentView:
+    """A component in the tree; ``condition`` is null where nothing was said of it."""
+
+    component: str
+    name: str
+    depth: int
+    description: str
+    part_of: str
+    needs: Sequence[NeedView]
+    needs_rule: str
+    recovery_actions: Sequence[str]
+    condition: Condition | None
+    modes: Sequence[ModeView] = field(default=())
+
+
+@dataclass(frozen=True, slots=True)
+class StatusTree:
+    """All components of a robot. ``silence`` says why nothing counts, ``note`` what is missing."""
+
+    robot: str
+    online: bool
+    silence: str
+    note: str
+    clock_offset_s: float | None
+    components: Sequence[ComponentView]
