@@ -33,15 +33,34 @@ class ErrorBody:
     error: Problem
 
 
+_TEXT = {"type": "string"}
+_SCHEMA: dict[str, Any] = {
+    "type": "object",
+    "required": ["error"],
+    "properties": {
+        "error": {
+            "type": "object",
+            "required": ["what", "hint"],
+            "properties": {"what": _TEXT, "hint": _TEXT},
+        }
+    },
+}
+"""``ErrorBody``, written out: as a model of each answer of each route it takes long to load."""
+
+
+def _problem(description: str) -> dict[str, Any]:
+    return {"description": description, "content": {"application/json": {"schema": _SCHEMA}}}
+
+
 PROBLEMS: dict[int | str, dict[str, Any]] = {
-    400: {"model": ErrorBody, "description": "not understood, or not possible as things are"},
-    401: {"model": ErrorBody, "description": "nobody is signed in, or the key does not work"},
-    403: {"model": ErrorBody, "description": "not allowed"},
-    404: {"model": ErrorBody, "description": "not there, or not for you"},
-    413: {"model": ErrorBody, "description": "too large"},
-    422: {"model": ErrorBody, "description": "not of the form that is described here"},
-    429: {"model": ErrorBody, "description": "too often: wait as long as Retry-After says"},
-    503: {"model": ErrorBody, "description": "too busy at the moment: try again"},
+    400: _problem("not understood, or not possible as things are"),
+    401: _problem("nobody is signed in, or the key does not work"),
+    403: _problem("not allowed"),
+    404: _problem("not there, or not for you"),
+    413: _problem("too large"),
+    422: _problem("not of the form that is described here"),
+    429: _problem("too often: wait as long as Retry-After says"),
+    503: _problem("too busy at the moment: try again"),
 }
 """What every route may answer; rooms declare only what they say beyond this."""
 
