@@ -82,7 +82,7 @@ class Judge:
         if value is None or value != value:
             return NOT_KNOWN
         try:
-            good = _holds(expectation, value)
+            good = holds(expectation, value)
         except TypeError:
             return NOT_KNOWN
         return OK if good else BAD
@@ -109,7 +109,7 @@ class Judge:
         expectation = self._expectation
         if expectation is None:
             return np.full(len(column), OK)
-        codes = np.where(_holds(expectation, column), OK, BAD)
+        codes = np.where(holds(expectation, column), OK, BAD)
         return np.where(column != column, NOT_KNOWN, codes)
 
     def output(self, kept: Any) -> Output:
@@ -126,7 +126,8 @@ class Judge:
         return value
 
 
-def _holds(expectation: Expectation, value: Any) -> Any:
+def holds(expectation: Expectation, value: Any) -> Any:
+    """Tell whether a value, or each of a column, is as expected."""
     if expectation.relation == "within":
         return (value >= expectation.value) & (value <= expectation.high)
     return _COMPARE[expectation.relation](value, expectation.value)

@@ -1,0 +1,1 @@
+"""What robots know, asked from outside: diagnoses, rules, fault trees, failure modes."""

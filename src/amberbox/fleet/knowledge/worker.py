@@ -1,0 +1,148 @@
+"""What is asked of robots' knowledge, in a worker: rules that never end do no harm there."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from amberbox.consult.closest import closest_json, outlooks
+from amberbox.consult.facts import known_facts, lookups
+from amberbox.consult.faulttrees import effect_json, effects_json
+from amberbox.consult.sheets import coverage_json, criticality_json, table_json
+from amberbox.core.config import did_you_mean, refuse
+from amberbox.core.errors import UsageError
+from amberbox.core.timetext import any_time, format_time
+from amberbox.diagnosis.faulttree import Budget as TreeBudget
+from amberbox.diagnosis.faulttree import analyse
+from amberbox.diagnosis.findings.facts import Facts
+from amberbox.diagnosis.fmea.coverage import coverage
+from amberbox.diagnosis.fmea.trees import effects, fault_tree_of
+from amberbox.diagnosis.rules import Budget, ask, read_rules
+from amberbox.fleet.archive.folder import FolderArchive
+from amberbox.fleet.data.look import open_catalogue
+from amberbox.fleet.data.recorded import Stores
+from amberbox.fleet.knowledge import diagnosing
+from amberbox.fleet.knowledge.asked import AboutRobot, AskDiagnosis, AskRules, AskTrees, read
+from amberbox.fleet.knowledge.moment import moment
+from amberbox.fleet.knowledge.past import past_of
+from amberbox.fleet.knowledge.then import folder_of_then
+
+_CLOSEST = 5
+_NODES = 2_000_000
+
+
+def diagnose(folder: Path, arguments: dict[str, Any]) -> bytes:
+    """Answer what is broken."""
+    return _json(diagnosing.answered(folder, _stores(folder), read(arguments, AskDiagnosis)))
+
+
+def fmea(folder: Path, arguments: dict[str, Any]) -> bytes:
+    """Return the sheet, what matters most and what nobody sees."""
+    asked = read(arguments, AboutRobot)
+    stores = _stores(folder)
+    subject, notes = folder_of_then(
+        folder, stores.database, asked.robot, asked.config_hash, _said(stores, asked)
+    )
+    found = subject.faults()
+    return _json({
+        "robot": asked.robot,
+        "config_hash": subject.folder.config_hash,
+        "description": found.title,
+        "table": table_json(found),
+        "criticality": criticality_json(found, asked.exposure_h),
+        "coverage": coverage_json(coverage(found, sorted(subject.known.watched))),
+        "notes": list(notes),
+    })  # fmt: skip
+
+
+def fault_trees(folder: Path, arguments: dict[str, Any]) -> bytes:
+    """Return the trees of all functions, or one with its cut sets and how close it is now."""
+    asked, stores = read(arguments, AskTrees), _stores(folder)
+    then = moment(stores, asked.robot, asked.at, asked.now_ns)
+    subject, notes = folder_of_then(
+        folder,
+        stores.database,
+        asked.robot,
+        asked.config_hash,
+        then.config_hash if asked.at else "",
+    )
+    known = subject.faults()
+    names = _effects(known, asked.effect)
+    budget = TreeBudget(_NODES, _ends(asked.seconds))
+    one = bool(asked.effect)
+    solved = [
+        analyse(fault_tree_of(known, name, asked.exposure_h), asked.order, one, budget)
+        for name in names
+    ]
+    shown = (
+        effect_json(known, solved[0], importance=True, cut_sets=asked.cut_sets)
+        if one
+        else effects_json(known, solved, asked.exposure_h)
+    )
+    standing = _standing(then.said.diagnoses)
+    closest = closest_json(known, then.at_ns, standing, outlooks(solved, standing, _CLOSEST))
+    about = {"robot": asked.robot, "config_hash": subject.folder.config_hash}
+    return _json({
+        **about, **shown, "at": format_time(then.at_ns), "closest": closest["effects"],
+        "diagnosis": closest["diagnosis"], "notes": [*then.notes, *notes],
+    })  # fmt: skip
+
+
+def rules(folder: Path, arguments: dict[str, Any]) -> bytes:
+    """Return all answers of a goal to the robot's rules and its past."""
+    asked, stores = read(arguments, AskRules), _stores(folder)
+    subject, notes = folder_of_then(folder, stores.database, asked.robot, asked.config_hash, "")
+    program = read_rules(subject.rules())
+    refuse(program.problems())
+    last_ns = moment(stores, asked.robot, "", asked.now_ns).at_ns
+    span = (_time(text, asked.now_ns, last_ns) for text in (asked.from_, asked.to))
+    window = past_of(stores, asked.robot, *span)
+    facts = tuple(known_facts(asked.robot, subject.fmea, asked.exposure_h))
+    program = Facts(facts, (), tuple(lookups(window))).added_to(program)
+    budget = Budget(steps=asked.steps or Budget().steps, is_over=_ends(asked.seconds))
+    found = ask(program, asked.query, budget, asked.want or None)
+    about = {"robot": asked.robot, "config_hash": subject.folder.config_hash}
+    told = [str(note) for note in program.notes]
+    return _json({**about, **found.to_json(), "notes": [*notes, *told]})
+
+
+def _stores(folder: Path) -> Stores:
+    database = open_catalogue(folder).database
+    return Stores(database, FolderArchive(folder, database))
+
+
+def _said(stores: Stores, asked: AboutRobot) -> str:
+    """Return which folder the watcher named at the time, where one is asked about."""
+    return moment(stores, asked.robot, asked.at, asked.now_ns).config_hash if asked.at else ""
+
+
+def _effects(known: Any, effect: str) -> list[str]:
+    names = effects(known)
+    if not effect:
+        return list(names)
+    if effect not in known.functions and effect not in known.components:
+        near = did_you_mean(effect, [*names, *known.components])
+        raise UsageError(f"there is no function '{effect}'{near}")
+    return [effect]
+
+
+def _standing(diagnoses: Any) -> Any:
+    """Return the diagnosis that stands: the last one, unless it has healed."""
+    last = diagnoses[-1] if diagnoses else None
+    return last if last is not None and last.state == "open" else None
+
+
+def _time(text: str, now_ns: int, last_ns: int) -> int | None:
+    return any_time(text, lambda: now_ns, lambda: last_ns) if text else None
+
+
+def _ends(seconds: float) -> Callable[[], bool]:
+    end_s = time.monotonic() + seconds
+    return lambda: time.monotonic() > end_s
+
+
+def _json(value: Any) -> bytes:
+    return json.dumps(value, ensure_ascii=False, allow_nan=False).encode()
