@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from fastapi import FastAPI
 from starlette.testclient import TestClient
 
 from amberbox.core.clock import NS
@@ -32,11 +33,12 @@ START_NS = 1_800_000_000 * NS
 class House:
     """A server without a network: ``client(name)`` is somebody who is signed in."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, app: FastAPI | None = None) -> None:
         self.clock = ManualClock(START_NS)
         self.passwords = Passwords(Cost(1, 8, 1))
         self.services = assembly.assemble(folder, Settings(URL), self.clock, self.passwords)
-        self.app = make_app(self.services)
+        self.app = app or make_app(self.services)
+        self.app.state.services = self.services
         self.keys: dict[str, str] = {}
         self._people()
 
@@ -86,11 +88,17 @@ class House:
         assembly.close(self.services)
 
 
+_APP: list[FastAPI] = []
+"""Getting ready for its first request takes an app 0.3 s."""
+
+
 @contextmanager
-def house(folder: Path) -> Iterator[House]:
-    """Keep a house for the time of a test."""
+def house(folder: Path, *, shared: bool = False) -> Iterator[House]:
+    """Keep a house for the time of a test; ``shared`` takes the app of the last such one."""
     folder.mkdir(parents=True, exist_ok=True)
-    found = House(folder)
+    found = House(folder, _APP[0] if shared and _APP else None)
+    if shared and not _APP:
+        _APP.append(found.app)
     try:
         yield found
     finally:

@@ -51,13 +51,15 @@ class Action:
     ``role`` is the least role of a person, ``scope`` what a token needs besides; None is: never.
     ``reach`` is what it touches: ``robot`` one robot (or, where none is named, all of them),
     ``server`` everybody (not for those who are restricted to groups), ``own`` one's own account.
-    With ``robots`` a robot may do it, to itself.
+    With ``robots`` a robot may do it, to itself. With ``first`` also a person who has to change the
+    password first.
     """
 
     role: Role | None
     scope: str | None = None
     reach: Reach = "robot"
     robots: bool = False
+    first: bool = False
 
 
 ACTIONS: Mapping[str, Action] = {
@@ -82,8 +84,8 @@ ACTIONS: Mapping[str, Action] = {
     "settings.write": Action(Role.ADMIN, reach="server"),
     "audit.read": Action(Role.ADMIN, "read:audit", reach="server"),
     "metrics.read": Action(Role.TECHNICIAN, "read:metrics", reach="server"),
-    "own.read": Action(Role.VIEWER, reach="own"),
-    "own.write": Action(Role.VIEWER, reach="own"),
+    "own.read": Action(Role.VIEWER, reach="own", first=True),
+    "own.write": Action(Role.VIEWER, reach="own", first=True),
     "own.tokens": Action(Role.TECHNICIAN, reach="own"),
     "link.connect": Action(None, robots=True),
     "journals.upload": Action(None, robots=True),

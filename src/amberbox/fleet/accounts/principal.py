@@ -62,7 +62,7 @@ def _may(principal: Principal, rule: Action) -> bool:
         return False
     if principal.kind == "token":
         return rule.scope is not None and rule.scope in principal.scopes
-    return principal.kind == "user" and (rule.reach == "own" or not principal.must_change)
+    return principal.kind == "user" and (rule.first or not principal.must_change)
 
 
 def _reaches(principal: Principal, rule: Action, robot: Robot | None) -> bool:

@@ -65,7 +65,9 @@ def described(openapi: Mapping[str, Any], rooms: Mapping[str, Routes], url: str)
     found: dict[str, list[Operation]] = {}
     for routes in rooms.values():
         for (method, path), rule in routes.rules.items():
-            said = openapi["paths"].get(path, {}).get(method.lower())
+            said = _said(openapi, method, path)
+            if said is None and method != "SOCKET":
+                continue  # a page for people
             tag = next(iter(routes.router.tags), "other")
             made = _socket(routes, path, rule, url) if said is None else _operation(
                 openapi, method, path, said, rule, url
@@ -75,6 +77,14 @@ def described(openapi: Mapping[str, Any], rooms: Mapping[str, Routes], url: str)
         Room(name, sorted(operations, key=lambda one: (one.method == "SOCKET", one.path)))
         for name, operations in sorted(found.items())
     ]
+
+
+def _said(openapi: Mapping[str, Any], method: str, path: str) -> dict[str, Any] | None:
+    """Return what OpenAPI says of a route; it leaves out that a part of a path may have slashes."""
+    found: dict[str, Any] | None = (
+        openapi["paths"].get(path.replace(":path}", "}"), {}).get(method.lower())
+    )
+    return found
 
 
 def who_may(rule: Rule) -> str:
@@ -186,7 +196,7 @@ def openapi_of(app: FastAPI, rules: Mapping[tuple[str, str], Rule]) -> dict[str,
     found = app.openapi()
     found.setdefault("components", {})["securitySchemes"] = _SCHEMES
     for (method, path), rule in rules.items():
-        said = found["paths"].get(path, {}).get(method.lower())
+        said = _said(found, method, path)
         if said is not None:
             said.update(_extras(rule))
     return found

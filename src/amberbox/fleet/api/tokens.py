@@ -68,7 +68,6 @@ def list_own(fleet: Fleet, who: Who) -> list[Listed]:
 @routes.post("/tokens", "own.tokens", status_code=201)
 def make(fleet: Fleet, who: Who, new: NewToken) -> Made:
     """Make a token for a program; its secret is in the answer and nowhere else."""
-    _refuse_newcomer(who)
     with fleet.database.begin() as connection:
         now_ns = fleet.clock.wall_ns()
         owner = find_user(connection, who.principal.id)
@@ -114,12 +113,6 @@ def _revoke(fleet: Services, who: Caller, name: str, token: str) -> None:
             raise HTTPException(404, "there is no such token that works")
         who.note(connection, now_ns, "tokens.revoke", token, details={"of": name})
     fleet.bus.publish(Change("account", data={"name": name}))
-
-
-def _refuse_newcomer(who: Caller) -> None:
-    """Keep whoever read a one-time password from making a token that outlives it."""
-    if who.principal.must_change:
-        raise HTTPException(403, "change your password first")
 
 
 def _refuse_too_many(held: list[tokens.Token], now_ns: int) -> None:

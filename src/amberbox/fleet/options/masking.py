@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from amberbox.core.errors import UsageError
+
 MASK = "***"
 _TELLTALES = ("password", "passwd", "secret", "token", "passphrase", "private_key", "api_key")
 
@@ -17,7 +19,10 @@ def masked(value: Any) -> Any:
 
 
 def unmasked(value: Any, before: Any) -> Any:
-    """Put secrets back where somebody returned the mask: those at the same place before."""
+    """Put secrets back where somebody returned the mask: those at the same place before.
+
+    Raises UsageError where there was none, or it would go to another host or address now.
+    """
     if isinstance(value, Mapping):
         old = before if isinstance(before, Mapping) else {}
         if any(key in value and value[key] != old.get(key) for key in ("host", "url")):
@@ -35,8 +40,13 @@ def _cover(key: str, value: Any) -> Any:
 
 
 def _uncover(key: str, value: Any, before: Any) -> Any:
-    if _is_secret(key) and value == MASK and isinstance(before, str):
-        return before
+    if _is_secret(key) and value == MASK:
+        if isinstance(before, str) and before:
+            return before
+        raise UsageError(
+            f"the {key} is masked, and there is none to keep",
+            "write it again: it is new, or goes to another host or address now",
+        )
     return unmasked(value, before)
 
 
