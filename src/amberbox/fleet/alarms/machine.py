@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Final
 
-from amberbox.core.errors import AmberboxError
+from amberbox.core.errors import UsageError
 from amberbox.core.timetext import format_time
 from amberbox.fleet.alarms.alarm import Alarm, Entry, Part, State, Step, is_worse, worst
 from amberbox.fleet.alarms.settings import AlarmSettings
@@ -21,7 +21,7 @@ OVER: Final = "over"
 MERGED: Final = "merged"
 
 
-class AlarmStateError(AmberboxError):
+class AlarmStateError(UsageError):
     """What was asked for makes no sense for an alarm as it stands now."""
 
 
