@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import gc
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -63,6 +64,7 @@ def _serve(args: argparse.Namespace) -> int:
     if args.host is not None and len(args.host) > 1:
         raise UsageError("a server listens at one address", "--host 0.0.0.0 for all of them")
     _check_installed()
+    gc.disable()  # until it answers: nothing that is loaded now goes away again
     from amberbox.fleet.serving.binding import Wanted
     from amberbox.fleet.serving.starting import run as start
 

@@ -11,6 +11,8 @@ from fastapi import FastAPI
 from amberbox import __version__
 from amberbox.fleet.api.access import Routes, Rule
 from amberbox.fleet.api.errors import add_handlers
+from amberbox.fleet.metrics.figures import Received
+from amberbox.fleet.metrics.requests import RequestCounts, Timed
 from amberbox.fleet.services import Services
 
 
@@ -32,6 +34,8 @@ def make_app(services: Services) -> FastAPI:
     app = FastAPI(title="Amberbox", version=__version__, docs_url=None, redoc_url=None,
                   openapi_url=None)  # fmt: skip
     app.state.services = services
+    app.state.requests, app.state.received = RequestCounts(), Received(services.bus)
+    app.add_middleware(Timed, counts=app.state.requests)
     add_handlers(app)
     for routes in rooms().values():
         app.include_router(routes.router)

@@ -78,6 +78,7 @@ async def serve(services: Services, port: socket.socket, told: Told | None = Non
     try:
         await _until_started(server, answering)
         gc.freeze()  # what is there now stays: the collector need not look at it each time
+        gc.enable()
         told.ready(int(port.getsockname()[1]))
         notifier.ready()
         await asyncio.wait([answering, stopping], return_when=asyncio.FIRST_COMPLETED)

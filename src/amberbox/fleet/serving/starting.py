@@ -5,15 +5,17 @@ from __future__ import annotations
 import asyncio
 import contextlib
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
 from amberbox.core.clock import Clock, SystemClock
 from amberbox.core.errors import AmberboxError
+from amberbox.fleet.accounts.passwords import Passwords
 from amberbox.fleet.accounts.setupcode import SetupCode, needs_setup, new_setup_code
 from amberbox.fleet.database.lock import ServerLock
 from amberbox.fleet.services import Services
-from amberbox.fleet.serving import assembly, certificates, process
+from amberbox.fleet.serving import app, assembly, certificates, process
 from amberbox.fleet.serving.binding import Wanted, settings_of
 from amberbox.fleet.serving.certificates import Files
 from amberbox.fleet.serving.process import Told
@@ -50,7 +52,7 @@ def run(
         settings = settings_of(folder, wanted)
         port = process.listen(settings)
         process.raise_file_limit()
-        services = assembly.assemble(folder, settings, clock)
+        services = assembly.assemble(folder, settings, clock, _passwords())
         try:
             code = _prepared(services, new_code=new_code)
             told = Told(ready=lambda _: begun(Start(settings, code, renewed)))
@@ -58,6 +60,14 @@ def run(
         finally:
             port.close()
             assembly.close(services)
+
+
+def _passwords() -> Passwords:
+    """Make what hashes passwords; its first hash takes as long as to load the routes: together."""
+    with ThreadPoolExecutor(1) as threads:
+        hashing = threads.submit(Passwords)
+        app.rooms()
+        return hashing.result()
 
 
 def make_folder(folder: Path) -> None:
