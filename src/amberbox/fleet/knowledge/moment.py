@@ -9,7 +9,7 @@ from typing import TypeVar
 from amberbox.blackbox.journal import reserved
 from amberbox.consult.journal import Said
 from amberbox.core.clock import NS
-from amberbox.core.timetext import any_time, format_time
+from amberbox.core.timetext import format_time, parse_time
 from amberbox.core.types import Diagnosis, Status, Symptom
 from amberbox.fleet.conclusions.entry import Entry
 from amberbox.fleet.conclusions.reading import Stores, entries
@@ -46,7 +46,7 @@ def moment(stores: Stores, robot: str, at: str, now_ns: int) -> Moment:
     """
     newest = _newest(stores, robot, None)
     last_ns = None if newest is None else newest.at_ns
-    at_ns = any_time(at, lambda: now_ns, lambda: last_ns) if at else last_ns
+    at_ns = parse_time(at, lambda: now_ns, lambda: last_ns) if at else last_ns
     if at_ns is None:
         return Moment(now_ns, notes=("nothing has come from this robot yet",))
     before = newest if newest and newest.at_ns <= at_ns else _newest(stores, robot, at_ns)

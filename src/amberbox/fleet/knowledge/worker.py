@@ -14,7 +14,7 @@ from amberbox.consult.faulttrees import effect_json, effects_json
 from amberbox.consult.sheets import coverage_json, criticality_json, table_json
 from amberbox.core.config import did_you_mean, refuse
 from amberbox.core.errors import UsageError
-from amberbox.core.timetext import any_time, format_time
+from amberbox.core.timetext import format_time, parse_time
 from amberbox.diagnosis.faulttree import Budget as TreeBudget
 from amberbox.diagnosis.faulttree import analyse
 from amberbox.diagnosis.findings.facts import Facts
@@ -50,7 +50,7 @@ def fmea(folder: Path, arguments: dict[str, Any]) -> bytes:
     return _json({
         "robot": asked.robot,
         "config_hash": subject.folder.config_hash,
-        "description": found.title,
+        "name": found.name,
         "table": table_json(found),
         "criticality": criticality_json(found, asked.exposure_h),
         "coverage": coverage_json(coverage(found, sorted(subject.known.watched))),
@@ -109,6 +109,15 @@ def rules(folder: Path, arguments: dict[str, Any]) -> bytes:
     return _json({**about, **found.to_json(), "notes": [*notes, *told]})
 
 
+def failure_modes(folder: Path, arguments: dict[str, Any]) -> bytes:
+    """Return the ids of all failure modes that a robot's folder knew at a time."""
+    asked, stores = read(arguments, AboutRobot), _stores(folder)
+    subject, _ = folder_of_then(
+        folder, stores.database, asked.robot, asked.config_hash, _said(stores, asked)
+    )
+    return _json(sorted(subject.faults().modes))
+
+
 def _stores(folder: Path) -> Stores:
     database = open_catalogue(folder).database
     return Stores(database, FolderArchive(folder, database))
@@ -136,7 +145,7 @@ def _standing(diagnoses: Any) -> Any:
 
 
 def _time(text: str, now_ns: int, last_ns: int) -> int | None:
-    return any_time(text, lambda: now_ns, lambda: last_ns) if text else None
+    return parse_time(text, lambda: now_ns, lambda: last_ns) if text else None
 
 
 def _ends(seconds: float) -> Callable[[], bool]:

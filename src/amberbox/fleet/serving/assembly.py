@@ -20,6 +20,7 @@ from amberbox.fleet.database.database import FILE, Database
 from amberbox.fleet.feed.feed import Feed
 from amberbox.fleet.folders.folders import Folders
 from amberbox.fleet.jobs.jobs import Jobs
+from amberbox.fleet.knowledge.announcing import announce
 from amberbox.fleet.linkend.server import Hooks, LinkServer
 from amberbox.fleet.linkend.tables import STORE
 from amberbox.fleet.part import Part
@@ -44,6 +45,7 @@ def assemble(
     clock = clock or SystemClock()
     database = Database(folder / FILE, clock)
     bus = Bus()
+    announce(bus)
     archive = FolderArchive(folder, database, clock)
     asking = Asking(folder, database, bus, clock)
     folders = Folders(folder, database, bus, clock, asking)

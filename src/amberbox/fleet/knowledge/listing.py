@@ -1,0 +1,60 @@
+"""The diagnoses that a robot's watcher made: each with its revisions, the newest first."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from amberbox.blackbox.journal import reserved
+from amberbox.core.types import Diagnosis
+from amberbox.fleet.conclusions.reading import Stores, entries
+from amberbox.fleet.knowledge.moment import findings
+
+_MOST = 5_000
+"""Revisions that are looked through for one page."""
+
+
+@dataclass(frozen=True, slots=True)
+class Known:
+    """One diagnosis: all that was said of it, in order."""
+
+    id: str
+    revisions: tuple[Diagnosis, ...]
+
+    @property
+    def last(self) -> Diagnosis:
+        """The revision that stands."""
+        return self.revisions[-1]
+
+    @property
+    def peak(self) -> Diagnosis:
+        """The last revision with hypotheses: a healed one may have none any more."""
+        return next((d for d in reversed(self.revisions) if d.hypotheses), self.last)
+
+
+def diagnoses(
+    stores: Stores, robot: str, from_ns: int | None = None, to_ns: int | None = None
+) -> list[Known]:
+    """Return a robot's diagnoses of which something was written in a range, the newest first.
+
+    A file of the watcher begins with what stands, so a revision may be written several times; it
+    counts once.
+    """
+    found = entries(stores, robot, reserved.DIAGNOSIS, (from_ns, to_ns), _MOST, newest=True)
+    by_id: dict[str, dict[tuple[int, str], Diagnosis]] = {}
+    for diagnosis in findings(found, Diagnosis):
+        revisions = by_id.setdefault(diagnosis.id, {})
+        revisions.setdefault((diagnosis.revision, diagnosis.state), diagnosis)
+    known = (Known(name, tuple(revisions.values())) for name, revisions in by_id.items())
+    return sorted(known, key=lambda one: (-one.last.at_ns, one.id))
+
+
+def find(stores: Stores, robot: str, name: str) -> Known | None:
+    """Return one diagnosis; None if the robot made none of this id."""
+    return next((one for one in diagnoses(stores, robot) if one.id == name), None)
+
+
+def page(found: Sequence[Known], after: str, limit: int) -> list[Known]:
+    """Return the part of a list behind an id; from the beginning where that is not in it."""
+    at = next((place + 1 for place, one in enumerate(found) if one.id == after), 0)
+    return list(found[at : at + limit])
