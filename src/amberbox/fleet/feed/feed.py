@@ -42,6 +42,7 @@ class Feed:
     ) -> None:
         self.state = state
         self.ring = Ring(clock.wall_ns())
+        self._first = self.ring.number
         self.live = Live(links, lambda: [one.watch for one in self.listeners])
         self.listeners: list[Listener] = []
         self._links = links
@@ -71,6 +72,11 @@ class Feed:
         """Send everybody away."""
         for listener in self.listeners:
             listener.end(1001, "the server stops")
+
+    @property
+    def told(self) -> int:
+        """Return how many changes were told since the start."""
+        return self.ring.number - self._first
 
     def join(self, listener: Listener) -> bool:
         """Let somebody listen; False when there are too many."""

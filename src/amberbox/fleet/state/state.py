@@ -81,12 +81,15 @@ class State:
             for end in ends:
                 end()
 
+    def open_alarms(self, connection: Connection) -> dict[str, int] | None:
+        """Return how many alarms are open, by robot; None where nothing counts them."""
+        return None if self.alarms is None else self.alarms.counts(connection)
+
     def snapshot(self, robots: Collection[str], now_ns: int, *, with_statuses: bool) -> Snapshot:
         """Return cards of robots, and their statuses."""
         with self.database.reading() as connection:
             known = [robot for robot in list_robots(connection) if robot.id in robots]
-            counts = None if self.alarms is None else self.alarms.counts(connection)
-            cards = self.cards.of(connection, known, now_ns, counts)
+            cards = self.cards.of(connection, known, now_ns, self.open_alarms(connection))
             found = standings(connection) if with_statuses else {}
         statuses = {
             robot: [status_data(one.said) for one in found[robot]]

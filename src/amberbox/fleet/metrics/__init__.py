@@ -1,0 +1,1 @@
+"""The server's own figures, in the text form that Prometheus reads."""
