@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
+from amberbox.core.clock import NS
 from amberbox.diagnosis.covering.evidence import Evidence
 from amberbox.diagnosis.covering.model import UNKNOWN, Model
 from amberbox.diagnosis.covering.prediction import outcomes, predict
@@ -44,6 +45,39 @@ def posterior(model: Model, evidence: Evidence) -> dict[frozenset[str], float]:
         weight *= np.array(seen)
     total = weight.sum()
     return dict(zip(sets, (weight / total).tolist(), strict=True)) if total > 0 else {}
+
+
+def with_common_cause(
+    model: Model, evidence: Evidence, exact: dict[frozenset[str], float]
+) -> dict[frozenset[str], float]:
+    """Let the unknown mode look like every set of three or more that began together."""
+    other = model.unknown
+    if other is None or any(UNKNOWN not in conflict for conflict in evidence.conflicts):
+        return exact
+    priors = {mode.id: mode.prior for mode in model.modes}
+    grown = dict(exact)
+    for faults, share in exact.items():
+        known = sorted(faults - {UNKNOWN})
+        if share == 0 or len(known) < 3 or _spread_s(model, evidence, known) > other.together_s:
+            continue
+        for fault in known:
+            share *= other.looks_like / priors[fault]
+        share *= 1.0 if UNKNOWN in faults else other.prior
+        grown[frozenset({UNKNOWN})] = grown.get(frozenset({UNKNOWN}), 0.0) + share
+    total = sum(grown.values())
+    return {faults: share / total for faults, share in grown.items()}
+
+
+def _spread_s(model: Model, evidence: Evidence, faults: Sequence[str]) -> float:
+    """Return how long after the first fault the last one began to show."""
+    first: dict[str, int] = {}
+    for name, onset_ns in evidence.onsets_ns.items():
+        place = model.sign_places[name]
+        shows = {fault: 1 - predict(model, [fault]).misses.get(place, 1.0) for fault in faults}
+        surest = max(faults, key=lambda fault: shows[fault])
+        if shows[surest] > 0:
+            first[surest] = min(onset_ns, first.get(surest, onset_ns))
+    return (max(first.values()) - min(first.values())) / NS if first else 0.0
 
 
 def restricted(

@@ -136,6 +136,27 @@ def test_what_the_fmea_does_not_know() -> None:
     assert (told.use.severity, told.use.text) == ("", NOBODY_KNOWS)
 
 
+@pytest.mark.parametrize("looks_like", [0.03, 0.0])
+def test_what_is_not_in_the_fmea_looks_like_several_faults_at_once(looks_like: float) -> None:
+    of = knowledge()
+    other = replace(of.fmea.other, looks_like=looks_like)
+    of = replace(of, fmea=replace(of.fmea, other=other))
+    alike = frozenset({"wheel_left#encoder_stuck", "laser_front#silent", "laser_rear#silent"})
+    found = (
+        Hypothesis("unknown#other", frozenset({"unknown#other"}), 0.9),
+        Hypothesis("two", frozenset({"laser_front#silent", "laser_rear#silent"}), 0.06),
+        Hypothesis("three", alike, 0.04),
+    )
+    told = explain(Diagnosis("d", 1, "ropod_001", START_NS, "", found, 1.0), of, ())
+    assert told.sure.note == (
+        "it looks like the front laser has no power, the rear laser has no power and the encoder "
+        "of drive 1 of the left wheel unit stands still at once, which have no cause in common "
+        "that the FMEA knows"
+        if looks_like
+        else ""
+    )
+
+
 def test_what_is_known_to_be_lost_counts_beside_what_is_not_known() -> None:
     of, faults = knowledge(), frozenset({"safety#pressed", "unknown#other"})
     both = Hypothesis(" + ".join(sorted(faults)), faults, 0.9)

@@ -29,6 +29,15 @@ def test_everything_is_handed_on() -> None:
     assert shorter["hook#bent"] == 0.03
 
 
+def test_what_the_unknown_looks_like_is_handed_on() -> None:
+    other = "other: {looks_like: 0.03, together_s: 20}\nexposure_h: 100"
+    unknown = compile_model(small("exposure_h: 100", other)).unknown
+    assert unknown is not None
+    assert (unknown.looks_like, unknown.together_s) == (0.03, 20.0)
+    off = compile_model(small()).unknown
+    assert off is not None and off.looks_like == 0.0
+
+
 def test_a_loss_explains_what_shows_at_the_top() -> None:
     fmea = small()
     present = ("tasks/log/none_given_up", "host/heartbeat/alive")

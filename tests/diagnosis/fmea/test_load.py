@@ -109,6 +109,10 @@ WRONG = [
         "1.2 is above 1: expected a share from 0 to 1",
     ),
     ("rate: 1.0e-4", "rate: -1", "rate: -1", "-1 lies below 0"),
+    ("exposure_h: 100", "remember_s: -5", "remember_s: -5", "-5 lies below 0"),
+    ("exposure_h: 100", "other: {looks_like: 2}", "looks_like: 2", "2 is above 1"),
+    ("exposure_h: 100", "other: {looks_lik: 0.1}", "looks_lik:", "did you mean 'looks_like'?"),
+    ("exposure_h: 100", "other: {together_s: -1}", "together_s: -1", "-1 lies below 0"),
     (
         "any: [laser_front, laser_rear]",
         "any: [laser_front, laser_raer]",

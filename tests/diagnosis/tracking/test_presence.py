@@ -3,7 +3,7 @@ from __future__ import annotations
 import json
 
 from amberbox.diagnosis.tracking.presence import Presence, Presences
-from tests.diagnosis.tracking.robot import At, gone, knowledge, seconds
+from tests.diagnosis.tracking.robot import TEXT, At, gone, knowledge, seconds
 
 NAME = "laser/scan/clear"
 
@@ -29,10 +29,34 @@ def test_keeps_its_onset_when_it_comes_back_in_time() -> None:
     assert presence(At(3, NAME, onset_s=1.5)).onset_ns == seconds(1.5)
 
 
-def test_what_becomes_unknown_is_remembered_as_long() -> None:
+def test_what_becomes_unknown_goes_on_to_count_for_ten_minutes_and_its_hold() -> None:
     one = presence(At(1, NAME), At(5, NAME, "unknown"))
-    assert one.counts_present(seconds(6.9)) and not one.counts_present(seconds(7))
+    assert one.counts_present(seconds(606.9)) and not one.counts_present(seconds(607))
     assert not one.is_absent
+
+
+def test_what_was_unknown_begins_to_be_forgotten_when_it_is_seen_absent() -> None:
+    one = presence(At(1, NAME), At(5, NAME, "unknown"), gone(300, NAME))
+    assert one.counts_present(seconds(301.9)) and not one.counts_present(seconds(302))
+    assert one.may_be_absent_ns == seconds(312)
+
+
+def test_what_nobody_can_look_at_does_not_fade() -> None:
+    one = presence(At(1, NAME), gone(5, NAME), At(6.5, NAME, "unknown"), gone(100, NAME))
+    assert one.counts_present(seconds(100.4)) and not one.counts_present(seconds(100.5))
+
+
+def test_what_had_faded_is_not_remembered_when_it_becomes_unknown() -> None:
+    one = presence(At(1, NAME), gone(5, NAME), At(8, NAME, "unknown"))
+    assert not one.counts_present(seconds(8))
+
+
+def test_it_is_remembered_no_longer_than_the_file_says() -> None:
+    presences = Presences(knowledge(f"remember_s: 3\n{TEXT}").fmea)
+    for at in (At(1, NAME), At(5, NAME, "unknown"), At(7, NAME, "absent", ("bus",))):
+        presences.take(at.symptom(), seconds(at.at_s))
+    one = presences[NAME]
+    assert one.counts_present(seconds(9.9)) and not one.counts_present(seconds(10))
 
 
 def test_what_comes_while_it_is_blocked_is_no_evidence() -> None:
@@ -55,7 +79,7 @@ def test_what_was_there_before_it_was_blocked_goes_on_to_count() -> None:
 
 def test_what_is_blocked_is_never_seen_absent() -> None:
     one = presence(At(1, NAME), At(5, NAME, "absent", ("bus",)))
-    assert one.counts_present(seconds(6.9)) and not one.counts_present(seconds(7))
+    assert one.counts_present(seconds(606.9)) and not one.counts_present(seconds(607))
     assert not one.is_absent
 
 
@@ -70,8 +94,16 @@ def test_is_shown_as_what_it_counts_as() -> None:
 
 def test_is_kept_as_json() -> None:
     presences = Presences(knowledge().fmea)
-    for at in (At(1, NAME), gone(5, NAME), At(6, "motor.hot"), At(7, "other/one/here", "unknown")):
+    for at in (
+        At(1, NAME),
+        gone(5, NAME),
+        At(6, "motor.hot"),
+        At(6.5, NAME, "unknown"),
+        At(7, "other/one/here", "unknown"),
+        At(8, "base/drive/follows", blocked_by=("bus",)),
+    ):
         presences.take(at.symptom(), seconds(at.at_s))
     other = Presences(knowledge().fmea)
     other.resume(json.loads(json.dumps(presences.snapshot())))
     assert dict(other) == dict(presences)
+    assert other.snapshot() == presences.snapshot()

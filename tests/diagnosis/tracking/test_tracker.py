@@ -211,10 +211,10 @@ def test_an_epoch_in_which_a_symptom_is_seen_again_goes_on_with_the_diagnosis() 
 
 def test_an_hour_without_any_symptom_ends_a_diagnosis_that_nothing_denies() -> None:
     tracker = begun()
-    run(tracker, [*WELL, At(20, CLEAR), At(40, CLEAR, "unknown")], 3641.5)
+    run(tracker, [*WELL, At(20, CLEAR), At(40, CLEAR, "unknown")], 4241.5)
     assert tracker.current() is not None
-    found = diagnoses(run(tracker, [], 3700))
-    assert [(one.at_ns, one.state) for one in found] == [(seconds(3642), "healed")]
+    found = diagnoses(run(tracker, [], 4300))
+    assert [(one.at_ns, one.state) for one in found] == [(seconds(4242), "healed")]
     assert tracker.current() is None
 
 

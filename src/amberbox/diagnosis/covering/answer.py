@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from amberbox.core.types import AmbiguityGroup, Hypothesis
 from amberbox.diagnosis.covering.budget import Budget
 from amberbox.diagnosis.covering.clues import folded
+from amberbox.diagnosis.covering.common_cause import with_common_cause
 from amberbox.diagnosis.covering.evidence import Evidence
 from amberbox.diagnosis.covering.groups import EXPECTED, grouped, signature
 from amberbox.diagnosis.covering.model import Model
@@ -55,7 +56,9 @@ def diagnose(
     problem = problem_of(model.tables, folded(model, evidence))
     found = search(problem, max_hypotheses, mass, budget or Budget())
     ids = model.mode_ids
-    sets = [(frozenset(ids[mode] for mode in modes), share) for modes, share in found.sets]
+    listed = [(frozenset(ids[mode] for mode in modes), share) for modes, share in found.sets]
+    sets, grown = with_common_cause(model, evidence, listed)
+    sets = sets[:max_hypotheses]
     predictions = [predict(model, faults) for faults, _ in sets]
     known = Known.of(model, evidence)
     hypotheses = [
@@ -66,7 +69,8 @@ def diagnose(
     signatures = [signature(model, evidence, seen, prediction) for prediction in predictions]
     filled, groups = grouped(hypotheses, signatures)
     findings = tuple(name for name in evidence.observations if name not in model.sign_places)
-    return Answer(filled, groups, found.covered, found.incomplete, findings, found.opened)
+    covered = found.covered and grown / (grown - 1.0 + 1.0 / found.covered)
+    return Answer(filled, groups, covered, found.incomplete, findings, found.opened)
 
 
 @dataclass(frozen=True, slots=True)

@@ -43,7 +43,8 @@ class Evidence:
 
     A conflict is a set of failure modes of which at least one is there. ``asked`` are tests
     that were done or cannot be done: they are not proposed again. ``doubled`` are symptoms that
-    do not count, because what they were measured from has been counted.
+    do not count, because what they were measured from has been counted. ``onsets_ns`` are when
+    present symptoms began, as far as that is known.
     """
 
     observations: Mapping[str, Observation] = field(default_factory=dict)
@@ -51,6 +52,7 @@ class Evidence:
     answers: tuple[Answered, ...] = ()
     asked: frozenset[str] = frozenset()
     doubled: tuple[str, ...] = ()
+    onsets_ns: Mapping[str, int] = field(default_factory=dict)
 
     def with_observation(self, symptom: str, state: SymptomState) -> Evidence:
         """Return the evidence after a look at a symptom; unknown means it cannot be told."""
@@ -69,6 +71,7 @@ def evidence_of(symptoms: Iterable[Symptom], conflicts: Iterable[Iterable[str]] 
     counted: dict[str, Observation] = {}
     spent: dict[str, list[tuple[str, int, int]]] = {}
     doubled: list[str] = []
+    onsets_ns: dict[str, int] = {}
     for symptom in sorted(symptoms, key=_strongest_first):
         if symptom.state == "unknown" or symptom.strength <= 0 or symptom.id in counted:
             continue
@@ -76,10 +79,14 @@ def evidence_of(symptoms: Iterable[Symptom], conflicts: Iterable[Iterable[str]] 
             doubled.append(symptom.id)
             continue
         counted[symptom.id] = Observation(symptom.state, min(1.0, symptom.strength))
+        onset_ns = symptom.confirmed_ns if symptom.onset_ns is None else symptom.onset_ns
+        if symptom.state == "present" and onset_ns is not None:
+            onsets_ns[symptom.id] = onset_ns
         for address, from_ns, to_ns in symptom.evidence:
             spent.setdefault(address, []).append((symptom.source, from_ns, to_ns))
     sets = tuple(frozenset(conflict) for conflict in conflicts)
-    return Evidence(counted, sets, doubled=tuple(name for name in doubled if name not in counted))
+    left_out = tuple(name for name in doubled if name not in counted)
+    return Evidence(counted, sets, doubled=left_out, onsets_ns=onsets_ns)
 
 
 def _strongest_first(symptom: Symptom) -> tuple[float, bool, str, str]:

@@ -78,11 +78,16 @@ class Unknown:
     so an absent symptom says nothing against it; ``denies`` above 0 makes each absent symptom
     count like an absent symptom of a cause with that probability. A large ``detects`` makes it
     a cheap excuse for two faults at once; the default leaves them most of their due.
+
+    It may look like three or more known modes that begin within ``together_s`` of each other,
+    like each with probability ``looks_like``; 0: it never does.
     """
 
     prior: float = 1e-3
     detects: float = 0.05
     denies: float = 0.0
+    looks_like: float = 0.0
+    together_s: float = 10.0
 
 
 @dataclass(frozen=True)
@@ -110,7 +115,7 @@ class Model:
         for link in self.links:
             _probability(link.detects, f"detects of {link.cause} for {link.symptom}")
         if self.unknown is not None:
-            for name in ("prior", "detects", "denies"):
+            for name in ("prior", "detects", "denies", "looks_like"):
                 _probability(getattr(self.unknown, name), f"{name} of {UNKNOWN}")
 
     @cached_property

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Sequence
 
 from amberbox.core.types import Diagnosis, Hypothesis, Symptom
+from amberbox.diagnosis.explanation.alike import alike
 from amberbox.diagnosis.explanation.details import details_of
 from amberbox.diagnosis.explanation.explanation import Explanation, Seen
 from amberbox.diagnosis.explanation.graph import graph_of
@@ -35,7 +36,7 @@ def explain(diagnosis: Diagnosis, knowledge: Knowledge, symptoms: Iterable[Sympt
     groups = [described(names, *group) for group in found[: 1 + OTHERS]]
     broken, others = (groups[0] if groups else None), groups[1:]
     others_with = list(zip(others, (group[1] for group in found[1:]), strict=False))
-    sure = sureness(diagnosis, broken)
+    sure = sureness(diagnosis, broken, alike(names, diagnosis, members))
     use = use_of(sights.ways, members, others_with)
     explained, missed = _explained(members), _missed(diagnosis, members)
     return Explanation(

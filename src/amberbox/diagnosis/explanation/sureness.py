@@ -10,16 +10,19 @@ COVERED = 0.98
 """What share of all probability must have been looked at to say nothing of the rest."""
 
 
-def sureness(diagnosis: Diagnosis, broken: Group | None) -> Sureness:
-    """Say how sure the leading group is; the word is that of the least it can be."""
+def sureness(diagnosis: Diagnosis, broken: Group | None, remark: str = "") -> Sureness:
+    """Say how sure the leading group is; the word is that of the least it can be.
+
+    ``remark`` is said before what was not looked at.
+    """
     if broken is None:
         return Sureness(sure_word(0.0), 0.0, 0.0, diagnosis.incomplete)
     covered = min(1.0, diagnosis.mass_covered)
     complete = covered >= COVERED and not diagnosis.incomplete
     probability = min(1.0, broken.probability)
     least = probability if complete else probability * covered
-    note = "" if complete else _note(diagnosis, covered)
-    return Sureness(sure_word(least), probability, least, note)
+    notes = (remark, "" if complete else _note(diagnosis, covered))
+    return Sureness(sure_word(least), probability, least, "; ".join(filter(None, notes)))
 
 
 def _note(diagnosis: Diagnosis, covered: float) -> str:

@@ -28,7 +28,12 @@ def compile_model(fmea: Fmea, exposure_h: float | None = None) -> Model:
     signs = tuple(Sign(symptom.id, symptom.leak) for symptom in fmea.symptoms.values())
     found, found_links = finding_signs(fmea)
     functions = tuple(Function(name, needs) for name, needs in fmea.needs().items())
-    other = Unknown(fmea.other.probability, fmea.other.detects)
+    other = Unknown(
+        fmea.other.probability,
+        fmea.other.detects,
+        looks_like=fmea.other.looks_like,
+        together_s=fmea.other.together_s,
+    )
     return Model(modes, signs + found, (*_links(fmea), *found_links), functions, other)
 
 

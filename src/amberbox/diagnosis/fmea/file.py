@@ -36,10 +36,13 @@ class OtherFile:
 
     probability: float = option(1e-3, "how probable it is that something else is broken")
     detects: float = option(0.05, "how probable that shows in a symptom, whichever")
+    looks_like: float = option(0.0, "how probable it looks like a failure mode, of several at once")
+    together_s: float = option(10.0, "so short after each other these begin", unit="s")
 
     def check(self) -> Iterator[Finding]:
         """Yield what is wrong."""
-        yield from _shares(self, "probability", "detects")
+        yield from _shares(self, "probability", "detects", "looks_like")
+        yield from _not_below_zero(self, "together_s")
 
 
 @dataclass(frozen=True)
@@ -108,6 +111,7 @@ class SymptomFile:
     leak: float | None = option(None, "how probable it shows although no cause is there")
     within_s: float | None = option(None, "so long after a cause began it may come", unit="s")
     hold_s: float | None = option(None, "so long it is remembered when it has gone", unit="s")
+    by_itself: bool = option(False, "whether what its component needs has no part in it")
     description: str = option("", "what it is")
 
     def check(self) -> Iterator[Finding]:
@@ -274,6 +278,9 @@ class FmeaFile:
 
     description: str = option("", "what it is about")
     exposure_h: float = option(24.0, "hours since all was known to be well", unit="h")
+    remember_s: float = option(
+        600.0, "so long a symptom that nobody can look at goes on to count", unit="s"
+    )
     defaults: DefaultsFile = option(DefaultsFile(), "what counts where an entry does not say it")
     other: OtherFile = option(OtherFile(), "something that is not in this file")
     scales: ScalesFile = option(ScalesFile(), "tables for S, O and D")
@@ -287,7 +294,7 @@ class FmeaFile:
 
     def check(self) -> Iterator[Finding]:
         """Yield what is wrong."""
-        yield from _not_below_zero(self, "exposure_h")
+        yield from _not_below_zero(self, "exposure_h", "remember_s")
 
 
 def _shares(entry: object, *keys: str) -> Iterator[Finding]:

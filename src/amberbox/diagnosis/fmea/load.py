@@ -62,11 +62,12 @@ def _made(root: Node, known: Known | None, problems: list[Problem], folder: Path
     }
     components = {part.component: component_of(part) for part in sheet.parts}
     components |= members(sheet.robots, root, scope, folder)
-    other = Other(sheet.file.other.probability, sheet.file.other.detects)
+    file = sheet.file.other
+    other = Other(file.probability, file.detects, file.looks_like, file.together_s)
     fmea = Fmea(
         sheet.file.description, scope.modes, components, functions, symptoms.found, scope.tests,
         other, sheet.file.exposure_h, mapped(sheet, scope.modes, known, problems),
-        folders(sheet.robots, folder),
+        folders(sheet.robots, folder), sheet.file.remember_s,
     )  # fmt: skip
     return check(fmea, sheet, problems)
 

@@ -25,6 +25,7 @@ class Symptom:
     ``id`` is the address of the output, or a name of the file; then ``condition`` is what must
     be true. ``leak`` is how probable it shows although no cause of it is there. It counts as
     absent only ``within_s`` after a cause can have begun, and is remembered for ``hold_s``.
+    ``by_itself``: it counts also while its component is blocked.
     """
 
     id: str
@@ -33,6 +34,7 @@ class Symptom:
     within_s: float = 0.0
     hold_s: float = 0.0
     description: str = ""
+    by_itself: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -180,15 +182,24 @@ class Mapped:
 
 @dataclass(frozen=True, slots=True)
 class Other:
-    """Something that is not in this analysis: how probable, and what it shows of anything."""
+    """Something that is not in this analysis: how probable, and what it shows of anything.
+
+    ``looks_like`` is how probable it looks like a failure mode when it looks like several that
+    begin within ``together_s``.
+    """
 
     probability: float = 1e-3
     detects: float = 0.5
+    looks_like: float = 0.0
+    together_s: float = 10.0
 
 
 @dataclass(frozen=True, slots=True)
 class Fmea:
-    """Everything, by id. ``members`` are the robots of a team with their folders, where named."""
+    """Everything, by id. ``members`` are the robots of a team with their folders, where named.
+
+    For ``remember_s`` a symptom that nobody can look at any more goes on to count.
+    """
 
     name: str
     modes: Mapping[str, FailureMode]
@@ -200,6 +211,7 @@ class Fmea:
     exposure_h: float = 24.0
     findings: tuple[Mapped, ...] = ()
     members: Mapping[str, str] = field(default_factory=dict)
+    remember_s: float = 600.0
 
     def needs(self) -> dict[str, Needs]:
         """Return what each component and function needs."""

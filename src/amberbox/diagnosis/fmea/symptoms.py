@@ -98,7 +98,7 @@ class Symptoms:
     def _made(self, name: str, entry: SymptomFile) -> Symptom:
         leak = _first(entry.leak, None, self._defaults.leak)
         within_s, hold_s = entry.within_s or 0.0, entry.hold_s or 0.0
-        return Symptom(name, entry.when, leak, within_s, hold_s, entry.description)
+        return Symptom(name, entry.when, leak, within_s, hold_s, entry.description, entry.by_itself)
 
     def add(
         self, entries: Mapping[str, SymptomFile], node: Node, where: str, component: str = ""

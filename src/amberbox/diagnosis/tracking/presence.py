@@ -11,7 +11,7 @@ import msgspec
 from amberbox.core.clock import NS
 from amberbox.core.types import Symptom
 from amberbox.diagnosis.fmea.model import Fmea
-from amberbox.diagnosis.tracking.showing import showing
+from amberbox.diagnosis.tracking.blocking import Blocking
 
 Counts: TypeAlias = Literal["present", "absent", ""]
 """What a symptom counts as; empty if it is no evidence."""
@@ -21,45 +21,56 @@ Counts: TypeAlias = Literal["present", "absent", ""]
 class Presence:
     """One symptom: what was told last, and when it came and went.
 
-    ``seen`` is what was told when it came, ``gone_ns`` when it went: for ``hold_ns`` it is
-    remembered, and only ``within_ns`` later it can count as absent. ``shown_by`` are the
-    components whose failures may show it.
+    ``seen`` is what was told when it came. Seen to be gone it is remembered for ``hold_ns``,
+    that is until ``until_ns``, and only ``within_ns`` later it can count as absent. While nobody
+    can look, ``left_ns`` of that are left, for ``remember_ns`` at most.
     """
 
     told: Symptom
     hold_ns: int = 0
     within_ns: int = 0
-    shown_by: frozenset[str] = frozenset()
+    remember_ns: int = 0
     seen: Symptom | None = None
-    gone_ns: int | None = None
+    until_ns: int | None = None
+    left_ns: int | None = None
 
     @property
     def is_there(self) -> bool:
         """Tell whether it is there now."""
-        return self.seen is not None and self.gone_ns is None
+        return self.seen is not None and self.until_ns is None
 
-    def take(self, told: Symptom, at_ns: int) -> None:
+    def take(self, told: Symptom, at_ns: int, counts: bool = True) -> None:
         """Take what is told of it at an instant; what comes back in time never went.
 
-        What comes while its component is blocked counts only if the analysis says that what
-        blocks may show it. What was there before goes on to count: it has another cause.
+        ``counts`` is whether it counts if it comes now. What was there before goes on to count.
         """
         was_present = self.counts_present(at_ns)
         self.told = told
-        if told.state == "present" and (was_present or self._is_explained(told)):
+        if told.state == "present" and (was_present or counts):
             self.seen = self.seen if was_present else told
-            self.gone_ns = None
-        elif self.is_there and told.state != "present":
-            self.gone_ns = at_ns
+            self.until_ns = self.left_ns = None
+        elif was_present and self.is_absent:
+            self._fade(at_ns)
+        elif was_present and told.state != "present":
+            self._hide(at_ns)
 
-    def _is_explained(self, told: Symptom) -> bool:
-        """Tell whether nothing blocks it, or something that the analysis knows to show it."""
-        blocking = {label.partition("/")[0] for label in told.blocked_by}
-        return not blocking or not blocking.isdisjoint(self.shown_by)
+    def _fade(self, at_ns: int) -> None:
+        """Begin to forget, or go on where nobody could look: it is seen absent."""
+        if self.until_ns is None:
+            self.until_ns = at_ns + self.hold_ns
+        elif self.left_ns is not None:
+            self.until_ns = min(self.until_ns, at_ns + self.left_ns)
+        self.left_ns = None
+
+    def _hide(self, at_ns: int) -> None:
+        """Stop to forget, for a limited time: unknown or blocked, it is not seen to be gone."""
+        if self.left_ns is None:
+            self.left_ns = self.hold_ns if self.until_ns is None else self.until_ns - at_ns
+            self.until_ns = at_ns + self.remember_ns + self.left_ns
 
     def counts_present(self, at_ns: int) -> bool:
         """Tell whether it is there, or went so short ago that it is remembered."""
-        return self.is_there or (self.gone_ns is not None and at_ns < self.gone_ns + self.hold_ns)
+        return self.is_there or (self.until_ns is not None and at_ns < self.until_ns)
 
     @property
     def is_absent(self) -> bool:
@@ -69,7 +80,7 @@ class Presence:
     @property
     def may_be_absent_ns(self) -> int:
         """From when on its absence can count: what takes long to come takes long to go."""
-        return 0 if self.gone_ns is None else self.gone_ns + self.hold_ns + self.within_ns
+        return 0 if self.until_ns is None else self.until_ns + self.within_ns
 
     @property
     def onset_ns(self) -> int:
@@ -91,12 +102,15 @@ class Presences:
 
     def __init__(self, fmea: Fmea) -> None:
         self._symptoms = fmea.symptoms
-        self._shown_by = showing(fmea)
+        self._remember_ns = round(fmea.remember_s * NS)
+        self._blocking = Blocking(fmea)
         self._all: dict[str, Presence] = {}
+        self._blocked: dict[str, None] = {}
 
     def begin(self) -> None:
         """Begin an epoch: nothing is known."""
         self._all.clear()
+        self._blocked.clear()
 
     def knows(self, name: str) -> bool:
         """Tell whether the analysis has a symptom."""
@@ -107,7 +121,19 @@ class Presences:
         presence = self._all.get(told.id)
         if presence is None:
             presence = self._all[told.id] = self._made(told)
-        presence.take(told, at_ns)
+        self._judge(presence, told, at_ns)
+        if presence.is_there:
+            for name in list(self._blocked):
+                self._judge(self._all[name], self._all[name].told, at_ns)
+
+    def _judge(self, presence: Presence, told: Symptom, at_ns: int) -> None:
+        """Take what is told; what is there but blocked is judged again when more is there."""
+        there = [name for name, one in self if one.is_there] if told.blocked_by else ()
+        presence.take(told, at_ns, self._blocking.lets_count(told, there))
+        if told.state == "present" and not presence.is_there:
+            self._blocked[told.id] = None
+        else:
+            self._blocked.pop(told.id, None)
 
     def _made(self, told: Symptom) -> Presence:
         """Make the presence of a symptom: how long it is remembered and may take to come."""
@@ -115,7 +141,7 @@ class Presences:
         if symptom is None:
             return Presence(told)
         hold_ns, within_ns = round(symptom.hold_s * NS), round(symptom.within_s * NS)
-        return Presence(told, hold_ns, within_ns, self._shown_by.get(told.id, frozenset()))
+        return Presence(told, hold_ns, within_ns, self._remember_ns)
 
     def __iter__(self) -> Iterator[tuple[str, Presence]]:
         return iter(self._all.items())
@@ -151,23 +177,28 @@ class Presences:
         return min((time for time in times if time > at_ns), default=None)
 
     def _turns(self, name: str, one: Presence, waits_ns: Mapping[str, int]) -> Iterator[int]:
-        if one.gone_ns is not None:
-            yield one.gone_ns + one.hold_ns
+        if one.until_ns is not None:
+            yield one.until_ns
         if one.is_absent:
             yield max(one.may_be_absent_ns, waits_ns.get(name, 0))
 
     def snapshot(self) -> dict[str, Any]:
         """Return all of it as JSON."""
         plain: Any = msgspec.to_builtins
-        return {n: [plain(one.told), plain(one.seen), one.gone_ns] for n, one in self}
+        return {
+            name: [plain(one.told), plain(one.seen), one.until_ns, one.left_ns]
+            for name, one in self
+        }
 
     def resume(self, snapshot: Mapping[str, Any]) -> None:
         """Go on from what ``snapshot`` returned."""
-        self._all.clear()
-        for name, (told, seen, gone_ns) in snapshot.items():
+        self.begin()
+        for name, (told, seen, until_ns, left_ns) in snapshot.items():
             presence = self._all[name] = self._made(msgspec.convert(told, Symptom))
             presence.seen = msgspec.convert(seen, Symptom | None)
-            presence.gone_ns = gone_ns
+            presence.until_ns, presence.left_ns = until_ns, left_ns
+            if presence.told.state == "present" and not presence.is_there:
+                self._blocked[name] = None
 
 
 def _time(at_ns: int | None) -> int:

@@ -32,7 +32,7 @@ HALF_NS: Final = NS // 2
 """Revisions come at multiples of this; only the first comes at once."""
 EFFORT = Effort(budget=Budget(nodes=1_000))
 """What a revision may cost: nodes alone, so that it is the same on every machine."""
-VERSION: Final = 1
+VERSION: Final = 2
 
 Event: TypeAlias = tuple[int, bool, Symptom]
 """When something was told, whether by a condition of the FMEA, and what."""
