@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from pathlib import Path
 
 from sqlalchemy import select
@@ -29,10 +30,16 @@ def folder_of_then(
     place = shelf.place(robot, config_hash) if config_hash else None
     if place is None or not place.is_dir():
         raise _not_here(database, robot, config_hash)
-    found = declared(place, robot, config_hash)
+    found = _read(place, robot, config_hash)
     if not said or said == config_hash:
         return found, ()
     return found, (f"its watcher had the folder {said[:_SHOWN]} then, not this one",)
+
+
+@lru_cache(maxsize=4)
+def _read(place: Path, robot: str, config_hash: str) -> Declared:
+    """Read a folder once per worker: one that stands on the shelf never changes."""
+    return declared(place, robot, config_hash)
 
 
 def _stated(database: Database, robot: str) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -28,18 +27,21 @@ from amberbox.fleet.knowledge import diagnosing
 from amberbox.fleet.knowledge.asked import AboutRobot, AskDiagnosis, AskRules, AskTrees, read
 from amberbox.fleet.knowledge.moment import moment
 from amberbox.fleet.knowledge.past import past_of
+from amberbox.fleet.knowledge.spoken import spoken
 from amberbox.fleet.knowledge.then import folder_of_then
 
 _CLOSEST = 5
 _NODES = 2_000_000
 
 
-def diagnose(folder: Path, arguments: dict[str, Any]) -> bytes:
+@spoken
+def diagnose(folder: Path, arguments: dict[str, Any]) -> Any:
     """Answer what is broken."""
-    return _json(diagnosing.answered(folder, _stores(folder), read(arguments, AskDiagnosis)))
+    return diagnosing.answered(folder, _stores(folder), read(arguments, AskDiagnosis))
 
 
-def fmea(folder: Path, arguments: dict[str, Any]) -> bytes:
+@spoken
+def fmea(folder: Path, arguments: dict[str, Any]) -> Any:
     """Return the sheet, what matters most and what nobody sees."""
     asked = read(arguments, AboutRobot)
     stores = _stores(folder)
@@ -47,7 +49,7 @@ def fmea(folder: Path, arguments: dict[str, Any]) -> bytes:
         folder, stores.database, asked.robot, asked.config_hash, _said(stores, asked)
     )
     found = subject.faults()
-    return _json({
+    return {
         "robot": asked.robot,
         "config_hash": subject.folder.config_hash,
         "name": found.name,
@@ -55,10 +57,11 @@ def fmea(folder: Path, arguments: dict[str, Any]) -> bytes:
         "criticality": criticality_json(found, asked.exposure_h),
         "coverage": coverage_json(coverage(found, sorted(subject.known.watched))),
         "notes": list(notes),
-    })  # fmt: skip
+    }  # fmt: skip
 
 
-def fault_trees(folder: Path, arguments: dict[str, Any]) -> bytes:
+@spoken
+def fault_trees(folder: Path, arguments: dict[str, Any]) -> Any:
     """Return the trees of all functions, or one with its cut sets and how close it is now."""
     asked, stores = read(arguments, AskTrees), _stores(folder)
     then = moment(stores, asked.robot, asked.at, asked.now_ns)
@@ -85,13 +88,14 @@ def fault_trees(folder: Path, arguments: dict[str, Any]) -> bytes:
     standing = _standing(then.said.diagnoses)
     closest = closest_json(known, then.at_ns, standing, outlooks(solved, standing, _CLOSEST))
     about = {"robot": asked.robot, "config_hash": subject.folder.config_hash}
-    return _json({
+    return {
         **about, **shown, "at": format_time(then.at_ns), "closest": closest["effects"],
         "diagnosis": closest["diagnosis"], "notes": [*then.notes, *notes],
-    })  # fmt: skip
+    }  # fmt: skip
 
 
-def rules(folder: Path, arguments: dict[str, Any]) -> bytes:
+@spoken
+def rules(folder: Path, arguments: dict[str, Any]) -> Any:
     """Return all answers of a goal to the robot's rules and its past."""
     asked, stores = read(arguments, AskRules), _stores(folder)
     subject, notes = folder_of_then(folder, stores.database, asked.robot, asked.config_hash, "")
@@ -106,16 +110,17 @@ def rules(folder: Path, arguments: dict[str, Any]) -> bytes:
     found = ask(program, asked.query, budget, asked.want or None)
     about = {"robot": asked.robot, "config_hash": subject.folder.config_hash}
     told = [str(note) for note in program.notes]
-    return _json({**about, **found.to_json(), "notes": [*notes, *told]})
+    return {**about, **found.to_json(), "notes": [*notes, *told]}
 
 
-def failure_modes(folder: Path, arguments: dict[str, Any]) -> bytes:
+@spoken
+def failure_modes(folder: Path, arguments: dict[str, Any]) -> Any:
     """Return the ids of all failure modes that a robot's folder knew at a time."""
     asked, stores = read(arguments, AboutRobot), _stores(folder)
     subject, _ = folder_of_then(
         folder, stores.database, asked.robot, asked.config_hash, _said(stores, asked)
     )
-    return _json(sorted(subject.faults().modes))
+    return sorted(subject.faults().modes)
 
 
 def _stores(folder: Path) -> Stores:
@@ -151,7 +156,3 @@ def _time(text: str, now_ns: int, last_ns: int) -> int | None:
 def _ends(seconds: float) -> Callable[[], bool]:
     end_s = time.monotonic() + seconds
     return lambda: time.monotonic() > end_s
-
-
-def _json(value: Any) -> bytes:
-    return json.dumps(value, ensure_ascii=False, allow_nan=False).encode()
