@@ -33,6 +33,7 @@ def serve(folder: Path, requests: IO[bytes], answers: IO[bytes]) -> None:
             _limit(request["limit_s"], request["memory_bytes"])
             for part in parts(folder, request["op"], request["arguments"]):
                 answers.write(packed({"part": part}))
+                answers.flush()
             last: Mapping[str, Any] = {}
         except BrokenPipeError:
             return

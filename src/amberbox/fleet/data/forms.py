@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterator
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 import numpy as np
@@ -18,6 +18,9 @@ from amberbox.core.timetext import format_time
 from amberbox.core.types import Column, ColumnData, Ragged
 from amberbox.fleet.data.asked import About, Form
 from amberbox.fleet.data.rows import Answer
+
+if TYPE_CHECKING:
+    import pyarrow as pa
 
 MAGIC = b"ABP1"
 """How a plot's numbers begin; a length of the header (uint32) follows."""
@@ -85,22 +88,26 @@ def _json(answer: Answer) -> Iterator[bytes]:
     yield b"]}"
 
 
-def _arrow(table: Table) -> Iterator[bytes]:
-    """Write an Arrow IPC stream; unit, path and labels stand in the metadata of the fields."""
+def arrow_table(table: Table) -> pa.Table:
+    """Return a pyarrow Table; unit, path and labels stand in the metadata of the fields."""
     import pyarrow as pa
 
-    def described(part: Table) -> pa.Table:
-        found = part.to_arrow()
-        fields = [
-            field.with_metadata(_metadata(column))
-            for field, column in zip(found.schema, part.fields, strict=True)
-        ]
-        return found.cast(pa.schema(fields, metadata={"item": table.item}))
+    found = table.to_arrow()
+    fields = [
+        field.with_metadata(_metadata(column))
+        for field, column in zip(found.schema, table.fields, strict=True)
+    ]
+    return found.cast(pa.schema(fields, metadata={"item": table.item}))
+
+
+def _arrow(table: Table) -> Iterator[bytes]:
+    """Write an Arrow IPC stream."""
+    import pyarrow as pa
 
     sink = io.BytesIO()
-    with pa.ipc.new_stream(sink, described(table.take(slice(0))).schema) as writer:
+    with pa.ipc.new_stream(sink, arrow_table(table.take(slice(0))).schema) as writer:
         for part in _slices(table):
-            writer.write_table(described(table.take(part)))
+            writer.write_table(arrow_table(table.take(part)))
             yield _taken(sink)
     yield _taken(sink)
 

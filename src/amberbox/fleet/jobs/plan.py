@@ -1,0 +1,52 @@
+"""What a download consists of: one piece per robot, or per mission of each robot."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from amberbox.blackbox.missions.mission import Mission, named
+from amberbox.core.timetext import format_time
+from amberbox.fleet.data.recorded import missions
+from amberbox.fleet.jobs.wanted import Wanted
+
+_FOREIGN = re.compile(r"[^A-Za-z0-9_.-]+")
+
+
+@dataclass(frozen=True, slots=True)
+class Piece:
+    """A range of one robot's record; ``folder`` is where it stands among the files."""
+
+    robot: str
+    folder: str
+    from_ns: int | None
+    to_ns: int | None
+
+
+def pieces(folder: Path, wanted: Wanted) -> Iterator[Piece]:
+    """Give the pieces of a download; raises UsageError for a mission that is not there."""
+    for robot in wanted.robots:
+        if not wanted.missions:
+            yield Piece(robot, safe(robot), wanted.from_ns, wanted.to_ns)
+            continue
+        known = missions(folder, robot)
+        chosen: dict[str, Mission] = {}
+        for text in wanted.missions:
+            chosen |= {mission.id: mission for mission in named(known, text)}
+        for mission in chosen.values():
+            place = f"{safe(robot)}/{safe(mission.id)}"
+            yield Piece(robot, place, mission.from_ns, mission.to_ns)
+
+
+def safe(name: str) -> str:
+    """Make a name of a file or folder, whatever a robot calls its things."""
+    return _FOREIGN.sub("_", name).lstrip(".")[:120] or "_"
+
+
+def file_name(wanted: Wanted, asked_ns: int, ending: str) -> str:
+    """Name the file of a download."""
+    who = wanted.robots[0] if len(wanted.robots) == 1 else f"{len(wanted.robots)}-robots"
+    moment = format_time(asked_ns)[:19].replace("-", "").replace(":", "")
+    return f"{safe(who)}-{moment}-{wanted.format}{ending}"
