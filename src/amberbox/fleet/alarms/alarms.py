@@ -38,6 +38,7 @@ class Alarms:
         self._bus = bus
         self._clock = clock
         self._url = public_url
+        self._made_ns = clock.wall_ns()
         self._inbox = Inbox()
         self._absence: Absence | None = None
         self._late = Lateness()
@@ -97,8 +98,9 @@ class Alarms:
         now_ns = self._clock.wall_ns()
         with self._database.reading() as connection:
             absence = absent_since_start(Register(connection), now_ns)
-            left: list[News] = list(boxes.missed_rows(connection))
+            left: list[News] = list(boxes.missed_rows(connection, self._made_ns))
         self._absence = absence
+        self._note_clocks(self._inbox.next())
         return self._take(left) if left else set()
 
     def _take(self, news: list[News]) -> set[int]:
@@ -107,9 +109,7 @@ class Alarms:
         now_ns = self._clock.wall_ns()
         rows = [one for one in news if isinstance(one, Received)]
         back = {one.robot for one in news if isinstance(one, Came)}
-        for one in news:
-            if isinstance(one, Came):
-                self._offsets[one.robot, one.boot_id] = one.offset_ns
+        self._note_clocks(news)
         with self._database.begin() as connection:
             settings = read(connection, NAME, AlarmSettings)
             register = Register(connection)
@@ -122,6 +122,11 @@ class Alarms:
         self._late.note(told, now_ns)
         self._move(news)
         return register.touched
+
+    def _note_clocks(self, news: list[News]) -> None:
+        for one in news:
+            if isinstance(one, Came):
+                self._offsets[one.robot, one.boot_id] = one.offset_ns
 
     def _move(self, news: list[News]) -> None:
         """Note who came and who went, in order."""

@@ -61,11 +61,13 @@ class Inbox:
             self._waiting.popleft()
 
 
-def missed_rows(connection: Connection) -> Iterator[Received]:
+def missed_rows(connection: Connection, until_ns: int) -> Iterator[Received]:
     """Yield rows that came before the server stopped, and were not looked at then."""
     mark = connection.execute(select(MARK.c.received_ns)).scalar() or 0
     chosen = select(ROW).where(
-        ROW.c.received_ns >= mark - _MARGIN_NS, ROW.c.channel.in_(sorted(CHANNELS))
+        ROW.c.received_ns >= mark - _MARGIN_NS,
+        ROW.c.received_ns <= until_ns,
+        ROW.c.channel.in_(sorted(CHANNELS)),
     )
     for row in connection.execute(chosen):
         found = Row(row.writer, row.run, row.seq, row.channel, row.log_ns, row.data)

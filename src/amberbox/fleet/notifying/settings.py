@@ -5,7 +5,7 @@ from __future__ import annotations
 import ipaddress
 import re
 from dataclasses import dataclass, field
-from datetime import UTC, datetime, time, timedelta
+from datetime import UTC, datetime, time, timedelta, tzinfo
 from typing import Final, Literal, TypeAlias
 from urllib.parse import urlsplit
 from zoneinfo import ZoneInfo
@@ -57,13 +57,13 @@ class Quiet:
         """Refuse times and zones that are none; raises ValueError."""
         time.fromisoformat(self.begin), time.fromisoformat(self.end)
         try:
-            ZoneInfo(self.zone)
-        except (OSError, ValueError) as error:
+            _zone(self.zone)
+        except (OSError, ValueError, KeyError) as error:
             raise ValueError(f"zone: there is no time zone {self.zone!r}") from error
 
     def until_ns(self, now_ns: int) -> int | None:
         """Return when it is over; None if it is not quiet now."""
-        now = datetime.fromtimestamp(now_ns / NS, UTC).astimezone(ZoneInfo(self.zone))
+        now = datetime.fromtimestamp(now_ns / NS, UTC).astimezone(_zone(self.zone))
         begin, end = time.fromisoformat(self.begin), time.fromisoformat(self.end)
         at = now.time()
         inside = begin <= at < end if begin <= end else at >= begin or at < end
@@ -144,6 +144,11 @@ class Notifications:
     def destination(self, name: str) -> Destination | None:
         """Return who has this name."""
         return next((one for one in self.destinations() if one.name == name), None)
+
+
+def _zone(name: str) -> tzinfo:
+    """Return a time zone; UTC also where the computer knows no others."""
+    return UTC if name == "UTC" else ZoneInfo(name)
 
 
 def check_url(url: str) -> None:

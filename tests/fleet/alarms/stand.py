@@ -1,0 +1,254 @@
+"""A server's alarms without a network: robots say something, time goes by, people are told."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from sqlalchemy import event, select
+
+from amberbox.core.clock import NS
+from amberbox.core.types import Diagnosis, Hypothesis, Level
+from amberbox.fleet.accounts.groups import add_group
+from amberbox.fleet.accounts.robotkeys import add_robot
+from amberbox.fleet.alarms.alarm import Alarm
+from amberbox.fleet.alarms.alarms import Alarms
+from amberbox.fleet.alarms.register import Register
+from amberbox.fleet.alarms.tables import ALARM, CONSEQUENCE, HISTORY
+from amberbox.fleet.bus import Bus, Change
+from amberbox.fleet.database.database import FILE, Database
+from amberbox.fleet.linkend import ledger
+from amberbox.fleet.notifying.message import Message
+from amberbox.fleet.notifying.settings import NAME, Destination, Notifications, Webhook
+from amberbox.fleet.notifying.tables import OUTBOX
+from amberbox.fleet.options.options import write
+from amberbox.link.frames import Hello, Row
+from amberbox.link.ledger import Admission
+from amberbox.monitoring.engine.findings import (
+    AlarmChange,
+    AlarmState,
+    Condition,
+    Finding,
+    Transition,
+)
+from amberbox.monitoring.messages.records import encoded
+from amberbox.monitoring.plan import Severity
+from amberbox.testing.clock import ManualClock
+from tests.fleet.database.portable import portable_database
+
+START_NS = 1_800_000_000 * NS
+STORE = "12345678-1234-1234-1234-123456789012"
+EVERYTHING = Notifications(webhooks=(Webhook("hook", "https://hook.example/", "0123456789abcdef"),))
+
+
+@dataclass
+class Stand:
+    """Alarms of a server, and who was told what."""
+
+    database: Database
+    clock: ManualClock
+    bus: Bus = field(default_factory=Bus)
+    told: list[tuple[str, Message]] = field(default_factory=list)
+    trouble: str = ""
+    published: list[int] = field(default_factory=list)
+    epochs: dict[str, int] = field(default_factory=dict)
+    places: dict[str, int] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.bus.on("alarm", lambda change: self.published.append(change.data["id"]))
+        self.alarms = self._made()
+
+    def _made(self) -> Alarms:
+        alarms = Alarms(self.database, self.bus, self.clock, "https://fleet.example")
+        alarms.sender.deliver = self._deliver
+        return alarms
+
+    def _deliver(self, to: Destination, message: Message, _: Notifications, __: int) -> str:
+        if not self.trouble:
+            self.told.append((to.name, message))
+        return self.trouble
+
+    def restart(self) -> None:
+        """Stop the server, without its having had a chance to do anything, and start it again."""
+        self.alarms.close()
+        self.alarms = self._made()
+
+    def set(self, name: str, value: object) -> None:
+        """Change a setting."""
+        with self.database.begin() as connection:
+            write(connection, self.clock.wall_ns(), name, value)
+
+    def add(self, robots: Iterable[str], groups: Iterable[str] = ()) -> None:
+        """Make robots known."""
+        with self.database.begin() as connection:
+            for robot in robots:
+                add_robot(connection, self.clock.wall_ns(), robot, groups)
+
+    def group(self, name: str) -> None:
+        """Make a group known."""
+        with self.database.begin() as connection:
+            add_group(connection, self.clock.wall_ns(), name)
+
+    def connect(self, *robots: str, behind_s: float = 0.0, boot: str = "b1") -> None:
+        """Let robots connect; their clocks are so far behind."""
+        for robot in robots:
+            wall_ns = self.clock.wall_ns() - round(behind_s * NS)
+            hello = Hello(robot, STORE, boot, {}, "hash", wall_ns, 0, "1.0")
+            with self.database.begin() as connection:
+                admission: Admission = ledger.admit(connection, hello, self.clock.wall_ns())
+            self.epochs[robot] = admission.epoch
+            told = {"hello": hello, "admission": admission}
+            self.bus.publish(Change("connected", robot, told))
+
+    def lose(self, *robots: str) -> None:
+        """End the connections to robots."""
+        for robot in robots:
+            self.bus.publish(Change("gone", robot))
+
+    def rows(self, robot: str, found: Iterable[Finding], at_ns: int | None = None) -> list[Row]:
+        """Make rows of what the watcher of a robot finds, written at a time by its clock."""
+        made = []
+        for finding in found:
+            channel, data = encoded(finding)
+            seq = self.places[robot] = self.places.get(robot, 0) + 1
+            log_ns = self.clock.wall_ns() if at_ns is None else at_ns
+            made.append(Row("watch", 1, seq, channel, log_ns, data))
+        return made
+
+    def send(self, robot: str, rows: list[Row], *, heard: bool = True) -> None:
+        """Let rows of a robot arrive; not ``heard`` if the server dies right after storing them."""
+        with self.database.begin() as connection:
+            stored = ledger.store(
+                connection, robot, self.epochs[robot], STORE, rows, {}, {}, self.clock.wall_ns()
+            )
+        if heard and stored.new:
+            told = {"store_id": STORE, "rows": stored.new}
+            self.bus.publish(Change("rows", robot, told))
+
+    def say(self, robot: str, *found: Finding) -> None:
+        """Let a robot find something now, and the server hear of it."""
+        self.send(robot, self.rows(robot, found))
+        self.alarms.step()
+
+    def hear(self, robot: str, *found: Finding) -> None:
+        """Let the alarms hear what a robot finds now, without storing its rows."""
+        told = {"store_id": STORE, "rows": self.rows(robot, found)}
+        self.bus.publish(Change("rows", robot, told))
+        self.alarms.step()
+
+    def wait(self, seconds: float, step_s: float = 1.0) -> None:
+        """Let time go by, for the server too."""
+        end_ns = self.clock.wall_ns() + round(seconds * NS)
+        while self.clock.wall_ns() < end_ns:
+            self.clock.advance(min(step_s, (end_ns - self.clock.wall_ns()) / NS))
+            self.alarms.step()
+            self.alarms.sender.step()
+
+    def found(self) -> list[Alarm]:
+        """Return the alarms there are, but for those that are part of others."""
+        with self.database.reading() as connection:
+            return Register(connection).alarms(ALARM.c.merged_into.is_(None))
+
+    def only(self) -> Alarm:
+        """Return the one alarm there is."""
+        (alarm,) = self.found()
+        return alarm
+
+    def history(self, number: int) -> list[str]:
+        """Return what happened to an alarm, in words."""
+        chosen = select(HISTORY.c.what).where(HISTORY.c.alarm == number).order_by(HISTORY.c.number)
+        with self.database.reading() as connection:
+            return list(connection.execute(chosen).scalars())
+
+    def suffering(self, number: int) -> dict[str, bool]:
+        """Return which components suffer (True) or suffered (False) from an alarm's root."""
+        chosen = select(CONSEQUENCE).where(CONSEQUENCE.c.alarm == number)
+        with self.database.reading() as connection:
+            return {r.component: r.to_ns is None for r in connection.execute(chosen)}
+
+    def outbox(self) -> list[dict[str, Any]]:
+        """Return all messages."""
+        with self.database.reading() as connection:
+            rows = connection.execute(select(OUTBOX).order_by(OUTBOX.c.number)).mappings()
+            return [dict(row) for row in rows]
+
+
+@contextmanager
+def stand(folder: Path, *, portable: bool = False) -> Iterator[Stand]:
+    """Keep a stand for the time of a test; somebody wants to hear of everything.
+
+    With ``portable`` every statement is checked to be one that PostgreSQL takes, which takes time.
+    """
+    clock = ManualClock(START_NS)
+    opened = portable_database if portable else _database
+    with opened(folder, clock) as database:
+        event.listen(database.engine, "connect", _hurry)
+        database.engine.dispose()
+        one = Stand(database, clock)
+        one.set(NAME, EVERYTHING)
+        one.add(["r1"])
+        one.connect("r1")
+        yield one
+        one.alarms.close()
+
+
+@contextmanager
+def _database(folder: Path, clock: ManualClock) -> Iterator[Database]:
+    database = Database(folder / FILE, clock)
+    try:
+        yield database
+    finally:
+        database.close()
+
+
+def _hurry(connection: Any, _record: object) -> None:
+    """Wait for no disk: what a power cut does to a database is tested elsewhere."""
+    connection.execute("PRAGMA synchronous=OFF").close()
+
+
+def alarm(
+    stand: Stand,
+    component: str = "laser",
+    state: AlarmState = "open",
+    *,
+    source: str = "",
+    severity: Severity = "urgent",
+    level: Level = "error",
+    reason: str = "it does not work",
+    count: int = 1,
+    opened_ns: int | None = None,
+    changed_ns: int | None = None,
+    cause: str = "",
+    diagnosis: str = "",
+) -> AlarmChange:
+    """Make what a robot says of an alarm of its own."""
+    now_ns = stand.clock.wall_ns()
+    opened = now_ns if opened_ns is None else opened_ns
+    changed = now_ns if changed_ns is None else changed_ns
+    return AlarmChange(
+        "r1", source or f"{component}-1", component, severity, state, level, reason, opened,
+        changed, count, "", None, "hash", cause=cause, diagnosis=diagnosis,
+    )  # fmt: skip
+
+
+def diagnosis(stand: Stand, *faults: str, share: float = 0.9, revision: int = 1) -> Diagnosis:
+    """Make a diagnosis with one answer, which names these failure modes."""
+    answer = Hypothesis("h1", frozenset(faults), share)
+    return Diagnosis("d1", revision, "r1", stand.clock.wall_ns(), "hash", (answer,), share)
+
+
+def blocked(stand: Stand, component: str, *by: str, level: Level = "error") -> Transition:
+    """Make the transition of a component that is blocked by others."""
+    before, after = Condition("ok", "nominal"), Condition(level, "working")
+    return Transition(
+        "r1", component, "", before, after, stand.clock.wall_ns(), "no data", by, "", "hash"
+    )
+
+
+def described(message: Message) -> dict[str, Any]:
+    """Return what a program is told."""
+    return dict(json.loads(json.dumps(message.data)))
