@@ -14,6 +14,7 @@ from amberbox.fleet.asking.asking import Asking
 from amberbox.fleet.bus import Bus
 from amberbox.fleet.database.database import Database
 from amberbox.fleet.feed.feed import Feed
+from amberbox.fleet.fetches.fetches import Fetches
 from amberbox.fleet.folders.folders import Folders
 from amberbox.fleet.jobs.jobs import Jobs
 from amberbox.fleet.linkend.server import LinkServer
@@ -40,6 +41,7 @@ class Services:
     folders: Folders
     asking: Asking
     jobs: Jobs
+    fetches: Fetches
     alarms: Alarms
     feed: Feed
     system: SystemLevel

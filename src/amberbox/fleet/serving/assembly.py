@@ -18,6 +18,7 @@ from amberbox.fleet.asking.asking import Asking
 from amberbox.fleet.bus import Bus, Change
 from amberbox.fleet.database.database import FILE, Database
 from amberbox.fleet.feed.feed import Feed
+from amberbox.fleet.fetches.fetches import Fetches
 from amberbox.fleet.folders.folders import Folders
 from amberbox.fleet.jobs.jobs import Jobs
 from amberbox.fleet.knowledge.announcing import announce
@@ -62,10 +63,10 @@ def assemble(
         folder=folder, settings=settings, clock=clock, database=database,
         passwords=passwords or Passwords(), bus=bus, archive=archive, links=links, desk=desk,
         folders=folders, asking=asking,
-        jobs=Jobs(folder, database, bus, clock),
+        jobs=Jobs(folder, database, bus, clock), fetches=Fetches(database, bus, clock, links),
         alarms=Alarms(database, bus, clock, settings.public_url),
         feed=Feed(database, bus, clock, links, state),
-        system=SystemLevel(folder, database, bus, clock),
+        system=SystemLevel(folder, bus, clock, links),
         keeping=Keeping(folder, database, bus, clock, archive),
         doors=Doorkeeper(database, bus, clock, links), threads=Threads(),
     )  # fmt: skip
@@ -74,8 +75,8 @@ def assemble(
 def parts(services: Services) -> Sequence[Part]:
     """Return what works in the background."""
     return (
-        services.folders, services.asking, services.jobs, services.alarms, services.feed,
-        services.system, services.keeping, services.doors,
+        services.folders, services.asking, services.jobs, services.fetches, services.alarms,
+        services.feed, services.system, services.keeping, services.doors,
     )  # fmt: skip
 
 

@@ -1,0 +1,163 @@
+"""Windows asked for, in the database: sent, answered, copied."""
+
+from __future__ import annotations
+
+import secrets
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import msgspec
+from sqlalchemy import Connection, Row, func, select, update
+
+from amberbox.core.errors import UsageError
+from amberbox.fleet.fetches.tables import FETCH
+from amberbox.fleet.uploads.tables import UPLOAD
+
+State = Literal["waiting", "asked", "copying", "ready", "gone", "cancelled"]
+OPEN: Sequence[State] = ("waiting", "asked", "copying")
+MOST_OPEN = 100
+"""Windows that wait for one robot."""
+
+_ENDED = ("verified", "aside", "quarantined")
+"""States of an upload that nothing more comes of."""
+
+
+class File(msgspec.Struct, frozen=True):
+    """A journal of a window: ``state`` is empty while it is to come, then that of its upload."""
+
+    store_id: str
+    journal: str
+    bytes: int
+    state: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Fetched:
+    """A window of a robot's record that somebody wants on the server."""
+
+    id: str
+    robot: str
+    item: str
+    from_ns: int
+    to_ns: int
+    who: str
+    state: State
+    files: Sequence[File]
+    asked_ns: int
+    sent_ns: int | None
+    ended_ns: int | None
+
+
+def add(
+    connection: Connection, now_ns: int, robot: str, who: str, item: str, span: tuple[int, int]
+) -> Fetched:
+    """Ask for a window; raises UsageError when too many wait for this robot."""
+    counted = select(func.count()).select_from(FETCH)
+    count = connection.scalar(counted.where(FETCH.c.robot == robot, FETCH.c.state.in_(OPEN))) or 0
+    if count >= MOST_OPEN:
+        raise UsageError(f"{count} windows of {robot} are waited for", "wait, or cancel some")
+    fetch_id = f"f-{secrets.token_hex(12)}"
+    row = {
+        "id": fetch_id, "robot": robot, "item": item, "from_ns": span[0], "to_ns": span[1],
+        "who": who, "state": "waiting", "files": "[]", "asked_ns": now_ns,
+    }  # fmt: skip
+    connection.execute(FETCH.insert(), [row])
+    found = find(connection, robot, fetch_id)
+    assert found is not None
+    return found
+
+
+def find(connection: Connection, robot: str, fetch_id: str) -> Fetched | None:
+    """Return what was asked for, of this robot."""
+    chosen = select(FETCH).where(FETCH.c.id == fetch_id, FETCH.c.robot == robot)
+    row = connection.execute(chosen).one_or_none()
+    return None if row is None else _fetched(row)
+
+
+def listed(connection: Connection, robot: str, after: str = "", limit: int = 100) -> list[Fetched]:
+    """Return what was asked of a robot, newest first, behind that of an id."""
+    chosen = select(FETCH).where(FETCH.c.robot == robot)
+    mark = find(connection, robot, after) if after else None
+    if mark is not None:
+        same = (FETCH.c.asked_ns == mark.asked_ns) & (FETCH.c.id > mark.id)
+        chosen = chosen.where((FETCH.c.asked_ns < mark.asked_ns) | same)
+    ordered = chosen.order_by(FETCH.c.asked_ns.desc(), FETCH.c.id).limit(limit)
+    return [_fetched(row) for row in connection.execute(ordered)]
+
+
+def waiting(connection: Connection, robot: str) -> list[Fetched]:
+    """Return what is open of a robot, in the order in which it was asked."""
+    chosen = select(FETCH).where(FETCH.c.robot == robot, FETCH.c.state.in_(OPEN))
+    return [_fetched(r) for r in connection.execute(chosen.order_by(FETCH.c.asked_ns, FETCH.c.id))]
+
+
+def robots(connection: Connection) -> list[str]:
+    """Return the robots of which something is waited for."""
+    chosen = select(FETCH.c.robot).where(FETCH.c.state.in_(OPEN)).distinct()
+    return list(connection.scalars(chosen))
+
+
+def sent(connection: Connection, now_ns: int, one: Fetched) -> bool:
+    """Note that the robot was asked; tell whether that is a change."""
+    changed = update(FETCH).where(FETCH.c.id == one.id, FETCH.c.state == "waiting")
+    return connection.execute(changed.values(state="asked", sent_ns=now_ns)).rowcount > 0
+
+
+def answered(
+    connection: Connection, now_ns: int, one: Fetched, named: Sequence[File]
+) -> Fetched | None:
+    """Note which journals a robot named; None where that changes nothing.
+
+    A robot that is asked again may have deleted meanwhile what it has handed in.
+    """
+    known = {(file.store_id, file.journal) for file in one.files}
+    more = [file for file in named if (file.store_id, file.journal) not in known]
+    if one.state not in OPEN:
+        return None
+    if not (one.files or more):
+        return _change(connection, one, state="gone", ended_ns=now_ns)
+    return looked(connection, now_ns, one, [*one.files, *more])
+
+
+def looked(
+    connection: Connection, now_ns: int, one: Fetched, files: Sequence[File]
+) -> Fetched | None:
+    """See which journals have come; None where that changes nothing."""
+    found = [_with_state(connection, one.robot, file) for file in files]
+    done = all(file.state for file in found)
+    state: State = "ready" if done else "copying"
+    if (list(one.files), one.state) == (found, state):
+        return None
+    text = msgspec.json.encode(found).decode()
+    return _change(connection, one, state=state, files=text, ended_ns=now_ns if done else None)
+
+
+def cancel(connection: Connection, now_ns: int, one: Fetched) -> bool:
+    """Want a window no more; tell whether it was open."""
+    changed = update(FETCH).where(FETCH.c.id == one.id, FETCH.c.state.in_(OPEN))
+    return connection.execute(changed.values(state="cancelled", ended_ns=now_ns)).rowcount > 0
+
+
+def _with_state(connection: Connection, robot: str, file: File) -> File:
+    if file.state:
+        return file
+    chosen = select(UPLOAD.c.state).where(
+        UPLOAD.c.robot == robot, UPLOAD.c.store_id == file.store_id,
+        UPLOAD.c.journal == file.journal, UPLOAD.c.state.in_(_ENDED),
+    )  # fmt: skip
+    states = set(connection.scalars(chosen))
+    best = next((state for state in _ENDED if state in states), "")
+    return msgspec.structs.replace(file, state=best)
+
+
+def _change(connection: Connection, one: Fetched, **values: Any) -> Fetched | None:
+    connection.execute(update(FETCH).where(FETCH.c.id == one.id).values(**values))
+    return find(connection, one.robot, one.id)
+
+
+def _fetched(row: Row[Any]) -> Fetched:
+    return Fetched(
+        row.id, row.robot, row.item, row.from_ns, row.to_ns, row.who, row.state,
+        msgspec.json.decode(row.files, type=list[File]), row.asked_ns, row.sent_ns, row.ended_ns,
+    )  # fmt: skip
