@@ -18,6 +18,7 @@ from tests.fleet.state.lives import (
     STATUS,
     connect,
     keep_folder,
+    put_alarm,
     say,
     status,
     transition,
@@ -56,6 +57,8 @@ def live(home: House) -> None:
     ]  # fmt: skip
     for seq, (channel, values) in enumerate(said):
         say(home, "ropod_001", channel, at_ns - (60 * NS if channel == EVENT else 0), seq, values)
+    put_alarm(home, 1, "ropod_001")
+    put_alarm(home, 2, "ropod_001", "ropod_002", severity="critical")
     home.services.feed.state._load("ropod_001")
 
 
@@ -67,6 +70,8 @@ def test_cards_say_what_is_worst_and_why(home: House) -> None:
     assert card["cause"] == "laser: front_laser_working is false, expected true"
     assert (card["backlog_rows"], card["backlog_bytes"]) == (7, 900)
     assert card["components"] == {"ok": 1, "error": 2}
+    assert (card["alarms"], card["severity"]) == (2, "critical")
+    assert cards["ropod_002"]["alarms"] == 1
     assert card["mission"]["name"] == "transport"
     assert card["battery"] == {"output": "charge_percent", "value": 81.5}
     never = cards["ropod_003"]

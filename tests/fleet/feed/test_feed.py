@@ -23,6 +23,7 @@ from amberbox.fleet.feed.delta import Ring
 from amberbox.fleet.feed.feed import MOST_EACH
 from tests.fleet.feed.listening import Stage, ask, hear, heard_within, stage
 from tests.fleet.house import URL, House, house
+from tests.fleet.state.lives import put_alarm
 
 
 @pytest.fixture
@@ -82,11 +83,13 @@ def test_robots_of_other_groups_never_appear(home: House) -> None:
             on.status("ropod_003")
             on.say("ropod_003", reserved.EVENT, kind="x", text="y")
             home.services.bus.publish(Change("alarm", "ropod_003", {"id": "a"}))
-            home.services.bus.publish(Change("alarm", "", {"id": "of many"}))
+            put_alarm(home, 7, "ropod_001", "ropod_003")
+            home.services.bus.publish(Change("alarm", "", {"id": 7}))
             home.services.bus.publish(Change("live", "ropod_003", {"values": {"odom/x": (1, 1.0)}}))
             on.status("ropod_001")
             found = await heard_within(socket, 0.4)
             assert {message["robot"] for message in found} == {"ropod_001"}
+            assert [m["data"]["id"] for m in found if m["kind"] == "alarm"] == [7]
             assert await _eventually_watched(home, "ropod_003") == ()
 
     asyncio.run(scene())
@@ -122,7 +125,7 @@ def test_of_jobs_only_the_owner_hears(home: House) -> None:
             for socket in (owner, other):
                 await ask(socket)
                 await hear(socket, "snapshot")
-            told = {"id": "j1", "owner": "user:technician"}
+            told = {"id": "j1", "owner": "technician"}
             home.services.bus.publish(Change("job", "ropod_001", told))
             on.status("ropod_001")
             assert (await hear(owner, "job"))["data"]["id"] == "j1"

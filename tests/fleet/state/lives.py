@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from typing import Any
 
 import msgspec
 
 from amberbox.blackbox.journal import reserved
 from amberbox.core.clock import NS
+from amberbox.fleet.alarms.alarm import Alarm
+from amberbox.fleet.alarms.tables import ALARM, ALARM_ROBOT
 from amberbox.fleet.linkend import board, ledger, presence
 from amberbox.fleet.linkend.server import Connected
 from amberbox.link.folders import pack
 from amberbox.link.frames import Beat, Hello, Row
 from amberbox.link.positions import Place, Reach, RunEnd
 from amberbox.link.serverend import ServerEnd
+from amberbox.monitoring.plan import Severity
 from tests.fleet.house import House
 from tests.fleet.linkend.test_server import FakeSocket
 
@@ -85,6 +89,16 @@ def transition(component: str, before: str, after: str, at_ns: int) -> dict[str,
 def keep_folder(home: House, robot: str) -> None:
     """Let a robot's folder be here."""
     assert home.services.folders.keep(robot, HASH, pack(FILES))
+
+
+def put_alarm(home: House, number: int, *robots: str, severity: Severity = "urgent") -> None:
+    """Let an alarm be open."""
+    one = robots[0] if len(robots) == 1 else ""
+    alarm = Alarm(number, "robot", one, "laser", severity, "error", "dead", 1, 1)
+    with home.services.database.begin() as connection:
+        connection.execute(ALARM.insert(), [asdict(alarm)])
+        rows = [{"alarm": number, "robot": robot, "from_ns": 1, "to_ns": None} for robot in robots]
+        connection.execute(ALARM_ROBOT.insert(), rows)
 
 
 STATUS, EVENT, MISSION = reserved.STATUS, reserved.EVENT, reserved.MISSION

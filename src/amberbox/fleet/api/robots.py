@@ -154,7 +154,7 @@ def read_link(
 
 def _cards(fleet: Services, connection: Connection, robots: Sequence[KnownRobot]) -> list[Card]:
     state = fleet.feed.state
-    return state.cards.of(connection, robots, fleet.clock.wall_ns(), state.open_alarms(connection))
+    return state.cards.of(connection, robots, fleet.clock.wall_ns())
 
 
 def _presence(connection: Connection, robot: str) -> Presence | None:

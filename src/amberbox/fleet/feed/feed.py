@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from typing import Any
 
@@ -21,6 +21,7 @@ from amberbox.fleet.feed.gate import permission
 from amberbox.fleet.feed.listener import Filter, Listener
 from amberbox.fleet.feed.live import EVERY_S, Live
 from amberbox.fleet.linkend.server import LinkServer
+from amberbox.fleet.state.openalarms import robots_of
 from amberbox.fleet.state.said import SaidStatus, status_data
 from amberbox.fleet.state.state import Snapshot, State
 
@@ -54,6 +55,7 @@ class Feed:
         self._is_due = False
         self._last_s = 0.0
         self._check = asyncio.Event()
+        self._tasks: set[asyncio.Task[None]] = set()
         self._making = asyncio.Semaphore(_MAKING)
         self._joined: dict[tuple[Filter, int, int], tuple[int, str]] = {}
         self._joined_at = 0
@@ -101,7 +103,7 @@ class Feed:
         yield from (("rows", self._rows), ("live", self._values))
         yield from (("connected", self._connected), ("gone", self._gone))
         yield from (("account", self._accounts), ("robot", self._accounts))
-        yield "alarm", lambda c: self.add("alarm", c.robot, dict(c.data))
+        yield "alarm", self._alarm
         yield "job", lambda c: self.add("job", c.robot, dict(c.data), str(c.data.get("owner", "")))
         yield "diagnosis", lambda c: self.add("diagnosis", c.robot, [dict(c.data)])
 
@@ -144,6 +146,23 @@ class Feed:
 
     def _gone(self, change: Change) -> None:
         self.add("presence", change.robot, {"online": False})
+
+    def _alarm(self, change: Change) -> None:
+        """Tell of an alarm; of one about several robots for each of them."""
+        if change.robot:
+            return self.add("alarm", change.robot, dict(change.data))
+        task = asyncio.create_task(self._common_alarm(change.data))
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+        return None
+
+    async def _common_alarm(self, data: Mapping[str, Any]) -> None:
+        for robot in await asyncio.to_thread(self._robots_of, data["id"]):
+            self.add("alarm", robot, dict(data))
+
+    def _robots_of(self, number: int) -> list[str]:
+        with self._database.reading() as connection:
+            return robots_of(connection, number)
 
     def _values(self, change: Change) -> None:
         self.live.take(change.robot, change.data["values"])

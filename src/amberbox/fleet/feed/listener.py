@@ -15,11 +15,10 @@ from amberbox.fleet.feed.gate import Credential, Permission
 class Filter:
     """What of all changes somebody hears; equal ones hear the same, but for their own jobs.
 
-    ``reach`` are the robots of each kind; with ``everything`` also what is about several robots.
+    ``reach`` are the robots of each kind.
     """
 
     reach: frozenset[tuple[str, frozenset[str]]]
-    everything: bool
     owners: frozenset[str] = field(compare=False)
 
     def chosen(self, deltas: Iterable[Delta]) -> list[Delta]:
@@ -29,11 +28,7 @@ class Filter:
             delta
             for delta in deltas
             if (robots := reach.get(delta.kind)) is not None
-            and (
-                delta.owner in self.owners
-                if delta.kind == "job"
-                else delta.robot in robots or (self.everything and not delta.robot)
-            )
+            and (delta.owner in self.owners if delta.kind == "job" else delta.robot in robots)
         ]
 
 
@@ -80,8 +75,8 @@ class Listener:
         asked, may = self.robots, self.permission.kinds
         reach = frozenset((kind, asked & may[kind]) for kind in kinds)
         principal = self.permission.principal
-        everything = principal.groups is None and self.asked.robots is None
-        self.filter = Filter(reach, everything, frozenset((self.who, principal.id)))
+        owner = principal.owner or principal.id  # tokens act for their owner
+        self.filter = Filter(reach, frozenset((owner,) if may["job"] else ()))
 
     def end(self, code: int, reason: str) -> None:
         """Have the socket closed."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from sqlalchemy import Connection
@@ -13,10 +13,10 @@ from amberbox.fleet.linkend.presence import Presence, presences
 from amberbox.fleet.linkend.server import LinkServer
 from amberbox.fleet.state.facts import FactsBook
 from amberbox.fleet.state.latest import Latest, Recent
+from amberbox.fleet.state.openalarms import OpenAlarms, open_alarms
 from amberbox.fleet.state.said import SaidStatus, moment
 from amberbox.fleet.state.standing import Standing, silence, standings
 from amberbox.fleet.state.views import Battery, Card, Lead, MissionView
-from amberbox.monitoring.engine.outputs import SEVERITIES
 
 _CHARGES = ("percent", "charge", "soc", "state_of_charge", "level")
 """Parts of the name of an output that says how full a battery is, the best first."""
@@ -37,16 +37,19 @@ class Cards:
         connection: Connection,
         robots: Sequence[KnownRobot],
         now_ns: int,
-        alarms: Mapping[str, int] | None = None,
     ) -> list[Card]:
-        """Return the cards of robots; ``alarms`` counts what is open, else the robots' own do."""
+        """Return the cards of robots."""
         names = [robot.id for robot in robots]
         statuses = standings(connection, names if len(names) <= _FEW else None)
         seen = {presence.robot: presence for presence in presences(connection)}
+        alarms = open_alarms(connection)
         return [
-            self._card(robot, seen.get(robot.id), statuses.get(robot.id, []), now_ns, alarms)
+            self._card(
+                robot, seen.get(robot.id), statuses.get(robot.id, []), now_ns,
+                alarms.get(robot.id, OpenAlarms()),
+            )
             for robot in robots
-        ]
+        ]  # fmt: skip
 
     def _card(
         self,
@@ -54,7 +57,7 @@ class Cards:
         presence: Presence | None,
         statuses: Sequence[Standing],
         now_ns: int,
-        alarms: Mapping[str, int] | None,
+        alarms: OpenAlarms,
     ) -> Card:
         link = self.links.robots.get(robot.id)
         online = link is not None
@@ -72,9 +75,9 @@ class Cards:
             moment(presence.connected_ns) if presence and online else None,
             link.backlog if link else presence.backlog if presence else 0,
             presence.backlog_bytes if presence else 0, presence.version if presence else "",
-            config_hash, "unknown" if silent else last_level, last_level, _severity(recent),
+            config_hash, "unknown" if silent else last_level, last_level, alarms.severity,
             silent or _cause(worst), dict(Counter(status.level for status in components)),
-            len(recent.alarms) if alarms is None else alarms.get(robot.id, 0),
+            alarms.count,
             _battery(statuses), _mission(recent), _lead(recent),
         )  # fmt: skip
 
@@ -90,11 +93,6 @@ def _cause(worst: SaidStatus | None) -> str:
     what = worst.reason or worst.state.replace("_", " ") or worst.level
     blocked = f" (blocked by {', '.join(worst.blocked_by)})" if worst.blocked_by else ""
     return f"{worst.component}: {what}{blocked}"
-
-
-def _severity(recent: Recent) -> str:
-    found = {alarm.severity for alarm in recent.alarms}
-    return next((severity for severity in reversed(SEVERITIES) if severity in found), "")
 
 
 def _battery(statuses: Sequence[Standing]) -> Battery | None:

@@ -1,4 +1,4 @@
-"""The newest missions, diagnoses and alarms of each robot: in memory, read again at a start."""
+"""The newest missions and diagnoses of each robot: in memory, read again at a start."""
 
 from __future__ import annotations
 
@@ -11,23 +11,22 @@ import msgspec
 
 from amberbox.blackbox.journal import reserved
 from amberbox.fleet.conclusions.reading import Stores, entries
-from amberbox.fleet.state.said import SaidAlarm, SaidDiagnosis, SaidMission, heard
+from amberbox.fleet.state.said import SaidDiagnosis, SaidMission, heard
 from amberbox.link.frames import Row
 
 _LOOK_BACK = 200
 """Records of each channel that are read at a start."""
 _KEPT = 200
-"""Missions, diagnoses and alarms that are remembered of a robot."""
+"""Missions and diagnoses that are remembered of a robot."""
 _KINDS: Mapping[str, type[msgspec.Struct]] = {
     reserved.MISSION: SaidMission,
     reserved.DIAGNOSIS: SaidDiagnosis,
-    reserved.ALARM: SaidAlarm,
 }
 
 
 @dataclass(slots=True)
 class Recent:
-    """What a robot said last of each mission, diagnosis and alarm, the newest at the end."""
+    """What a robot said last of each mission and diagnosis, the newest at the end."""
 
     said: dict[str, dict[str, Any]] = field(
         default_factory=lambda: {channel: {} for channel in _KINDS}
@@ -56,11 +55,6 @@ class Recent:
             d for d in self.said[reserved.DIAGNOSIS].values() if d.state != "healed" if d.hypotheses
         ]
         return known[-1] if known else None
-
-    @property
-    def alarms(self) -> list[SaidAlarm]:
-        """Return the alarms that have not healed."""
-        return [a for a in self.said[reserved.ALARM].values() if a.state != "healed"]
 
 
 class Latest:

@@ -51,7 +51,7 @@ class SaidStatus(msgspec.Struct, frozen=True):
     @property
     def rank(self) -> int:
         """Return how bad it is."""
-        return RANK.get(self.level, RANK["unknown"])  # type: ignore[call-overload,no-any-return]  # any text may come
+        return rank_of(self.level)
 
 
 class SaidMission(msgspec.Struct, frozen=True):
@@ -82,17 +82,6 @@ class SaidDiagnosis(msgspec.Struct, frozen=True):
     hypotheses: list[SaidHypothesis] = []
 
 
-class SaidAlarm(msgspec.Struct, frozen=True):
-    """An alarm after a change."""
-
-    id: str
-    component: str = ""
-    severity: str = ""
-    state: str = ""
-    reason: str = ""
-    opened_ns: int = 0
-
-
 class SaidEvent(msgspec.Struct, frozen=True):
     """An event; ``details`` is JSON."""
 
@@ -118,6 +107,12 @@ class SaidTransition(msgspec.Struct, frozen=True):
     after: SaidCondition = SaidCondition()
     at_ns: int = 0
     reason: str = ""
+
+
+def rank_of(level: str) -> int:
+    """Return how bad a level is; any text may come."""
+    ranks: dict[str, int] = dict(RANK.items())
+    return ranks.get(level, RANK["unknown"])
 
 
 def heard(data: bytes | str, kind: type[Kind]) -> Kind | None:

@@ -6,9 +6,9 @@ import asyncio
 import logging
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
-from sqlalchemy import Connection, select
+from sqlalchemy import select
 
 from amberbox.core.errors import AmberboxError
 from amberbox.fleet.accounts.robots import list_robots
@@ -28,13 +28,6 @@ from amberbox.fleet.state.standing import standings
 from amberbox.fleet.state.views import Card
 
 
-class AlarmCounter(Protocol):
-    """What counts open alarms."""
-
-    def counts(self, connection: Connection) -> dict[str, int]:
-        """Return how many alarms are open, by robot."""
-
-
 @dataclass(frozen=True, slots=True)
 class Snapshot:
     """How robots are at one moment."""
@@ -44,7 +37,7 @@ class Snapshot:
 
 
 class State:
-    """Newest missions, diagnoses and alarms, and what robots' folders say; threads may share it."""
+    """Newest missions and diagnoses, and what robots' folders say; threads may share it."""
 
     def __init__(
         self,
@@ -60,7 +53,6 @@ class State:
         self.latest = Latest()
         self.facts = FactsBook(folders, asking)
         self.cards = Cards(links, self.latest, self.facts)
-        self.alarms: AlarmCounter | None = None
         self._bus = bus
         self._wanted: asyncio.Queue[str] = asyncio.Queue()
 
@@ -81,15 +73,11 @@ class State:
             for end in ends:
                 end()
 
-    def open_alarms(self, connection: Connection) -> dict[str, int] | None:
-        """Return how many alarms are open, by robot; None where nothing counts them."""
-        return None if self.alarms is None else self.alarms.counts(connection)
-
     def snapshot(self, robots: Collection[str], now_ns: int, *, with_statuses: bool) -> Snapshot:
         """Return cards of robots, and their statuses."""
         with self.database.reading() as connection:
             known = [robot for robot in list_robots(connection) if robot.id in robots]
-            cards = self.cards.of(connection, known, now_ns, self.open_alarms(connection))
+            cards = self.cards.of(connection, known, now_ns)
             found = standings(connection) if with_statuses else {}
         statuses = {
             robot: [status_data(one.said) for one in found[robot]]

@@ -14,10 +14,10 @@ from amberbox.fleet.state.said import (
     SaidTransition,
     heard,
     moment,
+    rank_of,
     taken,
 )
 from amberbox.fleet.state.standing import Standing
-from amberbox.monitoring.engine.outputs import RANK
 from amberbox.monitoring.messages.records import COMPONENT_STATE
 
 _BEHIND = 2000
@@ -117,7 +117,7 @@ def shortened(
 
 
 def _joined(one: Stretch, other: Stretch) -> Stretch:
-    worst = max(one, other, key=lambda s: RANK.get(s.level, RANK["unknown"]))  # type: ignore[call-overload]  # any text may come
+    worst = max(one, other, key=lambda s: rank_of(s.level))
     return replace(
         worst, from_ns=one.from_ns, to_ns=other.to_ns, changes=one.changes + other.changes + 1
     )
