@@ -85,7 +85,13 @@ def add_handlers(app: FastAPI) -> None:
 
 def error(status: int, what: str, hint: str = "", headers: Any = None) -> JSONResponse:
     """Return an error as a response."""
-    return JSONResponse({"error": {"what": what, "hint": hint}}, status, headers)
+    said = {"what": _sayable(what), "hint": _sayable(hint)}
+    return JSONResponse({"error": said}, status, headers)
+
+
+def _sayable(text: str) -> str:
+    """Replace halves of surrogate pairs, which JSON lets in and UTF-8 does not let out."""
+    return text.encode("utf-8", "replace").decode("utf-8")
 
 
 def status_of(found: AmberboxError) -> int:

@@ -67,7 +67,11 @@ def change_setting(fleet: Fleet, who: Who, name: Named, value: Annotated[Any, Bo
 def _refuse(who: Caller, setting: Known, value: Any) -> None:
     if not who.may(setting.action):
         raise HTTPException(403, "you may not change this setting")
-    if len(msgspec.json.encode(value)) > _MOST_BYTES:
+    try:
+        size = len(msgspec.json.encode(value))
+    except (UnicodeEncodeError, RecursionError, msgspec.MsgspecError, OverflowError) as error:
+        raise UsageError("the setting has text or numbers that cannot be written") from error
+    if size > _MOST_BYTES:
         raise UsageError("the setting is too long", f"at most {_MOST_BYTES:,} bytes")
 
 
