@@ -58,6 +58,7 @@ def test_what_could_not_be_delivered_is_tried_again_and_shown(home: Stand) -> No
     home.wait(20)
     home.trouble = ""
     home.restart()
+    home.connect("r1")
     home.wait(3600, 60)
     assert [message.data["id"] for _, message in home.told] == [1, 2]
     assert {row["state"] for row in home.outbox()} == {"sent"}

@@ -95,7 +95,7 @@ def gather(connection: Connection, now_ns: int, setting: Notifications) -> int:
     """Make one message of those that are held and due, per destination; return how many."""
     chosen = (
         select(OUTBOX)
-        .where(OUTBOX.c.state == "held", OUTBOX.c.due_ns <= now_ns)
+        .where(OUTBOX.c.state == "held", OUTBOX.c.due_ns <= now_ns + _GATHER_NS)
         .order_by(OUTBOX.c.number)
     )
     held: dict[str, list[RowMapping]] = {}
@@ -103,6 +103,8 @@ def gather(connection: Connection, now_ns: int, setting: Notifications) -> int:
         held.setdefault(row["destination"], []).append(row)
     made = 0
     for destination, rows in held.items():
+        if min(row["due_ns"] for row in rows) > now_ns:
+            continue
         if _last_digest_ns(connection, destination) > now_ns - round(setting.digest_s * NS):
             continue
         connection.execute(OUTBOX.insert(), [_digest(destination, rows, now_ns)])
@@ -134,7 +136,7 @@ def _digest(destination: str, rows: Sequence[RowMapping], now_ns: int) -> dict[s
     return {
         "key": secrets.token_hex(16), "destination": destination, "kind": "digest", "alarm": 0,
         "severity": last["severity"], "state": "waiting",
-        "subject": f"{len(rows)} alarms, up to {last['severity']}", "body": shown + more,
+        "subject": f"{len(rows)} alarm{'s' * (len(rows) > 1)}, up to {last['severity']}", "body": shown + more,
         "data": json.dumps({"type": "digest", "count": len(rows), "alarms": alarms}),
         "created_ns": now_ns, "due_ns": now_ns, "tries": 0, "trouble": "", "sent_ns": None,
     }  # fmt: skip
