@@ -136,6 +136,8 @@ class Desk:
         if at != incoming.size:
             return Answer(409, at, text=f"{incoming.size - at} bytes are missing")
         key = self.public_key(incoming.robot, incoming.store_id)
+        if not key and proof is not None and ',"kind":"signed",' in proof.lines:
+            return Answer(503, at, text="the robot has to say first with which key it signs")
         path = self.root / incoming.part
         result = self.verifier.check(
             Claim(path, incoming.robot, incoming.store_id, incoming.journal, incoming.sha256,

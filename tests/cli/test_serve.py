@@ -1,0 +1,332 @@
+"""``amberbox serve`` as a process: a robot joins it over TLS, and nothing it told is lost."""
+
+from __future__ import annotations
+
+import asyncio
+import http.client
+import json
+import os
+import resource
+import signal
+import socket
+import ssl
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlencode
+
+import pytest
+from sqlalchemy import select
+
+from amberbox.blackbox.keeper.keeper import seal
+from amberbox.blackbox.signing.keys import open_keys
+from amberbox.blackbox.store import open_store
+from amberbox.cli.main import main
+from amberbox.fleet.accounts.joining import JoinLine, read_join_line
+from amberbox.fleet.accounts.robotkeys import revoke_keys
+from amberbox.fleet.archive.tables import JOURNALS
+from amberbox.fleet.database.database import Database
+from amberbox.fleet.linkend.tables import COMMITTED, ROW
+from amberbox.link.frames import Bye, Hello, encode, from_server
+from amberbox.robot.link.copying import Copier, HttpSending
+from amberbox.robot.link.dialing import RefusedError, dial
+from amberbox.robot.link.options import LinkOptions
+from amberbox.robot.link.tls import PinError, context_for, fingerprint
+from tests.robot.link.rig import Watcher, client_of, held, linked, recorded, until
+
+PASSWORD = "four words without meaning"
+START_CPU_S = 3.0
+"""What a start may take of the processor; alone on a machine of today that is below 2 s."""
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def command(*words: object) -> list[str]:
+    return [sys.executable, "-m", "amberbox", "serve", *map(str, words)]
+
+
+@dataclass
+class Server:
+    """A server in a process of its own."""
+
+    data: Path
+    port: int
+    process: subprocess.Popen[str]
+    context: ssl.SSLContext | None = None
+    cpu_s: float = 0.0
+
+    def ask(
+        self, path: str, method: str = "GET", body: bytes | None = None,
+        headers: Mapping[str, str] | None = None,
+    ) -> tuple[int, bytes, Mapping[str, str]]:  # fmt: skip
+        """Send one request; raises OSError while nobody answers."""
+        if self.context is None:
+            client = http.client.HTTPConnection("127.0.0.1", self.port, timeout=10)
+        else:
+            client = http.client.HTTPSConnection(
+                "localhost", self.port, timeout=10, context=self.context
+            )
+        try:
+            client.request(method, path, body, dict(headers or {}))
+            answer = client.getresponse()
+            return answer.status, answer.read(), dict(answer.headers)
+        finally:
+            client.close()
+
+    def await_answer(self) -> None:
+        """Wait until it answers; note how much of the processor that took."""
+        for _ in range(3000):
+            assert self.process.poll() is None, self.process.communicate()
+            try:
+                self.ask("/setup")
+                break
+            except OSError:
+                time.sleep(0.01)
+        fields = Path(f"/proc/{self.process.pid}/stat").read_text().rpartition(")")[2].split()
+        self.cpu_s = (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+    def stop(self) -> tuple[int, str, float]:
+        """End it as systemd does; return its status, what it said, and how long that took."""
+        began_s = time.monotonic()
+        self.process.send_signal(signal.SIGTERM)
+        _, said = self.process.communicate(timeout=20)
+        return self.process.returncode, said, time.monotonic() - began_s
+
+
+def started(data: Path, *words: object, context: ssl.SSLContext | None = None) -> Server:
+    port = free_port()
+    process = subprocess.Popen(
+        command("--data", data, "--port", port, *words), stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    server = Server(data, port, process, context)
+    server.await_answer()
+    return server
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+    """A server with TLS of its own, listening beyond loopback, set up by somebody on it."""
+    data = tmp_path_factory.mktemp("serve") / "data"
+    assert main(["serve", "cert", "--data", str(data), "--host", "localhost"]) == 0
+    context = ssl.create_default_context(cafile=str(data / "tls" / "ca.pem"))
+    found = started(data, "--host", "0.0.0.0", context=context)
+    form = {"name": "anna", "password": PASSWORD, "again": PASSWORD}
+    kind = {"Content-Type": "application/x-www-form-urlencoded"}
+    assert found.ask("/setup", "POST", urlencode(form).encode(), kind)[0] == 200
+    yield found
+    if found.process.poll() is None:
+        found.stop()
+
+
+@pytest.fixture(scope="module")
+def line(server: Server) -> JoinLine:
+    """What a robot is given, while the server runs."""
+    done = subprocess.run(
+        command("add-robot", "r1", "--data", server.data), capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    return read_join_line(done.stdout)
+
+
+def options_of(line: JoinLine) -> LinkOptions:
+    return LinkOptions(line.url, line.robot, line.key, line.ca)
+
+
+def test_it_starts_soon(server: Server) -> None:
+    print(f"{server.cpu_s:.2f} s of the processor until it answered")
+    assert server.cpu_s < START_CPU_S
+
+
+def test_a_second_process_on_the_folder_is_told_who_is_there(server: Server) -> None:
+    second = subprocess.run(
+        command("--data", server.data, "--port", free_port()), capture_output=True, text=True
+    )
+    assert second.returncode == 2
+    assert f"process {server.process.pid}" in second.stderr
+    assert "hint: stop that one first" in second.stderr
+
+
+def test_who_was_made_admin_signs_in(server: Server) -> None:
+    body = json.dumps({"name": "anna", "password": PASSWORD}).encode()
+    status, answer, headers = server.ask(
+        "/api/v1/session", "POST", body, {"Content-Type": "application/json"}
+    )
+    assert (status, json.loads(answer)["role"]) == (200, "admin")
+    assert "Secure" in headers["set-cookie"] and "strict-transport-security" in headers
+    assert server.ask("/setup")[0] == 404
+    assert not (server.data / "setup-code").exists()
+
+
+def test_a_robot_pins_the_authority(server: Server, line: JoinLine, tmp_path: Path) -> None:
+    assert line.url == f"https://localhost:{server.port}"
+    assert fingerprint(server.ask("/link/v1/ca.pem")[1]) == line.ca
+    assert context_for(line.url, line.ca, tmp_path) is not None
+    with pytest.raises(PinError):
+        context_for(line.url, "0" * 64, tmp_path)
+
+
+def test_what_a_robot_says_arrives_and_its_journals_become_columns(
+    server: Server, line: JoinLine, tmp_path: Path
+) -> None:
+    path = tmp_path / "store"
+    watcher = Watcher(path)
+    open_keys(watcher.store)
+    watcher.write(50, 3)
+    client = client_of(watcher.store, 0)
+    client.options = options_of(line)
+    with_database = Database(server.data / "server.db", read_only=True)
+
+    async def scene() -> None:
+        async with linked(client):
+            await until(lambda: len(held(with_database)) == 53)
+            assert held(with_database) == recorded(path)
+            watcher.close()
+            seal(open_store(path))
+            context = await asyncio.to_thread(context_for, line.url, line.ca, path)
+            sending = HttpSending(client.options, lambda: context)
+            copier = Copier(open_store(path), client.options, sending)
+            while await asyncio.to_thread(copier.step):
+                pass
+            sending.close()
+            await until(lambda: committed(with_database) == {"committed"}, 30)
+            await until(lambda: held(with_database) == {}, 10)
+
+    asyncio.run(scene())
+    with with_database.reading() as connection:
+        assert connection.execute(select(COMMITTED.c.to_seq)).scalars().all() != []
+        assert connection.execute(select(ROW)).first() is None, "the cache is empty again"
+    with_database.close()
+    assert main(["items", str(server.data)]) == 0
+
+
+def committed(database: Database) -> set[str]:
+    with database.reading() as connection:
+        return set(connection.execute(select(JOURNALS.c.state)).scalars())
+
+
+def hello(robot: str) -> Any:
+    return Hello(robot, "store", "boot", {}, "", 0, 0, "1")
+
+
+def test_a_robot_that_claims_to_be_another_is_sent_away(
+    server: Server, line: JoinLine, tmp_path: Path
+) -> None:
+    async def scene() -> None:
+        context = await asyncio.to_thread(context_for, line.url, line.ca, tmp_path)
+        socket_ = await dial(options_of(line), context)
+        await socket_.send(encode(hello("r2")))
+        answer = from_server(await socket_.receive())
+        assert isinstance(answer, Bye) and answer.for_good
+        await socket_.close()
+        wrong = LinkOptions(line.url, "r2", line.key, line.ca)
+        with pytest.raises(RefusedError):
+            await dial(wrong, context)
+
+    asyncio.run(scene())
+
+
+def test_a_key_that_is_revoked_ends_the_open_connection(server: Server, tmp_path: Path) -> None:
+    done = subprocess.run(
+        command("add-robot", "r3", "--data", server.data), capture_output=True, text=True
+    )
+    mine = read_join_line(done.stdout)
+
+    async def scene() -> None:
+        context = await asyncio.to_thread(context_for, mine.url, mine.ca, tmp_path)
+        socket_ = await dial(options_of(mine), context)
+        await socket_.send(encode(hello("r3")))
+        await socket_.receive()
+        database = Database(server.data / "server.db")
+        with database.begin() as connection:
+            revoke_keys(connection, time.time_ns(), "r3")
+        database.close()
+        answer = from_server(await asyncio.wait_for(socket_.receive(), 10))
+        assert isinstance(answer, Bye) and "key" in answer.reason
+        with pytest.raises(RefusedError):
+            await dial(options_of(mine), context)
+
+    asyncio.run(scene())
+
+
+def test_the_audit_log_holds_while_the_server_runs(
+    server: Server, line: JoinLine, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["serve", "verify-audit", "--data", str(server.data)]) == 0
+    head = capsys.readouterr().out.strip().partition("elsewhere: ")[2]
+    assert main(["serve", "verify-audit", "--data", str(server.data), "--head", head]) == 0
+    number = head.partition(" ")[0]
+    forged = f"{number} {'0' * 64}"
+    assert main(["serve", "verify-audit", "--data", str(server.data), "--head", forged]) == 1
+    assert "rewritten" in capsys.readouterr().out
+
+
+def test_it_ends_in_order_and_says_goodbye(server: Server, line: JoinLine, tmp_path: Path) -> None:
+    async def scene() -> tuple[int, str, float]:
+        context = await asyncio.to_thread(context_for, line.url, line.ca, tmp_path)
+        socket_ = await dial(options_of(line), context)
+        await socket_.send(encode(hello("r1")))
+        await socket_.receive()
+        ending = asyncio.create_task(asyncio.to_thread(server.stop))
+        answer = from_server(await asyncio.wait_for(socket_.receive(), 10))
+        assert answer == Bye("the server stops")
+        return await ending
+
+    status, said, took_s = asyncio.run(scene())
+    assert (status, said.partition("\n")[0][:19]) == (0, "To become an admin ")
+    assert took_s < 5
+    log = (server.data / "log" / "access.log").read_text().splitlines()
+    assert any(json.loads(entry)["principal"] == "robot:r1" for entry in log)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--host", "0.0.0.0"], "by TLS only"),
+        (["--behind-proxy", "10.0.0.5"], "what it is called"),
+        (["--host", "256.0.0.1", "--behind-proxy", "10.0.0.5", "--public-url", "https://f.example"],
+         "no address of this machine"),
+        (["cert"], "needs a name"),
+        (["cert", "--host", "a b"], "no name"),
+        (["add-robot"], "takes one ID"),
+        (["add-robot", "r1"], "no data folder"),
+        (["verify-audit"], "no data folder"),
+        (["certt"], "knows no 'certt'"),
+        (["--head", "1 abc"], "--head for verify-audit"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_is_told(
+    tmp_path: Path, words: list[str], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["serve", *words, "--data", str(tmp_path / "data")]) in (1, 2)
+    told = capsys.readouterr().err
+    assert said in told and "hint:" in told and "Traceback" not in told
+
+
+def test_a_port_that_is_taken_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        assert main(["serve", "--data", str(tmp_path), "--port", str(port)]) == 1
+    assert "Address already in use" in capsys.readouterr().err
+
+
+def test_file_limits_are_raised() -> None:
+    from amberbox.fleet.serving.process import raise_file_limit
+
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    try:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (min(512, hard), hard))
+        raise_file_limit()
+        assert resource.getrlimit(resource.RLIMIT_NOFILE)[0] >= min(hard, 4096)
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
