@@ -34,7 +34,8 @@ class Fetches:
         await self._look()
         while True:
             try:
-                change = await asyncio.wait_for(changes.get(), _LOOK_S)
+                async with asyncio.timeout(_LOOK_S):  # wait_for may swallow the end of the server
+                    change = await changes.get()
             except TimeoutError:
                 await self._look()
             else:

@@ -80,7 +80,8 @@ class Jobs:
                 await asyncio.to_thread(self._tidy)
                 continue
             with suppress(TimeoutError):
-                await asyncio.wait_for(self._asked.wait(), _LOOK_S)
+                async with asyncio.timeout(_LOOK_S):  # wait_for may swallow the end of the server
+                    await self._asked.wait()
             self._asked.clear()
             await asyncio.to_thread(self._tidy)
 
