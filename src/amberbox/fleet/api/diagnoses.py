@@ -128,7 +128,7 @@ def list_diagnoses(
 ) -> list[DiagnosisLine]:  # fmt: skip
     """List what a robot found to be broken, the newest first."""
     span = time_of(from_, fleet.clock), time_of(to, fleet.clock)
-    return [_line(one) for one in page(diagnoses(fleet, robot.id, *span), after, limit)]
+    return [line_of(one) for one in page(diagnoses(fleet, robot.id, *span), after, limit)]
 
 
 @routes.get("/robots/{robot}/diagnoses/{diagnosis}", "diagnoses.read")
@@ -140,7 +140,7 @@ def read_diagnosis(robot: OfRobot, diagnosis: Name, fleet: Fleet) -> DiagnosisDe
         said = notebook.causes(connection, robot.id, diagnosis)
         made = notebook.revisions(connection, robot.id, diagnosis)
     return DiagnosisDetail(
-        known.id, known.last.state, [_json(revision) for revision in known.revisions],
+        known.id, known.last.state, [revision_json(revision) for revision in known.revisions],
         [Answered(a.test, a.answer, a.who, format_time(a.at_ns)) for a in given],
         [ServerRevision(r.number, r.who, format_time(r.at_ns), r.body) for r in made],
         [CauseSaid(c.failure_mode, c.note, c.who, format_time(c.at_ns)) for c in said],
@@ -255,7 +255,8 @@ def _keep_cause(
         who.note(connection, cause.at_ns, "diagnoses.cause", robot, details=details)
 
 
-def _line(one: Known) -> DiagnosisLine:
+def line_of(one: Known) -> DiagnosisLine:
+    """Return a diagnosis as a list shows it."""
     leading = one.peak.hypotheses[:1]
     return DiagnosisLine(
         one.id, one.last.state, format_time(one.revisions[0].at_ns), format_time(one.last.at_ns),
@@ -264,7 +265,8 @@ def _line(one: Known) -> DiagnosisLine:
     )  # fmt: skip
 
 
-def _json(diagnosis: Diagnosis) -> dict[str, Any]:
+def revision_json(diagnosis: Diagnosis) -> dict[str, Any]:
+    """Return a revision as the robot wrote it."""
     shown = diagnosis_json(diagnosis)
     return {**{key: plain(value) for key, value in shown.items()},
             "symptoms": list(diagnosis.symptoms)}  # fmt: skip
