@@ -86,6 +86,7 @@ class Proxy:
         self.seed = seed
         self.connections = 0
         self.struck: list[Fault] = []
+        self.mangled: list[str] = []
         self._pairs: list[_Pair] = []
         self._stop = threading.Event()
         self._lock = threading.Lock()
@@ -136,6 +137,8 @@ class Proxy:
             self.connections += 1
             frames = self.faults.frames
             mangler = Mangler(frames, planned.seed) if frames is not None else None
+            if mangler is not None:
+                mangler.done = self.mangled
             with self._lock:
                 self._pairs.append(_Pair(client, server, planned, mangler))
 

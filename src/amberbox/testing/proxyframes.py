@@ -28,6 +28,8 @@ class _Direction:
     """One direction of a connection: bytes that are no whole frame yet, frames held back."""
 
     upgraded: bool = False
+    other: bool = False
+    """It is no WebSocket: everything passes untouched."""
     buffer: bytearray = field(default_factory=bytearray)
     swapped: bytes = b""
     held: list[tuple[int, bytes]] = field(default_factory=list)
@@ -45,12 +47,17 @@ class Mangler:
     def pass_on(self, data: bytes, *, up: bool) -> bytes:
         """Take bytes of one direction; return what goes on now."""
         way = self._ways[up]
+        if way.other:
+            return data
         way.buffer += data
         out = b""
         if not way.upgraded:
             head, found, _ = bytes(way.buffer).partition(b"\r\n\r\n")
             if not found:
                 return b""
+            if b"upgrade: websocket" not in head.lower():
+                way.other = True
+                return bytes(way.buffer)
             way.upgraded = True
             out, way.buffer = head + found, way.buffer[len(head) + len(found) :]
         while (size := _frame_size(way.buffer)) and len(way.buffer) >= size:

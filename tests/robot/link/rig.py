@@ -12,7 +12,7 @@ import msgspec
 from sqlalchemy import select
 from websockets.asyncio.server import ServerConnection, serve
 
-from amberbox.blackbox.follow.read import journals, sound_chunks
+from amberbox.blackbox.follow.read import JournalFile, journals, sound_chunks
 from amberbox.blackbox.journal import reserved
 from amberbox.blackbox.journal.chunk import sequences
 from amberbox.blackbox.keeper.ownjournal import OwnJournal, Record, event
@@ -82,17 +82,23 @@ def recorded(path: Path) -> Held:
     store = open_store(path)
     found: Held = {}
     for journal in journals(path):
-        if journal.writer not in limits.WRITERS:
-            continue
-        for chunk in sound_chunks(journal):
-            seq = sequences(chunk, journal.first_seq).tolist()
-            every = range(len(chunk))
-            messages = chunk.messages(every)  # type: ignore[arg-type]  # any index will do
-            for row, at, data in zip(every, seq, messages, strict=True):
-                topic = journal.streams[int(chunk.channel[row])].topic.name
-                if topic in limits.CHANNELS:
-                    place = store.id, journal.writer, journal.run, at
-                    found[place] = topic, int(chunk.log_ns[row]), data
+        if journal.writer in limits.WRITERS:
+            found |= conclusions_of(journal, store.id)
+    return found
+
+
+def conclusions_of(journal: JournalFile, store_id: str) -> Held:
+    """Return what of a journal goes over the link."""
+    found: Held = {}
+    for chunk in sound_chunks(journal):
+        seq = sequences(chunk, journal.first_seq).tolist()
+        every = range(len(chunk))
+        messages = chunk.messages(every)  # type: ignore[arg-type]  # any index will do
+        for row, at, data in zip(every, seq, messages, strict=True):
+            topic = journal.streams[int(chunk.channel[row])].topic.name
+            if topic in limits.CHANNELS:
+                place = store_id, journal.writer, journal.run, at
+                found[place] = topic, int(chunk.log_ns[row]), data
     return found
 
 

@@ -79,7 +79,9 @@ class StarletteSocket:
 
     async def close(self) -> None:
         """End the connection."""
+        from starlette.websockets import WebSocketDisconnect
+
         try:
             await self._websocket.close()
-        except RuntimeError:
-            return  # it is closed already
+        except (RuntimeError, WebSocketDisconnect, OSError):
+            return  # it is closed already, or the network is gone

@@ -6,6 +6,7 @@ import hashlib
 import multiprocessing
 import os
 import resource
+import threading
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
@@ -147,11 +148,20 @@ class Verifier:
 
 def _new_pool() -> ProcessPoolExecutor:
     return ProcessPoolExecutor(
-        1, mp_context=multiprocessing.get_context("spawn"), initializer=_limit
+        1, mp_context=multiprocessing.get_context("spawn"), initializer=_begin
     )
 
 
-def _limit() -> None:
-    """Keep the worker from taking the server's memory or time."""
+def _begin() -> None:
+    """Keep the worker from taking the server's memory or time, and from outliving a killed one."""
+    threading.Thread(target=_leave_with_parent, daemon=True).start()
     os.nice(_NICE)
     resource.setrlimit(resource.RLIMIT_AS, (_MEMORY_BYTES, _MEMORY_BYTES))
+
+
+def _leave_with_parent() -> None:
+    """End at once when the server has ended: it can be killed without a word to its workers."""
+    server = multiprocessing.parent_process()
+    if server is not None:
+        server.join()
+        os._exit(1)

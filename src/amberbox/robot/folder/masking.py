@@ -28,7 +28,7 @@ _YAML = frozenset({".yaml", ".yml"})
 _LEAST = 6
 """Shorter secrets are not looked for in other places: they would be found in every number."""
 _LEAST_IN_COMMENTS = 3
-_SOUNDS = r"(?:pass(?:word|wd|phrase)|secret|token|(?:api|private|access)[_-]?key|credential)"
+_SOUNDS = r"(?:pass(?:word|wd|phrase)|secret|token|(?:api|private|access)[ _-]?key|credential)"
 _SECRET_WORD = re.compile(_SOUNDS, re.IGNORECASE)
 _USER = re.compile(r"([a-zA-Z][a-zA-Z0-9+.-]*://)[^/\s@'\"<>]+@")
 _QUERY = re.compile(rf"([?&]\w*(?:{_SOUNDS}|key|sig)\w*=)[^&\s#'\"<>]+", re.IGNORECASE)

@@ -1,0 +1,188 @@
+"""Robots behind bad networks and their server, each a process that may be killed."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+import uuid
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from amberbox.blackbox.doctor.linked import STATE_FILE
+from amberbox.fleet.accounts.robotkeys import add_robot
+from amberbox.fleet.database.database import FILE, Database
+from amberbox.robot.joining.writing import write_key
+from amberbox.testing.proxy import Faults, Proxy
+from amberbox.testing.proxyframes import FrameFaults
+
+ROOT = Path(__file__).parents[3]
+BLACK_BOX = "- ros: {topics: [{name: /count}]}\n"
+NETWORK = Faults(
+    after_bytes=(500, 25_000), stall_s=1.0, rate=60_000,
+    frames=FrameFaults(duplicate=0.03, reorder=0.01, corrupt=0.005, hold=0.01),
+)  # fmt: skip
+
+
+def start(*command: str, log: Path) -> subprocess.Popen[bytes]:
+    """Start Python on something."""
+    environment = {**os.environ, "PYTHONPATH": f"{ROOT}:{ROOT / 'src'}"}
+    with log.open("ab") as said:
+        return subprocess.Popen(
+            [sys.executable, "-m", *command], cwd=ROOT, env=environment, stdin=subprocess.DEVNULL,
+            stdout=said, stderr=said,
+        )  # fmt: skip
+
+
+def kill(process: subprocess.Popen[bytes]) -> None:
+    """Kill a process without a word."""
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+
+
+@dataclass
+class Robot:
+    """One robot: a process that writes, its link, and its network."""
+
+    name: str
+    folder: Path
+    proxy: Proxy
+    lives: int = 0
+    boot: str = field(default_factory=lambda: str(uuid.uuid4()))
+    box: subprocess.Popen[bytes] | None = None
+    link: subprocess.Popen[bytes] | None = None
+    old: list[Path] = field(default_factory=list)
+    """Stores that it had before."""
+
+    @property
+    def store(self) -> Path:
+        return self.folder / "store"
+
+    @property
+    def log(self) -> Path:
+        return self.folder.parent / f"{self.name}.log"
+
+    def start_box(self) -> None:
+        """Begin to write."""
+        self.lives += 1
+        words = (str(self.store), self.name, self.boot, str(self.lives))
+        self.box = start("tests.fleet.endtoend.robotprocess", *words, log=self.log)
+
+    def start_link(self) -> None:
+        """Begin to link."""
+        self.link = start("amberbox", "link", str(self.folder), log=self.log)
+
+    @property
+    def is_linked(self) -> bool:
+        """Tell whether its link says that there is a connection."""
+        try:
+            return bool(json.loads((self.store / STATE_FILE).read_text())["connected"])
+        except (OSError, ValueError):
+            return False
+
+    def lose_power(self) -> None:
+        """Kill everything at once; the next start is another boot."""
+        for process in (self.box, self.link):
+            if process is not None:
+                kill(process)
+        self.boot = str(uuid.uuid4())
+
+    def start(self) -> None:
+        """Begin with everything."""
+        self.start_box()
+        self.start_link()
+
+    def wait(self) -> None:
+        """Wait until it writes."""
+        end_s = time.monotonic() + 40
+        while not any(self.store.glob("watch/*.mcap")):
+            assert time.monotonic() < end_s, self.log.read_text()[-3000:]
+            time.sleep(0.05)
+
+
+@dataclass
+class World:
+    """All of it; a context manager that leaves no process behind."""
+
+    folder: Path
+    count: int
+    seed: int
+    faults: Faults = NETWORK
+    robots: list[Robot] = field(default_factory=list)
+    server: subprocess.Popen[bytes] | None = None
+    port: int = 0
+
+    @property
+    def data(self) -> Path:
+        """Folder of the server."""
+        return self.folder / "server"
+
+    def __enter__(self) -> World:
+        with socket.create_server(("127.0.0.1", 0)) as free:
+            self.port = int(free.getsockname()[1])
+        self.data.mkdir()
+        database = Database(self.data / FILE)
+        for number in range(self.count):
+            self.robots.append(self._robot(f"r{number}", database))
+        database.close()
+        self.start_server()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for robot in self.robots:
+            for process in (robot.box, robot.link):
+                if process is not None and process.poll() is None:
+                    kill(process)
+            robot.proxy.__exit__()
+        if self.server is not None:
+            kill(self.server)
+
+    def start_server(self) -> None:
+        """Start the server."""
+        words = (str(self.data), str(self.port))
+        log = self.folder / "server.log"
+        self.server = start("tests.fleet.endtoend.serverprocess", *words, log=log)
+
+    def wait_for_server(self) -> None:
+        """Wait until the server listens."""
+        end_s = time.monotonic() + 40
+        while True:
+            try:
+                socket.create_connection(("127.0.0.1", self.port), 1.0).close()
+                return
+            except OSError:
+                assert time.monotonic() < end_s, (self.folder / "server.log").read_text()[-3000:]
+                time.sleep(0.1)
+
+    def wait_for_link(self) -> None:
+        """Wait for a while until a robot is linked, so that there is something to be cut."""
+        end_s = time.monotonic() + 5
+        while time.monotonic() < end_s and not any(robot.is_linked for robot in self.robots):
+            time.sleep(0.1)
+
+    def kill_server(self) -> None:
+        """Kill the server without a word."""
+        assert self.server is not None
+        kill(self.server)
+
+    def clear_networks(self) -> None:
+        """Let all networks be good from now on."""
+        for robot in self.robots:
+            robot.proxy.faults = Faults(kinds=("none",))
+            robot.proxy.cut()
+
+    def _robot(self, name: str, database: Database) -> Robot:
+        proxy = Proxy(self.port, self.faults, self.seed * 100 + len(self.robots))
+        proxy.__enter__()
+        folder = self.folder / name
+        folder.mkdir()
+        server = f"server: {{url: 'http://127.0.0.1:{proxy.port}'}}\n"
+        (folder / "robot.yaml").write_text(f"id: {name}\n{server}")
+        (folder / "black_box.yaml").write_text(BLACK_BOX)
+        with database.begin() as connection:
+            write_key(folder, add_robot(connection, time.time_ns(), name, ()).text)
+        return Robot(name, folder, proxy)
