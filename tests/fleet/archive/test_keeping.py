@@ -1,0 +1,263 @@
+"""The archive is kept going: committed as journals come, tidied, and its disk watched."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import shutil
+import signal
+from collections.abc import Awaitable, Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from sqlalchemy import func, insert, select
+
+from amberbox.blackbox.segments.entries import Tombstone, to_record
+from amberbox.blackbox.segments.lines import FIRST_HASH, encode
+from amberbox.core.errors import AmberboxError
+from amberbox.fleet.archive import settling
+from amberbox.fleet.archive.folder import FolderArchive
+from amberbox.fleet.archive.keeping import Keeping
+from amberbox.fleet.archive.options import RETENTION, RetentionRules
+from amberbox.fleet.archive.store import Retention
+from amberbox.fleet.archive.tables import BATCHES
+from amberbox.fleet.bus import Bus, Change
+from amberbox.fleet.database.database import FILE, Database
+from amberbox.fleet.linkend.events import link_events
+from amberbox.fleet.linkend.tables import ASIDE, COMMITTED, ROW
+from amberbox.fleet.options import options
+from amberbox.fleet.uploads.pieces import Incoming
+from amberbox.fleet.uploads.tables import UPLOAD
+from amberbox.link.history import LOST
+from amberbox.link.uploads import Proof
+from amberbox.testing.clock import ManualClock
+from tests.fleet.archive.recordings import Robot
+
+_GB = 1 << 30
+
+
+class Scene:
+    """An archive that is kept, with a disk that is as full as it is said to be."""
+
+    def __init__(self, folder: Path) -> None:
+        folder.mkdir()
+        self.clock, self.bus = ManualClock(), Bus()
+        self.database = Database(folder / FILE, self.clock)
+        self.archive = FolderArchive(folder, self.database, self.clock)
+        self.free = 50 * _GB
+        self.keeping = Keeping(folder, self.database, self.bus, self.clock, self.archive,
+                               every_s=0.0, usage=lambda _: (100 * _GB, 0, self.free))  # fmt: skip
+        self.heard: list[Change] = []
+        self.bus.on("committed", self.heard.append)
+        self.robot = Robot("r1", folder.parent)
+
+    def count(self, table: Any) -> int:
+        with self.database.reading() as connection:
+            return connection.execute(select(func.count()).select_from(table)).scalar() or 0
+
+    def early_rows(self, *seqs: int) -> None:
+        """Have rows come over the link before their journal."""
+        about = {"robot": "r1", "store_id": self.robot.store_id, "writer": "main", "run": 1}
+        rows = [
+            {**about, "seq": seq, "channel": "c", "log_ns": 1, "data": b"", "received_ns": 1}
+            for seq in seqs
+        ]
+        with self.database.begin() as connection:
+            connection.execute(insert(ROW), rows)
+
+    def hand_in(self) -> None:
+        """Have what the robot recorded come."""
+        self.robot.hand_in_all(self.archive)
+        self.bus.publish(Change("journal", "r1", {"state": "verified"}))
+
+    def play(self, play: Callable[[], Awaitable[None]]) -> None:
+        """Run the keeping beside what somebody does."""
+
+        async def both() -> None:
+            self.bus.attach(asyncio.get_running_loop())
+            task = asyncio.create_task(self.keeping.run())
+            try:
+                await asyncio.wait_for(play(), 30)
+            finally:
+                task.cancel()
+                await asyncio.gather(task, return_exceptions=True)
+
+        asyncio.run(both())
+
+
+async def until(what: Callable[[], bool]) -> None:
+    while not what():
+        await asyncio.sleep(0.02)
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Iterator[Scene]:
+    found = Scene(tmp_path / "server")
+    yield found
+    found.keeping.close()
+    found.database.close()
+
+
+def test_a_journal_is_committed_and_its_early_rows_go(scene: Scene) -> None:
+    scene.robot.record(0, files=2)
+
+    async def play() -> None:
+        scene.early_rows(0, 5, 10_000)
+        await asyncio.to_thread(scene.hand_in)
+        await until(lambda: bool(scene.heard))
+
+    scene.play(play)
+    assert scene.heard == [Change("committed", data={"robots": ["r1"]})]
+    assert len(scene.archive.robot("r1").query("odom", ["pose_x"])) == 80
+    with scene.database.reading() as connection:
+        assert connection.execute(select(ROW.c.seq)).scalars().all() == [10_000]
+        held = connection.execute(select(COMMITTED.c.from_seq, COMMITTED.c.to_seq)).all()
+    assert len(held) == 1 and held[0].from_seq == 0, "journals side by side are one stretch"
+    assert settling.settle(scene.database, scene.clock) == [], "done again it changes nothing"
+
+
+def test_where_nothing_waits_no_worker_is_started(scene: Scene) -> None:
+    async def play() -> None:
+        await asyncio.sleep(0.3)
+
+    scene.play(play)
+    assert scene.keeping._worker._process is None
+
+
+def test_a_worker_that_is_killed_is_started_again(scene: Scene) -> None:
+    scene.robot.record(0, files=1)
+
+    async def play() -> None:
+        os.kill(scene.keeping._worker.pid, signal.SIGKILL)
+        await asyncio.to_thread(scene.hand_in)
+        await until(lambda: bool(scene.heard))
+
+    scene.play(play)
+    assert scene.count(BATCHES) == 1 and scene.keeping.troubles() == []
+
+
+def test_what_a_worker_cannot_do_is_told_and_tried_again(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene.robot.record(0, files=1)
+    said: list[list[str]] = []
+    works = scene.keeping._worker.commit
+
+    def commit(every_s: float) -> Any:
+        if not said:
+            said.append([])
+            raise AmberboxError("the disk is full", "make room")
+        said.append(scene.keeping.troubles())
+        return works(every_s)
+
+    monkeypatch.setattr(scene.keeping._worker, "commit", commit)
+
+    async def play() -> None:
+        await asyncio.to_thread(scene.hand_in)
+        await until(lambda: bool(scene.heard))
+        await until(lambda: not scene.keeping.troubles())
+
+    scene.play(play)
+    assert said[1] == ["the archive: the disk is full"]
+
+
+def test_a_journal_that_was_verified_before_a_crash_is_taken_over(scene: Scene) -> None:
+    scene.robot.record(0, files=1)
+    for path in scene.robot.files():
+        _verified(scene, path)
+
+    async def play() -> None:
+        await until(lambda: bool(scene.heard))
+
+    scene.play(play)
+    assert len(scene.archive.robot("r1").query("odom", ["pose_x"])) == 40
+
+
+def _verified(scene: Scene, path: Path) -> None:
+    """Enter a journal as the desk does, and die before the archive hears of it."""
+    key = scene.robot.key(path)
+    place = scene.archive.layout.journal(key.robot, key.store_id, key.file)
+    place.parent.mkdir(parents=True, exist_ok=True)
+    shutil.copyfile(path, place)
+    numbers = dict.fromkeys(("run", "number", "first_seq", "end_seq", "start_ns", "end_ns"), 0)
+    row = {
+        "robot": key.robot, "store_id": key.store_id, "journal": key.file, "sha256": key.sha256,
+        "bytes": 1, "state": "verified", "reason": "", "signed": True, "writer": "main",
+        "path": str(place.relative_to(scene.archive.layout.folder)), "began_ns": 0,
+        "ended_ns": 0, **numbers,
+    }  # fmt: skip
+    with scene.database.begin() as connection:
+        connection.execute(insert(UPLOAD), [row])
+
+
+def test_what_a_power_cut_took_is_a_gap(scene: Scene) -> None:
+    scene.robot.record(0, files=1)
+    about = {"robot": "r1", "store_id": scene.robot.store_id, "writer": "watch", "run": 1}
+    rows = [
+        {**about, "seq": seq, "sha256": f"{seq:064}", "why": LOST, "channel": "c",
+         "log_ns": 1_000 + seq, "data": b"", "at_ns": 1}
+        for seq in (7, 8, 9)
+    ]  # fmt: skip
+    with scene.database.begin() as connection:
+        connection.execute(insert(ASIDE), rows)
+
+    async def play() -> None:
+        await asyncio.to_thread(scene.hand_in)
+        await until(lambda: bool(scene.heard))
+
+    scene.play(play)
+    [gap] = [gap for gap in scene.archive.robot("r1").gaps() if "power cut" in gap.reason]
+    assert (gap.from_seq, gap.to_seq, gap.count) == (7, 10, 3)
+
+
+def test_what_was_deleted_before_the_copy_is_a_gap_with_its_reason(scene: Scene) -> None:
+    scene.robot.record(0, files=2)
+    scene.hand_in()
+    gone = Tombstone(("journal/000002-x-0000.mcap",), "both", "main", 2, 100, 200, 5, 9, "",
+                     "no room", False, 10)  # fmt: skip
+    others = replace(gone, run=3, confirmed=True), replace(gone, run=4, what="columns")
+    records = [to_record(tombstone) for tombstone in (gone, *others)]
+    lines = encode(records, FIRST_HASH).decode() + "no line"
+    incoming = Incoming("r1", scene.robot.store_id, "", "", 0)
+    scene.keeping.note_deleted(incoming, Proof(lines))
+    found = scene.archive.robot("r1").gaps()
+    [gap] = [gap for gap in found if "deleted on the robot" in gap.reason]
+    assert (gap.run, gap.from_seq, gap.to_seq) == (2, 100, 200) and "no room" in gap.reason
+
+
+def test_data_go_by_the_rules_of_the_setting(scene: Scene) -> None:
+    scene.robot.record(0, files=3)
+    scene.robot.hand_in_all(scene.archive)
+    scene.archive.commit(0)
+    scene.clock.advance(3 * 24 * 3600)
+    with scene.database.begin() as connection:
+        rules = RetentionRules((Retention(journals_s=3600.0),))
+        options.write(connection, 0, RETENTION, rules)
+    before = len(list(scene.archive.layout.journals.rglob("*.mcap")))
+    scene.keeping.tidy(is_daily=False)
+    assert len(list(scene.archive.layout.journals.rglob("*.mcap"))) == before
+    scene.keeping.tidy(is_daily=True)
+    assert len(list(scene.archive.layout.journals.rglob("*.mcap"))) < before
+
+
+def test_a_disk_that_fills_is_told_and_takes_nothing_more(scene: Scene) -> None:
+    async def look(free: int) -> None:
+        scene.free = free
+        await scene.keeping._look_at_disk()
+
+    for free in (50 * _GB, 4 * _GB, 3 * _GB, _GB // 2, 60 * _GB):
+        asyncio.run(look(free))
+        assert scene.keeping.is_full == (free < _GB)
+        assert bool(scene.keeping.troubles()) == (free < 5 * _GB)
+    with scene.database.reading() as connection:
+        kinds = [event.kind for event in link_events(connection, "")]
+    assert kinds == ["disk_low", "disk_full", "disk_ok"], "each once"
+
+
+def test_an_end_does_not_wait_for_a_long_commit(scene: Scene) -> None:
+    process = scene.keeping._worker._running()
+    os.kill(process.pid, signal.SIGSTOP)  # as busy as can be
+    scene.keeping._worker.stop(0.1)
+    assert process.poll() == -signal.SIGKILL
