@@ -127,6 +127,15 @@ def test_what_is_said_no_more_counts_no_more(home: House) -> None:
     home.clock.advance(-60)
 
 
+def test_what_came_late_counts_as_old_as_it_is(home: House) -> None:
+    connect(home, "ropod_003")
+    at_ns = home.clock.wall_ns() - 8 * 3600 * NS
+    say(home, "ropod_003", STATUS, at_ns, 1, status("laser", "ok", at_ns))
+    card = home.client("viewer").get("/api/v1/robots/ropod_003").json()
+    assert (card["online"], card["level"], card["last_level"]) == (True, "unknown", "ok")
+    assert card["cause"] == "what it says is 8 h old"
+
+
 def test_the_timeline_shows_stretches(home: House) -> None:
     viewer = home.client("viewer")
     query = {"from": "2027-01-15T06:50:00Z", "to": "2027-01-15T07:00:00Z", "component": "laser"}

@@ -20,9 +20,9 @@ from amberbox.fleet.linkend.presence import Presence, presences
 from amberbox.fleet.services import Services
 from amberbox.fleet.state import links
 from amberbox.fleet.state.said import SaidEvent, moment, taken
-from amberbox.fleet.state.standing import clock_offset_ns, silence, standings
+from amberbox.fleet.state.standing import Moment, clock_offsets_ns, silence, standings
 from amberbox.fleet.state.timeline import Timeline, timeline
-from amberbox.fleet.state.tree import Moment, status_tree
+from amberbox.fleet.state.tree import status_tree
 from amberbox.fleet.state.views import Card, StatusTree
 
 routes = Routes("robots")
@@ -86,11 +86,12 @@ def read_status(fleet: Fleet, robot: OfRobot) -> StatusTree:
     with fleet.database.reading() as connection:
         statuses = standings(connection, [robot.id]).get(robot.id, [])
         seen = _presence(connection, robot.id)
-        offset_ns = clock_offset_ns(connection, robot.id, seen.boot_id) if seen else None
+        offset_ns = clock_offsets_ns(connection, [robot.id]).get(robot.id)
     online = robot.id in fleet.links.robots
     facts = fleet.feed.state.facts.read(robot.id, seen.config_hash if seen else "")
-    silent = silence(seen, online, statuses, now_ns)
-    return status_tree(robot.id, online, silent, statuses, facts, Moment(now_ns, offset_ns))
+    when = Moment(now_ns, offset_ns)
+    silent = silence(seen, online, statuses, when)
+    return status_tree(robot.id, online, silent, statuses, facts, when)
 
 
 @routes.get("/robots/{robot}/timeline", "status.read")

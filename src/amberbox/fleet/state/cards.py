@@ -15,7 +15,13 @@ from amberbox.fleet.state.facts import FactsBook
 from amberbox.fleet.state.latest import Latest, Recent
 from amberbox.fleet.state.openalarms import OpenAlarms, open_alarms
 from amberbox.fleet.state.said import SaidStatus, moment
-from amberbox.fleet.state.standing import Standing, silence, standings
+from amberbox.fleet.state.standing import (
+    Moment,
+    Standing,
+    clock_offsets_ns,
+    silence,
+    standings,
+)
 from amberbox.fleet.state.views import Battery, Card, Lead, MissionView
 
 _CHARGES = ("percent", "charge", "soc", "state_of_charge", "level")
@@ -42,10 +48,11 @@ class Cards:
         names = [robot.id for robot in robots]
         statuses = standings(connection, names if len(names) <= _FEW else None)
         seen = {presence.robot: presence for presence in presences(connection)}
-        alarms = open_alarms(connection)
+        alarms, offsets = open_alarms(connection), clock_offsets_ns(connection)
         return [
             self._card(
-                robot, seen.get(robot.id), statuses.get(robot.id, []), now_ns,
+                robot, seen.get(robot.id), statuses.get(robot.id, []),
+                Moment(now_ns, offsets.get(robot.id)),
                 alarms.get(robot.id, OpenAlarms()),
             )
             for robot in robots
@@ -56,12 +63,12 @@ class Cards:
         robot: KnownRobot,
         presence: Presence | None,
         statuses: Sequence[Standing],
-        now_ns: int,
+        when: Moment,
         alarms: OpenAlarms,
     ) -> Card:
         link = self.links.robots.get(robot.id)
         online = link is not None
-        silent = silence(presence, online, statuses, now_ns)
+        silent = silence(presence, online, statuses, when)
         components = [status.said for status in statuses if not status.said.mode]
         worst = _worst(components)
         last_level = worst.level if worst else "unknown"

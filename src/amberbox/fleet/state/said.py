@@ -13,6 +13,7 @@ import msgspec
 from amberbox.core.timetext import format_time
 from amberbox.monitoring.engine.outputs import RANK
 
+_RANKS: Mapping[str, int] = dict(RANK.items())
 _FIRST_NS, _BEYOND_NS = 1, 2**63
 Kind = TypeVar("Kind", bound=msgspec.Struct)
 
@@ -111,8 +112,7 @@ class SaidTransition(msgspec.Struct, frozen=True):
 
 def rank_of(level: str) -> int:
     """Return how bad a level is; any text may come."""
-    ranks: dict[str, int] = dict(RANK.items())
-    return ranks.get(level, RANK["unknown"])
+    return _RANKS.get(level, RANK["unknown"])
 
 
 def heard(data: bytes | str, kind: type[Kind]) -> Kind | None:

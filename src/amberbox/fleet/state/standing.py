@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from sqlalchemy import Connection, select
+from sqlalchemy import Connection, and_, select
 
 from amberbox.core.clock import NS
 from amberbox.fleet.linkend.presence import Presence
-from amberbox.fleet.linkend.tables import BOOT, STATUS
-from amberbox.fleet.state.said import SaidStatus, heard
+from amberbox.fleet.linkend.tables import BOOT, ROBOT, STATUS
+from amberbox.fleet.state.said import SaidStatus, heard, moment
 from amberbox.monitoring.messages.board import duration
 
 SILENT_NS = 10 * NS
@@ -26,6 +26,31 @@ class Standing:
     said: SaidStatus
     log_ns: int
     received_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class Moment:
+    """Now by the server's clock, and how far that is ahead of the robot's, if it is known."""
+
+    now_ns: int
+    offset_ns: int | None
+
+    def age_ns(self, status: Standing) -> int:
+        """Return how old a measurement is.
+
+        Differences of one clock each: since it came, from its writing to its coming, and on the
+        robot. Only the way over the link compares two clocks, by their offset.
+        """
+        since_ns = max(self.now_ns - status.received_ns, 0)
+        robot_ns = max(status.log_ns - status.said.measured_ns, 0) if status.said.measured_ns else 0
+        way_ns = 0
+        if self.offset_ns is not None:
+            way_ns = max(status.received_ns - status.log_ns - self.offset_ns, 0)
+        return since_ns + way_ns + robot_ns
+
+    def at(self, robot_ns: int) -> str | None:
+        """Write a time of the robot by the server's clock."""
+        return moment(robot_ns + (self.offset_ns or 0)) if robot_ns else None
 
 
 def standings(
@@ -49,16 +74,20 @@ def _watched(statuses: Sequence[Standing]) -> list[Standing]:
     return [status for status in statuses if status.log_ns >= newest_ns - _ROUND_NS]
 
 
-def clock_offset_ns(connection: Connection, robot: str, boot_id: str) -> int | None:
-    """Return how far the server's clock is ahead of the robot's in a boot."""
-    wanted = select(BOOT.c.offset_ns).where(BOOT.c.robot == robot, BOOT.c.boot_id == boot_id)
-    return connection.execute(wanted).scalar()
+def clock_offsets_ns(connection: Connection, robots: Sequence[str] | None = None) -> dict[str, int]:
+    """Return how far the server's clock is ahead of robots' in their present boots."""
+    same = and_(BOOT.c.robot == ROBOT.c.robot, BOOT.c.boot_id == ROBOT.c.boot_id)
+    wanted = select(BOOT.c.robot, BOOT.c.offset_ns).join(ROBOT, same)
+    if robots is not None:
+        wanted = wanted.where(BOOT.c.robot.in_(robots))
+    return {row.robot: row.offset_ns for row in connection.execute(wanted)}
 
 
 def silence(
-    presence: Presence | None, online: bool, statuses: Sequence[Standing], now_ns: int
+    presence: Presence | None, online: bool, statuses: Sequence[Standing], when: Moment
 ) -> str:
     """Say why nothing is known of a robot now; empty where something is."""
+    now_ns = when.now_ns
     if presence is None:
         return "it has never connected"
     if not online:
@@ -68,4 +97,5 @@ def silence(
     newest_ns = max(status.received_ns for status in statuses)
     if now_ns - newest_ns > SILENT_NS:
         return f"its watcher has said nothing for {duration(now_ns - newest_ns)}"
-    return ""
+    age_ns = min(when.age_ns(status) for status in statuses)
+    return f"what it says is {duration(age_ns)} old" if age_ns > SILENT_NS else ""

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 from amberbox.core.clock import NS
 from amberbox.fleet.state.facts import ComponentFacts, Facts, OutputFacts
-from amberbox.fleet.state.said import SaidOutput, moment
-from amberbox.fleet.state.standing import Standing
+from amberbox.fleet.state.said import SaidOutput
+from amberbox.fleet.state.standing import Moment, Standing
 from amberbox.fleet.state.views import (
     ComponentView,
     Condition,
@@ -19,31 +18,6 @@ from amberbox.fleet.state.views import (
 )
 
 _NOTHING = OutputFacts("")
-
-
-@dataclass(frozen=True, slots=True)
-class Moment:
-    """Now by the server's clock, and how far that is ahead of the robot's, if it is known."""
-
-    now_ns: int
-    offset_ns: int | None
-
-    def age_s(self, status: Standing) -> float:
-        """Return how old a measurement is.
-
-        Differences of one clock each: since it came, from its writing to its coming, and on the
-        robot. Only the way over the link compares two clocks, by their offset.
-        """
-        since_ns = max(self.now_ns - status.received_ns, 0)
-        robot_ns = max(status.log_ns - status.said.measured_ns, 0)
-        way_ns = 0
-        if self.offset_ns is not None:
-            way_ns = max(status.received_ns - status.log_ns - self.offset_ns, 0)
-        return round((since_ns + way_ns + robot_ns) / NS, 3)
-
-    def at(self, robot_ns: int) -> str | None:
-        """Write a time of the robot by the server's clock."""
-        return moment(robot_ns + (self.offset_ns or 0)) if robot_ns else None
 
 
 def status_tree(
@@ -92,7 +66,7 @@ def _condition(status: Standing, when: Moment) -> Condition:
     for_s = max(said.measured_ns - said.since_ns, 0) / NS if said.since_ns else 0.0
     return Condition(
         said.level, said.state, said.reason, said.blocked_by, when.at(said.measured_ns),
-        when.at(said.since_ns), when.age_s(status), round(for_s, 3),
+        when.at(said.since_ns), round(when.age_ns(status) / NS, 3), round(for_s, 3),
     )  # fmt: skip
 
 
