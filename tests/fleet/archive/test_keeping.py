@@ -19,8 +19,7 @@ from amberbox.blackbox.segments.lines import FIRST_HASH, encode
 from amberbox.core.errors import AmberboxError
 from amberbox.fleet.archive import settling
 from amberbox.fleet.archive.folder import FolderArchive
-from amberbox.fleet.archive.keeping import Keeping
-from amberbox.fleet.archive.options import RETENTION, RetentionRules
+from amberbox.fleet.archive.keeping import RETENTION, Keeping
 from amberbox.fleet.archive.store import Retention
 from amberbox.fleet.archive.tables import BATCHES
 from amberbox.fleet.bus import Bus, Change
@@ -233,8 +232,7 @@ def test_data_go_by_the_rules_of_the_setting(scene: Scene) -> None:
     scene.archive.commit(0)
     scene.clock.advance(3 * 24 * 3600)
     with scene.database.begin() as connection:
-        rules = RetentionRules((Retention(journals_s=3600.0),))
-        options.write(connection, 0, RETENTION, rules)
+        options.write(connection, 0, RETENTION, [Retention(journals_s=3600.0)])
     before = len(list(scene.archive.layout.journals.rglob("*.mcap")))
     scene.keeping.tidy(is_daily=False)
     assert len(list(scene.archive.layout.journals.rglob("*.mcap"))) == before

@@ -19,8 +19,8 @@ from amberbox.core.clock import Clock
 from amberbox.core.errors import AmberboxError
 from amberbox.fleet.archive import settling
 from amberbox.fleet.archive.folder import FolderArchive
-from amberbox.fleet.archive.options import RETENTION, RetentionRules
 from amberbox.fleet.archive.room import Room, Usage, room_of
+from amberbox.fleet.archive.store import Retention
 from amberbox.fleet.archive.worker import Worker
 from amberbox.fleet.bus import Bus, Change
 from amberbox.fleet.database.database import Database
@@ -32,6 +32,8 @@ from amberbox.link.uploads import Proof
 
 T = TypeVar("T")
 
+RETENTION = "retention"
+"""Name of the setting: a list of rules; without any everything is kept."""
 COMMIT_S = 60.0
 _GATHER_S = 1.0
 """So long a first journal waits for others: robots come home together."""
@@ -169,7 +171,7 @@ class Keeping:
             return
         if is_daily:
             with self._database.reading() as connection:
-                rules = options.read(connection, RETENTION, RetentionRules).rules
+                rules = options.read(connection, RETENTION, tuple[Retention, ...])
             self._worker.retain(*rules)
         self._worker.compact()
         self._worker.sweep()
