@@ -1,0 +1,128 @@
+"""``amberbox link`` as a process: killed again and again, and what is recorded has no gap."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from amberbox.blackbox.doctor.host import Host
+from amberbox.blackbox.doctor.linked import LOCK, judged_link, link, link_in_words
+from amberbox.blackbox.doctor.subject import subject
+from amberbox.blackbox.follow.read import journals
+from amberbox.blackbox.store import create_store, is_locked
+from amberbox.cli.main import main
+from amberbox.core.clock import NS
+from amberbox.core.source import TopicOptions
+from amberbox.robot.joining.writing import write_key
+from amberbox.testing.box import COUNT, ManualBox, number, raw_messages
+
+KEY = "abr_0123456789ab_" + "K" * 43
+
+
+def wait_until(is_so: Callable[[], bool], most_s: float = 30.0) -> None:
+    end_s = time.monotonic() + most_s
+    while not is_so():
+        assert time.monotonic() < end_s, "it never came to be"
+        time.sleep(0.02)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A robot folder whose server does not answer."""
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    (tmp_path / "robot.yaml").write_text(f"id: r1\nserver: {{url: 'http://127.0.0.1:{port}'}}\n")
+    (tmp_path / "black_box.yaml").write_text("- ros: {topics: [{name: /count}]}\n")
+    write_key(tmp_path, KEY)
+    return tmp_path
+
+
+@pytest.fixture
+def started() -> Iterator[list[subprocess.Popen[bytes]]]:
+    found: list[subprocess.Popen[bytes]] = []
+    yield found
+    for process in found:
+        if process.poll() is None:
+            process.kill()
+        process.wait()
+
+
+def start(folder: Path) -> subprocess.Popen[bytes]:
+    command = [sys.executable, "-m", "amberbox", "link", "--quiet", str(folder)]
+    return subprocess.Popen(command, stdin=subprocess.DEVNULL, env=dict(os.environ))
+
+
+def test_a_link_killed_20_times_leaves_no_gap(
+    folder: Path, started: list[subprocess.Popen[bytes]]
+) -> None:
+    box = ManualBox(folder / "store", [TopicOptions("/count")])
+    count, locked = 0, 0
+    store = box.pipeline.store
+    for kill in range(20):
+        started.append(start(folder))
+        end_s = time.monotonic() + (2.0 if kill < 3 else 0.15)  # some get to work, some do not
+        while time.monotonic() < end_s and not is_locked(store, LOCK):
+            box.hear(COUNT, number(count))
+            box.write()
+            count += 1
+            time.sleep(0.005)
+        locked += is_locked(store, LOCK)
+        started[-1].send_signal(signal.SIGKILL)
+        started[-1].wait()
+    box.close()
+    assert locked
+    found = [int.from_bytes(m, "little") for m in raw_messages(folder / "store", "/count")]
+    assert found == list(range(count)) and count > 20
+    assert not [d for journal in journals(folder / "store") for d in journal.damage]
+
+
+def test_it_ends_in_order_and_tells_how_it_is(
+    folder: Path, started: list[subprocess.Popen[bytes]], capsys: pytest.CaptureFixture[str]
+) -> None:
+    store = create_store(folder / "store")
+    process = start(folder)
+    started.append(process)
+    state = store.path / "link-state.json"
+    wait_until(lambda: state.exists() and bool(json.loads(state.read_text())["trouble"]))
+    [finding] = link(subject(folder), Host())
+    assert finding.level == "warn" and "no link to http://127.0.0.1" in finding.found
+    assert main(["link", str(folder)]) == 2, "a second one is refused"
+    assert "is being written by process" in capsys.readouterr().err
+    process.terminate()
+    assert process.wait(15) == 0
+    assert not is_locked(store, LOCK)
+    [finding] = link(subject(folder), Host())
+    assert "nothing links this robot" in finding.found
+
+
+@pytest.mark.parametrize(
+    ("remove", "what"), [("server.key", "there is no key in"), ("robot.yaml", "names no server")]
+)
+def test_without_server_or_key_it_says_how_to_join(
+    folder: Path, remove: str, what: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (folder / remove).unlink()
+    assert main(["link", str(folder)]) == 2
+    said = capsys.readouterr().err
+    assert what in said and "amberbox join" in said
+
+
+def test_the_doctor_says_how_the_link_is() -> None:
+    now_ns = 1_800_000_000 * NS
+    state = {"server": "https://f", "connected": True, "backlog": 0, "at_ns": now_ns}
+    assert judged_link(state, now_ns, "").level == "ok"
+    assert link_in_words(state, now_ns) == "linked to https://f, all is sent"
+    assert link_in_words({**state, "backlog": 12}, now_ns).endswith("12 rows wait")
+    late = judged_link(state, now_ns + 300 * NS, "")
+    assert (late.level, late.found) == ("warn", "the link to https://f has said nothing for 5 min")
+    cut = {**state, "connected": False, "trouble": "no way"}
+    assert link_in_words(cut, now_ns) == "no link to https://f: no way"

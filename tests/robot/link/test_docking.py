@@ -1,0 +1,41 @@
+"""Whether the robot is in its dock, by what it records."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+from amberbox.core.source import TopicOptions
+from amberbox.robot.link.docking import Dock
+from amberbox.testing.box import COUNT, ManualBox, number
+
+
+def wait_for(dock: Dock, docked: bool) -> None:
+    end_s = time.monotonic() + 10
+    while dock.docked is not docked:
+        assert time.monotonic() < end_s, (dock.docked, dock.problem)
+        time.sleep(0.02)
+
+
+def test_the_last_value_counts(tmp_path: Path) -> None:
+    box = ManualBox(tmp_path / "store", [TopicOptions("/count")])
+    box.hear(COUNT, number(0))
+    box.write()
+    dock = Dock(tmp_path / "store", "ros_count.data > 5")
+    assert dock.docked is None
+    dock.start()
+    wait_for(dock, docked=False)
+    box.hear(COUNT, number(9))
+    box.write()
+    wait_for(dock, docked=True)
+    box.hear(COUNT, number(1))
+    box.write()
+    wait_for(dock, docked=False)
+    dock.close()
+    box.close()
+
+
+def test_nobody_knows_without_an_expression(tmp_path: Path) -> None:
+    dock = Dock(tmp_path, "")
+    dock.start()
+    assert dock.docked is None
