@@ -21,6 +21,7 @@ from amberbox.fleet.archive.log import LiveFile
 from amberbox.fleet.archive.reading import Reader
 from amberbox.fleet.archive.segments import joined, segment_at
 from amberbox.fleet.archive.store import OWN, Retention
+from amberbox.fleet.data.remarks import pinned as marked
 
 _DATA = ("main", "bulk", "ring")
 _DAY_NS = 24 * 3600 * NS
@@ -33,7 +34,10 @@ def retain(layout: Layout, catalogue: Catalogue, rules: Sequence[Retention], now
     Whole days (UTC) go, so that files are not written anew for every journal. Return how many
     journals it concerned.
     """
-    pinned = {source: _windows(layout, catalogue, source) for source in catalogue.sources()}
+    pinned = {
+        source: [*_windows(layout, catalogue, source), *marked(catalogue.database, source.robot)]
+        for source in catalogue.sources()
+    }
     concerned: set[tuple[str, str, str]] = set()
     for row in catalogue.journals():
         if row.state != COMMITTED or _is_pinned(row, pinned[Source(row.robot, row.store_id)]):
@@ -50,7 +54,7 @@ def retain(layout: Layout, catalogue: Catalogue, rules: Sequence[Retention], now
 def _over(row: Row[Any], rules: Sequence[Retention], now_ns: int) -> Iterable[str]:
     """Name what of a journal is older than its rule."""
     age_s = (now_ns // _DAY_NS * _DAY_NS - row.put_ns) / NS
-    rule, own = _rule(row, row.keeping, rules), _rule(row, OWN, rules)
+    rule, own = rule_of(row.robot, row.keeping, rules), rule_of(row.robot, OWN, rules)
     if rule is not None and rule.journals_s is not None and age_s > rule.journals_s:
         yield "raw_gone"
     if rule is not None and rule.columns_s is not None and age_s > rule.columns_s:
@@ -59,12 +63,12 @@ def _over(row: Row[Any], rules: Sequence[Retention], now_ns: int) -> Iterable[st
         yield "own_gone"
 
 
-def _rule(row: Row[Any], keeping: str, rules: Sequence[Retention]) -> Retention | None:
+def rule_of(robot: str, keeping: str, rules: Sequence[Retention]) -> Retention | None:
     """Choose the rule that names robot and class most closely."""
     fitting = [
         rule
         for rule in rules
-        if rule.robot in ("*", row.robot)
+        if rule.robot in ("*", robot)
         and (rule.keeping == keeping or (rule.keeping == "*" and keeping in _DATA))
     ]
     return max(fitting, key=lambda rule: (rule.robot != "*", rule.keeping != "*"), default=None)

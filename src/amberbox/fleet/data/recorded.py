@@ -1,4 +1,4 @@
-"""Missions and incidents that robots have told of: in journals, or early over the link."""
+"""Missions and incidents: those robots have told of, and those people wrote down on the server."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+import msgspec
 
 from amberbox.blackbox.journal import reserved
 from amberbox.blackbox.missions.mission import Mission, of_record
@@ -16,6 +18,7 @@ from amberbox.fleet.archive.folder import FolderArchive
 from amberbox.fleet.archive.reading import Reader
 from amberbox.fleet.conclusions.entry import Entry
 from amberbox.fleet.conclusions.reading import MOST, entries
+from amberbox.fleet.data import remarks
 from amberbox.fleet.data.look import open_catalogue
 from amberbox.fleet.database.database import Database
 
@@ -29,13 +32,21 @@ class Stores:
 
 
 def missions(folder: Path, robot: str) -> list[Mission]:
-    """Return a robot's missions in order of their start, with times as they are known now."""
+    """Return a robot's missions in order of their start, with times as they are known now.
+
+    People's are among them.
+    """
     found: dict[str, Mission] = {}
     books = _Books(folder, robot)
     for entry in _entries(folder, robot, reserved.MISSION):
-        mission = of_record({**_MISSION, **entry.values})
+        try:
+            mission = of_record({**_MISSION, **entry.values})
+        except (msgspec.MsgspecError, TypeError, AttributeError):
+            continue  # kept as it came, but no mission that could be shown
         if mission.id not in found or found[mission.id].end is None:
             found[mission.id] = mission.corrected(books.of(entry.store_id))
+    with open_catalogue(folder).database.reading() as connection:
+        found |= {mission.id: mission for mission in remarks.missions(connection, robot)}
     return sorted(found.values(), key=lambda mission: (mission.from_ns, mission.id))
 
 

@@ -8,6 +8,8 @@ from typing import Any
 
 import msgspec
 
+from amberbox.fleet.archive.files import Layout
+from amberbox.fleet.archive.journal import sha256_of
 from amberbox.fleet.data import recorded
 from amberbox.fleet.data.asked import Asked
 from amberbox.fleet.data.forms import about_json, encoded
@@ -54,11 +56,22 @@ def gaps(folder: Path, arguments: Arguments) -> bytes:
 
 
 def missions(folder: Path, arguments: Arguments) -> bytes:
-    """List the missions that a robot told of, as JSON."""
-    found = recorded.missions(folder, arguments["robot"])
-    return msgspec.json.encode([mission.to_json() for mission in found])
+    """List the missions of a robot, as msgpack."""
+    return msgspec.msgpack.encode(recorded.missions(folder, arguments["robot"]))
 
 
 def incidents(folder: Path, arguments: Arguments) -> bytes:
     """List what a robot said last of each incident, as JSON."""
     return msgspec.json.encode(recorded.incidents(folder, arguments["robot"]))
+
+
+def altered(folder: Path, arguments: Arguments) -> bytes:
+    """Name the journals (store, file, SHA-256) whose content is not what it was, as JSON."""
+    layout = Layout(folder)
+    found = [
+        f"{store_id}/{file}"
+        for store_id, file, digest in arguments["journals"]
+        if (path := layout.journal(arguments["robot"], store_id, file)).exists()
+        and sha256_of(path) != digest
+    ]
+    return msgspec.json.encode(found)

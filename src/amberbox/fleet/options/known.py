@@ -14,6 +14,7 @@ from amberbox.core.errors import UsageError
 from amberbox.core.ids import is_id
 from amberbox.fleet.alarms.settings import AlarmSettings
 from amberbox.fleet.archive.store import OWN, Retention
+from amberbox.fleet.jobs.wanted import Downloads
 from amberbox.fleet.notifying.settings import Notifications
 
 _CLASSES = ("*", OWN, "main", "bulk", "ring", "watch", "keep", "kept")
@@ -46,6 +47,7 @@ def known() -> Mapping[str, Known]:
             _refuse_retention,
         ),
         "alarms": Known(AlarmSettings, "when alarms open, when they are over, who is missed"),
+        "downloads": Known(Downloads, "how long downloads are kept, and how much room they have"),
         "notifications": Known(Notifications, "who is told of alarms, by mail and by webhook"),
     }
 
