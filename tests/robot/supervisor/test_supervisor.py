@@ -255,3 +255,60 @@ def test_what_happened_is_left_for_the_record_and_for_others(stage: Stage) -> No
     state = json.loads((stage.box.store.path / STATE_FILE).read_text())
     assert state["children"]["watch"]["restarts"] == 1
     assert state["children"]["record"]["state"] == "off"
+
+
+def joined(stage: Stage) -> None:
+    """Have the folder name a server, with a key to it."""
+    (stage.folder / "robot.yaml").write_text("id: r1\nserver: {url: 'https://fleet.example'}\n")
+    (stage.folder / "server.key").write_text("abr_key\n")
+
+
+def test_a_folder_that_joins_a_server_is_linked_from_then_on(stage: Stage) -> None:
+    stage.begin()
+    joined(stage)
+    stage.judgement = Judgement(True, "", "two")
+    stage.pass_(10)
+    assert sorted(stage.theatre.names) == ["link", "record", "watch", "watch"]
+    assert stage.supervisor._known["link"]["state"] == "starting"
+
+
+def test_another_key_lets_only_the_link_begin_anew(stage: Stage) -> None:
+    joined(stage)
+    stage.supervisor._wanted = stage.supervisor._wishes()
+    stage.begin()
+    stage.pass_(10)
+    before = stage.theatre.names.count("link")
+    (stage.folder / "server.key").write_text("abr_another\n")
+    stage.judgement = Judgement(True, "", "one")
+    stage.pass_(15)
+    assert stage.theatre.names.count("link") == before + 1
+    assert stage.theatre.names.count("watch") == stage.theatre.names.count("record") == 1
+
+
+def test_the_link_ends_when_all_others_have(stage: Stage) -> None:
+    joined(stage)
+    stage.supervisor._wanted = stage.supervisor._wishes()
+    stage.begin()
+    stage.theatre.of("link").tell(READY)
+    for name in ("watch", "record"):
+        stage.theatre.of(name).obeys = False
+    stage.pass_(1)
+    stage.supervisor.stop()
+    stage.pass_(1)
+    assert signal.SIGTERM not in stage.theatre.of("link").sent
+    assert signal.SIGTERM in stage.theatre.of("watch").sent
+    stage.theatre.of("watch").status = 0
+    stage.pass_(1)
+    assert signal.SIGTERM in stage.theatre.of("record").sent
+    assert signal.SIGTERM not in stage.theatre.of("link").sent
+    stage.theatre.of("record").status = 0
+    stage.pass_(1)
+    assert signal.SIGTERM in stage.theatre.of("link").sent
+
+
+def test_without_a_key_there_is_nothing_to_link(stage: Stage) -> None:
+    joined(stage)
+    (stage.folder / "server.key").unlink()
+    stage.supervisor._wanted = stage.supervisor._wishes()
+    stage.begin()
+    assert stage.theatre.names == ["record", "watch"]
