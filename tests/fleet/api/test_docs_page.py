@@ -43,7 +43,7 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[House]:
 
 @pytest.fixture(scope="module")
 def text(home: House) -> str:
-    return home.client("viewer").get("/api/docs").text
+    return str(home.client("viewer").get("/api/docs").text)
 
 
 def test_every_route_and_socket_is_on_the_page(text: str) -> None:

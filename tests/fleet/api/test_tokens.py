@@ -35,7 +35,7 @@ def _make(client: TestClient, **more: Any) -> dict[str, str]:
 def _status(home: House, token: str, path: str = AUDITS) -> int:
     client = home.client()
     client.headers["Authorization"] = f"Bearer {token}"
-    return client.get(path).status_code
+    return int(client.get(path).status_code)
 
 
 def test_a_token_works_and_is_listed_without_its_secret(home: House) -> None:

@@ -54,7 +54,7 @@ def _urls(path: str) -> Iterator[str]:
             url = path
             for name in names:
                 value = nasty if name == chosen else KNOWN.get(name, "nothing")
-                url = re.sub(rf"{{{name}(:\w+)?}}", lambda _, v=value: quote(v, safe=""), url)
+                url = re.sub(rf"{{{name}(:\w+)?}}", quote(value, safe=""), url)
             yield url
 
 
