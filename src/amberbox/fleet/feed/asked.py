@@ -36,7 +36,7 @@ def parsed(text: str | bytes) -> Asked:
     try:
         asked = _DECODER.decode(text)
     except (msgspec.MsgspecError, ValueError, RecursionError) as error:
-        hint = 'send {"robots": null, "kinds": null, "live": {"ropod_001": ["odom/x"]}}'
+        hint = 'send {"robots": null, "kinds": null, "live": {"ropod_001": ["odom.x"]}}'
         raise UsageError(f"this cannot be subscribed to: {error}", hint) from error
     unknown = sorted(set(asked.kinds or ()) - KINDS)
     if unknown:

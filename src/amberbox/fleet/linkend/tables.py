@@ -2,11 +2,29 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from sqlalchemy import BigInteger, Boolean, Column, Index, LargeBinary, String, Table, Text
 
 from amberbox.fleet.database.metadata import METADATA, Counted, Digest, Id, Time
 
 _Word = String(128)
+
+
+def _run() -> tuple[Column[Any], ...]:
+    """Return the key columns of a run of a writer; each table needs columns of its own."""
+    return (
+        Column("robot", Id, primary_key=True),
+        Column("store_id", _Word, primary_key=True),
+        Column("writer", _Word, primary_key=True),
+        Column("run", BigInteger, primary_key=True, autoincrement=False),
+    )
+
+
+def _place() -> tuple[Column[Any], ...]:
+    """Return the key columns of a row's position."""
+    return (*_run(), Column("seq", BigInteger, primary_key=True, autoincrement=False))
+
 
 ROBOT = Table(
     "link_robot",
@@ -50,10 +68,7 @@ WRITER = Table(
 RUN = Table(
     "link_run",
     METADATA,
-    Column("robot", Id, primary_key=True),
-    Column("store_id", _Word, primary_key=True),
-    Column("writer", _Word, primary_key=True),
-    Column("run", BigInteger, primary_key=True, autoincrement=False),
+    *_run(),
     Column("boot", _Word, nullable=False),
     Column("end_seq", BigInteger, nullable=False),
 )
@@ -62,11 +77,7 @@ RUN = Table(
 ROW = Table(
     "link_row",
     METADATA,
-    Column("robot", Id, primary_key=True),
-    Column("store_id", _Word, primary_key=True),
-    Column("writer", _Word, primary_key=True),
-    Column("run", BigInteger, primary_key=True, autoincrement=False),
-    Column("seq", BigInteger, primary_key=True, autoincrement=False),
+    *_place(),
     Column("channel", _Word, nullable=False),
     Column("log_ns", BigInteger, nullable=False),
     Column("data", LargeBinary, nullable=False),
@@ -77,11 +88,7 @@ ROW = Table(
 ASIDE = Table(
     "link_aside",
     METADATA,
-    Column("robot", Id, primary_key=True),
-    Column("store_id", _Word, primary_key=True),
-    Column("writer", _Word, primary_key=True),
-    Column("run", BigInteger, primary_key=True, autoincrement=False),
-    Column("seq", BigInteger, primary_key=True, autoincrement=False),
+    *_place(),
     Column("sha256", Digest, primary_key=True),
     Column("why", _Word, nullable=False),
     Column("channel", _Word, nullable=False),
@@ -94,10 +101,7 @@ ASIDE = Table(
 COMMITTED = Table(
     "link_committed",
     METADATA,
-    Column("robot", Id, primary_key=True),
-    Column("store_id", _Word, primary_key=True),
-    Column("writer", _Word, primary_key=True),
-    Column("run", BigInteger, primary_key=True, autoincrement=False),
+    *_run(),
     Column("from_seq", BigInteger, primary_key=True, autoincrement=False),
     Column("to_seq", BigInteger, nullable=False),
 )
