@@ -48,6 +48,8 @@ class Shelf:
         try:
             for name, data in files.items():
                 _write(coming / name, data)
+            for name in files:  # all at once: the first takes the others along
+                _sync(coming / name)
             coming.chmod(0o755)
             coming.rename(place)
         except OSError:
@@ -88,5 +90,8 @@ def _write(path: Path, data: bytes) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("xb") as file:
         file.write(data)
-        file.flush()
+
+
+def _sync(path: Path) -> None:
+    with path.open("rb") as file:
         os.fsync(file.fileno())
