@@ -21,12 +21,12 @@ from amberbox.monitoring.messages.diagnoses import (
     symptom_of,
     symptom_values,
 )
+from amberbox.monitoring.messages.forms import FLAG, SAME, TIME_IF_ANY, WHOLE, Form, Forms, Values
 
 COMPONENT_STATE = "component_state"
 """Kind of the events that transitions are."""
 SOURCE = "watch"
 
-Values = Mapping[str, Any]
 _encode = msgspec.json.Encoder().encode
 
 
@@ -198,45 +198,17 @@ def transition_of(values: Values) -> Transition:
 
 def alarm_values(alarm: AlarmChange) -> Values:
     """Return what is written of an alarm after a change."""
-    return {
-        "id": alarm.id,
-        "robot": alarm.robot,
-        "component": alarm.component,
-        "severity": alarm.severity,
-        "state": alarm.state,
-        "level": alarm.level,
-        "reason": alarm.reason,
-        "opened_ns": alarm.opened_ns,
-        "changed_ns": alarm.changed_ns,
-        "count": alarm.count,
-        "who": alarm.who,
-        "until_ns": alarm.until_ns,
-        "cause": alarm.cause,
-        "diagnosis": alarm.diagnosis,
-        "config_hash": alarm.config_hash,
-        "live_only": alarm.live_only,
-    }
+    return _ALARM.write(alarm)
 
 
 def alarm_of(values: Values) -> AlarmChange:
     """Return the alarm that a record says."""
-    until_ns = values["until_ns"]
-    cause, diagnosis = values.get("cause", ""), values.get("diagnosis", "")  # not in older records
-    return AlarmChange(
-        id=values["id"],
-        robot=values["robot"],
-        component=values["component"],
-        severity=values["severity"],
-        state=values["state"],
-        level=values["level"],
-        reason=values["reason"],
-        opened_ns=int(values["opened_ns"]),
-        changed_ns=int(values["changed_ns"]),
-        count=int(values["count"]),
-        who=values["who"],
-        until_ns=None if until_ns is None else int(until_ns),
-        config_hash=values["config_hash"],
-        live_only=bool(values["live_only"]),
-        cause=cause,
-        diagnosis=diagnosis,
-    )
+    return _ALARM.read(values)
+
+
+_ALARM = Forms(AlarmChange, {
+    "id": SAME, "robot": SAME, "component": SAME, "severity": SAME, "state": SAME, "level": SAME,
+    "reason": SAME, "opened_ns": WHOLE, "changed_ns": WHOLE, "count": WHOLE, "who": SAME,
+    "until_ns": TIME_IF_ANY, "cause": Form(default=""), "diagnosis": Form(default=""),
+    "config_hash": SAME, "live_only": FLAG,
+})  # fmt: skip
