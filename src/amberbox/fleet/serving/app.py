@@ -38,5 +38,6 @@ def make_app(services: Services) -> FastAPI:
     app.add_middleware(Timed, counts=app.state.requests)
     add_handlers(app)
     for routes in rooms().values():
-        app.include_router(routes.router)
+        # not include_router: it would make every route anew, at the first request
+        app.router.routes.extend(routes.router.routes)
     return app
