@@ -135,13 +135,13 @@ class Stand:
         self.alarms.step()
 
     def hear(self, robot: str, *found: Finding) -> None:
-        """Let the alarms hear what a robot finds now, without storing its rows."""
+        """Tell the alarms what a robot finds now, which is stored nowhere; they look next."""
         told = {"store_id": STORE, "rows": self.rows(robot, found)}
         self.bus.publish(Change("rows", robot, told))
-        self.alarms.step()
 
-    def wait(self, seconds: float, step_s: float = 1.0) -> None:
-        """Let time go by, for the server too."""
+    def wait(self, seconds: float, step_s: float = 0.0) -> None:
+        """Let time go by, for the server too, which looks a dozen times or every second."""
+        step_s = step_s or max(1.0, seconds / 12)
         end_ns = self.clock.wall_ns() + round(seconds * NS)
         while self.clock.wall_ns() < end_ns:
             self.clock.advance(min(step_s, (end_ns - self.clock.wall_ns()) / NS))
@@ -233,6 +233,11 @@ def alarm(
         "r1", source or f"{component}-1", component, severity, state, level, reason, opened,
         changed, count, "", None, "hash", cause=cause, diagnosis=diagnosis,
     )  # fmt: skip
+
+
+def explained(stand: Stand, component: str = "laser", cause: str = "laser#x") -> AlarmChange:
+    """Make what a robot says of an alarm of its own that a diagnosis explains."""
+    return alarm(stand, component, cause=cause, diagnosis="d1")
 
 
 def diagnosis(stand: Stand, *faults: str, share: float = 0.9, revision: int = 1) -> Diagnosis:

@@ -43,7 +43,7 @@ def test_one_that_is_away_is_missed_after_a_while_and_comes_back(home: Stand) ->
     home.connect("r1")
     home.wait(30)
     assert (home.only().active, home.only().state) == (False, "open")
-    home.wait(31)
+    home.wait(34)
     assert home.only().state == "resolved"
     assert len(home.told) == 1
 

@@ -24,10 +24,22 @@ API = "/api/v1/alarms"
 @pytest.fixture
 def home(tmp_path: Path) -> Iterator[House]:
     with house(tmp_path / "server") as found:
-        found.services.alarms.step()
-        for robot in ("ropod_001", "ropod_003"):
-            say(found, robot)
+        settle(found)
         yield found
+
+
+@pytest.fixture(scope="module")
+def still(tmp_path_factory: pytest.TempPathFactory) -> Iterator[House]:
+    """Keep a house in which nothing changes."""
+    with house(tmp_path_factory.mktemp("still")) as found:
+        settle(found)
+        yield found
+
+
+def settle(home: House) -> None:
+    home.services.alarms.step()
+    for robot in ("ropod_001", "ropod_003"):
+        say(home, robot)
 
 
 def say(
@@ -49,8 +61,8 @@ def ids(answer: Any) -> list[int]:
     return [one["id"] for one in answer.json()]
 
 
-def test_they_are_listed_newest_first_and_by_page(home: House) -> None:
-    viewer = home.client("viewer")
+def test_they_are_listed_newest_first_and_by_page(still: House) -> None:
+    viewer = still.client("viewer")
     assert ids(viewer.get(API)) == [2, 1]
     assert ids(viewer.get(API, params={"limit": 1})) == [2]
     assert ids(viewer.get(API, params={"limit": 1, "after": 2})) == [1]
@@ -69,12 +81,12 @@ def test_they_are_listed_newest_first_and_by_page(home: House) -> None:
         ({"since": "now+1m"}, []),
     ],
 )
-def test_filters(home: House, params: dict[str, Any], found: list[int]) -> None:
-    assert ids(home.client("viewer").get(API, params=params)) == found
+def test_filters(still: House, params: dict[str, Any], found: list[int]) -> None:
+    assert ids(still.client("viewer").get(API, params=params)) == found
 
 
-def test_alarms_of_other_groups_are_not_there(home: House) -> None:
-    nurse = home.client("nurse")
+def test_alarms_of_other_groups_are_not_there(still: House) -> None:
+    nurse = still.client("nurse")
     assert ids(nurse.get(API)) == [1]
     assert ids(nurse.get(API, params={"robot": "ropod_003"})) == []
     there, missing = nurse.get(f"{API}/2"), nurse.get(f"{API}/77")
@@ -173,11 +185,11 @@ def test_that_it_got_worse_is_a_conflict(home: House) -> None:
     ],
 )
 def test_what_makes_no_sense_is_refused(
-    home: House, action: str, body: dict[str, Any], status: int
+    still: House, action: str, body: dict[str, Any], status: int
 ) -> None:
-    answer = home.client("operator").post(f"{API}/1/{action}", json=body)
+    answer = still.client("operator").post(f"{API}/1/{action}", json=body)
     assert (answer.status_code, answer.json()["error"]["what"] != "") == (status, True)
-    assert home.client("operator").get(f"{API}/1").json()["alarm"]["revision"] == 1
+    assert still.client("operator").get(f"{API}/1").json()["alarm"]["revision"] == 1
 
 
 def test_what_is_over_cannot_be_changed(home: House) -> None:

@@ -84,6 +84,7 @@ def test_a_restart_neither_loses_nor_doubles(home: Stand) -> None:
 
 def test_who_is_not_in_the_settings_any_more_gets_nothing(home: Stand) -> None:
     home.hear("r1", alarm(home))
+    home.alarms.step()
     home.set(NAME, Notifications())
     home.wait(5)
     assert home.told == []
@@ -136,6 +137,7 @@ def test_shelved_it_is_told_when_it_leaves_the_shelf_and_lasts(home: Stand) -> N
 
     home.set("alarms", AlarmSettings())
     home.hear("r1", alarm(home))
+    home.alarms.step()
     one = home.only()
     until_ns = home.clock.wall_ns() + 100 * NS
     with home.database.begin() as connection:

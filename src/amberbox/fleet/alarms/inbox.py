@@ -17,7 +17,8 @@ from amberbox.link.frames import Row
 
 _MARGIN_NS: Final = 10_000_000_000
 """So much of what came before the last mark is looked at again: it may have been on its way."""
-_AT_ONCE: Final = 2_000
+_AT_ONCE: Final = 100
+"""News in one transaction: others want to write, too."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
+from typing import Final
 
 from sqlalchemy import ColumnElement, Connection, and_, or_, select
 
@@ -17,6 +18,9 @@ from amberbox.fleet.alarms.tables import ALARM, ALARM_ROBOT
 from amberbox.fleet.notifying.outbox import Told, put
 from amberbox.fleet.notifying.settings import NAME, Notifications
 from amberbox.fleet.options.options import read
+
+_AT_ONCE: Final = 50
+"""Alarms that are told in one transaction, the oldest first; the others a moment later."""
 
 
 @dataclass(slots=True)
@@ -54,7 +58,7 @@ def pass_time(
     """Do what is due by now with all alarms."""
     for alarm in register.alarms(ALARM.c.state != "resolved", _is_over(now_ns, settings)):
         register.keep(alarm, machine.settled(alarm, now_ns, settings))
-    for alarm in register.alarms(_is_to_be_told(now_ns)):
+    for alarm in register.alarms(_is_to_be_told(now_ns))[:_AT_ONCE]:
         _tell(register, late, alarm, now_ns, settings, url)
 
 
