@@ -85,7 +85,8 @@ class _Counted:
         passed_s = asyncio.get_running_loop().time() - self._began_s
         patience_s = min(self._limit.pause_s, self._limit.whole_s - passed_s)
         try:
-            message = await asyncio.wait_for(self._receive(), max(patience_s, 0.001))
+            async with asyncio.timeout(max(patience_s, 0.001)):
+                message = await self._receive()
         except TimeoutError:
             raise HTTPException(408, "the body did not come", {"Connection": "close"}) from None
         self._is_whole = message["type"] != "http.request" or not message.get("more_body")
