@@ -59,9 +59,16 @@ class Declared:
 def declared(place: Path, robot: str, config_hash: str) -> Declared:
     """Read a copy of a robot's folder: only declarations, and only what is below it."""
     with only_below(place):
-        folder, _ = declared_folder(place, robot, config_hash)
-        plan, _ = load_plan(folder, own=False)
+        folder, plan = declared_plan(place, robot, config_hash)
         known = declared_of(folder, plan)
         path = place / FILE
         fmea, problems = load_fmea(path, known) if path.is_file() else (None, [])
     return Declared(folder, plan, known, fmea, problems)
+
+
+def declared_plan(place: Path, robot: str, config_hash: str) -> tuple[RobotFolder, Plan]:
+    """Return only what is to be monitored by a copy of a robot's folder."""
+    with only_below(place):
+        folder, _ = declared_folder(place, robot, config_hash)
+        plan, _ = load_plan(folder, own=False)
+    return folder, plan

@@ -8,18 +8,18 @@ from typing import Any
 
 import msgspec
 
-from amberbox.blackbox.folder.folder import load_folder
+from amberbox.consult.declared import declared_plan
 from amberbox.fleet.folders.shelf import Shelf
 from amberbox.fleet.state.facts import ComponentFacts, Facts, NeedFacts, OutputFacts
-from amberbox.monitoring.configuration.load import load_plan
 from amberbox.monitoring.messages.tree import branches
 from amberbox.monitoring.plan import ComponentPlan, Plan
 
 
 def facts(folder: Path, arguments: dict[str, Any]) -> bytes:
-    """Return what is to be monitored; raises ConfigurationError for a folder that is wrong."""
-    robot = load_folder(Shelf(folder).place(arguments["robot"], arguments["config_hash"]))
-    plan, _ = load_plan(robot)
+    """Return what is to be monitored; nothing of the folder is run, no store of it looked for."""
+    name, config_hash = arguments["robot"], arguments["config_hash"]
+    place = Shelf(folder).place(name, config_hash)
+    robot, plan = declared_plan(place, name, config_hash)
     return msgspec.json.encode(Facts(robot.robot.model, list(_components(plan))))
 
 
