@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,7 @@ from fastapi import FastAPI, Request
 from fastapi.responses import HTMLResponse, Response
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-from amberbox.fleet.api.access import Routes
+from amberbox.fleet.api.access import Routes, Rule
 from amberbox.fleet.api.described import described, openapi_of
 from amberbox.fleet.api.errors import PROBLEMS
 from amberbox.fleet.services import Services
@@ -30,9 +31,7 @@ _CSS: dict[int | str, dict[str, Any]] = {
 @routes.get("/v1/openapi.json", "own.read")
 def read_openapi(request: Request) -> dict[str, Any]:
     """Return the description of the API as OpenAPI 3.1, with who may do what (``x-action``)."""
-    from amberbox.fleet.serving.app import rules
-
-    return openapi_of(request.app, rules())
+    return openapi_of(request.app, _rules(request.app))
 
 
 @routes.get("/docs", "own.read", response_class=HTMLResponse, responses=_HTML)
@@ -52,15 +51,18 @@ def read_style() -> Response:
 
 
 def _page(app: FastAPI, services: Services) -> str:
-    from amberbox.fleet.serving.app import rooms, rules
-
     environment = Environment(
         loader=FileSystemLoader(_HERE), autoescape=True, undefined=StrictUndefined,
         trim_blocks=True, lstrip_blocks=True,
     )  # fmt: skip
-    found = rooms()
-    listed = described(openapi_of(app, rules()), found, services.settings.public_url)
+    found = openapi_of(app, _rules(app))
+    listed = described(found, app.state.rooms, services.settings.public_url)
     problems = {status: said["description"] for status, said in PROBLEMS.items()}
     return environment.get_template("docs_page.html").render(
         rooms=listed, problems=problems, version=app.version
     )
+
+
+def _rules(app: FastAPI) -> dict[tuple[str, str], Rule]:
+    rooms: Mapping[str, Routes] = app.state.rooms
+    return {where: rule for routes in rooms.values() for where, rule in routes.rules.items()}

@@ -37,7 +37,8 @@ def make_app(services: Services) -> FastAPI:
     app.state.requests, app.state.received = RequestCounts(), Received(services.bus)
     app.add_middleware(Timed, counts=app.state.requests)
     add_handlers(app)
-    for routes in rooms().values():
+    app.state.rooms = rooms()
+    for routes in app.state.rooms.values():
         # not include_router: it would make every route anew, at the first request
         app.router.routes.extend(routes.router.routes)
     return app
