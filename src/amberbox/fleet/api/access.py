@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Any, TypeAlias, TypeVar
 
-from fastapi import APIRouter, Depends, HTTPException
+from fastapi import APIRouter, Depends, HTTPException, Path
 from sqlalchemy import Connection
 from starlette.requests import HTTPConnection
 
@@ -20,6 +20,7 @@ from amberbox.fleet.accounts.actions import ACTIONS
 from amberbox.fleet.accounts.principal import Principal, Robot, UnknownActionError, allowed
 from amberbox.fleet.accounts.robots import KnownRobot, find_robot, list_robots
 from amberbox.fleet.api.errors import PROBLEMS
+from amberbox.fleet.api.forms import ID
 from amberbox.fleet.audit.entry import Entry, Result
 from amberbox.fleet.audit.log import append
 from amberbox.fleet.services import Services
@@ -159,7 +160,7 @@ def caller_of(connection: HTTPConnection) -> Caller:
     return found
 
 
-def robot_of(connection: HTTPConnection) -> KnownRobot:
+def robot_of(connection: HTTPConnection, robot: Annotated[str, Path(pattern=ID)]) -> KnownRobot:
     """Return the robot that the path names; 404 also for one that the caller may not see."""
     found: KnownRobot = connection.state.robot
     return found

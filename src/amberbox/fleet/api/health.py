@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from dataclasses import dataclass
+from typing import Any, Literal
 
 from fastapi import Response
 from sqlalchemy import select
@@ -12,11 +13,19 @@ from amberbox.fleet.api.access import Fleet, Open, Routes
 
 routes = Routes("health")
 
-Health = Literal["ok", "poor", "bad"]
+
+@dataclass(frozen=True, slots=True)
+class Health:
+    """Whether the server answers; ``poor``: it does, and needs somebody soon."""
+
+    status: Literal["ok", "poor", "bad"]
 
 
-@routes.get("/health", Open("for monitors of the server; says only whether it answers"))
-def read_health(fleet: Fleet, response: Response) -> dict[Literal["status"], Health]:
+_BAD: dict[int | str, dict[str, Any]] = {503: {"model": Health, "description": "it does not"}}
+
+
+@routes.get("/health", Open("for monitors of the server; says no more"), responses=_BAD)
+def read_health(fleet: Fleet, response: Response) -> Health:
     """Return 200 if the server and its database answer, else 503.
 
     ``poor``: it answers, and needs somebody soon (the disk is nearly full, nothing is committed).
@@ -27,4 +36,4 @@ def read_health(fleet: Fleet, response: Response) -> dict[Literal["status"], Hea
     except AmberboxError:
         response.status_code = 503
         return Health("bad")
-    return {"status": "poor" if fleet.keeping.troubles() else "ok"}
+    return Health("poor" if fleet.keeping.troubles() else "ok")
