@@ -13,8 +13,9 @@ from typing import Any
 
 import msgspec
 
+from amberbox.blackbox.doctor.linked import LOCK, link_in_words, link_state
 from amberbox.blackbox.folder.folder import inspect_folder, store_of
-from amberbox.blackbox.store import is_store, open_store
+from amberbox.blackbox.store import is_locked, is_store, open_store
 from amberbox.blackbox.where import store_path
 from amberbox.cli._anyorder import accept_any_order
 from amberbox.cli._colour import painter
@@ -119,10 +120,21 @@ def _show(board: Board, args: argparse.Namespace, plan: Plan | None) -> None:
             print(msgspec.json.encode(message).decode())
     else:
         print("\n".join(_lines(board, args, plan)))
+    if args.format == "table" and not args.json and not args.component:
+        for line in _link_lines(args.where):
+            print(line)
     if plan and {status.config_hash for status in board.statuses} - {plan.config_hash}:
         tell(["the robot folder is not as it was when the watcher began"])
     if board.silence:
         print(f"hint: {_UNKNOWN_HINT.format(where=args.where)}", file=sys.stderr)
+
+
+def _link_lines(where: str) -> Iterator[str]:
+    """Say how the link to the server is, while there is a process that keeps it."""
+    store = open_store(store_path(where))
+    if is_locked(store, LOCK):
+        yield ""
+        yield link_in_words(link_state(store), time.time_ns())
 
 
 def _lines(board: Board, args: argparse.Namespace, plan: Plan | None) -> Iterator[str]:

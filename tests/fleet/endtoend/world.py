@@ -14,7 +14,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from amberbox.blackbox.doctor.linked import STATE_FILE
+from amberbox.fleet.accounts.actions import Role
+from amberbox.fleet.accounts.passwords import Cost, Passwords
 from amberbox.fleet.accounts.robotkeys import add_robot
+from amberbox.fleet.accounts.users import add_user
 from amberbox.fleet.database.database import FILE, Database
 from amberbox.robot.joining.writing import write_key
 from amberbox.testing.proxy import Faults, Proxy
@@ -126,6 +129,9 @@ class World:
             self.port = int(free.getsockname()[1])
         self.data.mkdir()
         database = Database(self.data / FILE)
+        with database.begin() as connection:  # robots are let in once there is an admin
+            hashed = Passwords(Cost(1, 8, 1)).hash("a long enough passphrase")
+            add_user(connection, time.time_ns(), "admin", Role.ADMIN, hashed)
         for number in range(self.count):
             self.robots.append(self._robot(f"r{number}", database))
         database.close()
@@ -143,9 +149,8 @@ class World:
 
     def start_server(self) -> None:
         """Start the server."""
-        words = (str(self.data), str(self.port))
-        log = self.folder / "server.log"
-        self.server = start("tests.fleet.endtoend.serverprocess", *words, log=log)
+        words = ("--data", str(self.data), "--port", str(self.port), "--quiet")
+        self.server = start("amberbox", "serve", *words, log=self.folder / "server.log")
 
     def wait_for_server(self) -> None:
         """Wait until the server listens."""

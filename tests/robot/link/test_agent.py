@@ -18,11 +18,12 @@ from amberbox.blackbox.doctor.host import Host
 from amberbox.blackbox.doctor.linked import LOCK, judged_link, link, link_in_words
 from amberbox.blackbox.doctor.subject import subject
 from amberbox.blackbox.follow.read import journals
-from amberbox.blackbox.store import create_store, is_locked
+from amberbox.blackbox.store import WriterLock, create_store, is_locked
 from amberbox.cli.main import main
 from amberbox.core.clock import NS
 from amberbox.core.source import TopicOptions
 from amberbox.robot.joining.writing import write_key
+from amberbox.robot.link.state import LinkState, write_state
 from amberbox.testing.box import COUNT, ManualBox, number, raw_messages
 
 KEY = "abr_0123456789ab_" + "K" * 43
@@ -120,9 +121,22 @@ def test_the_doctor_says_how_the_link_is() -> None:
     now_ns = 1_800_000_000 * NS
     state = {"server": "https://f", "connected": True, "backlog": 0, "at_ns": now_ns}
     assert judged_link(state, now_ns, "").level == "ok"
-    assert link_in_words(state, now_ns) == "linked to https://f, all is sent"
-    assert link_in_words({**state, "backlog": 12}, now_ns).endswith("12 rows wait")
+    assert link_in_words(state, now_ns) == "linked to https://f"
+    assert link_in_words({**state, "backlog": 12}, now_ns).endswith(
+        "the newest 12 records are not acknowledged yet"
+    )
     late = judged_link(state, now_ns + 300 * NS, "")
     assert (late.level, late.found) == ("warn", "the link to https://f has said nothing for 5 min")
     cut = {**state, "connected": False, "trouble": "no way"}
     assert link_in_words(cut, now_ns) == "no link to https://f: no way"
+
+
+def test_status_says_how_the_link_is(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    store = create_store(folder / "store")
+    main(["status", str(folder)])
+    assert "link" not in capsys.readouterr().out
+    lock = WriterLock(store, LOCK)
+    write_state(store, LinkState("https://f", True, "", 0, 3, time.time_ns()))
+    main(["status", str(folder)])
+    lock.release()
+    assert capsys.readouterr().out.endswith("\nlinked to https://f\n")

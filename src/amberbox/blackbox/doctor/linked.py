@@ -55,8 +55,8 @@ def link_in_words(state: Mapping[str, Any], now_ns: int) -> str:
         trouble = str(state.get("trouble", ""))
         return f"no link to {server}{f': {trouble}' if trouble else ''}"
     backlog = int(state.get("backlog", 0))
-    waits = f"{backlog} rows wait" if backlog else "all is sent"
-    return f"linked to {server}, {waits}"
+    waits = f", the newest {backlog} records are not acknowledged yet" if backlog else ""
+    return f"linked to {server}{waits}"
 
 
 def link_state(store: Store) -> Mapping[str, Any]:

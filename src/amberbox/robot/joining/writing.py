@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 from amberbox.blackbox.folder.folder import ROBOT_FILE
@@ -16,13 +16,13 @@ from amberbox.core.nodes import Node, parse_yaml
 SERVER = "server"
 
 
-def with_server(text: str, values: Mapping[str, str], drop: Sequence[str] = ()) -> str:
+def with_server(text: str, values: dict[str, str], drop: Sequence[str] = ()) -> str:
     """Return the text of a ``robot.yaml`` with these keys under ``server``; ``drop`` goes.
 
     Raises UsageError where that cannot be done without touching the rest.
     """
-    for key, value in values.items():
-        text = _with(text, key, value)
+    for key in reversed(values):  # each new line comes before the others
+        text = _with(text, key, values[key])
     for key in drop:
         text = _without(text, key)
     server = _server(text)

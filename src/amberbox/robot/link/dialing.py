@@ -91,6 +91,7 @@ async def dial(options: LinkOptions, context: ssl.SSLContext | None) -> Line:
         status = error.response.status_code
         if status in (401, 403):
             raise RefusedError(f"the server refuses this robot's key ({status})") from error
-        raise LinkDownError(f"the server answers {status}") from error
+        busy = ": it is too busy, or not set up yet" if status == 503 else ""
+        raise LinkDownError(f"the server answers {status}{busy}") from error
     except (OSError, WebSocketException, TimeoutError) as error:
         raise LinkDownError(f"no connection: {error}") from error

@@ -32,7 +32,9 @@ class LinkState:
 
     def in_words(self) -> str:
         """Say in a line how it is, with what waits."""
-        waiting = f"; {self.backlog} rows not acknowledged" if self.backlog else ""
+        waiting = (
+            f"; the newest {self.backlog} records are not acknowledged yet" if self.backlog else ""
+        )
         copied = f"; {self.copied} journals copied" if self.copied else ""
         return f"{self.short()}{waiting}{copied}"
 
