@@ -6,8 +6,9 @@ import hashlib
 import multiprocessing
 import os
 import resource
+import signal
 import threading
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import CancelledError, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +20,7 @@ from amberbox.blackbox.store import FOLDERS, run_and_number
 from amberbox.blackbox.verify.block import Identity
 from amberbox.blackbox.verify.findings import BAD
 from amberbox.blackbox.verify.journal import Checked, Target, check_journal
+from amberbox.core.errors import AmberboxError
 from amberbox.link.proof import ProofError, Proven, prove
 from amberbox.link.uploads import Proof
 
@@ -128,22 +130,35 @@ class Verifier:
 
     def __init__(self) -> None:
         self._pool: ProcessPoolExecutor | None = None
+        self._is_closed = False
 
     def check(self, claim: Claim) -> Result | None:
-        """Verify a file; None when the worker died over it. Blocks: call it in a thread."""
+        """Verify a file; None when the worker died over it. Blocks: call it in a thread.
+
+        Raises AmberboxError when the server stops meanwhile: nothing is known of the file then.
+        """
+        if self._is_closed:
+            raise AmberboxError("the server stops", "send it again later")
         pool = self._pool = self._pool or _new_pool()
         try:
             return pool.submit(verify, claim).result()
-        except BrokenProcessPool:
+        except (BrokenProcessPool, CancelledError, RuntimeError):
+            if self._is_closed:
+                raise AmberboxError("the server stops", "send it again later") from None
             if self._pool is pool:
                 self._pool = None
             return None
 
     def close(self) -> None:
-        """End the worker."""
-        if self._pool is not None:
-            self._pool.shutdown(cancel_futures=True)
-            self._pool = None
+        """End the worker, also in the middle of a file: it is verified when it is sent again."""
+        self._is_closed = True
+        pool, self._pool = self._pool, None
+        if pool is not None:
+            # Python names no other way to the processes before 3.14
+            workers = list((pool._processes or {}).values())
+            pool.shutdown(wait=False, cancel_futures=True)
+            for worker in workers:
+                worker.kill()
 
 
 def _new_pool() -> ProcessPoolExecutor:
@@ -154,6 +169,7 @@ def _new_pool() -> ProcessPoolExecutor:
 
 def _begin() -> None:
     """Keep the worker from taking the server's memory or time, and from outliving a killed one."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the server, which ends it
     threading.Thread(target=_leave_with_parent, daemon=True).start()
     os.nice(_NICE)
     resource.setrlimit(resource.RLIMIT_AS, (_MEMORY_BYTES, _MEMORY_BYTES))
