@@ -1,0 +1,44 @@
+"""docs/server_alarms.md names every route and every key, with the defaults of the code."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import fields
+from pathlib import Path
+
+from amberbox.core.clock import NS
+from amberbox.fleet.alarms.alarm import SEVERITIES
+from amberbox.fleet.alarms.settings import AlarmSettings
+from amberbox.fleet.api import alarms, notifications
+from amberbox.fleet.notifying import outbox
+from amberbox.fleet.notifying.settings import Email, Notifications, Quiet, Smtp, Webhook
+
+PAGE = (Path(__file__).parents[3] / "docs" / "server_alarms.md").read_text(encoding="utf-8")
+
+
+def test_settings_stand_there_with_their_defaults() -> None:
+    rows = dict(re.findall(r"^\| `(\w+)` \| (\S+)", PAGE, re.MULTILINE))
+    defaults = AlarmSettings()
+    for field in fields(AlarmSettings):
+        value = getattr(defaults, field.name)
+        assert field.name in rows
+        if isinstance(value, float):
+            assert rows[field.name] == f"{value:g}"
+
+
+def test_every_key_of_notifications_is_named() -> None:
+    for kind in (Notifications, Smtp, Email, Webhook, Quiet):
+        for field in fields(kind):
+            assert re.search(rf'["`]{field.name}["`]', PAGE), field.name
+
+
+def test_every_route_is_named() -> None:
+    for _, path in (*alarms.routes.rules, *notifications.routes.rules):
+        last = path.rsplit("/", 1)[-1]
+        assert path in PAGE or f".../{last}`" in PAGE, path
+
+
+def test_numbers_are_those_of_the_code() -> None:
+    assert f"{outbox.TRIES} times" in PAGE and Notifications().digest_above == 5
+    assert Notifications().digest_s * NS == 600 * NS
+    assert all(f"`{word}`" in PAGE for word in SEVERITIES)
