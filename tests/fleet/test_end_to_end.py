@@ -11,6 +11,6 @@ from tests.fleet.endtoend import ordeal
 
 @pytest.mark.timeout(300)
 def test_nothing_is_lost_whatever_is_killed(tmp_path: Path) -> None:
-    result = ordeal.run(tmp_path, robots=3, seconds=24, kills=20, seed=6)
+    result = ordeal.run(tmp_path, robots=3, seconds=20, kills=20, seed=6)
     assert result.rows > 300 and result.messages > 1000 and result.journals > 10
     assert result.faults > 0 and result.frames > 0
