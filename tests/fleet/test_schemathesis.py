@@ -13,6 +13,7 @@ import pytest
 import schemathesis
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
+from hypothesis.stateful import run_state_machine_as_test
 from schemathesis.checks import not_a_server_error
 from schemathesis.generation import GenerationMode
 from schemathesis.specs.openapi.checks import (
@@ -126,9 +127,31 @@ def _put_known(case: Any) -> None:
 
 
 def _send(home: House, client: TestClient, case: Any, principal: str) -> None:
+    case.validate_response(_ask(home, client, case, principal), checks=CHECKS)
+
+
+def _ask(home: House, client: TestClient, case: Any, principal: str) -> Any:
     sent = case.as_transport_kwargs(base_url=URL)
     sent.pop("cookies", None)
     client.cookies.clear()
     sent["headers"] = {**dict(sent.get("headers") or {}), **headers_of(home, principal, None)}
-    answer = schemathesis.Response.from_any(client.request(**sent))
-    case.validate_response(answer, checks=CHECKS)
+    return schemathesis.Response.from_any(client.request(**sent))
+
+
+def test_answers_are_as_described_one_after_another(
+    home: House, schema: Any, client: TestClient
+) -> None:
+    """What one route made is asked of the others: their links follow from the description."""
+    machine: Any = schema.as_state_machine()
+
+    class Visitor(machine):  # type: ignore[misc]  # made at run time
+        def call(self, case: Any, **_: Any) -> Any:
+            path = case.operation.path
+            who = "robot" if path.startswith("/link/") else "admin"
+            return _ask(home, client, case, who)
+
+        def validate_response(self, response: Any, case: Any, *_: Any, **__: Any) -> None:
+            case.validate_response(response, checks=CHECKS)
+
+    few = settings(SETTINGS, max_examples=max(EXAMPLES // 4, 2), stateful_step_count=6)
+    run_state_machine_as_test(Visitor, settings=few)
