@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import ipaddress
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -148,6 +150,18 @@ def test_people_see_and_end_their_own_sessions_only(home: House) -> None:
     third = signed_in(home)
     assert mine.delete(f"{PATH}/others").json() == {"ended": 1}
     assert third.get(PATH).status_code == 401 and mine.get(PATH).status_code == 200
+
+
+@pytest.mark.parametrize(
+    ("peer", "address"), [("10.0.0.5", "203.0.113.9"), ("198.51.100.1", "198.51.100.1")]
+)
+def test_where_somebody_is_only_a_trusted_proxy_says(home: House, peer: str, address: str) -> None:
+    proxies = (ipaddress.ip_network("10.0.0.5"),)
+    home.services.settings = replace(home.services.settings, proxies=proxies)
+    client = TestClient(home.app, URL, client=(peer, 4711))
+    client.headers["X-Forwarded-For"] = "192.0.2.66, 203.0.113.9"
+    client.post(PATH, json={"name": "operator", "password": PASSWORD})
+    assert client.get(f"{PATH}/list").json()[0]["address"] == address
 
 
 def test_changes_need_the_token_of_the_session(home: House) -> None:

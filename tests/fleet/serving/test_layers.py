@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from starlette.testclient import TestClient
+from starlette.testclient import TestClient, WebSocketDenialResponse
 
 from amberbox.fleet.api.who import COOKIE
 from amberbox.fleet.serving.accesslog import FILE, AccessLog
@@ -67,6 +67,16 @@ def test_nobody_gets_around_the_proxy() -> None:
     assert ask(app, peer="10.0.0.5").status_code == 200
     assert ask(app, peer="203.0.113.9").status_code == 403
     assert ask(app, peer="203.0.113.9", headers={"X-Forwarded-For": "10.0.0.5"}).status_code == 403
+
+
+def test_sockets_are_refused_as_requests_are() -> None:
+    client = TestClient(Hosts(hello, SETTINGS), URL, client=("203.0.113.9", 1))
+    with (
+        pytest.raises(WebSocketDenialResponse) as refused,
+        client.websocket_connect("/link/v1", headers={"host": "evil.example"}),
+    ):
+        pass
+    assert refused.value.status_code == 421
 
 
 def test_every_answer_says_what_a_browser_may_do_with_it() -> None:
