@@ -17,6 +17,7 @@ import pytest
 
 from amberbox.core.clock import SystemClock
 from amberbox.core.errors import AmberboxError, UsageError
+from amberbox.fleet.asking import asking as module
 from amberbox.fleet.asking.asking import ANSWER_BYTES, Asking
 from amberbox.fleet.asking.errors import BrokenError, BusyError, LimitError
 from amberbox.fleet.asking.frames import Unpacker, packed
@@ -202,6 +203,27 @@ def test_frames_come_in_pieces() -> None:
     assert found == [{"part": b"abc"}, {"error": "x"}]
     with pytest.raises(ValueError, match="a frame of"):
         list(Unpacker().feed(b"\xff\xff\xff\xff"))
+
+
+def test_workers_are_started_before_somebody_asks(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "_WARM_S", 0.0)
+    database = Database(tmp_path / FILE, SystemClock())
+    fresh = Asking(tmp_path, database, Bus(), SystemClock())
+
+    async def run() -> None:
+        task = asyncio.create_task(fresh.run())
+        async with asyncio.timeout(20):
+            while len(fresh.pids) < 2:
+                await asyncio.sleep(0.05)
+        task.cancel()
+
+    try:
+        asyncio.run(run())
+    finally:
+        fresh.close()
+        database.close()
 
 
 def test_many_threads_ask_at_once(asking: Asking) -> None:

@@ -21,6 +21,9 @@ ANSWER_BYTES = 64 << 20
 """An answer that is kept in memory; longer ones go through a file (``ask_file``)."""
 
 _SPOOL_BYTES = 4 << 20
+_WORKERS = 2
+_WARM_S = 1.0
+_READY = "amberbox.fleet.data.worker:ready"
 
 
 class Asking:
@@ -39,7 +42,7 @@ class Asking:
         self._database = database
         self._bus = bus
         self._clock = clock
-        self._pool = pool or Pool(folder)
+        self._pool = pool or Pool(folder, _WORKERS)
 
     @property
     def pids(self) -> list[int]:
@@ -85,7 +88,10 @@ class Asking:
         return file
 
     async def run(self) -> None:
-        """Work until cancelled."""
+        """Start the workers once the server runs, so that the first question need not wait."""
+        await asyncio.sleep(_WARM_S)
+        ready = (self.ask(_READY, {}, asker=f"warm-{number}") for number in range(_WORKERS))
+        await asyncio.gather(*ready, return_exceptions=True)
         await asyncio.Event().wait()
 
     def close(self) -> None:

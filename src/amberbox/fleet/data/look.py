@@ -119,8 +119,9 @@ class Look:
             found.pieces += one.pieces
             found.gaps += one.gaps
             found.notes += one.notes
-            inside = {part.journal for s in store.segments(request.table) for part in s.parts}
-            self._add(found, source, request, inside)
+            if self.waiting:
+                inside = {part.journal for s in store.segments(request.table) for part in s.parts}
+                self._add(found, source, request, inside)
         return found
 
     def _add(self, found: Gathered, source: Source, request: Request, inside: set[str]) -> None:

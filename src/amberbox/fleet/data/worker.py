@@ -14,12 +14,20 @@ from amberbox.fleet.data import recorded
 from amberbox.fleet.data.asked import Asked
 from amberbox.fleet.data.forms import about_json, encoded
 from amberbox.fleet.data.items import item_json, items_json
-from amberbox.fleet.data.look import look
+from amberbox.fleet.data.look import look, open_catalogue
 from amberbox.fleet.data.missing import gaps_json
 from amberbox.fleet.data.rows import rows
 from amberbox.fleet.data.statistics import statistics_json
 
 Arguments = Mapping[str, Any]
+
+
+def ready(folder: Path, arguments: Arguments) -> bytes:
+    """Load what takes time: what reads columns, and what the archive knows."""
+    import pyarrow.parquet  # noqa: F401  # for the next question
+
+    open_catalogue(folder).revision()
+    return b""
 
 
 def query(folder: Path, arguments: Arguments) -> Iterator[bytes]:
