@@ -168,4 +168,5 @@ class Alarms:
         """Let go of what is held."""
         for forget in self._forget:
             forget()
-        self.sender.close()
+        with self._stepping:  # what has begun is finished first
+            self.sender.close()

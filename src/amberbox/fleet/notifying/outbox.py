@@ -136,7 +136,8 @@ def _digest(destination: str, rows: Sequence[RowMapping], now_ns: int) -> dict[s
     return {
         "key": secrets.token_hex(16), "destination": destination, "kind": "digest", "alarm": 0,
         "severity": last["severity"], "state": "waiting",
-        "subject": f"{len(rows)} alarm{'s' * (len(rows) > 1)}, up to {last['severity']}", "body": shown + more,
+        "subject": f"{len(rows)} alarm{'s' * (len(rows) > 1)}, up to {last['severity']}",
+        "body": shown + more,
         "data": json.dumps({"type": "digest", "count": len(rows), "alarms": alarms}),
         "created_ns": now_ns, "due_ns": now_ns, "tries": 0, "trouble": "", "sent_ns": None,
     }  # fmt: skip

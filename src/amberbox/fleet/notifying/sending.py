@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -25,12 +26,18 @@ class Sender:
     database: Database
     clock: Clock
     deliver: Deliver = deliver
+    _stepping: threading.Lock = field(default_factory=threading.Lock)
+    _closed: bool = False
     _pool: ThreadPoolExecutor = field(
         default_factory=lambda: ThreadPoolExecutor(_AT_ONCE, "notifying")
     )
 
     def step(self) -> int:
         """Deliver what is due now; return how many messages have arrived."""
+        with self._stepping:
+            return 0 if self._closed else self._step()
+
+    def _step(self) -> int:
         now_ns = self.clock.wall_ns()
         with self.database.reading() as connection:
             setting = read(connection, NAME, Notifications)
@@ -71,4 +78,6 @@ class Sender:
 
     def close(self) -> None:
         """Wait for what is being delivered."""
+        with self._stepping:
+            self._closed = True
         self._pool.shutdown()
