@@ -14,6 +14,7 @@ from amberbox.core.nodes import parse_yaml
 from amberbox.core.redaction import MASK, likely_secrets, redact
 
 _YAML = (".yaml", ".yml")
+_MASKS = (MASK, "(masked)")
 _KEY_BLOCK = re.compile(r"-----BEGIN ([A-Z ]*PRIVATE KEY)-----.*?(-----END \1-----|\Z)", re.DOTALL)
 _LOGIN = re.compile(r"(?<=://)([^\s:/?#@\"']*):([^\s/?#\"']+)@")
 _SAID = re.compile(
@@ -45,4 +46,11 @@ def _read(name: str, text: str) -> str | None:
 
 
 def _by_lines(text: str) -> str:
-    return _SAID.sub(lambda found: f"{found['key']}'{MASK}'", text)
+    return _SAID.sub(_hidden, text)
+
+
+def _hidden(found: re.Match[str]) -> str:
+    """Mask a value, unless the robot has done so; what its mask is followed by is no value."""
+    written: str = found[0]
+    is_masked = found["value"].strip("\"' ,;<").startswith(_MASKS)
+    return written if is_masked else f"{found['key']}'{MASK}'"
