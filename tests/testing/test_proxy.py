@@ -8,7 +8,7 @@ import threading
 from amberbox.testing.proxy import Faults, Proxy, plan
 from amberbox.testing.proxyframes import FrameFaults, Mangler
 
-HEAD = b"GET / HTTP/1.1\r\n\r\n"
+HEAD = b"GET / HTTP/1.1\r\nUpgrade: websocket\r\n\r\n"
 
 
 def frame(number: int, size: int = 300) -> bytes:
@@ -40,6 +40,14 @@ def test_without_faults_bytes_pass_as_they_are() -> None:
     mangler = Mangler(FrameFaults(), 3)
     parts = [sent[n : n + 77] for n in range(0, len(sent), 77)]
     assert b"".join(mangler.pass_on(part, up=False) for part in (HEAD, *parts)) == HEAD + sent
+
+
+def test_what_is_no_websocket_passes_as_it_is() -> None:
+    mangler = Mangler(FrameFaults(0.5, 0.2, 0.2, 0.1), 3)
+    sent = b"PATCH / HTTP/1.1\r\n\r\n" + b"".join(frame(n) for n in range(40))
+    parts = [sent[n : n + 77] for n in range(0, len(sent), 77)]
+    assert b"".join(mangler.pass_on(part, up=True) for part in parts) == sent
+    assert not mangler.done
 
 
 def test_a_connection_ends_in_the_middle_after_so_many_bytes() -> None:

@@ -36,7 +36,7 @@ class Scene:
         self.box = ManualBox(path, topics, options=options)
         self.store: Store = open_store(path)
         self.start_ns = self.box.clock.wall
-        self.record(550)
+        self.record(110)
         keeper = Keeper(self.store, KeeperOptions(quota_percent=100.0, min_free=0))
         keeper._with_segments = False  # columns are of no interest here
         keeper.step(threading.Event())
@@ -47,7 +47,7 @@ class Scene:
         for step in range(steps):
             self.box.hear(COUNT, number(step))
             self.box.hear(RING, number(step))
-            self.box.write(0.1)
+            self.box.write(0.5)
 
     def requests(self) -> Requests:
         return Requests(self.store, self.told.append, lambda: self.box.clock.wall)
@@ -120,7 +120,7 @@ def test_a_window_that_is_not_over_goes_on_and_tells_what_comes(scene: Scene) ->
     requests.step()
     before = scene.names()
     assert before[-1].endswith("-0005.mcap"), "the file that is being written is named, too"
-    scene.record(120)
+    scene.record(24)
     requests.step()
     assert set(before) < set(scene.names())
     scene.box.close()
