@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from sqlalchemy import Connection
@@ -26,7 +26,7 @@ from amberbox.fleet.state.views import Battery, Card, Lead, MissionView
 
 _CHARGES = ("percent", "charge", "soc", "state_of_charge", "level")
 """Parts of the name of an output that says how full a battery is, the best first."""
-_FEW = 50
+FEW = 50
 """Of so many robots the statuses are looked up by name; of more, all are read."""
 
 
@@ -43,10 +43,12 @@ class Cards:
         connection: Connection,
         robots: Sequence[KnownRobot],
         now_ns: int,
+        statuses: Mapping[str, Sequence[Standing]] | None = None,
     ) -> list[Card]:
-        """Return the cards of robots."""
-        names = [robot.id for robot in robots]
-        statuses = standings(connection, names if len(names) <= _FEW else None)
+        """Return the cards of robots; ``statuses`` where they have been read already."""
+        if statuses is None:
+            names = [robot.id for robot in robots]
+            statuses = standings(connection, names if len(names) <= FEW else None)
         seen = {presence.robot: presence for presence in presences(connection)}
         alarms, offsets = open_alarms(connection), clock_offsets_ns(connection)
         return [

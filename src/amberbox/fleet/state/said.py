@@ -6,10 +6,12 @@ A robot may send anything. Nothing that it says can break an answer that is abou
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import lru_cache
 from typing import Any, TypeVar
 
 import msgspec
 
+from amberbox.core.clock import NS
 from amberbox.core.timetext import format_time
 from amberbox.monitoring.engine.outputs import RANK
 
@@ -135,7 +137,14 @@ def moment(time_ns: int | None) -> str | None:
     """Write a time; None for none, and for a number that is no time."""
     if time_ns is None or not _FIRST_NS <= time_ns < _BEYOND_NS:
         return None
-    return format_time(time_ns)
+    seconds, rest_ns = divmod(time_ns, NS)
+    return f"{_second(seconds)}.{rest_ns:09}Z"
+
+
+@lru_cache(maxsize=4096)
+def _second(seconds: int) -> str:
+    """Write a whole second; statuses of one moment share it."""
+    return format_time(seconds * NS).partition(".")[0]
 
 
 def status_data(said: SaidStatus) -> Mapping[str, Any]:

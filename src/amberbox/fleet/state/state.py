@@ -20,7 +20,7 @@ from amberbox.fleet.database.database import Database
 from amberbox.fleet.folders.folders import Folders
 from amberbox.fleet.linkend.presence import presences
 from amberbox.fleet.linkend.server import LinkServer
-from amberbox.fleet.state.cards import Cards
+from amberbox.fleet.state.cards import FEW, Cards
 from amberbox.fleet.state.facts import FactsBook
 from amberbox.fleet.state.latest import Latest
 from amberbox.fleet.state.said import status_data
@@ -77,11 +77,12 @@ class State:
         """Return cards of robots, and their statuses."""
         with self.database.reading() as connection:
             known = [robot for robot in list_robots(connection) if robot.id in robots]
-            cards = self.cards.of(connection, known, now_ns)
-            found = standings(connection) if with_statuses else {}
+            few = sorted(robots) if len(robots) <= FEW else None
+            found = standings(connection, few)
+            cards = self.cards.of(connection, known, now_ns, found)
         statuses = {
             robot: [status_data(one.said) for one in found[robot]]
-            for robot in sorted(robots)
+            for robot in sorted(robots if with_statuses else ())
             if robot in found
         }
         return Snapshot(cards, statuses)
