@@ -7,14 +7,17 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from sqlalchemy import select
 
 from amberbox.blackbox import requests
 from amberbox.blackbox.journal import reserved
+from amberbox.blackbox.signing.keys import open_keys, public_key
 from amberbox.blackbox.store import open_store
 from amberbox.fleet.database.database import Database
 from amberbox.fleet.linkend.board import board
 from amberbox.fleet.linkend.presence import presences
 from amberbox.fleet.linkend.server import Hooks
+from amberbox.fleet.linkend.tables import STORE
 from amberbox.link.frames import Row
 from amberbox.robot.link.remembered import recall
 from amberbox.testing.clock import ManualClock
@@ -124,5 +127,25 @@ def test_a_robot_in_1970_connects_and_says_so(tmp_path: Path, database: Database
         watcher.close()
         [asked] = requests.pending(watcher.store)
         assert (asked.kind, asked.values["kind"]) == ("event", "clock_not_set")
+
+    asyncio.run(scene())
+
+
+def test_a_key_that_is_made_later_is_told(tmp_path: Path, database: Database) -> None:
+    def known() -> str:
+        with database.reading() as connection:
+            return str(connection.execute(select(STORE.c.public_key)).scalar() or "")
+
+    async def scene() -> None:
+        watcher = Watcher(tmp_path / "store")
+        watcher.write(5)
+        async with serving(database) as (_, port), linked(client_of(watcher.store, port)):
+            await until(lambda: len(held(database)) == 5)
+            assert known() == ""
+            open_keys(watcher.store)
+            await until(lambda: known() == public_key(watcher.store.path))
+            watcher.write(5)
+            await until(lambda: len(held(database)) == 10)
+        watcher.close()
 
     asyncio.run(scene())

@@ -110,6 +110,8 @@ class LinkClient:
         self.live = LiveValues(store)
         self.answers: deque[Found] = deque()
         """What is to be said about journals that were asked for; it waits for a connection."""
+        self.said_key = ""
+        """The public key that the server was told: it verifies journals with it."""
         self._dial = dialer
         self._backoff = backoff or Backoff()
         self._reaches = Reaches(store)
@@ -160,13 +162,18 @@ class LinkClient:
         else:
             self._remarks.over("clock_not_set")
 
+    def current_key(self) -> str:
+        """Return the public key that the store signs with; empty before the keeper has made it."""
+        return public_key(self.store.path) or ""
+
     async def _greet(self, line: Line) -> Session:
         """Say hello; raises RefusedError when the server sends the robot away."""
         reaches = await asyncio.to_thread(self._reaches.state)
+        self.said_key = self.current_key()
         hello = Hello(
             self.options.robot, self.store.id, self.clock.boot_id(), reaches,
             self.options.config_hash, self.clock.wall_ns(), self.clock.boot_ns(), __version__,
-            public_key=public_key(self.store.path) or "",
+            public_key=self.said_key,
         )  # fmt: skip
         await line.send(encode(hello))
         answer = from_server(await soon(line.receive()))

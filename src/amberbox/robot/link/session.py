@@ -205,6 +205,8 @@ class Session:
         while True:
             if self._beats % _NETWORK_BEATS == 0:
                 await self._look_at_network()
+            if self._client.current_key() != self._client.said_key:
+                raise LinkDownError("the store signs with a key that the server does not know yet")
             reaches = await asyncio.to_thread(self._looking.state)
             if self._is_due(reaches):
                 await self._send(Durable(self._end.epoch, reaches))
