@@ -18,7 +18,6 @@ from amberbox.fleet.asking.asking import Asking
 from amberbox.fleet.bus import Bus, Change
 from amberbox.fleet.database.database import Database
 from amberbox.fleet.folders.folders import Folders
-from amberbox.fleet.linkend.presence import presences
 from amberbox.fleet.linkend.server import LinkServer
 from amberbox.fleet.state.cards import FEW, Cards
 from amberbox.fleet.state.facts import FactsBook
@@ -54,6 +53,7 @@ class State:
         self.facts = FactsBook(folders, asking)
         self.cards = Cards(links, self.latest, self.facts)
         self._bus = bus
+        self._folders = folders
         self._wanted: asyncio.Queue[str] = asyncio.Queue()
 
     async def run(self) -> None:
@@ -101,9 +101,6 @@ class State:
     def _load(self, robot: str) -> None:
         try:
             self.latest.load(self, robot)
-            with self.database.reading() as connection:
-                seen = {presence.robot: presence for presence in presences(connection)}
-            if robot in seen:
-                self.facts.read(robot, seen[robot].config_hash)
+            self.facts.read(robot, self._folders.current(robot))
         except AmberboxError as error:  # its card lacks something; the others do not
             logging.getLogger(__name__).warning("%s: %s", robot, error)
