@@ -10,6 +10,8 @@ from pathlib import Path
 import numpy as np
 from sqlalchemy import select
 
+from amberbox.blackbox import requests
+from amberbox.blackbox.deletion.confirm import KIND as CONFIRM
 from amberbox.blackbox.follow.read import journal_file, sound_chunks
 from amberbox.blackbox.segments import manifest
 from amberbox.blackbox.store import open_store
@@ -48,7 +50,7 @@ def is_caught_up(database: Database, path: Path, robot: str) -> bool:
     """
     store, said = open_store(path), manifest.read(path)
     names = {name for name in said.sealed if name not in said.raw_gone}
-    if not names or names - said.confirmed:
+    if not names or names - confirmed(path):
         return False
     table = WRITER.c
     chosen = select(WRITER).where(table.robot == robot, table.store_id == store.id)
@@ -56,6 +58,12 @@ def is_caught_up(database: Database, path: Path, robot: str) -> bool:
         cursor = {r.writer: Place(r.run, r.seq) for r in connection.execute(chosen)}
     ends = {writer: reach.end for writer, reach in Reaches(store).state().items()}
     return all(cursor.get(writer, START) >= end for writer, end in ends.items())
+
+
+def confirmed(path: Path) -> set[str]:
+    """Return what the robot was told to be safe, also what its next keeper is to write down."""
+    waiting = (r for r in requests.pending(open_store(path)) if r.kind == CONFIRM)
+    return {*manifest.read(path).confirmed, *(n for r in waiting for n in r.values["journals"])}
 
 
 def on_server(database: Database, data: Path, robot: str) -> Held:
@@ -106,7 +114,7 @@ def judge_journals(database: Database, data: Path, robot: str, stores: list[Path
     count = 0
     for path in stores:
         store = open_store(path)
-        for name in manifest.read(path).confirmed:
+        for name in confirmed(path):
             content = store.journal_path(name).read_bytes()
             copy = by_content[store.id, name, hashlib.sha256(content).hexdigest()]
             assert copy.state in ("verified", "aside") and copy.path.read_bytes() == content

@@ -115,7 +115,7 @@ def _settle(world: World, result: Result) -> None:
     database = Database(world.data / FILE, read_only=True)
     waiting = list(world.robots)
     while waiting:
-        assert time.monotonic() - begin < 60, _reports(waiting)
+        assert time.monotonic() - begin < 120, _reports(waiting)
         time.sleep(0.2)
         waiting = [r for r in waiting if not is_caught_up(database, r.store, r.name)]
     result.caught_up_s = time.monotonic() - begin
