@@ -100,3 +100,11 @@ def test_it_is_told_when_it_comes_back_live(home: Stand) -> None:
     home.say("r1", alarm(home, count=2))
     home.wait(12)
     assert len(home.told) == 1 and not home.only().late
+
+
+def test_a_team_that_is_watched_on_the_server_goes_by_its_clock(home: Stand) -> None:
+    home.hear("team_1", alarm(home, state="open"))
+    home.alarms.step()
+    home.hear("team_1", alarm(home, state="healed"))
+    home.wait(12)
+    assert len(home.told) == 1 and not home.only().late

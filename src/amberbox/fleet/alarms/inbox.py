@@ -90,7 +90,8 @@ def offsets(
 ) -> Offsets:
     """Return how far the clocks of the runs were behind ours; ``said`` are those of now, by boot.
 
-    What the link has measured in a boot counts more than what a robot said when it came.
+    What the link has measured in a boot counts more than what a robot said when it came. Who has
+    never been linked, such as a team that is watched here, goes by our clock.
     """
     runs = {(one.robot, one.store_id, one.row.writer, one.row.run) for one in rows}
     boots = _boots(connection, runs)
@@ -100,7 +101,10 @@ def offsets(
     measured = {(row.robot, row.boot_id): row.offset_ns for row in connection.execute(
         select(BOOT).where(BOOT.c.robot.in_(robots)))}  # fmt: skip
     known = {**said, **measured}
-    return {run: known.get((run[0], boots.get(run) or now.get(run[0], ""))) for run in runs}
+    return {
+        run: known.get((run[0], boots.get(run) or now[run[0]])) if run[0] in now else 0
+        for run in runs
+    }
 
 
 def _boots(
