@@ -29,7 +29,7 @@ from tests.fleet.house import URL, House, house
 from tests.fleet.people import VICTIM, headers_of, settle
 from tests.fleet.routes import SOCKET
 
-EXAMPLES = int(os.environ.get("API_EXAMPLES", "4"))
+EXAMPLES = int(os.environ.get("API_EXAMPLES", "3"))
 CHECKS = [
     not_a_server_error,
     status_code_conformance,
