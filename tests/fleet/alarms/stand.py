@@ -22,12 +22,14 @@ from amberbox.fleet.alarms.tables import ALARM, CONSEQUENCE, HISTORY
 from amberbox.fleet.bus import Bus, Change
 from amberbox.fleet.database.database import FILE, Database
 from amberbox.fleet.linkend import ledger
+from amberbox.fleet.linkend.presence import short
 from amberbox.fleet.notifying.message import Message
 from amberbox.fleet.notifying.settings import NAME, Destination, Notifications, Webhook
 from amberbox.fleet.notifying.tables import OUTBOX
 from amberbox.fleet.options.options import write
 from amberbox.link.frames import Hello, Row
 from amberbox.link.ledger import Admission
+from amberbox.link.positions import Place, Reach, RunEnd
 from amberbox.monitoring.engine.findings import (
     AlarmChange,
     AlarmState,
@@ -42,7 +44,15 @@ from tests.fleet.database.portable import portable_database
 
 START_NS = 1_800_000_000 * NS
 STORE = "12345678-1234-1234-1234-123456789012"
+BOOT = "9c2e4f10-1111-4000-8000-000000000001"
+EARLIER = "0badb007-1111-4000-8000-000000000002"
 EVERYTHING = Notifications(webhooks=(Webhook("hook", "https://hook.example/", "0123456789abcdef"),))
+
+
+def reaches(boot: str) -> dict[str, Reach]:
+    """Return what a robot says of a run: its boot as the names of journals tell it."""
+    run = RunEnd(1, short(boot), 1_000_000, closed=False)
+    return {"watch": Reach(Place(1, 0), Place(1, 1_000_000), Place(1, 1_000_000), (run,))}
 
 
 @dataclass
@@ -93,11 +103,11 @@ class Stand:
         with self.database.begin() as connection:
             add_group(connection, self.clock.wall_ns(), name)
 
-    def connect(self, *robots: str, behind_s: float = 0.0, boot: str = "b1") -> None:
+    def connect(self, *robots: str, behind_s: float = 0.0, boot: str = BOOT) -> None:
         """Let robots connect; their clocks are so far behind."""
         for robot in robots:
             wall_ns = self.clock.wall_ns() - round(behind_s * NS)
-            hello = Hello(robot, STORE, boot, {}, "hash", wall_ns, 0, "1.0")
+            hello = Hello(robot, STORE, boot, reaches(boot), "hash", wall_ns, 0, "1.0")
             with self.database.begin() as connection:
                 admission: Admission = ledger.admit(connection, hello, self.clock.wall_ns())
             self.epochs[robot] = admission.epoch

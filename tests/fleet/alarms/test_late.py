@@ -9,7 +9,7 @@ import pytest
 
 from amberbox.core.clock import NS
 from amberbox.link.frames import Row
-from tests.fleet.alarms.stand import START_NS, Stand, alarm, stand
+from tests.fleet.alarms.stand import EARLIER, START_NS, Stand, alarm, stand
 
 HOURS_8 = 8 * 3600 * NS
 
@@ -81,7 +81,7 @@ def test_what_opened_offline_and_healed_since_is_not_told(home: Stand) -> None:
 
 
 def test_a_clock_that_is_wrong_is_no_delay(home: Stand) -> None:
-    home.connect("r1", behind_s=50 * 365 * 86_400, boot="b2")
+    home.connect("r1", behind_s=50 * 365 * 86_400, boot=EARLIER)
     at_ns = home.clock.wall_ns() - 50 * 365 * 86_400 * NS
     home.send("r1", home.rows("r1", [alarm(home, opened_ns=at_ns, changed_ns=at_ns)], at_ns))
     home.wait(12)

@@ -11,7 +11,16 @@ from amberbox.core.clock import NS
 from amberbox.fleet.alarms import machine
 from amberbox.fleet.alarms.register import Register
 from amberbox.fleet.bus import Change
-from tests.fleet.alarms.stand import STORE, Stand, alarm, blocked, diagnosis, explained, stand
+from tests.fleet.alarms.stand import (
+    EARLIER,
+    STORE,
+    Stand,
+    alarm,
+    blocked,
+    diagnosis,
+    explained,
+    stand,
+)
 
 
 @pytest.fixture
@@ -245,7 +254,7 @@ def test_a_robot_speaks_for_itself_alone(home: Stand) -> None:
 
 
 def test_times_are_those_of_the_server(home: Stand) -> None:
-    home.connect("r1", behind_s=3600, boot="b2")
+    home.connect("r1", behind_s=3600, boot=EARLIER)
     behind_ns = home.clock.wall_ns() - 3600 * NS
     rows = home.rows("r1", [alarm(home, opened_ns=behind_ns, changed_ns=behind_ns)], behind_ns)
     home.send("r1", rows)

@@ -12,6 +12,7 @@ from sqlalchemy import ColumnElement, Connection, and_, or_, select
 from amberbox.fleet.alarms.reports import CHANNELS, Offsets, Received, is_of_interest
 from amberbox.fleet.alarms.tables import MARK
 from amberbox.fleet.database.upsert import upsert
+from amberbox.fleet.linkend.presence import short
 from amberbox.fleet.linkend.tables import BOOT, ROBOT, ROW, RUN
 from amberbox.link.frames import Row
 
@@ -96,13 +97,13 @@ def offsets(
     runs = {(one.robot, one.store_id, one.row.writer, one.row.run) for one in rows}
     boots = _boots(connection, runs)
     robots = sorted({run[0] for run in runs})
-    now = {row.robot: row.boot_id for row in connection.execute(
+    now = {row.robot: short(row.boot_id) for row in connection.execute(
         select(ROBOT.c.robot, ROBOT.c.boot_id).where(ROBOT.c.robot.in_(robots)))}  # fmt: skip
-    measured = {(row.robot, row.boot_id): row.offset_ns for row in connection.execute(
+    measured = {(row.robot, short(row.boot_id)): row.offset_ns for row in connection.execute(
         select(BOOT).where(BOOT.c.robot.in_(robots)))}  # fmt: skip
-    known = {**said, **measured}
+    known = {**{(robot, short(boot)): by for (robot, boot), by in said.items()}, **measured}
     return {
-        run: known.get((run[0], boots.get(run) or now[run[0]])) if run[0] in now else 0
+        run: known.get((run[0], boots.get(run, "")[:8] or now[run[0]])) if run[0] in now else 0
         for run in runs
     }
 

@@ -12,6 +12,7 @@ from amberbox.fleet.archive.catalogue import COMMITTED
 from amberbox.fleet.archive.tables import JOURNALS
 from amberbox.fleet.conclusions.columns import Span
 from amberbox.fleet.conclusions.entry import Entry
+from amberbox.fleet.linkend.presence import short
 from amberbox.fleet.linkend.tables import ASIDE, BOOT, ROW, RUN
 
 
@@ -42,7 +43,7 @@ def offsets(connection: Connection, robot: str) -> dict[tuple[str, str, int], in
     The names of journals hold the beginning of the boot's id only.
     """
     boots = connection.execute(select(BOOT).where(BOOT.c.robot == robot)).all()
-    known = {boot.boot_id.replace("-", "")[:8]: boot.offset_ns for boot in boots}
+    known = {short(boot.boot_id): boot.offset_ns for boot in boots}
     runs = connection.execute(select(RUN).where(RUN.c.robot == robot, RUN.c.boot != ""))
     return {
         (run.store_id, run.writer, run.run): known[run.boot[:8]]
