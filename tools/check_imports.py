@@ -24,10 +24,11 @@ ALLOWED: Mapping[str, frozenset[str]] = {
     "consult": frozenset({"core", "blackbox", "monitoring", "diagnosis"}),
     "experiments": frozenset({"core", "blackbox"}),
     "link": frozenset({"core", "blackbox"}),
+    "client": frozenset({"core", "blackbox"}),
     "robot": _UPPER,
     "fleet": _UPPER,
-    "cli": _UPPER | {"sim", "testing", "robot", "fleet"},
-    "": frozenset({"core", "blackbox"}),
+    "cli": _UPPER | {"sim", "testing", "robot", "fleet", "client"},
+    "": frozenset({"core", "blackbox", "client"}),
     "__main__": frozenset({"cli"}),
 }
 """Which of our packages each may import, besides itself; "" is the package's front door."""

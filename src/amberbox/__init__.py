@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from amberbox.blackbox.follow.follow import follow as follow
     from amberbox.blackbox.incidents.marking import mark as mark
-    from amberbox.blackbox.query.record import open as open
+    from amberbox.client.opening import open as open
 
 __version__ = "0.1.0"
 
@@ -13,7 +13,7 @@ __version__ = "0.1.0"
 def __getattr__(name: str) -> Any:
     """Import the rest when it is first used: ``import amberbox`` alone stays cheap."""
     if name == "open":
-        from amberbox.blackbox.query.record import open as open_record
+        from amberbox.client.opening import open as open_record
 
         return open_record
     if name == "follow":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import IO, Annotated, Any
@@ -137,6 +138,8 @@ async def read_rows(
     for name in ("rows", "kind", "next", "complete_to"):
         if said[name] is not None:
             headers[f"X-Amberbox-{name.replace('_', '-').title()}"] = str(said[name])
+    if said["notes"]:  # as much as a header takes
+        headers["X-Amberbox-Notes"] = json.dumps([str(n)[:300] for n in said["notes"][:10]])
     if about.form != "json":
         name = f"{about.robot}-{about.item}.{_ENDINGS[about.form]}".replace(":", "_")
         headers["Content-Disposition"] = f'attachment; filename="{name}"'

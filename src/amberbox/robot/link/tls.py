@@ -1,70 +1,20 @@
-"""TLS to a server whose certificate authority is pinned by its fingerprint, whatever the date.
-
-Robots without a battery for their clock start in 1970 and have no time before they have a network.
-So a pinned server is verified by its chain and name, not by dates: nobody else has the key.
-"""
+"""TLS of the link: the authority that a robot pinned, kept in its store once it was fetched."""
 
 from __future__ import annotations
 
-import base64
-import hashlib
-import re
-import socket
 import ssl
 from pathlib import Path
 from urllib.parse import urlsplit
 
 from amberbox.blackbox.store import replace_file
-from amberbox.core.errors import AmberboxError, UsageError
+from amberbox.core.tls import CA_PATH as CA_PATH
+from amberbox.core.tls import PinError as PinError
+from amberbox.core.tls import fetch_ca as fetch_ca
+from amberbox.core.tls import fingerprint as fingerprint
+from amberbox.core.tls import normal as normal
+from amberbox.core.tls import pinned_context as pinned_context
 
-CA_PATH = "/link/v1/ca.pem"
-"""Where a server gives away its authority's certificate, to anybody."""
 FILE = "server-ca.pem"
-_NO_CHECK_TIME = 0x200000
-"""X509_V_FLAG_NO_CHECK_TIME of OpenSSL, which Python's enumeration leaves out."""
-_MOST_BYTES = 64 << 10
-_TIMEOUT_S = 10.0
-_PEM = re.compile(rb"-----BEGIN CERTIFICATE-----\s+([A-Za-z0-9+/=\s]+?)-----END CERTIFICATE-----")
-
-
-class PinError(AmberboxError):
-    """The server's authority is not the one that was pinned."""
-
-
-def fingerprint(pem: bytes) -> str:
-    """Return the SHA-256 of the first certificate of a PEM file, 64 hex digits.
-
-    Raises ValueError when there is none in it.
-    """
-    found = _PEM.search(pem)
-    if found is None:
-        raise ValueError("there is no certificate in it")
-    return hashlib.sha256(base64.b64decode(found.group(1))).hexdigest()
-
-
-def normal(pin: str) -> str:
-    """Write a fingerprint as 64 lower-case digits; raises UsageError when it is none."""
-    digits = pin.lower().removeprefix("sha256:").replace(":", "").strip()
-    if not re.fullmatch(r"[0-9a-f]{64}", digits):
-        raise UsageError(f"'{pin}' is no fingerprint", "paste the line that the server printed")
-    return digits
-
-
-def pinned_context(pem: bytes, pin: str) -> ssl.SSLContext:
-    """Return a context that trusts one authority only, by its chain and the server's name.
-
-    Raises PinError when the certificate is another than the pinned one.
-    """
-    if fingerprint(pem) != normal(pin):
-        raise PinError(
-            f"the server's authority is {fingerprint(pem)}, not {normal(pin)}",
-            "is this the right server? if its authority was made anew, add the robot again",
-        )
-    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
-    context.minimum_version = ssl.TLSVersion.TLSv1_2
-    context.load_verify_locations(cadata=pem.decode("ascii"))
-    context.verify_flags |= ssl.VerifyFlags(_NO_CHECK_TIME)
-    return context
 
 
 def context_for(url: str, pin: str, store: Path) -> ssl.SSLContext | None:
@@ -91,30 +41,3 @@ def _fits(pem: bytes, pin: str) -> bool:
         return fingerprint(pem) == normal(pin)
     except ValueError:
         return False
-
-
-def fetch_ca(url: str) -> bytes:
-    """Ask a server for its authority's certificate; nothing is told to it, nothing is believed.
-
-    Raises OSError when it does not answer, PinError when it has none.
-    """
-    parts = urlsplit(url)
-    host, port = parts.hostname or "", parts.port or 443
-    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
-    context.check_hostname = False
-    context.verify_mode = ssl.CERT_NONE  # what comes is compared with the pin
-    request = f"GET {CA_PATH} HTTP/1.0\r\nHost: {parts.netloc}\r\n\r\n".encode()
-    answer = b""
-    with (
-        socket.create_connection((host, port), _TIMEOUT_S) as plain,
-        context.wrap_socket(plain, server_hostname=host) as secure,
-    ):
-        secure.sendall(request)
-        while len(answer) < _MOST_BYTES and (more := secure.recv(8192)):
-            answer += more
-    found = _PEM.search(answer)
-    if found is None:
-        raise PinError(
-            f"{url} does not give its authority's certificate", "is this an Amberbox server?"
-        )
-    return found.group(0) + b"\n"
