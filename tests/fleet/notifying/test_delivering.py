@@ -56,6 +56,11 @@ def test_nobody_there_is_told_in_a_line() -> None:
     assert trouble.startswith("ConnectionRefusedError")
 
 
+def test_a_host_that_is_no_name_is_told_in_a_line() -> None:
+    hook = Webhook("hook", "https://hooks..example/", SECRET)
+    assert "label empty" in deliver(hook, MESSAGE, Notifications(), NOW_NS)
+
+
 def test_a_webhook_is_signed() -> None:
     with hook_server() as hook:
         assert deliver(Webhook("h", hook.url, SECRET), MESSAGE, Notifications(), NOW_NS) == ""

@@ -21,7 +21,8 @@ MAIL = {"name": "m", "to": ["anna@example.com"]}
     [
         "ftp://hook.example/", "https://", "https://user:pw@hook.example/", "https://a b.example/",
         "http://hook.example/", "https://169.254.169.254/latest", "https://0.0.0.0/",
-        "https://224.0.0.1/", "https://[fe80::1]/", "https://hook.example:99999/", "file:///etc",
+        "https://224.0.0.1/", "https://[fe80::1]/", "https://[::ffff:169.254.169.254]/",
+        "https://hook.example:99999/", "file:///etc",
         "https://hook.example/#x", "https://hook.example/\r\nX: y", "//hook.example", "",
     ],
 )  # fmt: skip
@@ -53,6 +54,8 @@ def test_an_address_of_a_program_is_taken(url: str) -> None:
         ({"webhooks": [{**HOOK, "quiet": {"begin": "22:00", "end": "06:00", "zone": "Mars"}}]},
          "no time zone"),
         ({"webhooks": [{**HOOK, "least": "dreadful"}]}, "dreadful"),
+        ({"webhooks": [{**HOOK, "quiet": {"begin": "22:00+01:00", "end": "06:00"}}]},
+         "without an offset"),
         ({"digest_above": 0}, "digest_above"),
     ],
 )  # fmt: skip

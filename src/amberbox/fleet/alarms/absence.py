@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -74,15 +74,22 @@ def _values(statuses: Statuses, output: str) -> list[bool | float | str]:
         value
         for status in statuses
         if component in ("*", status.get("component")) and mode in ("*", status.get("mode"))
-        for entry in status.get("outputs") or ()
+        for entry in _outputs(status)
         if name in ("*", entry.get("name")) and (value := _value(entry)) is not None
     ]
 
 
+def _outputs(status: Mapping[str, Any]) -> Iterator[Mapping[str, Any]]:
+    """Give the outputs of a status; a robot may say anything in their place."""
+    found = status.get("outputs")
+    if isinstance(found, list):
+        yield from (entry for entry in found if isinstance(entry, dict))
+
+
 def _value(entry: Mapping[str, Any]) -> bool | float | str | None:
     kind, value = entry.get("type"), entry.get("value")
-    if kind == "bool":
-        return None if value is None else bool(value)
     if kind == "string":
         return None if entry.get("text") is None else str(entry["text"])
-    return None if value is None else float(value)
+    if not isinstance(value, bool | int | float):
+        return None
+    return bool(value) if kind == "bool" else float(value)

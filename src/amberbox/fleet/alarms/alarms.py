@@ -78,8 +78,8 @@ class Alarms:
         while True:
             try:
                 await asyncio.to_thread(self.sender.step)
-            except AmberboxError:  # the database is busy: the messages are still there
-                logging.getLogger(__name__).exception("the outbox could not be read")
+            except Exception:  # the messages are still there, whatever it was
+                logging.getLogger(__name__).exception("the outbox could not be emptied")
             await asyncio.sleep(_TICK_S)
 
     def step(self) -> None:
@@ -87,7 +87,7 @@ class Alarms:
         with self._stepping:
             changed = self._start() if self._absence is None else set()
             while news := self._inbox.next():
-                changed |= self._take(news)
+                changed |= self._taken(news)
                 self._inbox.done(len(news))
             changed |= self._tick()
         for number, robot in sorted(self._robots(changed)):
@@ -101,7 +101,22 @@ class Alarms:
             left: list[News] = list(boxes.missed_rows(connection, self._made_ns))
         self._absence = absence
         self._note_clocks(self._inbox.next())
-        return self._take(left) if left else set()
+        return self._taken(left) if left else set()
+
+    def _taken(self, news: list[News]) -> set[int]:
+        """Take news; what cannot be taken is left out, so that it holds nothing else up.
+
+        Raises AmberboxError when the database is busy: then they are taken later.
+        """
+        try:
+            return self._take(news)
+        except AmberboxError:
+            raise
+        except Exception:  # a defect, or something that no robot should say
+            if len(news) > 1:
+                return set[int]().union(*[self._taken([one]) for one in news])
+            logging.getLogger(__name__).exception("this of %s is left out", news[0].robot)
+            return set()
 
     def _take(self, news: list[News]) -> set[int]:
         """Take news in one transaction."""

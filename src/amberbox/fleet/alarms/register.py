@@ -14,6 +14,8 @@ from amberbox.fleet.alarms.tables import ALARM, ALARM_ROBOT, BLOCKED, HISTORY, P
 from amberbox.fleet.database.upsert import upsert
 
 _TEXT = 2_000
+_LISTS = frozenset({"blocked_by", "components"})
+"""Columns with JSON, of which a part is nothing; who writes them bounds them."""
 
 
 class Register:
@@ -150,7 +152,7 @@ def _cut(values: dict[str, Any], table: Table) -> dict[str, Any]:
     """Keep texts as short as their columns: robots may say anything."""
     return {
         name: value.replace("\0", "")[: getattr(table.c[name].type, "length", None) or _TEXT]
-        if isinstance(value, str)
+        if isinstance(value, str) and name not in _LISTS
         else value
         for name, value in values.items()
     }

@@ -20,6 +20,8 @@ from amberbox.monitoring.watcher.leading import leading
 _SURE = 0.5
 """A diagnosis that is less probable than this does not make one alarm of two."""
 _LATEST_NS = 1 << 62
+_NAMED = 100
+"""Components that a diagnosis may blame; more are not of use to anybody."""
 
 
 def take(
@@ -176,10 +178,11 @@ def _take_diagnosis(register: Register, robot: str, diagnosis: Diagnosis) -> Non
     failed = [{fault.partition("#")[0] for fault in answer.faults} for answer in answers]
     single = bool(failed) and all(len(components) == 1 for components in failed)
     names = sorted(set().union(*failed)) if single and diagnosis.state == "open" else []
+    names = [name[:128] for name in names[:_NAMED]]
     share = diagnosis.groups[0].probability if diagnosis.groups else sum(
         answer.probability for answer in answers
     )  # fmt: skip
-    revision = min(diagnosis.revision, _LATEST_NS)
+    revision = _time(diagnosis.revision)
     register.keep_roots(robot, diagnosis.id[:128], revision, names, share)
 
 

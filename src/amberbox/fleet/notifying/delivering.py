@@ -35,7 +35,8 @@ def deliver(to: Destination, message: Message, setting: Notifications, now_ns: i
         if setting.smtp is None:
             return "there is no mail server in the settings"
         return _mail(to, message, setting.smtp, now_ns)
-    except (OSError, smtplib.SMTPException, http.client.HTTPException) as error:
+    except (OSError, ValueError, smtplib.SMTPException, http.client.HTTPException) as error:
+        # a host may be no name at all, which is a ValueError
         return plain(f"{type(error).__name__}: {error}")[:500]
 
 
@@ -84,7 +85,6 @@ def _post(to: Webhook, message: Message, now_ns: int) -> str:
     try:
         connection.request("POST", path, data, headers)
         answer = connection.getresponse()
-        answer.read(1 << 16)
     finally:
         connection.close()
     if 200 <= answer.status < 300:

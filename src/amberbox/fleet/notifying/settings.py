@@ -55,7 +55,8 @@ class Quiet:
 
     def __post_init__(self) -> None:
         """Refuse times and zones that are none; raises ValueError."""
-        time.fromisoformat(self.begin), time.fromisoformat(self.end)
+        if any(time.fromisoformat(one).tzinfo is not None for one in (self.begin, self.end)):
+            raise ValueError("zone: begin and end are without an offset; zone says where they hold")
         try:
             _zone(self.zone)
         except (OSError, ValueError, KeyError) as error:
@@ -183,7 +184,8 @@ def _literal(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
 
 def _is_odd(address: ipaddress.IPv4Address | ipaddress.IPv6Address) -> bool:
     """Tell whether an address is nobody's: unspecified, multicast, or link-local (metadata)."""
-    return address.is_unspecified or address.is_multicast or address.is_link_local
+    plain = getattr(address, "ipv4_mapped", None) or address
+    return bool(plain.is_unspecified or plain.is_multicast or plain.is_link_local)
 
 
 def _check_name(name: str) -> None:
