@@ -5,12 +5,16 @@ from __future__ import annotations
 import os
 import signal
 import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from amberbox.core.errors import AmberboxError
-from amberbox.fleet.uploads.verifying import Claim, Verifier
+from amberbox.fleet.uploads import verifying
+from amberbox.fleet.uploads.verifying import Claim, Result, Verifier
 
 CLAIM = Claim(Path("/nowhere"), "r1", "s", "journal/000001-a-0001.mcap", "0" * 64, None, "")
 
@@ -32,6 +36,8 @@ def asked(verifier: Verifier, said: list[object]) -> threading.Thread:
             said.append(verifier.check(CLAIM))
         except AmberboxError as error:
             said.append(error.what)
+        except OSError:
+            said.append("no file")
 
     thread = threading.Thread(target=ask)
     thread.start()
@@ -47,16 +53,36 @@ def test_an_end_does_not_wait_for_a_file_nor_judge_it() -> None:
     assert said == ["the server stops"]
 
 
-def test_a_worker_that_dies_over_a_file_is_replaced() -> None:
+def test_a_worker_that_was_killed_is_replaced_and_the_file_looked_at_again() -> None:
     verifier, said = Verifier(), list[object]()
     process = stopped(verifier)
     thread = asked(verifier, said)
     os.kill(process, signal.SIGKILL)
-    thread.join(5)
-    assert said == [None]
-    with pytest.raises(OSError):
-        verifier.check(CLAIM)  # another one looks, and finds no file
+    thread.join(10)
+    assert said == ["no file"]
     verifier.close()
+
+
+def judged_by_name(claim: Claim) -> Result:
+    """Stand for the verification of a bomb, of one without an end, and of a sound file."""
+    if claim.path.name == "bomb":
+        os._exit(1)
+    if claim.path.name == "endless":
+        time.sleep(60)
+    return Result()
+
+
+def test_a_file_is_not_judged_by_what_another_one_does(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(verifying, "verify", judged_by_name)
+    verifier = Verifier(lambda path: 1.0 if path.name == "endless" else 60.0)
+    names = ("sound", "bomb", "sound", "endless", "sound")
+    claims = [replace(CLAIM, path=Path(name)) for name in names]
+    with ThreadPoolExecutor(len(claims)) as threads:
+        found = list(threads.map(verifier.check, claims))
+    verifier.close()
+    assert found[1] is None and found[3] is not None
+    assert found[3].reason == "to read it takes longer than it may"
+    assert [found[n] for n in (0, 2, 4)] == [Result()] * 3
 
 
 def test_ctrl_c_is_not_for_the_worker() -> None:

@@ -8,6 +8,7 @@ import os
 import resource
 import signal
 import threading
+from collections.abc import Callable
 from concurrent.futures import CancelledError, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
@@ -29,6 +30,9 @@ _WRITER_OF = {folder: writer for writer, folder in FOLDERS.items()}
 _MEMORY_BYTES = 8 << 30
 _READ_BYTES = 1 << 20
 _NICE = 5
+_TRIES = 2
+_LEAST_S, _BYTES_PER_S = 60.0, 2e6
+"""Even the slowest computers verify many times as fast."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,33 +129,60 @@ def _sha256(path: Path) -> str:
     return digest.hexdigest()
 
 
-class Verifier:
-    """A worker process for verification; one that dies (a bomb, no memory) is replaced."""
+def _seconds(path: Path) -> float:
+    """Return how long a file may take: much longer than any that is none of a bomb."""
+    try:
+        return _LEAST_S + path.stat().st_size / _BYTES_PER_S
+    except OSError:
+        return _LEAST_S
 
-    def __init__(self) -> None:
+
+class Verifier:
+    """A worker process for verification; one that dies (a bomb, no memory) is replaced.
+
+    It has one file at a time: what it dies over, or never comes to an end with, is that one.
+    """
+
+    def __init__(self, seconds: Callable[[Path], float] = _seconds) -> None:
+        self._seconds = seconds
+        self._turn = threading.Lock()
         self._pool: ProcessPoolExecutor | None = None
         self._is_closed = False
 
     def check(self, claim: Claim) -> Result | None:
-        """Verify a file; None when the worker died over it. Blocks: call it in a thread.
+        """Verify a file; None when workers died over it. Blocks: call it in a thread.
 
-        Raises AmberboxError when the server stops meanwhile: nothing is known of the file then.
+        A worker may also die of something else (the system needs memory), so there is a second
+        try. Raises AmberboxError when the server stops meanwhile: nothing is known of the file.
         """
+        with self._turn:
+            for _ in range(_TRIES):
+                if self._is_closed:
+                    raise AmberboxError("the server stops", "send it again later")
+                self._pool = self._pool or _new_pool()
+                found = self._tried(self._pool, claim)
+                if found is not None:
+                    return found
+                self._stop()
         if self._is_closed:
             raise AmberboxError("the server stops", "send it again later")
-        pool = self._pool = self._pool or _new_pool()
+        return None
+
+    def _tried(self, pool: ProcessPoolExecutor, claim: Claim) -> Result | None:
         try:
-            return pool.submit(verify, claim).result()
+            return pool.submit(verify, claim).result(self._seconds(claim.path))
+        except TimeoutError:
+            self._stop()
+            return Result("to read it takes longer than it may")
         except (BrokenProcessPool, CancelledError, RuntimeError):
-            if self._is_closed:
-                raise AmberboxError("the server stops", "send it again later") from None
-            if self._pool is pool:
-                self._pool = None
             return None
 
     def close(self) -> None:
         """End the worker, also in the middle of a file: it is verified when it is sent again."""
         self._is_closed = True
+        self._stop()
+
+    def _stop(self) -> None:
         pool, self._pool = self._pool, None
         if pool is not None:
             # Python names no other way to the processes before 3.14
