@@ -19,6 +19,7 @@ from amberbox.fleet.linkend.server import LinkServer
 from amberbox.fleet.services import Services
 from amberbox.fleet.serving import assembly, background
 from amberbox.fleet.serving.asgi import ASGIApp
+from amberbox.fleet.serving.refusals import RefusingProtocol
 from amberbox.fleet.serving.settings import Settings
 from amberbox.fleet.serving.slowheaders import PatientProtocol
 from amberbox.fleet.serving.wrapping import wrapped
@@ -129,7 +130,7 @@ class _Server(uvicorn.Server):
 
 def _config(app: ASGIApp, settings: Settings) -> uvicorn.Config:
     return uvicorn.Config(
-        app, http=PatientProtocol, ws="websockets-sansio", lifespan="off", log_config=None,
+        app, http=PatientProtocol, ws=RefusingProtocol, lifespan="off", log_config=None,
         access_log=False, server_header=False, proxy_headers=False, timeout_keep_alive=15,
         timeout_graceful_shutdown=int(GRACE_S), ws_max_size=limits.FRAME_BYTES,
         ws_per_message_deflate=False, backlog=_BACKLOG, log_level="warning",
