@@ -39,8 +39,11 @@ def serve(folder: Path, requests: IO[bytes], answers: IO[bytes]) -> None:
             return
         except Exception as error:  # every one of them is an answer
             last = told(error)
-        answers.write(packed(last))
-        answers.flush()
+        try:
+            answers.write(packed(last))
+            answers.flush()
+        except BrokenPipeError:
+            return
 
 
 def parts(folder: Path, op: str, arguments: Mapping[str, Any]) -> Iterator[bytes]:
@@ -83,10 +86,10 @@ def main() -> None:
     """Serve stdin; leave without what libraries do at exit."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     os.nice(int(sys.argv[2]) if len(sys.argv) > 2 else 0)
-    with os.fdopen(os.dup(1), "wb", buffering=1 << 16) as answers:
-        os.dup2(2, 1)
-        serve(Path(sys.argv[1]), sys.stdin.buffer, answers)
-    os._exit(0)
+    answers = os.fdopen(os.dup(1), "wb", buffering=1 << 16)
+    os.dup2(2, 1)
+    serve(Path(sys.argv[1]), sys.stdin.buffer, answers)
+    os._exit(0)  # without closing: what a server that died left in the pipe cannot be written
 
 
 if __name__ == "__main__":
