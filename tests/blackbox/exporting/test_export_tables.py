@@ -146,7 +146,7 @@ def test_the_box_itself_only_when_asked(filled: Path, tmp_path: Path) -> None:
     assert run(filled, tmp_path / "run.csv", "csv", items=["amberbox_run"]).total == 1
 
 
-SAYINGS = ["=1+1", "+1", "-1", "@sum", "\tx", "\rx", "fine", "", "a=b", "'=1"]
+SAYINGS = ["=1+1", "+1", "-1", "@sum", "\tx", "\rx", "|x", " =1", "fine", "", "a=b", "'=1"]
 
 
 def test_text_that_is_a_formula_does_nothing(tmp_path: Path) -> None:
@@ -162,12 +162,12 @@ def test_text_that_is_a_formula_does_nothing(tmp_path: Path) -> None:
         export(opened, view, tmp_path / "out.csv", "csv")
         export(opened, view, tmp_path / "raw.csv", "csv", options=ExportOptions(raw_text=True))
     rows = list(csv.DictReader((tmp_path / "out.csv").open(newline="")))
-    assert [row["text"] for row in rows] == [f"'{t}" for t in SAYINGS[:6]] + SAYINGS[6:]
+    assert [row["text"] for row in rows] == [f"'{t}" for t in SAYINGS[:8]] + SAYINGS[8:]
     assert {(row["number"], row["data"]) for row in rows} == {("-1.5", '["=1"]')}
     rows = list(csv.DictReader((tmp_path / "raw.csv").open(newline="")))
     assert [row["text"] for row in rows] == SAYINGS
     shown = list(csv.DictReader(io.StringIO(as_csv(tmp_path / "store", "said"), newline="")))
-    assert [row["text"] for row in shown][:6] == [f"'{text}" for text in SAYINGS[:6]]
+    assert [row["text"] for row in shown][:8] == [f"'{text}" for text in SAYINGS[:8]]
 
 
 def test_a_segment_joined_meanwhile_costs_no_row(

@@ -10,8 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from amberbox.core.spreadsheets import harmless
 from amberbox.fleet.audit.entry import START, Entry, Row, link, row_after
-from amberbox.fleet.audit.export import COLUMNS, csv_lines, harmless, json_lines
+from amberbox.fleet.audit.export import COLUMNS, csv_lines, json_lines
 
 ROW = row_after(0, START, 1_700_000_000_123_456_789, Entry("user:anna", "::1", "own.read", "x"))
 

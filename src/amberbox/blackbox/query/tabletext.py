@@ -15,13 +15,13 @@ import numpy as np
 
 from amberbox.blackbox.query.fitting import DOTS, GAP, Fit, Room, cut, fit
 from amberbox.blackbox.segments import columns as col
+from amberbox.core.spreadsheets import harmless
 from amberbox.core.timetext import format_times
 from amberbox.core.types import Column, ColumnData, Ragged
 
 _CHUNK = 10_000
 _VALUES = 500_000
 _NUMBERS = {*col.NUMPY_TYPES} - {"bool", "time"}
-_FORMULA = "=+-@\t\r"
 _EDGE_ROWS = 5
 _CELL_WIDTH = 40
 _STEADY_WIDTH = 14
@@ -109,18 +109,13 @@ def _cells(field: Column, column: ColumnData, raw_text: bool) -> list[Any]:
         return msgspec.json.encode(plain(column))[1:-1].decode().split(",") if len(column) else []
     values = speakable(column, field.type)
     if field.type == "string":
-        return values if raw_text else [_harmless(value) for value in values]
+        return values if raw_text else [value and harmless(value) for value in values]
     return [_cell(value) for value in values] if field.type not in _NUMBERS else values
 
 
 def _has_carriage_return(cells: Sequence[Any]) -> bool:
     """Tell cells that the csv module (up to Python 3.12) leaves unquoted, cutting a row in two."""
     return any(type(cell) is str and "\r" in cell for cell in cells)
-
-
-def _harmless(text: str | None) -> str | None:
-    """Keep a spreadsheet from calculating what a robot, or somebody on its network, has said."""
-    return f"'{text}" if text and text[0] in _FORMULA else text
 
 
 def _cell(value: Any) -> Any:

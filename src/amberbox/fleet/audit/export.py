@@ -7,11 +7,11 @@ import io
 import json
 from collections.abc import Iterable, Iterator
 
+from amberbox.core.spreadsheets import harmless
 from amberbox.core.timetext import format_time
 from amberbox.fleet.audit.entry import Row
 
 COLUMNS = ("seq", "time", "principal", "address", "action", "object", "result", "details", "hash")
-_FORMULA = tuple("=+-@\t\r\n|%＝＋－＠")  # noqa: RUF001 -- full-width signs start formulas, too
 
 
 def json_lines(rows: Iterable[Row]) -> Iterator[str]:
@@ -39,11 +39,6 @@ def csv_lines(rows: Iterable[Row]) -> Iterator[str]:
         texts = (row.principal, row.address, row.action, row.object, row.result, row.details)
         cells = map(harmless, texts)
         yield _csv_line((str(row.seq), format_time(row.time_ns), *cells, row.hash))
-
-
-def harmless(text: str) -> str:
-    """Put ``'`` before a text that a spreadsheet would take for a formula or a command."""
-    return f"'{text}" if text.lstrip(" ").startswith(_FORMULA) else text
 
 
 def _csv_line(cells: Iterable[str]) -> str:
