@@ -85,7 +85,8 @@ def _told(folder: Path, *, quiet: bool) -> Callable[[Start], None]:
                 print("the server's certificate was made anew, for a year", flush=True)
             print(f"serving {folder} at {url}; Ctrl-C ends it", flush=True)
         if start.code is not None:
-            print(start.code.text(f"{url}/setup"), file=sys.stderr, flush=True)
+            text = start.code.text(f"{url}/setup", by_proxy=bool(start.settings.proxies))
+            print(text, file=sys.stderr, flush=True)
 
     return tell
 

@@ -124,6 +124,10 @@ def test_stderr_says_what_to_do(stand: Stand) -> None:
     code = _new(stand)
     text = code.text("https://fleet.example:8443/setup")
     assert all(part in text for part in (code.code, str(code.path), "30 minutes", "/setup"))
+    assert "On this machine no code is asked for" in text
+    assert "and enter this code" in code.text("https://fleet.example/setup", by_proxy=True)
+    _use(stand, code.code)
+    assert "and enter this code" in _new(stand).text("https://fleet.example:8443/setup")
 
 
 def test_a_mistake_does_not_use_up_the_code(stand: Stand) -> None:

@@ -52,14 +52,19 @@ class SetupCode:
     code: str
     path: Path
     expires_ns: int
+    is_first: bool = True
+    """Whether there is no admin yet."""
 
     def __repr__(self) -> str:
         return f"SetupCode({self.path})"
 
-    def text(self, url: str) -> str:
-        """Return what is said on stderr."""
+    def text(self, url: str, *, by_proxy: bool = False) -> str:
+        """Return what is said on stderr; the first admin needs no code on the machine itself."""
+        enter = " and enter this code:"
+        if self.is_first and not by_proxy:
+            enter = ".\nOn this machine no code is asked for; from elsewhere it takes this one:"
         return (
-            f"To become an admin of this server, open {url} and enter this code:\n\n"
+            f"To become an admin of this server, open {url}{enter}\n\n"
             f"    {self.code}\n\n"
             f"It holds for {LASTS_NS // (60 * NS)} minutes and once. It is also in {self.path}.\n"
         )
@@ -73,12 +78,13 @@ def new_setup_code(database: Database, clock: Clock, folder: Path) -> SetupCode:
     code = "-".join("".join(map(secrets.choice, [_LETTERS] * _EACH)) for _ in range(_GROUPS))
     now_ns = clock.wall_ns()
     with database.begin() as connection:
+        is_first = needs_setup(connection)
         connection.execute(delete(SETUP_CODES))
         row = {"hash": _hash(code), "created_ns": now_ns, "expires_ns": now_ns + LASTS_NS}
         connection.execute(insert(SETUP_CODES), [row])
         append(connection, now_ns, Entry("server", "", ACTION, "code", details={"made": True}))
     _write(folder / FILE, code)
-    return SetupCode(code, folder / FILE, now_ns + LASTS_NS)
+    return SetupCode(code, folder / FILE, now_ns + LASTS_NS, is_first)
 
 
 def needs_setup(connection: Connection) -> bool:
