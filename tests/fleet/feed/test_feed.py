@@ -18,9 +18,11 @@ from amberbox.fleet.accounts.tokens import add_token
 from amberbox.fleet.accounts.users import find_user
 from amberbox.fleet.api.who import COOKIE
 from amberbox.fleet.bus import Change
+from amberbox.fleet.conclusions.reading import Stores
 from amberbox.fleet.feed import feed as feed_module
 from amberbox.fleet.feed.delta import Ring
 from amberbox.fleet.feed.feed import MOST_EACH
+from amberbox.fleet.state.said import LONGEST, SaidStatus, heard
 from tests.fleet.feed.listening import Stage, ask, hear, heard_within, stage
 from tests.fleet.house import URL, House, house
 from tests.fleet.state.lives import put_alarm
@@ -355,3 +357,49 @@ def test_the_ring_is_bounded_by_count_and_bytes() -> None:
     assert ring.holds(1040) and ring.holds(1050) and not ring.holds(1039) and not ring.holds(1051)
     ring.add("event", "r", "x" * 9_800, 0.0)
     assert len(list(ring.after(0))) < 4
+
+
+def test_a_robot_whose_past_cannot_be_read_ends_nothing(
+    home: House, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Damaged columns raise whatever the library that reads them thinks of."""
+    state, read = home.services.feed.state, list[str]()
+
+    def load(stores: Stores, robot: str) -> None:
+        read.append(robot)
+        raise KeyError(robot)
+
+    async def scene() -> None:
+        running = asyncio.create_task(state.run())
+        while len(read) < 3:
+            await asyncio.sleep(0.01)
+        running.cancel()
+        await asyncio.gather(running, return_exceptions=True)
+        assert running.cancelled()
+
+    monkeypatch.setattr(state.latest, "load", load)
+    asyncio.run(asyncio.wait_for(scene(), 10))
+    assert read == ["ropod_001", "ropod_002", "ropod_003"]
+
+
+def test_what_fails_in_the_feed_leaves_nothing_behind_that_goes_on(
+    home: House, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    feed = home.services.feed
+
+    async def fails() -> None:
+        raise KeyError
+
+    async def scene() -> int:
+        before = len(asyncio.all_tasks())
+        with pytest.raises(ExceptionGroup):
+            await feed.run()
+        return len(asyncio.all_tasks()) - before
+
+    monkeypatch.setattr(feed, "_lives", fails)
+    assert asyncio.run(asyncio.wait_for(scene(), 10)) == 0
+
+
+def test_a_record_that_is_too_long_to_look_at_is_passed_over() -> None:
+    assert heard(b'{"component":"x","reason":"%s"}' % (b"a" * LONGEST), SaidStatus) is None
+    assert heard(b'{"component":"x","reason":"%s"}' % (b"a" * 1000), SaidStatus) is not None

@@ -65,7 +65,9 @@ class Feed:
         await asyncio.to_thread(self._load)
         ends = [self._bus.on(kind, work) for kind, work in self._hears()]
         try:
-            await asyncio.gather(self.state.run(), self.live.run(), self._checks(), self._lives())
+            async with asyncio.TaskGroup() as group:  # none of them goes on without the others
+                for work in (self.state.run(), self.live.run(), self._checks(), self._lives()):
+                    group.create_task(work)
         finally:
             for end in ends:
                 end()

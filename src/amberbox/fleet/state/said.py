@@ -17,6 +17,8 @@ from amberbox.monitoring.engine.outputs import RANK
 
 _RANKS: Mapping[str, int] = dict(RANK.items())
 _FIRST_NS, _BEYOND_NS = 1, 2**63
+LONGEST = 256 << 10
+"""Bytes of a record that is shown: what is remembered of a robot has an end."""
 Kind = TypeVar("Kind", bound=msgspec.Struct)
 
 
@@ -118,7 +120,9 @@ def rank_of(level: str) -> int:
 
 
 def heard(data: bytes | str, kind: type[Kind]) -> Kind | None:
-    """Read a record; None where it does not have the form."""
+    """Read a record; None where it does not have the form, or is too long to look at."""
+    if len(data) > LONGEST:
+        return None
     try:
         return msgspec.json.decode(data, type=kind)
     except (msgspec.MsgspecError, ValueError, RecursionError):

@@ -104,3 +104,5 @@ class State:
             self.facts.read(robot, self._folders.current(robot))
         except AmberboxError as error:  # its card lacks something; the others do not
             logging.getLogger(__name__).warning("%s: %s", robot, error)
+        except Exception:  # of a robot whose files are damaged, the same
+            logging.getLogger(__name__).exception("the past of %s cannot be read", robot)
