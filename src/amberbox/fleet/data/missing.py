@@ -6,15 +6,19 @@ from typing import Any
 
 from amberbox.core.timetext import format_time
 from amberbox.core.types import Gap
-from amberbox.fleet.archive.gaps import gaps_of
+from amberbox.fleet.archive.gaps import WAITING, gaps_of
 from amberbox.fleet.data.asked import Asked
 from amberbox.fleet.data.look import Look
 
 
 def gaps_json(look: Look, asked: Asked) -> dict[str, Any]:
-    """List gaps of an item (all without a name) that meet ``[from, to)``, in order of time."""
+    """List gaps of an item (all without a name) that meet ``[from, to)``, in order of time.
+
+    Journals that wait for their columns are none: questions are answered from them, too.
+    """
     item = asked.item or None
-    found = gaps_of(look.reader, look.catalogue, item, (asked.from_ns, asked.to_ns))
+    every = gaps_of(look.reader, look.catalogue, item, (asked.from_ns, asked.to_ns))
+    found = [gap for gap in every if gap.reason != WAITING]
     return {"gaps": [_gap(gap) for gap in found[: asked.limit]], "more": len(found) > asked.limit}
 
 
