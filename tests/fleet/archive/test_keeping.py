@@ -17,7 +17,7 @@ from sqlalchemy import func, insert, select
 from amberbox.blackbox.segments.entries import Tombstone, to_record
 from amberbox.blackbox.segments.lines import FIRST_HASH, encode
 from amberbox.core.errors import AmberboxError
-from amberbox.fleet.archive import settling
+from amberbox.fleet.archive import keeping, settling
 from amberbox.fleet.archive.folder import FolderArchive
 from amberbox.fleet.archive.keeping import RETENTION, Keeping
 from amberbox.fleet.archive.store import Retention
@@ -238,6 +238,30 @@ def test_data_go_by_the_rules_of_the_setting(scene: Scene) -> None:
     assert len(list(scene.archive.layout.journals.rglob("*.mcap"))) == before
     scene.keeping.tidy(is_daily=True)
     assert len(list(scene.archive.layout.journals.rglob("*.mcap"))) < before
+
+
+def test_data_go_daily_also_where_the_server_is_restarted_more_often(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    daily: list[bool] = []
+    monkeypatch.setattr(Keeping, "tidy", lambda _, *, is_daily: daily.append(is_daily))
+    monkeypatch.setattr(keeping, "_FIRST_S", 0.0)
+    for hours in (0, 9, 9, 9, 1):
+        scene.clock.advance(hours * 3600)
+        again = Keeping(scene.database.path.parent, scene.database, Bus(), scene.clock,
+                        scene.archive)  # fmt: skip
+        asyncio.run(_begun(again, daily, len(daily) + 1))
+        again.close()
+    assert daily == [True, False, False, True, False]
+
+
+async def _begun(again: Keeping, daily: list[bool], count: int) -> None:
+    running = asyncio.create_task(again.run())
+    while len(daily) < count and not running.done():
+        await asyncio.sleep(0.01)
+    await asyncio.sleep(0.05)  # it is written down after that
+    running.cancel()
+    await asyncio.gather(running, return_exceptions=True)
 
 
 def test_a_disk_that_fills_is_told_and_takes_nothing_more(scene: Scene) -> None:

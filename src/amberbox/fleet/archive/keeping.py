@@ -11,11 +11,12 @@ import logging
 import shutil
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
-from amberbox.core.clock import Clock
+from amberbox.core.clock import NS, Clock
 from amberbox.core.errors import AmberboxError
 from amberbox.fleet.archive import settling
 from amberbox.fleet.archive.folder import FolderArchive
@@ -32,6 +33,10 @@ from amberbox.link.uploads import Proof
 
 T = TypeVar("T")
 
+_RETAINED = "archive.retained"
+_DAY_NS = 24 * 3600 * NS - 60 * NS
+"""A day, and a minute less: what is looked at every hour never comes at the second."""
+
 RETENTION = "retention"
 """Name of the setting: a list of rules; without any everything is kept."""
 COMMIT_S = 60.0
@@ -41,6 +46,13 @@ _HOUR_S = 3600.0
 _FIRST_S = 600.0
 """When a server that was just started first tidies up."""
 _DISK_S = 10.0
+
+
+@dataclass(frozen=True, slots=True)
+class Retained:
+    """When data that are too old were deleted last."""
+
+    at_ns: int = 0
 
 
 class Keeping:
@@ -156,14 +168,23 @@ class Keeping:
     async def _tidy_always(self) -> None:
         """Join and sweep every hour, delete what is too old once a day."""
         await asyncio.sleep(_FIRST_S)
-        hours = 0
         while True:
             try:
-                await self._apart(partial(self.tidy, is_daily=hours % 24 == 0))
+                await self._apart(self._tidy_once)
             except AmberboxError as error:
                 self._failed(error)
-            hours += 1
             await asyncio.sleep(_HOUR_S)
+
+    def _tidy_once(self) -> None:
+        """Tidy; when old data were deleted last is kept, for servers that are restarted daily."""
+        now_ns = self._clock.wall_ns()
+        with self._database.reading() as connection:
+            since_ns = now_ns - options.read(connection, _RETAINED, Retained).at_ns
+        is_daily = not 0 <= since_ns < _DAY_NS
+        self.tidy(is_daily=is_daily)
+        if is_daily:
+            with self._database.begin() as connection:
+                options.write(connection, now_ns, _RETAINED, Retained(now_ns))
 
     def tidy(self, *, is_daily: bool) -> None:
         """Tidy the archive once; blocks. Raises AmberboxError when the worker could not."""
