@@ -7,6 +7,7 @@ import hashlib
 import uuid
 import zlib
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 
 import msgspec
@@ -21,6 +22,7 @@ from amberbox.fleet.archive.room import Room
 from amberbox.fleet.bus import Change
 from amberbox.fleet.linkend.sockets import SocketClosedError
 from amberbox.fleet.serving.doorkeeper import KeyedSocket
+from amberbox.fleet.serving.threads import EACH
 from amberbox.link import uploads
 from amberbox.link.frames import Bye, Hello, ServerFrame, Welcome, encode, from_server
 from amberbox.link.limits import PIECE_BYTES
@@ -150,6 +152,20 @@ def test_what_is_no_number_too_large_or_no_proof_is_refused(home: House) -> None
     large = b"x" * (PIECE_BYTES + 1)
     assert robot.patch(JOURNAL, content=large, headers=piece(large)).status_code == 413
     assert robot.post(JOURNAL, content=b"{", headers=about(b"other")).status_code == 400
+
+
+def test_a_robot_that_sends_very_much_at_once_is_sent_away(home: House) -> None:
+    threads, client = home.services.threads, home.robot_client("ropod_001")
+    with ExitStack() as busy:
+        for _ in range(EACH):
+            busy.enter_context(threads.turn("ropod_001"))
+        assert client.patch(JOURNAL, content=CONTENT, headers=piece(CONTENT)).status_code == 503
+        assert client.post(JOURNAL, headers=about()).status_code == 503
+        folder = f"/link/v1/folders/{'0' * 64}"
+        assert client.put(folder, content=b"x").status_code == 503
+        other = home.robot_client("ropod_002")
+        assert other.patch(JOURNAL, content=CONTENT, headers=piece(CONTENT)).status_code != 503
+    assert client.put(folder, content=b"x").status_code == 400
 
 
 def test_a_full_disk_takes_nothing(home: House, monkeypatch: pytest.MonkeyPatch) -> None:

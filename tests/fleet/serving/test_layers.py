@@ -197,6 +197,25 @@ def test_robots_are_not_counted() -> None:
     assert limited.statuses(1, "/link/v1/ca.pem") == [429], "without a key it is one of many"
 
 
+def test_who_only_says_that_he_is_a_robot_is_counted() -> None:
+    async def refuses(scope: Scope, receive: Receive, send: Send) -> None:
+        is_good = dict(scope["headers"])[b"authorization"] == b"Robot r1:good"
+        start: Any = {
+            "type": "http.response.start",
+            "status": 200 if is_good else 401,
+            "headers": [],
+        }
+        await send(start)
+        await send({"type": "http.response.body", "body": b""})
+
+    app = RateLimits(refuses, SETTINGS, strangers=Rate(3, 1.0), clock_s=lambda: 0.0)
+    bad = [{"Authorization": f"Robot r1:{number}"} for number in range(5)]
+    good, path = {"Authorization": "Robot r1:good"}, "/link/v1/journals/x"
+    assert ask(app, path, headers=good).status_code == 200
+    assert [ask(app, path, headers=one).status_code for one in bad] == [401, 401, 429, 429, 429]
+    assert ask(app, path, headers=good).status_code == 200, "its key has worked"
+
+
 def test_requests_are_written_down_without_what_is_private(home: House, tmp_path: Path) -> None:
     clock = ManualClock(1_800_000_000 * 10**9)
     log = AccessLog(home.app, tmp_path, PROXIED, clock)

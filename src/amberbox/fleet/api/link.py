@@ -60,10 +60,10 @@ async def add(
     offset, crc = _number(request, uploads.OFFSET), _number(request, uploads.CRC)
     if fleet.keeping.is_full:
         return _answered(Answer(507, text="the server's disk is full"))
-    piece = await _body(request, limits.PIECE_BYTES)
-    return _answered(
-        await fleet.threads.piece(lambda: fleet.desk.patch(incoming, offset, piece, crc))
-    )
+    with fleet.threads.turn(who.principal.id):
+        piece = await body_of(request, limits.PIECE_BYTES)
+        answer = await fleet.threads.piece(lambda: fleet.desk.patch(incoming, offset, piece, crc))
+    return _answered(answer)
 
 
 @routes.post("/journals/{store_id}/{folder}/{file}", "journals.upload")
@@ -72,8 +72,9 @@ async def finish(
 ) -> Response:
     """End a journal: it is verified, and what became of it is told."""
     incoming = _incoming(who.principal.id, store_id, f"{folder}/{file}", request)
-    proof = _proof(await _body(request, uploads.PROOF_BYTES))
-    answer = await fleet.threads.end(partial(fleet.desk.post, incoming, proof))
+    with fleet.threads.turn(who.principal.id):
+        proof = _proof(await body_of(request, uploads.PROOF_BYTES))
+        answer = await fleet.threads.end(partial(fleet.desk.post, incoming, proof))
     if answer.state == "verified":
         await fleet.threads.piece(partial(fleet.keeping.note_deleted, incoming, proof))
     return _answered(answer)
@@ -91,7 +92,8 @@ def _number(request: Request, name: str) -> int:
     return int(text)
 
 
-async def _body(request: Request, most: int) -> bytes:
+async def body_of(request: Request, most: int) -> bytes:
+    """Read what is sent; raises 413 as soon as it is too much."""
     found = bytearray()
     async for piece in request.stream():
         found += piece
