@@ -32,10 +32,22 @@ def show(
     connection: Connection, robot: str, store_id: str, rows: Sequence[Row], now_ns: int
 ) -> None:
     """Enter statuses; one that stands before what is shown (it came late) changes nothing."""
+    enter(connection, entries(robot, store_id, rows, now_ns))
+
+
+def entries(
+    robot: str, store_id: str, rows: Sequence[Row], now_ns: int
+) -> Sequence[dict[str, Any]]:
+    """Return what rows say to the board: the newest status of each component and mode."""
     found = {(s["component"], s["mode"]): s for s in _entries(robot, store_id, rows, now_ns)}
-    if found:
+    return list(found.values())
+
+
+def enter(connection: Connection, values: Sequence[dict[str, Any]]) -> None:
+    """Write entries in their order; of two, the one that stands later in the record is shown."""
+    if values:
         statement = upsert(connection.dialect, STATUS, _KEY, _CHANGE, when=_is_newer)
-        connection.execute(statement, list(found.values()))
+        connection.execute(statement, values)
 
 
 def board(connection: Connection, robot: str) -> list[dict[str, Any]]:

@@ -32,7 +32,7 @@ def admit(connection: Connection, hello: Hello, now_ns: int) -> Admission:
     keys = hello.robot, hello.store_id
     found = _compare(connection, keys, cursor, hello.writers, now_ns, is_hello=True)
     cursor = dict.fromkeys(hello.writers, START) | set_back(cursor, found)
-    _write_cursors(connection, keys, cursor, cursor)
+    write_cursors(connection, [(keys, cursor, cursor)])
     _note_runs(connection, keys, hello.writers)
     return Admission(epoch, cursor, tuple(found), is_new)
 
@@ -60,7 +60,7 @@ def store(
     board.show(connection, robot, store_id, new, now_ns)
     received = set_back({**received, **upto}, found)
     cursor = advanced(set_back(cursor, found), received, reaches)
-    _write_cursors(connection, keys, cursor, received)
+    write_cursors(connection, [(keys, cursor, received)])
     return Stored(cursor, tuple(new), tuple(conflicts), tuple(found))
 
 
@@ -112,14 +112,16 @@ def _cursors(connection: Connection, robot: str, store_id: str) -> tuple[Upto, U
     return cursor, {row.writer: Place(row.upto_run, row.upto_seq) for row in rows}
 
 
-def _write_cursors(
-    connection: Connection, keys: tuple[str, str], cursor: Upto, received: Upto
+def write_cursors(
+    connection: Connection, cursors: Iterable[tuple[tuple[str, str], Upto, Upto]]
 ) -> None:
+    """Write the cursors of stores (robot and store, cursor, up to where rows were received)."""
     values = [
         {
             "robot": keys[0], "store_id": keys[1], "writer": w, "run": at.run, "seq": at.seq,
             "upto_run": received.get(w, at).run, "upto_seq": received.get(w, at).seq,
         }
+        for keys, cursor, received in cursors
         for w, at in cursor.items()
     ]  # fmt: skip
     if values:
@@ -251,7 +253,8 @@ def _take(
         missing = {seq: row for seq, row in found.items() if seq not in known}
         new += without_committed(connection, keys, writer, run, missing)
         _reach(connection, keys, writer, run, max(found) + 1)
-    _insert(connection, keys, new, now_ns)
+    about = {"robot": keys[0], "store_id": keys[1], "received_ns": now_ns}
+    insert(connection, [{**about, **columns(row)} for row in new])
     if conflicts:
         put_aside(connection, keys, conflicts, OTHER, now_ns)
         text = f"{len(conflicts)} rows have other contents than those held at their positions"
@@ -280,14 +283,15 @@ def _reach(connection: Connection, keys: tuple[str, str], writer: str, run: int,
     connection.execute(statement, [values])
 
 
-def _insert(
-    connection: Connection, keys: tuple[str, str], rows: Sequence[Row], now_ns: int
-) -> None:
-    if rows:
-        about = {"robot": keys[0], "store_id": keys[1], "received_ns": now_ns}
-        values = [
-            {**about, "writer": row.writer, "run": row.run, "seq": row.seq,
-             "channel": row.channel, "log_ns": row.log_ns, "data": row.data}
-            for row in rows
-        ]  # fmt: skip
+def insert(connection: Connection, values: Sequence[Mapping[str, Any]]) -> None:
+    """Insert rows, each as the columns of its table."""
+    if values:
         connection.execute(ROW.insert(), values)
+
+
+def columns(row: Row) -> dict[str, Any]:
+    """Return what of a row stands in columns of its own."""
+    return {
+        "writer": row.writer, "run": row.run, "seq": row.seq, "channel": row.channel,
+        "log_ns": row.log_ns, "data": row.data,
+    }  # fmt: skip

@@ -15,6 +15,7 @@ from amberbox.fleet.database.database import Database
 from amberbox.fleet.linkend import ledger, presence
 from amberbox.fleet.linkend.grouped import GroupedWrites
 from amberbox.fleet.linkend.sockets import Socket, SocketClosedError
+from amberbox.fleet.linkend.together import Taking
 from amberbox.link import limits
 from amberbox.link.folders import is_config_hash
 from amberbox.link.frames import (
@@ -190,10 +191,9 @@ class LinkServer:
 
     def _keep(self, one: Connected, deed: Keep) -> asyncio.Task[Sequence[ServerFrame]]:
         now_ns = self._clock.wall_ns()
-        work = partial(
-            ledger.store, robot=one.robot, epoch=deed.epoch, store_id=deed.store_id,
-            rows=deed.rows, upto=deed.upto, reaches=deed.reaches, now_ns=now_ns,
-            compare=deed.compare,
+        work = Taking(
+            one.robot, deed.epoch, deed.store_id, deed.rows, deed.upto, deed.reaches, now_ns,
+            deed.compare,
         )  # fmt: skip
         stored = asyncio.wrap_future(self._writes.submit(work))
         return asyncio.create_task(self._kept(one, deed, stored))
