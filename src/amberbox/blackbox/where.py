@@ -15,6 +15,11 @@ def store_path(where: str | Path) -> Path:
     Raises UsageError when there is none.
     """
     path = Path(where)
+    if path.parts[:1] in (("https:",), ("http:",)):
+        raise UsageError(
+            "this takes what is on this computer, not a server",
+            "amberbox export URL --format journals downloads what a robot has signed",
+        )
     if is_store(path):
         return path
     store = store_of(path)

@@ -15,6 +15,8 @@ from typing import IO, TYPE_CHECKING, Any
 
 from amberbox.blackbox.query.fitting import Room
 from amberbox.blackbox.query.tabletext import grid
+from amberbox.cli._server import remote_record
+from amberbox.client.address import is_url
 from amberbox.core.errors import UsageError
 from amberbox.fleet.archive.where import archive_in
 
@@ -48,9 +50,16 @@ def tell(notes: Iterable[str]) -> None:
 
 @contextmanager
 def opened(where: str) -> Iterator[Record]:
-    """Open a record, or a server's archive of many, and say what of it cannot be read."""
+    """Open a record, a server's archive of many, or a robot's record on a server.
+
+    Says what of it cannot be read.
+    """
     from amberbox.blackbox.query.record import open as open_record
 
+    if is_url(where):
+        with remote_record(where) as remote:
+            yield remote
+        return
     archive = archive_in(where)
     with open_record(where) if archive is None else _opened_archive(*archive) as record:
         tell(record.notes)

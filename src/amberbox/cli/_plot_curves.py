@@ -56,7 +56,8 @@ def drawing(record: Record, args: argparse.Namespace) -> Drawing:
     if args.points < 1:
         raise UsageError("--points must be 1 or more")
     span = window_of(args, record)
-    table = record.query(args.item, [*args.variables, "received"], *span, args.by)
+    named = [*args.variables, "received"]
+    table, is_whole = record.drawn(args.item, named, span, args.by, args.points)
     if not len(table):
         raise AmberboxError(
             f"{table.item} has no rows in this range", "amberbox items shows its times"
@@ -64,7 +65,8 @@ def drawing(record: Record, args: argparse.Namespace) -> Drawing:
     fields = [f for f in table.fields if f.name not in ("timestamp", "received")]
     times = np.asarray(table["received" if args.by == "received" else "timestamp"])
     gaps = _gaps(record, table.item, times)
-    shown, breaks = _shown_rows(table, fields, times, gaps, args.points)
+    holes = _holes(times) if is_whole else np.empty(0, np.int64)  # thinned rows are uneven
+    shown, breaks = _shown_rows(table, fields, (times, holes), gaps, args.points)
     curves = tuple(_curve(table, field, times, shown, breaks) for field in fields)
     clock = "time of receipt" if args.by == "received" else "own time stamps"
     return Drawing(table.item, clock, args.local, curves, gaps, len(table), table.notes)
@@ -83,12 +85,12 @@ def _clipped(gap: Gap, first_ns: int, last_ns: int) -> tuple[int, int, str]:
 def _shown_rows(
     table: Table,
     fields: list[Column],
-    times: IntArray,
+    rows: tuple[IntArray, IntArray],
     gaps: tuple[tuple[int, int, str], ...],
     points: int,
 ) -> tuple[IntArray, IntArray]:
     """Return the rows to draw, and those of them after which the line breaks."""
-    breaks = _holes(times)
+    times, breaks = rows
     for from_ns, to_ns, _ in gaps:
         before = int(np.searchsorted(times, (from_ns + to_ns) // 2)) - 1
         breaks = np.append(breaks, before)

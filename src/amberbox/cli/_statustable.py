@@ -22,11 +22,15 @@ _DOTS = "..."
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """How statuses are shown: with what plan, in what colours, how wide; None is any width."""
+    """How statuses are shown: with what plan, in what colours, how wide; None is any width.
+
+    ``branches`` is the tree where there is no plan to make it of.
+    """
 
     plan: Plan | None = None
     paint: Paint = plain
     width: int | None = None
+    branches: tuple[Branch, ...] = ()
 
 
 def overview(board: Board, view: View) -> Iterator[str]:
@@ -35,7 +39,7 @@ def overview(board: Board, view: View) -> Iterator[str]:
     yield from _head(board, list(components.values()), view)
     rows = [
         (f"{'  ' * branch.depth}{branch.component}", components[branch.component])
-        for branch in _branches(board, view.plan)
+        for branch in view.branches or _branches(board, view.plan)
         if branch.component in components
     ]
     yield from _table(rows, board.measured_ns, view)
@@ -44,16 +48,26 @@ def overview(board: Board, view: View) -> Iterator[str]:
 
 def detail(board: Board, component: str, view: View) -> Iterator[str]:
     """Write one component with its modes, outputs, dependencies and alarms."""
-    status = board.components[component]
-    modes = board.modes_of(component)
-    yield from _head(board, [status], view)
-    naming = Naming.of(view.plan)
-    rows = [(component, status), *((f"  {naming.monitor(mode)}", mode) for mode in modes)]
-    yield from _table(rows, board.measured_ns, view)
-    yield from _outputs(modes, naming, view)
+    yield from statuses_table(board, component, view)
+    yield from _outputs(board.modes_of(component), Naming.of(view.plan), view)
     yield from _needs(board, component, view)
-    yield from _alarms([a for a in board.alarms if a.component == component],
-                       board.measured_ns, view)  # fmt: skip
+    yield from alarms_of(board, component, view)
+
+
+def statuses_table(board: Board, component: str, view: View) -> Iterator[str]:
+    """Write how a component and its modes are."""
+    status = board.components.get(component)
+    yield from _head(board, [status] if status else [], view)
+    naming, modes = Naming.of(view.plan), board.modes_of(component)
+    own = [(component, status)] if status else []
+    rows = [*own, *((f"  {naming.monitor(mode)}", mode) for mode in modes)]
+    yield from _table(rows, board.measured_ns, view)
+
+
+def alarms_of(board: Board, component: str, view: View) -> Iterator[str]:
+    """Write the alarms of one component."""
+    found = [alarm for alarm in board.alarms if alarm.component == component]
+    yield from _alarms(found, board.measured_ns, view)
 
 
 def waiting(board: Board, component: str) -> str:

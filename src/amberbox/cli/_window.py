@@ -31,7 +31,7 @@ def windows(args: argparse.Namespace, record: Record) -> list[Window]:
         return [span]
     if span != (None, None):
         raise UsageError("an incident has its own window", "leave out --from and --to")
-    return [*_of_incident(args.incident, record)]
+    return [*record.incident_windows(args.incident)]
 
 
 def window_of(args: argparse.Namespace, record: Record) -> Window:
@@ -43,11 +43,3 @@ def window_of(args: argparse.Namespace, record: Record) -> Window:
         tell([f"the clock was set in between: the window is in {len(found)} parts, "
               "rows between them are shown, too"])  # fmt: skip
     return found[0][0], found[-1][1]
-
-
-def _of_incident(incident_id: str, record: Record) -> list[tuple[int, int]]:
-    from amberbox.blackbox.incidents.incident import chosen
-    from amberbox.blackbox.incidents.window import windows_of
-    from amberbox.blackbox.store import open_store
-
-    return windows_of(record, chosen(open_store(record.path), incident_id))

@@ -15,6 +15,8 @@ from amberbox.blackbox.store import is_locked, open_store
 from amberbox.blackbox.where import store_path
 from amberbox.cli._anyorder import accept_any_order
 from amberbox.cli._output import print_grid, print_json
+from amberbox.cli._server import add_where
+from amberbox.client.address import is_url
 from amberbox.core.config import did_you_mean
 from amberbox.core.errors import UsageError
 from amberbox.core.timetext import NS, format_duration, format_time, parse_duration
@@ -35,7 +37,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
     accept_any_order(parser)
     parser.usage = _USAGE
-    parser.add_argument("where", metavar="WHERE", help="robot folder or store")
+    add_where(parser, "robot folder or store")
     parser.add_argument(
         "words",
         nargs="*",
@@ -60,6 +62,11 @@ def run(args: argparse.Namespace) -> int:
     if len(rest) != (action != "list"):
         wanted = "no more words" if action == "list" else "the ID of one alarm, or its component"
         raise UsageError(f"alarm {action} takes {wanted}", _USAGE)
+    if is_url(args.where):
+        from amberbox.cli._remote_alarm import run_remote
+
+        run_remote(args, action, *(rest or [""]))
+        return 0
     _ACTIONS[action](args, *rest)
     return 0
 

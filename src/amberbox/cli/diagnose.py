@@ -13,6 +13,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from amberbox.cli._output import accept_relative_times, print_json, tell, text_output
+from amberbox.cli._server import add_where
+from amberbox.client.address import is_url
 from amberbox.core.clock import NS
 from amberbox.core.config import refuse
 from amberbox.core.errors import UsageError
@@ -42,7 +44,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
     accept_relative_times(parser)
     parser.usage = _USAGE
-    parser.add_argument("where", metavar="WHERE", help="robot folder, store or recording file")
+    add_where(parser, "robot folder, store or recording file")
     parser.add_argument("--folder", metavar="FOLDER", help="robot folder with fmea.yaml and "
                         "components, where WHERE is none")  # fmt: skip
     parser.add_argument("--at", metavar="T", help=f"as it was then: {_TIMES}")
@@ -65,6 +67,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Show the diagnosis; 0 if nothing is wrong, 1 if something is."""
     _check(args)
+    if is_url(args.where):
+        from amberbox.cli._remote_diagnose import run_remote
+
+        return run_remote(args, _LOOKBACK)
     folder = _folder(args)
     subject = _subject(args, folder)
     with _record(args.where) as record:

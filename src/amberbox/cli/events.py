@@ -7,13 +7,14 @@ import sys
 from typing import Any
 
 from amberbox.cli._output import add_range_only, opened
+from amberbox.cli._server import add_where
 from amberbox.cli._window import add_window, window_of
 from amberbox.core.timetext import format_time
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
-    parser.add_argument("where", metavar="WHERE", help="robot folder, store or recording file")
+    add_where(parser, "robot folder, store or recording file")
     add_range_only(parser)
     add_window(parser)
     parser.add_argument("--json", action="store_true", help="a list of objects")

@@ -13,21 +13,28 @@ from amberbox.blackbox.query.record import Record
 from amberbox.blackbox.query.variables import closest
 from amberbox.cli._output import add_range, opened, print_json, writable
 from amberbox.cli._progress import progress_bar
+from amberbox.cli._server import add_where
 from amberbox.cli._window import add_window, windows
+from amberbox.client.address import is_url
 from amberbox.core.errors import UsageError
 from amberbox.core.units import in_bytes
 
+JOURNALS = "journals"
 _ENDINGS = {".csv": "csv", ".parquet": "parquet", ".mcap": "mcap", ".bag": "bag"}
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
-    parser.add_argument("where", metavar="WHERE", help="robot folder, store or recording file")
+    add_where(parser, "robot folder, store or recording file")
     parser.add_argument(
         "-o", "--output", metavar="TARGET",
         help="file, or for csv and parquet a folder; CSV goes to stdout without",
     )  # fmt: skip
-    parser.add_argument("--format", choices=tuple(FORMS), help="default: by the ending of TARGET")
+    parser.add_argument(
+        "--format",
+        choices=(*FORMS, JOURNALS),
+        help="default: by the ending of TARGET; journals of servers only",
+    )
     _add_choice(parser)
     parser.add_argument(
         "--raw-text", action="store_true",
@@ -69,6 +76,14 @@ def run(args: argparse.Namespace) -> int:
     form = chosen_form(args.format, target)
     if target is None and args.json:
         raise UsageError("the report and the rows would both go to stdout", "add -o TARGET")
+    if is_url(args.where):
+        from amberbox.cli._remote_export import export_remote
+
+        with opened(args.where) as remote:
+            variables = _variables(remote, args.variable)
+        return export_remote(args, form, target, variables)
+    if form == JOURNALS:
+        raise UsageError("a store has its journals in it", f"copy {args.where}")
     options = ExportOptions(args.raw_text, args.compression)
     started = time.monotonic()
     with opened(args.where) as record:

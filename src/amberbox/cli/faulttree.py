@@ -9,6 +9,8 @@ from pathlib import Path
 
 from amberbox.cli._faulttree_answer import show
 from amberbox.cli._output import accept_relative_times, print_json, tell, text_output
+from amberbox.cli._server import add_where
+from amberbox.client.address import is_url
 from amberbox.consult.faulttrees import analysis_json
 from amberbox.core.errors import UsageError
 from amberbox.diagnosis.faulttree import Analysis, Budget, FaultTree, analyse, read_mef, write_mef
@@ -20,10 +22,8 @@ _SECONDS = 300.0
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
     accept_relative_times(parser)
-    parser.add_argument(
-        "where", metavar="WHERE|FILE.xml",
-        help="robot folder or fmea.yaml, or a fault tree in Open-PSA MEF",
-    )  # fmt: skip
+    what = "robot folder or fmea.yaml, or a fault tree in Open-PSA MEF"
+    add_where(parser, what, "WHERE|FILE.xml")
     parser.add_argument(
         "--effect", default="", metavar="NAME",
         help="the function or component that is lost; the top gate of a file with several",
@@ -63,6 +63,10 @@ def _configure_solving(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Solve and show; 1 when a budget ended before all was done."""
     _check(args)
+    if is_url(args.where):
+        from amberbox.cli._remote_knowledge import faulttree_remote
+
+        return faulttree_remote(args)
     ends = time.monotonic() + args.seconds
     budget = Budget(args.nodes, lambda: time.monotonic() > ends)
     if _is_tree(args.where):

@@ -9,6 +9,8 @@ from typing import Any
 
 from amberbox.blackbox.folder.folder import inspect_folder
 from amberbox.cli._output import print_grid, print_json, tell, writable
+from amberbox.cli._server import add_where
+from amberbox.client.address import is_url
 from amberbox.consult.known import known_of
 from amberbox.consult.sheets import coverage_json, criticality_json
 from amberbox.core.config import did_you_mean, refuse
@@ -41,7 +43,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
     parser.usage = _USAGE
     parser.add_argument("action", metavar="ACTION", help=", ".join(_ACTIONS))
-    parser.add_argument("where", metavar="WHERE", help=f"robot folder, or a {FILE}")
+    add_where(parser, f"robot folder, or a {FILE}")
     parser.add_argument("--json", action="store_true", help="print JSON")
     parser.add_argument("--csv", metavar="FILE", help="write the sheet to a file (- prints it)")
     parser.add_argument(
@@ -60,6 +62,11 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError(f"there is no action '{args.action}'{near}", _USAGE)
     if args.exposure is not None and not args.exposure >= 0:
         raise UsageError(f"an exposure of {args.exposure:g} h cannot be", "give hours from 0")
+    if is_url(args.where):
+        from amberbox.cli._remote_knowledge import fmea_remote
+
+        fmea_remote(args)
+        return 0
     path = fmea_path(args.where)
     if args.import_:
         _import(Path(args.import_), path)

@@ -7,6 +7,7 @@ from typing import Any
 
 from amberbox.blackbox.segments.parquet import overlaps
 from amberbox.cli._output import add_range_only, opened, print_json
+from amberbox.cli._server import add_where
 from amberbox.cli._text import in_columns
 from amberbox.cli._window import Window, add_window, windows
 from amberbox.core.clock import NS
@@ -18,7 +19,7 @@ _HEADER = ("from (UTC)", "to (UTC)", "seconds", "item", "messages", "reason")
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
-    parser.add_argument("where", metavar="WHERE", help="robot folder, store or recording file")
+    add_where(parser, "robot folder, store or recording file")
     parser.add_argument("item", nargs="?", metavar="ITEM", help="data item; all when absent")
     add_range_only(parser)
     add_window(parser)

@@ -15,7 +15,9 @@ from amberbox.blackbox.query.record import Record
 from amberbox.blackbox.store import Store, open_store
 from amberbox.blackbox.where import store_path
 from amberbox.cli._output import print_grid, print_json, tell
+from amberbox.cli._server import add_robot, named
 from amberbox.cli._text import in_columns
+from amberbox.client.address import is_url
 from amberbox.core.clock import NS
 from amberbox.core.errors import UsageError
 from amberbox.core.timetext import format_time
@@ -30,8 +32,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.usage = _USAGE + " [options]"
     parser.add_argument(
         "words", metavar="WHERE", nargs="+",
-        help="robot folder or store; before it list, show or release",
+        help="robot folder, store, or a robot's page on a server; before it list, show or release",
     )  # fmt: skip
+    add_robot(parser)
     parser.add_argument("--before", default="60s", metavar="TIME", help="kept from before: 60s")
     parser.add_argument("--after", default="20s", metavar="TIME", help="kept from now on: 20s")
     parser.add_argument("--reason", default="", metavar="TEXT", help="why it is kept")
@@ -44,12 +47,18 @@ def run(args: argparse.Namespace) -> int:
     first, rest = args.words[0], args.words[1:]
     if first not in _ACTIONS:
         return _mark(args)
+    rest[:1] = [named(where, args.robot) for where in rest[:1]]
     action, count = _ACTIONS[first]
     if len(rest) != count:
         needed = " ".join(("WHERE", "ID")[:count])
         raise UsageError(
             f"incident {first} needs {needed}", f"{_USAGE}; a folder called {first}: ./{first}"
         )
+    if is_url(rest[0]):
+        from amberbox.cli._remote_incident import run_remote
+
+        run_remote(first, rest, args.json)
+        return 0
     action(rest, args.json)
     return 0
 
@@ -58,7 +67,12 @@ def _mark(args: argparse.Namespace) -> int:
     if len(args.words) > 1:
         raise UsageError(f"what is '{args.words[1]}'?", _USAGE)
     before_s, after_s = parse_duration_s(args.before), parse_duration_s(args.after)
-    where = args.words[0]
+    where = named(args.words[0], args.robot)
+    if is_url(where):
+        from amberbox.cli._remote_incident import mark_remote
+
+        mark_remote(args, where)
+        return 0
     made = mark(where, before_s=before_s, after_s=after_s, reason=args.reason, who=args.who)
     if args.json:
         print_json(made.to_json())

@@ -7,6 +7,7 @@ import argparse
 from amberbox.blackbox.journal.reserved import PREFIX
 from amberbox.blackbox.query.overview import ItemInfo
 from amberbox.cli._output import opened, print_grid, print_json, tell
+from amberbox.cli._server import add_where
 from amberbox.core.clock import NS
 from amberbox.core.timetext import format_time
 from amberbox.core.units import in_bytes
@@ -16,7 +17,7 @@ _HEADER = ("item", "type", "rows", "rate Hz", "first (UTC)", "last (UTC)", "stam
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
-    parser.add_argument("where", metavar="WHERE", help="robot folder, store or recording file")
+    add_where(parser, "robot folder, store or recording file")
     parser.add_argument("--all", action="store_true", help="the box's own items, too")
     parser.add_argument("--json", action="store_true", help="a list of objects")
 

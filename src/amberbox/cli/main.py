@@ -102,6 +102,10 @@ def _run_verb(name: str, arguments: Sequence[str], verbosity: int) -> int:
     module.configure(parser)
     parser.add_argument("-v", "--verbose", action="count", default=0, help="say more; -vv: all")
     parsed = parser.parse_args(arguments)
+    if getattr(parsed, "robot", None):
+        from amberbox.cli._server import name_robot
+
+        name_robot(parsed)
     _set_up_logging(verbosity + parsed.verbose)
     status: int = module.run(parsed)
     sys.stdout.flush()

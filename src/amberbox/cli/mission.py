@@ -12,6 +12,8 @@ from amberbox.blackbox.missions.ask import end, start
 from amberbox.blackbox.missions.detect import detect, find
 from amberbox.blackbox.where import store_path
 from amberbox.cli._output import add_range_only, opened, print_grid, print_json, tell
+from amberbox.cli._server import add_where
+from amberbox.client.address import is_url
 from amberbox.core.errors import UsageError
 from amberbox.core.timetext import format_duration, format_time
 
@@ -28,7 +30,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def _where(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("where", metavar="WHERE", help="robot folder or store")
+    add_where(parser, "robot folder or store")
 
 
 def _list(parser: argparse.ArgumentParser) -> None:
@@ -82,18 +84,34 @@ def _run_list(args: argparse.Namespace) -> int:
 
 def _run_start(args: argparse.Namespace) -> int:
     parameters = dict(_pair(text) for text in args.parameter)
+    if is_url(args.where):
+        from amberbox.cli._remote_mission import start_remote
+
+        print(start_remote(args.where, args.name, args.id, parameters))
+        return 0
     mission = start(args.where, args.name, mission_id=args.id, parameters=parameters, who=_user())
     print(mission.id)
     return 0
 
 
 def _run_end(args: argparse.Namespace) -> int:
+    if is_url(args.where):
+        from amberbox.cli._remote_mission import end_remote
+
+        ended = end_remote(args.where, args.id, args.outcome)
+        print(f"{ended.id}: {ended.outcome}")
+        return 0
     mission = end(args.where, args.id, outcome=args.outcome, who=_user())
     print(f"{mission.id}: {mission.outcome} after {_lasted(mission)}")
     return 0
 
 
 def _run_detect(args: argparse.Namespace) -> int:
+    if is_url(args.where):
+        raise UsageError(
+            "missions are found in old recordings on the robot",
+            "there: amberbox mission detect FOLDER; here: amberbox mission list URL",
+        )
     rules = read_rules(Path(args.rules or args.where))
     if not rules:
         raise UsageError(

@@ -9,6 +9,7 @@ from amberbox.cli._output import add_range, opened, tell, writable
 from amberbox.cli._plot_curves import Drawing, drawing
 from amberbox.cli._plot_image import draw_image
 from amberbox.cli._plot_page import draw_page
+from amberbox.cli._server import add_where
 from amberbox.cli._window import add_window
 from amberbox.core.errors import UsageError
 
@@ -22,7 +23,7 @@ _DRAW: dict[str, Callable[[Drawing], bytes]] = {
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
-    parser.add_argument("where", metavar="WHERE", help="robot folder, store or recording file")
+    add_where(parser, "robot folder, store or recording file")
     parser.add_argument("item", metavar="ITEM", help="data item; 'amberbox items' lists them")
     parser.add_argument("variables", metavar="VAR", nargs="+", help="as for 'amberbox query'")
     add_range(parser)

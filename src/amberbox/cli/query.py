@@ -13,7 +13,9 @@ from amberbox.blackbox.query.table import Table
 from amberbox.blackbox.query.tabletext import write_grid
 from amberbox.cli._missions import missions_of
 from amberbox.cli._output import add_range, opened, room, tell, text_output, writable
+from amberbox.cli._server import add_where
 from amberbox.cli._window import add_window, window_of
+from amberbox.client.address import is_url
 from amberbox.core.errors import UsageError
 from amberbox.core.timetext import format_time
 
@@ -23,7 +25,7 @@ _MORE = "name some, or --format csv"
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
-    parser.add_argument("where", metavar="WHERE", help="robot folder, store or recording file")
+    add_where(parser, "robot folder, store or recording file")
     parser.add_argument("item", metavar="ITEM", help="data item; 'amberbox items' lists them")
     parser.add_argument(
         "variables", metavar="VAR", nargs="*",
@@ -103,6 +105,9 @@ _WRITERS: dict[str, Callable[[Table, IO[str]], None]] = {
 
 def _follow(record: Record, args: argparse.Namespace, form: str) -> int:
     """Stream rows; JSON comes as one object per line."""
+    if is_url(args.where):
+        hint = "amberbox status URL --watch shows what is live"
+        raise UsageError("a server gets rows journal by journal: there is nothing to follow", hint)
     ended = args.points is not None or args.to is not None or args.incident is not None
     if form == "parquet" or ended:
         hint = "leave out parquet, --points, --to, --incident"

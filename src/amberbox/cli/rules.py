@@ -11,6 +11,8 @@ from pathlib import Path
 
 from amberbox.blackbox.query.record import Record
 from amberbox.cli._output import add_range_only, opened, print_json, tell, writable
+from amberbox.cli._server import add_robot
+from amberbox.client.address import is_url
 from amberbox.consult.facts import Place, facts_of, place_of
 from amberbox.core.config import refuse
 from amberbox.core.errors import UsageError
@@ -30,8 +32,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="rule files, read as one; without, rules/*.pl of the folder WHERE",
     )  # fmt: skip
     parser.add_argument(
-        "--where", metavar="WHERE", help="robot folder, store or recording file to ask about"
-    )
+        "--where", metavar="WHERE",
+        help="robot folder, store or recording file to ask about, or a robot's page on a server",
+    )  # fmt: skip
+    add_robot(parser)
     parser.add_argument("--ask", metavar="GOAL", help="all answers of a goal, such as 'broken(X)'")
     reasons = parser.add_mutually_exclusive_group()
     reasons.add_argument("--why", action="store_true", help="what each answer follows from")
@@ -48,6 +52,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Read the files, then export or ask; without either, say what is defined."""
     _refuse(args)
+    if is_url(args.where):
+        from amberbox.cli._remote_knowledge import rules_remote
+
+        return rules_remote(args)
     place = place_of(args.where) if args.where is not None else None
     program = _read(args, place)
     if not args.json:

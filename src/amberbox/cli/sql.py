@@ -5,12 +5,13 @@ from __future__ import annotations
 import argparse
 
 from amberbox.cli._output import opened, tell
+from amberbox.cli._server import add_where
 from amberbox.cli.query import add_format, chosen_format, write
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
-    parser.add_argument("where", metavar="WHERE", help="robot folder, store or recording file")
+    add_where(parser, "robot folder, store or recording file")
     parser.add_argument("statement", metavar="SQL", help='such as "select ... from ros_odom"')
     add_format(parser)
 

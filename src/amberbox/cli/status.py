@@ -20,7 +20,9 @@ from amberbox.blackbox.where import store_path
 from amberbox.cli._anyorder import accept_any_order
 from amberbox.cli._colour import painter
 from amberbox.cli._output import print_json, tell
+from amberbox.cli._server import add_where
 from amberbox.cli._statustable import View, detail, overview, waiting
+from amberbox.client.address import is_url
 from amberbox.core.clock import NS
 from amberbox.core.config import did_you_mean
 from amberbox.core.errors import AmberboxError, UsageError
@@ -40,7 +42,7 @@ _UNKNOWN_HINT = "amberbox watch {where} judges what is recorded"
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
     accept_any_order(parser)
-    parser.add_argument("where", metavar="WHERE", help="robot folder or store")
+    add_where(parser, "robot folder or store")
     parser.add_argument("component", nargs="?", metavar="COMPONENT", help="only this one, in full")
     parser.add_argument(
         "--wait", metavar="TIME", help="wait so long (30s) for it to be ok and initialised"
@@ -55,6 +57,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print what is known; 1 if anything is not ok or warn, or the watcher says nothing."""
+    if is_url(args.where):
+        return _remote(args)
     if args.wait is not None:
         return _wait(args, parse_duration_s(args.wait))
     plan = _plan_of(args.where)
@@ -63,6 +67,22 @@ def run(args: argparse.Namespace) -> int:
         return _watch(reader, args, plan)
     board = _read(reader, args, plan)
     _show(board, args, plan)
+    return _verdict(board, args.component)
+
+
+def _remote(args: argparse.Namespace) -> int:
+    """Do the same of a robot on a server."""
+    from amberbox.cli._remote_status import read_remote, show_remote, wait_remote, watch_remote
+
+    if args.wait is not None:
+        return wait_remote(args, parse_duration_s(args.wait))
+    if args.watch:
+        return _verdict(watch_remote(args), args.component)
+    board, tree = read_remote(args)
+    if args.json:
+        print_json(_as_json(board) | {"robot": tree.robot})
+    else:
+        show_remote(board, tree, args)
     return _verdict(board, args.component)
 
 

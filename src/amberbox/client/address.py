@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import TypeGuard
 from urllib.parse import quote, unquote, urlsplit
 
-from amberbox.core import tls
 from amberbox.core.errors import UsageError
 from amberbox.core.ids import is_id
 
@@ -80,4 +79,8 @@ def _robot(path: str) -> tuple[str, str]:
 
 
 def _pin(fragment: str) -> str:
-    return tls.normal(fragment.removeprefix("ca=")) if fragment.startswith("ca=") else ""
+    if not fragment.startswith("ca="):
+        return ""
+    from amberbox.core.tls import normal
+
+    return normal(fragment.removeprefix("ca="))

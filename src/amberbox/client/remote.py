@@ -29,6 +29,8 @@ _SQL_HINT = (
     "amberbox export URL --format parquet -o FOLDER, then ask there; on the server itself: "
     "amberbox sql DIR"
 )
+NOT_YET = "not on the server yet"
+"""Why there is a gap where the robot has something that was not copied."""
 DRAWN_ROWS = 200_000
 """Rows that are drawn as they are; of more, the server thins them out."""
 
@@ -39,6 +41,9 @@ class RemoteRecord(Record):
 
     fleet: Fleet = field(repr=False)
     robot: str = ""
+
+    def __enter__(self) -> RemoteRecord:
+        return self
 
     def close(self) -> None:
         """Let the connection go."""

@@ -133,6 +133,23 @@ class Record:
 
         return choose(load(self.path), name, failed=failed, last=last)
 
+    def drawn(
+        self, item: str, variables: Sequence[str], span: tuple[Time, Time], by: By, points: int
+    ) -> tuple[Table, bool]:
+        """Return the rows that a plot of so many points is made of; whether these are all."""
+        return self.query(item, variables, *span, by), True
+
+    def incident_windows(self, incident: str) -> list[tuple[int, int]]:
+        """Return the ranges of an incident (its id, or ``last``), in order.
+
+        Raises UsageError when there is none.
+        """
+        from amberbox.blackbox.incidents.incident import chosen
+        from amberbox.blackbox.incidents.window import windows_of
+        from amberbox.blackbox.store import open_store
+
+        return windows_of(self, chosen(open_store(self.path), incident))
+
     def clock(self) -> ClockBook:
         """Return what is known by now of the clocks of each boot, and what cannot be put right."""
         return self._ask(lambda catalogue: catalogue.book)

@@ -1,0 +1,113 @@
+"""Keep a token of a server here, and whom to trust there, so that its address can be WHERE."""
+
+from __future__ import annotations
+
+import argparse
+import getpass
+import ssl
+import sys
+from urllib.parse import urlsplit
+
+from amberbox.cli._output import tell
+from amberbox.client import servers, trust
+from amberbox.client.address import Address, read_address
+from amberbox.client.errors import NotAllowedError, UnreachableError
+from amberbox.client.servers import SignIn
+from amberbox.client.wire import Wire
+from amberbox.core import tls
+from amberbox.core.errors import AmberboxError, UsageError
+
+_SHORT_S = 10.0
+_YES = ("yes", "y")
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the verb's arguments."""
+    parser.add_argument(
+        "url", metavar="URL",
+        help="the server; with #ca=sha256:... behind it the authority to be trusted is named",
+    )  # fmt: skip
+    parser.epilog = (
+        "The API token is asked for without showing it, or read from standard input. It is kept "
+        "in ~/.config/amberbox/servers.yaml, which nobody else may read."
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Ask whom to trust and for the token, try them, keep them."""
+    address = read_address(args.url)
+    pin, authority = _trusted(address)
+    entry = SignIn(_token(address), pin, authority)
+    _try(address, entry)
+    servers.keep(address.url, entry)
+    print(f"signed in to {address.url}; kept in {servers.path()}")
+    return 0
+
+
+def _trusted(address: Address) -> tuple[str, str]:
+    """Return the pin and the certificate of the authority; empty for one that the system trusts.
+
+    Raises UsageError when a stranger's would have to be confirmed and nobody is there.
+    """
+    if urlsplit(address.url).scheme == "http":
+        return "", ""
+    if not address.pin and _is_trusted_anyway(address):
+        return "", ""
+    pem = trust.authority_of(address.url)
+    found = tls.fingerprint(pem)
+    if address.pin:
+        tls.pinned_context(pem, address.pin)  # raises when it is another
+    else:
+        _confirm(address, found)
+    return found, pem.decode("ascii")
+
+
+def _is_trusted_anyway(address: Address) -> bool:
+    """Tell whether the system trusts the server's certificate."""
+    try:
+        with Wire(address.url, context=ssl.create_default_context(), timeout_s=_SHORT_S).stream(
+            "/health", 0
+        ):
+            return True
+    except UnreachableError as error:
+        if isinstance(error.__cause__, ssl.SSLCertVerificationError):
+            return False
+        raise
+    except AmberboxError:  # it answers, and that is enough
+        return True
+
+
+def _confirm(address: Address, found: str) -> None:
+    question = f"{address.url} is vouched for by an authority that is not known here:\nsha256:"
+    if not sys.stdin.isatty():
+        raise UsageError(
+            f"nobody is here to confirm the authority of {address.url}, sha256:{found}",
+            f"is it what 'amberbox serve cert' printed? then: {address.url}#ca=sha256:...",
+        )
+    print(f"{question}{found}\nIs it what 'amberbox serve cert' printed on the server?",
+          file=sys.stderr)  # fmt: skip
+    if input("yes or no: ").strip().lower() not in _YES:
+        raise UsageError("not signed in", "ask who runs the server for the fingerprint")
+
+
+def _token(address: Address) -> str:
+    """Take the token where no shell remembers it and nobody sees it."""
+    if sys.stdin.isatty():
+        text = getpass.getpass(f"API token for {address.url}: ")
+    else:
+        text = sys.stdin.readline()
+    if not text.strip():
+        raise UsageError("no token was given", "a technician makes one: /account on the server")
+    return text.strip()
+
+
+def _try(address: Address, entry: SignIn) -> None:
+    """Raise NotSignedInError when the token does not work."""
+    context = trust.context_of(address.url, entry.pin, entry)
+    wire = Wire(address.url, entry.token, context)
+    try:
+        wire.get("/robots", {"limit": 1})
+    except NotAllowedError as error:
+        tell([f"the token works, but not for seeing robots: {error.what}"])
+    finally:
+        wire.close()
