@@ -6,11 +6,11 @@ rules of ``ledger.store``; everything else is left to that.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, TypeAlias
 
-from sqlalchemy import Connection, select, tuple_
+from sqlalchemy import Connection, bindparam, select
 
 from amberbox.fleet.database.upsert import upsert
 from amberbox.fleet.linkend import board, ledger
@@ -24,8 +24,7 @@ Keys: TypeAlias = tuple[str, str]
 """Robot and store."""
 Run: TypeAlias = tuple[str, str, str, int]
 """Robot, store, writer, run."""
-_AT_ONCE = 500
-"""Runs that one statement asks for."""
+_RUN_KEY = ("robot", "store_id", "writer", "run")
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,28 +114,28 @@ def _read(connection: Connection, takings: Sequence[Taking]) -> _State:
             state.received.setdefault(keys, {})[row.writer] = Place(row.upto_run, row.upto_seq)
     written = {run for taking in takings for run in taking.runs()}
     stated = {run for taking in takings if taking.compare for run in taking.stated()}
-    for part in _parts(written | stated):
-        for row in connection.execute(select(RUN).where(_among(RUN, part))):
-            state.runs[_run(row)] = _Known(row.boot, row.end_seq)
-    for part in _parts(written):
-        for row in connection.execute(select(COMMITTED).where(_among(COMMITTED, part))):
-            state.committed.setdefault(_run(row), []).append((row.from_seq, row.to_seq))
+    for run in written | stated:
+        for row in connection.execute(_A_RUN, _place(run)):
+            state.runs[run] = _Known(row.boot, row.end_seq)
+    for run in written:
+        found = connection.execute(_COMMITTED_OF, _place(run)).all()
+        state.committed[run] = [(row.from_seq, row.to_seq) for row in found]
     return state
 
 
-def _parts(runs: Iterable[Run]) -> Iterator[Sequence[Run]]:
-    """Give runs in parts of which one statement can name all."""
-    ordered = sorted(runs)
-    return (ordered[start : start + _AT_ONCE] for start in range(0, len(ordered), _AT_ONCE))
+def _of_run(table: Any) -> Any:
+    """Select what a table holds of one run; made once, for many that are asked for one by one.
+
+    (Many at once, by a list of keys, would be looked for without the table's index.)
+    """
+    return select(table).where(*(table.c[name] == bindparam(f"of_{name}") for name in _RUN_KEY))
 
 
-def _among(table: Any, runs: Sequence[Run]) -> Any:
-    columns = table.c.robot, table.c.store_id, table.c.writer, table.c.run
-    return tuple_(*columns).in_(runs)
+def _place(run: Run) -> dict[str, Any]:
+    return {f"of_{name}": value for name, value in zip(_RUN_KEY, run, strict=True)}
 
 
-def _run(row: Any) -> Run:
-    return row.robot, row.store_id, row.writer, row.run
+_A_RUN, _COMMITTED_OF = _of_run(RUN), _of_run(COMMITTED)
 
 
 def _taken(state: _State, taking: Taking) -> Stored | StaleEpochError | None:
@@ -211,14 +210,13 @@ def _write(connection: Connection, state: _State) -> None:
     """Write everything, one statement for each table."""
     ledger.insert(connection, state.rows)
     board.enter(connection, state.statuses)
-    names = "robot", "store_id", "writer", "run"
     runs = [
-        {**dict(zip(names, run, strict=True)), "boot": state.runs[run].boot,
+        {**dict(zip(_RUN_KEY, run, strict=True)), "boot": state.runs[run].boot,
          "end_seq": state.runs[run].end_seq}
         for run in sorted(state.changed_runs)
     ]  # fmt: skip
     if runs:
-        connection.execute(upsert(connection.dialect, RUN, names, ("boot", "end_seq")), runs)
+        connection.execute(upsert(connection.dialect, RUN, _RUN_KEY, ("boot", "end_seq")), runs)
     ledger.write_cursors(
         connection,
         [
