@@ -11,7 +11,7 @@ import pytest
 from amberbox.fleet.audit.log import rows as audited
 from amberbox.fleet.bus import Change
 from amberbox.fleet.notifying.message import Message
-from amberbox.link.frames import Row
+from amberbox.link.frames import Hello, Row
 from amberbox.monitoring.engine.findings import AlarmChange
 from amberbox.monitoring.messages.records import encoded
 from amberbox.monitoring.plan import Severity
@@ -108,6 +108,27 @@ def test_of_an_alarm_of_several_robots_one_sees_ones_own(home: House) -> None:
     assert "ropod_003" not in str(page)
     refused = mine.post(f"{API}/3/acknowledge", json={"revision": 1})
     assert (refused.status_code, "robots of others" in refused.text) == (403, True)
+
+
+def test_how_many_of_others_are_back_is_not_told(home: House) -> None:
+    services = home.services
+    for robot in ("ropod_001", "ropod_003"):
+        services.bus.publish(Change("gone", robot))
+    services.alarms.step()
+    home.clock.advance(130)
+    services.alarms.step()
+    hello = Hello("ropod_003", STORE, "b", {}, "", home.clock.wall_ns(), 0, "1")
+    services.bus.publish(Change("connected", "ropod_003", {"hello": hello, "admission": None}))
+    services.alarms.step()
+    every, mine = (home.client(name).get(f"{API}/3").json() for name in ("operator", "nurse"))
+    assert "back" in {one["what"] for one in every["history"]}
+    assert "back" not in {one["what"] for one in mine["history"]}
+
+
+def test_an_owner_that_is_nobody_tells_of_no_account(home: House) -> None:
+    own = {"revision": 1, "user": "technicia"}
+    answer = home.client("operator").post(f"{API}/1/own", json=own)
+    assert answer.status_code == 400 and "technician" not in answer.text
 
 
 def test_what_people_do_is_kept_with_who_and_when(home: House) -> None:

@@ -20,6 +20,8 @@ import pytest
 from amberbox.blackbox.query.record import open as open_record
 from amberbox.core.clock import NS
 from amberbox.core.timetext import format_time
+from amberbox.fleet.asking.pool import Pool
+from amberbox.fleet.asking.question import Question
 from amberbox.fleet.audit.tables import AUDIT
 from amberbox.fleet.jobs import ledger
 from amberbox.fleet.jobs.jobs import SETTING
@@ -148,6 +150,43 @@ def test_others_do_not_see_it(home: House) -> None:
     assert nurse.delete(url).status_code == 404
     assert told["id"] not in {one["id"] for one in nurse.get(DOWNLOADS).json()}
     assert told["id"] in {one["id"] for one in admin.get(f"{DOWNLOADS}?all=true").json()}
+
+
+def test_a_token_for_a_group_sees_no_downloads_of_others(home: House) -> None:
+    technician = home.client("technician")
+    asked = technician.post(DOWNLOADS, json={"robots": ["ropod_001"]}).json()
+    for group, is_seen in (("kitchen", False), ("ward", True)):
+        token = {"name": "x", "scopes": ["read:download"], "groups": [group]}
+        client = home.client()
+        secret = technician.post("/api/v1/tokens", json=token).json()["token"]
+        client.headers["Authorization"] = f"Bearer {secret}"
+        url = f"{DOWNLOADS}/{asked['id']}"
+        assert (client.get(url).status_code == 200) is is_seen
+        assert (asked["id"] in {one["id"] for one in client.get(DOWNLOADS).json()}) is is_seen
+    assert technician.delete(f"{DOWNLOADS}/{asked['id']}").status_code == 200
+
+
+def test_one_that_fails_in_a_way_nobody_foresaw_holds_up_no_other(
+    home: House, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    put, failed = Pool.put, list[str]()
+
+    def fails(pool: Pool, question: Question) -> None:
+        if not failed:
+            failed.append(question.op)
+            raise KeyError
+        put(pool, question)
+
+    technician = home.client("technician")
+    wanted = {"robots": ["ropod_001"], "items": ["odom"]}
+    with monkeypatch.context() as patch:
+        patch.setattr(Pool, "put", fails)
+        asked = [technician.post(DOWNLOADS, json=wanted).json()["id"] for _ in range(2)]
+
+        def states() -> set[str]:
+            return {technician.get(f"{DOWNLOADS}/{one}").json()["state"] for one in asked}
+
+        work(home, lambda: states() == {"failed", "done"})
 
 
 def test_robots_of_other_groups_cannot_be_asked_for(home: House) -> None:

@@ -79,6 +79,7 @@ def test_a_change_is_in_the_log_with_what_was_before(home: House) -> None:
     [
         ([{"journal_s": 5}], "did you mean 'journals_s'?"),
         ([{"journals_s": -1}], "not below 0"),
+        ([{"journals_s": 1e300}], "1e10 at most"),
         ([{"journals_s": "soon"}], "journals_s"),
         ([{"keeping": "rings"}], "did you mean 'ring'?"),
         ([{"robot": "../x"}], "not a name of a robot"),
@@ -100,6 +101,11 @@ def test_numbers_that_are_none_are_refused(home: House, number: str) -> None:
     admin.headers["Content-Type"] = "application/json"
     answer = admin.put(f"{SETTINGS}/retention", content=f'[{{"journals_s": {number}}}]')
     assert answer.status_code == 400
+
+
+@pytest.mark.parametrize("value", [{"each_gb": 1e300}, {"kept_h": -1}, {"each_waiting": 0}])
+def test_downloads_that_could_not_be_made_are_refused(home: House, value: Any) -> None:
+    assert _put(home, "downloads", value)[0] == 400
 
 
 def test_an_unknown_name_is_missing(home: House) -> None:

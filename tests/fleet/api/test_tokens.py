@@ -73,6 +73,17 @@ def test_a_token_may_be_for_some_groups_only(home: House) -> None:
     assert _status(home, made["token"]) == 403
 
 
+def test_who_is_for_a_group_learns_of_no_other(home: House) -> None:
+    nurse = home.client("nurse")
+    for group in ("kitchen", "kitchens"):
+        new = {"name": "x", "scopes": ["read:status"], "groups": [group]}
+        answer = nurse.post(TOKENS, json=new)
+        assert answer.status_code == 400
+        assert answer.json()["error"]["what"] == f"you are not for a group '{group}'"
+        assert "kitchen'?" not in answer.text
+    _make(nurse, groups=["ward"], scopes=["read:status"])
+
+
 def test_one_revokes_ones_own_and_no_others(home: House) -> None:
     made = _make(home.client("admin"))
     path = f"{TOKENS}/{made['id']}"

@@ -82,6 +82,20 @@ def test_a_restart_neither_loses_nor_doubles(home: Stand) -> None:
     assert len(home.told) == 1
 
 
+@pytest.mark.parametrize("settle_s", [0, 10])
+def test_a_clock_that_was_a_year_ahead_holds_nothing_up(home: Stand, settle_s: int) -> None:
+    home.set("alarms", AlarmSettings(settle_s=settle_s))
+    home.clock.step(366 * 86_400)
+    home.trouble = "nobody there"
+    home.hear("r1", alarm(home))
+    home.alarms.step()
+    home.alarms.sender.step()
+    home.clock.step(-366 * 86_400)
+    home.trouble = ""
+    home.wait(5)
+    assert len(home.told) == 1
+
+
 def test_who_is_not_in_the_settings_any_more_gets_nothing(home: Stand) -> None:
     home.hear("r1", alarm(home))
     home.alarms.step()

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import shutil
 import zlib
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -195,6 +197,22 @@ def test_pieces_out_of_place_change_nothing(store: Store, desk: Desk) -> None:
     big = bytes(PIECE_BYTES + 1)
     assert desk.patch(incoming, len(half), big, zlib.crc32(big)).status == 413
     assert desk.head(incoming).offset == len(half)
+
+
+def test_what_waits_of_a_robot_has_an_end_and_does_not_wait_for_ever(
+    store: Store, desk: Desk
+) -> None:
+    one, other = (
+        replace(incoming_of(store, name, b"x"), size=100)
+        for name in ("journal/000001-aaaa-0001.mcap", "journal/000001-aaaa-0002.mcap")
+    )
+    desk.quota, piece = 100, bytes(60)
+    assert desk.patch(one, 0, piece, zlib.crc32(piece)).status == 204
+    assert desk.patch(other, 0, piece, zlib.crc32(piece)).status == 507, "it did not ask first"
+    assert desk.head(other).status == 507
+    os.utime(desk.root / one.part, (0, 0))
+    assert desk.head(other).status == 200
+    assert desk.head(one).offset == 0
 
 
 def test_another_content_than_was_announced_begins_anew(store: Store, desk: Desk) -> None:

@@ -8,6 +8,7 @@ from typing import Final
 
 from sqlalchemy import ColumnElement, Connection, and_, or_, select
 
+from amberbox.core.clock import NS
 from amberbox.fleet.accounts.tables import ROBOT_GROUPS
 from amberbox.fleet.alarms import machine
 from amberbox.fleet.alarms.alarm import Alarm, is_worse
@@ -19,6 +20,7 @@ from amberbox.fleet.notifying.outbox import Told, put
 from amberbox.fleet.notifying.settings import NAME, Notifications
 from amberbox.fleet.options.options import read
 
+_ASTRAY_NS: Final = 60 * NS
 _AT_ONCE: Final = 50
 """Alarms that are told in one transaction, the oldest first; the others a moment later."""
 
@@ -39,7 +41,7 @@ class Lateness:
 def is_due(connection: Connection, now_ns: int, settings: AlarmSettings) -> bool:
     """Tell whether something happens to an alarm by itself now."""
     over = and_(ALARM.c.state != "resolved", _is_over(now_ns, settings))
-    chosen = select(ALARM.c.number).where(or_(over, _is_to_be_told(now_ns))).limit(1)
+    chosen = select(ALARM.c.number).where(or_(over, _is_to_be_told(now_ns, settings))).limit(1)
     return connection.execute(chosen).first() is not None
 
 
@@ -48,8 +50,11 @@ def _is_over(now_ns: int, settings: AlarmSettings) -> ColumnElement[bool]:
     return or_(ALARM.c.cleared_ns <= quiet_ns, ALARM.c.shelved_until_ns <= now_ns)
 
 
-def _is_to_be_told(now_ns: int) -> ColumnElement[bool]:
-    return and_(ALARM.c.notify_ns <= now_ns, ALARM.c.state != "shelved")
+def _is_to_be_told(now_ns: int, settings: AlarmSettings) -> ColumnElement[bool]:
+    """Judge when people are to be told; what is too far off is of a clock that was wrong."""
+    wrong_ns = now_ns + 2 * settings.ns("settle_s") + _ASTRAY_NS
+    due = or_(ALARM.c.notify_ns <= now_ns, ALARM.c.notify_ns > wrong_ns)
+    return and_(due, ALARM.c.state != "shelved")
 
 
 def pass_time(
@@ -58,7 +63,7 @@ def pass_time(
     """Do what is due by now with all alarms."""
     for alarm in register.alarms(ALARM.c.state != "resolved", _is_over(now_ns, settings)):
         register.keep(alarm, machine.settled(alarm, now_ns, settings))
-    for alarm in register.alarms(_is_to_be_told(now_ns))[:_AT_ONCE]:
+    for alarm in register.alarms(_is_to_be_told(now_ns, settings))[:_AT_ONCE]:
         _tell(register, late, alarm, now_ns, settings, url)
 
 

@@ -40,6 +40,11 @@ class Caller:
     session_id: str = ""
     secret: str = field(default="", repr=False)
 
+    @property
+    def asker(self) -> str:
+        """Return who takes turns with others: a person, whichever of their tokens asks."""
+        return self.principal.owner or self.principal.id
+
     def may(self, action: str, robot: KnownRobot | Robot | None = None) -> bool:
         """Tell whether an action is allowed, to a robot or to all of them; robots: to itself."""
         seen = robot.robot if isinstance(robot, KnownRobot) else robot
@@ -213,7 +218,3 @@ class Guard:
         if not caller.may(self.action, robot):
             raise HTTPException(403, f"{caller.principal.role or caller.principal.kind} may not")
         return robot
-
-
-def _sees(caller: Caller, robot: KnownRobot, action: str) -> bool:
-    return caller.may(action, robot) or caller.may("status.read", robot)

@@ -27,6 +27,8 @@ from amberbox.monitoring.plan import Severity
 
 routes = Routes("alarms")
 
+_COUNTED = ("opened", "away", "back")
+"""Lines of a common alarm's history that count or name robots, also those of others."""
 _LONGEST_NS = 366 * 86_400 * NS
 _CHANGED: dict[int | str, dict[str, Any]] = {
     409: {"description": "somebody changed the alarm meanwhile: look at it again"}
@@ -165,7 +167,7 @@ def own_alarm(fleet: Fleet, who: Who, id: Number, body: Owning) -> AlarmPage:
 
     def step(connection: Connection, alarm: Alarm, name: str, now_ns: int) -> Step:
         if body.user:
-            find_user(connection, body.user)
+            _refuse_nobody(connection, body.user)
         return machine.owned(alarm, name, now_ns, body.user)
 
     return _do(fleet, who, Asked(id, "own", body.revision, step, {"user": body.user}))
@@ -206,6 +208,14 @@ def _do(fleet: Services, who: Caller, asked: Asked) -> AlarmPage:
         page = _page(connection, who, changed)
     fleet.bus.publish(Change("alarm", alarm.robot, {"id": alarm.number}))
     return page
+
+
+def _refuse_nobody(connection: Connection, name: str) -> None:
+    """Refuse a name that nobody has, without saying which there are."""
+    try:
+        find_user(connection, name)
+    except UsageError:
+        raise UsageError(f"there is no account '{name}'", "ask an admin who there is") from None
 
 
 def _name(who: Caller) -> str:
@@ -271,6 +281,6 @@ def _page(connection: Connection, who: Caller, alarm: Alarm) -> AlarmPage:
         [
             Happening(format_time(row["at_ns"]), row["who"], row["what"], row["text"])
             for row in listing.history_of(connection, alarm.number)
-            if alarm.robot or who.principal.groups is None or row["what"] not in ("opened", "away")
+            if alarm.robot or who.principal.groups is None or row["what"] not in _COUNTED
         ],
     )  # fmt: skip

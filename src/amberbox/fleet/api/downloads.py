@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -96,7 +97,9 @@ def list_downloads(
     """List one's own downloads, newest first."""
     owner = None if all and _is_admin(who) else _owner(who)
     with fleet.database.reading() as connection:
-        return [_shown(job) for job in ledger.listed(connection, owner, after, limit)]
+        found = ledger.listed(connection, owner, after, limit)
+        hidden = _hidden(connection, who, found)
+        return [_shown(job) for job in found if job.id not in hidden]
 
 
 @routes.get("/downloads/{id}", "data.download", each=True)
@@ -164,7 +167,17 @@ def _find(connection: Connection, who: Caller, job_id: str) -> Job:
     job = ledger.find(connection, job_id)
     if job is None or not (job.owner == _owner(who) or _is_admin(who)):
         raise HTTPException(404, "there is no such download, or not for you")
+    if _hidden(connection, who, [job]):
+        raise HTTPException(404, "there is no such download, or not for you")
     return job
+
+
+def _hidden(connection: Connection, who: Caller, jobs: Sequence[Job]) -> set[str]:
+    """Return which downloads a token does not see: those with robots that it is not for."""
+    if who.principal.kind != "token" or who.principal.groups is None:
+        return set()
+    mine = {robot.id for robot in who.robots(connection, "data.download")}
+    return {job.id for job in jobs if not mine.issuperset(job.wanted.robots)}
 
 
 def _owner(who: Caller) -> str:

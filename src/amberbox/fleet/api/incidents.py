@@ -56,9 +56,7 @@ def list_incidents(
 ) -> list[IncidentShown]:  # fmt: skip
     """List the incidents of a robot that meet a range of time, newest first."""
     from_ns, to_ns = span_in(fleet, robot.id, from_, to)
-    answer = fleet.asking.ask_now(
-        f"{WORKER}:incidents", {"robot": robot.id}, asker=str(who.principal)
-    )
+    answer = fleet.asking.ask_now(f"{WORKER}:incidents", {"robot": robot.id}, asker=who.asker)
     told = [_of_robot(values) for values in msgspec.json.decode(answer)]
     with fleet.database.reading() as connection:
         told += [_of_server(one) for one in remarks.incidents(connection, robot.id)]

@@ -65,7 +65,7 @@ class Described:
 @routes.get("/robots/{robot}/items", "items.read")
 def list_items(fleet: Fleet, who: Who, robot: OfRobot) -> list[Listed]:
     """List the data items of a robot that the server has rows of, the box's own at the end."""
-    answer = fleet.asking.ask_now(f"{WORKER}:items", {"robot": robot.id}, asker=str(who.principal))
+    answer = fleet.asking.ask_now(f"{WORKER}:items", {"robot": robot.id}, asker=who.asker)
     return msgspec.json.decode(answer, type=list[Listed])
 
 
@@ -73,7 +73,7 @@ def list_items(fleet: Fleet, who: Who, robot: OfRobot) -> list[Listed]:
 def read_item(fleet: Fleet, who: Who, robot: OfRobot, item: ItemName) -> Described:
     """Describe a data item: columns with types, units and labels, over all its versions."""
     answer = fleet.asking.ask_now(
-        f"{WORKER}:item", {"robot": robot.id, "item": item}, asker=str(who.principal)
+        f"{WORKER}:item", {"robot": robot.id, "item": item}, asker=who.asker
     )
     found = msgspec.json.decode(answer, type=Described | None)
     if found is None:

@@ -76,7 +76,7 @@ async def ask_rules(robot: OfRobot, body: RuleQuestion, fleet: Fleet, who: Who) 
 
 async def _ask(fleet: Services, who: Caller, name: str, asked: AboutRobot) -> dict[str, Any]:
     found = await fleet.asking.ask(
-        f"{WORKER}:{name}", written(asked), LIMIT_S, MEMORY_BYTES, asker=str(who.principal)
+        f"{WORKER}:{name}", written(asked), LIMIT_S, MEMORY_BYTES, asker=who.asker
     )
     answer: dict[str, Any] = json.loads(found)
     return answer

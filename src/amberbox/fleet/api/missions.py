@@ -154,7 +154,7 @@ def _at(fleet: Services, robot: str, text: str) -> int:
 
 
 def _missions(fleet: Services, who: Caller, robot: str) -> list[Mission]:
-    answer = fleet.asking.ask_now(f"{WORKER}:missions", {"robot": robot}, asker=str(who.principal))
+    answer = fleet.asking.ask_now(f"{WORKER}:missions", {"robot": robot}, asker=who.asker)
     return msgspec.msgpack.decode(answer, type=list[Mission])
 
 

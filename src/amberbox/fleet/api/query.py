@@ -131,7 +131,7 @@ async def read_rows(
     The headers ``X-Amberbox-Next`` and ``X-Amberbox-Complete-To`` say what the fields ``next`` and
     ``complete_to`` say in JSON.
     """
-    work = fleet.asking.ask_file(f"{WORKER}:query", arguments(about), asker=str(who.principal))
+    work = fleet.asking.ask_file(f"{WORKER}:query", arguments(about), asker=who.asker)
     file = await while_there(request, work)
     said = msgspec.json.decode(file.read(int.from_bytes(file.read(4), "little")))
     headers = {"X-Content-Type-Options": "nosniff", "Cache-Control": "no-store"}
@@ -161,7 +161,7 @@ def list_gaps(
     """List what is missing of a robot's record and why, in order of time."""
     span = span_in(fleet, robot.id, from_, to)
     question = Asked(robot.id, item, None, *span, limit=limit)
-    answer = fleet.asking.ask_now(f"{WORKER}:gaps", arguments(question), asker=str(who.principal))
+    answer = fleet.asking.ask_now(f"{WORKER}:gaps", arguments(question), asker=who.asker)
     return Gaps.model_validate_json(answer)
 
 
@@ -173,7 +173,5 @@ def read_statistics(
     """Sum up variables over a range: number of values, least, greatest, mean."""
     span = span_in(fleet, robot.id, from_, to)
     question = Asked(robot.id, item, _names(variables), *span)
-    answer = fleet.asking.ask_now(
-        f"{WORKER}:statistics", arguments(question), asker=str(who.principal)
-    )
+    answer = fleet.asking.ask_now(f"{WORKER}:statistics", arguments(question), asker=who.asker)
     return msgspec.json.decode(answer, type=Summaries)

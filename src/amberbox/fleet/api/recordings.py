@@ -82,7 +82,7 @@ def _checked(
         if one.integrity in ("intact", "unsigned")
     ]
     arguments = {"robot": robot, "journals": named}
-    answer = fleet.asking.ask_now(f"{WORKER}:altered", arguments, asker=str(who.principal))
+    answer = fleet.asking.ask_now(f"{WORKER}:altered", arguments, asker=who.asker)
     altered = set(msgspec.json.decode(answer, type=list[str]))
     return [
         replace(one, integrity="altered") if f"{one.store_id}/{one.journal}" in altered else one

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
@@ -22,7 +23,7 @@ from amberbox.fleet.accounts.sessions import (
     revoke_session,
     revoke_sessions,
 )
-from amberbox.fleet.accounts.users import find_user
+from amberbox.fleet.accounts.users import User, find_user
 from amberbox.fleet.api.access import Caller, Fleet, Open, Routes, Who
 from amberbox.fleet.api.errors import ErrorBody
 from amberbox.fleet.api.forms import Form
@@ -146,8 +147,7 @@ async def change_password(
     )  # fmt: skip
     _tell(fleet, who)
     _set_cookie(response, fleet, session)
-    with fleet.database.reading() as connection:
-        user = find_user(connection, who.principal.id)
+    user = await asyncio.to_thread(_user, fleet, who.principal.id)
     return _myself(user.principal, session.secret)
 
 
@@ -188,6 +188,11 @@ def revoke_others(who: Who, fleet: Fleet) -> Ended:
         who.note(connection, fleet.clock.wall_ns(), "session.revoke", "others", details=told)
     _tell(fleet, who)
     return Ended(count)
+
+
+def _user(fleet: Services, name: str) -> User:
+    with fleet.database.reading() as connection:
+        return find_user(connection, name)
 
 
 def _from(request: Request) -> signin.Caller:

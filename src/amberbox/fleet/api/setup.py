@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Mapping
 from functools import lru_cache, partial
 from pathlib import Path
@@ -44,7 +45,7 @@ def ask(request: Request, fleet: Fleet) -> Response:
 @routes.post("/setup", _WHY, **_ASKS)
 async def make(request: Request, fleet: Fleet) -> Response:
     """Make the admin; what is wrong is said on the page."""
-    situation = _situation(request, fleet)
+    situation = await asyncio.to_thread(_situation, request, fleet)
     origin = request.headers.get("origin")
     if origin is not None and not is_own_page(origin, request, fleet.settings):
         raise HTTPException(403, "the form is on a page of this server only")

@@ -71,6 +71,7 @@ def make(fleet: Fleet, who: Who, new: NewToken) -> Made:
     with fleet.database.begin() as connection:
         now_ns = fleet.clock.wall_ns()
         owner = find_user(connection, who.principal.id)
+        _refuse_foreign(owner, new.groups)
         _refuse_too_many(tokens.list_tokens(connection, owner.user_id), now_ns)
         lasts_ns = new.days * tokens.DAY_NS
         secret = tokens.add_token(
@@ -119,6 +120,14 @@ def _refuse_too_many(held: list[tokens.Token], now_ns: int) -> None:
     working = [one for one in held if one.revoked_ns is None and now_ns < one.expires_ns]
     if len(working) >= _MOST:
         raise UsageError(f"there are {len(working)} tokens that work", "revoke some first")
+
+
+def _refuse_foreign(owner: User, groups: list[str] | None) -> None:
+    """Refuse groups that are not the owner's: they would open nothing, and tell which there are."""
+    for name in groups or () if owner.groups is not None else ():
+        if name not in (owner.groups or ()):
+            listed = f"yours are: {', '.join(sorted(owner.groups or ()))}"
+            raise UsageError(f"you are not for a group '{name}'", listed)
 
 
 def _shown(token: tokens.Token) -> Listed:

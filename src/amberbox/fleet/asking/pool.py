@@ -12,10 +12,13 @@ from amberbox.fleet.asking.waiting import Waiting
 
 
 class Pool:
-    """Answers questions with ``count`` workers; they start with the first question."""
+    """Answers questions with ``count`` workers; they start with the first question.
+
+    ``most`` wait: fewer than the server has threads that answer people, or those could all wait.
+    """
 
     def __init__(
-        self, folder: Path, count: int = 2, *, most: int = 64, each: int = 16, nice: int = 0,
+        self, folder: Path, count: int = 2, *, most: int = 32, each: int = 8, nice: int = 0,
         program: str = PROGRAM,
     ) -> None:  # fmt: skip
         self._children = [Child(folder, nice, program) for _ in range(count)]

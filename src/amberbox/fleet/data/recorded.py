@@ -55,7 +55,13 @@ def incidents(folder: Path, robot: str) -> list[Mapping[str, Any]]:
     found: dict[str, Mapping[str, Any]] = {}
     for entry in _entries(folder, robot, reserved.INCIDENT):
         found[str(entry.values.get("id"))] = entry.values
-    return sorted(found.values(), key=lambda values: values.get("from_ns") or 0)
+    return sorted(found.values(), key=_from_ns)
+
+
+def _from_ns(values: Mapping[str, Any]) -> int:
+    """Return when a window begins; a robot may say anything in its place."""
+    from_ns = values.get("from_ns")
+    return from_ns if isinstance(from_ns, int) else 0
 
 
 def _entries(folder: Path, robot: str, channel: str) -> list[Entry]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 import shutil
 import time
 from collections.abc import Callable
@@ -96,6 +97,10 @@ class Jobs:
         with self._database.reading() as connection:
             return ledger.next_one(connection)
 
+    def _options(self) -> Downloads:
+        with self._database.reading() as connection:
+            return read(connection, SETTING, Downloads)
+
     async def _do(self, work: Callable[[Connection], Answer]) -> Answer:
         def in_transaction() -> Answer:
             with self._database.begin() as connection:
@@ -114,8 +119,7 @@ class Jobs:
         now_ns = self._clock.wall_ns()
         if not await self._change(job, "queued", state="running", progress=0.0, started_ns=now_ns):
             return  # cancelled meanwhile
-        with self._database.reading() as connection:
-            options = read(connection, SETTING, Downloads)
+        options = await asyncio.to_thread(self._options)
         hearing = _Hearing(self._database, self._bus, job)
         arguments = {
             "id": job.id, "wanted": msgspec.to_builtins(job.wanted), "asked_ns": job.asked_ns,
@@ -129,8 +133,9 @@ class Jobs:
         except asyncio.CancelledError:
             question.cancel()
             raise
-        except (AmberboxError, OSError, ValueError) as error:
-            text = error.what if isinstance(error, AmberboxError) else str(error)
+        except Exception as error:  # of this one: the next ones are made
+            text = error.what if isinstance(error, AmberboxError) else type(error).__name__
+            logging.getLogger(__name__).warning("%s failed", job.id, exc_info=error)
             await self._ended(job, "failed", error=text)
         else:
             made = hearing.last

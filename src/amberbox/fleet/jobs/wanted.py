@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -38,3 +39,11 @@ class Downloads:
     each_gb: float = 5.0
     each_waiting: int = 20
     limit_h: float = 2.0
+
+    def __post_init__(self) -> None:
+        """Refuse numbers that make no sense; raises ValueError."""
+        for name in ("kept_h", "quota_gb", "each_gb", "limit_h"):
+            if not (math.isfinite(getattr(self, name)) and 0 < getattr(self, name) <= 1e6):
+                raise ValueError(f"{name} is above 0, and 1000000 at most")
+        if not 1 <= self.each_waiting <= 1000:
+            raise ValueError("each_waiting is 1 to 1000")

@@ -12,7 +12,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
-from sqlalchemy import Connection, RowMapping, func, select, update
+from sqlalchemy import ColumnElement, Connection, RowMapping, func, or_, select, update
 
 from amberbox.core.clock import NS
 from amberbox.fleet.alarms.alarm import Alarm, is_worse
@@ -151,11 +151,16 @@ def due(connection: Connection, now_ns: int, most: int = 20) -> list[RowMapping]
     """Return messages that are to be delivered now, oldest first."""
     chosen = (
         select(OUTBOX)
-        .where(OUTBOX.c.state == "waiting", OUTBOX.c.due_ns <= now_ns)
+        .where(OUTBOX.c.state == "waiting", _is_due(now_ns))
         .order_by(OUTBOX.c.due_ns, OUTBOX.c.number)
         .limit(most)
     )
     return list(connection.execute(chosen).mappings())
+
+
+def _is_due(now_ns: int) -> ColumnElement[bool]:
+    """Judge when a message is due; one so far off is of a clock that has been put right since."""
+    return or_(OUTBOX.c.due_ns <= now_ns, OUTBOX.c.due_ns > now_ns + 2 * _LONGEST_NS)
 
 
 def message_of(row: RowMapping) -> Message:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -17,6 +16,7 @@ from amberbox.fleet.archive.store import OWN, Retention
 from amberbox.fleet.jobs.wanted import Downloads
 from amberbox.fleet.notifying.settings import Notifications
 
+_LONGEST_S = 1e10
 _CLASSES = ("*", OWN, "main", "bulk", "ring", "watch", "keep", "kept")
 
 
@@ -70,8 +70,9 @@ def _refuse_retention(rules: tuple[Retention, ...]) -> None:
             listed = f"classes are: {', '.join(_CLASSES)}"
             raise UsageError(f"there is no class '{rule.keeping}'{near}", listed)
         for lasts_s in (rule.journals_s, rule.columns_s):
-            if lasts_s is not None and not (math.isfinite(lasts_s) and lasts_s >= 0):
-                raise UsageError("a lifetime is a number of seconds, not below 0", "null: for ever")
+            if lasts_s is not None and not 0 <= lasts_s <= _LONGEST_S:
+                what = "a lifetime is a number of seconds, not below 0, 1e10 at most"
+                raise UsageError(what, "null: for ever")
     pairs = [(rule.robot, rule.keeping) for rule in rules]
     twice = next((pair for pair in pairs if pairs.count(pair) > 1), None)
     if twice is not None:

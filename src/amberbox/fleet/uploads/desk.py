@@ -14,7 +14,7 @@ from pathlib import Path
 from sqlalchemy import ColumnElement, Connection, and_, select
 
 from amberbox.blackbox.store import sync_folder
-from amberbox.core.clock import Clock, SystemClock
+from amberbox.core.clock import NS, Clock, SystemClock
 from amberbox.fleet.database.database import Database
 from amberbox.fleet.database.upsert import upsert
 from amberbox.fleet.linkend.events import note
@@ -26,6 +26,8 @@ from amberbox.link.limits import PIECE_BYTES
 from amberbox.link.uploads import JOURNAL_BYTES, Proof, State, Verdict
 
 _KEY = ("robot", "store_id", "journal", "sha256")
+_TOO_MUCH = "too much of this robot waits here already"
+_KEPT_S = 7 * 86_400.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,6 +80,8 @@ class Desk:
             return known
         if len(piece) > PIECE_BYTES:
             return Answer(413, text=f"a piece has at most {PIECE_BYTES} bytes")
+        if self._waiting_bytes(incoming.robot) + len(piece) > self.quota:
+            return Answer(507, text=_TOO_MUCH)
         with self._lock(incoming):
             try:
                 return Answer(204, pieces.add(self.root, incoming, offset, piece, crc))
@@ -117,12 +121,23 @@ class Desk:
     def _coming(self, incoming: Incoming) -> Answer:
         at = pieces.held(self.root, incoming)
         if not at and self._waiting_bytes(incoming.robot) + incoming.size > self.quota:
-            return Answer(507, text="too much of this robot waits here already")
+            self._drop_old(incoming.robot)
+            if self._waiting_bytes(incoming.robot) + incoming.size > self.quota:
+                return Answer(507, text=_TOO_MUCH)
         return Answer(200, at)
 
     def _waiting_bytes(self, robot: str) -> int:
-        parts = (self.root / "incoming" / robot).glob("*/*.part")
-        return sum(path.stat().st_size for path in parts)
+        return sum(path.stat().st_size for path in self._parts(robot))
+
+    def _drop_old(self, robot: str) -> None:
+        """Forget pieces of which none came for long: their robot may not have the file any more."""
+        oldest_s = self.clock.wall_ns() / NS - _KEPT_S
+        for path in self._parts(robot):
+            if path.stat().st_mtime < oldest_s:
+                path.unlink(missing_ok=True)
+
+    def _parts(self, robot: str) -> list[Path]:
+        return list((self.root / "incoming" / robot).glob("*/*.part"))
 
     def _lock(self, incoming: Incoming) -> threading.Lock:
         """Let one request at a time work on a file, whatever is sent twice."""
