@@ -16,6 +16,7 @@ class Place(NamedTuple):
 
 
 START = Place()
+LARGEST = 2**63 - 1
 
 
 class RunEnd(msgspec.Struct, frozen=True, array_like=True):
@@ -42,10 +43,13 @@ class Reach(msgspec.Struct, frozen=True, array_like=True):
         """Say what cannot be true in it; empty where all can."""
         if min(*self.oldest, *self.end, *self.durable) < 0:
             return "a position below 0"
+        ends = (run.end_seq for run in self.runs)
+        if max(*self.oldest, *self.end, *self.durable, *ends) > LARGEST:
+            return "a position that is no number of 64 bits"
         if self.durable > self.end:
             return "more is durable than was written"
         numbers = [run.run for run in self.runs]
-        if numbers != sorted(set(numbers)):
+        if numbers != sorted(set(numbers)) or any(abs(n) > LARGEST for n in numbers):
             return "runs out of order"
         return "a run that ends below 0" if any(run.end_seq < 0 for run in self.runs) else ""
 

@@ -17,13 +17,14 @@ from amberbox.fleet.linkend.board import board
 from amberbox.fleet.linkend.committed import drop_committed
 from amberbox.fleet.linkend.grouped import GroupedWrites
 from amberbox.fleet.linkend.presence import offset_ns, presences
-from amberbox.fleet.linkend.server import LinkServer
+from amberbox.fleet.linkend.server import Hooks, LinkServer
 from amberbox.fleet.linkend.sockets import SocketClosedError
-from amberbox.fleet.linkend.tables import ROW
+from amberbox.fleet.linkend.tables import HEADS, ROW
 from amberbox.link.frames import (
     Ack,
     Beat,
     Bye,
+    Heads,
     Hello,
     Live,
     Pong,
@@ -37,6 +38,7 @@ from amberbox.link.frames import (
     from_server,
 )
 from amberbox.link.positions import Place, Reach, RunEnd
+from amberbox.link.serverend import ServerEnd
 
 REACH = Reach(Place(1, 0), Place(1, 9), Place(1, 5), (RunEnd(1, "b", 9, closed=False),))
 HELLO = Hello("r1", "s", "boot", {"watch": REACH}, "", 0, 0, "1")
@@ -122,6 +124,99 @@ def test_acknowledged_is_what_is_durable_on_the_robot(database: Database) -> Non
     asyncio.run(scene())
 
 
+def test_names_that_fit_in_no_frame_keep_no_robot_out(database: Database) -> None:
+    async def scene() -> None:
+        link, socket = LinkServer(database), FakeSocket()
+        await link.watch("r1", [f"{n:04}" + "\N{EURO SIGN}" * 500 for n in range(1000)])
+        task = asyncio.create_task(link.serve(socket, "r1"))
+        socket.say(HELLO)
+        welcome = await socket.hear()
+        assert isinstance(welcome, Welcome) and 100 < len(welcome.watch) < 200
+        await socket.close()
+        await task
+        link.close()
+
+    asyncio.run(scene())
+
+
+def test_what_cannot_be_answered_ends_the_connection(
+    database: Database, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nobody would be heard on it any more, and the robot would look as if it were there."""
+
+    async def scene() -> None:
+        link, socket = LinkServer(database), FakeSocket()
+        task = asyncio.create_task(link.serve(socket, "r1"))
+        socket.say(HELLO)
+        await socket.hear()
+        monkeypatch.setattr(ServerEnd, "stored", lambda *_: 1 / 0)
+        socket.say(Rows(1, 1, [status(0, "a")], {}))
+        await asyncio.wait_for(task, 5)
+        assert socket.closed and not link.robots
+        link.close()
+
+    asyncio.run(scene())
+
+
+@pytest.mark.parametrize("place", [{"run": 2**64 - 1}, {"seq": 2**63}, {"log_ns": 2**64 - 1}])
+def test_numbers_beyond_64_bits_end_the_connection(
+    database: Database, place: dict[str, int]
+) -> None:
+    async def scene() -> None:
+        link, socket = LinkServer(database), FakeSocket()
+        task = asyncio.create_task(link.serve(socket, "r1"))
+        socket.say(HELLO)
+        await socket.hear()
+        socket.say(Rows(1, 1, [msgspec.structs.replace(status(0, "a"), **place)], {}))
+        bye = await socket.hear()
+        assert isinstance(bye, Bye) and "64 bits" in bye.reason
+        await asyncio.wait_for(task, 5)
+        link.close()
+
+    asyncio.run(scene())
+
+
+def test_one_that_takes_nothing_holds_up_nobody(database: Database) -> None:
+    class Stalled(FakeSocket):
+        async def send(self, data: bytes) -> None:
+            if self.down.qsize():
+                await asyncio.Event().wait()
+            await super().send(data)
+
+    async def scene() -> None:
+        link, socket = LinkServer(database, silent_s=0.3), Stalled()
+        task = asyncio.create_task(link.serve(socket, "r1"))
+        socket.say(HELLO)
+        while not socket.down.qsize():
+            await asyncio.sleep(0.01)
+        assert not await asyncio.wait_for(link.send("r1", Bye("x")), 5)
+        await asyncio.wait_for(task, 5)
+        link.close()
+
+    asyncio.run(scene())
+
+
+def test_statements_that_are_none_and_statuses_without_an_end_are_not_kept(
+    database: Database,
+) -> None:
+    async def scene() -> None:
+        link, socket = LinkServer(database), FakeSocket()
+        task = asyncio.create_task(link.serve(socket, "r1"))
+        socket.say(HELLO)
+        await socket.hear()
+        long = status(0, "a" * 70_000)
+        socket.say(Heads(1, b"x" * 100_000), Heads(1, b"{}"), Rows(1, 1, [long], {}))
+        assert isinstance(await socket.hear(), Ack)
+        await socket.close()
+        await task
+        link.close()
+
+    asyncio.run(scene())
+    with database.reading() as connection:
+        assert list(connection.execute(select(HEADS.c.heads)).scalars()) == [b"{}"]
+        assert board(connection, "r1") == []
+
+
 def test_silence_is_noticed_and_the_robot_is_offline(database: Database) -> None:
     async def scene() -> None:
         link, socket = LinkServer(database, silent_s=0.2), FakeSocket()
@@ -142,7 +237,9 @@ def test_heartbeats_tell_backlog_and_clock_and_live_values_stay_in_memory(
     database: Database,
 ) -> None:
     async def scene() -> None:
-        link, socket = LinkServer(database), FakeSocket()
+        heard: list[object] = []
+        hooks = Hooks(live=lambda robot, values: heard.append((robot, values)))
+        link, socket = LinkServer(database, hooks), FakeSocket()
         await link.watch("r1", ["odom.x"])
         task = asyncio.create_task(link.serve(socket, "r1"))
         socket.say(HELLO)
@@ -151,7 +248,7 @@ def test_heartbeats_tell_backlog_and_clock_and_live_values_stay_in_memory(
         socket.say(Live(1, {"odom.x": (5, 1.5)}), Beat(1, 7, 8, 12, 100, 10))
         answer = await socket.hear()
         assert isinstance(answer, Pong) and answer.mono_ns == 8
-        assert link.robots["r1"].live == {"odom.x": (5, 1.5)}
+        assert heard == [("r1", {"odom.x": (5, 1.5)})]
         await link.watch("r1", [])
         assert await socket.hear() == Watch([])
         await socket.close()

@@ -13,6 +13,8 @@ from amberbox.fleet.database.upsert import Excluded, upsert
 from amberbox.fleet.linkend.tables import STATUS
 from amberbox.link.frames import Row
 
+LONGEST = 64 << 10
+"""Bytes of a status; a longer one is stored as a row, and not shown."""
 _KEY = ("robot", "component", "mode")
 _CHANGE = ("level", "store_id", "run", "seq", "log_ns", "received_ns", "data")
 
@@ -63,6 +65,8 @@ def _entries(
     robot: str, store_id: str, rows: Sequence[Row], now_ns: int
 ) -> Iterator[dict[str, Any]]:
     for row in sorted((r for r in rows if r.channel == reserved.STATUS), key=lambda r: r.place):
+        if len(row.data) > LONGEST:
+            continue
         try:
             status = _DECODER.decode(row.data)
         except msgspec.MsgspecError:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable, Callable, Mapping, Sequence
+import logging
+from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
@@ -38,6 +39,10 @@ from amberbox.link.serverend import Admit, Deed, Keep, Say, ServerEnd
 Value = tuple[int, float | str | None]
 _SEEN_EVERY_NS = 10 * 1_000_000_000
 """How often a heartbeat is written to the database; in between it is known in memory."""
+_WATCHED_BYTES = 256 << 10
+"""Names of variables that are asked of a robot: they have to fit in a frame, many times over."""
+_HEADS_BYTES = 64 << 10
+"""A statement of how far a record reaches has some hundred bytes; a larger one is not kept."""
 _WAITING = 64
 """Frames that are taken before the oldest of them is answered."""
 
@@ -75,7 +80,6 @@ class Connected:
     last_seen_ns: int
     written_ns: int = 0
     backlog: int = 0
-    live: dict[str, Value] = field(default_factory=dict)
     answers: asyncio.Queue[Answer | None] = field(default_factory=lambda: asyncio.Queue(_WAITING))
 
 
@@ -118,19 +122,19 @@ class LinkServer:
             await self._left(one)
 
     async def send(self, robot: str, frame: ServerFrame) -> bool:
-        """Send a frame to a robot; tell whether it is connected."""
+        """Send a frame to a robot; tell whether it is connected, and takes what it is sent."""
         one = self.robots.get(robot)
         if one is None:
             return False
         try:
-            await one.socket.send(encode(frame))
-        except SocketClosedError:
+            await asyncio.wait_for(one.socket.send(encode(frame)), self._silent_s)
+        except (TimeoutError, SocketClosedError):
             return False
         return True
 
     async def watch(self, robot: str, variables: Sequence[str]) -> None:
         """Ask for the latest values of variables from now on, also after a new connection."""
-        self._watched[robot] = tuple(variables[: limits.VARIABLES])
+        self._watched[robot] = tuple(_fitting(variables))
         await self.send(robot, Watch(list(self._watched[robot])))
 
     async def _listen(self, one: Connected) -> None:
@@ -160,10 +164,9 @@ class LinkServer:
             await one.answers.put((one.end.pong(deed, self._clock.wall_ns()),))
             self._beat(one, deed)
         elif isinstance(deed, Live):
-            one.live.update(deed.values)
             self._hooks.live(one.robot, deed.values)
         elif isinstance(deed, Heads):
-            self._heads(one, deed)
+            await self._heads(one, deed)
         elif isinstance(deed, Has):
             self._hooks.has(one.robot, _store_of(one), deed)
 
@@ -219,11 +222,16 @@ class LinkServer:
                 boot=one.end.hello.boot_id, at_ns=now_ns,
             ))  # fmt: skip
 
-    def _heads(self, one: Connected, deed: Heads) -> None:
-        self._writes.submit(partial(
+    async def _heads(self, one: Connected, deed: Heads) -> None:
+        """Keep a statement; more is heard of the robot then, so that nothing piles up."""
+        if len(deed.heads) > _HEADS_BYTES:
+            return
+        kept = self._writes.submit(partial(
             presence.keep_heads, robot=one.robot, store_id=_store_of(one), heads=deed.heads,
             at_ns=one.last_seen_ns,
         ))  # fmt: skip
+        with suppress(AmberboxError):  # the database is busy: the next statement says as much
+            await asyncio.wrap_future(kept)
 
     async def _answer(self, one: Connected) -> None:
         """Send answers in the order of what they answer, each once it is true."""
@@ -238,6 +246,10 @@ class LinkServer:
             except (TimeoutError, SocketClosedError, AmberboxError):
                 await _drop(one)  # without an answer the robot tries again
                 return
+            except Exception:  # something that no robot should say; its listener must not wait
+                logging.getLogger(__name__).exception("no answer to %s", one.robot)
+                await _drop(one)
+                return
 
     async def _left(self, one: Connected) -> None:
         await one.socket.close()
@@ -248,6 +260,16 @@ class LinkServer:
             self._writes.submit(partial(
                 presence.gone, robot=one.robot, epoch=one.end.epoch, last_seen_ns=one.last_seen_ns
             ))  # fmt: skip
+
+
+def _fitting(variables: Sequence[str]) -> Iterator[str]:
+    """Give as many of some names as one frame takes."""
+    left = _WATCHED_BYTES
+    for name in variables[: limits.VARIABLES]:
+        left -= len(name.encode("utf-8", "replace"))
+        if left < 0:
+            return
+        yield name
 
 
 def _store_of(one: Connected) -> str:

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import asyncio
 from contextlib import suppress
 from typing import Any, Protocol
+
+_CLOSE_S = 2.0
+"""One who takes nothing any more would have us wait for ever."""
 
 
 class SocketClosedError(Exception):
@@ -81,4 +85,4 @@ class StarletteSocket:
     async def close(self) -> None:
         """End the connection."""
         with suppress(Exception):  # closed already, or the network gone: each server's own error
-            await self._websocket.close()
+            await asyncio.wait_for(self._websocket.close(), _CLOSE_S)
