@@ -124,10 +124,11 @@ def _report(server: Server, heard: robots.Heard, run: _Run, how: str, left: int)
     yield Row("workers", 100 * run.share["worker"], "% of a core", note="verify, commit")
     yield Row("memory of the server", server.memory_mb("server"), "MB")
     yield Row("memory of its workers", server.memory_mb("worker"), "MB")
-    most, last = max(server.rows, default=0), server.rows[-1] if server.rows else 0
-    yield Row("early rows in the database, most", most, "rows", note=f"{last} at the end")
-    size = server.database_mb()
-    yield Row("database", size, "MB", note=f"{3600 * size / run.lasted_s:.0f} MB/h if it went on")
+    most, held = max(server.rows, default=0), server.rows[:: max(len(server.rows) // 8, 1)]
+    note = f"{', '.join(f'{count}' for count in held)} as time went"
+    yield Row("early rows in the database, most", most, "rows", note=note)
+    grows = f"grows by {server.growth_mb_h():.0f} MB/h in the second half"
+    yield Row("database", server.database_mb(), "MB", note=grows)
     yield Row("tables of the archive", server.archive_mb(), "MB")
 
 

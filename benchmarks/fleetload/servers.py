@@ -54,6 +54,8 @@ class Server:
     usage: dict[int, Usage] = field(default_factory=dict)
     rows: list[int] = field(default_factory=list)
     """How many early rows the database held, as time went."""
+    sizes_mb: list[float] = field(default_factory=list)
+    """How large the database was then."""
     _process: subprocess.Popen[bytes] | None = None
     _stop: threading.Event = field(default_factory=threading.Event)
 
@@ -103,6 +105,11 @@ class Server:
     def database_mb(self) -> float:
         """Size of the database and of what is not merged into it yet."""
         return sum(p.stat().st_size for p in self.folder.glob(f"{FILE}*")) / 1e6
+
+    def growth_mb_h(self) -> float:
+        """How much the database grows an hour, by the second half of the time."""
+        half = self.sizes_mb[len(self.sizes_mb) // 2 :]
+        return (half[-1] - half[0]) / max(len(half) - 1, 1) * 360 if half else 0.0
 
     def archive_mb(self) -> float:
         """Size of the tables."""
@@ -163,6 +170,7 @@ class Server:
                 with database.reading() as connection:
                     count = connection.execute(select(func.count()).select_from(ROW)).scalar()
                 self.rows.append(int(count or 0))
+                self.sizes_mb.append(self.database_mb())
         database.close()
 
 
