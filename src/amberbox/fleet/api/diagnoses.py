@@ -29,6 +29,8 @@ routes = Routes("diagnoses")
 WORKER = "amberbox.fleet.knowledge.worker"
 LIMIT_S = 20.0
 MEMORY_BYTES = 1 << 30
+_TRIES = 5
+"""So often an answer is ranked anew because somebody else has answered meanwhile."""
 
 _Address = Annotated[str, StringConstraints(min_length=1, max_length=300)]
 _Word = Annotated[str, StringConstraints(min_length=1, max_length=100)]
@@ -170,13 +172,18 @@ async def answer_test(
 ) -> dict[str, Any]:
     """Say what a test gave; the diagnosis is ranked anew, and kept as a revision of the server."""
     await asyncio.to_thread(_known, fleet, robot, diagnosis)
-    before = await asyncio.to_thread(_given, fleet, robot.id, diagnosis)
-    asked = AskDiagnosis(robot=robot.id, now_ns=fleet.clock.wall_ns(), diagnosis=diagnosis,
-                         answers={**before, body.test: body.answer})  # fmt: skip
-    answer = await _ask(fleet, who, asked)
-    await asyncio.to_thread(_keep_answer, fleet, who, robot.id, diagnosis, body, answer)
-    fleet.bus.publish(Change("diagnosis", robot.id, {"id": diagnosis}))
-    return _loaded(answer)
+    for _ in range(_TRIES):
+        before = await asyncio.to_thread(_given, fleet, robot.id, diagnosis)
+        asked = AskDiagnosis(robot=robot.id, now_ns=fleet.clock.wall_ns(), diagnosis=diagnosis,
+                             answers={**before, body.test: body.answer})  # fmt: skip
+        answer = await _ask(fleet, who, asked)
+        kept = await asyncio.to_thread(
+            _keep_answer, fleet, who, robot.id, diagnosis, body, before, answer
+        )
+        if kept:
+            fleet.bus.publish(Change("diagnosis", robot.id, {"id": diagnosis}))
+            return _loaded(answer)
+    raise UsageError("others answer tests of this diagnosis just now", "try again")
 
 
 @routes.post("/robots/{robot}/diagnoses/{diagnosis}/cause", "diagnoses.write", status_code=201)
@@ -236,14 +243,19 @@ def _with_answers(asked: AskDiagnosis, before: dict[str, str]) -> AskDiagnosis:
 
 
 def _keep_answer(
-    fleet: Services, who: Caller, robot: str, diagnosis: str, body: AnswerForm, answer: bytes
-) -> None:
+    fleet: Services, who: Caller, robot: str, diagnosis: str, body: AnswerForm,
+    before: dict[str, str], answer: bytes,
+) -> bool:  # fmt: skip
+    """Keep an answer and what follows; False if somebody else has answered since ``before``."""
     now_ns, person = fleet.clock.wall_ns(), who.principal.owner or who.principal.id
     given = notebook.Given(body.test, body.answer, person, now_ns)
     with fleet.database.begin() as connection:
+        if notebook.counting(notebook.given(connection, robot, diagnosis)) != before:
+            return False
         notebook.keep_answer(connection, robot, diagnosis, given, answer)
         details = {"diagnosis": diagnosis, "test": body.test, "answer": body.answer}
         who.note(connection, now_ns, "diagnoses.answer", robot, details=details)
+    return True
 
 
 def _keep_cause(
