@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import shutil
 from collections.abc import Iterator, Mapping
@@ -22,6 +23,7 @@ from amberbox.link.frames import Row
 from amberbox.monitoring.engine.findings import Finding
 from amberbox.monitoring.messages.records import encoded, record_of
 from amberbox.testing.records import FakeRun
+from tests.fleet.archive.recordings import Robot
 from tests.fleet.house import House, house
 from tests.fleet.knowledge import robot as sim
 
@@ -210,6 +212,29 @@ def test_an_answer_ranks_anew_and_is_kept(home: House, operator: TestClient) -> 
     assert actions.count("diagnoses.answer") == 2
 
 
+def test_two_answers_at_the_same_time_both_count(
+    home: House, operator: TestClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """While the first is ranked, somebody else gives another."""
+    path = f"{PATH}/diagnoses/{sim.DIAGNOSIS}/answers"
+    ask_worker, other = home.services.asking.ask, home.client("nurse")
+    asked: list[int] = []
+
+    async def slowly(*words: Any, **options: Any) -> bytes:
+        asked.append(len(asked))
+        if len(asked) == 1:
+            body = {"test": "laser_front.sound", "answer": "yes"}
+            assert (await asyncio.to_thread(other.post, path, json=body)).status_code == 200
+        return await ask_worker(*words, **options)
+
+    monkeypatch.setattr(home.services.asking, "ask", slowly)
+    first = operator.post(path, json={"test": "laser_front.lamp", "answer": "yes"})
+    assert len(asked) == 3  # the first one again, with the answer of the other
+    assert first.json()["answers"] == {"laser_front.lamp": "yes", "laser_front.sound": "yes"}
+    kept = operator.get(f"{PATH}/diagnoses/{sim.DIAGNOSIS}").json()["server_revisions"][-1]
+    assert kept["diagnosis"]["answers"] == first.json()["answers"]
+
+
 def test_what_it_was_is_kept_with_who_and_when(operator: TestClient) -> None:
     path = f"{PATH}/diagnoses/{sim.DIAGNOSIS}"
     cause = {"failure_mode": "laser_front#silent", "note": "the plug was loose"}
@@ -304,3 +329,21 @@ def test_a_question_that_eats_memory_does_no_harm(
     assert (answer.status_code, what(answer)) == (422, "the answer needs more memory than 120 MB")
     monkeypatch.undo()
     assert operator.post(f"{PATH}/rules", json={"query": "robot(X)"}).status_code == 200
+
+
+def test_conditions_say_what_they_do_not_see(
+    home: House, operator: TestClient, tmp_path: Path
+) -> None:
+    sim.hand_in(home, "ropod_003")
+    sim.say(home, [(sim.AT_NS, sim.status("laser_front", sim.AT_NS))], robot="ropod_003", start=90)
+    recorded = Robot("ropod_003", tmp_path)
+    recorded.record(0, files=1)
+    recorded.hand_in_all(home.services.archive)
+    path = "/api/v1/robots/ropod_003/rules"
+    conditions = {"query": "status(C, ok, F, T), \\+ (C = none, holds('odom.x > 1', F, T))"}
+    found = operator.post(path, json=conditions)
+    assert any("next commit: conditions (holds)" in note for note in found.json()["notes"]), (
+        found.text
+    )
+    committed = operator.post(f"{PATH}/rules", json=conditions).json()
+    assert not any("commit" in note for note in committed["notes"])

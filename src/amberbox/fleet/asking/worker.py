@@ -6,6 +6,7 @@ error. What an operation prints goes to stderr. It ends when its pipe does.
 
 from __future__ import annotations
 
+import errno
 import logging
 import os
 import resource
@@ -57,13 +58,19 @@ def parts(folder: Path, op: str, arguments: Mapping[str, Any]) -> Iterator[bytes
 
 def told(error: Exception) -> Mapping[str, Any]:
     """Say an error as a frame; what nobody foresaw goes to the log with its traceback."""
-    if isinstance(error, MemoryError) or type(error).__name__ == _OUT_OF_MEMORY:
+    if _is_for_memory(error):
         return {"error": "memory", "kind": "memory", "hint": ""}
     if isinstance(error, AmberboxError):
         return {"error": error.what, "hint": error.hint, "kind": _kind(error)}
     logging.getLogger(__name__).error("a worker failed", exc_info=error)
     what = f"the question could not be answered: {type(error).__name__}"
     return {"error": what, "kind": "broken", "hint": "the server's log says more"}
+
+
+def _is_for_memory(error: Exception) -> bool:
+    """Tell all ways in which an operation says that it had no memory, imports among them."""
+    no_room = isinstance(error, OSError) and error.errno == errno.ENOMEM
+    return no_room or isinstance(error, MemoryError) or type(error).__name__ == _OUT_OF_MEMORY
 
 
 def _kind(error: AmberboxError) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ from amberbox.diagnosis.findings.facts import Facts
 from amberbox.diagnosis.fmea.coverage import coverage
 from amberbox.diagnosis.fmea.trees import effects, fault_tree_of
 from amberbox.diagnosis.rules import Budget, ask, read_rules
+from amberbox.fleet.archive.catalogue import Catalogue
 from amberbox.fleet.archive.folder import FolderArchive
 from amberbox.fleet.data.look import open_catalogue
 from amberbox.fleet.data.recorded import Stores
@@ -110,7 +111,19 @@ def rules(folder: Path, arguments: dict[str, Any]) -> Any:
     found = ask(program, asked.query, budget, asked.want or None)
     about = {"robot": asked.robot, "config_hash": subject.folder.config_hash}
     told = [str(note) for note in program.notes]
+    told += _not_looked_at(stores, asked, subject.rules())
     return {**about, **found.to_json(), "notes": [*notes, *told]}
+
+
+def _not_looked_at(stores: Stores, asked: AskRules, files: Iterable[Path]) -> list[str]:
+    """Say what conditions do not see: journals that are here, but in no table yet."""
+    catalogue = Catalogue(stores.database)
+    waiting = sum(row.robot == asked.robot for row in catalogue.waiting())
+    texts = (path.read_text(encoding="utf-8", errors="replace") for path in files)
+    if not waiting or not any("holds" in text for text in (asked.query, *texts)):
+        return []
+    count = "a journal waits" if waiting == 1 else f"{waiting} journals wait"
+    return [f"{count} for the next commit: conditions (holds) do not see what is in there yet"]
 
 
 @spoken
