@@ -123,15 +123,21 @@ def _placed(record: RemoteRecord, made: Download, target: Path, form: str) -> li
     near = target if is_folder else target.parent
     with tempfile.TemporaryDirectory(prefix=".amberbox-", dir=near) as folder:
         packed = record.fleet.save_download(made.id, Path(folder) / "download.zip")
-        return _unpacked(packed, target, is_folder=is_folder)
+        return _unpacked(packed, target, "" if is_folder else (*made.items, "")[0])
 
 
-def _unpacked(packed: Path, target: Path, *, is_folder: bool) -> list[Path]:
+def _unpacked(packed: Path, target: Path, item: str) -> list[Path]:
+    """Unpack all into a folder, or one item's file to a name of its own."""
     with zipfile.ZipFile(packed) as archive:
         names = [name for name in archive.namelist() if not name.endswith("/")]
-        if is_folder:
+        if target.is_dir():
             return [Path(archive.extract(name, target)) for name in names]
         found = [name for name in names if name != _CONTENTS]
+        own = [name for name in found if Path(name).stem == item]
+        if len(own) == 1 < len(found):
+            rest = sorted(Path(name).stem for name in found if name not in own)
+            tell([f"{name} is a table of its own: --item {name}, or a folder" for name in rest])
+            found = own
         if len(found) != 1:
             raise UsageError(f"these are {len(found)} files, not one",
                              "name a folder, a file ending in .zip, or one --item")  # fmt: skip

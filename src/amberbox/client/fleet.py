@@ -19,6 +19,7 @@ from amberbox.client.wire import TIMEOUT_S, Wire
 if TYPE_CHECKING:
     from amberbox.blackbox.query.table import Table
     from amberbox.client.downloading import Progress
+    from amberbox.client.feed import Change
 
 By = Literal["received", "timestamp"]
 ROWS = 200_000
@@ -296,7 +297,16 @@ class Fleet(AlarmCalls):
         body = {"query": query, "want": want, **_span(from_, to), "steps": steps}
         return self._send("POST", f"{_of(robot)}/rules", dict[str, Any], body)
 
-    # The server itself.
+    # The server itself, and what changes.
+
+    def follow(
+        self, robots: Sequence[str] | None = None, kinds: Sequence[str] | None = None,
+        live: Mapping[str, Sequence[str]] | None = None,
+    ) -> Iterator[Change]:  # fmt: skip
+        """Yield changes as they come, a snapshot first (``feed.follow``); needs websockets."""
+        from amberbox.client.feed import follow
+
+        return follow(self.wire, robots, kinds, live)
 
     def audit(self, from_: Time = None, to: Time = None, limit: int = 100) -> list[models.AuditRow]:
         """Return rows of the audit log, newest first."""

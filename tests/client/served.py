@@ -1,0 +1,135 @@
+"""A server of its own for the client's tests: a process, with what a robot recorded and said."""
+
+from __future__ import annotations
+
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from amberbox.cli.main import main
+from amberbox.core.clock import NS
+from amberbox.core.tls import fingerprint
+from amberbox.fleet.accounts.tokens import add_token
+from amberbox.fleet.accounts.users import find_user
+from amberbox.fleet.linkend.tables import STATUS
+from amberbox.monitoring.messages.records import encoded
+from tests.fleet.archive.recordings import Robot
+from tests.fleet.data.filled import fill
+from tests.fleet.house import House, house
+from tests.fleet.knowledge import robot as sim
+from tests.fleet.state import lives
+
+
+@dataclass
+class Served:
+    """A server that listens; ``robot`` is the folder whose record it has a copy of."""
+
+    data: Path
+    robot: Robot
+    port: int
+    pin: str
+    tokens: dict[str, str] = field(default_factory=dict)
+    process: subprocess.Popen[bytes] | None = None
+
+    @property
+    def url(self) -> str:
+        return f"https://localhost:{self.port}"
+
+    @property
+    def where(self) -> str:
+        """The page of the robot, with whom to trust."""
+        return f"{self.url}/robots/ropod_001#ca=sha256:{self.pin}"
+
+    @property
+    def store(self) -> str:
+        return str(self.robot.store)
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+@contextmanager
+def served(folder: Path) -> Iterator[Served]:
+    """Fill a server's folder, start the server on it, and end it afterwards."""
+    data = folder / "server"
+    with house(data) as home:
+        robot = fill(home, folder)
+        home.services.archive.commit(0)
+        _say(home)
+        tokens = {name: _token(home, *words) for name, words in _TOKENS.items()}
+    assert main(["serve", "cert", "--data", str(data), "--host", "localhost"]) == 0
+    pin = fingerprint((data / "tls" / "ca.pem").read_bytes())
+    found = Served(data, robot, free_port(), pin, tokens)
+    words = ("--data", str(data), "--port", str(found.port), "--quiet")
+    with (folder / "server.log").open("wb") as log:
+        found.process = subprocess.Popen(
+            [sys.executable, "-m", "amberbox", "serve", *words], stdin=subprocess.DEVNULL,
+            stdout=log, stderr=log,
+        )  # fmt: skip
+    try:
+        _await(found, folder / "server.log")
+        yield found
+    finally:
+        found.process.kill()
+        found.process.wait()
+
+
+_TOKENS: dict[str, tuple[str, ...]] = {
+    "admin": ("admin",),
+    "technician": ("technician",),
+    "viewer": ("viewer",),
+    "scope": ("technician", "read:status"),
+}
+
+
+def _token(home: House, owner: str, *scopes: str) -> str:
+    from amberbox.fleet.accounts.actions import SCOPES
+
+    with home.services.database.begin() as connection:
+        now_ns = time.time_ns()
+        user = find_user(connection, owner)
+        return add_token(connection, now_ns, user, "tests", scopes or tuple(SCOPES)).text
+
+
+def _say(home: House) -> None:
+    """Let the robot's watcher have found a laser without scans, and the server have an alarm."""
+    at_ns = sim.AT_NS
+    sim.hand_in(home)
+    sim.state(home)
+    silent = sim.symptom(sim.NO_SCANS, at_ns)
+    sim.say(home, [
+        (at_ns - 5 * NS, sim.status("laser_front", at_ns - 5 * NS)),
+        (at_ns, silent), (at_ns, sim.diagnosis(at_ns, silent)),
+        (at_ns + NS, sim.status("laser_front", at_ns + NS)),
+    ])  # fmt: skip
+    rows = []
+    for mode in ("", "heartbeat"):
+        _, data = encoded(sim.status("laser_front", at_ns + 2 * NS, mode, alive=False))
+        rows.append(
+            {"robot": "ropod_001", "component": "laser_front", "mode": mode, "level": "error",
+             "store_id": sim.STORE, "run": 1, "seq": 10, "log_ns": at_ns + 2 * NS,
+             "received_ns": at_ns + 2 * NS, "data": data}
+        )  # fmt: skip
+    with home.services.database.begin() as connection:
+        connection.execute(STATUS.insert(), rows)
+    lives.put_alarm(home, 7, "ropod_001")
+
+
+def _await(found: Served, log: Path) -> None:
+    end_s = time.monotonic() + 30
+    while True:
+        assert found.process is not None and found.process.poll() is None, log.read_text()
+        try:
+            socket.create_connection(("127.0.0.1", found.port), 1.0).close()
+            return
+        except OSError:
+            assert time.monotonic() < end_s, log.read_text()
+            time.sleep(0.05)
