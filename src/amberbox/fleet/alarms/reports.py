@@ -10,9 +10,9 @@ import msgspec
 
 from amberbox.blackbox.journal import reserved
 from amberbox.core.types import Diagnosis
+from amberbox.fleet.conclusions.findings import finding
 from amberbox.link.frames import Row
 from amberbox.monitoring.engine.findings import AlarmChange, Transition
-from amberbox.monitoring.messages.records import finding_of
 
 CHANNELS: Final = frozenset({reserved.ALARM, reserved.DIAGNOSIS, reserved.EVENT})
 """Channels that alarms are made of."""
@@ -75,9 +75,7 @@ def _order(one: Received) -> tuple[str, str, str, int, int]:
 def _told(row: Row) -> Told | None:
     """Return what a row says; None for nonsense, which the ledger keeps all the same."""
     try:
-        found = finding_of(row.channel, msgspec.json.decode(row.data))
-        if not isinstance(found, Told):
-            return None
-        return msgspec.convert(msgspec.to_builtins(found), type(found))
-    except (msgspec.MsgspecError, KeyError, TypeError, ValueError, AttributeError, OverflowError):
+        found = finding(row.channel, msgspec.json.decode(row.data))
+    except msgspec.MsgspecError:
         return None
+    return found if isinstance(found, Told) else None

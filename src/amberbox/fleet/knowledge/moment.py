@@ -12,8 +12,8 @@ from amberbox.core.clock import NS
 from amberbox.core.timetext import format_time, parse_time
 from amberbox.core.types import Diagnosis, Status, Symptom
 from amberbox.fleet.conclusions.entry import Entry
+from amberbox.fleet.conclusions.findings import finding
 from amberbox.fleet.conclusions.reading import Stores, entries
-from amberbox.monitoring.messages.records import finding_of
 
 _STATUS_NS = 30 * NS
 """A watcher that is alive has said of everything within this time how it is."""
@@ -92,12 +92,9 @@ def _said(stores: Stores, robot: str, at_ns: int) -> Said:
 def findings(found: Sequence[Entry], kind: type[Told]) -> Iterator[Told]:
     """Yield what records say, at times as they are known now; what cannot be read is left out."""
     for entry in found:
-        try:
-            finding = finding_of(entry.channel, entry.values)
-        except (KeyError, TypeError, ValueError):
-            continue  # of another version, or not what its channel says
-        if isinstance(finding, kind):
-            yield _moved(finding, entry.at_ns - entry.log_ns)
+        said = finding(entry.channel, entry.values)
+        if isinstance(said, kind):  # else of another version, or not what its channel says
+            yield _moved(said, entry.at_ns - entry.log_ns)
 
 
 def _moved(finding: Told, by_ns: int) -> Told:
