@@ -191,7 +191,8 @@ class Feed:
         """Ask again who may hear what: when accounts or robots change, and every 30 s."""
         while True:
             with suppress(TimeoutError):
-                await asyncio.wait_for(self._check.wait(), CHECK_S)
+                async with asyncio.timeout(CHECK_S):
+                    await self._check.wait()
             self._check.clear()
             for listener in tuple(self.listeners):
                 await self.check(listener)

@@ -89,7 +89,8 @@ class Live:
     async def _ask(self, robot: str) -> None:
         variables = sorted(self._asked.get(robot, ()))[: limits.VARIABLES]
         with suppress(TimeoutError):  # it asks again when it connects again
-            await asyncio.wait_for(self._links.watch(robot, variables), _PATIENCE_S)
+            async with asyncio.timeout(_PATIENCE_S):
+                await self._links.watch(robot, variables)
 
 
 def _union(watches: Iterable[Watch]) -> dict[str, frozenset[str]]:

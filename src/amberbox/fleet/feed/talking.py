@@ -68,7 +68,8 @@ class Talk:
         while True:
             wait_s = None if self._is_asked.is_set() else FIRST_S
             try:
-                text = await asyncio.wait_for(self._socket.receive(), wait_s)
+                async with asyncio.timeout(wait_s):
+                    text = await self._socket.receive()
                 if text is None:
                     return None
                 self._ask(text)
@@ -98,7 +99,8 @@ class Talk:
             text = await self._next()
             if text:
                 try:
-                    await asyncio.wait_for(self._socket.send(text), SEND_S)
+                    async with asyncio.timeout(SEND_S):
+                        await self._socket.send(text)
                     self._sent_s = time.monotonic()
                 except TimeoutError:
                     return listener.end(SLOW, "nothing was taken for too long")
@@ -135,7 +137,8 @@ class Talk:
     async def _wait(self) -> str:
         wait_s = max(self._sent_s + PING_S - time.monotonic(), 0.0)
         try:
-            await asyncio.wait_for(self._listener.wake.wait(), wait_s)
+            async with asyncio.timeout(wait_s):
+                await self._listener.wake.wait()
         except TimeoutError:
             return f"[{message(self._feed.ring.number, 'ping', '', None)}]"
         self._listener.wake.clear()

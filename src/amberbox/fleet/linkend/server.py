@@ -115,7 +115,8 @@ class LinkServer:
             await self._listen(one)
             await one.answers.put(None)
             with suppress(asyncio.TimeoutError):
-                await asyncio.wait_for(asyncio.shield(answering), self._silent_s)
+                async with asyncio.timeout(self._silent_s):
+                    await asyncio.shield(answering)
         finally:
             answering.cancel()
             await asyncio.gather(answering, *_unanswered(one), return_exceptions=True)
@@ -127,7 +128,8 @@ class LinkServer:
         if one is None:
             return False
         try:
-            await asyncio.wait_for(one.socket.send(encode(frame)), self._silent_s)
+            async with asyncio.timeout(self._silent_s):
+                await one.socket.send(encode(frame))
         except (TimeoutError, SocketClosedError):
             return False
         return True
@@ -141,7 +143,8 @@ class LinkServer:
         """Take frames until the connection ends, or nothing has come for too long."""
         while not one.end.closed:
             try:
-                data = await asyncio.wait_for(one.socket.receive(), self._silent_s)
+                async with asyncio.timeout(self._silent_s):
+                    data = await one.socket.receive()
                 frame = from_robot(data)
             except (TimeoutError, SocketClosedError):
                 return
@@ -242,7 +245,8 @@ class LinkServer:
             try:
                 frames = waiting if isinstance(waiting, tuple) else await asyncio.shield(waiting)
                 for frame in frames:
-                    await asyncio.wait_for(one.socket.send(encode(frame)), self._silent_s)
+                    async with asyncio.timeout(self._silent_s):
+                        await one.socket.send(encode(frame))
             except (TimeoutError, SocketClosedError, AmberboxError):
                 await _drop(one)  # without an answer the robot tries again
                 return

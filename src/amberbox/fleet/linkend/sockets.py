@@ -85,4 +85,5 @@ class StarletteSocket:
     async def close(self) -> None:
         """End the connection."""
         with suppress(Exception):  # closed already, or the network gone: each server's own error
-            await asyncio.wait_for(self._websocket.close(), _CLOSE_S)
+            async with asyncio.timeout(_CLOSE_S):
+                await self._websocket.close()

@@ -67,7 +67,8 @@ class Doorkeeper:
             self._changed.clear()
             await self._look()
             try:
-                await asyncio.wait_for(self._changed.wait(), self._every_s)
+                async with asyncio.timeout(self._every_s):
+                    await self._changed.wait()
             except TimeoutError:
                 continue
 

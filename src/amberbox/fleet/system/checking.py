@@ -53,7 +53,8 @@ async def _check(folder: Path) -> Sequence[Problem]:
         stderr=asyncio.subprocess.DEVNULL,
     )  # fmt: skip
     try:
-        out, _ = await asyncio.wait_for(process.communicate(), _SECONDS)
+        async with asyncio.timeout(_SECONDS):
+            out, _ = await process.communicate()
         return msgspec.json.decode(out, type=_Report).problems
     except (TimeoutError, msgspec.MsgspecError):
         what = "could not be checked: 'amberbox check' of it does not end, or says nothing"

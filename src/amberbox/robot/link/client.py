@@ -127,7 +127,8 @@ class LinkClient:
             except (LinkDownError, FrameError, OutOfStepError, AmberboxError, OSError) as error:
                 self._failed(error)
             with contextlib.suppress(asyncio.TimeoutError):
-                await asyncio.wait_for(stop.wait(), self._backoff.failed())
+                async with asyncio.timeout(self._backoff.failed()):
+                    await stop.wait()
         await asyncio.to_thread(self.live.close)
 
     def _failed(self, error: Exception) -> None:
@@ -202,6 +203,7 @@ class LinkClient:
 async def soon(waiting: Awaitable[bytes]) -> bytes:
     """Wait for an answer; raises LinkDownError when none comes for too long."""
     try:
-        return await asyncio.wait_for(waiting, limits.SILENT_S)
+        async with asyncio.timeout(limits.SILENT_S):
+            return await waiting
     except TimeoutError:
         raise LinkDownError(f"nothing was heard for {limits.SILENT_S:g} s") from None

@@ -118,7 +118,8 @@ class Session:
     async def _listen(self) -> None:
         while True:
             try:
-                data = await asyncio.wait_for(self._line.receive(), limits.SILENT_S)
+                async with asyncio.timeout(limits.SILENT_S):
+                    data = await self._line.receive()
             except TimeoutError:
                 raise LinkDownError(f"nothing was heard for {limits.SILENT_S:g} s") from None
             self._hear(from_server(data))
