@@ -1,0 +1,42 @@
+"""The end of the server's process: soon, whatever somebody waits for."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import time
+from pathlib import Path
+
+from amberbox.fleet.asking.pool import Pool
+from amberbox.fleet.serving import process
+from amberbox.fleet.serving.settings import Settings
+from tests.fleet.asking.program import MODULE
+from tests.fleet.house import house
+
+LASTS_S = 30.0
+
+
+def test_a_question_that_takes_long_holds_up_no_end(tmp_path: Path) -> None:
+    with house(tmp_path / "server") as home:
+        asking, told = home.services.asking, list[BaseException]()
+        asking._pool = Pool(tmp_path, 1, program="tests.fleet.asking.program")
+
+        def ask() -> None:
+            try:
+                asking.ask_now(f"{MODULE}:echo", {"text": "", "wait_s": LASTS_S}, LASTS_S + 5)
+            except Exception as error:
+                told.append(error)
+
+        async def scene() -> None:
+            loop = asyncio.get_running_loop()
+            ready = Told(ready=lambda _: loop.call_later(1.0, os.kill, os.getpid(), signal.SIGTERM))
+            loop.run_in_executor(None, ask)
+            await process.serve(
+                home.services, process.listen(Settings("http://localhost", port=0)), ready
+            )
+
+        began_s = time.monotonic()
+        asyncio.run(scene())
+        assert time.monotonic() - began_s < LASTS_S / 2
+        assert len(told) == 1, "it was told that nobody answers any more"
