@@ -30,11 +30,10 @@ def test_a_question_that_takes_long_holds_up_no_end(tmp_path: Path) -> None:
 
         async def scene() -> None:
             loop = asyncio.get_running_loop()
-            ready = Told(ready=lambda _: loop.call_later(1.0, os.kill, os.getpid(), signal.SIGTERM))
+            port = process.listen(Settings("http://localhost", port=0))
             loop.run_in_executor(None, ask)
-            await process.serve(
-                home.services, process.listen(Settings("http://localhost", port=0)), ready
-            )
+            loop.call_later(2.0, os.kill, os.getpid(), signal.SIGTERM)
+            await process.serve(home.services, port)
 
         began_s = time.monotonic()
         asyncio.run(scene())
