@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 from collections.abc import Generator
 from pathlib import Path
@@ -35,6 +36,13 @@ def pytest_configure(config: pytest.Config) -> None:
     config.stash[SKIPPED] = []
     if in_ci() and not config.option.durations:
         config.option.durations = 10
+
+
+def pytest_collection_finish(session: pytest.Session) -> None:
+    """Do not look through all that was imported again and again: that takes a sixth of the time."""
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(50_000, 20, 100)
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 from fastapi import FastAPI
 from starlette.testclient import TestClient
@@ -19,6 +20,7 @@ from amberbox.fleet.accounts.sessions import begin_session, csrf_token
 from amberbox.fleet.accounts.tokens import add_token
 from amberbox.fleet.accounts.users import add_user, find_user
 from amberbox.fleet.api.who import COOKIE, CSRF_HEADER
+from amberbox.fleet.database import database
 from amberbox.fleet.serving import assembly
 from amberbox.fleet.serving.app import make_app
 from amberbox.fleet.serving.settings import Settings
@@ -30,17 +32,27 @@ ROBOTS = {"ropod_001": ("ward",), "ropod_002": ("ward",), "ropod_003": ("kitchen
 START_NS = 1_800_000_000 * NS
 
 
+_really = database._configure
+
+
+def _configure(connection: Any, record: object) -> None:
+    """Do not wait for the disk: no power is cut here."""
+    _really(connection, record)
+    connection.execute("PRAGMA synchronous=OFF").close()
+
+
 class House:
     """A server without a network: ``client(name)`` is somebody who is signed in."""
 
     def __init__(self, folder: Path, app: FastAPI | None = None) -> None:
         self.clock = ManualClock(START_NS)
         self.passwords = Passwords(Cost(1, 8, 1))
-        self.services = assembly.assemble(folder, Settings(URL), self.clock, self.passwords)
+        self.keys: dict[str, str] = {}
+        with patch.object(database, "_configure", _configure):
+            self.services = assembly.assemble(folder, Settings(URL), self.clock, self.passwords)
+            self._people()
         self.app = app or make_app(self.services)
         self.app.state.services = self.services
-        self.keys: dict[str, str] = {}
-        self._people()
 
     def _people(self) -> None:
         """Add robots in two groups, one person of each role, and one who is for the ward only."""
