@@ -10,8 +10,10 @@ from typing import Any
 import pytest
 
 from amberbox.fleet.bus import Change
+from amberbox.fleet.fetches import ledger
 from amberbox.fleet.uploads.tables import UPLOAD
 from amberbox.link.frames import Fetch, ServerFrame
+from amberbox.link.limits import FILES
 from tests.fleet.house import House, house
 
 FETCHES = "/api/v1/robots/ropod_001/fetches"
@@ -158,3 +160,15 @@ def test_who_may_ask(home: House) -> None:
     away = "/api/v1/robots/ropod_003/fetches"
     assert home.client("nurse").post(away, json=WINDOW).status_code == 404
     assert home.client("nurse").get(away).status_code == 404
+
+
+def test_a_robot_that_names_ever_more_journals_is_not_believed_for_ever(home: House) -> None:
+    def named(start: int) -> list[ledger.File]:
+        return [ledger.File("s", f"journal/{n}", 1) for n in range(start, start + FILES // 2)]
+
+    with home.services.database.begin() as connection:
+        one = ledger.add(connection, 1, "ropod_002", "user:x", "", (1, 2))
+        for start in range(0, 2 * FILES, FILES // 2):
+            one = ledger.answered(connection, 2, one, named(start)) or one
+        assert len(one.files) == FILES
+        assert ledger.cancel(connection, 3, one)

@@ -13,6 +13,7 @@ from sqlalchemy import Connection, Row, func, select, update
 from amberbox.core.errors import UsageError
 from amberbox.fleet.fetches.tables import FETCH
 from amberbox.fleet.uploads.tables import UPLOAD
+from amberbox.link.limits import FILES
 
 State = Literal["waiting", "asked", "copying", "ready", "gone", "cancelled"]
 OPEN: Sequence[State] = ("waiting", "asked", "copying")
@@ -113,6 +114,7 @@ def answered(
     """
     known = {(file.store_id, file.journal) for file in one.files}
     more = [file for file in named if (file.store_id, file.journal) not in known]
+    more = more[: FILES - len(one.files)]  # a robot that names ever more names nonsense
     if one.state not in OPEN:
         return None
     if not (one.files or more):
