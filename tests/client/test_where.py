@@ -13,6 +13,9 @@ import pytest
 
 from amberbox.cli.main import main
 from amberbox.client import servers
+from amberbox.client.remote import NOT_YET, RemoteRecord
+from amberbox.core.types import Gap
+from amberbox.testing.records import T0_NS
 from tests.client.served import Served, free_port
 
 Capture = pytest.CaptureFixture[str]
@@ -99,6 +102,17 @@ def test_a_file_is_exported_as_on_the_robot(
     assert "does not make bag" in text
     text = refused(capsys, "export", technician.where, "-o", str(tmp_path / "x.csv"), "--received")
     assert "--received" in text
+
+
+def test_what_is_still_on_the_robot_is_told_with_how_to_get_it(
+    technician: Served, capsys: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    gap = Gap("", 0, T0_NS, T0_NS + 10**9, NOT_YET)
+    monkeypatch.setattr(RemoteRecord, "gaps", lambda *_: [gap])
+    text = refused(capsys, "export", technician.where, "--item", "note", status=1)
+    assert "not all of it is on the server yet" in text
+    window = "note 2026-09-21T14:13:20.000Z 2026-09-21T14:13:21.000Z"
+    assert f"amberbox fetch {technician.where} {window} --wait" in text
 
 
 def test_status_is_a_table_a_component_and_json(technician: Served, capsys: Capture) -> None:

@@ -38,7 +38,7 @@ def mark_remote(args: argparse.Namespace, where: str) -> None:
         print_json(msgspec.to_builtins(made))
     else:
         print(f"{made.id}: {_range(made)} is kept; what is still on the robot: "
-              f"amberbox fetch {where} '' {made.from_[:19]} {made.to[:19]}")  # fmt: skip
+              f"amberbox fetch {where} all {made.from_[:19]} {made.to[:19]}")  # fmt: skip
 
 
 def run_remote(first: str, rest: list[str], as_json: bool) -> None:

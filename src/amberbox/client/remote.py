@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from amberbox.client.models import Item
 
 _SQL_HINT = (
-    "amberbox export URL --format parquet -o FOLDER, then ask there; on the server itself: "
+    "amberbox export URL -o robot.mcap, then amberbox sql robot.mcap; on the server itself: "
     "amberbox sql DIR"
 )
 NOT_YET = "not on the server yet"
