@@ -43,9 +43,10 @@ class FolderArchive:
         self.layout.journals.mkdir(exist_ok=True)
         self.catalogue = Catalogue(database or Database(folder / FILE, self.clock))
 
-    def put(self, key: JournalKey, path: Path) -> Stored:
+    def put(self, key: JournalKey, path: Path, *, is_checked: bool = False) -> Stored:
         """Move a verified journal file to its place; one that is here already changes nothing.
 
+        With ``is_checked`` its hash and its chain have just been found to hold.
         Raises AmberboxError for a file that does not hold, or that differs from the one of this
         name that is here: it is refused whole and stays where it was.
         """
@@ -60,7 +61,7 @@ class FolderArchive:
                 )
             if known.state != REFUSED:
                 return Stored(False, place)
-        arrived = inspect(key, path, self.clock.wall_ns())
+        arrived = inspect(key, path, self.clock.wall_ns(), is_checked=is_checked)
         _move(path, place)
         if known is not None:  # what had changed here is replaced by what the robot has
             self.catalogue.change([known], state=PUT, facts=arrived.row["facts"])

@@ -94,12 +94,20 @@ def sha256_of(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def inspect(key: JournalKey, path: Path, put_ns: int) -> Arrived:
+def inspect(key: JournalKey, path: Path, put_ns: int, *, is_checked: bool = False) -> Arrived:
     """Check a journal file from its first byte to its last, and describe it.
 
-    Raises AmberboxError for one that is another, damaged, unfinished, or of another store.
+    With ``is_checked`` somebody has just done so. Raises AmberboxError for one that is another,
+    damaged, unfinished, or of another store.
     """
     folder = checked_key(key)
+    if not is_checked:
+        _check(key, folder, path)
+    file = journal_file(path, key.file)
+    return Arrived(file, _row(key, folder, file, put_ns))
+
+
+def _check(key: JournalKey, folder: str, path: Path) -> None:
     if sha256_of(path) != key.sha256:
         raise AmberboxError(f"{key.file}: its content is not what was announced", _HINT)
     run, number = run_and_number(Path(key.file))
@@ -110,8 +118,6 @@ def inspect(key: JournalKey, path: Path, put_ns: int) -> Arrived:
     if bad or checked.torn or not start:
         text = bad[0].text if bad else "its end is torn" if checked.torn else "it is no journal"
         raise AmberboxError(f"{key.file}: {text}", _HINT)
-    file = journal_file(path, key.file)
-    return Arrived(file, _row(key, folder, file, put_ns))
 
 
 def _row(key: JournalKey, folder: str, file: JournalFile, put_ns: int) -> dict[str, Any]:

@@ -107,9 +107,10 @@ class Stats:
 class ArchiveStore(Protocol):
     """Keeps what robots have recorded. One process works on it at a time; many may ask."""
 
-    def put(self, key: JournalKey, path: Path) -> Stored:
+    def put(self, key: JournalKey, path: Path, *, is_checked: bool = False) -> Stored:
         """Take over a verified journal file, durably; one that is here already changes nothing.
 
+        With ``is_checked`` its hash and its chain have just been found to hold.
         Raises AmberboxError for a file that does not hold, or is not the one the key says.
         """
 

@@ -120,7 +120,7 @@ def _keep(archive: FolderArchive, bus: Bus, incoming: Incoming, result: Result, 
     state = "aside"
     if path.is_relative_to(archive.layout.journals):
         key = JournalKey(incoming.robot, incoming.store_id, incoming.journal, incoming.sha256)
-        archive.put(key, path)
+        archive.put(key, path, is_checked=result.signed)  # sealed and signed: all of it holds
         state = "verified"
     told = {"store_id": incoming.store_id, "journal": incoming.journal, "state": state}
     bus.publish(Change("journal", incoming.robot, told))

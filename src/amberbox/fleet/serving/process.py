@@ -31,6 +31,9 @@ GRACE_S = 3.0
 _BYE_S = 1.0
 _BACKLOG = 2048
 _FILES = 65_536
+_PONG_S = 90.0
+"""A pong stands behind what its sender said before; under load that is not read at once, and to end
+connections then makes it worse. Links and the feed notice silence by themselves, sooner."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,8 +137,8 @@ def _config(app: ASGIApp, settings: Settings) -> uvicorn.Config:
         app, http=PatientProtocol, ws=RefusingProtocol, lifespan="off", log_config=None,
         access_log=False, server_header=False, proxy_headers=False, timeout_keep_alive=15,
         timeout_graceful_shutdown=int(GRACE_S), ws_max_size=limits.FRAME_BYTES,
-        ws_per_message_deflate=False, backlog=_BACKLOG, log_level="warning",
-        ssl_certfile=settings.certificate, ssl_keyfile=settings.key,
+        ws_per_message_deflate=False, ws_ping_timeout=_PONG_S, backlog=_BACKLOG,
+        log_level="warning", ssl_certfile=settings.certificate, ssl_keyfile=settings.key,
     )  # fmt: skip
 
 
