@@ -204,9 +204,7 @@ async def say_cause(
 
 async def _ask(fleet: Services, who: Caller, asked: AskDiagnosis) -> bytes:
     name = f"{WORKER}:diagnose"
-    return await fleet.asking.ask(
-        name, written(asked), LIMIT_S, MEMORY_BYTES, asker=str(who.principal)
-    )
+    return await fleet.asking.ask(name, written(asked), LIMIT_S, MEMORY_BYTES, asker=who.asker)
 
 
 async def _check_mode(
@@ -219,7 +217,7 @@ async def _check_mode(
         robot=robot, now_ns=fleet.clock.wall_ns(), config_hash=known.last.config_hash
     )
     found = await fleet.asking.ask(
-        f"{WORKER}:failure_modes", written(asked), LIMIT_S, MEMORY_BYTES, asker=str(who.principal)
+        f"{WORKER}:failure_modes", written(asked), LIMIT_S, MEMORY_BYTES, asker=who.asker
     )
     if failure_mode not in json.loads(found):
         what = f"there is no failure mode '{failure_mode}' in the robot's analysis"
