@@ -12,6 +12,7 @@ import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from amberbox.core.errors import AmberboxError
 from amberbox.fleet.database.database import Database
 from tests.robot.link.rig import held, put_aside, recorded
 
@@ -78,6 +79,7 @@ def run(folder: Path, robots: int, kills: int, seconds: float, seed: int = 0) ->
     try:
         for name in ("server", *world.names):
             world.start(name)
+        _await_rows(world, folder)
         for _ in range(kills):
             time.sleep(chance.uniform(0.5, 1.5) * seconds / kills)
             victim = chance.choice(["server", *world.names])
@@ -89,6 +91,21 @@ def run(folder: Path, robots: int, kills: int, seconds: float, seed: int = 0) ->
         return _judged(world, folder, kills)
     finally:
         world.end()
+
+
+def _await_rows(world: Field, folder: Path) -> None:
+    """Wait until each robot writes: how long a start takes depends on the machine."""
+    end = time.monotonic() + 60
+    while not all(_has_rows(folder / name) for name in world.names):
+        assert time.monotonic() < end, "robots do not write"
+        time.sleep(0.1)
+
+
+def _has_rows(path: Path) -> bool:
+    try:
+        return bool(recorded(path))
+    except AmberboxError:  # no store yet
+        return False
 
 
 def _judged(world: Field, folder: Path, kills: int) -> Result:
