@@ -125,6 +125,21 @@ def test_it_is_what_the_command_line_says_on_the_robot(
     assert answer == printed
 
 
+def test_what_a_watcher_found_late_counts_for_its_time(tmp_path: Path) -> None:
+    """A watcher that has little of its computer writes down half a minute later what was."""
+    silent = sim.symptom(sim.NO_SCANS, sim.AT_NS)
+    with house(tmp_path) as found:
+        sim.hand_in(found)
+        sim.say(found, [
+            (sim.AT_NS, sim.status("laser_front", sim.AT_NS)),
+            (sim.AT_NS + 30 * NS, silent), (sim.AT_NS + 30 * NS, sim.diagnosis(sim.AT_NS, silent)),
+            (sim.AT_NS + 40 * NS, sim.status("laser_front", sim.AT_NS + 10 * NS)),
+        ])  # fmt: skip
+        answer = ask(found.client("operator"), diagnosis=sim.DIAGNOSIS)
+    assert (answer["revision"], answer["origin"]) == (1, "watcher")
+    assert faults(answer) == ["laser_front#driver_crash"]
+
+
 def test_what_if_a_symptom_were_there(operator: TestClient) -> None:
     then = format_time(sim.AT_NS)
     answer = ask(operator, at=then, symptoms={"laser_rear/heartbeat/alive": "present"})

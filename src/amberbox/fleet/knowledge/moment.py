@@ -18,7 +18,10 @@ from amberbox.fleet.conclusions.reading import Stores, entries
 _STATUS_NS = 30 * NS
 """A watcher that is alive has said of everything within this time how it is."""
 _LATE_NS = 5 * NS
-"""So long after an instant what was found of it has been written."""
+"""So long after an instant the statuses of it have been written."""
+_FOUND_LATE_NS = 600 * NS
+"""The same for symptoms and diagnoses: a watcher that was restarted, or has little of its computer,
+catches up with what it missed."""
 _SYMPTOMS, _DIAGNOSES, _STATUSES = 20_000, 500, 5_000
 
 Told = TypeVar("Told", Status, Symptom, Diagnosis)
@@ -80,7 +83,7 @@ def _statuses(stores: Stores, robot: str, at_ns: int) -> list[Status]:
 
 def _said(stores: Stores, robot: str, at_ns: int) -> Said:
     """Return symptoms and diagnoses up to an instant, in the order in which they were told."""
-    span = None, at_ns + _LATE_NS
+    span = None, at_ns + _FOUND_LATE_NS
     symptoms = entries(stores, robot, reserved.SYMPTOM, span, _SYMPTOMS, newest=True)
     diagnoses = entries(stores, robot, reserved.DIAGNOSIS, span, _DIAGNOSES, newest=True)
     return Said(
