@@ -102,10 +102,14 @@ class Robot:
         listening.cancel()
         await asyncio.gather(listening, return_exceptions=True)
 
-    async def idle(self, seconds: float) -> None:
-        """Say nothing but that it is there."""
+    async def idle(self, greeted: asyncio.Barrier, enough: asyncio.Event) -> None:
+        """Connect, and say nothing but that it is there, until it is enough."""
+        await self.greet()
         listening = asyncio.create_task(self._listen())
-        await self._beat_for(seconds)
+        waiting = asyncio.create_task(greeted.wait())
+        while not enough.is_set():
+            await self._beat_for(limits.BEAT_S)
+        await waiting
         listening.cancel()
         await asyncio.gather(listening, return_exceptions=True)
 
