@@ -14,7 +14,7 @@ from amberbox.blackbox.query.table import Table
 from amberbox.blackbox.segments import columns as col
 from amberbox.client import tables
 from amberbox.client.wire import Reply
-from amberbox.core.types import Column, Ragged
+from amberbox.core.types import Column, ColumnData, Ragged
 from amberbox.fleet.data.asked import About
 from amberbox.fleet.data.forms import encoded
 from amberbox.fleet.data.rows import Answer
@@ -33,7 +33,7 @@ _KINDS = {"json": "application/json", "arrow": "application/vnd.apache.arrow.str
 
 
 def table() -> Table:
-    columns = {
+    columns: dict[str, ColumnData] = {
         "timestamp": _TIMES,
         "x": np.array([math.inf, math.nan]),
         "count": np.ma.masked_array(np.array([1, 0], np.uint64), mask=[False, True]),

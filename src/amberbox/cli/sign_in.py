@@ -6,6 +6,7 @@ import argparse
 import getpass
 import ssl
 import sys
+from pathlib import Path
 from urllib.parse import urlsplit
 
 from amberbox.cli._output import tell
@@ -40,8 +41,14 @@ def run(args: argparse.Namespace) -> int:
     entry = SignIn(_token(address), pin, authority)
     _try(address, entry)
     servers.keep(address.url, entry)
-    print(f"signed in to {address.url}; kept in {servers.path()}")
+    print(f"signed in to {address.url}; kept in {_shown(servers.path())}")
     return 0
+
+
+def _shown(path: Path) -> str:
+    """Write a path as people do: the home folder is ``~``."""
+    home = Path.home()
+    return f"~/{path.relative_to(home)}" if path.is_relative_to(home) else str(path)
 
 
 def _trusted(address: Address) -> tuple[str, str]:
