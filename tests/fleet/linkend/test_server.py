@@ -19,7 +19,7 @@ from amberbox.fleet.linkend.grouped import GroupedWrites
 from amberbox.fleet.linkend.presence import offset_ns, presences
 from amberbox.fleet.linkend.server import Hooks, LinkServer
 from amberbox.fleet.linkend.sockets import SocketClosedError
-from amberbox.fleet.linkend.tables import HEADS, ROW
+from amberbox.fleet.linkend.tables import EVENT, HEADS, ROW
 from amberbox.link.frames import (
     Ack,
     Beat,
@@ -107,6 +107,15 @@ def test_a_robot_that_connects_again_ends_its_older_connection(database: Databas
     asyncio.run(scene())
     with database.reading() as connection:
         assert connection.execute(select(ROW)).all() == []
+
+
+def test_a_first_key_is_no_other_key(database: Database) -> None:
+    """A store begins without a key; what comes first is none that takes another's place."""
+    with database.begin() as connection:
+        for key in ("", "first", "first", "", "second"):
+            ledger.admit(connection, msgspec.structs.replace(HELLO, public_key=key), 0)
+        found = connection.execute(select(EVENT.c.kind, EVENT.c.text)).all()
+    assert [(kind, said.split()[-1]) for kind, said in found] == [("new_key", "second")]
 
 
 def test_acknowledged_is_what_is_durable_on_the_robot(database: Database) -> None:

@@ -84,8 +84,8 @@ def _note_store(connection: Connection, hello: Hello, now_ns: int) -> bool:
     if known and hello.store_id not in known:
         text = f"it has a new store ({hello.store_id}): its disk was replaced, or made anew"
         note(connection, hello.robot, now_ns, "new_store", text)
-    changed = known.get(hello.store_id, hello.public_key) != hello.public_key
-    if changed and hello.public_key:
+    before = known.get(hello.store_id)
+    if before and hello.public_key and before != hello.public_key:  # a store begins without a key
         text = f"the store {hello.store_id} signs with another key than before: {hello.public_key}"
         note(connection, hello.robot, now_ns, "new_key", text)
     values = {"robot": hello.robot, "store_id": hello.store_id, "first_seen_ns": now_ns,
