@@ -62,8 +62,8 @@ def _by_header(connection: HTTPConnection, services: Services, header: str) -> C
             robot = find_robot_key(reading, now_ns, *claim)
         if robot is not None:
             if is_minute_old(robot.key.used_ns, now_ns):
-                with services.database.begin() as writing:
-                    touch_key(writing, now_ns, robot.key)
+                key = robot.key
+                services.links.write(lambda writing: touch_key(writing, now_ns, key))
             return Caller(robot.principal, address, session_id=robot.key.key_id)
     raise HTTPException(401, "this key or token is unknown, or does not work any more")
 

@@ -10,6 +10,8 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, TypeAlias
 
+from sqlalchemy import Connection
+
 from amberbox.core.clock import Clock, SystemClock
 from amberbox.core.errors import AmberboxError
 from amberbox.fleet.database.database import Database
@@ -106,6 +108,13 @@ class LinkServer:
     def close(self) -> None:
         """Finish what is being written; connections have ended before."""
         self._writes.close()
+
+    def write(self, work: Callable[[Connection], None]) -> None:
+        """Write together with what robots say; returns when it is durable. Blocks.
+
+        When all robots come at once, the disk is waited for once, not for each of them.
+        """
+        self._writes.submit(work).result()
 
     async def serve(self, socket: Socket, robot: str) -> None:
         """Talk to a robot, which was authenticated, until either side ends it."""
