@@ -9,12 +9,14 @@ import socket
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 from amberbox.core.errors import AmberboxError
 from amberbox.fleet.database.database import Database
-from tests.robot.link.rig import held, put_aside, recorded
+from tests.robot.link.rig import Held, held, put_aside, recorded
 
 ROOT = Path(__file__).parents[3]
 
@@ -111,17 +113,29 @@ def _has_rows(path: Path) -> bool:
 def _judged(world: Field, folder: Path, kills: int) -> Result:
     """Wait for all that robots have written; nothing twice, nothing changed, nothing else."""
     begin = time.monotonic()
-    for name in world.names:
-        process = world.processes[name]
-        assert process.wait(60) == 0
     database = Database(folder / "server.db", read_only=True)
     try:
         rows = 0
         for name in world.names:
+            _await((folder / f"{name}.written").exists)
             wanted = recorded(folder / name)
+            _await(partial(_has_all, database, name, wanted))
+            (folder / f"{name}.stop").touch()
+            assert world.processes[name].wait(60) == 0
             assert held(database, name) == wanted
             assert not put_aside(database, name)
             rows += len(wanted)
     finally:
         database.close()
     return Result(rows, kills, time.monotonic() - begin)
+
+
+def _has_all(database: Database, name: str, wanted: Held) -> bool:
+    return held(database, name).keys() >= wanted.keys()
+
+
+def _await(is_so: Callable[[], bool]) -> None:
+    """Wait for what has to come, a minute at most: whoever asks next sees what is missing."""
+    end = time.monotonic() + 60
+    while not is_so() and time.monotonic() < end:
+        time.sleep(0.1)

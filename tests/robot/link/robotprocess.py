@@ -11,7 +11,7 @@ from tests.robot.link.rig import Watcher, client_of
 
 
 async def live(path: Path, robot: str, port: int, seed: int) -> None:
-    """Write and link until it is killed, or told to be quiet by a file beside the store."""
+    """Write until a file beside the store says to be quiet; stay linked until another says stop."""
     chance = random.Random(seed)
     watcher = Watcher(path, robot)
     watcher.count = seed * 1_000_000
@@ -23,6 +23,9 @@ async def live(path: Path, robot: str, port: int, seed: int) -> None:
         await asyncio.to_thread(watcher.write, count, int(events), sync=chance.random() < 0.3)
         await asyncio.sleep(0.02)
     await asyncio.to_thread(watcher.close)
+    path.with_name(path.name + ".written").touch()
+    while not path.with_name(path.name + ".stop").exists():
+        await asyncio.sleep(0.05)
     stop.set()
     await client
 

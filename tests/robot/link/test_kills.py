@@ -8,5 +8,5 @@ from tests.robot.link import kills
 
 
 def test_no_row_is_lost_or_doubled_by_kills(tmp_path: Path) -> None:
-    result = kills.run(tmp_path, robots=3, kills=5, seconds=6)
-    assert result.rows > 50
+    result = kills.run(tmp_path, robots=3, kills=10, seconds=8)
+    assert result.rows > 100
