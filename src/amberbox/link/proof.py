@@ -16,6 +16,8 @@ from amberbox.blackbox.signing.keys import holds
 from amberbox.blackbox.signing.signing import signature_message
 from amberbox.link.uploads import Proof
 
+_MOST_GONE = 500
+
 
 class ProofError(ValueError):
     """A proof does not hold."""
@@ -46,13 +48,19 @@ def proofs_of(store: Path, journals: Sequence[str]) -> dict[str, Proof]:
     lines = [line for line in content.split(b"\n") if line]
     found: dict[str, Proof] = {}
     marks = {name: b'"journal":"%s"' % name.encode() for name in journals}
+    gone = b"\n".join(_gone(lines)).decode()
     for at, line in enumerate(lines):
         if b',"kind":"sealed",' not in line:
             continue
         name = next((name for name, mark in marks.items() if mark in line), None)
         if name is not None:
-            found[name] = Proof(b"\n".join(_to_signature(lines, at)).decode())
+            found[name] = Proof(b"\n".join(_to_signature(lines, at)).decode(), gone)
     return found
+
+
+def _gone(lines: Sequence[bytes]) -> list[bytes]:
+    """Return the lines of what was deleted unconfirmed, the newest when there are very many."""
+    return [n for n in lines if b',"kind":"gone",' in n and b'"confirmed":false' in n][-_MOST_GONE:]
 
 
 def _to_signature(lines: Sequence[bytes], at: int) -> list[bytes]:

@@ -34,9 +34,12 @@ class Proof(Struct, frozen=True):
     """What the robot's manifest says of a journal: its lines from the seal to a signature.
 
     Without a seal (journals of the ring, which only an incident keeps) there are no lines.
+    ``gone`` are the lines of all that was deleted before a server had it, wherever they stand: what
+    was deleted while the robot was away is behind seals of journals that never come.
     """
 
     lines: str = ""
+    gone: str = ""
 
 
 class Verdict(Struct, frozen=True):

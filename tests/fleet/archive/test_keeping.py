@@ -211,7 +211,11 @@ def test_what_a_power_cut_took_is_a_gap(scene: Scene) -> None:
     assert (gap.from_seq, gap.to_seq, gap.count) == (7, 10, 3)
 
 
-def test_what_was_deleted_before_the_copy_is_a_gap_with_its_reason(scene: Scene) -> None:
+@pytest.mark.parametrize("is_near", [True, False])
+def test_what_was_deleted_before_the_copy_is_a_gap_with_its_reason(
+    scene: Scene, is_near: bool
+) -> None:
+    """Whether it stands between the journal's seal and its signature, or anywhere else."""
     scene.robot.record(0, files=2)
     scene.hand_in()
     gone = Tombstone(("journal/000002-x-0000.mcap",), "both", "main", 2, 100, 200, 5, 9, "",
@@ -220,7 +224,7 @@ def test_what_was_deleted_before_the_copy_is_a_gap_with_its_reason(scene: Scene)
     records = [to_record(tombstone) for tombstone in (gone, *others)]
     lines = encode(records, FIRST_HASH).decode() + "no line"
     incoming = Incoming("r1", scene.robot.store_id, "", "", 0)
-    scene.keeping.note_deleted(incoming, Proof(lines))
+    scene.keeping.note_deleted(incoming, Proof(lines) if is_near else Proof("", lines))
     found = scene.archive.robot("r1").gaps()
     [gap] = [gap for gap in found if "deleted on the robot" in gap.reason]
     assert (gap.run, gap.from_seq, gap.to_seq) == (2, 100, 200) and "no room" in gap.reason

@@ -120,8 +120,8 @@ def _lost(connection: Connection) -> Sequence[Any]:
 
 
 def deleted(proof: Proof) -> Iterator[Missing]:
-    """Yield what a proof's lines say was deleted on the robot before any server had it."""
-    for line in proof.lines.encode().split(b"\n"):
+    """Yield what a proof says was deleted on the robot before any server had it."""
+    for line in f"{proof.lines}\n{proof.gone}".encode().split(b"\n"):
         if b',"kind":"gone",' not in line:
             continue
         tombstone = _tombstone(decode(line))
