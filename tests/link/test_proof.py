@@ -19,7 +19,14 @@ SIGNED = Signature("00", 1, "00", "00")
 def test_what_was_deleted_unconfirmed_goes_along_wherever_it_stands(tmp_path: Path) -> None:
     """A robot that was away deletes after signatures, and behind seals of what it deletes next."""
     confirmed = replace(GONE, run=7, confirmed=True)
-    entries = [GONE, confirmed, SIGNED, SEALED, SIGNED, replace(GONE, run=2)]
+    entries: list[Sealed | Tombstone | Signature] = [
+        GONE,
+        confirmed,
+        SIGNED,
+        SEALED,
+        SIGNED,
+        replace(GONE, run=2),
+    ]
     manifest.append(tmp_path, [to_record(entry) for entry in entries])
     proof = proof_of(tmp_path, SEALED.journal)
     assert proof is not None
