@@ -64,7 +64,8 @@ def say(home: House, robot: str, channel: str, at_ns: int, seq: int, values: Any
     data = msgspec.json.encode(values)
     row = Row("watch", 1, seq, channel, at_ns, data)
     with home.services.database.begin() as connection:
-        ledger._insert(connection, (robot, "s"), [row], home.clock.wall_ns())
+        about = {"robot": robot, "store_id": "s", "received_ns": home.clock.wall_ns()}
+        ledger.insert(connection, [{**about, **ledger.columns(row)}])
         board.show(connection, robot, "s", [row], home.clock.wall_ns())
     return row
 

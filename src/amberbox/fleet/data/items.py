@@ -62,7 +62,7 @@ def _info(look: Look, table: str) -> dict[str, Any]:
 def _held(look: Look, table: str) -> Iterator[Held]:
     for version in look.reader.schemas.get(table, ())[:1]:
         yield from (Held(*file) for file in files_of(look, version, None))
-    for one in look.readable:
+    for one in look.only_in_journals(table):
         rows = one.journal.items.get(table, 0)
         if rows:
             yield Held(one.row.start_ns, one.row.end_ns, rows)

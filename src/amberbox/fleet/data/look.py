@@ -15,6 +15,7 @@ from typing import Any, TypeVar
 from sqlalchemy import Row, select
 
 from amberbox.blackbox.follow.read import JournalFile, journal_file
+from amberbox.blackbox.query.catalogue import Catalogue as StoreCatalogue
 from amberbox.blackbox.query.catalogue import item_of, journal_tables, union
 from amberbox.blackbox.query.gather import Gathered, Request, gather, journal_rows, within
 from amberbox.blackbox.query.variables import closest
@@ -120,9 +121,16 @@ class Look:
             found.gaps += one.gaps
             found.notes += one.notes
             if self.waiting:
-                inside = {part.journal for s in store.segments(request.table) for part in s.parts}
-                self._add(found, source, request, inside)
+                self._add(found, source, request, _inside(store, request.table))
         return found
+
+    def only_in_journals(self, table: str) -> Iterator[Waiting]:
+        """Yield the readable journals whose rows a table does not have, not even by now."""
+        inside = {
+            source: _inside(self.reader.of(source, table), table)
+            for source in {one.source for one in self.readable}
+        }
+        return (one for one in self.readable if one.row.file not in inside[one.source])
 
     def _add(self, found: Gathered, source: Source, request: Request, inside: set[str]) -> None:
         span = request.span if request.by == "received" else (None, None)
@@ -157,6 +165,11 @@ class Look:
         """Return when the newest row of the tables was received."""
         robots = [source.robot for source in self.reader.sources]
         return self.catalogue.last_ns(robots) if robots else None
+
+
+def _inside(store: StoreCatalogue, table: str) -> set[str]:
+    """Name the journals whose rows a table has."""
+    return {part.journal for segment in store.segments(table) for part in segment.parts}
 
 
 @lru_cache(maxsize=4)
