@@ -236,7 +236,9 @@ def test_a_robot_that_claims_to_be_another_is_sent_away(
 
 def test_a_key_that_is_revoked_ends_the_open_connection(server: Server, tmp_path: Path) -> None:
     done = subprocess.run(
-        command("add-robot", "r3", "--data", server.data), capture_output=True, text=True
+        command("add-robot", "r3", "--data", server.data, "--group", "new"),
+        capture_output=True,
+        text=True,
     )
     mine = read_join_line(done.stdout)
 

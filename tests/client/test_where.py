@@ -17,6 +17,7 @@ from amberbox.client.remote import NOT_YET, RemoteRecord
 from amberbox.core.types import Gap
 from amberbox.testing.records import T0_NS
 from tests.client.served import Served, free_port
+from tests.fleet.house import PASSWORD
 
 Capture = pytest.CaptureFixture[str]
 
@@ -235,6 +236,19 @@ def test_signing_in_keeps_a_token_for_its_owner_only(
     file.chmod(0o600)
     assert "signed out" in said(capsys, "sign-out", server.url)
     assert "nobody is signed in" in refused(capsys, "sign-out", server.url)
+
+
+def test_a_name_and_a_password_make_a_token_for_this_computer(
+    server: Served, capsys: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    address = f"{server.url}#ca=sha256:{server.pin}"
+    monkeypatch.setattr("sys.stdin", io.StringIO("not the right password\n"))
+    assert "wrong" in refused(capsys, "sign-in", address, "--user", "technician")
+    monkeypatch.setattr("sys.stdin", io.StringIO(PASSWORD + "\n"))
+    assert "signed in" in said(capsys, "sign-in", address, "--user", "technician")
+    assert "odom" in said(capsys, "items", f"{server.url}/robots/ropod_001")
+    monkeypatch.setattr("sys.stdin", io.StringIO(PASSWORD + "\n"))
+    refused(capsys, "sign-in", address, "--user", "viewer")  # viewers make no tokens
 
 
 def test_a_strange_authority_and_a_wrong_token_are_not_kept(

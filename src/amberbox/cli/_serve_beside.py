@@ -31,8 +31,9 @@ def make_certificate(folder: Path, names: Sequence[str]) -> int:
 
 
 def add_robot(folder: Path, robot: str, groups: Sequence[str]) -> int:
-    """Make a robot known; print the one line that is pasted on it."""
+    """Make a robot known, and groups that are new; print the one line that is pasted on it."""
     from amberbox.fleet.accounts import robotkeys
+    from amberbox.fleet.accounts.groups import add_group, list_groups
     from amberbox.fleet.audit.entry import Entry
     from amberbox.fleet.audit.log import append
     from amberbox.fleet.database.database import Database
@@ -42,9 +43,12 @@ def add_robot(folder: Path, robot: str, groups: Sequence[str]) -> int:
     try:
         with database.begin() as connection:
             now_ns = SystemClock().wall_ns()
+            new = sorted(set(groups) - set(list_groups(connection)))
+            for group in new:
+                add_group(connection, now_ns, group)
             secret = robotkeys.add_robot(connection, now_ns, robot, groups)
             line = line_of(connection, folder, robot, secret.text)
-            details = {"groups": sorted(groups), "key_id": secret.id}
+            details = {"groups": sorted(groups), "new_groups": new, "key_id": secret.id}
             entry = Entry(_who(), "", "robots.add", robot, details=details)
             append(connection, now_ns, entry)
     finally:

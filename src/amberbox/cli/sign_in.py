@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import getpass
+import socket
 import ssl
 import sys
 from pathlib import Path
@@ -13,6 +14,7 @@ from amberbox.cli._output import tell
 from amberbox.client import servers, trust
 from amberbox.client.address import Address, read_address
 from amberbox.client.errors import NotAllowedError, UnreachableError
+from amberbox.client.making import make_token
 from amberbox.client.servers import SignIn
 from amberbox.client.wire import Wire
 from amberbox.core import tls
@@ -28,8 +30,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "url", metavar="URL",
         help="the server; with #ca=sha256:... behind it the authority to be trusted is named",
     )  # fmt: skip
+    parser.add_argument("--user", metavar="NAME", help="make a token for this computer, with the "
+                        "password of this person (asked for)")  # fmt: skip
     parser.epilog = (
-        "The API token is asked for without showing it, or read from standard input. It is kept "
+        "The API token, or the password, is asked for without showing it, or read from standard "
+        "input. The token is kept "
         "in ~/.config/amberbox/servers.yaml, which nobody else may read."
     )
 
@@ -38,7 +43,8 @@ def run(args: argparse.Namespace) -> int:
     """Ask whom to trust and for the token, try them, keep them."""
     address = read_address(args.url)
     pin, authority = _trusted(address)
-    entry = SignIn(_token(address), pin, authority)
+    token = _made(address, args.user, pin, authority) if args.user else _token(address)
+    entry = SignIn(token, pin, authority)
     _try(address, entry)
     servers.keep(address.url, entry)
     print(f"signed in to {address.url}; kept in {_shown(servers.path())}")
@@ -98,14 +104,32 @@ def _confirm(address: Address, found: str) -> None:
 
 
 def _token(address: Address) -> str:
-    """Take the token where no shell remembers it and nobody sees it."""
+    text = _secret(f"API token for {address.url}: ").strip()
+    if not text:
+        raise UsageError(
+            "no token was given", f"amberbox sign-in {address.url} --user NAME makes one"
+        )
+    return text
+
+
+def _made(address: Address, name: str, pin: str, authority: str) -> str:
+    """Make a token with a password; it lasts 90 days and is listed as this computer's."""
+    from amberbox.fleet.accounts.actions import SCOPES
+
+    password = _secret(f"password of {name} at {address.url}: ")
+    context = trust.context_of(address.url, pin, SignIn("", pin, authority))
+    wire = Wire(address.url, context=context)
+    try:
+        return make_token(wire, name, password, f"amberbox on {socket.gethostname()}", SCOPES)
+    finally:
+        wire.close()
+
+
+def _secret(question: str) -> str:
+    """Take a secret where no shell remembers it and nobody sees it."""
     if sys.stdin.isatty():
-        text = getpass.getpass(f"API token for {address.url}: ")
-    else:
-        text = sys.stdin.readline()
-    if not text.strip():
-        raise UsageError("no token was given", "a technician makes one: /account on the server")
-    return text.strip()
+        return getpass.getpass(question)
+    return sys.stdin.readline().rstrip("\n")
 
 
 def _try(address: Address, entry: SignIn) -> None:

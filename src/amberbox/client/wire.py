@@ -48,6 +48,8 @@ class Wire:
     token: str = field(default="", repr=False)
     context: ssl.SSLContext | None = None
     timeout_s: float = TIMEOUT_S
+    headers: dict[str, str] = field(default_factory=dict, repr=False)
+    """What every request has besides."""
     _kept: http.client.HTTPConnection | None = field(default=None, repr=False)
     _used_s: float = field(default=0.0, repr=False)
     _lock: threading.Lock = field(default_factory=threading.Lock, repr=False)
@@ -125,6 +127,7 @@ class Wire:
 
     def _headers(self) -> dict[str, str]:
         headers = {"User-Agent": f"amberbox/{__version__}", "Accept-Encoding": "gzip"}
+        headers |= self.headers
         if self.token:
             headers["Authorization"] = f"Bearer {self.token}"
         return headers
