@@ -42,9 +42,13 @@ rules: $(TEST)
 bench: $(TEST)  ## measure the numbers that the documentation quotes (BENCH_ARGS="unroll query")
 	$(BIN)/python -m benchmarks.run $(BENCH_ARGS)
 
-soak: $(TEST)  ## what takes long: random lives of stores, verified and kept (about half an hour)
+soak: $(TEST)  ## what takes long: random lives of stores, of robots and their server, load (about two hours)
 	$(BIN)/python -m benchmarks.soak_verify
 	HYPOTHESIS_PROFILE=soak $(BIN)/python -m pytest --timeout=0 tests/blackbox/deletion/test_keeping_model.py
+	$(BIN)/python -m tests.fleet.endtoend.ordeal 10 600 200
+	API_EXAMPLES=200 $(BIN)/python -m pytest --timeout=0 tests/fleet/test_schemathesis.py
+	BENCH_ALARM_HOURS=20 $(BIN)/python -m benchmarks.run alarms
+	$(BIN)/python -m benchmarks.fleet_load --robots 100 --minutes 10
 
 venv: $(TEST)  ## only install
 
