@@ -154,7 +154,8 @@ class _Member:
                 self.alarms[record.values["id"]] = record.values["state"]
             self._hand_on(components)
         elif self.is_up and now_s - self.heard_s > _SILENT_S:
-            self.down(f"the watcher of {self.config.where} has said nothing for {_SILENT_S:g} s")
+            name = Path(self.config.where).name
+            self.down(f"the watcher of {name} has said nothing for {_SILENT_S:g} s")
 
     def down(self, reason: str) -> None:
         """Say that nothing is heard any more."""

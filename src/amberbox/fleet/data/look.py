@@ -32,6 +32,10 @@ from amberbox.fleet.database.database import FILE, Database
 READ_BYTES = 64 << 20
 """Waiting journals that a question reads; of more the answer says up to when it is complete."""
 
+NONE = (
+    "no journal of this robot has come yet: it sends one every ten minutes, or when it is asked for"
+)
+
 _ATTEMPTS = 5
 _MARGIN_NS = 60 * 10**9
 """Corrected times of receipt may differ from those that were noted when a journal came."""
@@ -98,9 +102,9 @@ class Look:
         by_case = {name.casefold(): name for name in reversed(self.schemas)}
         name = table if table in self.schemas else by_case.get(table.casefold())
         if name is None:
-            raise UsageError(
-                f"there is no data item {table!r}", closest(table, sorted(self.schemas))
-            )
+            known = sorted(self.schemas)
+            hint = closest(table, known) if known else NONE
+            raise UsageError(f"there is no data item {table!r}", hint)
         return union(self.schemas[name])
 
     @property

@@ -22,7 +22,8 @@ class Message:
 
 def subject_of(alarm: Alarm) -> str:
     """Return an alarm in a few words: ``critical: ropod_001 laser``."""
-    return plain(f"{alarm.severity}: {alarm.robot or 'several robots'} {alarm.origin}")[:200]
+    whose = alarm.robot or "several robots:"
+    return plain(f"{alarm.severity}: {whose} {alarm.origin}")[:200]
 
 
 def body_of(alarm: Alarm, url: str, now_ns: int) -> str:
