@@ -177,6 +177,8 @@ class Proxy:
         most = _READ_BYTES
         if kind == "throttle" and pair.struck:
             most = int(pair.budget)
+            if most <= 0:
+                return  # the other direction has used it up
         elif kind == "mid_frame" and left > 0:
             most = max(left, 1)  # it ends in the middle of whatever is on its way
         data = source.recv(most)
@@ -187,7 +189,8 @@ class Proxy:
         target.sendall(pair.mangler.pass_on(data, up=up) if pair.mangler else data)
         was_struck = pair.struck
         pair.passed += len(data)
-        pair.budget -= len(data)
+        if was_struck:
+            pair.budget -= len(data)
         if pair.struck and not was_struck:
             self._strike(pair)
 
@@ -198,6 +201,8 @@ class Proxy:
             self._end(pair, abruptly=kind == "cut")
         elif kind == "half_open":
             pair.dead = True
+        elif kind == "throttle":
+            pair.seen_at = time.monotonic()
         elif kind == "stall":
             pair.stalled_until = time.monotonic() + self.faults.stall_s
 
