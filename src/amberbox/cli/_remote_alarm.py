@@ -10,8 +10,8 @@ import msgspec
 
 from amberbox.cli._output import print_grid, print_json
 from amberbox.cli._server import robot_at
+from amberbox.client.alarm_models import Alarm
 from amberbox.client.fleet import Fleet
-from amberbox.client.models import Alarm
 from amberbox.core.config import did_you_mean
 from amberbox.core.errors import UsageError
 from amberbox.core.timetext import parse_duration

@@ -15,8 +15,9 @@ from amberbox.cli._output import tell
 from amberbox.cli._server import robot_at
 from amberbox.cli._statustable import View, alarms_of, overview, statuses_table, waiting
 from amberbox.cli._text import in_columns
+from amberbox.client.alarm_models import Alarm
 from amberbox.client.fleet import Fleet
-from amberbox.client.models import Alarm, Component, Condition, StatusTree
+from amberbox.client.models import Component, Condition, StatusTree
 from amberbox.client.times import maybe_ns, time_ns
 from amberbox.core.config import did_you_mean
 from amberbox.core.errors import AmberboxError, UsageError

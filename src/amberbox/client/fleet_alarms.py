@@ -7,7 +7,7 @@ from typing import Any
 
 import msgspec
 
-from amberbox.client import models
+from amberbox.client import alarm_models
 from amberbox.client.paging import paged
 from amberbox.client.times import Time, said
 from amberbox.client.wire import Wire
@@ -25,42 +25,42 @@ class AlarmCalls:
     def alarms(
         self, robot: str = "", *, state: Sequence[str] = (), group: str = "",
         severity: str = "warning", since: Time = None,
-    ) -> list[models.Alarm]:  # fmt: skip
+    ) -> list[alarm_models.Alarm]:  # fmt: skip
         """Return alarms, newest first; ``severity`` and worse, changed ``since`` then."""
         asked = {"robot": robot, "state": list(state), "group": group, "severity": severity,
                  "since": said(since)}  # fmt: skip
-        return [*paged(self.wire, "/alarms", models.Alarm, lambda a: a.id, asked)]
+        return [*paged(self.wire, "/alarms", alarm_models.Alarm, lambda a: a.id, asked)]
 
-    def alarm(self, alarm: int) -> models.AlarmPage:
+    def alarm(self, alarm: int) -> alarm_models.AlarmPage:
         """Return an alarm with its consequences and its history."""
         found = self.wire.get(f"/alarms/{alarm}").body
-        return msgspec.json.decode(found, type=models.AlarmPage)
+        return msgspec.json.decode(found, type=alarm_models.AlarmPage)
 
-    def acknowledge(self, alarm: int, revision: int, note: str = "") -> models.AlarmPage:
+    def acknowledge(self, alarm: int, revision: int, note: str = "") -> alarm_models.AlarmPage:
         """Say that one sees to it."""
         return self._do(alarm, "acknowledge", {"revision": revision, "note": note})
 
-    def shelve(self, alarm: int, revision: int, until: Time, reason: str) -> models.AlarmPage:
+    def shelve(self, alarm: int, revision: int, until: Time, reason: str) -> alarm_models.AlarmPage:
         """Put an alarm aside until a time."""
         body = {"revision": revision, "until": said(until), "reason": reason}
         return self._do(alarm, "shelve", body)
 
-    def unshelve(self, alarm: int, revision: int) -> models.AlarmPage:
+    def unshelve(self, alarm: int, revision: int) -> alarm_models.AlarmPage:
         """Take an alarm from the shelf."""
         return self._do(alarm, "unshelve", {"revision": revision})
 
-    def own(self, alarm: int, revision: int, user: str) -> models.AlarmPage:
+    def own(self, alarm: int, revision: int, user: str) -> alarm_models.AlarmPage:
         """Make an alarm somebody's business; nobody's with an empty name."""
         return self._do(alarm, "own", {"revision": revision, "user": user})
 
-    def note(self, alarm: int, text: str) -> models.AlarmPage:
+    def note(self, alarm: int, text: str) -> alarm_models.AlarmPage:
         """Add a note to the history of an alarm."""
         return self._do(alarm, "note", {"text": text})
 
-    def resolve(self, alarm: int, revision: int, reason: str) -> models.AlarmPage:
+    def resolve(self, alarm: int, revision: int, reason: str) -> alarm_models.AlarmPage:
         """Close an alarm; it opens again when the robot finds it anew."""
         return self._do(alarm, "resolve", {"revision": revision, "reason": reason})
 
-    def _do(self, alarm: int, action: str, body: Mapping[str, Any]) -> models.AlarmPage:
+    def _do(self, alarm: int, action: str, body: Mapping[str, Any]) -> alarm_models.AlarmPage:
         reply = self.wire.send("POST", f"/alarms/{alarm}/{action}", body)
-        return msgspec.json.decode(reply.body, type=models.AlarmPage)
+        return msgspec.json.decode(reply.body, type=alarm_models.AlarmPage)

@@ -53,8 +53,11 @@ def test_incidents_are_copied_first_and_the_ring_s_files_with_them(tmp_path: Pat
         options = LinkOptions(f"http://127.0.0.1:{port}", "r1", "key-r1")
         copier = Copier(store, options, HttpSending(options, lambda: None))
         order = copier.waiting()
+        sizes = [store.journal_path(name).stat().st_size for name in order]
+        backlog = []
         while copier.step():
-            pass
+            backlog.append(copier.backlog_bytes)
+    assert backlog[0] == sum(sizes) > backlog[-1] > 0 == copier.backlog_bytes
     main = [p.relative_to(store.path).as_posix() for p in store.journal_files("main")]
     rings = [name for name in order if name.startswith("ring/")]
     rest = [name for name in order if not name.startswith("ring/")]

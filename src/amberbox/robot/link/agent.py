@@ -113,6 +113,7 @@ class Agent:
     async def _live(self) -> None:
         """Give signs of life from the loop that does the work, and say what has changed."""
         while True:
+            self.client.progress.backlog_bytes = self.loop.copier.backlog_bytes
             self._tell()
             self._notifier.alive(lambda: self.state().in_words())
             await asyncio.sleep(_ALIVE_S)

@@ -79,6 +79,7 @@ class Progress:
     trouble: str = ""
     attempts: int = 0
     backlog: int = 0
+    backlog_bytes: int = 0
     rows_sent: int = 0
     bytes_sent: int = 0
     offset: OffsetEstimate = field(default_factory=OffsetEstimate)

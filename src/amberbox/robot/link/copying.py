@@ -123,6 +123,8 @@ class Copier:
     bucket: TokenBucket = field(default_factory=lambda: TokenBucket(0.0))
     stop: threading.Event = field(default_factory=threading.Event)
     remarks: Remarks | None = None
+    backlog_bytes: int = 0
+    """How much is to be copied, as of the last step."""
     _refused: set[str] = field(default_factory=set)
     _piece_bytes: int = PIECE_BYTES
 
@@ -147,9 +149,11 @@ class Copier:
 
     def step(self) -> bool:
         """Copy the next journal; tell whether there was one. Raises CopyError for another time."""
-        name = next(iter(self.waiting()), None)
-        if name is None or self.stop.is_set():
+        names = self.waiting()
+        self.backlog_bytes = sum(map(self._size, names))
+        if not names or self.stop.is_set():
             return False
+        name = names[0]
         verdict = self.copy(name)
         if verdict is None:
             self._refused.add(name)  # it is gone meanwhile
@@ -160,6 +164,12 @@ class Copier:
         else:
             self._confirm(name)
         return True
+
+    def _size(self, name: str) -> int:
+        try:
+            return self.store.journal_path(name).stat().st_size
+        except FileNotFoundError:
+            return 0
 
     def copy(self, name: str) -> Verdict | None:
         """Send a journal, or the rest of it; return the server's verdict, None if it is gone."""

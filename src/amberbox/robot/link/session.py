@@ -235,6 +235,7 @@ class Session:
         return Beat(
             self._end.epoch, client.clock.wall_ns(), client.clock.boot_ns(),
             client.progress.backlog, offset.offset_ns, offset.round_ns,
+            client.progress.backlog_bytes,
         )  # fmt: skip
 
     async def _look_at_network(self) -> None:
