@@ -26,12 +26,12 @@ from amberbox.blackbox.keeper.keeper import seal
 from amberbox.blackbox.signing.keys import open_keys
 from amberbox.blackbox.store import open_store
 from amberbox.cli.main import main
-from amberbox.fleet.accounts.joining import JoinLine, read_join_line
 from amberbox.fleet.accounts.robotkeys import revoke_keys
 from amberbox.fleet.archive.tables import JOURNALS
 from amberbox.fleet.database.database import Database
 from amberbox.fleet.linkend.tables import COMMITTED, ROW
 from amberbox.link.frames import Bye, Hello, encode, from_server
+from amberbox.link.joining import JoinLine, read_join_line
 from amberbox.robot.link.copying import Copier, HttpSending
 from amberbox.robot.link.dialing import RefusedError, dial
 from amberbox.robot.link.options import LinkOptions

@@ -25,14 +25,13 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Check the line, write it down, try it."""
-    from amberbox.fleet.accounts.joining import read_join_line
-    from amberbox.robot.joining.join import Server, join
+    from amberbox.link.joining import read_join_line
+    from amberbox.robot.joining.join import join
 
     if not Path(args.folder).is_dir():
         raise UsageError(f"'{args.folder}' is no folder", "join takes a robot folder")
     line = read_join_line(sys.stdin.readline() if args.line == "-" else args.line)
-    server = Server(line.url, line.robot, line.key, line.ca)
-    joined = join(Path(args.folder), server, replace=args.replace)
+    joined = join(Path(args.folder), line, replace=args.replace)
     if args.json:
         print_json({"url": line.url, "reached": joined.reached, "said": list(joined.lines)})
     else:

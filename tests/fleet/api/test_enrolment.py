@@ -13,9 +13,9 @@ import pytest
 from starlette.testclient import TestClient
 
 from amberbox.fleet.accounts.authority import CERTIFICATE
-from amberbox.fleet.accounts.joining import read_join_line
 from amberbox.fleet.audit.tables import AUDIT
 from amberbox.fleet.bus import Change
+from amberbox.link.joining import read_join_line
 from tests.fleet.house import URL, House, house
 
 ROBOTS = "/api/v1/robots"

@@ -8,15 +8,10 @@ choose, are hashed in ``passwords``.
 from __future__ import annotations
 
 import hashlib
-import re
 import secrets
 from dataclasses import dataclass
-from typing import Literal
 
-Kind = Literal["session", "token", "robot"]
-
-_MARK = {"session": "abs", "token": "abt", "robot": "abr"}
-_FORM = re.compile(r"(ab[str])_([0-9a-f]{12})_([A-Za-z0-9_-]{43})")
+from amberbox.link.keys import MARKS, Kind
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,16 +33,10 @@ class Secret:
 def new_secret(kind: Kind) -> Secret:
     """Make a secret of the system's random numbers."""
     id_ = secrets.token_hex(6)
-    text = f"{_MARK[kind]}_{id_}_{secrets.token_urlsafe(32)}"
+    text = f"{MARKS[kind]}_{id_}_{secrets.token_urlsafe(32)}"
     return Secret(text, id_, digest(text))
 
 
 def digest(text: str) -> str:
     """Return the SHA-256 of a secret, 64 hex digits."""
     return hashlib.sha256(text.encode("utf-8", "surrogatepass")).hexdigest()
-
-
-def is_secret(text: str, kind: Kind) -> bool:
-    """Tell whether a text has the form of such a secret; all others need no look-up."""
-    found = _FORM.fullmatch(text)
-    return found is not None and found[1] == _MARK[kind]

@@ -12,10 +12,11 @@ from typing import Any
 from sqlalchemy import ColumnElement, Connection, Update, insert, or_, select, update
 
 from amberbox.core.clock import NS
-from amberbox.fleet.accounts.keys import Secret, digest, is_secret, new_secret
+from amberbox.fleet.accounts.keys import Secret, digest, new_secret
 from amberbox.fleet.accounts.principal import Principal
 from amberbox.fleet.accounts.robots import find_robot, register_robot
 from amberbox.fleet.accounts.tables import ROBOT_KEYS, ROBOTS
+from amberbox.link.keys import is_secret
 
 OVERLAP_NS = 7 * 24 * 3600 * NS
 _TOUCH_NS = 60 * NS

@@ -15,9 +15,10 @@ from typing import Any
 from sqlalchemy import ColumnElement, Connection, RowMapping, delete, insert, or_, select, update
 
 from amberbox.core.clock import NS
-from amberbox.fleet.accounts.keys import digest, is_secret, new_secret
+from amberbox.fleet.accounts.keys import digest, new_secret
 from amberbox.fleet.accounts.tables import SESSIONS, USERS
 from amberbox.fleet.accounts.users import User, user_of
+from amberbox.link.keys import is_secret
 
 IDLE_NS = 30 * 60 * NS
 LONGEST_NS = 12 * 3600 * NS

@@ -15,10 +15,11 @@ from amberbox.core.config import did_you_mean
 from amberbox.core.errors import UsageError
 from amberbox.fleet.accounts.actions import SCOPES
 from amberbox.fleet.accounts.groups import groups_of, set_groups
-from amberbox.fleet.accounts.keys import Secret, digest, is_secret, new_secret
+from amberbox.fleet.accounts.keys import Secret, digest, new_secret
 from amberbox.fleet.accounts.principal import Principal
 from amberbox.fleet.accounts.tables import TOKEN_GROUPS, TOKENS, USERS
 from amberbox.fleet.accounts.users import User, user_of
+from amberbox.link.keys import is_secret
 
 DAY_NS = 24 * 3600 * NS
 LONGEST_NS = 366 * DAY_NS

@@ -13,12 +13,12 @@ from amberbox.core.clock import NS
 from amberbox.core.timetext import format_time
 from amberbox.fleet.accounts import robotkeys, robots
 from amberbox.fleet.accounts.authority import fingerprint
-from amberbox.fleet.accounts.joining import join_line
 from amberbox.fleet.accounts.keys import Secret
 from amberbox.fleet.api.access import Caller, Fleet, OfRobot, Routes, Who
 from amberbox.fleet.api.forms import Form, Id, Named, shown
 from amberbox.fleet.bus import Change
 from amberbox.fleet.services import Services
+from amberbox.link.joining import join_line
 
 routes = Routes("robots")
 

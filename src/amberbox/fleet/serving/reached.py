@@ -9,9 +9,9 @@ from sqlalchemy import Connection
 
 from amberbox.core.errors import UsageError
 from amberbox.fleet.accounts.authority import fingerprint
-from amberbox.fleet.accounts.joining import JoinLine, join_line
 from amberbox.fleet.options import options
 from amberbox.fleet.serving.settings import Settings
+from amberbox.link.joining import JoinLine, join_line
 
 _NAME = "server.reached"
 

@@ -20,6 +20,7 @@ from amberbox.core.errors import AmberboxError, Problem
 from amberbox.core.nodes import Node, parse_yaml
 from amberbox.core.plugins import Plugin, find
 from amberbox.core.redaction import MASK, likely_secrets, redact, secrets
+from amberbox.link.keys import LOOKS_LIKE_ONE
 
 WORD = "(masked)"
 """Stands for a secret within a text, where it breaks no syntax."""
@@ -32,7 +33,6 @@ _SOUNDS = r"(?:pass(?:word|wd|phrase)|secret|token|(?:api|private|access)[ _-]?k
 _SECRET_WORD = re.compile(_SOUNDS, re.IGNORECASE)
 _USER = re.compile(r"([a-zA-Z][a-zA-Z0-9+.-]*://)[^/\s@'\"<>]+@")
 _QUERY = re.compile(rf"([?&]\w*(?:{_SOUNDS}|key|sig)\w*=)[^&\s#'\"<>]+", re.IGNORECASE)
-_OURS = re.compile(r"ab[str]_[0-9a-f]{12}_[A-Za-z0-9_-]{20,}")
 _PEM = re.compile(r"-----BEGIN [A-Z ]*PRIVATE KEY-----.*?(?:-----END [A-Z ]*-----|\Z)", re.DOTALL)
 _SAID = re.compile(
     rf"(\b\w*{_SOUNDS}\w*[\"']?\s*(?:[:=]|\bis\b)\s*)(\"[^\"]*\"|'[^']*'|[^\s\"'<>,;]+)",
@@ -167,7 +167,7 @@ def _quoted_as(written: str) -> str:
 def _by_form(text: str) -> str:
     """Mask what is a secret by its form: keys, users and passwords in addresses."""
     text = _PEM.sub(WORD, text)
-    text = _OURS.sub(WORD, text)
+    text = LOOKS_LIKE_ONE.sub(WORD, text)
     text = _QUERY.sub(rf"\1{WORD}", text)
     return _USER.sub(rf"\1{MASK}@", text)
 

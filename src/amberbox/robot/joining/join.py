@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 from amberbox.blackbox.folder.folder import ROBOT_FILE, RobotFolder, load_folder
@@ -11,21 +11,12 @@ from amberbox.blackbox.folder.server import url_problem
 from amberbox.blackbox.store import create_store
 from amberbox.core.clock import Clock, SystemClock
 from amberbox.core.errors import UsageError
+from amberbox.link.joining import JoinLine
 from amberbox.robot.joining.trial import try_hello
 from amberbox.robot.joining.writing import with_server, write_key, write_robot_file
 from amberbox.robot.link.dialing import LinkDownError, RefusedError
 from amberbox.robot.link.options import LinkOptions
 from amberbox.robot.link.tls import context_for
-
-
-@dataclass(frozen=True, slots=True)
-class Server:
-    """What the server's line says: its address, the robot, the key, the authority to trust."""
-
-    url: str
-    robot: str
-    key: str = field(repr=False)
-    ca: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +28,7 @@ class Joined:
 
 
 def join(
-    path: Path, server: Server, *, replace: bool = False, clock: Clock | None = None
+    path: Path, line: JoinLine, *, replace: bool = False, clock: Clock | None = None
 ) -> Joined:
     """Make a robot folder report to a server.
 
@@ -46,28 +37,28 @@ def join(
     there without ``replace``, or the server is not the one of the line, or refuses the key.
     """
     folder = load_folder(path)
-    _agree(folder, server, replace=replace)
-    ca = {"ca": f"sha256:{server.ca}"} if server.ca else {}
+    _agree(folder, line, replace=replace)
+    ca = {"ca": f"sha256:{line.ca}"} if line.ca else {}
     drop = ("token",) if ca else ("token", "ca")
-    text = with_server(_text_of(folder.path), {"url": server.url, **ca}, drop)
-    reached, lines = _tried(folder, server, clock or SystemClock())
-    write_key(folder.path, server.key)
+    text = with_server(_text_of(folder.path), {"url": line.url, **ca}, drop)
+    reached, lines = _tried(folder, line, clock or SystemClock())
+    write_key(folder.path, line.key)
     write_robot_file(folder.path, text)
-    return Joined(reached, (f"{folder.path / ROBOT_FILE} names {server.url} now", *lines))
+    return Joined(reached, (f"{folder.path / ROBOT_FILE} names {line.url} now", *lines))
 
 
-def _agree(folder: RobotFolder, server: Server, *, replace: bool) -> None:
+def _agree(folder: RobotFolder, line: JoinLine, *, replace: bool) -> None:
     """Refuse a line for another robot, and to put a server in another one's place."""
-    wrong = url_problem(server.url)
+    wrong = url_problem(line.url)
     if wrong:
         raise UsageError(f"the server's address {wrong}", "ask the server for another line")
-    if server.robot != folder.robot.id:
+    if line.robot != folder.robot.id:
         raise UsageError(
-            f"the line is for the robot '{server.robot}', this folder is '{folder.robot.id}'",
-            f"write 'id: {server.robot}' into {ROBOT_FILE} if they are the same robot",
+            f"the line is for the robot '{line.robot}', this folder is '{folder.robot.id}'",
+            f"write 'id: {line.robot}' into {ROBOT_FILE} if they are the same robot",
         )
     known = folder.robot.server
-    if known is not None and not replace and _place(known.url) != _place(server.url):
+    if known is not None and not replace and _place(known.url) != _place(line.url):
         raise UsageError(
             f"{folder.path / ROBOT_FILE} names another server, {known.url}",
             "add --replace to leave that one for this",
@@ -83,11 +74,9 @@ def _text_of(folder: Path) -> str:
     return path.read_bytes().decode("utf-8-sig") if path.exists() else ""
 
 
-def _tried(folder: RobotFolder, server: Server, clock: Clock) -> tuple[bool, tuple[str, ...]]:
+def _tried(folder: RobotFolder, line: JoinLine, clock: Clock) -> tuple[bool, tuple[str, ...]]:
     """Say hello once; tell whether that worked, and what there is to say."""
-    options = LinkOptions(
-        server.url, server.robot, server.key, server.ca, config_hash=folder.config_hash
-    )
+    options = LinkOptions(line.url, line.robot, line.key, line.ca, config_hash=folder.config_hash)
     store = create_store(folder.store_path)
     try:
         context = context_for(options.url, options.ca, store.path)
@@ -95,7 +84,7 @@ def _tried(folder: RobotFolder, server: Server, clock: Clock) -> tuple[bool, tup
     except RefusedError as error:
         raise UsageError(
             f"the server does not take this robot: {error}",
-            f"add it there again: amberbox serve add-robot {server.robot}",
+            f"add it there again: amberbox serve add-robot {line.robot}",
         ) from error
     except (LinkDownError, OSError) as error:
         return False, (f"it cannot be reached now: {error}", *_why(error))

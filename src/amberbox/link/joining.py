@@ -12,12 +12,12 @@ import re
 from dataclasses import dataclass, field
 from urllib.parse import SplitResult, parse_qs, urlsplit
 
+from amberbox.blackbox.folder.server import LOOPBACK
 from amberbox.core.errors import UsageError
 from amberbox.core.ids import is_id
-from amberbox.fleet.accounts.keys import is_secret
+from amberbox.link.keys import is_secret
 
 _SCHEMES = {"amberbox+https": "https", "amberbox+http": "http"}
-_LOOPBACK = frozenset({"localhost", "127.0.0.1", "::1"})
 _DIGEST = re.compile(r"[0-9a-f]{64}")
 
 
@@ -57,7 +57,7 @@ def read_join_line(text: str) -> JoinLine:
         raise _refused("it does not begin with amberbox+https://")
     if not is_id(robot) or not is_secret(key, "robot"):
         raise _refused("its robot or its key is cut off or changed")
-    if scheme == "http" and parts.hostname not in _LOOPBACK:
+    if scheme == "http" and parts.hostname not in LOOPBACK:
         raise _refused("only a server on this machine is reached without TLS")
     place = parts.netloc.rpartition("@")[2]
     return JoinLine(f"{scheme}://{place}{parts.path.rstrip('/')}", robot, key, _fingerprint(parts))

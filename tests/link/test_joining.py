@@ -7,10 +7,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from amberbox.core.errors import UsageError
-from amberbox.fleet.accounts.joining import JoinLine, join_line, read_join_line
-from amberbox.fleet.accounts.keys import new_secret
+from amberbox.link.joining import JoinLine, join_line, read_join_line
 
-KEY = new_secret("robot").text
+KEY = "abr_0123456789ab_" + "K" * 20 + "7_-" + "x" * 20
 CA = "3f" * 32
 LINE = f"amberbox+https://ropod_001:{KEY}@fleet.example:8443/?ca=sha256:{CA}"
 
