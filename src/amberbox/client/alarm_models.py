@@ -9,8 +9,8 @@ class AlarmRobot(Answer, frozen=True):
     """A robot that an alarm is about."""
 
     robot: str
-    since: str
-    until: str | None = None
+    from_: str
+    to: str | None = None
 
 
 class Said(Answer, frozen=True):
@@ -26,8 +26,8 @@ class Window(Answer, frozen=True):
     """Where the data about an alarm are."""
 
     robot: str
-    begin: str
-    end: str | None = None
+    from_: str
+    to: str | None = None
 
 
 class Alarm(Answer, frozen=True):
@@ -64,8 +64,8 @@ class Consequence(Answer, frozen=True):
     component: str
     level: str
     reason: str
-    since: str
-    until: str | None = None
+    from_: str
+    to: str | None = None
 
 
 class Happening(Answer, frozen=True):

@@ -140,8 +140,8 @@ class StatusTree(Answer, frozen=True):
 class Stretch(Answer, frozen=True):
     """From when to when something was so."""
 
-    start: str | None
-    end: str | None
+    from_: str
+    to: str
     level: str
     state: str
     reason: str = ""
@@ -159,6 +159,8 @@ class Lane(Answer, frozen=True):
 class Timeline(Answer, frozen=True):
     """The lanes of a window; not ``complete`` where there was more than can be shown."""
 
+    from_: str
+    to: str
     lanes: tuple[Lane, ...]
     complete: bool = True
 

@@ -241,7 +241,7 @@ def test_consequences_and_the_window_of_data(home: House) -> None:
     page = home.client("viewer").get(f"{API}/1").json()
     assert [one["component"] for one in page["consequences"]] == ["loc"]
     assert page["alarm"]["window"] == {
-        "robot": "ropod_001", "begin": "2027-01-15T07:59:00.000000000Z", "end": None,
+        "robot": "ropod_001", "from": "2027-01-15T07:59:00.000000000Z", "to": None,
     }  # fmt: skip
 
 

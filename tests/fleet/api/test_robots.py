@@ -143,7 +143,7 @@ def test_the_timeline_shows_stretches(home: House) -> None:
     lanes = {(lane["component"], lane["mode"]): lane["stretches"] for lane in found["lanes"]}
     before, after = lanes["laser", ""]
     assert (before["level"], after["level"]) == ("ok", "error")
-    assert before["end"] == after["start"] == "2027-01-15T06:59:00.000000000Z"
+    assert before["to"] == after["from"] == "2027-01-15T06:59:00.000000000Z"
     assert found["complete"] and lanes["laser", "laser_device_monitor"][0]["level"] == "error"
     wrong = {"from": "2027-01-15T07:00:00Z", "to": "2027-01-15T06:00:00Z"}
     assert viewer.get("/api/v1/robots/ropod_001/timeline", params=wrong).status_code == 400

@@ -10,19 +10,19 @@ from amberbox.core.clock import NS
 from amberbox.core.timetext import format_time
 from amberbox.fleet.alarms.alarm import Alarm, Kind, State
 from amberbox.fleet.api.forms import shown
+from amberbox.fleet.api.windows import FROM, Shown
 from amberbox.monitoring.plan import Severity
 
 _AROUND_NS = 60 * NS
 """So much before and after an alarm belongs to its window of data."""
 
 
-@dataclass(frozen=True, slots=True)
-class RobotOf:
-    """A robot that an alarm is about; of one that was offline also when it came back."""
+class AlarmRobot(Shown):
+    """A robot that an alarm is about; ``to`` is null while it lasts."""
 
     robot: str
-    since: str
-    until: str | None
+    from_: str = FROM
+    to: str | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,13 +35,12 @@ class Said:
     reason: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class Window:
+class Window(Shown):
     """Where its data are: query or fetch them from the robot between these times."""
 
     robot: str
-    begin: str
-    end: str | None
+    from_: str = FROM
+    to: str | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +49,7 @@ class AlarmLine:
 
     id: int
     kind: Kind
-    robots: list[RobotOf]
+    robots: list[AlarmRobot]
     origin: str
     severity: Severity
     level: str
@@ -73,15 +72,14 @@ class AlarmLine:
     revision: int
 
 
-@dataclass(frozen=True, slots=True)
-class Consequence:
-    """A component that suffers from the root of the alarm."""
+class Consequence(Shown):
+    """A component that suffers from the root of the alarm; ``to`` is null while it does."""
 
     component: str
     level: str
     reason: str
-    since: str
-    until: str | None
+    from_: str = FROM
+    to: str | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,9 +103,15 @@ class AlarmPage:
 
 def line_of(alarm: Alarm, robots: list[RowMapping]) -> AlarmLine:
     """Return an alarm as it is shown to somebody who may see these of its robots."""
-    about = [RobotOf(r["robot"], format_time(r["from_ns"]), shown(r["to_ns"])) for r in robots]
+    about = [
+        AlarmRobot(robot=r["robot"], from_=format_time(r["from_ns"]), to=shown(r["to_ns"]))
+        for r in robots
+    ]
     end_ns = None if alarm.cleared_ns is None else alarm.cleared_ns + _AROUND_NS
-    begin = format_time(max(0, alarm.opened_ns - _AROUND_NS))
+    window = Window(
+        robot=alarm.robot or (about[0].robot if about else ""),
+        from_=format_time(max(0, alarm.opened_ns - _AROUND_NS)), to=shown(end_ns),
+    )  # fmt: skip
     return AlarmLine(
         id=alarm.number, kind=alarm.kind, robots=about, origin=alarm.origin,
         severity=alarm.severity, level=alarm.level, state=alarm.state, active=alarm.active,
@@ -115,16 +119,15 @@ def line_of(alarm: Alarm, robots: list[RowMapping]) -> AlarmLine:
         opened=format_time(alarm.opened_ns), changed=format_time(alarm.changed_ns),
         cleared=shown(alarm.cleared_ns), count=alarm.count, late=alarm.late, owner=alarm.owner,
         acknowledged=_acknowledged(alarm), shelved=_shelved(alarm), resolved=_resolved(alarm),
-        merged_into=alarm.merged_into, revision=alarm.revision,
-        window=Window(alarm.robot or (about[0].robot if about else ""), begin, shown(end_ns)),
+        merged_into=alarm.merged_into, window=window, revision=alarm.revision,
     )  # fmt: skip
 
 
-def _reason(alarm: Alarm, about: list[RobotOf]) -> str:
+def _reason(alarm: Alarm, about: list[AlarmRobot]) -> str:
     """Return why; of several offline robots only those are named that the caller may see."""
     if alarm.kind == "robot" or alarm.robot:
         return alarm.reason
-    away = [one.robot for one in about if one.until is None] or [one.robot for one in about]
+    away = [one.robot for one in about if one.to is None] or [one.robot for one in about]
     names = ", ".join(away[:5]) + (f" and {len(away) - 5} more" if len(away) > 5 else "")
     return f"offline: {names}"
 

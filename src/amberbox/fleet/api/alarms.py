@@ -273,8 +273,8 @@ def _page(connection: Connection, who: Caller, alarm: Alarm) -> AlarmPage:
         _line(connection, who, alarm),
         [
             Consequence(
-                row["component"], row["level"], row["reason"],
-                format_time(row["from_ns"]), shown(row["to_ns"]),
+                component=row["component"], level=row["level"], reason=row["reason"],
+                from_=format_time(row["from_ns"]), to=shown(row["to_ns"]),
             )
             for row in listing.consequences_of(connection, alarm.number)
         ],

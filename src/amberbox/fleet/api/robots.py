@@ -14,6 +14,7 @@ from amberbox.core.clock import NS
 from amberbox.fleet.accounts.robots import KnownRobot
 from amberbox.fleet.api.access import Fleet, OfRobot, Routes, Who
 from amberbox.fleet.api.forms import ID, AfterName, Limit, TimeText, time_of
+from amberbox.fleet.api.timelines import Timeline, timeline_of
 from amberbox.fleet.conclusions.entry import Entry
 from amberbox.fleet.conclusions.reading import entries
 from amberbox.fleet.linkend.presence import Presence, presences
@@ -21,7 +22,7 @@ from amberbox.fleet.services import Services
 from amberbox.fleet.state import links
 from amberbox.fleet.state.said import SaidEvent, moment, taken
 from amberbox.fleet.state.standing import Moment, clock_offsets_ns, silence, standings
-from amberbox.fleet.state.timeline import Timeline, timeline
+from amberbox.fleet.state.timeline import timeline
 from amberbox.fleet.state.tree import status_tree
 from amberbox.fleet.state.views import Card, StatusTree
 
@@ -98,27 +99,28 @@ def read_status(fleet: Fleet, robot: OfRobot) -> StatusTree:
 def read_timeline(
     fleet: Fleet,
     robot: OfRobot,
-    start: Annotated[TimeText, Query(alias="from")] = "now-1h",
+    from_: Annotated[TimeText, Query(alias="from")] = "now-1h",
     to: TimeText = "now",
     component: Name = "",
     points: Points = 500,
 ) -> Timeline:
     """Return which component was in what state when."""
-    from_ns, to_ns = time_of(start, fleet.clock), time_of(to, fleet.clock)
+    from_ns, to_ns = time_of(from_, fleet.clock), time_of(to, fleet.clock)
     to_ns = fleet.clock.wall_ns() if to_ns is None else to_ns
     from_ns = to_ns - _HOUR_NS if from_ns is None else from_ns
     if from_ns >= to_ns:
         raise HTTPException(400, "the window ends before it begins")
     with fleet.database.reading() as connection:
         standing = standings(connection, [robot.id]).get(robot.id, [])
-    return timeline(fleet, robot.id, (from_ns, to_ns), standing, component, points)
+    span = (from_ns, to_ns)
+    return timeline_of(timeline(fleet, robot.id, span, standing, component, points), span)
 
 
 @routes.get("/robots/{robot}/events", "items.read")
 def list_events(
     fleet: Fleet,
     robot: OfRobot,
-    start: Annotated[TimeText, Query(alias="from")] = "",
+    from_: Annotated[TimeText, Query(alias="from")] = "",
     to: TimeText = "",
     kind: Name = "",
     newest: bool = True,
@@ -126,7 +128,7 @@ def list_events(
     limit: Limit = 100,
 ) -> Sequence[EventView]:
     """Return events of a robot in order of time: the newest of a range, or the first ones."""
-    span = time_of(start, fleet.clock), time_of(to, fleet.clock)
+    span = time_of(from_, fleet.clock), time_of(to, fleet.clock)
     searched = _SEARCHED if kind else limit
     found = entries(fleet, robot.id, reserved.EVENT, span, searched, newest=newest, aside=aside)
     views = [view for entry in found if (view := _event(entry)) and kind in ("", view.kind)]

@@ -10,6 +10,8 @@ from typing import Final, Literal, TypeAlias
 from urllib.parse import urlsplit
 from zoneinfo import ZoneInfo
 
+import msgspec
+
 from amberbox.core.clock import NS
 from amberbox.core.redaction import MASK
 from amberbox.monitoring.plan import Severity
@@ -44,19 +46,18 @@ class Smtp:
             raise ValueError("security: a login without TLS shows the password to everybody")
 
 
-@dataclass(frozen=True, slots=True)
-class Quiet:
+class Quiet(msgspec.Struct, frozen=True, rename={"from_": "from"}):
     """Hours of the day in which only ``but`` and what is worse is told; the rest comes after."""
 
-    begin: str
-    end: str
+    from_: str
+    to: str
     zone: str = "UTC"
     but: Severity = "fatal"
 
     def __post_init__(self) -> None:
         """Refuse times and zones that are none; raises ValueError."""
-        if any(time.fromisoformat(one).tzinfo is not None for one in (self.begin, self.end)):
-            raise ValueError("zone: begin and end are without an offset; zone says where they hold")
+        if any(time.fromisoformat(one).tzinfo is not None for one in (self.from_, self.to)):
+            raise ValueError("zone: from and to are without an offset; zone says where they hold")
         try:
             _zone(self.zone)
         except (OSError, ValueError, KeyError) as error:
@@ -65,7 +66,7 @@ class Quiet:
     def until_ns(self, now_ns: int) -> int | None:
         """Return when it is over; None if it is not quiet now."""
         now = datetime.fromtimestamp(now_ns / NS, UTC).astimezone(_zone(self.zone))
-        begin, end = time.fromisoformat(self.begin), time.fromisoformat(self.end)
+        begin, end = time.fromisoformat(self.from_), time.fromisoformat(self.to)
         at = now.time()
         inside = begin <= at < end if begin <= end else at >= begin or at < end
         if not inside:

@@ -13,7 +13,6 @@ from amberbox.fleet.state.said import (
     SaidEvent,
     SaidTransition,
     heard,
-    moment,
     rank_of,
     taken,
 )
@@ -44,34 +43,11 @@ class Stretch:
 
 
 @dataclass(frozen=True, slots=True)
-class StretchView:
-    """A stretch as the API shows it."""
-
-    start: str | None
-    end: str | None
-    level: str
-    state: str
-    reason: str
-    changes: int
-
-
-@dataclass(frozen=True, slots=True)
-class LaneView:
-    """What was of a component, or a mode of it."""
-
-    component: str
-    mode: str
-    stretches: Sequence[StretchView]
-
-
-@dataclass(frozen=True, slots=True)
 class Timeline:
     """The lanes of a window. ``complete`` is false where there was more than can be shown."""
 
-    start: str | None
-    end: str | None
     complete: bool
-    lanes: Sequence[LaneView]
+    lanes: Mapping[Lane, Sequence[Stretch]]
 
 
 def timeline(
@@ -91,12 +67,12 @@ def timeline(
     lanes = sorted(
         lane for lane in {*inside, *after, *now} if not component or lane[0] == component
     )
-    views = [
-        LaneView(*lane, [_view(stretch) for stretch in shortened(stretches, span, points)])
+    shown = {
+        lane: shortened(stretches, span, points)
         for lane in lanes
         if (stretches := _stretches(span, inside.get(lane, ()), after.get(lane, ()), now.get(lane)))
-    ]
-    return Timeline(moment(span[0]), moment(span[1]), len(found) < MOST, views)
+    }
+    return Timeline(len(found) < MOST, shown)
 
 
 def shortened(
@@ -171,10 +147,3 @@ def _before(
     inside: Sequence[tuple[int, SaidTransition]], after: Sequence[tuple[int, SaidTransition]]
 ) -> SaidCondition | None:
     return next((said.before for _, said in (*inside[:1], *after[:1])), None)
-
-
-def _view(stretch: Stretch) -> StretchView:
-    return StretchView(
-        moment(stretch.from_ns), moment(stretch.to_ns), stretch.level, stretch.state,
-        stretch.reason, stretch.changes,
-    )  # fmt: skip
