@@ -13,6 +13,7 @@ from amberbox.fleet.archive.keeping import Keeping
 from amberbox.fleet.asking.asking import Asking
 from amberbox.fleet.bus import Bus
 from amberbox.fleet.database.database import Database
+from amberbox.fleet.demonstration import Demonstration
 from amberbox.fleet.feed.feed import Feed
 from amberbox.fleet.fetches.fetches import Fetches
 from amberbox.fleet.folders.folders import Folders
@@ -48,3 +49,5 @@ class Services:
     keeping: Keeping
     doors: Doorkeeper
     threads: Threads
+    demo: Demonstration | None = None
+    """Set where the server is part of a demonstration: ``amberbox demo``, and nothing else."""

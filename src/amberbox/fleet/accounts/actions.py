@@ -76,6 +76,7 @@ ACTIONS: Mapping[str, Action] = {
     "missions.write": Action(Role.OPERATOR, "write:missions"),
     "diagnoses.read": Action(Role.VIEWER, "read:diagnoses"),
     "diagnoses.write": Action(Role.OPERATOR, "write:diagnoses"),
+    "demo.break": Action(Role.VIEWER),
     "folder.read": Action(Role.TECHNICIAN),
     "robots.write": Action(Role.ADMIN, reach="server"),
     "retention.write": Action(Role.ADMIN, reach="server"),

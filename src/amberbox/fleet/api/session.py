@@ -68,8 +68,8 @@ class Myself:
 
 
 @dataclass(frozen=True, slots=True)
-class OneSession:
-    """A session of one's own; ``current`` is the one that asks."""
+class OpenSession:
+    """A session that lasts; ``id`` revokes it."""
 
     id: str
     began: str
@@ -77,11 +77,17 @@ class OneSession:
     ends: str
     address: str
     agent: str
+
+
+@dataclass(frozen=True, slots=True)
+class OwnSession(OpenSession):
+    """A session of one's own; ``current`` is the one that asks."""
+
     current: bool
 
 
 @dataclass(frozen=True, slots=True)
-class Ended:
+class EndedSessions:
     """How many sessions were ended."""
 
     ended: int
@@ -112,16 +118,16 @@ async def begin(
     """Sign in: the session is in a cookie that no script can read."""
     user, session = await fleet.passwords.apart(
         signin.sign_in, fleet.database, fleet.clock, fleet.passwords, login.name, login.password,
-        _from(request),
+        came_from(request),
     )  # fmt: skip
-    _set_cookie(response, fleet, session)
-    return _myself(user.principal, session.secret)
+    set_cookie(response, fleet, session)
+    return myself(user.principal, session.secret)
 
 
 @routes.get("/session", "own.read")
 def read_session(who: Who) -> Myself:
     """Return who asks, and the token that changes need."""
-    return _myself(who.principal, who.secret)
+    return myself(who.principal, who.secret)
 
 
 @routes.delete("/session", "own.write", status_code=204)
@@ -143,22 +149,22 @@ async def change_password(
     """Change one's password: all sessions end, and a new one begins here."""
     session = await fleet.passwords.apart(
         signin.change_password, fleet.database, fleet.clock, fleet.passwords, who.principal.id,
-        passwords.old, passwords.new, _from(request),
+        passwords.old, passwords.new, came_from(request),
     )  # fmt: skip
     _tell(fleet, who)
-    _set_cookie(response, fleet, session)
+    set_cookie(response, fleet, session)
     user = await asyncio.to_thread(_user, fleet, who.principal.id)
-    return _myself(user.principal, session.secret)
+    return myself(user.principal, session.secret)
 
 
 @routes.get("/session/list", "own.read")
-def list_own(who: Who, fleet: Fleet) -> list[OneSession]:
+def list_own(who: Who, fleet: Fleet) -> list[OwnSession]:
     """Return one's open sessions, newest first."""
     with fleet.database.reading() as connection:
         user = find_user(connection, who.principal.id)
         found = list_sessions(connection, fleet.clock.wall_ns(), user.user_id)
     return [
-        OneSession(
+        OwnSession(
             one.session_id, format_time(one.created_ns), format_time(one.seen_ns),
             format_time(one.ends_ns), one.address, one.agent, one.session_id == who.session_id,
         )
@@ -179,7 +185,7 @@ def revoke(session_id: str, who: Who, fleet: Fleet) -> Response:
 
 
 @routes.delete("/session/others", "own.write")
-def revoke_others(who: Who, fleet: Fleet) -> Ended:
+def revoke_others(who: Who, fleet: Fleet) -> EndedSessions:
     """End all of one's sessions but the one that asks."""
     with fleet.database.begin() as connection:
         user = find_user(connection, who.principal.id)
@@ -187,7 +193,7 @@ def revoke_others(who: Who, fleet: Fleet) -> Ended:
         told = {"ended": count}
         who.note(connection, fleet.clock.wall_ns(), "session.revoke", "others", details=told)
     _tell(fleet, who)
-    return Ended(count)
+    return EndedSessions(count)
 
 
 def _user(fleet: Services, name: str) -> User:
@@ -195,18 +201,21 @@ def _user(fleet: Services, name: str) -> User:
         return find_user(connection, name)
 
 
-def _from(request: Request) -> signin.Caller:
+def came_from(request: Request) -> signin.Caller:
+    """Return where a login comes from."""
     agent = request.headers.get("user-agent", "")
     return signin.Caller(address_of(request), agent, request.cookies.get(COOKIE))
 
 
-def _myself(who: Principal, secret: str) -> Myself:
+def myself(who: Principal, secret: str) -> Myself:
+    """Say who somebody is, who has a session."""
     groups = None if who.groups is None else sorted(who.groups)
     csrf = csrf_token(secret) if secret else ""
     return Myself(who.kind, who.id, who.role, groups, who.must_change, csrf)
 
 
-def _set_cookie(response: Response, fleet: Services, session: NewSession) -> None:
+def set_cookie(response: Response, fleet: Services, session: NewSession) -> None:
+    """Let the browser keep a session."""
     response.set_cookie(
         COOKIE, session.secret, max_age=LONGEST_NS // NS, path="/",
         secure=fleet.settings.is_secure, httponly=True, samesite="lax",

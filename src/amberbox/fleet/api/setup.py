@@ -88,10 +88,10 @@ def _situation(request: Request, fleet: Services) -> dict[str, Any]:
         waits = code_waits(connection, fleet.clock.wall_ns())
     if not is_first and not waits:
         raise HTTPException(404, "this server is set up")
-    return {"is_first": is_first, "needs_code": not (is_first and _is_here(request, fleet))}
+    return {"is_first": is_first, "needs_code": not (is_first and is_here(request, fleet))}
 
 
-def _is_here(request: Request, fleet: Services) -> bool:
+def is_here(request: Request, fleet: Services) -> bool:
     """Tell whether somebody on the machine asks: behind a proxy nobody can know."""
     peer = request.client.host if request.client else ""
     by_proxy = any(name in request.headers for name in ("x-forwarded-for", "forwarded", "via"))

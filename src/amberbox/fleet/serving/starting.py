@@ -14,6 +14,7 @@ from amberbox.core.errors import AmberboxError
 from amberbox.fleet.accounts.passwords import Passwords
 from amberbox.fleet.accounts.setupcode import SetupCode, needs_setup, new_setup_code
 from amberbox.fleet.database.lock import ServerLock
+from amberbox.fleet.demonstration import Demonstration
 from amberbox.fleet.services import Services
 from amberbox.fleet.serving import app, assembly, certificates, process
 from amberbox.fleet.serving.binding import Wanted, settings_of
@@ -40,8 +41,11 @@ def run(
     new_code: bool = False,
     begun: Callable[[Start], None] = lambda start: None,
     clock: Clock | None = None,
+    demo: Demonstration | None = None,
 ) -> None:
     """Serve a data folder until somebody stops it; ``begun`` is told once it answers.
+
+    With ``demo`` it is part of a demonstration: people sign in by links, and may break robots.
 
     Raises UsageError when another server has the folder, or what is wanted is not safe.
     """
@@ -53,6 +57,7 @@ def run(
         port = process.listen(settings)
         process.raise_file_limit()
         services = assembly.assemble(folder, settings, clock, _passwords())
+        services.demo = demo
         try:
             code = _prepared(services, new_code=new_code)
             told = Told(ready=lambda _: begun(Start(settings, code, renewed)))
