@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+import pytest
 import yaml
 
 from amberbox.core.nodes import Node, parse_yaml
 from amberbox.core.options import option
-from amberbox.core.redaction import as_plain, likely_secrets, redact, secrets
+from amberbox.core.redaction import as_plain, likely_secrets, redact, secrets, sounds_secret
 
 
 @dataclass(frozen=True)
@@ -68,6 +69,18 @@ def test_unknown_blocks_lose_what_sounds_secret() -> None:
     redacted = redact(text, likely_secrets(tree(text)))
     assert yaml.safe_load(redacted)["host"] == "a"
     assert not any(secret in redacted for secret in ("x1", "x2", "x3", "x4"))
+
+
+@pytest.mark.parametrize(
+    "key", ["mqtt_password", "PASSWD", "apiKey", "API key", "access-key", "tokens", "credentials"]
+)
+def test_what_sounds_secret(key: str) -> None:
+    assert sounds_secret(key)
+
+
+@pytest.mark.parametrize("key", ["host", "keys", "passed", "public_key", "keyboard", ""])
+def test_what_does_not(key: str) -> None:
+    assert not sounds_secret(key)
 
 
 def test_listings_mask_secrets() -> None:

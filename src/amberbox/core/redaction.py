@@ -14,7 +14,21 @@ from amberbox.core.fieldtypes import field_types
 from amberbox.core.nodes import Node
 
 MASK = "***"
-_TELLTALES = ("password", "passwd", "secret", "token", "passphrase", "private_key", "api_key")
+SECRET_WORDS = (
+    "password", "passwd", "passphrase", "secret", "token", "credential",
+    "api_key", "access_key", "private_key",
+)  # fmt: skip
+"""What the name of a secret has in it; for ``_`` there may be a space, a hyphen, or nothing."""
+
+SOUNDS_SECRET = "(?:" + "|".join(word.replace("_", "[ _-]?") for word in SECRET_WORDS) + ")"
+"""Matches one of these words in a text: a pattern, for ``re.IGNORECASE``."""
+
+_SOUNDS_SECRET = re.compile(SOUNDS_SECRET, re.IGNORECASE)
+
+
+def sounds_secret(key: str) -> bool:
+    """Tell whether what has this name is a secret: ``mqtt_password``, ``apiKey``, ``API key``."""
+    return _SOUNDS_SECRET.search(key) is not None
 
 
 def secrets(cls: type[Any], node: Node) -> Iterator[Node]:
@@ -33,7 +47,7 @@ def secrets(cls: type[Any], node: Node) -> Iterator[Node]:
 
 def likely_secrets(node: Node, key: str = "") -> Iterator[Node]:
     """Yield values whose key sounds secret, for blocks of which no class is known."""
-    if any(word in key.lower() for word in _TELLTALES):
+    if sounds_secret(key):
         yield node
         return
     for name, value in (node.mapping or {}).items():

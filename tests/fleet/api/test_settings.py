@@ -11,11 +11,12 @@ from typing import Any
 import pytest
 
 from amberbox.core.errors import UsageError
+from amberbox.core.redaction import MASK
 from amberbox.fleet.archive.store import Retention
 from amberbox.fleet.audit.tables import AUDIT
 from amberbox.fleet.options import known, options
 from amberbox.fleet.options.known import Known
-from amberbox.fleet.options.masking import MASK, masked, unmasked
+from amberbox.fleet.options.masking import masked, unmasked
 from tests.fleet.house import House, house
 
 SETTINGS = "/api/v1/settings"

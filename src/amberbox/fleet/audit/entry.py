@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from amberbox.core.redaction import MASK
+from amberbox.core.redaction import MASK, sounds_secret
 
 Result = Literal["ok", "refused", "failed"]
 START = "0" * 64
@@ -16,7 +16,8 @@ START = "0" * 64
 
 _LONGEST = {"principal": 140, "address": 64, "action": 64, "object": 300}
 _LONGEST_DETAILS = 8_000
-_SECRET = ("password", "secret", "token", "passphrase", "private", "api_key", "csrf", "cookie")
+_SECRET_HERE = ("csrf", "cookie", "private")
+"""What requests have besides, that opens something."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,5 +111,9 @@ def _masked(value: Any) -> Any:
 
 def _masked_pairs(pairs: Mapping[Any, Any]) -> Iterator[tuple[str, Any]]:
     for key, value in pairs.items():
-        secret = isinstance(value, str) and any(word in str(key).lower() for word in _SECRET)
+        secret = isinstance(value, str) and _is_secret(str(key))
         yield str(key), MASK if secret else _masked(value)
+
+
+def _is_secret(key: str) -> bool:
+    return sounds_secret(key) or any(word in key.lower() for word in _SECRET_HERE)

@@ -11,15 +11,15 @@ from collections.abc import Mapping
 
 from amberbox.core.errors import Problem
 from amberbox.core.nodes import parse_yaml
-from amberbox.core.redaction import MASK, likely_secrets, redact
+from amberbox.core.redaction import MASK, SOUNDS_SECRET, likely_secrets, redact
 
 _YAML = (".yaml", ".yml")
 _MASKS = (MASK, "(masked)")
 _KEY_BLOCK = re.compile(r"-----BEGIN ([A-Z ]*PRIVATE KEY)-----.*?(-----END \1-----|\Z)", re.DOTALL)
 _LOGIN = re.compile(r"(?<=://)([^\s:/?#@\"']*):([^\s/?#\"']+)@")
 _SAID = re.compile(
-    r"(?im)^(?P<key>[\s\-#\"'<]*[\w.\-]*(?:password|passwd|passphrase|secret|token|private_key"
-    r"|api_key)[\w.\-]*[\"']?\s*[:=>]\s*)(?P<value>[^\s{\[|>&*].*)$"
+    rf"(?im)^(?P<key>[\s\-#\"'<]*[\w.\-]*{SOUNDS_SECRET}[\w.\-]*[\"']?\s*[:=>]\s*)"
+    r"(?P<value>[^\s{\[|>&*].*)$"
 )
 
 

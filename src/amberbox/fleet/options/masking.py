@@ -6,9 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from amberbox.core.errors import UsageError
-
-MASK = "***"
-_TELLTALES = ("password", "passwd", "secret", "token", "passphrase", "private_key", "api_key")
+from amberbox.core.redaction import MASK, sounds_secret
 
 
 def masked(value: Any) -> Any:
@@ -36,11 +34,11 @@ def unmasked(value: Any, before: Any) -> Any:
 
 
 def _cover(key: str, value: Any) -> Any:
-    return MASK if _is_secret(key) and isinstance(value, str) and value else masked(value)
+    return MASK if sounds_secret(key) and isinstance(value, str) and value else masked(value)
 
 
 def _uncover(key: str, value: Any, before: Any) -> Any:
-    if _is_secret(key) and value == MASK:
+    if sounds_secret(key) and value == MASK:
         if isinstance(before, str) and before:
             return before
         raise UsageError(
@@ -48,7 +46,3 @@ def _uncover(key: str, value: Any, before: Any) -> Any:
             "write it again: it is new, or goes to another host or address now",
         )
     return unmasked(value, before)
-
-
-def _is_secret(key: str) -> bool:
-    return any(word in key.lower() for word in _TELLTALES)

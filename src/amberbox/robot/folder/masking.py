@@ -19,7 +19,14 @@ from amberbox.blackbox.folder.robot import RobotConfig
 from amberbox.core.errors import AmberboxError, Problem
 from amberbox.core.nodes import Node, parse_yaml
 from amberbox.core.plugins import Plugin, find
-from amberbox.core.redaction import MASK, likely_secrets, redact, secrets
+from amberbox.core.redaction import (
+    MASK,
+    SOUNDS_SECRET,
+    likely_secrets,
+    redact,
+    secrets,
+    sounds_secret,
+)
 from amberbox.link.keys import LOOKS_LIKE_ONE
 
 WORD = "(masked)"
@@ -29,16 +36,14 @@ _YAML = frozenset({".yaml", ".yml"})
 _LEAST = 6
 """Shorter secrets are not looked for in other places: they would be found in every number."""
 _LEAST_IN_COMMENTS = 3
-_SOUNDS = r"(?:pass(?:word|wd|phrase)|secret|token|(?:api|private|access)[ _-]?key|credential)"
-_SECRET_WORD = re.compile(_SOUNDS, re.IGNORECASE)
 _USER = re.compile(r"([a-zA-Z][a-zA-Z0-9+.-]*://)[^/\s@'\"<>]+@")
-_QUERY = re.compile(rf"([?&]\w*(?:{_SOUNDS}|key|sig)\w*=)[^&\s#'\"<>]+", re.IGNORECASE)
+_QUERY = re.compile(rf"([?&]\w*(?:{SOUNDS_SECRET}|key|sig)\w*=)[^&\s#'\"<>]+", re.IGNORECASE)
 _PEM = re.compile(r"-----BEGIN [A-Z ]*PRIVATE KEY-----.*?(?:-----END [A-Z ]*-----|\Z)", re.DOTALL)
 _SAID = re.compile(
-    rf"(\b\w*{_SOUNDS}\w*[\"']?\s*(?:[:=]|\bis\b)\s*)(\"[^\"]*\"|'[^']*'|[^\s\"'<>,;]+)",
+    rf"(\b\w*{SOUNDS_SECRET}\w*[\"']?\s*(?:[:=]|\bis\b)\s*)(\"[^\"]*\"|'[^']*'|[^\s\"'<>,;]+)",
     re.IGNORECASE,
 )
-_ELEMENT = re.compile(rf"(<\w*{_SOUNDS}\w*\b[^>]*>)[^<]+(</)", re.IGNORECASE)
+_ELEMENT = re.compile(rf"(<\w*{SOUNDS_SECRET}\w*\b[^>]*>)[^<]+(</)", re.IGNORECASE)
 
 
 @dataclass
@@ -131,7 +136,7 @@ def _without_comments(text: str, known: Collection[str]) -> str:
         line = text[text.rfind("\n", 0, start) + 1 : start]
         said = text[start:end]
         holds = any(s in said for s in known if len(s) >= _LEAST_IN_COMMENTS)
-        if MASK in line or holds or _SECRET_WORD.search(said):
+        if MASK in line or holds or sounds_secret(said):
             before = text[:start].rstrip(" ") if line.strip() else f"{text[:start]}#"
             text = before + text[end:]
     return text
