@@ -10,7 +10,7 @@ import msgspec
 
 from amberbox.cli._output import print_grid, print_json
 from amberbox.cli._server import robot_at
-from amberbox.client.alarm_models import Alarm
+from amberbox.client.alarm_models import AlarmLine
 from amberbox.client.fleet import Fleet
 from amberbox.core.config import did_you_mean
 from amberbox.core.errors import UsageError
@@ -38,7 +38,7 @@ def run_remote(args: argparse.Namespace, action: str, name: str) -> None:
         print(f"{changed.id} ({changed.origin}): {_state(changed)}")
 
 
-def _do(fleet: Fleet, alarm: Alarm, action: str, args: argparse.Namespace) -> Alarm:
+def _do(fleet: Fleet, alarm: AlarmLine, action: str, args: argparse.Namespace) -> AlarmLine:
     if action == "ack":
         return fleet.acknowledge(alarm.id, alarm.revision, args.note).alarm
     if action == "unshelve":
@@ -50,7 +50,7 @@ def _do(fleet: Fleet, alarm: Alarm, action: str, args: argparse.Namespace) -> Al
     return fleet.shelve(alarm.id, alarm.revision, until_ns, args.note).alarm
 
 
-def _find(fleet: Fleet, robot: str, name: str) -> Alarm:
+def _find(fleet: Fleet, robot: str, name: str) -> AlarmLine:
     """Return the alarm that has this id, or is of this component."""
     known = fleet.alarms(robot, state=_STANDING)
     by_name = {alarm.origin: alarm for alarm in reversed(known)}
@@ -61,7 +61,7 @@ def _find(fleet: Fleet, robot: str, name: str) -> Alarm:
     return by_name[name]
 
 
-def _list(args: argparse.Namespace, alarms: list[Alarm]) -> None:
+def _list(args: argparse.Namespace, alarms: list[AlarmLine]) -> None:
     if args.json:
         print_json([msgspec.to_builtins(alarm) for alarm in reversed(alarms)])
     elif alarms:
@@ -70,7 +70,7 @@ def _list(args: argparse.Namespace, alarms: list[Alarm]) -> None:
         print("no alarms" if args.all else "no alarms now")
 
 
-def _row(alarm: Alarm) -> tuple[Any, ...]:
+def _row(alarm: AlarmLine) -> tuple[Any, ...]:
     said = alarm.shelved or alarm.acknowledged
     return (
         alarm.id, alarm.origin, _state(alarm), alarm.level, alarm.severity, alarm.opened[:19],
@@ -78,7 +78,7 @@ def _row(alarm: Alarm) -> tuple[Any, ...]:
     )  # fmt: skip
 
 
-def _state(alarm: Alarm) -> str:
+def _state(alarm: AlarmLine) -> str:
     until = alarm.shelved.until if alarm.shelved else None
     text = alarm.state + (f" until {until[:16]}" if until else "")
     return text if alarm.active or alarm.state == "resolved" else f"{text}, quiet"

@@ -15,7 +15,7 @@ from amberbox.cli._output import tell
 from amberbox.cli._server import robot_at
 from amberbox.cli._statustable import View, alarms_of, overview, statuses_table, waiting
 from amberbox.cli._text import in_columns
-from amberbox.client.alarm_models import Alarm
+from amberbox.client.alarm_models import AlarmLine
 from amberbox.client.fleet import Fleet
 from amberbox.client.models import Component, Condition, StatusTree
 from amberbox.client.times import maybe_ns, time_ns
@@ -142,7 +142,7 @@ def _status(
     return msgspec.convert(made, Status)
 
 
-def _alarm(robot: str, alarm: Alarm) -> AlarmChange:
+def _alarm(robot: str, alarm: AlarmLine) -> AlarmChange:
     """Make an alarm as a robot has it; its id is that of the server."""
     said = alarm.shelved or alarm.acknowledged
     state = {"open": "open", "acknowledged": "acknowledged", "shelved": "shelved"}[alarm.state]

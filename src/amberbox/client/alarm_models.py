@@ -30,7 +30,7 @@ class Window(Answer, frozen=True):
     to: str | None = None
 
 
-class Alarm(Answer, frozen=True):
+class AlarmLine(Answer, frozen=True):
     """An alarm: ``active`` is whether it lasts, ``state`` what people made of it."""
 
     id: int
@@ -80,6 +80,6 @@ class Happening(Answer, frozen=True):
 class AlarmPage(Answer, frozen=True):
     """All that is known of an alarm."""
 
-    alarm: Alarm
+    alarm: AlarmLine
     consequences: tuple[Consequence, ...] = ()
     history: tuple[Happening, ...] = ()

@@ -25,11 +25,11 @@ class AlarmCalls:
     def alarms(
         self, robot: str = "", *, state: Sequence[str] = (), group: str = "",
         severity: str = "warning", since: Time = None,
-    ) -> list[alarm_models.Alarm]:  # fmt: skip
+    ) -> list[alarm_models.AlarmLine]:  # fmt: skip
         """Return alarms, newest first; ``severity`` and worse, changed ``since`` then."""
         asked = {"robot": robot, "state": list(state), "group": group, "severity": severity,
                  "since": said(since)}  # fmt: skip
-        return [*paged(self.wire, "/alarms", alarm_models.Alarm, lambda a: a.id, asked)]
+        return [*paged(self.wire, "/alarms", alarm_models.AlarmLine, lambda a: a.id, asked)]
 
     def alarm(self, alarm: int) -> alarm_models.AlarmPage:
         """Return an alarm with its consequences and its history."""

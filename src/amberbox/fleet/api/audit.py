@@ -37,7 +37,7 @@ _ABOUT: dict[int | str, dict[str, Any]] = {
 
 
 @dataclass(frozen=True, slots=True)
-class Noted:
+class AuditRow:
     """A row of the log; ``hash`` ties it to the row before."""
 
     seq: int
@@ -52,7 +52,7 @@ class Noted:
 
 
 @dataclass(frozen=True, slots=True)
-class Head:
+class AuditHead:
     """How far the log goes. Noted elsewhere, ``text`` proves all rows up to there."""
 
     seq: int
@@ -61,12 +61,12 @@ class Head:
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class AuditVerdict:
     """Whether every row follows on the one before; if not, the first that does not, and why."""
 
     holds: bool
     rows: int
-    head: Head
+    head: AuditHead
     broken: int | None
     what: str
 
@@ -98,7 +98,7 @@ def list_rows(
     order: Literal["newest", "oldest"] = "newest",
     after: After = 0,
     limit: Limit = 100,
-) -> list[Noted]:
+) -> list[AuditRow]:
     """List rows, newest first or oldest first; ``after`` goes on behind a row."""
     chosen = _chosen(wanted, fleet.clock).limit(limit)
     if order == "oldest":
@@ -111,20 +111,20 @@ def list_rows(
 
 
 @routes.get("/audit/head", "audit.read")
-def read_head(fleet: Fleet) -> Head:
+def read_head(fleet: Fleet) -> AuditHead:
     """Return how far the log goes: note it elsewhere from time to time."""
     with fleet.database.reading() as connection:
         return _head(log.head(connection))
 
 
 @routes.get("/audit/verify", "audit.read")
-def verify_rows(fleet: Fleet, head: Kept = []) -> Verdict:  # noqa: B006 -- FastAPI copies it
+def verify_rows(fleet: Fleet, head: Kept = []) -> AuditVerdict:  # noqa: B006 -- FastAPI copies it
     """Follow the log from its first row to its last, by the heads that were noted before too."""
     kept = [log.Head.from_text(text) for text in head]
     with fleet.database.reading() as connection:
         found = verify.verify(connection, kept)
     broken = found.broken
-    return Verdict(
+    return AuditVerdict(
         found.holds, found.rows, _head(found.head),
         None if broken is None else broken.seq, "" if broken is None else broken.what,
     )  # fmt: skip
@@ -172,12 +172,12 @@ def _chosen(wanted: Filter, clock: Clock) -> Select[Any]:
     return chosen.where(begins) if wanted.object else chosen
 
 
-def _head(head: log.Head) -> Head:
-    return Head(head.seq, head.hash, str(head))
+def _head(head: log.Head) -> AuditHead:
+    return AuditHead(head.seq, head.hash, str(head))
 
 
-def _noted(row: Row) -> Noted:
-    return Noted(
+def _noted(row: Row) -> AuditRow:
+    return AuditRow(
         row.seq, format_time(row.time_ns), row.principal, row.address, row.action, row.object,
         row.result, json.loads(row.details), row.hash,
     )  # fmt: skip

@@ -40,7 +40,7 @@ Moment = Annotated[str, StringConstraints(max_length=64)]
 After = Annotated[str, Query(max_length=128, description="the last id of the page before")]
 
 
-class Question(Form):
+class DiagnosisQuestion(Form):
     """What is asked: now or of then, what if symptoms were there, with answers to tests."""
 
     at: Moment = Field("", description="2026-11-21T14:00:00Z, an epoch, now-10m; -10m before the "
@@ -53,14 +53,14 @@ class Question(Form):
     exposure_h: float | None = Field(None, ge=0, le=1e6, allow_inf_nan=False)
 
 
-class AnswerForm(Form):
+class NewAnswer(Form):
     """What a test gave: one of its outcomes, or ``cannot``."""
 
     test: _Address
     answer: _Word
 
 
-class CauseForm(Form):
+class NewCause(Form):
     """What it was."""
 
     failure_mode: _Address
@@ -82,7 +82,7 @@ class DiagnosisLine:
 
 
 @dataclass(frozen=True, slots=True)
-class Answered:
+class TestAnswer:
     """An answer that somebody gave."""
 
     test: str
@@ -92,7 +92,7 @@ class Answered:
 
 
 @dataclass(frozen=True, slots=True)
-class CauseSaid:
+class Cause:
     """What it was, as somebody says."""
 
     failure_mode: str
@@ -118,9 +118,9 @@ class DiagnosisDetail:
     id: str
     state: Literal["open", "healed"]
     revisions: list[dict[str, Any]]
-    answers: list[Answered]
+    answers: list[TestAnswer]
     server_revisions: list[ServerRevision]
-    causes: list[CauseSaid]
+    causes: list[Cause]
 
 
 @routes.get("/robots/{robot}/diagnoses", "diagnoses.read")
@@ -143,14 +143,16 @@ def read_diagnosis(robot: OfRobot, diagnosis: Name, fleet: Fleet) -> DiagnosisDe
         made = notebook.revisions(connection, robot.id, diagnosis)
     return DiagnosisDetail(
         known.id, known.last.state, [revision_json(revision) for revision in known.revisions],
-        [Answered(a.test, a.answer, a.who, format_time(a.at_ns)) for a in given],
+        [TestAnswer(a.test, a.answer, a.who, format_time(a.at_ns)) for a in given],
         [ServerRevision(r.number, r.who, format_time(r.at_ns), r.body) for r in made],
-        [CauseSaid(c.failure_mode, c.note, c.who, format_time(c.at_ns)) for c in said],
+        [Cause(c.failure_mode, c.note, c.who, format_time(c.at_ns)) for c in said],
     )  # fmt: skip
 
 
 @routes.post("/robots/{robot}/diagnose", "diagnoses.write")
-async def diagnose(robot: OfRobot, body: Question, fleet: Fleet, who: Who) -> dict[str, Any]:
+async def diagnose(
+    robot: OfRobot, body: DiagnosisQuestion, fleet: Fleet, who: Who
+) -> dict[str, Any]:
     """Ask what is broken, now or then: what ``amberbox diagnose --json`` says, with notes.
 
     Of a ``diagnosis``, the answers that were given to it before count as well. Nothing is kept.
@@ -168,7 +170,7 @@ async def diagnose(robot: OfRobot, body: Question, fleet: Fleet, who: Who) -> di
 
 @routes.post("/robots/{robot}/diagnoses/{diagnosis}/answers", "diagnoses.write")
 async def answer_test(
-    robot: OfRobot, diagnosis: Name, body: AnswerForm, fleet: Fleet, who: Who
+    robot: OfRobot, diagnosis: Name, body: NewAnswer, fleet: Fleet, who: Who
 ) -> dict[str, Any]:
     """Say what a test gave; the diagnosis is ranked anew, and kept as a revision of the server."""
     await asyncio.to_thread(_known, fleet, robot, diagnosis)
@@ -188,8 +190,8 @@ async def answer_test(
 
 @routes.post("/robots/{robot}/diagnoses/{diagnosis}/cause", "diagnoses.write", status_code=201)
 async def say_cause(
-    robot: OfRobot, diagnosis: Name, body: CauseForm, fleet: Fleet, who: Who
-) -> CauseSaid:
+    robot: OfRobot, diagnosis: Name, body: NewCause, fleet: Fleet, who: Who
+) -> Cause:
     """Say what it was in the end: a failure mode of the robot's analysis."""
     known = await asyncio.to_thread(_known, fleet, robot, diagnosis)
     await _check_mode(fleet, who, known, robot.id, body.failure_mode)
@@ -199,7 +201,7 @@ async def say_cause(
     )  # fmt: skip
     await asyncio.to_thread(_keep_cause, fleet, who, robot.id, diagnosis, cause)
     fleet.bus.publish(Change("diagnosis", robot.id, {"id": diagnosis}))
-    return CauseSaid(cause.failure_mode, cause.note, cause.who, format_time(cause.at_ns))
+    return Cause(cause.failure_mode, cause.note, cause.who, format_time(cause.at_ns))
 
 
 async def _ask(fleet: Services, who: Caller, asked: AskDiagnosis) -> bytes:
@@ -241,7 +243,7 @@ def _with_answers(asked: AskDiagnosis, before: dict[str, str]) -> AskDiagnosis:
 
 
 def _keep_answer(
-    fleet: Services, who: Caller, robot: str, diagnosis: str, body: AnswerForm,
+    fleet: Services, who: Caller, robot: str, diagnosis: str, body: NewAnswer,
     before: dict[str, str], answer: bytes,
 ) -> bool:  # fmt: skip
     """Keep an answer and what follows; False if somebody else has answered since ``before``."""

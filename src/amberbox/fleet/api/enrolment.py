@@ -27,7 +27,7 @@ _LONGEST_H = 90 * 24
 
 
 @dataclass(frozen=True, slots=True)
-class Enrolled:
+class EnrolledRobot:
     """The line to paste on the robot; its key is in it, and it is shown only here."""
 
     robot: str
@@ -36,7 +36,7 @@ class Enrolled:
 
 
 @dataclass(frozen=True, slots=True)
-class Key:
+class RobotKey:
     """A key as it is listed: what it opens is never shown again."""
 
     id: str
@@ -48,7 +48,7 @@ class Key:
 
 
 @dataclass(frozen=True, slots=True)
-class Registered:
+class RegisteredRobot:
     """A robot that was added."""
 
     robot: str
@@ -58,7 +58,7 @@ class Registered:
 
 
 @dataclass(frozen=True, slots=True)
-class Revoked:
+class RevokedKeys:
     """How many keys worked until now."""
 
     revoked: int
@@ -85,7 +85,7 @@ class NewKey(Form):
 
 
 @routes.post("/robots", "robots.write", status_code=201)
-def enrol(fleet: Fleet, who: Who, new: NewRobot) -> Enrolled:
+def enrol(fleet: Fleet, who: Who, new: NewRobot) -> EnrolledRobot:
     """Add a robot; the line to paste on it is in the answer and nowhere else."""
     with fleet.database.begin() as connection:
         now_ns = fleet.clock.wall_ns()
@@ -98,7 +98,7 @@ def enrol(fleet: Fleet, who: Who, new: NewRobot) -> Enrolled:
 
 
 @routes.patch("/robots/{robot}", "robots.write")
-def change(fleet: Fleet, who: Who, robot: OfRobot, new: ChangedRobot) -> Registered:
+def change(fleet: Fleet, who: Who, robot: OfRobot, new: ChangedRobot) -> RegisteredRobot:
     """Put a robot into other groups, close it, or open it again."""
     with fleet.database.begin() as connection:
         now_ns = fleet.clock.wall_ns()
@@ -108,7 +108,7 @@ def change(fleet: Fleet, who: Who, robot: OfRobot, new: ChangedRobot) -> Registe
         changed = robots.find_robot(connection, robot.id)
     _tell(fleet, robot.id)
     added, disabled = format_time(changed.added_ns), shown(changed.disabled_ns)
-    return Registered(changed.id, sorted(changed.groups), added, disabled)
+    return RegisteredRobot(changed.id, sorted(changed.groups), added, disabled)
 
 
 def _apply(connection: Connection, now_ns: int, robot: str, new: ChangedRobot) -> None:
@@ -121,7 +121,7 @@ def _apply(connection: Connection, now_ns: int, robot: str, new: ChangedRobot) -
 
 
 @routes.get("/robots/{robot}/keys", "robots.write")
-def list_keys(fleet: Fleet, robot: OfRobot) -> list[Key]:
+def list_keys(fleet: Fleet, robot: OfRobot) -> list[RobotKey]:
     """List the keys that a robot has had, newest first."""
     now_ns = fleet.clock.wall_ns()
     with fleet.database.reading() as connection:
@@ -129,7 +129,7 @@ def list_keys(fleet: Fleet, robot: OfRobot) -> list[Key]:
 
 
 @routes.post("/robots/{robot}/key", "robots.write", status_code=201)
-def replace_key(fleet: Fleet, who: Who, robot: OfRobot, new: NewKey | None = None) -> Enrolled:
+def replace_key(fleet: Fleet, who: Who, robot: OfRobot, new: NewKey | None = None) -> EnrolledRobot:
     """Give a robot a new key; the line to paste is in the answer and nowhere else."""
     overlap_h = (new or NewKey()).overlap_h
     with fleet.database.begin() as connection:
@@ -143,7 +143,7 @@ def replace_key(fleet: Fleet, who: Who, robot: OfRobot, new: NewKey | None = Non
 
 
 @routes.delete("/robots/{robot}/keys/{key}", "robots.write")
-def revoke_key(fleet: Fleet, who: Who, robot: OfRobot, key: Named) -> Revoked:
+def revoke_key(fleet: Fleet, who: Who, robot: OfRobot, key: Named) -> RevokedKeys:
     """Revoke one key of a robot, at once."""
     revoked = _revoke(fleet, who, robot.id, key)
     if not revoked.revoked:
@@ -152,12 +152,12 @@ def revoke_key(fleet: Fleet, who: Who, robot: OfRobot, key: Named) -> Revoked:
 
 
 @routes.delete("/robots/{robot}/keys", "robots.write")
-def revoke_keys(fleet: Fleet, who: Who, robot: OfRobot) -> Revoked:
+def revoke_keys(fleet: Fleet, who: Who, robot: OfRobot) -> RevokedKeys:
     """Revoke all keys of a robot, at once: it was stolen, or its card was."""
     return _revoke(fleet, who, robot.id, "")
 
 
-def _revoke(fleet: Services, who: Caller, robot: str, key: str) -> Revoked:
+def _revoke(fleet: Services, who: Caller, robot: str, key: str) -> RevokedKeys:
     with fleet.database.begin() as connection:
         now_ns = fleet.clock.wall_ns()
         revoked = robotkeys.revoke_keys(connection, now_ns, robot, key)
@@ -165,17 +165,17 @@ def _revoke(fleet: Services, who: Caller, robot: str, key: str) -> Revoked:
             told = {"key_id": key or "all", "revoked": revoked}
             who.note(connection, now_ns, "robots.key.revoke", robot, details=told)
     _tell(fleet, robot)
-    return Revoked(revoked)
+    return RevokedKeys(revoked)
 
 
-def _enrolled(fleet: Services, robot: str, secret: Secret) -> Enrolled:
+def _enrolled(fleet: Services, robot: str, secret: Secret) -> EnrolledRobot:
     ca = "" if fleet.settings.certificate is None else fingerprint(fleet.folder)
     line = join_line(fleet.settings.public_url, robot, secret.text, ca)
-    return Enrolled(robot, secret.id, str(line))
+    return EnrolledRobot(robot, secret.id, str(line))
 
 
-def _key(key: robotkeys.RobotKey, now_ns: int) -> Key:
-    return Key(
+def _key(key: robotkeys.RobotKey, now_ns: int) -> RobotKey:
+    return RobotKey(
         key.key_id,
         format_time(key.created_ns),
         shown(key.expires_ns),

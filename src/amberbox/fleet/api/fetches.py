@@ -33,7 +33,7 @@ class NewFetch(Form):
     to: TimeField
 
 
-class Journal(Shown):
+class FetchedJournal(Shown):
     """A journal of the window; ``state`` is empty until it has come."""
 
     store_id: str
@@ -42,7 +42,7 @@ class Journal(Shown):
     state: str
 
 
-class Window(Shown):
+class Fetch(Shown):
     """What was asked of a robot.
 
     ``state``: ``waiting`` for the robot, ``asked``, ``copying`` (``copied`` of ``journals``),
@@ -57,14 +57,14 @@ class Window(Shown):
     who: str
     state: State
     copied: int
-    journals: list[Journal]
+    journals: list[FetchedJournal]
     asked: str
     sent: str | None
     ended: str | None
 
 
 @routes.post("/robots/{robot}/fetches", "data.fetch", status_code=202)
-def ask_robot(fleet: Fleet, who: Who, robot: OfRobot, new: NewFetch) -> Window:
+def ask_robot(fleet: Fleet, who: Who, robot: OfRobot, new: NewFetch) -> Fetch:
     """Ask a robot for a window of its record: now, or as soon as it is connected."""
     from_ns, to_ns = span_in(fleet, robot.id, new.from_, new.to)
     if from_ns is None or to_ns is None:
@@ -82,21 +82,21 @@ def ask_robot(fleet: Fleet, who: Who, robot: OfRobot, new: NewFetch) -> Window:
 def list_fetches(
     fleet: Fleet, robot: OfRobot, limit: Limit = 100,
     after: Annotated[str, Query(max_length=64, description="the last id of the page before")] = "",
-) -> list[Window]:  # fmt: skip
+) -> list[Fetch]:  # fmt: skip
     """List what was asked of a robot, newest first."""
     with fleet.database.reading() as connection:
         return [_shown(one) for one in ledger.listed(connection, robot.id, after, limit)]
 
 
 @routes.get("/robots/{robot}/fetches/{id}", "data.query")
-def read_fetch(fleet: Fleet, robot: OfRobot, id: FetchId) -> Window:
+def read_fetch(fleet: Fleet, robot: OfRobot, id: FetchId) -> Fetch:
     """Tell how far it is."""
     with fleet.database.reading() as connection:
         return _shown(_find(connection, robot, id))
 
 
 @routes.delete("/robots/{robot}/fetches/{id}", "data.fetch")
-def cancel_fetch(fleet: Fleet, who: Who, robot: OfRobot, id: FetchId) -> Window:
+def cancel_fetch(fleet: Fleet, who: Who, robot: OfRobot, id: FetchId) -> Fetch:
     """Want it no more; journals that the robot has marked already may still come."""
     with fleet.database.begin() as connection:
         one, now_ns = _find(connection, robot, id), fleet.clock.wall_ns()
@@ -118,12 +118,12 @@ def _tell(fleet: Services, one: Fetched, *, ask: bool) -> None:
     fleet.bus.publish(Change("fetch", one.robot, {"id": one.id, "ask": ask}))
 
 
-def _shown(one: Fetched) -> Window:
+def _shown(one: Fetched) -> Fetch:
     files = [
-        Journal(store_id=f.store_id, journal=f.journal, bytes=f.bytes, state=f.state)
+        FetchedJournal(store_id=f.store_id, journal=f.journal, bytes=f.bytes, state=f.state)
         for f in one.files
     ]
-    return Window(
+    return Fetch(
         id=one.id, robot=one.robot, item=one.item, from_=format_time(one.from_ns),
         to=format_time(one.to_ns), who=one.who, state=one.state,
         copied=sum(bool(file.state) for file in files), journals=files,

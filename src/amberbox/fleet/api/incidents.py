@@ -28,7 +28,7 @@ _BEYOND_NS = 2**63
 """Times are 64 bits."""
 
 
-class IncidentShown(Shown):
+class Incident(Shown):
     """A window that is kept; ``state`` is ``open``, ``complete`` or ``released``."""
 
     id: str
@@ -53,7 +53,7 @@ class NewIncident(Form):
 def list_incidents(
     fleet: Fleet, who: Who, robot: OfRobot, from_: From = "", to: To = "", limit: Limit = 100,
     after: Annotated[str, Query(max_length=200, description="the last id of the page before")] = "",
-) -> list[IncidentShown]:  # fmt: skip
+) -> list[Incident]:  # fmt: skip
     """List the incidents of a robot that meet a range of time, newest first."""
     from_ns, to_ns = span_in(fleet, robot.id, from_, to)
     answer = fleet.asking.ask_now(f"{WORKER}:incidents", {"robot": robot.id}, asker=who.asker)
@@ -72,7 +72,7 @@ def list_incidents(
 
 
 @routes.post("/robots/{robot}/incidents", "incidents.write", status_code=201)
-def mark_incident(fleet: Fleet, who: Who, robot: OfRobot, new: NewIncident) -> IncidentShown:
+def mark_incident(fleet: Fleet, who: Who, robot: OfRobot, new: NewIncident) -> Incident:
     """Mark a window: what the server has of it, or gets, is kept until it is released.
 
     What is still on the robot is asked for with ``/fetches``.
@@ -91,7 +91,7 @@ def mark_incident(fleet: Fleet, who: Who, robot: OfRobot, new: NewIncident) -> I
 
 
 @routes.post("/robots/{robot}/incidents/{id}/release", "incidents.write")
-def release_incident(fleet: Fleet, who: Who, robot: OfRobot, id: IncidentId) -> IncidentShown:
+def release_incident(fleet: Fleet, who: Who, robot: OfRobot, id: IncidentId) -> Incident:
     """Let a window go that was marked here: retention counts for it again."""
     with fleet.database.begin() as connection:
         now_ns = fleet.clock.wall_ns()
@@ -101,9 +101,9 @@ def release_incident(fleet: Fleet, who: Who, robot: OfRobot, id: IncidentId) -> 
     return _of_server(released)
 
 
-def _of_robot(values: Mapping[str, Any]) -> IncidentShown:
+def _of_robot(values: Mapping[str, Any]) -> Incident:
     texts = {name: str(values.get(name) or "") for name in ("id", "state", "reason", "who")}
-    return IncidentShown(
+    return Incident(
         origin="robot", trigger=str(values.get("trigger") or ""),
         from_=_time(values.get("from_ns")), to=_time(values.get("to_ns")),
         **texts,
@@ -115,8 +115,8 @@ def _time(value: object) -> str:
     return format_time(value if isinstance(value, int) and abs(value) < _BEYOND_NS else 0)
 
 
-def _of_server(one: Marked) -> IncidentShown:
-    return IncidentShown(
+def _of_server(one: Marked) -> Incident:
+    return Incident(
         id=one.id, origin="server", state="complete" if one.released_ns is None else _RELEASED,
         reason=one.reason, who=one.who, trigger="", from_=format_time(one.from_ns),
         to=format_time(one.to_ns),

@@ -15,7 +15,7 @@ routes = Routes("data")
 
 
 @dataclass(frozen=True, slots=True)
-class Listed:
+class Item:
     """A data item or child table; ``source`` is ``amberbox`` for what the box says of itself."""
 
     name: str
@@ -40,7 +40,7 @@ class Variable:
 
 
 @dataclass(frozen=True, slots=True)
-class Described:
+class ItemDetail:
     """An item with its columns.
 
     ``stamp`` is the path of its own time stamp, ``chosen`` are the variables that the robot's
@@ -63,19 +63,19 @@ class Described:
 
 
 @routes.get("/robots/{robot}/items", "items.read")
-def list_items(fleet: Fleet, who: Who, robot: OfRobot) -> list[Listed]:
+def list_items(fleet: Fleet, who: Who, robot: OfRobot) -> list[Item]:
     """List the data items of a robot that the server has rows of, the box's own at the end."""
     answer = fleet.asking.ask_now(f"{WORKER}:items", {"robot": robot.id}, asker=who.asker)
-    return msgspec.json.decode(answer, type=list[Listed])
+    return msgspec.json.decode(answer, type=list[Item])
 
 
 @routes.get("/robots/{robot}/items/{item}", "items.read")
-def read_item(fleet: Fleet, who: Who, robot: OfRobot, item: ItemName) -> Described:
+def read_item(fleet: Fleet, who: Who, robot: OfRobot, item: ItemName) -> ItemDetail:
     """Describe a data item: columns with types, units and labels, over all its versions."""
     answer = fleet.asking.ask_now(
         f"{WORKER}:item", {"robot": robot.id, "item": item}, asker=who.asker
     )
-    found = msgspec.json.decode(answer, type=Described | None)
+    found = msgspec.json.decode(answer, type=ItemDetail | None)
     if found is None:
         raise HTTPException(404, f"there is no data item {item!r} of {robot.id}")
     return found

@@ -10,7 +10,8 @@ from fastapi import HTTPException, Path, Query
 from pydantic import Field
 from sqlalchemy import Connection
 
-from amberbox.blackbox.missions.mission import Mission, choose
+from amberbox.blackbox.missions.mission import Mission as Known
+from amberbox.blackbox.missions.mission import choose
 from amberbox.core.errors import UsageError
 from amberbox.core.timetext import format_time
 from amberbox.fleet.api.access import Caller, Fleet, OfRobot, Routes, Who
@@ -28,7 +29,7 @@ At = Annotated[str, Field(max_length=64, description="when it was; empty: now")]
 Origin = Literal["robot", "server"]
 
 
-class NoteShown(Shown):
+class Note(Shown):
     """A remark of somebody."""
 
     at: str
@@ -36,7 +37,7 @@ class NoteShown(Shown):
     text: str
 
 
-class MissionShown(Shown):
+class Mission(Shown):
     """A mission; ``to`` is null while it lasts, ``origin`` says who began it."""
 
     id: str
@@ -48,7 +49,7 @@ class MissionShown(Shown):
     failed: bool
     who: str
     parameters: dict[str, Any]
-    notes: list[NoteShown]
+    notes: list[Note]
 
 
 class NewMission(Form):
@@ -80,7 +81,7 @@ def list_missions(
     failed: Annotated[bool, Query(description="failed ones only")] = False,
     from_: From = "", to: To = "", limit: Limit = 100,
     after: Annotated[str, Query(max_length=200, description="the last id of the page before")] = "",
-) -> list[MissionShown]:  # fmt: skip
+) -> list[Mission]:  # fmt: skip
     """List the missions of a robot that meet a range of time, newest first."""
     span = span_in(fleet, robot.id, from_, to)
     known = _missions(fleet, who, robot.id)
@@ -92,7 +93,7 @@ def list_missions(
 
 
 @routes.get("/robots/{robot}/missions/{id}", "missions.read")
-def read_mission(fleet: Fleet, who: Who, robot: OfRobot, id: MissionId) -> MissionShown:
+def read_mission(fleet: Fleet, who: Who, robot: OfRobot, id: MissionId) -> Mission:
     """Return a mission with what people remarked on it."""
     mission = _find(fleet, who, robot.id, id)
     with fleet.database.reading() as connection:
@@ -100,7 +101,7 @@ def read_mission(fleet: Fleet, who: Who, robot: OfRobot, id: MissionId) -> Missi
 
 
 @routes.post("/robots/{robot}/missions", "missions.write", status_code=201)
-def begin_mission(fleet: Fleet, who: Who, robot: OfRobot, new: NewMission) -> MissionShown:
+def begin_mission(fleet: Fleet, who: Who, robot: OfRobot, new: NewMission) -> Mission:
     """Begin a mission; one of the same name that was begun here and still lasts ends."""
     if len(msgspec.json.encode(new.parameters)) > _PARAMETERS_BYTES:
         raise UsageError(f"parameters are longer than {_PARAMETERS_BYTES} bytes")
@@ -118,9 +119,7 @@ def begin_mission(fleet: Fleet, who: Who, robot: OfRobot, new: NewMission) -> Mi
 
 
 @routes.post("/robots/{robot}/missions/{id}/end", "missions.write")
-def end_mission(
-    fleet: Fleet, who: Who, robot: OfRobot, id: MissionId, how: EndMission
-) -> MissionShown:
+def end_mission(fleet: Fleet, who: Who, robot: OfRobot, id: MissionId, how: EndMission) -> Mission:
     """End a mission that was begun here; a robot's own mission ends there."""
     at_ns = _at(fleet, robot.id, how.at)
     with fleet.database.begin() as connection:
@@ -135,7 +134,7 @@ def end_mission(
 @routes.post("/robots/{robot}/missions/{id}/notes", "missions.write", status_code=201)
 def annotate_mission(
     fleet: Fleet, who: Who, robot: OfRobot, id: MissionId, new: NewNote
-) -> MissionShown:
+) -> Mission:
     """Remark something on a mission, a robot's own one too."""
     mission = _find(fleet, who, robot.id, id)
     with fleet.database.begin() as connection:
@@ -153,27 +152,27 @@ def _at(fleet: Services, robot: str, text: str) -> int:
     return fleet.clock.wall_ns() if found is None else found
 
 
-def _missions(fleet: Services, who: Caller, robot: str) -> list[Mission]:
+def _missions(fleet: Services, who: Caller, robot: str) -> list[Known]:
     answer = fleet.asking.ask_now(f"{WORKER}:missions", {"robot": robot}, asker=who.asker)
-    return msgspec.msgpack.decode(answer, type=list[Mission])
+    return msgspec.msgpack.decode(answer, type=list[Known])
 
 
-def _find(fleet: Services, who: Caller, robot: str, mission_id: str) -> Mission:
+def _find(fleet: Services, who: Caller, robot: str, mission_id: str) -> Known:
     for mission in _missions(fleet, who, robot):
         if mission.id == mission_id:
             return mission
     raise HTTPException(404, f"there is no such mission of {robot}")
 
 
-def _shown(connection: Connection, robot: str, found: Sequence[Mission]) -> list[MissionShown]:
+def _shown(connection: Connection, robot: str, found: Sequence[Known]) -> list[Mission]:
     noted = remarks.notes(connection, robot, [mission.id for mission in found])
     ours = {mission.id for mission in remarks.missions(connection, robot)}
     return [
-        MissionShown(
+        Mission(
             id=m.id, name=m.name, origin="server" if m.id in ours else "robot",
             from_=format_time(m.from_ns), to=shown(m.to_ns), outcome=m.outcome, failed=m.failed,
             who=m.who, parameters=dict(m.parameters),
-            notes=[NoteShown(at=format_time(n.at_ns), who=n.who, text=n.text)
+            notes=[Note(at=format_time(n.at_ns), who=n.who, text=n.text)
                    for n in noted.get(m.id, ())],
         )
         for m in found

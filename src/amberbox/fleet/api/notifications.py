@@ -43,14 +43,14 @@ class Notification:
     sent: str | None
 
 
-class Test(Form):
+class NotificationTest(Form):
     """The destination that is to be tried, by its name in the settings."""
 
     destination: Annotated[str, StringConstraints(min_length=1, max_length=64)]
 
 
 @dataclass(frozen=True, slots=True)
-class Tried:
+class NotificationTried:
     """Whether the test has arrived; if not, why."""
 
     arrived: bool
@@ -82,7 +82,7 @@ def list_notifications(
 
 
 @routes.post("/settings/notifications/test", "settings.write")
-def try_notification(fleet: Fleet, who: Who, body: Test) -> Tried:
+def try_notification(fleet: Fleet, who: Who, body: NotificationTest) -> NotificationTried:
     """Send a test to a destination of the settings, now, and tell whether it arrived."""
     now_ns = fleet.clock.wall_ns()
     with fleet.database.begin() as connection:
@@ -96,4 +96,4 @@ def try_notification(fleet: Fleet, who: Who, body: Test) -> Tried:
         {"type": "test"},
     )  # fmt: skip
     trouble = fleet.alarms.sender.deliver(to, message, setting, now_ns)
-    return Tried(not trouble, trouble)
+    return NotificationTried(not trouble, trouble)

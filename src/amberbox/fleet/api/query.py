@@ -56,7 +56,7 @@ class Rows:
     data: list[list[Any]]
 
 
-class Missing(Shown):
+class Gap(Shown):
     """A range without data, and why; ``count`` is None when nobody can know."""
 
     item: str
@@ -71,7 +71,7 @@ class Missing(Shown):
 class Gaps(Shown):
     """What is missing, in order of time; ``more`` says that the list was cut."""
 
-    gaps: list[Missing]
+    gaps: list[Gap]
     more: bool
 
 

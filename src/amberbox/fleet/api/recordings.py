@@ -17,7 +17,8 @@ from amberbox.fleet.api.windows import FROM, Shown
 from amberbox.fleet.archive.retaining import rule_of
 from amberbox.fleet.archive.store import Retention
 from amberbox.fleet.data import WORKER
-from amberbox.fleet.data.journals import Integrity, Recording, State, recordings
+from amberbox.fleet.data.journals import Integrity, State, recordings
+from amberbox.fleet.data.journals import Recording as Kept
 from amberbox.fleet.options.options import read
 from amberbox.fleet.services import Services
 
@@ -26,7 +27,7 @@ routes = Routes("recordings")
 _CHECKED = 50
 
 
-class RecordingShown(Shown):
+class Recording(Shown):
     """A journal on the server, or on its way to it.
 
     ``state``: ``copying`` (``copied`` of ``bytes``), ``waiting`` for its columns, ``in_columns``,
@@ -62,7 +63,7 @@ def list_recordings(
     check: Annotated[
         bool, Query(description=f"read each, at most {_CHECKED}, and compare its hash")
     ] = False,
-) -> list[RecordingShown]:  # fmt: skip
+) -> list[Recording]:  # fmt: skip
     """List the journals of a robot by name; without ``check`` their integrity is as last known."""
     if check and limit > _CHECKED:
         raise HTTPException(400, f"at most {_CHECKED} are checked at a time: give limit")
@@ -73,9 +74,7 @@ def list_recordings(
     return [_shown(one, robot.id, rules) for one in checked]
 
 
-def _checked(
-    fleet: Services, who: Caller, robot: str, found: Sequence[Recording]
-) -> Sequence[Recording]:
+def _checked(fleet: Services, who: Caller, robot: str, found: Sequence[Kept]) -> Sequence[Kept]:
     named = [
         [one.store_id, one.journal, one.sha256]
         for one in found
@@ -90,13 +89,13 @@ def _checked(
     ]
 
 
-def _shown(one: Recording, robot: str, rules: Sequence[Retention]) -> RecordingShown:
+def _shown(one: Kept, robot: str, rules: Sequence[Retention]) -> Recording:
     rule = rule_of(robot, one.keeping, rules)
     until = [
         None if seconds is None or one.came_ns is None else one.came_ns + int(seconds * NS)
         for seconds in (rule.journals_s, rule.columns_s)
     ] if rule is not None else [None, None]  # fmt: skip
-    return RecordingShown(
+    return Recording(
         store_id=one.store_id, journal=one.journal, keeping=one.keeping, sha256=one.sha256,
         state=one.state, integrity=one.integrity, reason=one.reason, bytes=one.bytes,
         copied=one.copied, rows=one.rows, from_=format_time(one.from_ns),

@@ -24,7 +24,7 @@ from amberbox.fleet.state.said import SaidEvent, moment, taken
 from amberbox.fleet.state.standing import Moment, clock_offsets_ns, silence, standings
 from amberbox.fleet.state.timeline import timeline
 from amberbox.fleet.state.tree import status_tree
-from amberbox.fleet.state.views import Card, StatusTree
+from amberbox.fleet.state.views import Robot, StatusTree
 
 routes = Routes("robots")
 
@@ -39,7 +39,7 @@ AfterNumber = Annotated[int, Query(ge=0, le=2**62, description="behind this numb
 
 
 @dataclass(frozen=True, slots=True)
-class EventView:
+class Event:
     """An event; ``at`` by the robot's clock, ``server_at`` by the server's where it is known.
 
     Store, writer, run and number are its place; ``aside`` says why it is not in the robot's record
@@ -62,7 +62,7 @@ class EventView:
 @routes.get("/robots", "status.read", each=True)
 def list_cards(
     fleet: Fleet, who: Who, group: Group = "", after: AfterName = "", limit: Limit = 1000
-) -> Sequence[Card]:
+) -> Sequence[Robot]:
     """Return the robots that one may see, by id; also those that never connected."""
     with fleet.database.reading() as connection:
         chosen = [
@@ -74,7 +74,7 @@ def list_cards(
 
 
 @routes.get("/robots/{robot}", "status.read")
-def read_card(fleet: Fleet, robot: OfRobot) -> Card:
+def read_card(fleet: Fleet, robot: OfRobot) -> Robot:
     """Return a robot at a glance."""
     with fleet.database.reading() as connection:
         return _cards(fleet, connection, [robot])[0]
@@ -126,7 +126,7 @@ def list_events(
     newest: bool = True,
     aside: bool = False,
     limit: Limit = 100,
-) -> Sequence[EventView]:
+) -> Sequence[Event]:
     """Return events of a robot in order of time: the newest of a range, or the first ones."""
     span = time_of(from_, fleet.clock), time_of(to, fleet.clock)
     searched = _SEARCHED if kind else limit
@@ -138,13 +138,13 @@ def list_events(
 @routes.get("/robots/{robot}/link", "status.read")
 def read_link(
     fleet: Fleet, robot: OfRobot, after: AfterNumber = 0, limit: Limit = 100
-) -> links.LinkView:
+) -> links.Link:
     """Return what is known of a robot's link, and what was noticed of it."""
     one = fleet.links.robots.get(robot.id)
     with fleet.database.reading() as connection:
         seen = _presence(connection, robot.id)
         last_ns = one.last_seen_ns if one else seen.last_seen_ns if seen else None
-        return links.LinkView(
+        return links.Link(
             robot.id, one is not None, moment(seen.connected_ns) if seen and one else None,
             moment(last_ns), seen.store_id if seen else "", seen.boot_id if seen else "",
             seen.config_hash if seen else "", seen.version if seen else "",
@@ -155,7 +155,7 @@ def read_link(
         )  # fmt: skip
 
 
-def _cards(fleet: Services, connection: Connection, robots: Sequence[KnownRobot]) -> list[Card]:
+def _cards(fleet: Services, connection: Connection, robots: Sequence[KnownRobot]) -> list[Robot]:
     state = fleet.feed.state
     return state.cards.of(connection, robots, fleet.clock.wall_ns())
 
@@ -165,11 +165,11 @@ def _presence(connection: Connection, robot: str) -> Presence | None:
     return known.get(robot)
 
 
-def _event(entry: Entry) -> EventView | None:
+def _event(entry: Entry) -> Event | None:
     said = taken(entry.values, SaidEvent)
     if said is None:
         return None
-    return EventView(
+    return Event(
         moment(entry.at_ns), moment(entry.server_ns), said.kind, said.text, said.source,
         said.details, entry.store_id, entry.writer, entry.run, entry.seq, entry.aside,
     )  # fmt: skip

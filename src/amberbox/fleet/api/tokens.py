@@ -25,7 +25,7 @@ Scope = Annotated[str, Field(max_length=64)]
 
 
 @dataclass(frozen=True, slots=True)
-class Listed:
+class Token:
     """A token as it is listed: its secret begins with ``prefix`` and is never shown again."""
 
     id: str
@@ -40,7 +40,7 @@ class Listed:
 
 
 @dataclass(frozen=True, slots=True)
-class Made:
+class MadeToken:
     """A new token; ``token`` is its secret, shown only here."""
 
     id: str
@@ -60,13 +60,13 @@ class NewToken(Form):
 
 
 @routes.get("/tokens", "own.read")
-def list_own(fleet: Fleet, who: Who) -> list[Listed]:
+def list_own(fleet: Fleet, who: Who) -> list[Token]:
     """List one's own tokens, those that are over too, newest first."""
     return _listed(fleet, who.principal.id)
 
 
 @routes.post("/tokens", "own.tokens", status_code=201)
-def make(fleet: Fleet, who: Who, new: NewToken) -> Made:
+def make(fleet: Fleet, who: Who, new: NewToken) -> MadeToken:
     """Make a token for a program; its secret is in the answer and nowhere else."""
     with fleet.database.begin() as connection:
         now_ns = fleet.clock.wall_ns()
@@ -79,7 +79,7 @@ def make(fleet: Fleet, who: Who, new: NewToken) -> Made:
         )
         told = {"name": new.name, "scopes": new.scopes, "days": new.days, "groups": new.groups}
         who.note(connection, now_ns, "tokens.make", secret.id, details=told)
-    return Made(secret.id, secret.text, format_time(now_ns + lasts_ns))
+    return MadeToken(secret.id, secret.text, format_time(now_ns + lasts_ns))
 
 
 @routes.delete("/tokens/{token}", "own.write", status_code=204)
@@ -89,7 +89,7 @@ def revoke_own(fleet: Fleet, who: Who, token: Named) -> None:
 
 
 @routes.get("/users/{name}/tokens", "users.read")
-def list_of(fleet: Fleet, name: Named) -> list[Listed]:
+def list_of(fleet: Fleet, name: Named) -> list[Token]:
     """List the tokens of somebody."""
     return _listed(fleet, name)
 
@@ -100,7 +100,7 @@ def revoke_of(fleet: Fleet, who: Who, name: Named, token: Named) -> None:
     _revoke(fleet, who, name, token)
 
 
-def _listed(fleet: Services, name: str) -> list[Listed]:
+def _listed(fleet: Services, name: str) -> list[Token]:
     with fleet.database.reading() as connection:
         user: User = find(connection, name)
         return [_shown(token) for token in tokens.list_tokens(connection, user.user_id)]
@@ -130,8 +130,8 @@ def _refuse_foreign(owner: User, groups: list[str] | None) -> None:
             raise UsageError(f"you are not for a group '{name}'", listed)
 
 
-def _shown(token: tokens.Token) -> Listed:
-    return Listed(
+def _shown(token: tokens.Token) -> Token:
+    return Token(
         token.token_id,
         token.name,
         token.prefix,

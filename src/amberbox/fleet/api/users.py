@@ -15,6 +15,7 @@ from amberbox.fleet.accounts.actions import Role
 from amberbox.fleet.accounts.onetime import one_time_password
 from amberbox.fleet.api.access import Fleet, Routes, Who
 from amberbox.fleet.api.forms import AfterName, Form, Id, Limit, Named, missing, shown
+from amberbox.fleet.api.session import EndedSessions, OpenSession
 from amberbox.fleet.bus import Change
 from amberbox.fleet.services import Services
 
@@ -37,37 +38,11 @@ class Person:
 
 
 @dataclass(frozen=True, slots=True)
-class People:
-    """A page of accounts, by name."""
-
-    people: list[Person]
-
-
-@dataclass(frozen=True, slots=True)
-class OneTime:
+class OneTimePassword:
     """A password that works for one login: it has to be changed then. It is shown only here."""
 
     name: str
     password: str
-
-
-@dataclass(frozen=True, slots=True)
-class Login:
-    """An open session; ``id`` revokes it."""
-
-    id: str
-    began: str
-    seen: str
-    ends: str
-    address: str
-    agent: str
-
-
-@dataclass(frozen=True, slots=True)
-class Ended:
-    """How many sessions were ended."""
-
-    ended: int
 
 
 class NewPerson(Form):
@@ -87,15 +62,15 @@ class ChangedPerson(Form):
 
 
 @routes.get("/users", "users.read")
-def list_people(fleet: Fleet, after: AfterName = "", limit: Limit = 100) -> People:
-    """List the accounts, closed ones too."""
+def list_people(fleet: Fleet, after: AfterName = "", limit: Limit = 100) -> list[Person]:
+    """List the accounts by name, closed ones too."""
     with fleet.database.reading() as connection:
         found = [user for user in users.list_users(connection) if user.name > after]
-    return People([person(user) for user in found[:limit]])
+    return [person(user) for user in found[:limit]]
 
 
 @routes.post("/users", "users.write", status_code=201)
-def add_person(fleet: Fleet, who: Who, new: NewPerson) -> OneTime:
+def add_person(fleet: Fleet, who: Who, new: NewPerson) -> OneTimePassword:
     """Add an account; its one-time password is in the answer and nowhere else."""
     password = one_time_password()
     hashed = fleet.passwords.hash(password)
@@ -107,7 +82,7 @@ def add_person(fleet: Fleet, who: Who, new: NewPerson) -> OneTime:
         told = {"role": new.role, "groups": new.groups}
         who.note(connection, now_ns, "users.add", new.name, details=told)
     _tell(fleet, new.name)
-    return OneTime(new.name, password)
+    return OneTimePassword(new.name, password)
 
 
 @routes.get("/users/{name}", "users.read")
@@ -143,7 +118,7 @@ def _apply(connection: Connection, now_ns: int, name: str, change: ChangedPerson
 
 
 @routes.post("/users/{name}/password", "users.write")
-def reset_password(fleet: Fleet, who: Who, name: Named) -> OneTime:
+def reset_password(fleet: Fleet, who: Who, name: Named) -> OneTimePassword:
     """Give somebody a one-time password; all their sessions end."""
     if name == who.principal.id:
         raise UsageError("this is your own account", "change your password with the old one")
@@ -155,11 +130,11 @@ def reset_password(fleet: Fleet, who: Who, name: Named) -> OneTime:
         users.set_password(connection, now_ns, name, hashed, must_change=True)
         who.note(connection, now_ns, "users.password", name)
     _tell(fleet, name)
-    return OneTime(name, password)
+    return OneTimePassword(name, password)
 
 
 @routes.get("/users/{name}/sessions", "users.read")
-def list_logins(fleet: Fleet, name: Named) -> list[Login]:
+def list_logins(fleet: Fleet, name: Named) -> list[OpenSession]:
     """List the open sessions of somebody, newest first."""
     with fleet.database.reading() as connection:
         user = find(connection, name)
@@ -168,14 +143,14 @@ def list_logins(fleet: Fleet, name: Named) -> list[Login]:
 
 
 @routes.delete("/users/{name}/sessions", "users.write")
-def end_logins(fleet: Fleet, who: Who, name: Named) -> Ended:
+def end_logins(fleet: Fleet, who: Who, name: Named) -> EndedSessions:
     """End all sessions of somebody."""
     with fleet.database.begin() as connection:
         ended = sessions.revoke_sessions(connection, find(connection, name).user_id)
         details = {"ended": ended}
         who.note(connection, fleet.clock.wall_ns(), "users.sessions.end", name, details=details)
     _tell(fleet, name)
-    return Ended(ended)
+    return EndedSessions(ended)
 
 
 def find(connection: Connection, name: str) -> users.User:
@@ -200,9 +175,9 @@ def person(user: users.User) -> Person:
     )
 
 
-def login(session: sessions.Session) -> Login:
+def login(session: sessions.Session) -> OpenSession:
     """Return a session as it is listed."""
-    return Login(
+    return OpenSession(
         session.session_id,
         format_time(session.created_ns),
         format_time(session.seen_ns),

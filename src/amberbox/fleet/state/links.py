@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from sqlalchemy import Connection, func, select
 
 from amberbox.core.clock import NS
-from amberbox.fleet.linkend.events import LinkEvent
 from amberbox.fleet.linkend.tables import ASIDE, BOOT, EVENT, HEADS, STORE, WRITER
 from amberbox.fleet.state.said import moment
 
@@ -17,7 +16,7 @@ _BOOTS = 50
 
 
 @dataclass(frozen=True, slots=True)
-class StoreView:
+class Store:
     """A store of a robot; ``cursor`` is run and number up to which each writer is held for good."""
 
     store_id: str
@@ -27,7 +26,7 @@ class StoreView:
 
 
 @dataclass(frozen=True, slots=True)
-class ClockView:
+class BootClock:
     """How far the server's clock was ahead in a boot; ``round_s`` bounds the error."""
 
     boot_id: str
@@ -37,7 +36,7 @@ class ClockView:
 
 
 @dataclass(frozen=True, slots=True)
-class HeadView:
+class SignedHead:
     """A robot's signed statement of how far its record reached, as it came."""
 
     store_id: str
@@ -47,7 +46,7 @@ class HeadView:
 
 
 @dataclass(frozen=True, slots=True)
-class LinkEventView:
+class LinkEvent:
     """Something that was noticed; ``number`` is for ``after``."""
 
     number: int
@@ -57,7 +56,7 @@ class LinkEventView:
 
 
 @dataclass(frozen=True, slots=True)
-class LinkView:
+class Link:
     """A robot's link. ``aside`` counts rows that are kept apart, by reason."""
 
     robot: str
@@ -70,14 +69,14 @@ class LinkView:
     version: str
     backlog_rows: int
     backlog_bytes: int
-    stores: Sequence[StoreView]
-    clocks: Sequence[ClockView]
-    heads: Sequence[HeadView]
+    stores: Sequence[Store]
+    clocks: Sequence[BootClock]
+    heads: Sequence[SignedHead]
     aside: dict[str, int]
-    events: Sequence[LinkEventView]
+    events: Sequence[LinkEvent]
 
 
-def stores(connection: Connection, robot: str) -> list[StoreView]:
+def stores(connection: Connection, robot: str) -> list[Store]:
     """Return the stores of a robot, the first one first."""
     cursors: dict[str, dict[str, tuple[int, int]]] = {}
     for row in connection.execute(select(WRITER).where(WRITER.c.robot == robot)):
@@ -86,18 +85,18 @@ def stores(connection: Connection, robot: str) -> list[StoreView]:
         select(STORE).where(STORE.c.robot == robot).order_by(STORE.c.first_seen_ns)
     )
     return [
-        StoreView(
+        Store(
             row.store_id, moment(row.first_seen_ns), row.public_key, cursors.get(row.store_id, {})
         )
         for row in rows
     ]
 
 
-def clocks(connection: Connection, robot: str) -> list[ClockView]:
+def clocks(connection: Connection, robot: str) -> list[BootClock]:
     """Return the clocks of a robot's newest boots, the newest first."""
     wanted = select(BOOT).where(BOOT.c.robot == robot).order_by(BOOT.c.at_ns.desc())
     return [
-        ClockView(
+        BootClock(
             row.boot_id, round(row.offset_ns / NS, 6), round(row.round_ns / NS, 6),
             moment(row.at_ns),
         )
@@ -105,11 +104,11 @@ def clocks(connection: Connection, robot: str) -> list[ClockView]:
     ]  # fmt: skip
 
 
-def heads(connection: Connection, robot: str) -> list[HeadView]:
+def heads(connection: Connection, robot: str) -> list[SignedHead]:
     """Return the newest statements of a robot, the newest first."""
     wanted = select(HEADS).where(HEADS.c.robot == robot).order_by(HEADS.c.at_ns.desc())
     return [
-        HeadView(row.store_id, row.sha256, moment(row.at_ns), row.heads.decode(errors="replace"))
+        SignedHead(row.store_id, row.sha256, moment(row.at_ns), row.heads.decode(errors="replace"))
         for row in connection.execute(wanted.limit(_HEADS))
     ]
 
@@ -121,16 +120,15 @@ def aside(connection: Connection, robot: str) -> dict[str, int]:
     return {row[0]: row[1] for row in rows}
 
 
-def events(connection: Connection, robot: str, after: int, limit: int) -> list[LinkEventView]:
+def events(connection: Connection, robot: str, after: int, limit: int) -> list[LinkEvent]:
     """Return what was noticed behind a number, oldest first; without one the newest."""
     wanted = select(EVENT).where(EVENT.c.robot == robot)
     if after:
         wanted = wanted.where(EVENT.c.number > after).order_by(EVENT.c.number)
     else:
         wanted = wanted.order_by(EVENT.c.number.desc())
-    found = [
-        LinkEvent(row.number, row.robot, row.at_ns, row.kind, row.text)
-        for row in connection.execute(wanted.limit(limit))
+    rows = connection.execute(wanted.limit(limit)).all()
+    return [
+        LinkEvent(row.number, moment(row.at_ns), row.kind, row.text)
+        for row in sorted(rows, key=lambda row: int(row.number))
     ]
-    found.sort(key=lambda event: event.number)
-    return [LinkEventView(e.number, moment(e.at_ns), e.kind, e.text) for e in found]

@@ -9,11 +9,11 @@ from amberbox.fleet.state.facts import ComponentFacts, Facts, OutputFacts
 from amberbox.fleet.state.said import SaidOutput
 from amberbox.fleet.state.standing import Moment, Standing
 from amberbox.fleet.state.views import (
-    ComponentView,
+    Component,
     Condition,
-    ModeView,
-    NeedView,
-    OutputView,
+    Mode,
+    Need,
+    Output,
     StatusTree,
 )
 
@@ -48,13 +48,13 @@ def _component(
     statuses: Sequence[Standing],
     levels: Mapping[tuple[str, str], str],
     when: Moment,
-) -> ComponentView:
+) -> Component:
     own = next((status for status in statuses if not status.said.mode), None)
     needs = [
-        NeedView(need.name, need.component, levels.get((need.component, need.mode), "unknown"))
+        Need(need.name, need.component, levels.get((need.component, need.mode), "unknown"))
         for need in facts.needs
     ]
-    return ComponentView(
+    return Component(
         facts.id, facts.name, facts.depth, facts.description, facts.part_of, needs, facts.rule,
         facts.recovery_actions, None if own is None else _condition(own, when),
         [_mode(status, facts, when) for status in statuses if status.said.mode],
@@ -70,14 +70,14 @@ def _condition(status: Standing, when: Moment) -> Condition:
     )  # fmt: skip
 
 
-def _mode(status: Standing, facts: ComponentFacts, when: Moment) -> ModeView:
+def _mode(status: Standing, facts: ComponentFacts, when: Moment) -> Mode:
     mode = status.said.mode
     planned = {output.name: output for output in facts.outputs.get(mode, ())}
     outputs = [_output(said, planned.get(said.name, _NOTHING)) for said in status.said.outputs]
-    return ModeView(mode, facts.names.get(mode, mode), _condition(status, when), outputs)
+    return Mode(mode, facts.names.get(mode, mode), _condition(status, when), outputs)
 
 
-def _output(said: SaidOutput, facts: OutputFacts) -> OutputView:
-    return OutputView(
+def _output(said: SaidOutput, facts: OutputFacts) -> Output:
+    return Output(
         said.name, said.type, said.shown, facts.expected, facts.severity, facts.description
     )

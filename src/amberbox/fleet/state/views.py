@@ -17,7 +17,7 @@ class Battery:
 
 
 @dataclass(frozen=True, slots=True)
-class MissionView:
+class OnMission:
     """The mission that a robot is on."""
 
     id: str
@@ -36,7 +36,7 @@ class Lead:
 
 
 @dataclass(frozen=True, slots=True)
-class Card:
+class Robot:
     """A robot at a glance.
 
     ``level`` is ``unknown`` where nobody can know; ``last_level`` is what it was then. ``cause``
@@ -61,12 +61,12 @@ class Card:
     components: Mapping[str, int]
     alarms: int
     battery: Battery | None
-    mission: MissionView | None
+    mission: OnMission | None
     diagnosis: Lead | None
 
 
 @dataclass(frozen=True, slots=True)
-class OutputView:
+class Output:
     """An output of a mode, and what is expected of it (empty: nothing)."""
 
     name: str
@@ -95,17 +95,17 @@ class Condition:
 
 
 @dataclass(frozen=True, slots=True)
-class ModeView:
+class Mode:
     """A mode of a component."""
 
     mode: str
     name: str
     condition: Condition
-    outputs: Sequence[OutputView]
+    outputs: Sequence[Output]
 
 
 @dataclass(frozen=True, slots=True)
-class NeedView:
+class Need:
     """What a component needs, and how that is."""
 
     name: str
@@ -114,7 +114,7 @@ class NeedView:
 
 
 @dataclass(frozen=True, slots=True)
-class ComponentView:
+class Component:
     """A component in the tree; ``condition`` is null where nothing was said of it."""
 
     component: str
@@ -122,11 +122,11 @@ class ComponentView:
     depth: int
     description: str
     part_of: str
-    needs: Sequence[NeedView]
+    needs: Sequence[Need]
     needs_rule: str
     recovery_actions: Sequence[str]
     condition: Condition | None
-    modes: Sequence[ModeView] = field(default=())
+    modes: Sequence[Mode] = field(default=())
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,4 +138,4 @@ class StatusTree:
     silence: str
     note: str
     clock_offset_s: float | None
-    components: Sequence[ComponentView]
+    components: Sequence[Component]
