@@ -105,8 +105,12 @@ def test_the_catalogue_prints_as_table_and_json(capsys: pytest.CaptureFixture[st
     ],
 )
 def test_wrong_usage_ends_with_a_hint(
-    arguments: list[str], part: str, capsys: pytest.CaptureFixture[str]
+    arguments: list[str],
+    part: str,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    monkeypatch.setattr("sys.stdin", io.StringIO())  # its orders: none
     assert main(arguments) in (1, 2)
     told = capsys.readouterr().err
     assert part in told and "hint:" in told
