@@ -18,6 +18,7 @@ from amberbox.fleet.feed.feed import Feed
 from amberbox.fleet.fetches.fetches import Fetches
 from amberbox.fleet.folders.folders import Folders
 from amberbox.fleet.jobs.jobs import Jobs
+from amberbox.fleet.knowledge.explained import Explained
 from amberbox.fleet.linkend.server import LinkServer
 from amberbox.fleet.serving.doorkeeper import Doorkeeper
 from amberbox.fleet.serving.settings import Settings
@@ -41,6 +42,7 @@ class Services:
     desk: Desk
     folders: Folders
     asking: Asking
+    explained: Explained
     jobs: Jobs
     fetches: Fetches
     alarms: Alarms

@@ -12,6 +12,8 @@ from amberbox.fleet.knowledge.moment import findings
 
 _MOST = 5_000
 """Revisions that are looked through for one page."""
+_FEW = 50
+"""Revisions that are looked through for the newest diagnosis alone."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,14 +35,20 @@ class Known:
 
 
 def diagnoses(
-    stores: Stores, robot: str, from_ns: int | None = None, to_ns: int | None = None
+    stores: Stores,
+    robot: str,
+    from_ns: int | None = None,
+    to_ns: int | None = None,
+    most: int = _MOST,
 ) -> list[Known]:
     """Return a robot's diagnoses of which something was written in a range, the newest first.
+
+    The newest ``most`` revisions are looked at.
 
     A file of the watcher begins with what stands, so a revision may be written several times; it
     counts once.
     """
-    found = entries(stores, robot, reserved.DIAGNOSIS, (from_ns, to_ns), _MOST, newest=True)
+    found = entries(stores, robot, reserved.DIAGNOSIS, (from_ns, to_ns), most, newest=True)
     by_id: dict[str, dict[tuple[int, str], Diagnosis]] = {}
     for diagnosis in findings(found, Diagnosis):
         revisions = by_id.setdefault(diagnosis.id, {})
@@ -52,6 +60,11 @@ def diagnoses(
 def find(stores: Stores, robot: str, name: str) -> Known | None:
     """Return one diagnosis; None if the robot made none of this id."""
     return next((one for one in diagnoses(stores, robot) if one.id == name), None)
+
+
+def newest(stores: Stores, robot: str) -> Known | None:
+    """Return what a robot found last, with its newest revisions; quicker than all of them."""
+    return next(iter(diagnoses(stores, robot, most=_FEW)), None)
 
 
 def page(found: Sequence[Known], after: str, limit: int) -> list[Known]:

@@ -22,6 +22,7 @@ from amberbox.fleet.fetches.fetches import Fetches
 from amberbox.fleet.folders.folders import Folders
 from amberbox.fleet.jobs.jobs import Jobs
 from amberbox.fleet.knowledge.announcing import announce
+from amberbox.fleet.knowledge.explained import Explained
 from amberbox.fleet.linkend.server import Hooks, LinkServer
 from amberbox.fleet.linkend.tables import STORE
 from amberbox.fleet.part import Part
@@ -48,7 +49,7 @@ def assemble(
     bus = Bus()
     announce(bus)
     archive = FolderArchive(folder, database, clock)
-    asking = Asking(folder, database, bus, clock)
+    asking = Asking(folder)
     folders = Folders(folder, database, bus, clock, asking)
     links = LinkServer(database, _hooks(bus, folders), clock)
     state = State(database, archive, bus, links, folders, asking)
@@ -63,6 +64,7 @@ def assemble(
         folder=folder, settings=settings, clock=clock, database=database,
         passwords=passwords or Passwords(), bus=bus, archive=archive, links=links, desk=desk,
         folders=folders, asking=asking,
+        explained=Explained(database, archive, bus, clock, asking),
         jobs=Jobs(folder, database, bus, clock), fetches=Fetches(database, bus, clock, links),
         alarms=Alarms(database, bus, clock, settings.public_url),
         feed=Feed(database, bus, clock, links, state),
@@ -75,8 +77,8 @@ def assemble(
 def parts(services: Services) -> Sequence[Part]:
     """Return what works in the background."""
     return (
-        services.folders, services.asking, services.jobs, services.fetches, services.alarms,
-        services.feed, services.system, services.keeping, services.doors,
+        services.folders, services.asking, services.explained, services.jobs, services.fetches,
+        services.alarms, services.feed, services.system, services.keeping, services.doors,
     )  # fmt: skip
 
 
