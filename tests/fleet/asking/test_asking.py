@@ -15,7 +15,6 @@ from typing import Any
 
 import pytest
 
-from amberbox.core.clock import SystemClock
 from amberbox.core.errors import AmberboxError, UsageError
 from amberbox.fleet.asking import asking as module
 from amberbox.fleet.asking.asking import ANSWER_BYTES, Asking
@@ -24,8 +23,6 @@ from amberbox.fleet.asking.frames import Unpacker, packed
 from amberbox.fleet.asking.pool import Pool
 from amberbox.fleet.asking.question import Question
 from amberbox.fleet.asking.waiting import Waiting
-from amberbox.fleet.bus import Bus
-from amberbox.fleet.database.database import FILE, Database
 from tests.fleet.asking.program import MODULE
 
 PROGRAM = "tests.fleet.asking.program"
@@ -34,12 +31,10 @@ PROGRAM = "tests.fleet.asking.program"
 @pytest.fixture(scope="module")
 def asking(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Asking]:
     folder = tmp_path_factory.mktemp("server")
-    database = Database(folder / FILE, SystemClock())
     pool = Pool(folder, most=6, each=3, program=PROGRAM)
-    found = Asking(folder, database, Bus(), SystemClock(), pool)
+    found = Asking(folder, pool)
     yield found
     found.close()
-    database.close()
 
 
 def op(name: str) -> str:
@@ -209,8 +204,7 @@ def test_workers_are_started_before_somebody_asks(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(module, "_WARM_S", 0.0)
-    database = Database(tmp_path / FILE, SystemClock())
-    fresh = Asking(tmp_path, database, Bus(), SystemClock())
+    fresh = Asking(tmp_path)
 
     async def run() -> None:
         task = asyncio.create_task(fresh.run())
@@ -223,7 +217,6 @@ def test_workers_are_started_before_somebody_asks(
         asyncio.run(run())
     finally:
         fresh.close()
-        database.close()
 
 
 def test_many_threads_ask_at_once(asking: Asking) -> None:

@@ -8,12 +8,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import IO, Any, cast
 
-from amberbox.core.clock import Clock
 from amberbox.fleet.asking.errors import LimitError
 from amberbox.fleet.asking.pool import Pool
 from amberbox.fleet.asking.question import Question, Sink
-from amberbox.fleet.bus import Bus
-from amberbox.fleet.database.database import Database
 
 LIMIT_S = 20.0
 MEMORY_BYTES = 1 << 30
@@ -35,13 +32,8 @@ class Asking:
     BusyError when too many wait. ``asker`` is whose question it is: askers take turns.
     """
 
-    def __init__(
-        self, folder: Path, database: Database, bus: Bus, clock: Clock, pool: Pool | None = None
-    ) -> None:
+    def __init__(self, folder: Path, pool: Pool | None = None) -> None:
         self._folder = folder
-        self._database = database
-        self._bus = bus
-        self._clock = clock
         self._pool = pool or Pool(folder, _WORKERS)
 
     @property
