@@ -1,0 +1,255 @@
+"""The card that answers what is broken: made of what the server says about a diagnosis.
+
+It has the same parts wherever it stands: what is broken, how sure, why, whether the robot can be
+used, what to do next. Texts about the robot come from its own list of what can fail.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, TypeAlias
+from urllib.parse import quote, urlencode
+
+from amberbox.core.clock import NS
+from amberbox.core.sureness import percent
+from amberbox.core.timetext import format_time
+
+REASONS = 3
+"""How many sentences say why."""
+LIKELY = 0.5
+"""From which probability on one cause is called likely."""
+BEFORE_NS, AFTER_NS = 60 * NS, 60 * NS
+"""So much of the data is shown around the moment at which something was seen."""
+CANNOT = "cannot"
+
+Sure: TypeAlias = Literal["", "likely", "possible", "cannot_tell_apart"]
+Kind: TypeAlias = Literal["fault", "false_alarm", "other"]
+Answer: TypeAlias = Mapping[str, Any]
+
+_SEVERITIES = ("warning", "urgent", "critical", "fatal")
+_UNKNOWN = "unknown#other"
+
+
+@dataclass(frozen=True, slots=True)
+class Cause:
+    """What may be broken; ``share`` is how probable it is, in words."""
+
+    id: str
+    text: str
+    share: str
+    kind: Kind = "fault"
+    comes_from: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Reason:
+    """What was seen, since when, and where the data of that moment are."""
+
+    text: str
+    at: str | None
+    href: str
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """An answer to a test: ``value`` is what is sent, ``leads`` what it would mean."""
+
+    value: str
+    chance: str = ""
+    leads: str = ""
+    then: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Next:
+    """What to do next; without ``test`` there is nothing to answer."""
+
+    text: str
+    test: str = ""
+    role: str = ""
+    minutes: str = ""
+    risk: str = ""
+    choices: Sequence[Choice] = ()
+    remedies: Sequence[str] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class DiagnosisCard:
+    """A diagnosis for people.
+
+    ``state`` is ``none`` where nothing is known to be broken; then ``at`` is up to when that is
+    known. ``complete`` is false while only the robot's own words are known, without explanation.
+    ``more`` counts what was seen beyond ``why``. ``number`` is empty where there is none.
+    """
+
+    robot: str
+    state: Literal["open", "healed", "none"]
+    at: str | None
+    diagnosis: str = ""
+    revision: int = 0
+    causes: Sequence[Cause] = ()
+    sure: Sure = ""
+    number: str = ""
+    why: Sequence[Reason] = ()
+    more: int = 0
+    severity: str = ""
+    use: str = ""
+    lost: Sequence[str] = ()
+    careful: str = ""
+    next: Next | None = None
+    complete: bool = True
+    answers: Mapping[str, str] | None = None
+    notes: Sequence[str] = ()
+
+
+def nothing_broken(robot: str, at: str | None, notes: Sequence[str] = ()) -> DiagnosisCard:
+    """Return the card of a robot of which nothing is known to be broken."""
+    return DiagnosisCard(robot, "none", at, notes=tuple(notes))
+
+
+def card_of(answer: Answer, until_ns: int | None = None) -> DiagnosisCard:
+    """Return the card of an answer of ``POST .../diagnose``.
+
+    ``until_ns``: data after this are not linked to.
+    """
+    told, robot = answer["explanation"], str(answer["robot"])
+    if told is None:
+        return nothing_broken(robot, answer["at"], answer.get("notes", ()))
+    causes = tuple(_told_causes(told["broken"]))
+    probability = told["sure"]["probability"]
+    seen = told["because"] or told["unexplained"]
+    return DiagnosisCard(
+        robot, answer["state"], answer["at"], answer["id"], answer["revision"], causes,
+        _sure(causes, probability), percent(probability) if causes else "",
+        tuple(_reason(robot, one, until_ns) for one in seen[:REASONS]),
+        max(0, len(seen) - REASONS),
+        told["use"]["severity"], _sentence(told["use"]["text"]),
+        tuple(lost["text"] for lost in told["use"]["lost"]), _sentence(told["use"]["careful"]),
+        _told_next(told["next"], answer["next_tests"]),
+        answers=answer.get("answers"), notes=tuple(answer.get("notes", ())),
+    )  # fmt: skip
+
+
+def plain_card_of(revision: Answer) -> DiagnosisCard:
+    """Return the card of a robot's own words alone: causes are called by their ids."""
+    group = next(iter(revision["groups"]), None)
+    faults = group["faults"] if group else []
+    shares = {entry["id"]: entry["probability"] for entry in revision["hypotheses"]}
+    causes = tuple(
+        _plain_cause(ids, shares.get(name)) for name, ids in zip(
+            group["members"] if group else (), faults, strict=False)
+    )  # fmt: skip
+    probability = group["probability"] if group else 0.0
+    robot, names = str(revision["robot"]), revision.get("symptoms", [])
+    return DiagnosisCard(
+        robot, revision["state"], revision["at"], revision["id"], revision["revision"], causes,
+        _sure(causes, probability), percent(probability) if causes else "",
+        tuple(Reason(_sentence(_readable(name)), revision["at"],
+                     data_href(robot, (), revision["at_ns"])) for name in names[:REASONS]),
+        max(0, len(names) - REASONS),
+        next=_plain_next(revision["next_tests"]), complete=False,
+    )  # fmt: skip
+
+
+def data_href(
+    robot: str, addresses: Sequence[str], at_ns: int | None, until_ns: int | None = None
+) -> str:
+    """Return where the data of a moment are shown, with these variables."""
+    query = [("v", address) for address in dict.fromkeys(addresses) if "/" not in address]
+    if at_ns is not None:
+        to_ns = (
+            at_ns + AFTER_NS if until_ns is None else max(at_ns, min(until_ns, at_ns + AFTER_NS))
+        )
+        query += [("from", _text(at_ns - BEFORE_NS)), ("to", _text(to_ns))]
+    return f"/robots/{quote(robot, safe='')}/data?{urlencode(query)}"
+
+
+def _told_causes(broken: Answer | None) -> Iterator[Cause]:
+    for member in broken["members"] if broken else ():
+        ids = [fault["id"] for fault in member["faults"]]
+        comes_from = "; ".join(fault["cause"] for fault in member["faults"] if fault["cause"])
+        yield Cause(member["id"], _capital(member["text"]), percent(member["probability"]),
+                    _kind(ids), comes_from)  # fmt: skip
+
+
+def _plain_cause(ids: Sequence[str], probability: float | None) -> Cause:
+    text = " + ".join(_capital(_readable(name.replace("#", ": "))) for name in ids)
+    share = "" if probability is None else percent(probability)
+    return Cause(" ".join(ids), text, share, _kind(ids))
+
+
+def _kind(ids: Sequence[str]) -> Kind:
+    if not ids:
+        return "false_alarm"
+    return "other" if list(ids) == [_UNKNOWN] else "fault"
+
+
+def _sure(causes: Sequence[Cause], probability: float) -> Sure:
+    if len(causes) > 1:
+        return "cannot_tell_apart"
+    if not causes:
+        return ""
+    return "likely" if probability >= LIKELY else "possible"
+
+
+def _reason(robot: str, seen: Answer, until_ns: int | None) -> Reason:
+    onset_ns = seen["onset_ns"]
+    return Reason(
+        _sentence(seen["text"]), None if onset_ns is None else format_time(onset_ns),
+        data_href(robot, seen["measured_from"], onset_ns, until_ns),
+    )  # fmt: skip
+
+
+def _told_next(step: Answer, tests: Sequence[Answer]) -> Next:
+    cost_s = next((test["cost_s"] for test in tests if test["id"] == step["test"]), 0.0)
+    choices = [
+        Choice(b["answer"], percent(b["probability"]), _capital(b["leads"]), percent(b["then"]))
+        for b in step["answers"]
+    ]
+    return Next(
+        _sentence(step["text"]), step["test"], step["by"], minutes(cost_s) or step["takes"],
+        step["risk"], _in_order(choices) if step["test"] else (),
+        tuple(_sentence(text) for text in step["remedies"]),
+    )  # fmt: skip
+
+
+def _plain_next(tests: Sequence[Answer]) -> Next | None:
+    if not tests:
+        return None
+    test = tests[0]
+    choices = [Choice(value, percent(chance)) for value, chance in test["outcomes"].items()]
+    return Next(_sentence(test["text"]), test["id"], test["role"], minutes(test["cost_s"]),
+                choices=_in_order(choices))  # fmt: skip
+
+
+def _in_order(choices: Sequence[Choice]) -> tuple[Choice, ...]:
+    """Put yes before no, whatever is more probable; others stay as they are."""
+    rank = {"yes": 0, "no": 1}
+    return tuple(sorted(choices, key=lambda choice: rank.get(choice.value, 2)))
+
+
+def minutes(seconds: float) -> str:
+    """Write how many minutes something takes: half a minute at least."""
+    if seconds <= 0:
+        return ""
+    if seconds <= 45:
+        return "½"
+    return f"{max(1, round(seconds / 60))}"
+
+
+def _readable(name: str) -> str:
+    return re.sub(r"[_/\s]+", " ", name).strip()
+
+
+def _capital(text: str) -> str:
+    return text[:1].upper() + text[1:]
+
+
+def _sentence(text: str) -> str:
+    return _capital(text) + ("" if not text or text[-1] in ".!?" else ".")
+
+
+def _text(at_ns: int) -> str:
+    return f"{format_time(at_ns)[:23]}Z"
