@@ -69,7 +69,10 @@ class NewCause(Form):
 
 @dataclass(frozen=True, slots=True)
 class DiagnosisLine:
-    """A diagnosis in a list; ``faults`` and ``probability`` are those of the leading hypothesis."""
+    """A diagnosis in a list; ``faults`` and ``probability`` are those of the leading hypothesis.
+
+    ``first`` and ``last`` are when its first and its last revision was made.
+    """
 
     id: str
     state: Literal["open", "healed"]

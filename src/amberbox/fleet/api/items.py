@@ -16,7 +16,10 @@ routes = Routes("data")
 
 @dataclass(frozen=True, slots=True)
 class Item:
-    """A data item or child table; ``source`` is ``amberbox`` for what the box says of itself."""
+    """A data item or child table; ``source`` is ``amberbox`` for what the box says of itself.
+
+    ``first`` and ``last`` are when its first and its last row was received.
+    """
 
     name: str
     source: str
