@@ -44,8 +44,8 @@ def _configure(connection: Any, record: object) -> None:
 class House:
     """A server without a network: ``client(name)`` is somebody who is signed in."""
 
-    def __init__(self, folder: Path, app: FastAPI | None = None) -> None:
-        self.clock = ManualClock(START_NS)
+    def __init__(self, folder: Path, app: FastAPI | None = None, start_ns: int = START_NS) -> None:
+        self.clock = ManualClock(start_ns)
         self.passwords = Passwords(Cost(1, 8, 1))
         self.keys: dict[str, str] = {}
         with patch.object(database, "_configure", _configure):

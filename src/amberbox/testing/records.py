@@ -50,12 +50,13 @@ class FakeRun:
     store: Path
     writer: str = "main"
     items: Sequence[FakeItem] = ()
+    boot: str = ""
     _channels: dict[Topic | str, int] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         store = create_store(self.store)
         self.run = store.next_run()
-        boot = f"{self.run:08x}"
+        boot = self.boot or f"{self.run:08x}"
         folder = self.store / FOLDERS[self.writer]
         self.journal = JournalWriter(JournalOptions(folder, store.id, self.writer, self.run, boot))
 

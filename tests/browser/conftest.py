@@ -1,0 +1,131 @@
+"""One real server and one real browser for all tests of pages.
+
+A test of a page::
+
+    import pytest
+    from tests.browser.conftest import PageAs
+    from tests.browser.looks import axe, no_sideways_scroll, shot
+    from tests.browser.site import Site
+
+    @pytest.mark.parametrize("theme", ["light", "dark"])
+    def test_the_fleet(page_as: PageAs, site: Site, theme: str) -> None:
+        page = page_as("viewer", width=390, theme=theme)
+        page.goto("/")                                   # paths are those of the site
+        page.get_by_role("link", name="ropod_001").wait_for()
+        site.say("ropod_002", "wifi", "error", reason="no network")   # comes over the link
+        page.get_by_text("wifi: no network").wait_for()  # and over the feed
+        axe(page), no_sideways_scroll(page), shot(page, "fleet")
+
+At the end of a test each of its pages is closed, and the test fails when one had an error on its
+console, an error in a script, an answer of 400 or more, or asked anybody but the site. What is
+meant to happen is named by a word of its line: ``page_as("viewer", expects=["404 GET"])``; while
+the server is restarted ``expects=RESTART`` (``tests/browser/watching.py``).
+
+- ``site`` (site.py): ``url``, ``restart()``, ``ask("/robots")``, ``session(name)``; ``site.robots``
+  are the robots (robot.py) that one lets find something: ``change``, ``status``, ``say``,
+  ``tell`` (an event), ``measure`` (live values), and who ``silence()``, ``wake()``, ``leave()``
+  and ``come()``. What a test changes it puts right again: all tests share one site.
+  What was recorded and said stands in record.py and story.py, hostile names in hostile.py.
+- People: viewer, operator, technician, admin, and nurse, a technician for the ward only.
+- ``expect`` of Playwright, in a module: ``from tests.browser.expecting import expect``.
+- Screenshots go to the folder $AMBERBOX_SHOTS.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Iterator, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING, Protocol
+from urllib.parse import urlsplit
+
+import pytest
+
+from amberbox.fleet.api.who import COOKIE
+from tests.browser.chromium import chromium
+from tests.browser.site import Site, made
+from tests.browser.watching import Watched
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser, BrowserContext, Page
+
+_HERE = Path(__file__).parent
+_WAIT_MS = 10_000
+_OPEN: pytest.StashKey[ExitStack] = pytest.StashKey()
+
+
+class PageAs(Protocol):
+    """Opens pages of somebody; of nobody without a name."""
+
+    watched: list[Watched]
+
+    def __call__(
+        self, name: str = "", width: int = 1440, theme: str = "light", *, height: int = 900,
+        expects: Sequence[str] = (), **options: object,
+    ) -> Page: ...  # fmt: skip
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_teardown(
+    item: pytest.Item, nextitem: pytest.Item | None
+) -> Generator[None, None, None]:
+    """End browser and server behind the last test here: Playwright's loop would be in the way."""
+    yield
+    if nextitem is None or _HERE not in nextitem.path.parents:
+        item.config.stash.setdefault(_OPEN, ExitStack()).close()
+
+
+@pytest.fixture(scope="session")
+def site(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Site:
+    """The server with its robots."""
+    _ = request.getfixturevalue("browser")  # without one there is no use in a server
+    opened = request.config.stash.setdefault(_OPEN, ExitStack())
+    return opened.enter_context(made(tmp_path_factory.mktemp("site")))
+
+
+@pytest.fixture(scope="session")
+def browser(request: pytest.FixtureRequest) -> Browser:
+    """The browser."""
+    opened = request.config.stash.setdefault(_OPEN, ExitStack())
+    return opened.enter_context(chromium())
+
+
+class _Pages:
+    def __init__(self, browser: Browser, site: Site) -> None:
+        self._browser, self._site = browser, site
+        self.watched: list[Watched] = []
+
+    def __call__(
+        self, name: str = "", width: int = 1440, theme: str = "light", *, height: int = 900,
+        expects: Sequence[str] = (), **options: object,
+    ) -> Page:  # fmt: skip
+        more = {"locale": "en-GB", "timezone_id": "Europe/Berlin", **options}
+        context = self._browser.new_context(
+            base_url=self._site.url, viewport={"width": width, "height": height},
+            color_scheme="dark" if theme == "dark" else "light", **more,  # type: ignore[arg-type]  # Playwright's own options, by name
+        )  # fmt: skip
+        context.set_default_timeout(_WAIT_MS)
+        self._set(context, "theme", theme)
+        if name:
+            self._set(context, COOKIE, self._site.session(name))
+        page = context.new_page()
+        self.watched.append(Watched(page, self._site.url, expects))
+        return page
+
+    def _set(self, context: BrowserContext, name: str, value: str) -> None:
+        host = urlsplit(self._site.url).hostname
+        context.add_cookies([{"name": name, "value": value, "domain": host, "path": "/"}])
+
+    def close(self) -> None:
+        for one in self.watched:
+            one.page.context.close()
+
+
+@pytest.fixture
+def page_as(browser: Browser, site: Site) -> Iterator[PageAs]:
+    """What opens pages; the test fails at its end when something went wrong in one of them."""
+    pages = _Pages(browser, site)
+    yield pages
+    pages.close()
+    troubles = [f"{one.page.url}: {trouble}" for one in pages.watched for trouble in one.troubles]
+    assert not troubles, "\n".join(troubles)

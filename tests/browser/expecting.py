@@ -1,0 +1,13 @@
+"""Playwright's ``expect``; modules that import it are skipped where Playwright is missing."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.browser.chromium import NO_PLAYWRIGHT
+
+pytest.importorskip("playwright.sync_api", reason=NO_PLAYWRIGHT)
+
+from playwright.sync_api import expect  # only where it is there
+
+__all__ = ["expect"]

@@ -1,0 +1,58 @@
+"""Judge how a page is made: for people who cannot see it, on narrow screens; and look at it."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Page
+
+NO_AXE = "the package axe-playwright-python is missing: pip install 'amberbox[test]'"
+SHOTS = "AMBERBOX_SHOTS"
+_GRAVE = ("serious", "critical")
+_OPTIONS = {"resultTypes": ["violations"]}
+_WIDER = """() => {
+    const room = document.documentElement.clientWidth
+    const sticksOut = (e) => e.getBoundingClientRect().right > room + 1 && !e.closest(".scroll, pre")
+    const names = [...document.querySelectorAll("body *")].filter(sticksOut).map(
+        (e) => e.tagName.toLowerCase() + (e.id ? "#" + e.id : "") + [...e.classList].map((c) => "." + c).join(""))
+    return document.documentElement.scrollWidth > room ? names.slice(0, 8).concat("(page)") : []
+}"""
+
+
+def axe(page: Page, within: str | None = None) -> None:
+    """Fail where people with impairments would be stopped (impact serious or critical)."""
+    found = pytest.importorskip("axe_playwright_python.sync_playwright", reason=NO_AXE)
+    violations = found.Axe().run(page, within, _OPTIONS).response["violations"]
+    grave = [_in_words(one) for one in violations if one["impact"] in _GRAVE]
+    assert not grave, "\n".join([page.url, *grave])
+
+
+def _in_words(violation: dict[str, Any]) -> str:
+    nodes = [
+        f"    {' '.join(map(str, node['target']))}: {node.get('failureSummary', '')!r}"
+        for node in violation["nodes"][:5]
+    ]
+    head = f"{violation['impact']}: {violation['id']}: {violation['help']}"
+    return "\n".join([f"{head} ({len(violation['nodes'])} places)", *nodes])
+
+
+def no_sideways_scroll(page: Page) -> None:
+    """Fail when the page is wider than its window; tables scroll in a ``.scroll`` of their own."""
+    assert page.evaluate(_WIDER) == [], f"{page.url} is wider than its window"
+
+
+def shot(page: Page, name: str, *, whole: bool = True) -> Path:
+    """Write ``<name>-<width>-<theme>.png`` to the folder $AMBERBOX_SHOTS; return where."""
+    folder = Path(os.environ.get(SHOTS) or Path(tempfile.gettempdir()) / "amberbox-shots")
+    folder.mkdir(parents=True, exist_ok=True)
+    dark = page.evaluate("() => matchMedia('(prefers-color-scheme: dark)').matches")
+    width = (page.viewport_size or {}).get("width", 0)
+    path = folder / f"{name}-{width}-{'dark' if dark else 'light'}.png"
+    page.screenshot(path=path, full_page=whole)
+    return path

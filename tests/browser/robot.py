@@ -1,0 +1,175 @@
+"""Robots that are linked with a real store and the robot's own client, and do what tests say."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+import time
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from amberbox.blackbox.keeper.ownjournal import OwnJournal, event
+from amberbox.blackbox.keeper.ownstreams import Own
+from amberbox.blackbox.store import WriterLock, create_store
+from amberbox.core.types import Level, Output, Status
+from amberbox.link.backoff import Backoff
+from amberbox.monitoring.engine.findings import Condition, Finding, Transition
+from amberbox.monitoring.messages.records import encoded, record_of
+from amberbox.robot.link.client import LinkClient
+from amberbox.robot.link.network import Network
+from amberbox.robot.link.options import LinkOptions
+from amberbox.testing.records import FakeItem, FakeRun
+from tests.browser.robotclock import RobotClock
+
+_REPEAT_S = 1.0
+_END_S = 10.0
+Row = tuple[str, bytes]
+
+
+class Robot:
+    """One robot: what its watcher finds goes into its journal, and over the link from there.
+
+    While it is there it says all its statuses again each second, as watchers do.
+    """
+
+    def __init__(self, store: Path, clock: RobotClock, options: LinkOptions) -> None:
+        self.name = options.robot
+        self.clock = clock
+        self.repeats = True
+        """Turn this off for a robot whose link holds, while its watcher says nothing."""
+        self.statuses: dict[tuple[str, str], Status] = {}
+        """What stands of each component and mode."""
+        self._options = options
+        self._store = create_store(store)
+        self._lock = WriterLock(self._store, "watch")
+        self._journal = OwnJournal(
+            self._store, "watch", robot=self.name, config_hash=options.config_hash, clock=clock
+        )
+        self._saying = threading.Lock()
+        self._record: FakeRun | None = None
+        self._thread: threading.Thread | None = None
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._stop = asyncio.Event()
+        self._awake = threading.Event()
+
+    # -- what it finds
+
+    def status(
+        self, component: str, level: Level = "ok", state: str = "", *, mode: str = "",
+        reason: str = "", blocked_by: tuple[str, ...] = (), **outputs: Output,
+    ) -> Status:  # fmt: skip
+        """Say how a component (or one of its modes) is from now on; return that."""
+        now_ns = self.clock.wall_ns()
+        found = Status(
+            self.name, component, mode, level, state or ("nominal" if level == "ok" else level),
+            outputs, blocked_by, now_ns, now_ns, reason, self._options.config_hash,
+        )  # fmt: skip
+        self.say(found)
+        return found
+
+    def change(
+        self, component: str, level: Level, state: str = "", *, reason: str = "",
+        blocked_by: tuple[str, ...] = (), hint: str = "",
+    ) -> None:  # fmt: skip
+        """Let a component go into another condition: the status, and the event of it."""
+        old = self.statuses.get((component, ""))
+        before = Condition(old.level, old.state) if old else Condition("ok", "nominal")
+        new = self.status(component, level, state, reason=reason, blocked_by=blocked_by)
+        self.say(Transition(
+            self.name, component, "", before, Condition(new.level, new.state), new.measured_ns,
+            reason, blocked_by, hint, self._options.config_hash,
+        ))  # fmt: skip
+
+    def say(self, *found: Finding) -> None:
+        """Write findings down; statuses among them stand from now on."""
+        with self._saying:
+            for one in found:
+                if isinstance(one, Status):
+                    self.statuses[one.component, one.mode] = one
+            self._journal.write([record_of(one) for one in found])
+
+    def tell(self, kind: str, text: str, source: str = "watch", **details: Any) -> None:
+        """Write an event down."""
+        self._journal.write([event(kind, text, source, **details)])
+
+    def write(self, channel: str, values: Mapping[str, Any]) -> None:
+        """Write a record of another channel down, such as a mission."""
+        self._journal.write([(channel, values)])
+
+    def repeat(self) -> None:
+        """Say all statuses once more, measured now."""
+        with self._saying:
+            now_ns = self.clock.wall_ns()
+            rows = [encoded(replace(s, measured_ns=now_ns)) for s in self.statuses.values()]
+            self._journal.append([Own(channel, data) for channel, data in rows])
+
+    def measure(self, item: FakeItem, **values: Any) -> None:
+        """Record a message now: who looks at its variables live sees them."""
+        self._record = self._record or FakeRun(self._store.path, boot=self.clock.boot)
+        now_ns = self.clock.wall_ns()
+        self._record.write([(now_ns, item, msgspec.json.encode(values))])
+        self._record.journal.publish_head(now_ns)
+
+    # -- whether it is there
+
+    def come(self) -> None:
+        """Connect, and again whenever the connection breaks, until it leaves."""
+        assert self._thread is None, "it is here already"
+        started = threading.Event()
+        self._awake.set()
+        self._thread = threading.Thread(target=self._run, args=(started,), daemon=True)
+        self._thread.start()
+        assert started.wait(_END_S)
+
+    def silence(self) -> None:
+        """Stand still, as a computer does that hangs: the connection stays, nothing comes."""
+        assert self._loop is not None
+        self._awake.clear()
+        self._loop.call_soon_threadsafe(self._awake.wait)
+
+    def wake(self) -> None:
+        """Go on after a silence."""
+        self._awake.set()
+
+    def leave(self) -> None:
+        """Disconnect in good order; what it finds meanwhile it says when it comes again."""
+        if self._thread is None or self._loop is None:
+            return
+        self._awake.set()
+        self._loop.call_soon_threadsafe(self._stop.set)
+        self._thread.join(_END_S)
+        assert not self._thread.is_alive()
+        self._thread = self._loop = None
+
+    def close(self) -> None:
+        """Leave for good."""
+        self.leave()
+        self._journal.close()
+        self._lock.release()
+        if self._record is not None:
+            self._record.close()
+
+    def _run(self, started: threading.Event) -> None:
+        asyncio.run(self._live(started))
+
+    async def _live(self, started: threading.Event) -> None:
+        self._loop, self._stop = asyncio.get_running_loop(), asyncio.Event()
+        started.set()
+        client = LinkClient(
+            self._store, self._options, clock=self.clock, network=lambda: Network("eth0"),
+            backoff=Backoff(least_s=0.05, most_s=0.3),
+        )  # fmt: skip
+        repeating = asyncio.create_task(self._repeat())
+        await client.run(self._stop)
+        repeating.cancel()
+
+    async def _repeat(self) -> None:
+        while True:
+            began_s = time.monotonic()
+            if self.repeats and self.statuses:
+                await asyncio.to_thread(self.repeat)
+            await asyncio.sleep(max(0.1, began_s + _REPEAT_S - time.monotonic()))

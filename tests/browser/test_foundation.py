@@ -1,0 +1,103 @@
+"""The ground that tests of pages stand on: a page opens, what goes wrong in it is noticed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from http.server import BaseHTTPRequestHandler, HTTPServer
+from threading import Thread
+
+import pytest
+
+from tests.browser.conftest import PageAs
+from tests.browser.expecting import expect
+from tests.browser.looks import axe, no_sideways_scroll, shot
+from tests.browser.site import Site, until
+
+
+@pytest.mark.parametrize(("width", "theme"), [(390, "light"), (1440, "dark")])
+def test_the_page_of_the_api(page_as: PageAs, width: int, theme: str) -> None:
+    page = page_as("viewer", width, theme)
+    page.goto("/api/docs")
+    expect(page.get_by_role("heading", name="Amberbox API")).to_be_visible()
+    no_sideways_scroll(page)
+    axe(page)
+    shot(page, "api-docs", whole=False)
+
+
+def test_what_goes_wrong_in_a_page_is_noticed(page_as: PageAs, site: Site) -> None:
+    page = page_as("viewer", expects=["404 GET", "status of 404", "boom", "wrong"])
+    page.goto("/api/v1/nothing")
+    page.evaluate("() => console.error('wrong')")
+    page.evaluate("() => { setTimeout(() => { throw new Error('boom') }) }")
+    page.wait_for_function("() => true")
+    (watched,) = page_as.watched
+    until(lambda: page.wait_for_timeout(20) or len(watched.heard) >= 4, "all is heard")
+    assert watched.heard[0] == f"404 GET {site.url}/api/v1/nothing"
+    assert any("boom" in one for one in watched.heard)
+    assert not watched.troubles
+    watched.expects = ()
+    assert len(watched.troubles) == len(watched.heard)
+    watched.heard.clear()
+
+
+@contextmanager
+def stranger() -> Iterator[tuple[str, list[str]]]:
+    """Serve as somebody else; give the address, and what was asked."""
+    asked: list[str] = []
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            asked.append(self.path)
+            self.send_error(404)
+
+        def log_message(self, format: str, *args: object) -> None:
+            """Print nothing."""
+
+    with HTTPServer(("127.0.0.1", 0), Handler) as server:
+        Thread(target=server.serve_forever, daemon=True).start()
+        yield f"http://127.0.0.1:{server.server_port}", asked
+        server.shutdown()
+
+
+def test_nobody_but_the_site_is_reached(page_as: PageAs) -> None:
+    page = page_as("viewer", expects=["another host"])
+    (watched,) = page_as.watched
+    with stranger() as (address, asked):
+        page.goto("about:blank")
+        page.set_content(f'<img src="{address}/a"><img src="http://198.51.100.1/b">'
+                         '<img src="https://example.com/c">')  # fmt: skip
+        until(lambda: page.wait_for_timeout(20) or len(watched.troubles) >= 3, "all have failed")
+    assert asked == []
+    hosts = [one for one in watched.heard if one.startswith("asked another host")]
+    assert len(hosts) == 3
+    watched.heard.clear()
+
+
+def test_the_robots_are_as_they_say(site: Site) -> None:
+    cards = {card["robot"]: card for card in site.ask("/robots")}
+    assert cards["ropod_001"]["level"] == "error" and cards["ropod_001"]["alarms"] == 1
+    assert cards["ropod_001"]["diagnosis"]["faults"] == ["laser_front#silent"]
+    assert cards["ropod_002"]["level"] == "warn"
+    assert not cards["ropod_003"]["online"] and cards["ropod_003"]["backlog_rows"] == 1234
+
+
+def test_a_robot_says_something_leaves_and_comes(site: Site) -> None:
+    def level(component: str = "imu") -> str:
+        status = site.ask("/robots/ropod_001/status")
+        return next(c["condition"]["level"] for c in status["components"] if c["name"] == component)
+
+    site.say("ropod_001", "imu", "warn", reason="it shakes")
+    until(lambda: level() == "warn", "the server hears of it")
+    site.robots["ropod_001"].leave()
+    until(lambda: not site.is_online("ropod_001"), "the robot is gone")
+    site.say("ropod_001", "imu", "ok")
+    site.robots["ropod_001"].come()
+    until(lambda: site.is_online("ropod_001") and level() == "ok", "it is back")
+
+
+def test_the_server_is_restarted(site: Site) -> None:
+    before = site.url
+    site.restart()
+    until(lambda: site.is_online(*site.robots), "the robots came back by themselves")
+    assert site.url == before
