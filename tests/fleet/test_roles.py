@@ -24,6 +24,7 @@ from tests.fleet.routes import SOCKET, all_routes
 TABLE = yaml.safe_load((Path(__file__).parent / "roles.yaml").read_text(encoding="utf-8"))
 NOT_THERE = "there is no such robot, or not for you"
 REFUSED = (401, 403)
+ELSEWHERE = ("/sign-in", "/account")
 FOREIGN = ("https://evil.example", "null", "http://fleet.example", f"{URL}.evil.example")
 READS = ("GET", "HEAD", SOCKET)
 RUNNER = asyncio.Runner()
@@ -157,6 +158,8 @@ def _is_through(answer: httpx.Response) -> bool:
     assert answer.status_code < 500, answer.text
     if answer.status_code == 404:
         return NOT_THERE not in answer.text
+    if answer.status_code == 303:  # what is not for somebody leads them to sign in
+        return not answer.headers["location"].startswith(ELSEWHERE)
     return answer.status_code not in REFUSED
 
 

@@ -78,9 +78,9 @@ _STATUS: Mapping[type[AmberboxError], int] = {
 
 def add_handlers(app: FastAPI) -> None:
     """Make an app answer errors in this form."""
-    app.add_exception_handler(AmberboxError, _known)
-    app.add_exception_handler(HTTPException, _http)
-    app.add_exception_handler(RequestValidationError, _invalid)
+    app.add_exception_handler(AmberboxError, say_known)
+    app.add_exception_handler(HTTPException, say_http)
+    app.add_exception_handler(RequestValidationError, say_invalid)
 
 
 def error(status: int, what: str, hint: str = "", headers: Any = None) -> JSONResponse:
@@ -99,18 +99,21 @@ def status_of(found: AmberboxError) -> int:
     return next(_STATUS[cls] for cls in type(found).__mro__ if cls in _STATUS)
 
 
-async def _known(_: Request, found: Exception) -> JSONResponse:
+async def say_known(_: Request, found: Exception) -> JSONResponse:
+    """Answer an error of ours."""
     assert isinstance(found, AmberboxError)
     wait = {"Retry-After": str(found.seconds)} if isinstance(found, MustWaitError) else None
     return error(status_of(found), found.what, found.hint, wait)
 
 
-async def _http(_: Request, found: Exception) -> JSONResponse:
+async def say_http(_: Request, found: Exception) -> JSONResponse:
+    """Answer what a route refused."""
     assert isinstance(found, HTTPException)
     return error(found.status_code, str(found.detail), "", found.headers)
 
 
-async def _invalid(_: Request, found: Exception) -> JSONResponse:
+async def say_invalid(_: Request, found: Exception) -> JSONResponse:
+    """Answer a question that is not of its form."""
     assert isinstance(found, RequestValidationError)
     first = found.errors()[0]
     place = ".".join(str(part) for part in first["loc"])

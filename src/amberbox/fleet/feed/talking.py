@@ -17,7 +17,7 @@ from amberbox.fleet.feed.delta import Delta, message
 from amberbox.fleet.feed.feed import Feed
 from amberbox.fleet.feed.listener import Listener
 
-PING_S = 15.0
+PING_S = 1.0
 BEHIND_S = 5.0
 """What is older than this is not sent as news."""
 FIRST_S = 10.0

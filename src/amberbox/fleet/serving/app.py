@@ -1,32 +1,41 @@
-"""The app: every room of the API, with its guards, around the parts of a server."""
+"""The app: every room of the API and every page, with its guards, around a server's parts."""
 
 from __future__ import annotations
 
 import pkgutil
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib import import_module
 
 from fastapi import FastAPI
 
 from amberbox import __version__
 from amberbox.fleet.api.access import Routes, Rule
-from amberbox.fleet.api.errors import add_handlers
 from amberbox.fleet.metrics.figures import Received
 from amberbox.fleet.metrics.requests import RequestCounts, Timed
+from amberbox.fleet.pages.errors import add_handlers
 from amberbox.fleet.services import Services
+
+ROOMS = ("amberbox.fleet.api", "amberbox.fleet.pages")
 
 
 def rooms() -> Mapping[str, Routes]:
-    """Return the routes of all rooms, found by file name: ``routes`` in ``fleet/api/*.py``."""
-    package = import_module("amberbox.fleet.api")
-    names = sorted(info.name for info in pkgutil.iter_modules(package.__path__))
-    found = ((name, import_module(f"{package.__name__}.{name}")) for name in names)
-    return {name: module.routes for name, module in found if hasattr(module, "routes")}
+    """Return the routes of all rooms, found by file name: ``routes`` in the files of ``ROOMS``."""
+    found = (import_module(name) for package in ROOMS for name in _modules(package))
+    return {_short(module.__name__): module.routes for module in found if hasattr(module, "routes")}
+
+
+def _short(module: str) -> str:
+    return module.removeprefix("amberbox.fleet.").removeprefix("api.")
 
 
 def rules() -> dict[tuple[str, str], Rule]:
     """Return what each route takes, by method and path."""
     return {where: rule for routes in rooms().values() for where, rule in routes.rules.items()}
+
+
+def _modules(package: str) -> Sequence[str]:
+    path = import_module(package).__path__
+    return sorted(f"{package}.{info.name}" for info in pkgutil.iter_modules(path))
 
 
 def make_app(services: Services) -> FastAPI:

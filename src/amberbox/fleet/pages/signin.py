@@ -1,0 +1,25 @@
+"""The page to sign in."""
+
+from __future__ import annotations
+
+from fastapi import Request, Response
+from starlette.responses import RedirectResponse
+
+from amberbox.fleet.api.access import Open
+from amberbox.fleet.pages.page import Pages, render, visitor
+
+routes = Pages()
+
+
+@routes.get("/sign-in", Open("asks for name and password; shows nothing"))
+def show(request: Request, next: str = "/") -> Response:
+    """Ask for name and password; who is signed in goes on to where they wanted to go."""
+    onward = next if _is_here(next) else "/"
+    if visitor(request) is not None:
+        return RedirectResponse(onward, 303)
+    return render(request, "signin.html", onward=onward)
+
+
+def _is_here(address: str) -> bool:
+    """Tell whether an address is a path of this server: nobody is led elsewhere."""
+    return address.startswith("/") and not address.startswith(("//", "/\\")) and "\n" not in address
