@@ -12,8 +12,8 @@ from dataclasses import dataclass, field
 from typing import Any, Literal, TypeAlias, get_args
 
 Kind: TypeAlias = Literal[
-    "rows", "live", "connected", "gone", "journal", "committed", "robot", "alarm", "job", "asked",
-    "fetch", "account", "diagnosis", "has",
+    "rows", "live", "connected", "gone", "journal", "committed", "robot", "alarm", "job", "fetch",
+    "account", "diagnosis", "has",
 ]  # fmt: skip
 """What a change is about.
 
@@ -21,8 +21,8 @@ Kind: TypeAlias = Literal[
 values (data: values). ``connected`` (data: hello, admission) and ``gone``: a robot's link.
 ``journal``: one arrived, whatever became of it (data: store_id, journal, state). ``committed``:
 columns of journals are in the archive (data: robots). ``robot``: one was added, changed, given
-another folder. ``alarm`` (data: id), ``job`` (data: id, owner), ``asked`` (data: id), ``fetch``
-(data: id), ``account`` (data: name; its sessions may have ended), ``diagnosis`` (data: id).
+another folder. ``alarm`` (data: id), ``job`` (data: id, owner), ``fetch`` (data: id),
+``account`` (data: name; its sessions may have ended), ``diagnosis`` (data: id).
 ``has``: a robot told which journals hold a window (data: store_id, id, files).
 """
 

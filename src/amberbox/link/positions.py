@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
 import msgspec
@@ -52,13 +51,3 @@ class Reach(msgspec.Struct, frozen=True, array_like=True):
         if numbers != sorted(set(numbers)) or any(abs(n) > LARGEST for n in numbers):
             return "runs out of order"
         return "a run that ends below 0" if any(run.end_seq < 0 for run in self.runs) else ""
-
-
-def earliest(places: Iterable[Place], other: Place) -> Place:
-    """Return the first of some places, or ``other`` if that lies before them."""
-    return min([*places, other])
-
-
-def durable_part(upto: Mapping[str, Place], reaches: Mapping[str, Reach]) -> dict[str, Place]:
-    """Cut what has been received back to what its robot said is durable."""
-    return {w: min(at, reaches[w].durable) for w, at in upto.items() if w in reaches}

@@ -58,7 +58,7 @@ def test_a_worker_that_is_killed_over_a_commit_is_started_again(
     robot.hand_in_all(archive)
     with Worker(archive.layout.folder) as worker:
         first = worker.pid
-        worker.ask("stats")  # it is up
+        worker.sweep()  # it is up
         killer = threading.Timer(0.15, os.kill, (first, signal.SIGKILL))
         killer.start()
         try:

@@ -24,8 +24,7 @@ from amberbox.fleet.archive.store import Retention
 from amberbox.fleet.archive.tables import BATCHES
 from amberbox.fleet.bus import Bus, Change
 from amberbox.fleet.database.database import FILE, Database
-from amberbox.fleet.linkend.events import link_events
-from amberbox.fleet.linkend.tables import ASIDE, COMMITTED, ROW
+from amberbox.fleet.linkend.tables import ASIDE, COMMITTED, EVENT, ROW
 from amberbox.fleet.options import options
 from amberbox.fleet.uploads.pieces import Incoming
 from amberbox.fleet.uploads.tables import UPLOAD
@@ -278,7 +277,8 @@ def test_a_disk_that_fills_is_told_and_takes_nothing_more(scene: Scene) -> None:
         assert scene.keeping.is_full == (free < _GB)
         assert bool(scene.keeping.troubles()) == (free < 5 * _GB)
     with scene.database.reading() as connection:
-        kinds = [event.kind for event in link_events(connection, "")]
+        events = select(EVENT.c.kind).where(EVENT.c.robot == "").order_by(EVENT.c.number)
+        kinds = list(connection.scalars(events))
     assert kinds == ["disk_low", "disk_full", "disk_ok"], "each once"
 
 

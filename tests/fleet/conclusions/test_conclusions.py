@@ -12,7 +12,7 @@ from amberbox.blackbox.journal import reserved
 from amberbox.core.clock import NS
 from amberbox.core.types import AmbiguityGroup, Diagnosis, Hypothesis, Output, Status, Symptom
 from amberbox.core.types import Test as Step
-from amberbox.fleet.conclusions.reading import conclusions
+from amberbox.fleet.conclusions.reading import entries
 from amberbox.fleet.linkend.tables import ASIDE, BOOT, ROW, RUN
 from amberbox.monitoring.messages.records import finding_of, record_of
 from amberbox.testing.records import T0_NS, FakeRun
@@ -86,27 +86,27 @@ def come_early(home: House, store_id: str, seqs: Sequence[int], run: int = 1) ->
 
 def test_records_come_back_as_they_were_written(home: House, recorded: Robot) -> None:
     for made, channel in ((status, reserved.STATUS), (symptom, reserved.SYMPTOM)):
-        found = conclusions(home.services, ROBOT, channel)
+        found = entries(home.services, ROBOT, channel)
         assert len(found) == 10
-        assert finding_of(channel, found[0]["values"]) == made(0)
-        assert finding_of(channel, found[2]["values"]) == made(2)
-    found = conclusions(home.services, ROBOT, reserved.DIAGNOSIS)
-    assert [finding_of(reserved.DIAGNOSIS, e["values"]) for e in found] == [
+        assert finding_of(channel, found[0].values) == made(0)
+        assert finding_of(channel, found[2].values) == made(2)
+    found = entries(home.services, ROBOT, reserved.DIAGNOSIS)
+    assert [finding_of(reserved.DIAGNOSIS, e.values) for e in found] == [
         diagnosis(number % 2) for number in range(10)
     ]
-    assert list(found[1]["values"]) == list(record_of(diagnosis(1))[1])
+    assert list(found[1].values) == list(record_of(diagnosis(1))[1])
 
 
 def test_a_range_and_a_limit_are_kept(home: House, recorded: Robot) -> None:
     def times(**asked: Any) -> list[int]:
-        found = conclusions(home.services, ROBOT, reserved.STATUS, **asked)
-        return [(entry["at_ns"] - T0_NS) // NS for entry in found]
+        found = entries(home.services, ROBOT, reserved.STATUS, **asked)
+        return [(entry.at_ns - T0_NS) // NS for entry in found]
 
-    assert times(from_ns=T0_NS + 3 * NS, to_ns=T0_NS + 6 * NS) == [3, 4, 5]
+    assert times(span=(T0_NS + 3 * NS, T0_NS + 6 * NS)) == [3, 4, 5]
     assert times(limit=2) == [0, 1]
     assert times(limit=2, newest=True) == [8, 9]
-    assert times(limit=7, newest=True, to_ns=T0_NS + 8 * NS) == [1, 2, 3, 4, 5, 6, 7]
-    assert times(from_ns=T0_NS + NS * 4 + 1, limit=1) == [5]
+    assert times(limit=7, newest=True, span=(None, T0_NS + 8 * NS)) == [1, 2, 3, 4, 5, 6, 7]
+    assert times(span=(T0_NS + NS * 4 + 1, None), limit=1) == [5]
 
 
 def test_rows_of_the_link_follow_once(home: House, recorded: Robot) -> None:
@@ -121,16 +121,16 @@ def test_rows_of_the_link_follow_once(home: House, recorded: Robot) -> None:
                 "channel": reserved.STATUS, "log_ns": T0_NS + 41 * NS, "at_ns": 0,
                 "data": b'{"component":"gone"}'}  # fmt: skip
         connection.execute(ASIDE.insert(), [lost])
-    found = conclusions(home.services, ROBOT, reserved.STATUS)
-    assert [entry["seq"] for entry in found][-3:] == [30, 31, 40]
-    places = [(entry["store_id"], entry["writer"], entry["run"], entry["seq"]) for entry in found]
+    found = entries(home.services, ROBOT, reserved.STATUS)
+    assert [entry.seq for entry in found][-3:] == [30, 31, 40]
+    places = [(entry.store_id, entry.writer, entry.run, entry.seq) for entry in found]
     assert len(found) == 13 == len(set(places))
-    assert found[-1]["server_ns"] == T0_NS + 45 * NS and found[-2]["server_ns"] is None
-    shown = conclusions(home.services, ROBOT, reserved.STATUS, aside=True)
-    assert [entry["aside"] for entry in shown][-2:] == ["", "lost_at_power_cut"]
-    newest = conclusions(home.services, ROBOT, reserved.STATUS, limit=2, newest=True)
-    assert [entry["seq"] for entry in newest] == [31, 40]
+    assert found[-1].server_ns == T0_NS + 45 * NS and found[-2].server_ns is None
+    shown = entries(home.services, ROBOT, reserved.STATUS, aside=True)
+    assert [entry.aside for entry in shown][-2:] == ["", "lost_at_power_cut"]
+    newest = entries(home.services, ROBOT, reserved.STATUS, limit=2, newest=True)
+    assert [entry.seq for entry in newest] == [31, 40]
 
 
 def test_another_robot_has_concluded_nothing(home: House, recorded: Robot) -> None:
-    assert conclusions(home.services, "ropod_002", reserved.STATUS, aside=True) == []
+    assert entries(home.services, "ropod_002", reserved.STATUS, aside=True) == []

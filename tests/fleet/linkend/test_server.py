@@ -16,10 +16,10 @@ from amberbox.fleet.linkend import ledger
 from amberbox.fleet.linkend.board import board
 from amberbox.fleet.linkend.committed import drop_committed
 from amberbox.fleet.linkend.grouped import GroupedWrites
-from amberbox.fleet.linkend.presence import offset_ns, presences
+from amberbox.fleet.linkend.presence import presences
 from amberbox.fleet.linkend.server import Hooks, LinkServer
 from amberbox.fleet.linkend.sockets import SocketClosedError
-from amberbox.fleet.linkend.tables import EVENT, HEADS, ROW
+from amberbox.fleet.linkend.tables import BOOT, EVENT, HEADS, ROW
 from amberbox.link.frames import (
     Ack,
     Beat,
@@ -267,7 +267,7 @@ def test_heartbeats_tell_backlog_and_clock_and_live_values_stay_in_memory(
     asyncio.run(scene())
     with database.reading() as connection:
         assert presences(connection)[0].backlog == 12
-        assert offset_ns(connection, "r1", "boot") == 100
+        assert connection.execute(select(BOOT.c.boot_id, BOOT.c.offset_ns)).all() == [("boot", 100)]
 
 
 def test_the_board_goes_by_position_not_by_clock_or_arrival(database: Database) -> None:

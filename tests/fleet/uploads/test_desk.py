@@ -18,7 +18,7 @@ from amberbox.blackbox.segments import manifest
 from amberbox.blackbox.signing.keys import public_key
 from amberbox.blackbox.store import Store, open_store
 from amberbox.fleet.database.database import Database
-from amberbox.fleet.linkend.events import link_events
+from amberbox.fleet.linkend.tables import EVENT
 from amberbox.fleet.uploads.desk import Desk
 from amberbox.fleet.uploads.pieces import Incoming
 from amberbox.fleet.uploads.tables import UPLOAD
@@ -130,7 +130,7 @@ def test_a_file_that_was_changed_on_the_robot_is_quarantined(store: Store, desk:
     assert states(desk)[name] == "quarantined"
     assert name not in manifest.read(store.path).confirmed
     with desk.database.reading() as connection:
-        [told] = link_events(connection, "r1")
+        [told] = connection.execute(select(EVENT).where(EVENT.c.robot == "r1"))
     assert told.kind == "quarantined" and name in told.text
     [kept] = (desk.root / "quarantine").rglob("*.mcap")
     assert kept.read_bytes() == bytes(content)
@@ -173,7 +173,7 @@ def test_an_old_image_that_went_on_is_kept_aside(store: Store, desk: Desk, tmp_p
                 pass
     with desk.database.reading() as connection:
         rows = connection.execute(select(UPLOAD).where(UPLOAD.c.writer == "main")).all()
-        kinds = {told.kind for told in link_events(connection, "r1")}
+        kinds = set(connection.scalars(select(EVENT.c.kind).where(EVENT.c.robot == "r1")))
     assert sorted(row.state for row in rows).count("aside") == 1
     assert kinds == {"aside"}
     for row in rows:

@@ -11,6 +11,7 @@ from typing import Any
 import msgspec
 from sqlalchemy import select
 from websockets.asyncio.server import ServerConnection, serve
+from websockets.exceptions import ConnectionClosed
 
 from amberbox.blackbox.follow.read import JournalFile, journals, sound_chunks
 from amberbox.blackbox.journal import reserved
@@ -19,7 +20,7 @@ from amberbox.blackbox.keeper.ownjournal import OwnJournal, Record, event
 from amberbox.blackbox.store import Store, WriterLock, create_store, open_store
 from amberbox.fleet.database.database import Database
 from amberbox.fleet.linkend.server import Hooks, LinkServer
-from amberbox.fleet.linkend.sockets import WebsocketsSocket
+from amberbox.fleet.linkend.sockets import SocketClosedError
 from amberbox.fleet.linkend.tables import ASIDE, ROW
 from amberbox.link import limits
 from amberbox.link.backoff import Backoff
@@ -116,6 +117,32 @@ def held(database: Database, robot: str = "r1", table: Any = ROW) -> Held:
 def put_aside(database: Database, robot: str = "r1") -> Held:
     """Return what the server keeps beside the record."""
     return held(database, robot, ASIDE)
+
+
+class WebsocketsSocket:
+    """A connection of the ``websockets`` package."""
+
+    def __init__(self, connection: ServerConnection) -> None:
+        self._connection = connection
+
+    async def receive(self) -> bytes:
+        """Wait for the next message; text is none of ours."""
+        try:
+            data = await self._connection.recv()
+        except (ConnectionClosed, OSError) as error:
+            raise SocketClosedError(str(error)) from error
+        return data if isinstance(data, bytes) else b""
+
+    async def send(self, data: bytes) -> None:
+        """Send a message."""
+        try:
+            await self._connection.send(data)
+        except (ConnectionClosed, OSError) as error:
+            raise SocketClosedError(str(error)) from error
+
+    async def close(self) -> None:
+        """End the connection."""
+        await self._connection.close()
 
 
 @asynccontextmanager

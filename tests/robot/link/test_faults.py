@@ -8,10 +8,11 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from sqlalchemy import select
 
 from amberbox.blackbox.store import open_store
 from amberbox.fleet.database.database import Database
-from amberbox.fleet.linkend.events import link_events
+from amberbox.fleet.linkend.tables import EVENT
 from amberbox.link import limits
 from amberbox.testing.proxy import FAULTS, Fault, Faults, Proxy
 from amberbox.testing.proxyframes import FrameFaults
@@ -36,7 +37,7 @@ def database(tmp_path: Path) -> Iterator[Database]:
 
 def kinds(database: Database) -> set[str]:
     with database.reading() as connection:
-        return {told.kind for told in link_events(connection, "r1")}
+        return set(connection.scalars(select(EVENT.c.kind).where(EVENT.c.robot == "r1")))
 
 
 async def carry(path: Path, database: Database, faults: Faults, seed: int) -> Proxy:

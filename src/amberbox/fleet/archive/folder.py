@@ -16,13 +16,11 @@ from amberbox.fleet.archive.catalogue import PUT, REFUSED, Catalogue, Source
 from amberbox.fleet.archive.files import Layout
 from amberbox.fleet.archive.journal import checked_key, inspect
 from amberbox.fleet.archive.record import ArchiveRecord
-from amberbox.fleet.archive.stats import stats
 from amberbox.fleet.archive.store import (
     Committed,
     JournalKey,
     Missing,
     Retention,
-    Stats,
     Stored,
 )
 from amberbox.fleet.database.database import FILE, Database
@@ -96,10 +94,6 @@ class FolderArchive:
     def robot(self, *robots: str) -> ArchiveRecord:
         """Open the record of one robot, or of several (all without a name) for queries."""
         return ArchiveRecord(self.layout.folder, robots=robots, catalogue=self.catalogue)
-
-    def stats(self) -> Stats:
-        """Tell how much is here."""
-        return stats(self.layout, self.catalogue)
 
 
 def _move(path: Path, place: Path) -> None:

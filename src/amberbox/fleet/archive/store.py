@@ -81,29 +81,6 @@ class Committed:
     next_in_s: float = 0.0
 
 
-@dataclass(frozen=True, slots=True)
-class RobotStats:
-    """How much of one robot is here: journals by state, bytes, recorded time."""
-
-    robot: str
-    journals: int
-    journal_bytes: int
-    waiting: int
-    rows: int
-    first_ns: int
-    last_ns: int
-
-
-@dataclass(frozen=True, slots=True)
-class Stats:
-    """How much is in the archive; ``table_bytes`` are the live files of all tables."""
-
-    robots: Sequence[RobotStats]
-    tables: int
-    table_files: int
-    table_bytes: int
-
-
 class ArchiveStore(Protocol):
     """Keeps what robots have recorded. One process works on it at a time; many may ask."""
 
@@ -128,6 +105,3 @@ class ArchiveStore(Protocol):
 
     def robot(self, *robots: str) -> Record:
         """Open the record of one robot, or of several (all without a name) for queries."""
-
-    def stats(self) -> Stats:
-        """Tell how much is here."""

@@ -40,8 +40,6 @@ def handle(archive: FolderArchive, request: Mapping[str, Any]) -> Any:
             return archive.retain(msgspec.convert(request["rules"], list[Retention]))
         case "sweep":
             return archive.sweep()
-        case "stats":
-            return archive.stats()
         case other:
             raise AmberboxError(f"the archive's worker knows no {other!r}")
 

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
-from typing import Any, Protocol
+from typing import Protocol
 
 from amberbox.core.errors import AmberboxError
 from amberbox.fleet.archive.folder import FolderArchive
@@ -30,27 +29,6 @@ class Stores(Protocol):
         """The archive."""
 
 
-def conclusions(
-    services: Stores,
-    robot: str,
-    channel: str,
-    from_ns: int | None = None,
-    to_ns: int | None = None,
-    limit: int = 1000,
-    *,
-    newest: bool = False,
-    aside: bool = False,
-) -> list[dict[str, Any]]:
-    """Return the fields of ``Entry`` of what a robot wrote in ``[from_ns, to_ns)``, as dicts.
-
-    ``channel`` is one of ``blackbox.journal.reserved`` (``reserved.EVENT``); ``values`` is the
-    record, as the functions of ``monitoring.messages`` read it. In order of time, at most
-    ``limit``: the first ones, or with ``newest`` the last. With ``aside`` also what was put aside.
-    """
-    found = entries(services, robot, channel, (from_ns, to_ns), limit, newest=newest, aside=aside)
-    return [asdict(entry) for entry in found]
-
-
 def entries(
     services: Stores,
     robot: str,
@@ -61,7 +39,12 @@ def entries(
     newest: bool = False,
     aside: bool = False,
 ) -> list[Entry]:
-    """Return what ``conclusions`` does, as ``Entry``."""
+    """Return what a robot wrote on a channel within ``[from, to)``, each record once.
+
+    ``channel`` is one of ``blackbox.journal.reserved`` (``reserved.EVENT``); ``values`` is the
+    record, as the functions of ``monitoring.messages`` read it. In order of time, at most
+    ``limit``: the first ones, or with ``newest`` the last. With ``aside`` also what was put aside.
+    """
     limit = min(limit, MOST)
     # first the link: what is committed in between is then found in the archive as well, not lost
     with services.database.reading() as connection:

@@ -75,9 +75,3 @@ def keep_heads(connection: Connection, robot: str, store_id: str, heads: bytes, 
 def short(boot_id: str) -> str:
     """Return how the name of a journal's file tells its boot: what robots say of their runs."""
     return boot_id.replace("-", "")[:8]
-
-
-def offset_ns(connection: Connection, robot: str, boot: str) -> int | None:
-    """Return how far the server's clock was ahead of the robot's in a boot, if that is known."""
-    wanted = select(BOOT.c.offset_ns).where(BOOT.c.robot == robot, BOOT.c.boot_id == boot)
-    return connection.execute(wanted).scalar()

@@ -1,4 +1,4 @@
-"""What the link needs of a WebSocket, and how servers' own sockets give it."""
+"""What the link needs of a WebSocket, and how the server's own sockets give it."""
 
 from __future__ import annotations
 
@@ -25,36 +25,6 @@ class Socket(Protocol):
 
     async def close(self) -> None:
         """End the connection; harmless when it has ended."""
-
-
-class WebsocketsSocket:
-    """A connection of the ``websockets`` package."""
-
-    def __init__(self, connection: Any) -> None:
-        self._connection = connection
-
-    async def receive(self) -> bytes:
-        """Wait for the next message; text is none of ours."""
-        from websockets.exceptions import ConnectionClosed
-
-        try:
-            data = await self._connection.recv()
-        except (ConnectionClosed, OSError) as error:
-            raise SocketClosedError(str(error)) from error
-        return data if isinstance(data, bytes) else b""
-
-    async def send(self, data: bytes) -> None:
-        """Send a message."""
-        from websockets.exceptions import ConnectionClosed
-
-        try:
-            await self._connection.send(data)
-        except (ConnectionClosed, OSError) as error:
-            raise SocketClosedError(str(error)) from error
-
-    async def close(self) -> None:
-        """End the connection."""
-        await self._connection.close()
 
 
 class StarletteSocket:

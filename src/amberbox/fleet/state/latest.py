@@ -69,10 +69,6 @@ class Latest:
         """Return what is known of a robot; nothing before it was loaded."""
         return self._known.get(robot, Recent())
 
-    def is_loaded(self, robot: str) -> bool:
-        """Tell whether the past of a robot was read."""
-        return robot in self._known
-
     def take(self, robot: str, rows: Sequence[Row]) -> None:
         """Note rows that came; those of a robot that is being loaded come after its past."""
         wanted = [row for row in rows if row.channel in _KINDS]

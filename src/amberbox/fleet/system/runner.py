@@ -17,7 +17,6 @@ from amberbox.link.backoff import Backoff
 State = Literal["off", "running", "waiting"]
 HEALTHY_S = 60.0
 END_S = 12.0
-_LINES = 50
 
 
 def command_of(folder: Path) -> list[str]:

@@ -53,15 +53,14 @@ def _ignore(incoming: Incoming, result: Result, path: Path) -> None:
 class Desk:
     """Takes journals into the folder ``root`` of the server.
 
-    ``unsigned`` says whether journals of robots that have no key are taken all the same. ``quota``
-    is how many bytes of a robot may wait unverified. ``verified`` is told of each new journal.
+    ``quota`` is how many bytes of a robot may wait unverified. ``verified`` is told of each new
+    journal.
     """
 
     root: Path
     database: Database
     public_key: PublicKey
     clock: Clock = field(default_factory=SystemClock)
-    unsigned: bool = False
     quota: int = JOURNAL_BYTES
     verified: OnVerified = _ignore
     verifier: Verifier = field(default_factory=Verifier)
@@ -164,7 +163,7 @@ class Desk:
             pieces.drop(self.root, incoming)
             return Answer(409, 0, text=result.reason)
         sealed = proof is not None and bool(proof.lines)
-        if not result.reason and sealed and not result.signed and not self.unsigned:
+        if not result.reason and sealed and not result.signed:
             result = Result("it is not signed, and this server takes signed journals only")
         return self._place(incoming, result)
 
