@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import gc
 import os
-from collections.abc import Generator
 from pathlib import Path
 
 import pytest
@@ -12,7 +11,7 @@ from hypothesis import settings
 
 SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 NO_DATA = "needs_data: the folder ../shared/data beside the repository is absent"
-SKIPPED: pytest.StashKey[list[tuple[str, str]]] = pytest.StashKey()
+SKIPS: pytest.StashKey[Skips] = pytest.StashKey()
 
 settings.register_profile("soak", max_examples=400)  # about twenty minutes of random histories
 if os.environ.get("HYPOTHESIS_PROFILE"):
@@ -33,7 +32,8 @@ def shared_data() -> Path:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    config.stash[SKIPPED] = []
+    config.stash[SKIPS] = Skips()
+    config.pluginmanager.register(config.stash[SKIPS])
     if in_ci() and not config.option.durations:
         config.option.durations = 10
 
@@ -54,24 +54,22 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
         pytest.skip(NO_DATA)
 
 
-@pytest.hookimpl(wrapper=True)
-def pytest_runtest_makereport(
-    item: pytest.Item, call: pytest.CallInfo[None]
-) -> Generator[None, pytest.TestReport, pytest.TestReport]:
-    report = yield
-    if report.skipped and not hasattr(report, "wasxfail"):
-        item.config.stash[SKIPPED].append((report.nodeid, _reason(report.longrepr)))
-    return report
+class Skips:
+    """Notes what is skipped, wherever it ran: reports of other processes come here as well."""
 
+    def __init__(self) -> None:
+        self.found: list[tuple[str, str]] = []
 
-@pytest.hookimpl(wrapper=True)
-def pytest_make_collect_report(
-    collector: pytest.Collector,
-) -> Generator[None, pytest.CollectReport, pytest.CollectReport]:
-    report = yield
-    if report.skipped:
-        collector.config.stash[SKIPPED].append((report.nodeid, _reason(report.longrepr)))
-    return report
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        if report.skipped and not hasattr(report, "wasxfail"):
+            self.found.append((report.nodeid, _reason(report.longrepr)))
+
+    def pytest_collectreport(self, report: pytest.CollectReport) -> None:
+        if report.skipped:
+            self.found.append((report.nodeid, _reason(report.longrepr)))
+
+    def unexcused(self) -> list[tuple[str, str]]:
+        return [skip for skip in self.found if skip[1] != NO_DATA]
 
 
 def _reason(longrepr: object) -> str:
@@ -79,20 +77,17 @@ def _reason(longrepr: object) -> str:
     return str(text).removeprefix("Skipped: ")
 
 
-def _unexcused(config: pytest.Config) -> list[tuple[str, str]]:
-    return [skip for skip in config.stash[SKIPPED] if skip[1] != NO_DATA]
-
-
 def pytest_sessionfinish(session: pytest.Session, exitstatus: int) -> None:
-    if in_ci() and exitstatus == pytest.ExitCode.OK and _unexcused(session.config):
+    if in_ci() and exitstatus == pytest.ExitCode.OK and session.config.stash[SKIPS].unexcused():
         session.exitstatus = pytest.ExitCode.TESTS_FAILED
 
 
 def pytest_terminal_summary(
     terminalreporter: pytest.TerminalReporter, exitstatus: int, config: pytest.Config
 ) -> None:
-    unexcused = _unexcused(config)
-    without_data = len(config.stash[SKIPPED]) - len(unexcused)
+    skips = config.stash[SKIPS]
+    unexcused = skips.unexcused()
+    without_data = len(skips.found) - len(unexcused)
     if in_ci() or without_data:
         terminalreporter.write_line(f"tests skipped for want of ../shared/data: {without_data}")
     if in_ci():
