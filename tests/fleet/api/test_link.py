@@ -29,7 +29,7 @@ from amberbox.link.limits import PIECE_BYTES
 from amberbox.link.uploads import Proof
 from tests.fleet.house import House, house
 
-STORE = str(uuid.uuid4())
+STORE = str(uuid.UUID(int=7, version=4))
 JOURNAL = f"/link/v1/journals/{STORE}/journal/000001-aaaa-0001.mcap"
 CONTENT = b"no journal" * 100
 
