@@ -154,12 +154,6 @@ class Fetch(Struct, frozen=True, tag="fetch"):
     to_ns: int
 
 
-class Confirm(Struct, frozen=True, tag="confirm"):
-    """The server holds these journals, verified."""
-
-    files: list[str]
-
-
 class Bye(Struct, frozen=True, tag="bye"):
     """Why the sender ends the link; ``for_good`` says that to try again is of no use now."""
 
@@ -168,7 +162,7 @@ class Bye(Struct, frozen=True, tag="bye"):
 
 
 RobotFrame: TypeAlias = Hello | Rows | Durable | Live | Beat | Heads | Has | Bye
-ServerFrame: TypeAlias = Welcome | Ack | Pong | Watch | Fetch | Confirm | Bye
+ServerFrame: TypeAlias = Welcome | Ack | Pong | Watch | Fetch | Bye
 
 _ENCODER = msgspec.msgpack.Encoder()
 _FROM_ROBOT: msgspec.msgpack.Decoder[RobotFrame] = msgspec.msgpack.Decoder(RobotFrame)

@@ -9,9 +9,8 @@ from amberbox import __version__
 from amberbox.blackbox.signing.keys import public_key
 from amberbox.blackbox.store import Store
 from amberbox.core.clock import NS, Clock
-from amberbox.link.frames import Bye, FrameError, Hello, Welcome, encode, from_server
-from amberbox.robot.link.client import soon
-from amberbox.robot.link.dialing import LinkDownError, RefusedError, dial
+from amberbox.link.frames import Bye, FrameError, Hello, encode
+from amberbox.robot.link.dialing import LinkDownError, dial, greet
 from amberbox.robot.link.options import LinkOptions
 from amberbox.robot.link.reaching import Reaches
 
@@ -48,14 +47,9 @@ async def try_hello(
             options.robot, store.id, clock.boot_id(), Reaches(store).state(), options.config_hash,
             clock.wall_ns(), clock.boot_ns(), __version__, public_key=public_key(store.path) or "",
         )  # fmt: skip
-        await line.send(encode(hello))
-        answer = from_server(await soon(line.receive()))
-        if isinstance(answer, Bye):
-            raise (RefusedError if answer.for_good else LinkDownError)(answer.reason)
-        if not isinstance(answer, Welcome):
-            raise LinkDownError("the server did not say welcome")
+        welcome = await greet(line, hello)
         await line.send(encode(Bye("only a try")))
-        return Trial(answer.server_wall_ns - clock.wall_ns())
+        return Trial(welcome.server_wall_ns - clock.wall_ns())
     except FrameError as error:
         raise LinkDownError(f"the server did not answer as an Amberbox server: {error}") from error
     finally:

@@ -6,17 +6,14 @@ import asyncio
 import ssl
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import partial
 
-from amberbox.blackbox.deletion.confirm import confirm
 from amberbox.blackbox.folder.folder import RobotFolder
 from amberbox.blackbox.service import Notifier
 from amberbox.blackbox.store import Store
 from amberbox.core.errors import AmberboxError
 from amberbox.link.frames import Fetch
-from amberbox.link.uploads import is_journal_name
 from amberbox.robot.folder.sending import send_folder
 from amberbox.robot.link.client import Asked, LinkClient
 from amberbox.robot.link.copying import Copier, HttpSending
@@ -71,7 +68,7 @@ class Agent:
         self.options = options_of(folder)
         self._remarks = Remarks(store)
         self._dock = Dock(store.path, self.options.docked)
-        asked = Asked(self._fetch, self._confirm, self._want_folder)
+        asked = Asked(self._fetch, self._want_folder)
         self.client = LinkClient(store, self.options, asked=asked, network=self._network)
         self._sending = HttpSending(self.options, self._context)
         copier = Copier(
@@ -136,12 +133,6 @@ class Agent:
         self._requests.add(frame)
         self.loop.wake.set()
 
-    def _confirm(self, files: Sequence[str]) -> None:
-        """Note what the server holds, verified; it may come again."""
-        names = [name for name in files if is_journal_name(name)]
-        note = partial(confirm, self._store, names, self.options.url)
-        threading.Thread(target=_quietly, args=(note,), daemon=True).start()
-
     def _want_folder(self, config_hash: str) -> None:
         if config_hash == self._folder.config_hash:
             self._wanted.set()
@@ -172,11 +163,3 @@ class Agent:
         except Exception:
             self._wanted.set()
             raise
-
-
-def _quietly(work: Callable[[], None]) -> None:
-    """Do what may be done another time: the server says it again."""
-    try:
-        work()
-    except (AmberboxError, OSError):
-        return

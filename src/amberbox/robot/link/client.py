@@ -21,19 +21,14 @@ from amberbox.link import limits
 from amberbox.link.backoff import Backoff
 from amberbox.link.bucket import TokenBucket
 from amberbox.link.frames import (
-    Bye,
-    Confirm,
     Fetch,
     FrameError,
     Has,
     Hello,
-    Welcome,
-    encode,
-    from_server,
 )
 from amberbox.link.offset import OffsetEstimate
 from amberbox.link.robotend import OutOfStepError
-from amberbox.robot.link.dialing import Line, LinkDownError, RefusedError, dial
+from amberbox.robot.link.dialing import Line, LinkDownError, RefusedError, dial, greet
 from amberbox.robot.link.live import LiveValues
 from amberbox.robot.link.network import Network, current_network
 from amberbox.robot.link.options import LinkOptions
@@ -55,7 +50,6 @@ class Asked:
     """What the server wants of the rest of the robot's agent; called in the event loop."""
 
     fetch: Callable[[Fetch], None] = lambda frame: None
-    confirm: Callable[[Sequence[str]], None] = lambda files: None
     folder: Callable[[str], None] = lambda config_hash: None
 
 
@@ -177,12 +171,7 @@ class LinkClient:
             self.options.config_hash, self.clock.wall_ns(), self.clock.boot_ns(), __version__,
             public_key=self.said_key,
         )  # fmt: skip
-        await line.send(encode(hello))
-        answer = from_server(await soon(line.receive()))
-        if isinstance(answer, Bye):
-            raise (RefusedError if answer.for_good else LinkDownError)(answer.reason)
-        if not isinstance(answer, Welcome):
-            raise LinkDownError("the server did not say welcome")
+        answer = await greet(line, hello)
         if answer.wants_folder:
             self.asked.folder(self.options.config_hash)
         self.look_at(answer.watch)
@@ -192,19 +181,3 @@ class LinkClient:
         """Tell the latest values of these from now on, if the robot's folder allows it."""
         if self.options.live:
             self.live.watch(variables)
-
-    def hear(self, frame: Fetch | Confirm) -> None:
-        """Pass on what the server wants of others."""
-        if isinstance(frame, Fetch):
-            self.asked.fetch(frame)
-        else:
-            self.asked.confirm(frame.files)
-
-
-async def soon(waiting: Awaitable[bytes]) -> bytes:
-    """Wait for an answer; raises LinkDownError when none comes for too long."""
-    try:
-        async with asyncio.timeout(limits.SILENT_S):
-            return await waiting
-    except TimeoutError:
-        raise LinkDownError(f"nothing was heard for {limits.SILENT_S:g} s") from None

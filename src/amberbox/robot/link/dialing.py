@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import asyncio
 import ssl
+from collections.abc import Awaitable
 from typing import Any, Protocol
 from urllib.parse import urlsplit, urlunsplit
 
 from amberbox.link import limits
+from amberbox.link.frames import Bye, Hello, Welcome, encode, from_server
 from amberbox.robot.link.options import LinkOptions
 
 _OPEN_S = 10.0
@@ -95,3 +98,27 @@ async def dial(options: LinkOptions, context: ssl.SSLContext | None) -> Line:
         raise LinkDownError(f"the server answers {status}{busy}") from error
     except (OSError, WebSocketException, TimeoutError) as error:
         raise LinkDownError(f"no connection: {error}") from error
+
+
+async def greet(line: Line, hello: Hello) -> Welcome:
+    """Say hello, and return the server's welcome.
+
+    Raises RefusedError when the server sends the robot away for good, LinkDownError when it does
+    so for now, says something else, or nothing for too long; FrameError for what is no frame.
+    """
+    await line.send(encode(hello))
+    answer = from_server(await _soon(line.receive()))
+    if isinstance(answer, Bye):
+        raise (RefusedError if answer.for_good else LinkDownError)(answer.reason)
+    if not isinstance(answer, Welcome):
+        raise LinkDownError("the server did not say welcome")
+    return answer
+
+
+async def _soon(waiting: Awaitable[bytes]) -> bytes:
+    """Wait for an answer; raises LinkDownError when none comes for too long."""
+    try:
+        async with asyncio.timeout(limits.SILENT_S):
+            return await waiting
+    except TimeoutError:
+        raise LinkDownError(f"nothing was heard for {limits.SILENT_S:g} s") from None

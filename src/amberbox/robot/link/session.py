@@ -13,7 +13,6 @@ from amberbox.link.frames import (
     Ack,
     Beat,
     Bye,
-    Confirm,
     Durable,
     Fetch,
     Heads,
@@ -137,8 +136,8 @@ class Session:
             )  # fmt: skip
         elif isinstance(frame, Watch):
             self._client.look_at(frame.variables)
-        elif isinstance(frame, Fetch | Confirm):
-            self._client.hear(frame)
+        elif isinstance(frame, Fetch):
+            self._client.asked.fetch(frame)
         elif isinstance(frame, Bye):
             raise LinkDownError(f"the server says: {frame.reason}")
 
