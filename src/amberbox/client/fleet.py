@@ -59,13 +59,13 @@ class Fleet(AlarmCalls):
 
     # Robots and how they are.
 
-    def robots(self, group: str = "") -> list[models.Robot]:
+    def robots(self, group: str = "") -> list[models.Card]:
         """Return the robots that one may see, by id."""
-        return [*paged(self.wire, "/robots", models.Robot, lambda r: r.robot, {"group": group})]
+        return [*paged(self.wire, "/robots", models.Card, lambda r: r.robot, {"group": group})]
 
-    def robot(self, robot: str) -> models.Robot:
+    def robot(self, robot: str) -> models.Card:
         """Return one robot at a glance."""
-        return self._get(_of(robot), models.Robot)
+        return self._get(_of(robot), models.Card)
 
     def status(self, robot: str) -> models.StatusTree:
         """Return the components of a robot as a tree."""

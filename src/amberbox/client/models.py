@@ -45,7 +45,7 @@ class Lead(Answer, frozen=True):
     at: str | None = None
 
 
-class Robot(Answer, frozen=True):
+class Card(Answer, frozen=True):
     """A robot at a glance; ``level`` is ``unknown`` where nobody can know."""
 
     robot: str

@@ -24,7 +24,7 @@ from amberbox.fleet.state.said import SaidEvent, moment, taken
 from amberbox.fleet.state.standing import Moment, clock_offsets_ns, silence, standings
 from amberbox.fleet.state.timeline import timeline
 from amberbox.fleet.state.tree import status_tree
-from amberbox.fleet.state.views import Robot, StatusTree
+from amberbox.fleet.state.views import Card, StatusTree
 
 routes = Routes("robots")
 
@@ -62,7 +62,7 @@ class Event:
 @routes.get("/robots", "status.read", each=True)
 def list_cards(
     fleet: Fleet, who: Who, group: Group = "", after: AfterName = "", limit: Limit = 1000
-) -> Sequence[Robot]:
+) -> Sequence[Card]:
     """Return the robots that one may see, by id; also those that never connected."""
     with fleet.database.reading() as connection:
         chosen = [
@@ -74,7 +74,7 @@ def list_cards(
 
 
 @routes.get("/robots/{robot}", "status.read")
-def read_card(fleet: Fleet, robot: OfRobot) -> Robot:
+def read_card(fleet: Fleet, robot: OfRobot) -> Card:
     """Return a robot at a glance."""
     with fleet.database.reading() as connection:
         return _cards(fleet, connection, [robot])[0]
@@ -155,7 +155,7 @@ def read_link(
         )  # fmt: skip
 
 
-def _cards(fleet: Services, connection: Connection, robots: Sequence[KnownRobot]) -> list[Robot]:
+def _cards(fleet: Services, connection: Connection, robots: Sequence[KnownRobot]) -> list[Card]:
     state = fleet.feed.state
     return state.cards.of(connection, robots, fleet.clock.wall_ns())
 

@@ -22,7 +22,7 @@ from amberbox.fleet.state.standing import (
     silence,
     standings,
 )
-from amberbox.fleet.state.views import Battery, Lead, OnMission, Robot
+from amberbox.fleet.state.views import Battery, Card, Lead, OnMission
 
 _CHARGES = ("percent", "charge", "soc", "state_of_charge", "level")
 """Parts of the name of an output that says how full a battery is, the best first."""
@@ -44,7 +44,7 @@ class Cards:
         robots: Sequence[KnownRobot],
         now_ns: int,
         statuses: Mapping[str, Sequence[Standing]] | None = None,
-    ) -> list[Robot]:
+    ) -> list[Card]:
         """Return the cards of robots; ``statuses`` where they have been read already."""
         if statuses is None:
             names = [robot.id for robot in robots]
@@ -67,7 +67,7 @@ class Cards:
         statuses: Sequence[Standing],
         when: Moment,
         alarms: OpenAlarms,
-    ) -> Robot:
+    ) -> Card:
         link = self.links.robots.get(robot.id)
         online = link is not None
         silent = silence(presence, online, statuses, when)
@@ -78,7 +78,7 @@ class Cards:
         config_hash = presence.config_hash if presence else ""
         facts = self.facts.known(robot.id, config_hash)
         last_seen = link.last_seen_ns if link else presence.last_seen_ns if presence else None
-        return Robot(
+        return Card(
             robot.id, sorted(robot.groups), facts.model if facts else "",
             robot.disabled_ns is not None, online, moment(last_seen),
             moment(presence.connected_ns) if presence and online else None,

@@ -24,14 +24,14 @@ from amberbox.fleet.state.facts import FactsBook
 from amberbox.fleet.state.latest import Latest
 from amberbox.fleet.state.said import status_data
 from amberbox.fleet.state.standing import standings
-from amberbox.fleet.state.views import Robot
+from amberbox.fleet.state.views import Card
 
 
 @dataclass(frozen=True, slots=True)
 class Snapshot:
     """How robots are at one moment."""
 
-    robots: Sequence[Robot]
+    robots: Sequence[Card]
     statuses: Mapping[str, Sequence[Mapping[str, Any]]]
 
 

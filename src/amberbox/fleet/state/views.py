@@ -36,7 +36,7 @@ class Lead:
 
 
 @dataclass(frozen=True, slots=True)
-class Robot:
+class Card:
     """A robot at a glance.
 
     ``level`` is ``unknown`` where nobody can know; ``last_level`` is what it was then. ``cause``
