@@ -104,9 +104,11 @@ def effect_graph(
     strong = _brought_about(nodes, edges, chosen)
     symptoms = [node.id for node in nodes.values() if node.kind == "symptom"]
     layout = layered(
-        [Box(node.id, WIDE, _high(node)) for node in nodes.values()], [(e.start, e.end) for e in edges],
-        gaps=GAPS, last=symptoms,
-    )  # fmt: skip
+        [Box(node.id, WIDE, _high(node)) for node in nodes.values()],
+        [(edge.start, edge.end) for edge in edges],
+        gaps=GAPS,
+        last=symptoms,
+    )
     lines = [
         _edge(edge, route, edge.start in strong and edge.end in strong)
         for edge, route in zip(edges, layout.routes, strict=True)
@@ -187,7 +189,7 @@ def _left(node: Node) -> float:
 
 
 def _lines(node: Node) -> list[str]:
-    return broken(node.text, WIDE - _left(node) - 10, LINES)
+    return broken(node.text, WIDE - _left(node) - 10, LINES, bold=True)
 
 
 def _high(node: Node) -> float:

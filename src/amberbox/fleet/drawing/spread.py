@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 from amberbox.fleet.drawing.crossings import Near, Order
 
@@ -45,7 +46,7 @@ def _steps(
 ) -> list[float]:
     """Return the least distance of each item from the first one, middle to middle."""
     offsets = [0.0]
-    for before, item in zip(items, items[1:], strict=False):
+    for before, item in pairwise(items):
         gap = gaps / 2 if lanes[before] or lanes[item] else gaps
         offsets.append(offsets[-1] + (sizes[before] + sizes[item]) / 2 + gap)
     return offsets[: len(items)]

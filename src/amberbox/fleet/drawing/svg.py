@@ -96,6 +96,11 @@ def root(
     return element("svg", *children, **(about | more))
 
 
+def fluid(kind: str, high: float, label: str, parts: Iterable[Child]) -> Element:
+    """Return a drawing as wide as there is room; its parts stand at percentages."""
+    return root(kind, (0, high), label, parts, width="100%", viewBox=None)
+
+
 def group(*children: Child, at: tuple[float, float] | None = None, **attributes: Value) -> Element:
     """Return a group, moved to ``at``."""
     place = None if at is None else f"translate({number(at[0])} {number(at[1])})"
@@ -123,12 +128,12 @@ def fitted(text: str, most: float, size: float = SIZE, *, bold: bool = False) ->
     return f"{kept.rstrip()}{ELLIPSIS}"
 
 
-def broken(text: str, most: float, lines: int, size: float = SIZE) -> list[str]:
-    """Return bold text in at most so many lines, the last one shortened if it is more."""
-    found = wrapped(text, most, size, bold=True)
+def broken(text: str, most: float, lines: int, *, bold: bool = False) -> list[str]:
+    """Return the text in at most so many lines, the last one shortened if it is more."""
+    found = wrapped(text, most, SIZE, bold=bold)
     if len(found) <= lines:
         return found
-    cut = fitted(f"{found[lines - 1]} {' '.join(found[lines:])}", most, size, bold=True)
+    cut = fitted(f"{found[lines - 1]} {' '.join(found[lines:])}", most, SIZE, bold=bold)
     return [*found[: lines - 1], cut]
 
 
@@ -151,7 +156,9 @@ def _name(name: str) -> str:
 
 
 def _checked(name: str, value: str | int | float) -> str:
-    if isinstance(value, int | float):
+    if isinstance(value, int):
+        return str(value)
+    if isinstance(value, float):
         return number(value)
     if name == "href" and (value[:1] not in "/?#" or value.startswith("//")):
         raise ValueError(f"a drawing does not link to '{value}'")
