@@ -37,12 +37,11 @@ from collections.abc import Generator, Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
-from urllib.parse import urlsplit
 
 import pytest
 
 from amberbox.fleet.api.who import COOKIE
-from tests.browser.chromium import chromium
+from tests.browser.chromium import chromium, only
 from tests.browser.site import Site, made
 from tests.browser.watching import Watched
 
@@ -55,13 +54,13 @@ _OPEN: pytest.StashKey[ExitStack] = pytest.StashKey()
 
 
 class PageAs(Protocol):
-    """Opens pages of somebody; of nobody without a name."""
+    """Opens pages of somebody, of nobody without a name; ``at`` is another server's address."""
 
     watched: list[Watched]
 
     def __call__(
         self, name: str = "", width: int = 1440, theme: str = "light", *, height: int = 900,
-        expects: Sequence[str] = (), **options: object,
+        expects: Sequence[str] = (), at: str = "", **options: object,
     ) -> Page: ...  # fmt: skip
 
 
@@ -97,24 +96,24 @@ class _Pages:
 
     def __call__(
         self, name: str = "", width: int = 1440, theme: str = "light", *, height: int = 900,
-        expects: Sequence[str] = (), **options: object,
+        expects: Sequence[str] = (), at: str = "", **options: object,
     ) -> Page:  # fmt: skip
-        more = {"locale": "en-GB", "timezone_id": "Europe/Berlin", **options}
+        url = at or self._site.url
+        more = {"locale": "en-GB", "timezone_id": "Europe/Berlin", "proxy": only(url), **options}
         context = self._browser.new_context(
-            base_url=self._site.url, viewport={"width": width, "height": height},
+            base_url=url, viewport={"width": width, "height": height},
             color_scheme="dark" if theme == "dark" else "light", **more,  # type: ignore[arg-type]  # Playwright's own options, by name
         )  # fmt: skip
         context.set_default_timeout(_WAIT_MS)
-        self._set(context, "theme", theme)
+        self._set(context, url, "theme", theme)
         if name:
-            self._set(context, COOKIE, self._site.session(name))
+            self._set(context, url, COOKIE, self._site.session(name))
         page = context.new_page()
-        self.watched.append(Watched(page, self._site.url, expects))
+        self.watched.append(Watched(page, url, expects))
         return page
 
-    def _set(self, context: BrowserContext, name: str, value: str) -> None:
-        host = urlsplit(self._site.url).hostname
-        context.add_cookies([{"name": name, "value": value, "domain": host, "path": "/"}])
+    def _set(self, context: BrowserContext, url: str, name: str, value: str) -> None:
+        context.add_cookies([{"name": name, "value": value, "url": url}])
 
     def close(self) -> None:
         for one in self.watched:

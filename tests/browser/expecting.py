@@ -10,4 +10,6 @@ pytest.importorskip("playwright.sync_api", reason=NO_PLAYWRIGHT)
 
 from playwright.sync_api import expect  # only where it is there
 
+expect.set_options(timeout=10_000)
+
 __all__ = ["expect"]

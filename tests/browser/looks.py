@@ -18,10 +18,12 @@ _GRAVE = ("serious", "critical")
 _OPTIONS = {"resultTypes": ["violations"]}
 _WIDER = """() => {
     const room = document.documentElement.clientWidth
-    const sticksOut = (e) => e.getBoundingClientRect().right > room + 1 && !e.closest(".scroll, pre")
-    const names = [...document.querySelectorAll("body *")].filter(sticksOut).map(
-        (e) => e.tagName.toLowerCase() + (e.id ? "#" + e.id : "") + [...e.classList].map((c) => "." + c).join(""))
-    return document.documentElement.scrollWidth > room ? names.slice(0, 8).concat("(page)") : []
+    const sticksOut = (element) =>
+        element.getBoundingClientRect().right > room + 1 && !element.closest(".scroll, pre")
+    const named = (element) =>
+        [element.tagName.toLowerCase(), element.id, ...element.classList].join(" ")
+    const found = [...document.querySelectorAll("body *")].filter(sticksOut).map(named)
+    return document.documentElement.scrollWidth > room ? [...found.slice(0, 8), "(page)"] : []
 }"""
 
 

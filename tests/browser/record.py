@@ -1,4 +1,4 @@
-"""What ``ropod_001`` recorded in the last hour: numbers, labels, texts, a spike, a gap, missions."""
+"""What ``ropod_001`` recorded in the last hour: numbers, labels, texts, a spike, a gap."""
 
 from __future__ import annotations
 

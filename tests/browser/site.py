@@ -94,13 +94,17 @@ class Site:
 
     def start(self) -> None:
         """Start the server on its port and wait until it answers."""
+        self.launch()
+        until(self.answers, "the server answers", 30)
+
+    def launch(self) -> None:
+        """Start the server without waiting for it."""
         words = ("--data", str(self.data), "--port", str(self.port), "--quiet")
         with (self.folder / "server.log").open("ab") as log:
             self.process = subprocess.Popen(
                 [sys.executable, "-m", "amberbox", "serve", *words], stdin=subprocess.DEVNULL,
                 stdout=log, stderr=log,
             )  # fmt: skip
-        until(self._answers, "the server answers", 30)
 
     def kill(self) -> None:
         """End the server as a power cut does."""
@@ -127,7 +131,7 @@ class Site:
         if self.process is not None:
             self.kill()
 
-    def _answers(self) -> bool:
+    def answers(self) -> bool:
         assert self.process is not None
         assert self.process.poll() is None, (self.folder / "server.log").read_text()[-4000:]
         try:
@@ -158,8 +162,10 @@ def made(folder: Path) -> Iterator[Site]:
     finally:
         home.close()
     try:
-        site.start()
-        _let_come(site, boot)
+        site.launch()
+        _let_happen(site, boot)
+        until(site.answers, "the server answers", 30)
+        _let_come(site)
         yield site
     finally:
         site.close()
@@ -235,14 +241,18 @@ def _old_alarms(home: House, now_ns: int) -> None:
         connection.execute(HISTORY.insert(), history)
 
 
-def _let_come(site: Site, boot: str) -> None:
-    """Let two robots say what happened, connect, and wait until the server knows it."""
+def _let_happen(site: Site, boot: str) -> None:
+    """Let two robots find what happened to them."""
     for name, hash_ in (("ropod_001", sim.HASH), ("ropod_002", HASH_2)):
         options = LinkOptions(site.url, name, site.keys[name], config_hash=hash_)
         site.robots[name] = Robot(site.folder / name, RobotClock(boot), options)
     story.past(site.robots["ropod_001"])
     story.laser_dies(site.robots["ropod_001"])
     story.hostile_past(site.robots["ropod_002"])
+
+
+def _let_come(site: Site) -> None:
+    """Let the robots connect, and wait until the server knows what they have to say."""
     for robot in site.robots.values():
         robot.come()
     until(lambda: site.is_online(*site.robots), "the robots are here", 20)

@@ -31,6 +31,7 @@ BLOCKED: Mapping[str, tuple[str, ...]] = {
 DIAGNOSIS = "ropod_001-1"
 ALARM = "laser_front-1"
 NO_SCANS = "laser_front/heartbeat/alive"
+RUNS = "laser_front/process/running"
 REASON = "no scans for 1.0 s, expected 10 Hz"
 
 
@@ -55,6 +56,7 @@ def all_well(robot: Robot) -> None:
     for component in COMPONENTS:
         robot.status(component)
     robot.status("laser_front", mode="heartbeat", alive=True, rate_hz=10.0)
+    robot.status("laser_front", mode="process", running=True)
     robot.status("laser_front", mode="window", window_clear=True)
     robot.status("laser_rear", mode="heartbeat", alive=True, rate_hz=10.0)
     robot.status("battery", mode="charge", not_empty=True, charge=64.5, time_to_empty=5400.0)
@@ -76,8 +78,9 @@ def laser_dies(robot: Robot) -> None:
     for component, by in BLOCKED.items():
         robot.change(component, "error", "blocked", reason=f"needs {by[0]}", blocked_by=by)
     silent = Symptom(NO_SCANS, "present", NO_SCANS, at_ns, at_ns)
-    found = diagnosis(robot.name, at_ns, silent)
-    robot.say(silent, found, alarm(robot.name, at_ns, found))
+    runs = Symptom(RUNS, "absent", RUNS, None, at_ns)
+    found = diagnosis(robot.name, at_ns, silent, runs)
+    robot.say(silent, runs, found, alarm(robot.name, at_ns, found))
     robot.clock.ago_ns = 0
 
 
