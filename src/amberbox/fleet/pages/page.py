@@ -22,7 +22,7 @@ from amberbox.fleet.pages.strings import catalogue, for_browser
 
 TEMPLATES = Path(__file__).parent / "templates"
 THEMES = ("light", "dark")
-_UNSAFE = str.maketrans({"<": "\\u003c", ">": "\\u003e", "&": "\\u0026"})
+_UNSAFE = str.maketrans({"<": "\\u003c", ">": "\\u003e", "&": "\\u0026", "'": "\\u0027"})
 
 
 class Pages(Routes):
@@ -72,7 +72,7 @@ def environment() -> Environment:
 
 
 def as_json(value: Any) -> Markup:
-    """Return a value as JSON that may stand in a script element."""
+    """Return a value as JSON, for a script element or an attribute in single quotes."""
     return Markup(json.dumps(value, separators=(",", ":")).translate(_UNSAFE))
 
 

@@ -1,0 +1,60 @@
+"""The first page in a browser: all robots at a glance, as they are now."""
+
+import re
+
+import pytest
+
+from tests.browser.conftest import PageAs
+from tests.browser.expecting import expect
+from tests.browser.looks import axe, no_sideways_scroll, shot
+from tests.browser.site import Site
+
+
+@pytest.mark.parametrize("theme", ["light", "dark"])
+@pytest.mark.parametrize("width", [390, 1440])
+def test_robots_at_a_glance(page_as: PageAs, theme: str, width: int) -> None:
+    page = page_as("viewer", width=width, theme=theme)
+    page.goto("/")
+    expect(page.locator(".robot-card")).to_have_count(3)
+    axe(page)
+    no_sideways_scroll(page)
+    shot(page, f"home-{theme}-{width}")
+
+
+def test_a_card_follows_its_robot(page_as: PageAs, site: Site) -> None:
+    page = page_as("viewer")
+    page.goto("/")
+    card = page.locator('[data-robot="ropod_002"]')
+    expect(page.locator("html")).to_have_attribute("data-feed", "live")
+    site.say("ropod_002", "wifi", "error", reason="no network")
+    expect(card).to_contain_text("wifi: no network")
+    expect(card).to_have_attribute("data-level", "error")
+    site.say("ropod_002", "wifi", "ok")
+    expect(card).not_to_contain_text("no network")
+
+
+def test_one_finds_the_robot_one_looks_for(page_as: PageAs) -> None:
+    page = page_as("viewer")
+    page.goto("/")
+    page.get_by_role("searchbox").fill("002")
+    expect(page.locator(".robot-card")).to_have_count(1)
+    expect(page).to_have_url(re.compile(r"\?q=002$"))
+    page.get_by_role("searchbox").fill("no such robot")
+    expect(page.get_by_text("No robot fits")).to_be_visible()
+    page.get_by_role("searchbox").fill("")
+    page.get_by_role("button", name="Offline").click()
+    expect(page.get_by_role("button", name="Offline")).to_have_attribute("aria-pressed", "true")
+    page.go_back()
+    expect(page.get_by_role("button", name="All")).to_have_attribute("aria-pressed", "true")
+    expect(page.locator(".robot-card")).to_have_count(3)
+
+
+def test_robots_by_team_and_by_name(page_as: PageAs) -> None:
+    page = page_as("viewer")
+    page.goto("/?by=team&sort=name")
+    expect(page.get_by_role("heading", level=2)).not_to_have_count(0)
+    names = page.locator(".robot-card h3").all_inner_texts()
+    assert len(names) >= 3
+    page.get_by_role("checkbox").uncheck()
+    expect(page.get_by_role("heading", level=2)).to_have_count(0)
+    assert page.locator(".robot-card h3").all_inner_texts() == sorted(set(names))
