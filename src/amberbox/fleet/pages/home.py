@@ -15,7 +15,7 @@ from amberbox.fleet.api.system import SystemFolder
 from amberbox.fleet.api.system import read_status as read_system
 from amberbox.fleet.pages.page import Pages, render
 from amberbox.fleet.services import Services
-from amberbox.fleet.state.views import Robot as Card
+from amberbox.fleet.state.views import Card
 
 routes = Pages()
 
