@@ -16,7 +16,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from amberbox.blackbox.store import Store, replace_file
+from amberbox.blackbox.store import Store
+from amberbox.core.files import replace_file
 
 FOLDER = "requests"
 

@@ -17,8 +17,9 @@ from amberbox.blackbox.follow import read
 from amberbox.blackbox.follow.read import JournalFile
 from amberbox.blackbox.journal import reserved
 from amberbox.blackbox.segments import manifest
-from amberbox.blackbox.store import FOLDERS, Store, WriterLock, sync_folder
+from amberbox.blackbox.store import FOLDERS, Store, WriterLock
 from amberbox.core.errors import AmberboxError
+from amberbox.core.files import sync_folder
 from amberbox.core.names import identifier
 
 FOLDER = "importing"

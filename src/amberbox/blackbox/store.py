@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import IO
 
 from amberbox.core.errors import AmberboxError, UsageError
+from amberbox.core.files import replace_file
 
 FOLDERS = {
     "main": "journal",
@@ -187,23 +188,3 @@ def run_and_number(path: Path) -> tuple[int, int]:
         return int(run), int(number)
     except ValueError:
         return 0, 0
-
-
-def replace_file(path: Path, text: str) -> None:
-    """Write a small file so that a power cut leaves the old or the new one."""
-    part = path.with_name(path.name + ".part")
-    with part.open("w") as file:
-        file.write(text)
-        file.flush()
-        os.fsync(file.fileno())
-    part.replace(path)
-    sync_folder(path.parent)
-
-
-def sync_folder(folder: Path) -> None:
-    """Make a new name in a folder survive a power cut."""
-    fd = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        os.fsync(fd)
-    finally:
-        os.close(fd)

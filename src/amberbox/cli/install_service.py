@@ -14,9 +14,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from amberbox.blackbox.folder.folder import load_folder
-from amberbox.blackbox.store import replace_file, sync_folder
 from amberbox.blackbox.unitfile import MARK, Service, service_of, unit_text
 from amberbox.core.errors import AmberboxError, UsageError
+from amberbox.core.files import replace_file, sync_folder
 from amberbox.robot.supervisor.child import has_components
 
 Run = Callable[[Sequence[str]], None]

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from amberbox.core.errors import AmberboxError, UsageError
+from amberbox.core.files import write_private
 
 VARIABLE = "AMBERBOX_TOKEN"
 _FILE = "servers.yaml"
@@ -80,16 +81,8 @@ def _read() -> Mapping[str, Any]:
 
 
 def _write(known: Mapping[str, Any]) -> None:
-    """Replace the file in one step; it is never there with other rights than 0600."""
     import yaml
 
     file = path()
     file.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
-    part = file.with_name(f"{_FILE}.{os.getpid()}")
-    part.unlink(missing_ok=True)
-    descriptor = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
-    with os.fdopen(descriptor, "w", encoding="utf-8") as opened:
-        yaml.safe_dump(dict(known), opened)
-        opened.flush()
-        os.fsync(opened.fileno())
-    part.replace(file)
+    write_private(file, yaml.safe_dump(dict(known)))

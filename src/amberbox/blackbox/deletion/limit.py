@@ -11,7 +11,8 @@ from typing import TypeVar
 
 from amberbox.blackbox.deletion.usage import free_bytes, total_bytes
 from amberbox.blackbox.keeper.options import KeeperOptions
-from amberbox.blackbox.store import Store, replace_file
+from amberbox.blackbox.store import Store
+from amberbox.core.files import replace_file
 
 FULL = "full"
 RESERVE = "reserve"

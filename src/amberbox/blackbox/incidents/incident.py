@@ -13,10 +13,11 @@ from typing import Any, Literal, NamedTuple
 import msgspec
 
 from amberbox.blackbox.segments import manifest
-from amberbox.blackbox.store import INCIDENTS, Store, replace_file
+from amberbox.blackbox.store import INCIDENTS, Store
 from amberbox.core.clock import NS
 from amberbox.core.config import did_you_mean
 from amberbox.core.errors import UsageError
+from amberbox.core.files import replace_file
 from amberbox.core.timetext import format_time
 
 FILE = "incident.json"

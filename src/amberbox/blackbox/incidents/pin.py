@@ -36,16 +36,10 @@ from amberbox.blackbox.incidents.incident import (
 )
 from amberbox.blackbox.incidents.timeline import Timeline, look_back
 from amberbox.blackbox.keeper.options import KeeperOptions
-from amberbox.blackbox.store import (
-    INCIDENTS,
-    Store,
-    is_locked,
-    replace_file,
-    run_and_number,
-    sync_folder,
-)
+from amberbox.blackbox.store import INCIDENTS, Store, is_locked, run_and_number
 from amberbox.core.clock import NS
 from amberbox.core.errors import UsageError
+from amberbox.core.files import replace_file, sync_folder
 
 
 @dataclass(frozen=True, slots=True)

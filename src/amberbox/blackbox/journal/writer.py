@@ -29,8 +29,8 @@ from amberbox.blackbox.journal.mcap import (
 )
 from amberbox.blackbox.journal.openfile import OpenFile
 from amberbox.blackbox.journal.syncmark import SyncMark
-from amberbox.blackbox.store import sync_folder
 from amberbox.core.clock import NS
+from amberbox.core.files import sync_folder
 from amberbox.core.types import IntArray, Schema, Topic
 
 SCHEMA_REPEAT_NS = (NS, 10 * NS)

@@ -7,7 +7,7 @@ import threading
 from contextlib import suppress
 from pathlib import Path
 
-from amberbox.blackbox.store import replace_file
+from amberbox.core.files import replace_file
 from amberbox.core.names import extend_names, item_name
 
 _FILE = "names.json"

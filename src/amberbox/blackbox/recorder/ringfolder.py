@@ -8,8 +8,9 @@ from collections.abc import Collection
 from pathlib import Path
 
 from amberbox.blackbox.follow.follow import RECORDED
-from amberbox.blackbox.store import Store, sync_folder
+from amberbox.blackbox.store import Store
 from amberbox.core.errors import AmberboxError
+from amberbox.core.files import sync_folder
 
 _MOVING = "ring.moving"
 

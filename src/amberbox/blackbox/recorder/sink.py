@@ -12,7 +12,7 @@ from typing import Any
 from amberbox.blackbox.follow import read
 from amberbox.blackbox.recorder.pipeline import Pipeline
 from amberbox.blackbox.recorder.streams import Stream, tell_unused
-from amberbox.blackbox.store import replace_file
+from amberbox.core.files import replace_file
 from amberbox.core.source import Power, TopicOptions
 from amberbox.core.types import Topic
 

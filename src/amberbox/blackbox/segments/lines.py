@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from amberbox.blackbox.store import sync_folder
+from amberbox.core.files import sync_folder
 
 FIRST_HASH = "0" * 64
 CHECKPOINT = "checkpoint"

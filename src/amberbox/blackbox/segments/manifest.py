@@ -17,7 +17,7 @@ from amberbox.blackbox.segments import lines as text
 from amberbox.blackbox.segments.entries import Sealed, Signature, Tombstone, from_record
 from amberbox.blackbox.segments.flat import TableSchema
 from amberbox.blackbox.segments.growing import GrowingLines
-from amberbox.blackbox.store import sync_folder
+from amberbox.core.files import sync_folder
 from amberbox.core.types import Gap
 
 NAME = "manifest"

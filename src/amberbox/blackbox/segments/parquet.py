@@ -22,7 +22,7 @@ from amberbox.blackbox.segments.manifest import (
     part_clock,
     part_from_json,
 )
-from amberbox.blackbox.store import sync_folder
+from amberbox.core.files import sync_folder
 from amberbox.core.types import IntArray
 
 if TYPE_CHECKING:

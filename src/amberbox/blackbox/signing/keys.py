@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import importlib.util
-import os
 import stat
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
-from amberbox.blackbox.store import Store, replace_file, sync_folder
+from amberbox.blackbox.store import Store
 from amberbox.core.errors import UsageError
+from amberbox.core.files import replace_file, write_private
 
 if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
@@ -69,22 +69,14 @@ def open_keys(store: Store) -> Keys:
 
 
 def _create(path: Path) -> None:
-    """Make a key under another name first: a power cut leaves a whole one or none."""
+    """Make a key; a power cut leaves a whole one or none."""
     from cryptography.hazmat.primitives import serialization as form
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
     content = Ed25519PrivateKey.generate().private_bytes(
         form.Encoding.PEM, form.PrivateFormat.PKCS8, form.NoEncryption()
     )
-    part = path.with_name(path.name + ".part")
-    part.unlink(missing_ok=True)
-    descriptor = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
-    with os.fdopen(descriptor, "wb") as file:
-        file.write(content)
-        file.flush()
-        os.fsync(file.fileno())
-    part.rename(path)
-    sync_folder(path.parent)
+    write_private(path, content.decode("ascii"))
 
 
 def _load(path: Path) -> SigningKey:

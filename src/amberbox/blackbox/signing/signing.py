@@ -18,8 +18,9 @@ from amberbox.blackbox.segments import manifest as mf
 from amberbox.blackbox.segments.entries import Sealed, Signature, to_record
 from amberbox.blackbox.segments.lines import first_hash
 from amberbox.blackbox.signing.keys import SigningKey, holds
-from amberbox.blackbox.store import Store, is_locked, replace_file, run_and_number
+from amberbox.blackbox.store import Store, is_locked, run_and_number
 from amberbox.blackbox.verify.links import Link, links
+from amberbox.core.files import replace_file
 
 HEADS = "heads.json"
 STATED = ("main", "bulk", "keep", "kept", "watch")

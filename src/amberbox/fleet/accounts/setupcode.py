@@ -6,18 +6,16 @@ read one of these runs the server anyhow. A new one replaces the old one.
 
 from __future__ import annotations
 
-import os
 import re
 import secrets
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 from sqlalchemy import Connection, delete, insert, select
 
-from amberbox.blackbox.store import sync_folder
 from amberbox.core.clock import NS, Clock
 from amberbox.core.errors import AmberboxError
+from amberbox.core.files import write_private
 from amberbox.fleet.accounts.actions import Role
 from amberbox.fleet.accounts.backoff import begin_attempt
 from amberbox.fleet.accounts.keys import digest
@@ -196,18 +194,8 @@ def _hash(code: str) -> str:
 
 
 def _write(path: Path, code: str) -> None:
-    """Replace the file; it never exists with rights for others, nor half written."""
-    part = path.with_name(path.name + ".part")
     try:
-        with suppress(FileNotFoundError):
-            part.unlink()
-        descriptor = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
-        with os.fdopen(descriptor, "w") as file:
-            file.write(code + "\n")
-            file.flush()
-            os.fsync(file.fileno())
-        part.replace(path)
-        sync_folder(path.parent)
+        write_private(path, f"{code}\n")
     except OSError as error:
         raise AmberboxError(
             f"cannot write {path}: {error.strerror}", "name a folder that the server may write"

@@ -8,9 +8,9 @@ from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
-from amberbox.blackbox.store import sync_folder
 from amberbox.core.clock import Clock, SystemClock
 from amberbox.core.errors import AmberboxError
+from amberbox.core.files import sync_folder
 from amberbox.fleet.archive import committing, compacting, retaining
 from amberbox.fleet.archive.catalogue import PUT, REFUSED, Catalogue, Source
 from amberbox.fleet.archive.files import Layout

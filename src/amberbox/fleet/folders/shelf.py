@@ -9,8 +9,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
-from amberbox.blackbox.store import sync_folder
 from amberbox.core.errors import UsageError
+from amberbox.core.files import sync_folder
 from amberbox.core.ids import is_id
 from amberbox.link.folders import is_config_hash, travels
 

@@ -8,16 +8,15 @@ from __future__ import annotations
 
 import datetime as dt
 import ipaddress
-import os
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from amberbox.blackbox.store import sync_folder
 from amberbox.core.clock import NS
 from amberbox.core.errors import AmberboxError, UsageError
+from amberbox.core.files import write_private
 
 if TYPE_CHECKING:
     from cryptography import x509
@@ -122,8 +121,8 @@ def _make_authority(files: Files, now_ns: int) -> None:
     builder = _builder(subject, subject, key, now_ns, _AUTHORITY_DAYS)
     builder = builder.add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
     builder = builder.add_extension(_usage(signs=True), critical=True)
-    _write(files.authority_key, _key_text(key))
-    _write(files.authority, _text(_signed(builder, key)), mode=0o644)
+    write_private(files.authority_key, _key_text(key))
+    write_private(files.authority, _text(_signed(builder, key)), mode=0o644)
 
 
 def _make_server(files: Files, names: Sequence[str], now_ns: int) -> None:
@@ -148,8 +147,8 @@ def _make_server(files: Files, names: Sequence[str], now_ns: int) -> None:
     issuer = x509.AuthorityKeyIdentifier.from_issuer_public_key(authority_key.public_key())
     builder = builder.add_extension(issuer, critical=False)
     certificate = _text(_signed(builder, authority_key)) + files.authority.read_text()
-    _write(files.server_key, _key_text(key))
-    _write(files.server, certificate, mode=0o644)
+    write_private(files.server_key, _key_text(key))
+    write_private(files.server, certificate, mode=0o644)
 
 
 def _builder(
@@ -247,19 +246,6 @@ def _key_text(key: EllipticCurvePrivateKey) -> str:
 
     form = PrivateFormat.PKCS8
     return key.private_bytes(Encoding.PEM, form, NoEncryption()).decode("ascii")
-
-
-def _write(path: Path, text: str, mode: int = 0o600) -> None:
-    """Replace a file durably; it never exists with more rights than it shall have."""
-    part = path.with_name(f".{path.name}.part")
-    part.unlink(missing_ok=True)
-    descriptor = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
-    with os.fdopen(descriptor, "w") as file:
-        file.write(text)
-        file.flush()
-        os.fsync(file.fileno())
-    part.replace(path)
-    sync_folder(path.parent)
 
 
 def _checked(name: str) -> str:

@@ -13,8 +13,8 @@ from pathlib import Path
 
 from sqlalchemy import ColumnElement, Connection, and_, select
 
-from amberbox.blackbox.store import sync_folder
 from amberbox.core.clock import NS, Clock, SystemClock
+from amberbox.core.files import sync_folder
 from amberbox.fleet.database.database import Database
 from amberbox.fleet.database.upsert import upsert
 from amberbox.fleet.linkend.events import note

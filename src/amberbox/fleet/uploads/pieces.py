@@ -7,7 +7,7 @@ import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
-from amberbox.blackbox.store import sync_folder
+from amberbox.core.files import sync_folder
 from amberbox.link.uploads import is_digest, is_journal_name, is_store_id
 
 

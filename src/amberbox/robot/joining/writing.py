@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Sequence
 from pathlib import Path
 
 from amberbox.blackbox.folder.folder import ROBOT_FILE
 from amberbox.blackbox.folder.server import KEY_FILE
-from amberbox.blackbox.store import replace_file, sync_folder
 from amberbox.core.errors import Problem, UsageError
+from amberbox.core.files import replace_file, write_private
 from amberbox.core.nodes import Node, parse_yaml
 
 SERVER = "server"
@@ -38,15 +37,7 @@ def with_server(text: str, values: dict[str, str], drop: Sequence[str] = ()) -> 
 
 def write_key(folder: Path, key: str) -> None:
     """Write the key so that its owner alone can read it, and a power cut leaves old or new."""
-    part = folder / f".{KEY_FILE}.part"
-    part.unlink(missing_ok=True)
-    descriptor = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
-    with os.fdopen(descriptor, "w", encoding="utf-8") as file:
-        file.write(f"{key}\n")
-        file.flush()
-        os.fsync(descriptor)
-    part.replace(folder / KEY_FILE)
-    sync_folder(folder)
+    write_private(folder / KEY_FILE, f"{key}\n")
 
 
 def write_robot_file(folder: Path, text: str) -> None:

@@ -16,8 +16,9 @@ from amberbox.blackbox.follow.read import journal_file
 from amberbox.blackbox.incidents.extent import extent
 from amberbox.blackbox.segments import manifest
 from amberbox.blackbox.segments.manifest import Manifest
-from amberbox.blackbox.store import Store, is_locked, replace_file
+from amberbox.blackbox.store import Store, is_locked
 from amberbox.core.clock import NS
+from amberbox.core.files import replace_file
 from amberbox.link.frames import Fetch
 from amberbox.robot.link.client import Found
 

@@ -7,7 +7,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from amberbox.blackbox.store import Store, replace_file
+from amberbox.blackbox.store import Store
+from amberbox.core.files import replace_file
 from amberbox.link.positions import Place
 
 NAME = "link.json"

@@ -6,7 +6,7 @@ import ssl
 from pathlib import Path
 from urllib.parse import urlsplit
 
-from amberbox.blackbox.store import replace_file
+from amberbox.core.files import replace_file
 from amberbox.core.tls import CA_PATH as CA_PATH
 from amberbox.core.tls import PinError as PinError
 from amberbox.core.tls import fetch_ca as fetch_ca

@@ -12,7 +12,8 @@ from typing import Any
 from amberbox.blackbox import requests
 from amberbox.blackbox.doctor.supervised import STATE_FILE
 from amberbox.blackbox.keeper.remarks import KIND
-from amberbox.blackbox.store import Store, replace_file
+from amberbox.blackbox.store import Store
+from amberbox.core.files import replace_file
 from amberbox.robot.supervisor.output import say
 
 _MOST = 1000

@@ -1,0 +1,67 @@
+"""Files that are for their owner only: at no moment more, and never half written."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from amberbox.core.files import write_private
+
+
+def test_a_file_is_replaced_and_nothing_is_left_over(tmp_path: Path) -> None:
+    path = tmp_path / "key"
+    path.write_text("old")
+    path.chmod(0o644)
+    write_private(path, "ü\n")
+    assert path.read_bytes() == "ü\n".encode()
+    assert path.stat().st_mode & 0o777 == 0o600
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_it_is_never_open_to_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    modes: list[int] = []
+    sync = os.fsync
+
+    def look(descriptor: int) -> None:
+        modes.extend(file.stat().st_mode & 0o077 for file in tmp_path.iterdir())
+        sync(descriptor)
+
+    monkeypatch.setattr(os, "fsync", look)
+    write_private(tmp_path / "key", "secret")
+    assert modes == [0, 0], "while it is written, and at its place"
+
+
+def test_what_others_may_read_says_so(tmp_path: Path) -> None:
+    write_private(tmp_path / "certificate", "public", mode=0o644)
+    assert (tmp_path / "certificate").stat().st_mode & 0o077 == 0o044 & ~_umask()
+
+
+def test_a_link_is_replaced_not_followed(tmp_path: Path) -> None:
+    victim, path = tmp_path / "victim", tmp_path / "key"
+    victim.write_text("mine")
+    path.symlink_to(victim)
+    (tmp_path / f".key.{os.getpid()}.part").symlink_to(victim)
+    write_private(path, "secret")
+    assert victim.read_text() == "mine"
+    assert not path.is_symlink() and path.read_text() == "secret"
+
+
+def test_what_fails_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(descriptor: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    path = tmp_path / "key"
+    path.write_text("old")
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match="No space"):
+        write_private(path, "new")
+    assert path.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask
