@@ -7,6 +7,8 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
+import msgspec
+
 from amberbox.consult.closest import closest_json, outlooks
 from amberbox.consult.facts import known_facts, lookups
 from amberbox.consult.faulttrees import effect_json, effects_json
@@ -24,6 +26,7 @@ from amberbox.fleet.archive.catalogue import Catalogue
 from amberbox.fleet.archive.folder import FolderArchive
 from amberbox.fleet.data.look import open_catalogue
 from amberbox.fleet.data.recorded import Stores
+from amberbox.fleet.drawing.branches import tree_of
 from amberbox.fleet.knowledge import diagnosing
 from amberbox.fleet.knowledge.asked import AboutRobot, AskDiagnosis, AskRules, AskTrees, read
 from amberbox.fleet.knowledge.moment import moment
@@ -93,6 +96,17 @@ def fault_trees(folder: Path, arguments: dict[str, Any]) -> Any:
         **about, **shown, "at": format_time(then.at_ns), "closest": closest["effects"],
         "diagnosis": closest["diagnosis"], "notes": [*then.notes, *notes],
     }  # fmt: skip
+
+
+@spoken
+def drawn_tree(folder: Path, arguments: dict[str, Any]) -> Any:
+    """Return the gates and events of one tree, as ``fleet.drawing`` draws them."""
+    asked, stores = read(arguments, AskTrees), _stores(folder)
+    said = _said(stores, asked)
+    subject, _ = folder_of_then(folder, stores.database, asked.robot, asked.config_hash, said)
+    known = subject.faults()
+    (effect,) = _effects(known, asked.effect)
+    return msgspec.to_builtins(tree_of(fault_tree_of(known, effect, asked.exposure_h)))
 
 
 @spoken

@@ -123,7 +123,7 @@ def card_of(answer: Answer, until_ns: int | None = None) -> DiagnosisCard:
     return DiagnosisCard(
         robot, answer["state"], answer["at"], answer["id"], answer["revision"], causes,
         _sure(causes, probability), percent(probability) if causes else "",
-        tuple(_reason(robot, one, until_ns) for one in seen[:REASONS]),
+        tuple(reason_of(robot, one, until_ns) for one in seen[:REASONS]),
         max(0, len(seen) - REASONS),
         told["use"]["severity"], _sentence(told["use"]["text"]),
         tuple(lost["text"] for lost in told["use"]["lost"]), _sentence(told["use"]["careful"]),
@@ -194,7 +194,8 @@ def _sure(causes: Sequence[Cause], probability: float) -> Sure:
     return "likely" if probability >= LIKELY else "possible"
 
 
-def _reason(robot: str, seen: Answer, until_ns: int | None) -> Reason:
+def reason_of(robot: str, seen: Answer, until_ns: int | None = None) -> Reason:
+    """Return what was seen, with a link to the data of its beginning."""
     onset_ns = seen["onset_ns"]
     return Reason(
         _sentence(seen["text"]), None if onset_ns is None else format_time(onset_ns),
@@ -202,15 +203,24 @@ def _reason(robot: str, seen: Answer, until_ns: int | None) -> Reason:
     )  # fmt: skip
 
 
-def _told_next(step: Answer, tests: Sequence[Answer]) -> Next:
-    cost_s = next((test["cost_s"] for test in tests if test["id"] == step["test"]), 0.0)
-    choices = [
+def choices_of(test: Answer, step: Answer | None = None) -> tuple[Choice, ...]:
+    """Return the answers of a test; of a step also what they would mean."""
+    if step is None:
+        plain = [Choice(value, percent(chance)) for value, chance in test["outcomes"].items()]
+        return _in_order(plain)
+    told = [
         Choice(b["answer"], percent(b["probability"]), _capital(b["leads"]), percent(b["then"]))
         for b in step["answers"]
     ]
+    return _in_order(told)
+
+
+def _told_next(step: Answer, tests: Sequence[Answer]) -> Next:
+    test = next((test for test in tests if test["id"] == step["test"]), None)
     return Next(
-        _sentence(step["text"]), step["test"], step["by"], minutes(cost_s) or step["takes"],
-        step["risk"], _in_order(choices) if step["test"] else (),
+        _sentence(step["text"]), step["test"], step["by"],
+        minutes(test["cost_s"]) if test else step["takes"], step["risk"],
+        choices_of({}, step) if step["test"] else (),
         tuple(_sentence(text) for text in step["remedies"]),
     )  # fmt: skip
 
@@ -219,9 +229,8 @@ def _plain_next(tests: Sequence[Answer]) -> Next | None:
     if not tests:
         return None
     test = tests[0]
-    choices = [Choice(value, percent(chance)) for value, chance in test["outcomes"].items()]
     return Next(_sentence(test["text"]), test["id"], test["role"], minutes(test["cost_s"]),
-                choices=_in_order(choices))  # fmt: skip
+                choices=choices_of(test))  # fmt: skip
 
 
 def _in_order(choices: Sequence[Choice]) -> tuple[Choice, ...]:

@@ -1,0 +1,51 @@
+// The page of a robot's diagnosis: its card, and the details a tab at a time.
+
+import { one } from "./dom.js";
+import { keep } from "./diagnosiscard.js";
+import * as details from "./diagnosisdetails.js";
+import { listen } from "./feed.js";
+import * as view from "./view.js";
+
+const page = one("#dx");
+const robot = page.dataset.robot;
+const base = `/robots/${encodeURIComponent(robot)}/diagnosis`;
+const place = one("#dx-card");
+
+/** Return the address of a part, of the diagnosis and the moment that the page is about. */
+function part(name, more = []) {
+  const query = new URLSearchParams(["diagnosis", "at"].map((key) => [key, view.get(key)]).filter(([, value]) => value));
+  for (const [key, value] of more) query.append(key, value);
+  const text = query.toString();
+  return `${base}/${name}${text ? `?${text}` : ""}`;
+}
+
+/** Write an instant as a field for date and time takes it, in the viewer's zone. @param {string} stamp */
+function forField(stamp) {
+  const at = new Date(stamp);
+  return new Date(at.getTime() - at.getTimezoneOffset() * 60000).toISOString().slice(0, 19);
+}
+
+/** Show the diagnosis as of another moment: the whole page is about that. */
+function chooseMoment(event) {
+  event.preventDefault();
+  const { value } = event.target.elements.at;
+  const query = new URLSearchParams(location.search);
+  for (const key of ["diagnosis", "at"]) query.delete(key);
+  if (value) query.set("at", new Date(value).toISOString());
+  location.assign(`${base}?${query}`);
+}
+
+function startMoment() {
+  const form = one("#dx-moment");
+  const { at } = one("[name=at]", form).dataset;
+  if (at && !Number.isNaN(Date.parse(at))) form.elements.at.value = forField(at);
+  form.addEventListener("submit", chooseMoment);
+}
+
+if (place) {
+  const feed = view.get("at") ? null : listen({ robots: [robot], kinds: ["diagnosis", "presence"] });
+  const tab = details.start({ part, renewed: () => renew() });
+  const renew = keep(place, { path: () => part("card"), feed, renewed: tab.renew, robot });
+  startMoment();
+  view.on(tab.show);
+}

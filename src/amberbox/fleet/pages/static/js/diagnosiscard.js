@@ -1,0 +1,44 @@
+// The card of a diagnosis, wherever it stands: explained, answered, and renewed in its place.
+
+import { fail, toast } from "./ask.js";
+import { one } from "./dom.js";
+import { fragment, replace } from "./fragment.js";
+import { t } from "./strings.js";
+
+/**
+ * Keep the card of a place up to date. Returns `renew()`, which asks for it anew.
+ * @param {HTMLElement} place what the card stands in
+ * @param {{path: () => string, feed?: {on: Function} | null, renewed?: (() => void) | null, robot: string}} about
+ */
+export function keep(place, { path, feed = null, renewed = null, robot }) {
+  let asking = new AbortController();
+
+  async function renew() {
+    asking.abort();
+    asking = new AbortController();
+    place.setAttribute("aria-busy", "true");
+    try {
+      replace(place, await fragment(path(), { signal: asking.signal }));
+      place.removeAttribute("aria-busy");
+      renewed?.();
+    } catch (error) {
+      if (error.name === "AbortError") return;
+      place.removeAttribute("aria-busy");
+      fail(error, place);
+    }
+  }
+
+  place.addEventListener("done", async (event) => {
+    if (!event.target.closest("[data-answers]")) return;
+    await renew();
+    toast(t("diagnosis.anew"));
+  });
+  place.addEventListener("click", (event) => {
+    if (event.target.closest("[data-again]")) renew();
+  });
+  feed?.on("diagnosis", (_, of) => {
+    if (of === robot) renew();
+  });
+  if (one("[data-complete='yes']", place) === null) renew();
+  return renew;
+}
