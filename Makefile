@@ -11,7 +11,7 @@ ROS := ros-core python3-rospy python3-roslaunch python3-rosbag \
   python3-std-msgs python3-nav-msgs python3-sensor-msgs python3-geometry-msgs \
   python3-diagnostic-msgs python3-tf2-msgs
 
-SYSTEM := systemd swi-prolog-nox
+SYSTEM := systemd swi-prolog-nox chromium fonts-dejavu-core
 
 .DEFAULT_GOAL := help
 .PHONY: help demo test check lint types rules bench soak venv debian clean
@@ -54,7 +54,7 @@ venv: $(TEST)  ## only install
 
 debian:
 	@tools/apt.sh $(SYSTEM) $(ROS) || \
-	  echo "tests against a real ROS 1 master, SWI-Prolog, or of systemd units, will be skipped" >&2
+	  echo "tests against a real ROS 1 master, SWI-Prolog, a browser, or of systemd units, will be skipped" >&2
 
 clean:  ## remove what was installed and cached here
 	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .hypothesis build dist
