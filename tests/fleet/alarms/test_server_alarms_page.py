@@ -7,11 +7,11 @@ from dataclasses import fields
 from pathlib import Path
 
 from amberbox.core.clock import NS
-from amberbox.fleet.alarms.alarm import SEVERITIES
 from amberbox.fleet.alarms.settings import AlarmSettings
 from amberbox.fleet.api import alarms, notifications
 from amberbox.fleet.notifying import outbox
 from amberbox.fleet.notifying.settings import Email, Notifications, Quiet, Smtp, Webhook
+from amberbox.monitoring.engine.outputs import SEVERITIES
 
 PAGE = (Path(__file__).parents[3] / "docs" / "server_alarms.md").read_text(encoding="utf-8")
 

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final, Literal, TypeAlias
+from typing import Literal, TypeAlias
 
 from amberbox.core.types import Level
+from amberbox.monitoring.engine.outputs import SEVERITIES
 from amberbox.monitoring.plan import Severity
 
 Kind: TypeAlias = Literal["robot", "offline"]
 State: TypeAlias = Literal["open", "acknowledged", "shelved", "resolved"]
-SEVERITIES: Final[tuple[Severity, ...]] = ("warning", "urgent", "critical", "fatal")
-"""From low to high, the words of VDA 5050 and of the mode files."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,13 +93,14 @@ Step: TypeAlias = "tuple[Alarm, Sequence[Entry]]"
 
 def is_worse(severity: str, than: str) -> bool:
     """Tell whether a severity is higher than another; any is higher than none."""
-    return _rank(severity) > _rank(than)
+    return rank_of(severity) > rank_of(than)
 
 
 def worst(severities: Sequence[Severity]) -> Severity:
     """Return the highest severity."""
-    return max(severities, key=_rank)
+    return max(severities, key=rank_of)
 
 
-def _rank(severity: str) -> int:
+def rank_of(severity: str) -> int:
+    """Tell how high a severity is; none, and a word that is none, come before all."""
     return SEVERITIES.index(severity) if severity in SEVERITIES else -1

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 
 from sqlalchemy import ColumnElement, Connection, RowMapping, select
 
-from amberbox.fleet.alarms.alarm import SEVERITIES, Alarm, State
+from amberbox.fleet.alarms.alarm import Alarm, State
 from amberbox.fleet.alarms.tables import ALARM, ALARM_ROBOT, CONSEQUENCE, HISTORY
+from amberbox.monitoring.engine.outputs import SEVERITIES
 from amberbox.monitoring.plan import Severity
 
 _MOST = 1_000

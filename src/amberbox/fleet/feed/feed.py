@@ -9,6 +9,7 @@ from contextlib import suppress
 from typing import Any
 
 from amberbox.core.clock import Clock
+from amberbox.fleet.alarms.listing import robots_of
 from amberbox.fleet.bus import Bus, Change
 from amberbox.fleet.database.database import Database
 from amberbox.fleet.feed.changes import (
@@ -21,7 +22,6 @@ from amberbox.fleet.feed.gate import permission
 from amberbox.fleet.feed.listener import Filter, Listener
 from amberbox.fleet.feed.live import EVERY_S, Live
 from amberbox.fleet.linkend.server import LinkServer
-from amberbox.fleet.state.openalarms import robots_of
 from amberbox.fleet.state.said import SaidStatus, status_data
 from amberbox.fleet.state.state import Snapshot, State
 
@@ -164,7 +164,7 @@ class Feed:
 
     def _robots_of(self, number: int) -> list[str]:
         with self._database.reading() as connection:
-            return robots_of(connection, number)
+            return [row["robot"] for row in robots_of(connection, [number])[number]]
 
     def _values(self, change: Change) -> None:
         self.live.take(change.robot, change.data["values"])

@@ -15,7 +15,7 @@ from typing import Any, Final
 from sqlalchemy import ColumnElement, Connection, RowMapping, func, or_, select, update
 
 from amberbox.core.clock import NS
-from amberbox.fleet.alarms.alarm import Alarm, is_worse
+from amberbox.fleet.alarms.alarm import Alarm, is_worse, rank_of
 from amberbox.fleet.notifying.message import Message, body_of, data_of, subject_of
 from amberbox.fleet.notifying.settings import Destination, Notifications
 from amberbox.fleet.notifying.tables import OUTBOX
@@ -132,7 +132,7 @@ def _digest(destination: str, rows: Sequence[RowMapping], now_ns: int) -> dict[s
     shown = "\n\n".join(row["body"] for row in rows[:_LISTED])
     more = f"\n\nand {len(rows) - _LISTED} more" if len(rows) > _LISTED else ""
     alarms = [json.loads(row["data"]) for row in rows[:_LISTED]]
-    last = max(rows, key=lambda row: _rank(row["severity"]))
+    last = max(rows, key=lambda row: rank_of(row["severity"]))
     return {
         "key": secrets.token_hex(16), "destination": destination, "kind": "digest", "alarm": 0,
         "severity": last["severity"], "state": "waiting",
@@ -141,10 +141,6 @@ def _digest(destination: str, rows: Sequence[RowMapping], now_ns: int) -> dict[s
         "data": json.dumps({"type": "digest", "count": len(rows), "alarms": alarms}),
         "created_ns": now_ns, "due_ns": now_ns, "tries": 0, "trouble": "", "sent_ns": None,
     }  # fmt: skip
-
-
-def _rank(severity: str) -> int:
-    return sum(is_worse(severity, than) for than in ("", "warning", "urgent", "critical"))
 
 
 def due(connection: Connection, now_ns: int, most: int = 20) -> list[RowMapping]:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from sqlalchemy import Connection, select
 
-from amberbox.fleet.alarms.alarm import SEVERITIES
+from amberbox.fleet.alarms.alarm import rank_of
 from amberbox.fleet.alarms.tables import ALARM, ALARM_ROBOT
 
 _OPEN = ("open", "acknowledged")
@@ -32,16 +32,5 @@ def open_alarms(connection: Connection) -> dict[str, OpenAlarms]:
     found: dict[str, OpenAlarms] = {}
     for robot, severity in connection.execute(wanted):
         known = found.get(robot, OpenAlarms())
-        found[robot] = OpenAlarms(known.count + 1, _higher(known.severity, severity))
+        found[robot] = OpenAlarms(known.count + 1, max(known.severity, severity, key=rank_of))
     return found
-
-
-def robots_of(connection: Connection, number: int) -> list[str]:
-    """Return which robots an alarm is about."""
-    chosen = select(ALARM_ROBOT.c.robot).where(ALARM_ROBOT.c.alarm == number)
-    return list(connection.execute(chosen.order_by(ALARM_ROBOT.c.robot)).scalars())
-
-
-def _higher(one: str, other: str) -> str:
-    ranks: dict[str, int] = {severity: rank for rank, severity in enumerate(SEVERITIES)}
-    return max(one, other, key=lambda severity: ranks.get(severity, -1))

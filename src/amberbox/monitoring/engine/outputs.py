@@ -13,6 +13,7 @@ from amberbox.monitoring.plan import Expectation, OutputPlan, Severity
 RANK: Final[Mapping[Level, int]] = {"ok": 0, "warn": 1, "unknown": 2, "stale": 3, "error": 4}
 """How bad a level is."""
 SEVERITIES: Final[tuple[Severity, ...]] = ("warning", "urgent", "critical", "fatal")
+"""From low to high, the words of VDA 5050 and of the mode files."""
 FUNCTIONAL: Final[frozenset[Level]] = frozenset(("ok", "warn"))
 """Levels of what others can build on."""
 NOT_MEASURED: Final = "not measured yet"
