@@ -6,6 +6,8 @@ import re
 from dataclasses import fields
 from pathlib import Path
 
+from msgspec.inspect import DataclassType, StructType, type_info
+
 from amberbox.core.clock import NS
 from amberbox.fleet.alarms.settings import AlarmSettings
 from amberbox.fleet.api import alarms, notifications
@@ -28,8 +30,10 @@ def test_settings_stand_there_with_their_defaults() -> None:
 
 def test_every_key_of_notifications_is_named() -> None:
     for kind in (Notifications, Smtp, Email, Webhook, Quiet):
-        for field in fields(kind):
-            assert re.search(rf'["`]{field.name}["`]', PAGE), field.name
+        form = type_info(kind)
+        assert isinstance(form, DataclassType | StructType)
+        for field in form.fields:
+            assert re.search(rf'["`]{field.encode_name}["`]', PAGE), field.encode_name
 
 
 def test_every_route_is_named() -> None:
