@@ -54,7 +54,7 @@ def shot(page: Page, name: str, *, whole: bool = True) -> Path:
     folder = Path(os.environ.get(SHOTS) or Path(tempfile.gettempdir()) / "amberbox-shots")
     folder.mkdir(parents=True, exist_ok=True)
     dark = page.evaluate("() => matchMedia('(prefers-color-scheme: dark)').matches")
-    width = (page.viewport_size or {}).get("width", 0)
+    width = page.viewport_size["width"] if page.viewport_size else 0
     path = folder / f"{name}-{width}-{'dark' if dark else 'light'}.png"
     page.screenshot(path=path, full_page=whole)
     return path

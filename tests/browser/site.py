@@ -171,6 +171,18 @@ def made(folder: Path) -> Iterator[Site]:
         site.close()
 
 
+@contextmanager
+def fresh(folder: Path) -> Iterator[Site]:
+    """Start a server that nobody has set up yet; end it afterwards."""
+    (folder / "server").mkdir(parents=True)
+    site = Site(folder, free_port(), time.time_ns(), {})
+    try:
+        site.start()
+        yield site
+    finally:
+        site.close()
+
+
 def _fill(home: House, folder: Path, now_ns: int, boot: str) -> None:
     """Put records, folders, a robot that is away and alarms of before into the server."""
     one = Recorded("ropod_001", folder)

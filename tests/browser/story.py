@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 from amberbox.consult.declared import declared
 from amberbox.core.clock import NS
@@ -104,6 +105,7 @@ def hostile_past(robot: Robot) -> None:
     robot.clock.ago_ns = 20 * MINUTE_NS
     all_well(robot)
     robot.status(hostile.COMPONENT, "warn", "odd", reason=hostile.SCRIPT)
-    robot.status(hostile.COMPONENT, mode="m", **{hostile.OUTPUT: hostile.BACKWARDS})
+    odd: dict[str, Any] = {hostile.OUTPUT: hostile.BACKWARDS}
+    robot.status(hostile.COMPONENT, mode="m", **odd)
     robot.tell("remark", hostile.EVENT)
     robot.clock.ago_ns = 0

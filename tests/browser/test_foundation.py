@@ -6,23 +6,71 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from threading import Thread
+from typing import TYPE_CHECKING
 
 import pytest
 
 from tests.browser.conftest import PageAs
 from tests.browser.expecting import expect
 from tests.browser.looks import axe, no_sideways_scroll, shot
-from tests.browser.site import Site, until
+from tests.browser.site import Site, fresh, until
+from tests.browser.watching import Watched
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Page
+
+_SOME = "main > section:nth-of-type(-n+3)"
+"""The whole page of the API takes axe many seconds, and is the same thing a hundred times."""
 
 
-@pytest.mark.parametrize(("width", "theme"), [(390, "light"), (1440, "dark")])
+@pytest.mark.parametrize("width", [390, 1440])
+@pytest.mark.parametrize("theme", ["light", "dark"])
 def test_the_page_of_the_api(page_as: PageAs, width: int, theme: str) -> None:
     page = page_as("viewer", width, theme)
     page.goto("/api/docs")
     expect(page.get_by_role("heading", name="Amberbox API")).to_be_visible()
     no_sideways_scroll(page)
-    axe(page)
+    axe(page, "nav")
+    axe(page, _SOME)
     shot(page, "api-docs", whole=False)
+
+
+@pytest.fixture(scope="module")
+def empty(browser: object, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
+    """A server that nobody has set up."""
+    with fresh(tmp_path_factory.mktemp("fresh")) as found:
+        yield found
+
+
+@pytest.mark.parametrize("width", [390, 1440])
+@pytest.mark.parametrize("theme", ["light", "dark"])
+def test_the_page_to_set_up(page_as: PageAs, empty: Site, width: int, theme: str) -> None:
+    page = page_as("", width, theme, at=empty.url)
+    page.goto("/setup")
+    expect(page.get_by_role("heading", name="Set up this server")).to_be_visible()
+    page.get_by_label("Name").fill("anna")
+    no_sideways_scroll(page)
+    axe(page)
+    shot(page, "setup")
+
+
+def test_somebody_sets_the_server_up(page_as: PageAs, empty: Site) -> None:
+    page = page_as("", at=empty.url, expects=["status of 4", " POST "])
+    page.goto("/setup")
+    page.get_by_label("Name").fill("anna")
+    for again, then in (("four other words", "alert"), ("four words for it", "heading")):
+        page.get_by_label("Password", exact=True).fill("four words for it")
+        page.get_by_label("Password again").fill(again)
+        page.get_by_role("button", name="Make the admin").click()
+        expect(page.get_by_role("alert")).to_have_count(1 if then == "alert" else 0)
+        axe(page)
+    expect(page.get_by_role("heading", name="Done")).to_be_visible()
+
+
+def heard(page: Page, watched: Watched) -> int:
+    """Let the browser say what it has to say; return how many lines that are by now."""
+    page.wait_for_timeout(20)
+    return len(watched.heard)
 
 
 def test_what_goes_wrong_in_a_page_is_noticed(page_as: PageAs, site: Site) -> None:
@@ -32,7 +80,7 @@ def test_what_goes_wrong_in_a_page_is_noticed(page_as: PageAs, site: Site) -> No
     page.evaluate("() => { setTimeout(() => { throw new Error('boom') }) }")
     page.wait_for_function("() => true")
     (watched,) = page_as.watched
-    until(lambda: page.wait_for_timeout(20) or len(watched.heard) >= 4, "all is heard")
+    until(lambda: heard(page, watched) >= 4, "all is heard")
     assert watched.heard[0] == f"404 GET {site.url}/api/v1/nothing"
     assert any("boom" in one for one in watched.heard)
     assert not watched.troubles
@@ -85,7 +133,8 @@ def test_the_robots_are_as_they_say(site: Site) -> None:
 def test_a_robot_says_something_leaves_and_comes(site: Site) -> None:
     def level(component: str = "imu") -> str:
         status = site.ask("/robots/ropod_001/status")
-        return next(c["condition"]["level"] for c in status["components"] if c["name"] == component)
+        found = {c["name"]: str(c["condition"]["level"]) for c in status["components"]}
+        return found[component]
 
     site.say("ropod_001", "imu", "warn", reason="it shakes")
     until(lambda: level() == "warn", "the server hears of it")
