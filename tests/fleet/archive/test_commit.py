@@ -14,7 +14,6 @@ from amberbox.core.clock import NS
 from amberbox.core.errors import AmberboxError
 from amberbox.fleet.archive.folder import FolderArchive
 from amberbox.fleet.archive.segments import segment_at
-from amberbox.fleet.archive.store import ArchiveStore
 from amberbox.testing.clock import ManualClock
 from amberbox.testing.records import BATTERY, POSE, T0_NS, FakeItem, FakeRun
 from tests.fleet.archive.recordings import DAY_NS, Robot, positions
@@ -31,18 +30,17 @@ def same_answers(ours: Record, theirs: Record) -> None:
 
 
 def test_an_archive_answers_as_the_robot_does(archive: FolderArchive, tmp_path: Path) -> None:
-    store: ArchiveStore = archive
     robot = Robot("ropod_001", tmp_path)
     robot.record(0)
     robot.record(500, files=1)
     robot.hand_in_all(archive)
-    done = store.commit()
+    done = archive.commit()
     assert (done.journals, done.waiting) == (4, 0)
-    same_answers(store.robot("ropod_001"), Record(robot.store))
+    same_answers(archive.robot("ropod_001"), Record(robot.store))
     window = {"from_": T0_NS + NS // 4, "to": T0_NS + NS}
-    ours, theirs = (r.query("odom", **window) for r in (store.robot(), Record(robot.store)))  # type: ignore[arg-type]  # both take ints
+    ours, theirs = (r.query("odom", **window) for r in (archive.robot(), Record(robot.store)))  # type: ignore[arg-type]  # both take ints
     assert len(ours) == len(theirs) == 75
-    assert positions(store.robot().query("odom", ["seq", "pose_x"])) == positions(
+    assert positions(archive.robot().query("odom", ["seq", "pose_x"])) == positions(
         Record(robot.store).query("odom", ["seq", "pose_x"])
     )
 

@@ -27,9 +27,10 @@ from amberbox.fleet.database.database import FILE, Database
 
 
 class FolderArchive:
-    """An ``ArchiveStore`` below a server's data folder.
+    """Keeps what robots have recorded, below a server's data folder.
 
     ``commit``, ``compact``, ``retain`` and ``sweep`` are for one process at a time: the worker.
+    All the rest many may ask at once.
     """
 
     def __init__(

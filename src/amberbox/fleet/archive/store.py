@@ -1,13 +1,10 @@
-"""What an archive can be asked to do: the contract behind which journals and tables lie."""
+"""What an archive is told and tells: which journal, what will not come, how long to keep what."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, Protocol
-
-from amberbox.blackbox.query.record import Record
+from typing import Literal
 
 OWN = "own"
 """Keeping class of what the box itself says: statuses, events, gaps, incidents, runs."""
@@ -79,29 +76,3 @@ class Committed:
     refused: int = 0
     waiting: int = 0
     next_in_s: float = 0.0
-
-
-class ArchiveStore(Protocol):
-    """Keeps what robots have recorded. One process works on it at a time; many may ask."""
-
-    def put(self, key: JournalKey, path: Path, *, is_checked: bool = False) -> Stored:
-        """Take over a verified journal file, durably; one that is here already changes nothing.
-
-        With ``is_checked`` its hash and its chain have just been found to hold.
-        Raises AmberboxError for a file that does not hold, or is not the one the key says.
-        """
-
-    def note_missing(self, robot: str, store_id: str, ranges: Sequence[Missing]) -> None:
-        """Remember what will not come; saying it twice changes nothing."""
-
-    def commit(self, every_s: float = 60.0) -> Committed:
-        """Turn the journals that wait into columns, one commit per table, every ``every_s``."""
-
-    def compact(self) -> int:
-        """Join small files of the tables; return how many files went."""
-
-    def retain(self, rules: Sequence[Retention]) -> int:
-        """Delete what is older than the rules say; return how many journals it concerned."""
-
-    def robot(self, *robots: str) -> Record:
-        """Open the record of one robot, or of several (all without a name) for queries."""

@@ -100,7 +100,7 @@ class Worker:
         return self._running().pid
 
     def commit(self, every_s: float = 60.0) -> Committed:
-        """Have the journals that wait committed (see ``ArchiveStore.commit``)."""
+        """Have the journals that wait committed (see ``FolderArchive.commit``)."""
         return msgspec.convert(self.ask("commit", every_s=every_s), Committed)
 
     def compact(self) -> int:
