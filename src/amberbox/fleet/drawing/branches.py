@@ -49,6 +49,9 @@ class Tree:
     events: Mapping[str, Event]
 
 
+BranchKind: TypeAlias = Literal["gate", "event", "transfer", "cut"]
+
+
 @dataclass(slots=True)
 class Branch:
     """A place in the drawing.
@@ -58,7 +61,7 @@ class Branch:
     """
 
     id: str
-    kind: Literal["gate", "event", "transfer", "cut"]
+    kind: BranchKind
     inputs: list[Branch] = field(default_factory=list)
 
     def all(self) -> Iterator[Branch]:
@@ -75,30 +78,30 @@ def unfolded(tree: Tree, depth: int, most: int) -> Branch:
     are not unfolded. Raises KeyError for an input that there is not.
     """
     top = Branch(tree.top, "gate")
-    taken, count = {tree.top}, 1
+    taken, count = {tree.top}, 1 + len(tree.gates[tree.top].inputs)
     waiting = deque([(top, 1)])
     while waiting:
         branch, level = waiting.popleft()
-        inputs = tree.gates[branch.id].inputs
-        room = level < depth and count + len(inputs) <= most
-        for name in inputs:
-            below = _branch(tree, name, taken, room=room)
+        for name in tree.gates[branch.id].inputs:
+            kind = _kind_of(tree, name, taken)
+            more = len(tree.gates[name].inputs) if kind == "gate" else 0
+            if kind == "gate" and (level >= depth or count + more > most):
+                kind = "cut"
+            below = Branch(name, kind)
             branch.inputs.append(below)
-            count += 1
-            if below.kind == "gate":
+            if kind == "gate":
+                count += more
                 taken.add(name)
                 waiting.append((below, level + 1))
     return top
 
 
-def _branch(tree: Tree, name: str, taken: Collection[str], *, room: bool) -> Branch:
+def _kind_of(tree: Tree, name: str, taken: Collection[str]) -> BranchKind:
     if name in tree.events:
-        return Branch(name, "event")
+        return "event"
     if name not in tree.gates:
         raise KeyError(name)
-    if name in taken:
-        return Branch(name, "transfer")
-    return Branch(name, "gate" if room else "cut")
+    return "transfer" if name in taken else "gate"
 
 
 def below(tree: Tree, gate: str) -> int:

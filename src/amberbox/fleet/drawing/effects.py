@@ -102,11 +102,14 @@ def effect_graph(
     nodes = {node.id: node for node in effects.nodes}
     edges = [e for e in dict.fromkeys(effects.edges) if e.start in nodes and e.end in nodes]
     strong = _brought_about(nodes, edges, chosen)
-    symptoms = [node.id for node in nodes.values() if node.kind == "symptom"]
+    causes, symptoms = (
+        [node.id for node in nodes.values() if node.kind == kind] for kind in ("cause", "symptom")
+    )
     layout = layered(
         [Box(node.id, WIDE, _high(node)) for node in nodes.values()],
         [(edge.start, edge.end) for edge in edges],
         gaps=GAPS,
+        first=causes,
         last=symptoms,
     )
     lines = [

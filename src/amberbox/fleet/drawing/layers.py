@@ -63,17 +63,18 @@ NO_GAPS = Gaps()
 
 def layered(
     boxes: Sequence[Box], links: Sequence[tuple[str, str]], *, down: bool = False,
-    gaps: Gaps = NO_GAPS, last: Collection[str] = (),
+    gaps: Gaps = NO_GAPS, first: Collection[str] = (), last: Collection[str] = (),
 ) -> Layout:  # fmt: skip
     """Lay out boxes and the links between them, left to right or top down.
 
-    Boxes of ``last`` stand in the last rank. Boxes without a link stand in rows after all others.
+    Boxes of ``first`` to which nothing leads stand in the first rank, those of ``last`` from which
+    nothing leads in the last. Boxes without a link stand in rows after all others.
     Raises KeyError for a link to a box that there is not.
     """
-    joined = {name for link in links for name in link}.union(last if links else ())
+    joined = {name for link in links for name in link}.union(first, last)
     main = [box for box in boxes if box.id in joined]
     single = [box for box in boxes if box.id not in joined]
-    plan = _plan(main, links, last, down=down)
+    plan = _plan(main, links, (first, last), down=down)
     layout = _placed(plan, main, gaps, down=down)
     return _with_rows(layout, single, gaps) if single else layout
 
@@ -91,14 +92,16 @@ class _Plan:
 
 
 def _plan(
-    boxes: Sequence[Box], links: Sequence[tuple[str, str]], last: Collection[str], *, down: bool
-) -> _Plan:
+    boxes: Sequence[Box], links: Sequence[tuple[str, str]],
+    ends: tuple[Collection[str], Collection[str]], *, down: bool,
+) -> _Plan:  # fmt: skip
     numbers = {box.id: number for number, box in enumerate(boxes)}
     pairs = [(numbers[start], numbers[end]) for start, end in links]
     broken = backward(len(boxes), pairs)
     turned = [(e, s) if place in broken else (s, e) for place, (s, e) in enumerate(pairs)]
     straight = list(dict.fromkeys((start, end) for start, end in turned if start != end))
-    rank_of = ranks(len(boxes), straight, [numbers[name] for name in last if name in numbers])
+    first, last = ({numbers[name] for name in names if name in numbers} for names in ends)
+    rank_of = ranks(len(boxes), straight, first, last)
     rows: list[list[int]] = [[] for _ in range(max(rank_of, default=-1) + 1)]
     for number, rank in enumerate(rank_of):
         rows[rank].append(number)
@@ -141,10 +144,14 @@ def _neighbours(
 
 @dataclass(frozen=True, slots=True)
 class _Spot:
-    """Where an item stands: along the ranks from ``near`` to ``far``, across in the middle."""
+    """Where an item stands: along the ranks from ``near`` to ``far``, across in the middle.
+
+    ``edge`` is where its rank ends.
+    """
 
     near: float
     far: float
+    edge: float
     middle: float
     size: float
 
@@ -159,7 +166,7 @@ def _placed(plan: _Plan, boxes: Sequence[Box], gaps: Gaps, *, down: bool) -> Lay
         depth = max((_depth(boxes[i], down=down) for i in items if i < count), default=0.0)
         for item in items:
             long = depth if lanes[item] else _depth(boxes[item], down=down)
-            spots[item] = _Spot(along, along + long, middles[item], plan.sizes[item])
+            spots[item] = _Spot(along, along + long, along + depth, middles[item], plan.sizes[item])
         along += depth + gaps.ranks
     corners = {box.id: _corner(spots[number], down=down) for number, box in enumerate(boxes)}
     across = max((spot.middle + spot.size / 2 for spot in spots.values()), default=0.0)
@@ -199,7 +206,8 @@ def _points(items: Sequence[int], spots: Mapping[int, _Spot], port: float) -> li
     start, end = spots[items[0]], spots[items[-1]]
     lanes = (spots[item] for item in items[1:-1])
     through = [(along, lane.middle) for lane in lanes for along in (lane.near, lane.far)]
-    return [(start.far, start.middle), *through, (end.near, port)]
+    out = dict.fromkeys(((start.far, start.middle), (start.edge, start.middle)))
+    return [*out, *through, (end.near, port)]
 
 
 def _loop(spot: _Spot) -> list[Point]:

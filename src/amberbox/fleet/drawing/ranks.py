@@ -47,11 +47,13 @@ def _walk(
             path.pop()
 
 
-def ranks(count: int, links: Links, last: Collection[int] = ()) -> list[int]:
+def ranks(
+    count: int, links: Links, first: Collection[int] = (), last: Collection[int] = ()
+) -> list[int]:
     """Return the rank of each box: one after the last box that leads to it.
 
     ``links`` have no circle. Boxes of ``last`` without a link out stand in the last rank; others
-    with more links out than in stand as near to what they lead to as they can.
+    with more links out than in stand as near to what they lead to as they can, but not ``first``.
     """
     outgoing: list[list[int]] = [[] for _ in range(count)]
     waiting = [0] * count
@@ -69,7 +71,7 @@ def ranks(count: int, links: Links, last: Collection[int] = ()) -> list[int]:
                 order.append(end)
     _to_the_end(found, outgoing, last)
     for box in reversed(order):
-        if len(outgoing[box]) > entering[box]:
+        if len(outgoing[box]) > entering[box] and box not in first:
             found[box] = min(found[end] for end in outgoing[box]) - 1
     return _from_zero(found)
 
