@@ -47,17 +47,18 @@ export function showAround(stack) {
 }
 
 function tools(stack) {
-  const button = (name, picture, act) =>
+  const small = (name, inside, act) =>
     el("button", { type: "button", class: "button small icon-only", "aria-label": t(`plot.tool.${name}`),
-      title: t(`plot.tool.${name}`), onclick: act }, typeof picture === "string" ? picture : picture);
+      title: t(`plot.tool.${name}`), onclick: act }, inside);
+  const worded = (name, act) =>
+    el("button", { type: "button", class: "button small", title: t(`plot.tool.${name}_help`), onclick: act }, t(`plot.tool.${name}`));
   const to = ({ from, to }) => stack.window(from, to);
+  const zoom = (factor) => to(zoomed(stack.view, factor, stack.cursor ?? undefined));
   return el("div", { class: "plot-tools no-print", role: "toolbar", "aria-label": t("plot.tools") },
-    button("back", icon("reload"), () => stack.back()),
-    button("earlier", icon("back"), () => to(panned(stack.view, -0.5))),
-    button("later", icon("next"), () => to(panned(stack.view, 0.5))),
-    button("out", "−", () => to(zoomed(stack.view, 2, stack.cursor ?? undefined))),
-    button("in", "+", () => to(zoomed(stack.view, 0.5, stack.cursor ?? undefined))),
-    el("button", { type: "button", class: "button small", onclick: () => stack.all() }, t("plot.tool.all")));
+    small("earlier", icon("back"), () => to(panned(stack.view, -0.5))),
+    small("later", icon("next"), () => to(panned(stack.view, 0.5))),
+    small("out", "−", () => zoom(2)), small("in", "+", () => zoom(0.5)),
+    worded("all", () => stack.all()), worded("back", () => stack.back()));
 }
 
 function showTime(stack, element) {
