@@ -17,7 +17,16 @@ from amberbox.fleet.api.items import Variable
 from amberbox.fleet.api.windows import FROM, ITEM, From, ItemQuery, Shown, To, span_in
 from amberbox.fleet.asking.leaving import while_there
 from amberbox.fleet.data import WORKER
-from amberbox.fleet.data.asked import MOST_POINTS, MOST_ROWS, ROWS, Asked, By, Form, arguments
+from amberbox.fleet.data.asked import (
+    MOST_BINS,
+    MOST_POINTS,
+    MOST_ROWS,
+    ROWS,
+    Asked,
+    By,
+    Form,
+    arguments,
+)
 
 routes = Routes("data")
 
@@ -42,13 +51,15 @@ class Rows:
 
     ``next`` is the ``from`` of the next question where there are more rows. ``kind`` is
     ``envelope`` where so many rows were asked for as ``points`` that they were summed up: the
-    columns are then ``x:min``, ``x:max``, ``x:mean``, ``x:count``. ``complete_to`` is up to when
-    all that the server holds was looked at.
+    columns are then ``x:min``, ``x:max``, ``x:mean``, ``x:count``. ``of`` is how many rows a
+    thinned answer or an envelope was made of. ``complete_to`` is up to when all that the server
+    holds was looked at.
     """
 
     item: str
     columns: list[Variable]
     rows: int
+    of: int | None
     kind: str
     next: str | None
     complete_to: str | None
@@ -76,8 +87,19 @@ class Gaps(Shown):
 
 
 @dataclass(frozen=True, slots=True)
+class Histogram:
+    """How many values lie in each bar; of bar ``n`` the ends are ``edges[n]``, ``edges[n + 1]``."""
+
+    edges: list[float]
+    counts: list[int]
+
+
+@dataclass(frozen=True, slots=True)
 class Summary:
-    """Numbers of a variable summed up; NaN and missing values do not count."""
+    """Numbers of a variable summed up; NaN and missing values do not count.
+
+    If the sums are not ``exact``, the histogram counts the means of short steps.
+    """
 
     name: str
     unit: str
@@ -85,6 +107,7 @@ class Summary:
     min: float | None
     max: float | None
     mean: float | None
+    histogram: Histogram | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,9 +192,12 @@ def list_gaps(
 def read_statistics(
     fleet: Fleet, who: Who, robot: OfRobot, item: ItemQuery, variables: Names = None,
     from_: From = "", to: To = "",
+    bins: Annotated[
+        int | None, Query(ge=1, le=MOST_BINS, description="count values in so many bars")
+    ] = None,
 ) -> Summaries:  # fmt: skip
-    """Sum up variables over a range: number of values, least, greatest, mean."""
+    """Sum up variables over a range: number of values, least, greatest, mean, histogram."""
     span = span_in(fleet, robot.id, from_, to)
-    question = Asked(robot.id, item, _names(variables), *span)
+    question = Asked(robot.id, item, _names(variables), *span, bins=bins)
     answer = fleet.asking.ask_now(f"{WORKER}:statistics", arguments(question), asker=who.asker)
     return msgspec.json.decode(answer, type=Summaries)

@@ -37,9 +37,10 @@ def envelope(reader: Reader, item: str, variables: Sequence[str], span: Span, po
     width_ns = max(-(-(to_ns - from_ns) // points), 1)
     level = next((n for n, w in reversed(LEVELS.items()) if w <= width_ns), "1s")
     names = [f"{column.name}:{state}" for column in columns for state in _STATES]
-    request = Request(schema.item, names, (from_ns, to_ns))
+    # a bucket has the time of its first row: one that the range begins in begins before it
+    request = Request(schema.item, names, (from_ns - LEVELS[level], to_ns))
     found = [
-        (source.robot, piece)
+        (source.robot, _reaching(piece, from_ns, LEVELS[level]))
         for source in reader.sources
         for piece in gather(
             reader.of(source, schema.item, request=request, level=level), request
@@ -47,6 +48,12 @@ def envelope(reader: Reader, item: str, variables: Sequence[str], span: Span, po
     ]
     width_ns = max(width_ns, LEVELS[level])
     return _table(schema.item, columns, found, from_ns, width_ns)
+
+
+def _reaching(piece: Flat, from_ns: int, level_ns: int) -> Flat:
+    """Leave out buckets that end before a time of receipt; they are cut by log time."""
+    ends_ns = piece.received_ns + level_ns - piece.log_time_ns % level_ns
+    return piece.take(np.flatnonzero(ends_ns > from_ns))
 
 
 def _bounds(reader: Reader, item: str, span: Span) -> tuple[int, int]:
@@ -101,7 +108,7 @@ def _joined(
     width_ns: int,
 ) -> tuple[IntArray, dict[str, list[NDArray[Any]]]]:
     parts = [
-        (p.received_ns - from_ns) // width_ns * len(robots) + robots.index(robot)
+        np.maximum(p.received_ns - from_ns, 0) // width_ns * len(robots) + robots.index(robot)
         for robot, p in found
     ]
     keys = np.concatenate(parts) if parts else np.empty(0, np.int64)

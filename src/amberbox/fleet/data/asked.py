@@ -13,10 +13,14 @@ ROWS = 100_000
 """Rows of an answer where nothing else is said."""
 MOST_ROWS = 5_000_000
 MOST_POINTS = 100_000
+MOST_BINS = 500
 
 
 class Asked(msgspec.Struct, frozen=True):
-    """Rows of an item: of ``[from_ns, to_ns)``, at most ``limit``, or thinned to ``points``."""
+    """Rows of an item: of ``[from_ns, to_ns)``, at most ``limit``, or thinned to ``points``.
+
+    ``bins`` is in how many bars sums count values, none if it is None.
+    """
 
     robot: str
     item: str
@@ -27,6 +31,7 @@ class Asked(msgspec.Struct, frozen=True):
     limit: int = ROWS
     points: int | None = None
     form: Form = "json"
+    bins: int | None = None
 
 
 class About(msgspec.Struct, frozen=True):
@@ -34,7 +39,8 @@ class About(msgspec.Struct, frozen=True):
 
     ``next_ns`` is from where on there are more, None at the end. ``kind`` is ``rows``, or
     ``envelope`` where rows were summed up: least, greatest and mean value of each step.
-    ``complete_ns`` is up to when all that the server holds was looked at.
+    ``complete_ns`` is up to when all that the server holds was looked at; ``of`` is how many rows
+    a thinned answer or an envelope was made of.
     """
 
     rows: int
@@ -42,6 +48,7 @@ class About(msgspec.Struct, frozen=True):
     next_ns: int | None = None
     complete_ns: int | None = None
     notes: list[str] = []
+    of: int | None = None
 
 
 def arguments(asked: Asked) -> dict[str, Any]:

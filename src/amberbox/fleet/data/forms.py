@@ -50,8 +50,8 @@ def about_json(about: About) -> dict[str, Any]:
     """Say of an answer what it says beside its rows."""
     shown = [None if ns is None else format_time(ns) for ns in (about.next_ns, about.complete_ns)]
     return {
-        "rows": about.rows, "kind": about.kind, "next": shown[0], "complete_to": shown[1],
-        "notes": about.notes,
+        "rows": about.rows, "of": about.of, "kind": about.kind, "next": shown[0],
+        "complete_to": shown[1], "notes": about.notes,
     }  # fmt: skip
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 
 from amberbox.blackbox.query.downsample import downsample
@@ -24,6 +25,8 @@ from amberbox.fleet.data.look import Look, Span
 
 THINNED_ROWS = 1_000_000
 """Of more rows than this a thinned answer is made from the pyramid."""
+_LEAST_POINTS = 5
+"""Of each variable least, greatest, first, last and a missing value; fewer would drop extremes."""
 _KEYS = frozenset({"timestamp", "received", "seq", "parent_seq"})
 
 
@@ -135,8 +138,8 @@ def _thinned(answer: Answer, points: int) -> Answer:
     if answer.about.next_ns is not None:
         raise LimitError(f"this is more than {MOST_ROWS} rows", "name a shorter range")
     variables = [table.columns[name] for name in table.names if name not in _KEYS]
-    chosen = downsample(variables, len(table), points)
-    about = About(len(chosen), "rows", None, answer.about.complete_ns, answer.about.notes)
+    chosen = downsample(variables, len(table), max(points, _LEAST_POINTS * len(variables)))
+    about = msgspec.structs.replace(answer.about, rows=len(chosen), of=len(table))
     return Answer(table.take(chosen), answer.times_ns[chosen], about)
 
 
@@ -157,4 +160,6 @@ def _summed(look: Look, schema: TableSchema, wanted: Sequence[Wanted], asked: As
     notes = list(table.notes)
     left = [w.name for w in wanted[1:] if w.name not in numbers]
     notes += [f"left out, only numbers can be summed up: {', '.join(left)}"] if left else []
-    return Answer(table, times, About(len(table), "envelope", None, look.committed_ns(), notes))
+    of = max((int(np.asarray(table.columns[f"{name}:count"]).sum()) for name in numbers), default=0)
+    about = About(len(table), "envelope", None, look.committed_ns(), notes, of)
+    return Answer(table, times, about)

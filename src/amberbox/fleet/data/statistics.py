@@ -37,11 +37,11 @@ def statistics_json(look: Look, asked: Asked) -> dict[str, Any]:
     if long and numbers:
         names = [column.name for column in numbers]
         table = envelope(look.reader, schema.item, names, span, _STEPS)
-        found = [_of_steps(table, column) for column in numbers]
+        found = [_of_steps(table, column, asked.bins) for column in numbers]
         return {"exact": False, "complete_to": None, "variables": found}
     answer = rows(look, _all_rows(asked, numbers))
     said = about_json(answer.about)
-    found = [_of_rows(answer.table, column) for column in numbers]
+    found = [_of_rows(answer.table, column, asked.bins) for column in numbers]
     return {"exact": True, "complete_to": said["complete_to"], "variables": found}
 
 
@@ -52,20 +52,18 @@ def _all_rows(asked: Asked, numbers: Sequence[Column]) -> Asked:
     )  # fmt: skip
 
 
-def _of_rows(table: Table, column: Column) -> dict[str, Any]:
+def _of_rows(table: Table, column: Column, bins: int | None) -> dict[str, Any]:
     line = table.columns[column.name]
     assert not isinstance(line, Ragged)  # see is_plotted
     values = np.ma.getdata(line).astype(np.float64)
-    return _summary(column, values[~(col.null_mask(line) | np.isnan(values))])
-
-
-def _summary(column: Column, values: NDArray[np.float64]) -> dict[str, Any]:
-    if not len(values):
+    known = values[~(col.null_mask(line) | np.isnan(values))]
+    if not len(known):
         return _entry(column, 0, None, None, None)
-    return _entry(column, len(values), values.min(), values.max(), values.mean())
+    bars = counted(known, np.ones(len(known)), bins)
+    return _entry(column, len(known), known.min(), known.max(), known.mean(), bars)
 
 
-def _of_steps(table: Table, column: Column) -> dict[str, Any]:
+def _of_steps(table: Table, column: Column, bins: int | None) -> dict[str, Any]:
     low, high, mean, count = (
         np.asarray(table.columns[f"{column.name}:{state}"])
         for state in ("min", "max", "mean", "count")
@@ -74,12 +72,41 @@ def _of_steps(table: Table, column: Column) -> dict[str, Any]:
     if not total:
         return _entry(column, 0, None, None, None)
     middle = float(np.nansum(mean * count)) / total
-    return _entry(column, total, np.nanmin(low), np.nanmax(high), middle)
+    known = count > 0
+    bars = counted(mean[known], count[known], bins)
+    return _entry(column, total, np.nanmin(low), np.nanmax(high), middle, bars)
 
 
-def _entry(column: Column, count: int, low: Any, high: Any, mean: Any) -> dict[str, Any]:
+def counted(
+    values: NDArray[np.float64], weights: NDArray[Any], bins: int | None
+) -> dict[str, list[Any]] | None:
+    """Count values in bars: ``edges``, one more than ``counts``. None for no bins or no values.
+
+    Whole numbers that are few enough get a bar each, about its number.
+    """
+    finite = np.isfinite(values)
+    values, weights = values[finite], weights[finite]
+    if bins is None or not len(values):
+        return None
+    edges = _edges(values, bins)
+    counts, _ = np.histogram(values, edges, weights=weights)
+    return {"edges": edges.tolist(), "counts": np.round(counts).astype(np.int64).tolist()}
+
+
+def _edges(values: NDArray[np.float64], bins: int) -> NDArray[np.float64]:
+    low, high = float(values.min()), float(values.max())
+    if high - low < bins and bool(np.all(values == np.round(values))):
+        return np.arange(low - 0.5, high + 1)
+    if high - low <= 4 * bins * np.spacing(max(abs(low), abs(high))):  # no room for bars
+        return np.array([low - 0.5, high + 0.5])
+    return np.linspace(low, high, bins + 1)
+
+
+def _entry(
+    column: Column, count: int, low: Any, high: Any, mean: Any, bars: Any = None
+) -> dict[str, Any]:
     shown = [None if v is None or not np.isfinite(v) else float(v) for v in (low, high, mean)]
     return {
         "name": column.name, "unit": column.unit, "count": count, "min": shown[0],
-        "max": shown[1], "mean": shown[2],
+        "max": shown[1], "mean": shown[2], "histogram": bars,
     }  # fmt: skip
