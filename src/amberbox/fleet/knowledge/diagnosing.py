@@ -55,7 +55,8 @@ def _moment(stores: Stores, asked: AskDiagnosis) -> Moment:
     if not times:
         raise UsageError(f"{asked.robot} has no diagnosis '{asked.diagnosis}'")
     if not asked.at:
-        return moment(stores, asked.robot, format_time(max(times)), asked.now_ns)
+        last_ns = max(times)
+        return moment(stores, asked.robot, format_time(last_ns), asked.now_ns, last_ns)
     return moment(stores, asked.robot, asked.at, asked.now_ns)
 
 

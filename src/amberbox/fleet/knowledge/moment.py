@@ -42,10 +42,11 @@ class Moment:
     notes: tuple[str, ...] = ()
 
 
-def moment(stores: Stores, robot: str, at: str, now_ns: int) -> Moment:
+def moment(stores: Stores, robot: str, at: str, now_ns: int, spoke_ns: int = 0) -> Moment:
     """Return what was known at a time; of the newest status without one.
 
-    ``-10m`` counts from the newest status. Raises UsageError for what is no time.
+    ``-10m`` counts from the newest status. ``spoke_ns`` is an instant at which the watcher is known
+    to have said something. Raises UsageError for what is no time.
     """
     newest = _newest(stores, robot, None)
     last_ns = None if newest is None else newest.at_ns
@@ -55,7 +56,7 @@ def moment(stores: Stores, robot: str, at: str, now_ns: int) -> Moment:
     before = newest if newest and newest.at_ns <= at_ns else _newest(stores, robot, at_ns)
     if before is None:
         return Moment(at_ns, notes=(f"nothing is known of the time before {_words(at_ns)}",))
-    if before.at_ns < at_ns - _STATUS_NS:
+    if max(before.at_ns, min(spoke_ns, at_ns)) < at_ns - _STATUS_NS:
         notes: tuple[str, ...] = (f"the robot said nothing after {_words(before.at_ns)}; "
                                   "this is as of then",)  # fmt: skip
         at_ns = before.at_ns

@@ -8,6 +8,7 @@ from itertools import islice
 from typing import Any, cast
 
 from amberbox.core.errors import UsageError
+from amberbox.core.timetext import format_time
 from amberbox.fleet.knowledge.asked import AskDiagnosis, AskRules, Engine, SymptomWord
 from amberbox.fleet.knowledge.explained import Answer
 from amberbox.fleet.pages.diagnosiscard import card_of
@@ -16,6 +17,8 @@ from amberbox.fleet.pages.diagnosisparts import Asked, Values
 ENGINES = ("covering", "rules", "faulttree")
 WORDS: tuple[SymptomWord, ...] = ("present", "absent", "unknown")
 WANTS = ("why", "why_not")
+INSTANTS_NS = range(10**18, 4 * 10**18)
+"""Whole numbers that are times, of 2001 to 2096; nothing else of a robot is as large."""
 LINES = 300
 """Lines of one proof that are shown."""
 
@@ -48,9 +51,10 @@ async def what_if(asked: Asked, symptoms: Mapping[str, SymptomWord], engine: str
 
 
 async def _supposed(asked: Asked, symptoms: Mapping[str, SymptomWord], engine: str) -> Answer:
+    diagnosis, answers = await asked.standing()
     question = AskDiagnosis(
         robot=asked.robot, now_ns=asked.now_ns, at=asked.at, symptoms=dict(symptoms),
-        answers=await asked.given(), diagnosis=asked.diagnosis, engine=cast("Engine", engine),
+        answers=answers, diagnosis=diagnosis, engine=cast("Engine", engine),
     )  # fmt: skip
     found: Answer = await asked.ask(question)
     return found
@@ -73,11 +77,18 @@ async def rules(asked: Asked, query: str, want: str) -> Values:
     return {
         **values, "found": found,
         "answers": [
-            {"values": one, "lines": _shown(_proof(proof))}
+            {"values": {key: _value(value) for key, value in one.items()},
+             "lines": _shown(_proof(proof))}
             for one, proof in zip(found["answers"], proofs, strict=False)
         ],
         "failed": _shown(line for entry in found["failed"] for line in _failed(entry, 0)),
     }  # fmt: skip
+
+
+def _value(value: Any) -> Values:
+    """Return a value of an answer; what can only be an instant is shown as one."""
+    is_instant = isinstance(value, int) and value in INSTANTS_NS
+    return {"text": str(value), "at": format_time(value) if is_instant else None}
 
 
 def _listed(found: Sequence[Answer], given: Mapping[str, str]) -> list[Values]:

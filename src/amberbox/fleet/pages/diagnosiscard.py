@@ -209,7 +209,7 @@ def choices_of(test: Answer, step: Answer | None = None) -> tuple[Choice, ...]:
         plain = [Choice(value, percent(chance)) for value, chance in test["outcomes"].items()]
         return _in_order(plain)
     told = [
-        Choice(b["answer"], percent(b["probability"]), _capital(b["leads"]), percent(b["then"]))
+        Choice(b["answer"], percent(b["probability"]), b["leads"], percent(b["then"]))
         for b in step["answers"]
     ]
     return _in_order(told)

@@ -68,17 +68,14 @@ def card_now(fleet: Services, seen: Look, as_of: str | None) -> DiagnosisCard:
     if seen.known is None or not seen.stands:
         return nothing_broken(seen.robot, as_of)
     answer = _at_hand(fleet, seen)
-    if answer is not None:
-        return _card(answer, seen)
-    plain = plain_card_of(revision_json(seen.known.peak))
-    return replace(plain, state=seen.known.last.state, answers=seen.answers)
+    return _plain(seen, seen.known) if answer is None else _card(answer, seen, seen.known)
 
 
 async def card_told(fleet: Services, who: Caller, seen: Look, as_of: str | None) -> DiagnosisCard:
     """Return the card with its explanation; raises AmberboxError where there can be none."""
     if seen.known is None or not seen.stands:
         return nothing_broken(seen.robot, as_of)
-    return _card(await answer_told(fleet, who, seen), seen)
+    return _card(await answer_told(fleet, who, seen), seen, seen.known)
 
 
 async def answer_told(fleet: Services, who: Caller, seen: Look) -> Answer:
@@ -131,8 +128,17 @@ def _at_hand(fleet: Services, seen: Look) -> Answer | None:
     return kept or fleet.explained.known(seen.robot, seen.known.last, seen.answers)
 
 
-def _card(answer: Answer, seen: Look) -> DiagnosisCard:
-    """Return the card of an answer; its state is that of now, not of when it was given."""
+def _plain(seen: Look, known: Known) -> DiagnosisCard:
+    plain = plain_card_of(revision_json(known.peak))
+    return replace(plain, state=known.last.state, answers=seen.answers)
+
+
+def _card(answer: Answer, seen: Look, known: Known) -> DiagnosisCard:
+    """Return the card of an answer; its state is that of now, not of when it was given.
+
+    What the robot says is broken is shown in its own words where the answer knows of nothing.
+    """
     card = card_of(answer)
-    state = seen.known.last.state if seen.known and card.state != "none" else card.state
-    return replace(card, state=state, answers=seen.answers)
+    if card.state == "none":
+        return replace(_plain(seen, known), complete=True, notes=card.notes)
+    return replace(card, state=known.last.state, answers=seen.answers)

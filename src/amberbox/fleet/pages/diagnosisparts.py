@@ -8,6 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from amberbox.core.errors import UsageError
 from amberbox.core.sureness import percent
 from amberbox.core.timetext import format_time
 from amberbox.fleet.api.access import Caller
@@ -55,10 +56,12 @@ class Asked:
         """Return what is looked at."""
         return await asyncio.to_thread(look, self.fleet, self.robot, self.diagnosis)
 
-    async def given(self) -> dict[str, str]:
-        """Return the answers to tests that count for what is looked at."""
+    async def standing(self) -> tuple[str, dict[str, str]]:
+        """Return which diagnosis is looked at, and the answers to tests that count for it."""
         seen = await self.look()
-        return seen.answers if seen.stands and not self.at else {}
+        if self.at or seen.known is None or not seen.stands:
+            return "", {}
+        return seen.known.id, seen.answers
 
     async def at_then(self) -> Answer:
         """Return the answer as of the instant."""
@@ -70,9 +73,12 @@ class Asked:
         """Return the explained answer; None where nothing is known to be broken."""
         if self.at:
             found = await self.at_then()
-            return found if found["explanation"] else None
-        seen = await self.look()
-        return await answer_told(self.fleet, self.who, seen) if seen.stands else None
+        else:
+            seen = await self.look()
+            if not seen.stands:
+                return None
+            found = await answer_told(self.fleet, self.who, seen)
+        return found if found["explanation"] else None
 
     async def ask(self, question: AboutRobot, name: str = "diagnose") -> Any:
         """Return what a worker says."""
@@ -134,7 +140,8 @@ async def effects(asked: Asked) -> Values:
 async def history(asked: Asked) -> Values:
     """Return what was found before, and the revisions of the one that is looked at."""
     seen = await asked.look()
-    return await asyncio.to_thread(_history, asked, seen)
+    found = await asyncio.to_thread(_history, asked, seen)
+    return {**found, "texts": await _texts(asked)}
 
 
 async def cause(asked: Asked) -> Values:
@@ -142,12 +149,8 @@ async def cause(asked: Asked) -> Values:
     seen = await asked.look()
     if seen.known is None:
         return {"seen": seen}
-    found = await asked.fmea()
-    modes = [
-        {"id": f"{row['Item']}#{row['Failure mode']}", "text": row["Description"]}
-        for row in found["table"]
-    ]
-    texts = {mode["id"]: mode["text"] for mode in modes}
+    texts = mode_texts(await asked.fmea())
+    modes = [{"id": name, "text": text} for name, text in texts.items()]
     named = [fault for h in seen.known.peak.hypotheses for fault in sorted(h.faults)]
     leading = [{"id": name, "text": texts[name]} for name in dict.fromkeys(named) if name in texts]
     rest = sorted((m for m in modes if m not in leading), key=lambda mode: str(mode["id"]))
@@ -189,7 +192,7 @@ def _evidence(robot: str, seen: Mapping[str, Answer], name: str) -> Reason:
     entry = seen.get(name, {"text": name})
     if "measured_from" in entry:
         return reason_of(robot, entry)
-    return Reason(_capital(str(entry["text"])), None, "")
+    return Reason(str(entry["text"]), None, "")
 
 
 def _tests(answer: Answer) -> Iterator[Next]:
@@ -208,6 +211,21 @@ def _links(answer: Answer) -> dict[str, str]:
         f"symptom:{name}": data_href(robot, entry["measured_from"], entry["onset_ns"])
         for name, entry in _seen(answer).items() if "measured_from" in entry
     }  # fmt: skip
+
+
+def mode_texts(fmea: Answer) -> dict[str, str]:
+    """Return what each failure mode is called, by its id."""
+    return {
+        f"{row['Item']}#{row['Failure mode']}": str(row["Description"]) for row in fmea["table"]
+    }
+
+
+async def _texts(asked: Asked) -> dict[str, str]:
+    """Return what failure modes are called; a history is there without the robot's folder, too."""
+    try:
+        return mode_texts(await asked.fmea())
+    except UsageError:
+        return {}
 
 
 def remarks(seen: Look) -> Values:

@@ -9,6 +9,8 @@ import * as view from "./view.js";
 
 /** What of the address each tab is about. */
 const ABOUT = { tree: ["effect"], rules: ["q", "want"], whatif: ["present", "absent", "unknown", "engine"] };
+/** So much of what stands before a tab is seen beside it, in pixels. */
+const BESIDE = 48;
 /** Tabs that follow what happens; in the others somebody may be writing. */
 const FOLLOWING = ["others", "effects", "history"];
 
@@ -48,7 +50,9 @@ export function start({ part, renewed }) {
       const is = tab.dataset.tab === name;
       tab.setAttribute("aria-selected", String(is));
       tab.tabIndex = is ? 0 : -1;
-      if (is) place.setAttribute("aria-labelledby", tab.id);
+      if (!is) continue;
+      place.setAttribute("aria-labelledby", tab.id);
+      tab.parentElement.scrollLeft = tab.offsetLeft - tab.parentElement.offsetLeft - BESIDE;
     }
   }
 
@@ -107,6 +111,7 @@ export function start({ part, renewed }) {
     if (event.target.closest("[data-cause]")) load("cause");
     renewed();
   });
+  mark(current());
   if (around.open) load(current());
   return { show, renew: () => around.open && FOLLOWING.includes(current()) && load(current()) };
 }
