@@ -16,7 +16,7 @@ from tests.browser.robot import Robot
 from tests.fleet.knowledge.robot import FOLDER, HASH
 
 MINUTE_NS = 60 * NS
-FAULT_NS = -40 * NS
+FAULT_NS = -15 * NS
 """When the front laser of ``ropod_001`` fell silent, from now on backwards."""
 COMPONENTS: Sequence[str] = (
     "host", "bus", "battery", "base_controller", "safety", "imu", "wifi", "log",
@@ -70,6 +70,7 @@ def all_well(robot: Robot) -> None:
 
 def laser_dies(robot: Robot) -> None:
     """Let the front laser fall silent: status, consequences, symptom, diagnosis, alarm."""
+    known = declared(FOLDER, robot.name, HASH).knowledge()
     robot.clock.ago_ns = -FAULT_NS
     at_ns = robot.clock.wall_ns()
     robot.status("laser_front", "error", "alive", mode="heartbeat", reason=REASON, alive=False,
@@ -80,16 +81,9 @@ def laser_dies(robot: Robot) -> None:
         robot.change(component, "error", "blocked", reason=f"needs {by[0]}", blocked_by=by)
     silent = Symptom(NO_SCANS, "present", NO_SCANS, at_ns, at_ns)
     runs = Symptom(RUNS, "absent", RUNS, None, at_ns)
-    found = diagnosis(robot.name, at_ns, silent, runs)
+    found = answer(known, Situation((silent, runs), watched=True), Heading(DIAGNOSIS, 1, at_ns))
     robot.say(silent, runs, found, alarm(robot.name, at_ns, found))
     robot.clock.ago_ns = 0
-
-
-def diagnosis(robot: str, at_ns: int, *symptoms: Symptom, revision: int = 1) -> Diagnosis:
-    """Return what the robot's own engine makes of symptoms."""
-    knowledge = declared(FOLDER, robot, HASH).knowledge()
-    situation = Situation(symptoms, watched=True)
-    return answer(knowledge, situation, Heading(DIAGNOSIS, revision, at_ns))
 
 
 def alarm(robot: str, at_ns: int, of: Diagnosis) -> AlarmChange:

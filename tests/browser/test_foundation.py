@@ -6,10 +6,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from threading import Thread
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from tests.browser import hostile
 from tests.browser.conftest import PageAs
 from tests.browser.expecting import expect
 from tests.browser.looks import axe, no_sideways_scroll, shot
@@ -122,11 +123,18 @@ def test_nobody_but_the_site_is_reached(page_as: PageAs) -> None:
     watched.heard.clear()
 
 
+def card(site: Site, robot: str) -> dict[str, Any]:
+    """Return what the server says of a robot."""
+    found: dict[str, Any] = site.ask(f"/robots/{robot}")
+    return found
+
+
 def test_the_robots_are_as_they_say(site: Site) -> None:
     cards = {card["robot"]: card for card in site.ask("/robots")}
     assert cards["ropod_001"]["level"] == "error" and cards["ropod_001"]["alarms"] == 1
     assert cards["ropod_001"]["diagnosis"]["faults"] == ["laser_front#silent"]
     assert cards["ropod_002"]["level"] == "warn"
+    until(lambda: card(site, "ropod_002")["model"] == hostile.MODEL, "its folder is read", 30)
     assert not cards["ropod_003"]["online"] and cards["ropod_003"]["backlog_rows"] == 1234
 
 
