@@ -20,6 +20,7 @@ from amberbox.fleet.state.said import (
     heard,
     moment,
 )
+from amberbox.fleet.state.standing import Standing
 from amberbox.link.frames import Row
 
 _MOST = 2000
@@ -33,7 +34,11 @@ class _Known:
     store_id: str
     run: int
     seq: int
-    said: SaidStatus
+    standing: Standing
+
+    @property
+    def said(self) -> SaidStatus:
+        return self.standing.said
 
 
 class StatusMemory:
@@ -47,9 +52,16 @@ class StatusMemory:
         for row in connection.execute(select(STATUS)):
             said = heard(row.data, SaidStatus)
             if said is not None:
-                self._enter(row.robot, _Known(row.store_id, row.run, row.seq, said))
+                standing = Standing(said, row.log_ns, row.received_ns)
+                self._enter(row.robot, _Known(row.store_id, row.run, row.seq, standing))
 
-    def changed(self, robot: str, store_id: str, rows: Iterable[Row]) -> list[SaidStatus]:
+    def standing(self, robot: str) -> Mapping[tuple[str, str], Standing]:
+        """Return what was said last of each component and mode of a robot."""
+        return {key: one.standing for key, one in self._known.get(robot, {}).items()}
+
+    def changed(
+        self, robot: str, store_id: str, rows: Iterable[Row], now_ns: int
+    ) -> list[SaidStatus]:
         """Return the statuses that are not as they were; those that came late are none."""
         found: dict[tuple[str, str], SaidStatus] = {}
         for row in rows:
@@ -59,7 +71,8 @@ class StatusMemory:
             before = self._known.get(robot, {}).get((said.component, said.mode))
             if before is not None and _is_late(before, store_id, row):
                 continue
-            self._enter(robot, _Known(store_id, row.run, row.seq, said))
+            standing = Standing(said, row.log_ns, now_ns)
+            self._enter(robot, _Known(store_id, row.run, row.seq, standing))
             if before is None or not _is_same(before.said, said):
                 found[said.component, said.mode] = said
         return list(found.values())

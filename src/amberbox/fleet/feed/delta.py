@@ -9,8 +9,10 @@ from typing import Any, Final, Literal, TypeAlias, get_args
 
 import msgspec
 
-Kind: TypeAlias = Literal["presence", "status", "event", "diagnosis", "alarm", "job"]
+Kind: TypeAlias = Literal["presence", "status", "ages", "event", "diagnosis", "alarm", "job"]
 KINDS: Final[frozenset[str]] = frozenset(get_args(Kind))
+PLAIN: Final[frozenset[str]] = KINDS - {"ages"}
+"""The kinds that somebody hears who names none."""
 HELD = 10_000
 HELD_BYTES = 64 << 20
 

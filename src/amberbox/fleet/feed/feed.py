@@ -12,6 +12,8 @@ from amberbox.core.clock import Clock
 from amberbox.fleet.alarms.listing import robots_of
 from amberbox.fleet.bus import Bus, Change
 from amberbox.fleet.database.database import Database
+from amberbox.fleet.feed.ages import EVERY_S as AGES_S
+from amberbox.fleet.feed.ages import ages_data
 from amberbox.fleet.feed.changes import (
     StatusMemory,
     diagnosis_data,
@@ -21,8 +23,10 @@ from amberbox.fleet.feed.delta import Delta, Kind, Ring
 from amberbox.fleet.feed.gate import permission
 from amberbox.fleet.feed.listener import Filter, Listener
 from amberbox.fleet.feed.live import EVERY_S, Live
+from amberbox.fleet.feed.silence import LOOK_S, Silence
 from amberbox.fleet.linkend.server import LinkServer
 from amberbox.fleet.state.said import SaidStatus, status_data
+from amberbox.fleet.state.standing import Moment, clock_offsets_ns
 from amberbox.fleet.state.state import Snapshot, State
 
 GATHER_S = 0.04
@@ -51,6 +55,8 @@ class Feed:
         self._bus = bus
         self._clock = clock
         self._memory = StatusMemory()
+        self._silence = Silence()
+        self._repeated: set[str] = set()
         self._pending: dict[str, dict[tuple[str, str], SaidStatus]] = {}
         self._is_due = False
         self._last_s = 0.0
@@ -64,9 +70,11 @@ class Feed:
         """Listen to what happens until cancelled."""
         await asyncio.to_thread(self._load)
         ends = [self._bus.on(kind, work) for kind, work in self._hears()]
+        works = (self.state.run(), self.live.run(), self._checks(), self._lives(),
+                 self._silences(), self._ages())  # fmt: skip
         try:
             async with asyncio.TaskGroup() as group:  # none of them goes on without the others
-                for work in (self.state.run(), self.live.run(), self._checks(), self._lives()):
+                for work in works:
                     group.create_task(work)
         finally:
             for end in ends:
@@ -118,7 +126,9 @@ class Feed:
         for kind, data in (("event", event_data(rows)), ("diagnosis", diagnosis_data(rows))):
             if data:
                 self.add(kind, robot, data)  # type: ignore[arg-type]  # one of two literals
-        changed = self._memory.changed(robot, change.data["store_id"], rows)
+        self._repeated.add(robot)
+        now_ns = self._clock.wall_ns()
+        changed = self._memory.changed(robot, change.data["store_id"], rows, now_ns)
         if changed:
             pending = self._pending.setdefault(robot, {})
             pending.update({(said.component, said.mode): said for said in changed})
@@ -183,6 +193,31 @@ class Feed:
                     if texts.get(key):
                         listener.live[robot] = texts[key]
                         listener.wake.set()
+
+    async def _silences(self) -> None:
+        """Tell of robots that miss their heartbeats while their link holds."""
+        while True:
+            await asyncio.sleep(LOOK_S)
+            for robot, data in self._silence.news(self._links.robots):
+                self.add("presence", robot, data)
+
+    async def _ages(self) -> None:
+        """Tell how old statuses are, of robots that said them again, as long as somebody asks."""
+        while True:
+            await asyncio.sleep(AGES_S)
+            repeated, self._repeated = self._repeated, set()
+            heard = {robot for one in self.listeners for robot in one.robots_of("ages")}
+            wanted = sorted(repeated & heard)
+            offsets = await asyncio.to_thread(self._offsets, wanted) if wanted else {}
+            now_ns = self._clock.wall_ns()
+            for robot in wanted:
+                known = self._memory.standing(robot)
+                if known:
+                    self.add("ages", robot, ages_data(known, Moment(now_ns, offsets.get(robot))))
+
+    def _offsets(self, robots: Sequence[str]) -> Mapping[str, int]:
+        with self._database.reading() as connection:
+            return clock_offsets_ns(connection, robots)
 
     def _accounts(self, _: Change) -> None:
         self._check.set()

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from amberbox.fleet.feed.asked import Asked
-from amberbox.fleet.feed.delta import KINDS, Delta
+from amberbox.fleet.feed.delta import PLAIN, Delta
 from amberbox.fleet.feed.gate import Credential, Permission
 
 
@@ -69,9 +69,13 @@ class Listener:
         asked = self.asked.robots
         return self.permission.robots if asked is None else self.permission.robots & {*asked}
 
+    def robots_of(self, kind: str) -> frozenset[str]:
+        """Return the robots of which somebody hears changes of a kind."""
+        return dict(self.filter.reach).get(kind, frozenset())
+
     def settle(self) -> None:
         """Work out what is heard; after each change of what is asked or allowed."""
-        kinds = KINDS if self.asked.kinds is None else frozenset(self.asked.kinds)
+        kinds = PLAIN if self.asked.kinds is None else frozenset(self.asked.kinds)
         asked, may = self.robots, self.permission.kinds
         reach = frozenset((kind, asked & may[kind]) for kind in kinds)
         principal = self.permission.principal

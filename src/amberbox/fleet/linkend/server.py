@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import time
 from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -47,6 +48,8 @@ _HEADS_BYTES = 64 << 10
 """A statement of how far a record reaches has some hundred bytes; a larger one is not kept."""
 _WAITING = 64
 """Frames that are taken before the oldest of them is answered."""
+QUIET_S = 3.2 * limits.BEAT_S
+"""A robot that is connected and says nothing for so long has missed three heartbeats."""
 
 
 Answer: TypeAlias = "tuple[ServerFrame, ...] | asyncio.Task[Sequence[ServerFrame]]"
@@ -83,6 +86,13 @@ class Connected:
     written_ns: int = 0
     backlog: int = 0
     answers: asyncio.Queue[Answer | None] = field(default_factory=lambda: asyncio.Queue(_WAITING))
+    heard_s: float = field(default_factory=time.monotonic)
+    """When something came last, by a clock that nobody sets."""
+
+    @property
+    def is_silent(self) -> bool:
+        """Tell whether heartbeats are missing, though the connection holds."""
+        return time.monotonic() - self.heard_s > QUIET_S
 
 
 class LinkServer:
@@ -161,7 +171,7 @@ class LinkServer:
                 one.end.closed = True
                 await one.answers.put((_bye(str(error)),))
                 return
-            one.last_seen_ns = self._clock.wall_ns()
+            one.last_seen_ns, one.heard_s = self._clock.wall_ns(), time.monotonic()
             for deed in one.end.receive(frame):
                 await self._do(one, deed)
 

@@ -41,6 +41,7 @@ class Card:
 
     ``level`` is ``unknown`` where nobody can know; ``last_level`` is what it was then. ``cause``
     says in words what is worst. ``severity`` is the highest of the alarms that it has open.
+    ``silent``: its link holds, and three heartbeats are missing.
     """
 
     robot: str
@@ -63,6 +64,7 @@ class Card:
     battery: Battery | None
     mission: OnMission | None
     diagnosis: Lead | None
+    silent: bool = False
 
 
 @dataclass(frozen=True, slots=True)
