@@ -74,6 +74,11 @@ def pytest_runtest_teardown(
         item.config.stash.setdefault(_OPEN, ExitStack()).close()
 
 
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """End them also where tests stopped in the middle (``-x``, Ctrl-C)."""
+    session.config.stash.setdefault(_OPEN, ExitStack()).close()
+
+
 @pytest.fixture(scope="session")
 def site(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Site:
     """The server with its robots."""
