@@ -91,8 +91,9 @@ function published(stack, end) {
     setWhole(whole) {
       stack.whole = whole;
     },
-    /** What is shown: window, cursor and variables. */
-    now: () => ({ ...stack.view, cursor: stack.cursor, traces: [...stack.traces.values()] }),
+    /** What is shown: window, cursor and variables; `settled` when everything for it has come. */
+    now: () => ({ ...stack.view, cursor: stack.cursor, traces: [...stack.traces.values()],
+      settled: !stack.loader.isBusy() && !stack.around.isBusy() && !stack.drawing }),
     destroy() {
       end.abort();
       stack.live.start(null);

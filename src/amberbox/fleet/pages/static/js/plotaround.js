@@ -8,7 +8,7 @@ const PAUSE_MS = 250;
 
 /** @param {any} stack */
 export function surroundings(stack) {
-  const state = { watched: null, timer: 0, control: new AbortController(), given: [] };
+  const state = { watched: null, timer: 0, control: new AbortController(), isBusy: false };
 
   /**
    * Show what happened to a robot beside its values.
@@ -25,6 +25,7 @@ export function surroundings(stack) {
   /** Ask, as soon as the window has stayed for a moment. */
   function want() {
     clearTimeout(state.timer);
+    state.isBusy = true;
     state.timer = setTimeout(load, PAUSE_MS);
   }
 
@@ -35,7 +36,9 @@ export function surroundings(stack) {
     const traces = [...stack.traces.values()];
     const work = [stack.gaps.want(traces, stack.view), ...sums(traces, stack.view, signal), ...beside(signal)];
     await Promise.allSettled(work);
-    if (!signal.aborted) stack.redraw();
+    if (signal.aborted) return;
+    state.isBusy = false;
+    stack.redraw();
   }
 
   function* beside(signal) {
@@ -51,7 +54,7 @@ export function surroundings(stack) {
     });
   }
 
-  return { watch, want };
+  return { watch, want, isBusy: () => state.isBusy };
 }
 
 /** Ask for the sums of the window, of variables of one item together. */

@@ -14,6 +14,7 @@
 import { TIME_HEIGHT, axisWidth, timeAxis, valueAxis } from "./axes.js";
 import { el } from "./dom.js";
 import { extremes } from "./plotdata.js";
+import { t } from "./strings.js";
 import { drawMoment, drawSeries, drawStretch } from "./plotdraw.js";
 
 const HEIGHT = 190;
@@ -96,7 +97,8 @@ function emptyData(shown) {
 function optionsOf(shown, { width, rights, last, narrow }) {
   const { stack } = shown;
   const scales = scalesOf(shown);
-  const words = scales.map((scale) => shown.traces.find((t) => scaleOf(t) === scale).names);
+  const words = scales.map((scale) => shown.traces.find((one) => scaleOf(one) === scale).names
+    .map((name) => name || t("plot.empty_text")));
   const own = axisWidth(narrow) * (rights - (scales.length - 1));
   return {
     width, height: heightOf(words) + (last ? TIME_HEIGHT : 8),
@@ -142,7 +144,7 @@ function hooksOf(shown) {
     draw: [() => drawTraces(shown)],
     setCursor: [(chart) => {
       if (chart.cursor.left >= 0) stack.pointed(chart.posToVal(chart.cursor.left, "x"), shown);
-      else stack.pointed(null, shown);
+      else stack.redraw(); // the cursor stays where the mouse left
     }],
     setSelect: [(chart) => {
       const { left, width } = chart.select;

@@ -5,7 +5,11 @@ import { moment, since } from "./plottime.js";
 import { t } from "./strings.js";
 
 const ICONS = { alarm: "bell", incident: "flag", mission: "robot", note: "note", event: "info" };
-const TOGETHER_PX = 22;
+/** Levels with which there is nothing to see. */
+const CALM = new Set(["ok", "unknown"]);
+const LASTING = new Set(["mission", "incident"]);
+const TOGETHER_PX = 28;
+const FLAG_PX = 40;
 const WORD_PX = 6.5;
 
 /** Make the strip of flags, and the same as a list. */
@@ -24,9 +28,35 @@ export function showFlags(strip, marks, width) {
   strip.flags.hidden = !marks.length;
   strip.details.hidden = !marks.length;
   const placed = inside.map((mark) => ({ mark, x: Math.max(0, ((mark.from - from) / (to - from)) * width) }));
-  strip.flags.replaceChildren(...grouped(placed).map((group) => flag(strip, group)));
+  const lasting = inside.filter((mark) => LASTING.has(mark.kind)).map((mark) => ({
+    key: `span ${mark.id}`, make: () => spanOf(mark), move: (element) => placeSpan(strip, element, mark, width),
+  }));
+  const groups = grouped(placed);
+  keep(strip.flags, [...lasting, ...groups.map((group) => ({
+    key: group.map(({ mark }) => `${mark.id} ${mark.text} ${mark.to}`).join("\n"),
+    make: () => flag(strip, group), move: (element) => placeFlag(element, group[0].x, width),
+  }))]);
   setText(strip.summary, t("plot.happened", { n: inside.length }));
-  strip.list.replaceChildren(...inside.map((mark) => el("li", {}, ...line(strip, mark))));
+  keep(strip.list, inside.map((mark) => ({
+    key: `${mark.id} ${mark.text}`, make: () => el("li", {}, ...line(strip, mark)), move: () => undefined,
+  })));
+}
+
+/**
+ * Keep the children of an element that are the same as before: they keep focus and are only moved.
+ * @param {HTMLElement} parent
+ * @param {{key: string, make: function(): HTMLElement, move: function(HTMLElement): void}[]} wanted
+ */
+function keep(parent, wanted) {
+  const known = new Map([...parent.children].map((child) => [child.dataset.key, child]));
+  const children = wanted.map(({ key, make, move }) => {
+    const child = known.get(key) ?? make();
+    child.dataset.key = key;
+    move(child);
+    return child;
+  });
+  const same = children.length === parent.children.length && children.every((child, n) => parent.children[n] === child);
+  if (!same) parent.replaceChildren(...children);
 }
 
 /** Flags that would cover each other become one. */
@@ -41,7 +71,7 @@ function grouped(placed) {
 }
 
 function flag(strip, group) {
-  const [{ mark, x }] = group;
+  const [{ mark }] = group;
   const worst = group.find((one) => one.mark.kind === "alarm")?.mark ?? mark;
   const lines = group.map((one) => el("span", { class: "plot-flag-line" }, sentence(strip, one.mark)));
   const tip = el("span", { class: "plot-tip" }, ...lines);
@@ -50,9 +80,30 @@ function flag(strip, group) {
   const made = el(alone ? "a" : "button", alone ? { ...about, href: mark.href } : { ...about, type: "button" },
     icon(ICONS[worst.kind]), group.length > 1 ? String(group.length) : null, tip);
   if (!alone) made.addEventListener("click", () => strip.stack.cursorTo(mark.from));
-  made.style.left = `${x}px`;
-  if (x > strip.stack.plotWidth() / 2) made.classList.add("plot-flag-late");
   return made;
+}
+
+function placeFlag(element, x, width) {
+  element.style.left = `${x}px`;
+  element.classList.toggle("plot-flag-late", x > width / 2);
+  element.classList.toggle("plot-flag-last", x > width - FLAG_PX);
+}
+
+/** A bar from the beginning to the end of what lasts; the flag and the list say what it is. */
+function spanOf(mark) {
+  return el("span", { class: `plot-span plot-span-${mark.kind}`, "aria-hidden": "true" });
+}
+
+function placeSpan({ stack }, element, mark, width) {
+  const xOf = along(stack.view, width);
+  const left = xOf(mark.from);
+  element.style.left = `${left}px`;
+  element.style.width = `${Math.max(xOf(mark.to ?? stack.view.to) - left, 2)}px`;
+}
+
+/** Where a time lies on a strip, no farther than its ends. */
+function along({ from, to }, width) {
+  return (time) => ((Math.min(Math.max(time, from), to) - from) / (to - from)) * width;
 }
 
 function sentence({ stack }, mark) {
@@ -70,34 +121,54 @@ function timeText({ options }, time) {
   return options.relative ? since(time, 0.1) : moment(time, 1);
 }
 
-/** Make what holds the lanes of states. */
+/** Make what holds the lanes of states: those that were not always fine, and the others folded. */
 export function laneStrip(stack) {
-  return { stack, root: el("div", { class: "plot-lanes" }) };
+  const troubled = el("div", { class: "plot-lanes" });
+  const fine = el("div", { class: "plot-lanes" });
+  const summary = el("summary", {}, "");
+  const details = el("details", { class: "plot-fine" }, summary, fine);
+  const root = el("div", { class: "plot-lanes" }, troubled, details);
+  root.hidden = true;
+  return { stack, root, troubled, fine, summary, details };
 }
 
 /** Show lanes. @param {import("./plotmarks.js").Lane[]} lanes */
 export function showLanes(strip, lanes, width) {
+  const { from, to } = strip.stack.view;
+  const isFine = (lane) => lane.stretches.every((one) => one.to <= from || one.from >= to || CALM.has(one.level));
+  const [fine, troubled] = [lanes.filter(isFine), lanes.filter((lane) => !isFine(lane))];
   strip.root.hidden = !lanes.length;
-  strip.root.replaceChildren(...lanes.map((lane) => laneOf(strip, lane, width)));
+  strip.details.hidden = !fine.length;
+  setText(strip.summary, t("plot.fine", { n: fine.length }));
+  for (const [root, some] of [[strip.troubled, troubled], [strip.fine, fine]]) {
+    keep(root, some.map((lane) => ({
+      key: lane.id, make: () => laneOf(lane), move: (element) => fillLane(strip, element, lane, width),
+    })));
+  }
 }
 
-function laneOf({ stack }, lane, width) {
-  const { from, to } = stack.view;
-  const xOf = (time) => ((Math.min(Math.max(time, from), to) - from) / (to - from)) * width;
-  const parts = lane.stretches.filter((one) => one.from < to && one.to > from);
-  const bar = el("div", { class: "plot-lane-bar" }, ...parts.map((one) => part(stack, one, xOf)));
+function laneOf(lane) {
   return el("div", { class: "plot-lane", role: "group", "aria-label": t("plot.states_of", { name: lane.label }) },
-    el("span", { class: "plot-lane-name clip", title: lane.label }, lane.label), bar);
+    el("span", { class: "plot-lane-name" }, lane.label), el("div", { class: "plot-lane-bar" }));
 }
 
-function part(stack, one, xOf) {
+function fillLane({ stack }, element, lane, width) {
+  const { from, to } = stack.view;
+  const xOf = along(stack.view, width);
+  keep(element.lastElementChild, lane.stretches.filter((one) => one.from < to && one.to > from).map((one) => ({
+    key: `${one.from} ${one.to} ${one.text}`, make: () => stateOf(stack, one), move: (child) => placeState(child, one, xOf),
+  })));
+}
+
+function stateOf(stack, one) {
+  const text = `${one.text} · ${timeText(stack, one.from)} – ${timeText(stack, one.to)}`;
+  return el("span", { class: `plot-state plot-state-${one.level}`, title: text, role: "img", "aria-label": text });
+}
+
+function placeState(element, one, xOf) {
   const left = xOf(one.from);
   const wide = Math.max(xOf(one.to) - left, 2);
-  const text = `${one.text} · ${timeText(stack, one.from)} – ${timeText(stack, one.to)}`;
-  const fits = one.text.length * WORD_PX < wide;
-  const made = el("span", { class: `plot-state plot-state-${one.level}`, title: text, role: "img", "aria-label": text },
-    fits ? one.text : null);
-  made.style.left = `${left}px`;
-  made.style.width = `${wide}px`;
-  return made;
+  element.style.left = `${left}px`;
+  element.style.width = `${wide}px`;
+  setText(element, one.text.length * WORD_PX < wide ? one.text : "");
 }

@@ -60,7 +60,7 @@ function valueOf(trace, series, place, time) {
 /** A value by its name, where values have names. */
 function named(trace, place, raw) {
   if (Number.isNaN(place)) return "–";
-  return trace.names[place] ?? plain(raw);
+  return trace.names[place] === "" ? t("plot.empty_text") : trace.names[place] ?? plain(raw);
 }
 
 function addRow(shown, trace) {
@@ -87,9 +87,8 @@ function write(cells, trace, time, gaps) {
 }
 
 function sumText(trace, key, value) {
-  if (value === null) return "–";
-  const name = key === "mean" ? undefined : trace.names[trace.codes.indexOf(value)];
-  return name ?? plain(value);
+  if (value === null || (key === "mean" && trace.names.length)) return "–";
+  return trace.names[trace.codes.indexOf(value)] ?? plain(value);
 }
 
 /** How many rows one point of the plot stands for, in words; empty while nothing is there. */
