@@ -9,8 +9,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as some
 
+from amberbox import sim
 from amberbox.diagnosis.faulttree.formula import Constant, all_of, any_of, at_least, none_of
 from amberbox.diagnosis.faulttree.tree import fault_tree as of_formulas
+from amberbox.diagnosis.fmea import load_fmea
+from amberbox.diagnosis.fmea.trees import effects, fault_tree_of
 from amberbox.fleet.drawing.branches import (
     Branch,
     Event,
@@ -152,7 +155,7 @@ _ROOM = {
 }
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(trees())
 def test_parts_do_not_overlap(tree: Tree) -> None:
     """Give every gate and every leaf room of its own, inside the drawing."""
@@ -167,7 +170,7 @@ def test_parts_do_not_overlap(tree: Tree) -> None:
     assert max(frame.y + frame.height for frame in found) <= block.height + 0.01
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(trees(), some.sets(some.sampled_from([f"e{n}" for n in range(6)])))
 def test_held_agrees_with_the_definition(tree: Tree, events: set[str]) -> None:
     """Find what holds as a plain recursion does."""
@@ -245,14 +248,9 @@ def test_hostile_names_are_text(hostile: str) -> None:
     }  # fmt: skip
 
 
-def test_tree_of_a_real_robot_is_drawn(tmp_path: Path) -> None:
-    """Draw the trees of the robot that a new folder has."""
-    from amberbox.cli.main import main
-    from amberbox.diagnosis.fmea import load_fmea
-    from amberbox.diagnosis.fmea.trees import effects, fault_tree_of
-
-    assert main(["new", str(tmp_path / "ropod_001")]) == 0
-    fmea, _ = load_fmea(tmp_path / "ropod_001" / "fmea.yaml")
+def test_tree_of_a_real_robot_is_drawn() -> None:
+    """Draw the trees of the simulated robot."""
+    fmea, _ = load_fmea(Path(sim.__file__).parent / "folder" / "fmea.yaml")
     assert fmea is not None
     for effect in effects(fmea):
         tree = tree_of(fault_tree_of(fmea, effect))
