@@ -1,0 +1,232 @@
+"""The page of a robot's diagnosis: what it shows to whom, and what is kept."""
+
+import asyncio
+import html
+import re
+from collections.abc import Iterator
+
+import pytest
+from starlette.testclient import TestClient
+
+from amberbox.core.clock import NS
+from amberbox.fleet.pages import diagnosislook
+from tests.fleet.house import House, house
+from tests.fleet.knowledge import robot as sim
+
+BASE = "/robots/ropod_001/diagnosis"
+API = f"/api/v1/robots/ropod_001/diagnoses/{sim.DIAGNOSIS}"
+HOSTILE = '"><img src=x onerror=alert(1)>{{7*7}}'
+
+
+@pytest.fixture(scope="module")
+def home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[House]:
+    """One robot has a laser without scans, one no folder, one was never there."""
+    with house(tmp_path_factory.mktemp("house"), shared=True) as found:
+        silent, at_ns = sim.symptom(sim.NO_SCANS, sim.AT_NS), sim.AT_NS
+        sim.hand_in(found)
+        sim.state(found)
+        sim.state(found, "ropod_002", "ab" * 32)
+        sim.say(found, [
+            (at_ns - 5 * NS, sim.status("laser_front", at_ns - 5 * NS)),
+            (at_ns, silent), (at_ns, sim.diagnosis(at_ns, silent)),
+            (at_ns + NS, sim.status("laser_front", at_ns + NS)),
+        ])  # fmt: skip
+        yield found
+
+
+@pytest.fixture
+def operator(home: House) -> TestClient:
+    return home.client("operator")
+
+
+@pytest.fixture
+def viewer(home: House) -> TestClient:
+    return home.client("viewer")
+
+
+def text_of(page: str) -> str:
+    """Return the words of a page, without its markup."""
+    return " ".join(html.unescape(re.sub(r"<[^>]+>", " ", page)).split())
+
+
+def part(client: TestClient, path: str) -> str:
+    answer = client.get(f"{BASE}{path}")
+    assert answer.status_code == 200, answer.text
+    return text_of(answer.text)
+
+
+def test_the_page_comes_without_a_worker_in_the_robots_own_words(
+    home: House, viewer: TestClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(home.services.asking, "ask", None)
+    monkeypatch.setattr(home.services.explained, "known", lambda *_: None)
+    shown = part(viewer, "")
+    assert "One of these two" in shown and "Laser front: silent" in shown
+    assert "Does the lamp of the front laser burn?" in shown
+
+
+def test_the_card_explains_and_is_remembered(home: House, viewer: TestClient) -> None:
+    assert "The front laser has no power" in part(viewer, "/card")
+    page = viewer.get(BASE).text
+    assert 'data-complete="yes"' in page and "The front laser has no power" in text_of(page)
+    card = diagnosislook.current_card(home.services, "ropod_001", None)
+    assert card.complete and card.severity == "critical"
+
+
+def test_only_who_may_answer_has_buttons(viewer: TestClient, operator: TestClient) -> None:
+    buttons = f'data-post="{API}/answers"'
+    assert buttons in operator.get(BASE).text and buttons in operator.get(f"{BASE}/card").text
+    assert buttons not in viewer.get(BASE).text
+    assert "An operator can say" in part(viewer, "/cause")
+
+
+def test_who_may_not_ask_has_no_tabs_to_ask(viewer: TestClient, operator: TestClient) -> None:
+    assert 'data-tab="whatif"' in operator.get(BASE).text
+    assert 'data-tab="whatif"' not in viewer.get(BASE).text
+    assert viewer.get(f"{BASE}/whatif").status_code == 403
+
+
+def test_candidates_have_what_speaks_for_and_against_them(viewer: TestClient) -> None:
+    shown = part(viewer, "/others")
+    assert shown.index("The driver of the front laser has ended") < shown.index("motor_slow")
+    assert "Speaks for it" in shown and "worn bearing" in shown
+    assert "Does the front laser sound rough or uneven?" in shown
+
+
+def test_effects_are_drawn_and_listed(viewer: TestClient) -> None:
+    page = viewer.get(f"{BASE}/effects").text
+    assert "<svg" in page and 'role="group"' in page
+    assert text_of(page).count("the front laser has no power") >= 2
+
+
+def test_the_tree_is_that_of_what_is_closest_to_being_lost(viewer: TestClient) -> None:
+    page = viewer.get(f"{BASE}/tree").text
+    assert '<option value="see_people" selected>' in page and "<svg" in page
+    assert "the rear laser has no power" in text_of(page)
+    other = viewer.get(f"{BASE}/tree", params={"effect": "move"}).text
+    assert '<option value="move" selected>' in other
+
+
+def test_a_tree_that_there_is_not_says_so(viewer: TestClient) -> None:
+    assert "there is no function 'moove'" in part(viewer, "/tree?effect=moove")
+
+
+def test_rules_answer_with_reasons(operator: TestClient) -> None:
+    shown = part(operator, "/rules?q=status(C, ok, From, To)")
+    assert "laser_front" in shown and "lookup, watcher" in shown
+    assert "15 Jan" in shown or "2027-01-15 07:43:15 UTC" in shown  # an instant, not a number
+
+
+def test_rules_say_why_there_is_no_answer(operator: TestClient) -> None:
+    shown = part(operator, "/rules?q=in_error(laser_rear)&want=why_not")
+    assert "No answer" in shown and "status(laser_rear,error" in shown
+
+
+def test_a_slip_in_a_goal_keeps_the_goal(operator: TestClient) -> None:
+    page = operator.get(f"{BASE}/rules", params={"q": 'status("<b>'})
+    assert 'value="status(&#34;&lt;b&gt;"' in page.text and 'class="problem"' in page.text
+
+
+def test_what_if_another_symptom_were_there(operator: TestClient) -> None:
+    found = part(operator, "/whatif")
+    assert "The answer as it is" in found and "rear laser" not in found.split("The answer")[1]
+    supposed = part(operator, "/whatif?present=laser_rear/heartbeat/alive")
+    assert "rear laser" in supposed.split("The answer would be")[1]
+    assert part(operator, "/whatif") == found  # nothing of it is kept
+
+
+def test_what_if_all_were_well(operator: TestClient) -> None:
+    shown = part(operator, f"/whatif?absent={sim.NO_SCANS}")
+    assert "Nothing is known to be broken" in shown.split("The answer would be")[1]
+
+
+def test_what_if_by_fault_trees_alone(operator: TestClient) -> None:
+    page = operator.get(f"{BASE}/whatif", params={"engine": "faulttree"}).text
+    assert '<option value="faulttree" selected>' in page
+
+
+def test_a_symptom_that_there_is_not_keeps_the_form(operator: TestClient) -> None:
+    shown = part(operator, "/whatif?present=nonsense")
+    assert "there is no symptom 'nonsense'" in shown and "The answer as it is" in shown
+
+
+def test_any_moment_has_its_own_answer(viewer: TestClient) -> None:
+    assert "The front laser has no power" in part(viewer, "/card?at=2027-01-15T07:43:21Z")
+    assert "Nothing is known to be broken" in part(viewer, "/card?at=2027-01-15T07:43:17Z")
+    assert "You see what was known then" in part(viewer, "?at=2027-01-15T07:43:17Z")
+    assert "could not be worked out" in part(viewer, "/card?at=yesterday-ish")
+
+
+def test_a_diagnosis_that_there_is_not_is_not_found(viewer: TestClient) -> None:
+    assert viewer.get(f"{BASE}?diagnosis=nothing").status_code == 404
+    assert viewer.get(f"{BASE}/card?diagnosis=nothing").status_code == 404
+
+
+def test_history_has_words_and_revisions(viewer: TestClient) -> None:
+    shown = part(viewer, "/history")
+    assert "the driver of the front laser has ended" in shown and sim.NO_SCANS in shown
+
+
+def test_a_robot_that_was_never_there_says_what_to_do(home: House) -> None:
+    page = home.client("admin").get("/robots/ropod_003/diagnosis").text
+    assert "never been connected" in page and 'href="/admin/robots"' in page
+    assert 'href="/admin/robots"' not in home.client("viewer").get(
+        "/robots/ropod_003/diagnosis").text.split("<main")[1]  # fmt: skip
+
+
+def test_a_robot_without_its_folder_says_what_to_do(viewer: TestClient) -> None:
+    assert "folder of this robot is not here yet" in text_of(
+        viewer.get("/robots/ropod_002/diagnosis").text)  # fmt: skip
+
+
+def test_a_robot_without_failure_modes_says_what_to_do(home: House, viewer: TestClient) -> None:
+    sim.hand_in(home, "ropod_002", "ab" * 32)
+    place = home.services.folders.shelf.place("ropod_002", "ab" * 32)
+    assert diagnosislook.missing(home.services, "ropod_002", True) == ""
+    place.chmod(0o755)
+    (place / "fmea.yaml").unlink()
+    assert "Nobody has said what can fail" in text_of(
+        viewer.get("/robots/ropod_002/diagnosis").text)  # fmt: skip
+
+
+def test_somebody_answers_and_says_what_it_was(tmp_path_factory: pytest.TempPathFactory) -> None:
+    with house(tmp_path_factory.mktemp("answered"), shared=True) as home:
+        silent = sim.symptom(sim.NO_SCANS, sim.AT_NS)
+        sim.hand_in(home)
+        sim.state(home)
+        sim.say(home, [(sim.AT_NS, sim.status("laser_front", sim.AT_NS)), (sim.AT_NS, silent),
+                       (sim.AT_NS, sim.diagnosis(sim.AT_NS, silent))])  # fmt: skip
+        client = home.client("operator")
+        body = {"test": "laser_front.lamp", "answer": "no"}
+        assert client.post(f"{API}/answers", json=body).status_code == 200
+        shown = part(client, "")  # at once, without asking a worker again
+        assert "98 %" in shown and "One of these" not in shown
+        cause = {"failure_mode": "laser_front#silent", "note": HOSTILE}
+        assert client.post(f"{API}/cause", json=cause).status_code == 201
+        page = client.get(BASE).text
+        assert "It was this, says operator" in text_of(page) and HOSTILE in text_of(page)
+        assert HOSTILE not in page and "49" not in text_of(page).split("It was this")[1][:80]
+        assert HOSTILE in part(client, "/cause") and "laser_front.lamp: no" in part(
+            client, "/history")  # fmt: skip
+
+
+def test_several_who_want_an_explanation_wait_for_the_same_one(
+    home: House, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = []
+
+    async def ask(*about: object, **more: object) -> bytes:
+        asked.append(about)
+        await asyncio.sleep(0)
+        return b'{"state": "open"}'
+
+    monkeypatch.setattr(home.services.asking, "ask", ask)
+    explained, revision = home.services.explained, sim.diagnosis(7, sim.symptom(sim.NO_SCANS, 7))
+
+    async def all_of() -> list[object]:
+        wanted = (explained.read("ropod_009", revision, {}, "somebody") for _ in range(5))
+        return list(await asyncio.gather(*wanted))
+
+    assert asyncio.run(all_of()) == [{"state": "open"}] * 5
+    assert len(asked) == 1
+    assert explained.known("ropod_009", revision, {"lamp": "no"}) is None

@@ -1,0 +1,145 @@
+"""The card of a diagnosis: what it makes of answers."""
+
+from typing import Any
+
+import pytest
+
+from amberbox.consult.case import Case, answered
+from amberbox.consult.declared import declared
+from amberbox.consult.telling import explained, json_of
+from amberbox.core.types import Symptom
+from amberbox.diagnosis.knowledge import Knowledge
+from amberbox.diagnosis.situation import Situation
+from amberbox.fleet.api.diagnoses import revision_json
+from amberbox.fleet.pages.diagnosiscard import (
+    REASONS,
+    DiagnosisCard,
+    card_of,
+    data_href,
+    minutes,
+    plain_card_of,
+)
+from tests.fleet.knowledge import robot as sim
+
+NOW = sim.AT_NS
+SECOND_NS = 1_000_000_000
+NO_POWER = "The front laser has no power"
+
+
+@pytest.fixture(scope="module")
+def knowledge() -> Knowledge:
+    return declared(sim.FOLDER, "ropod_001", sim.HASH).knowledge()
+
+
+def seen(name: str, *addresses: str, at_ns: int = NOW) -> Symptom:
+    evidence = tuple((address, at_ns, at_ns) for address in addresses)
+    return Symptom(name, "present", name, at_ns, at_ns, evidence=evidence)
+
+
+def answer_of(knowledge: Knowledge, *symptoms: Symptom, **answers: str) -> dict[str, Any]:
+    given = {name.replace("__", "."): value for name, value in answers.items()}
+    case = Case(NOW, Situation(symptoms, watched=True, answers=given))
+    found = answered(knowledge, case) if symptoms else None
+    return json_of(knowledge, case, found, explained(knowledge, case, found))
+
+
+def card(knowledge: Knowledge, *symptoms: Symptom, **answers: str) -> DiagnosisCard:
+    return card_of(answer_of(knowledge, *symptoms, **answers))
+
+
+def test_two_that_nothing_tells_apart_are_named_both(knowledge: Knowledge) -> None:
+    found = card(knowledge, seen(sim.NO_SCANS))
+    assert {cause.text for cause in found.causes} == {
+        "The driver of the front laser has ended", NO_POWER,
+    }  # fmt: skip
+    assert (found.sure, found.number) == ("cannot_tell_apart", "92 %")
+
+
+def test_an_answer_makes_one_likely(knowledge: Knowledge) -> None:
+    found = card(knowledge, seen(sim.NO_SCANS), laser_front__lamp="no")
+    assert [cause.text for cause in found.causes] == [NO_POWER]
+    assert (found.sure, found.number) == ("likely", "98 %")
+
+
+def test_below_one_in_two_it_is_only_possible(knowledge: Knowledge) -> None:
+    answer = answer_of(knowledge, seen(sim.NO_SCANS), laser_front__lamp="no")
+    answer["explanation"]["sure"]["probability"] = 0.4999
+    assert card_of(answer).sure == "possible"
+
+
+def test_it_says_whether_the_robot_can_be_used_on_one_scale(knowledge: Knowledge) -> None:
+    found = card(knowledge, seen(sim.NO_SCANS))
+    assert (found.severity, found.use) == ("critical", "No, it cannot go on with what it does.")
+
+
+def test_the_next_test_has_minutes_somebody_and_answers_in_order(knowledge: Knowledge) -> None:
+    step = card(knowledge, seen(sim.NO_SCANS)).next
+    assert step is not None
+    assert (step.text, step.role, step.minutes) == (
+        "Does the lamp of the front laser burn?", "operator", "½",
+    )  # fmt: skip
+    assert [choice.value for choice in step.choices] == ["yes", "no"]
+    assert step.choices[1].leads == "the front laser has no power"
+
+
+def test_reasons_lead_to_the_data_of_their_moment(knowledge: Knowledge) -> None:
+    at_ns = NOW - 5 * SECOND_NS
+    symptom = seen(sim.NO_SCANS, "sim_scan_front", "sim_bus.devices", at_ns=at_ns)
+    (reason,) = card(knowledge, symptom).why
+    assert reason.at == "2027-01-15T07:43:15.000000000Z"
+    assert reason.href == (
+        "/robots/ropod_001/data?v=sim_scan_front&v=sim_bus.devices"
+        "&from=2027-01-15T07%3A42%3A15.000Z&to=2027-01-15T07%3A44%3A15.000Z"
+    )
+
+
+def test_there_are_at_most_three_reasons_and_a_count_of_the_others(knowledge: Knowledge) -> None:
+    answer = answer_of(knowledge, seen(sim.NO_SCANS))
+    answer["explanation"]["because"] *= REASONS + 2
+    found = card_of(answer)
+    assert (len(found.why), found.more) == (REASONS, 2)
+
+
+def test_nothing_open_is_nothing_known_to_be_broken(knowledge: Knowledge) -> None:
+    found = card(knowledge)
+    assert (found.state, found.causes, found.next) == ("none", (), None)
+    assert found.at == "2027-01-15T07:43:20.000000000Z"
+
+
+def test_a_false_alarm_and_what_nobody_knows_are_called_so(knowledge: Knowledge) -> None:
+    answer = answer_of(knowledge, seen(sim.NO_SCANS), laser_front__lamp="no")
+    member = answer["explanation"]["broken"]["members"][0]
+    fault = member["faults"][0]
+    answer["explanation"]["broken"]["members"] = [
+        {**member, "faults": []}, {**member, "faults": [{**fault, "id": "unknown#other"}]},
+    ]  # fmt: skip
+    assert [cause.kind for cause in card_of(answer).causes] == ["false_alarm", "other"]
+
+
+def test_without_any_explanation_the_revision_speaks_by_ids() -> None:
+    found = plain_card_of(revision_json(sim.diagnosis(NOW, seen(sim.NO_SCANS))))
+    assert [cause.text for cause in found.causes] == [
+        "Laser front: driver crash", "Laser front: silent",
+    ]  # fmt: skip
+    assert not found.complete and found.next is not None
+    assert [choice.value for choice in found.next.choices] == ["yes", "no"]
+    assert found.why[0].text == "Laser front heartbeat alive."
+
+
+def test_a_revision_without_any_hypothesis_has_a_card() -> None:
+    shown = revision_json(sim.diagnosis(NOW, seen(sim.NO_SCANS)))
+    found = plain_card_of({**shown, "hypotheses": [], "groups": [], "next_tests": []})
+    assert (found.causes, found.sure, found.next) == ((), "", None)
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"), [(0, ""), (20, "½"), (60, "1"), (89, "1"), (150, "2"), (3600, "60")]
+)
+def test_minutes_are_whole_but_for_a_half(seconds: float, text: str) -> None:
+    assert minutes(seconds) == text
+
+
+def test_addresses_of_data_are_quoted_and_those_of_monitors_left_out() -> None:
+    hostile = '"><script>'
+    found = data_href("a/b", [hostile, "laser/heartbeat/alive"], None)
+    assert found == "/robots/a%2Fb/data?v=%22%3E%3Cscript%3E"
