@@ -65,8 +65,15 @@ export function plain(value) {
 function numbers(values, step) {
   const size = Math.max(...values.map(Math.abs));
   if (size >= 1e6 || (size && size < 1e-4)) return values.map((v) => v && minus(v.toExponential(1)));
-  const digits = Math.max(0, Math.ceil(-Math.log10(step) - 1e-9));
+  const digits = decimals(step);
   return values.map((value) => minus(value.toFixed(digits)));
+}
+
+/** Decimals that all multiples of a step can be written with. */
+function decimals(step) {
+  let digits = 0;
+  while (digits < 10 && Math.abs(step * 10 ** digits - Math.round(step * 10 ** digits)) > 1e-6) digits += 1;
+  return digits;
 }
 
 function minus(text) {

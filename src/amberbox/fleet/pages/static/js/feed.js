@@ -11,66 +11,90 @@ const LOST_MS = 3000;
 const PATIENCE_MS = [250, 500, 1000, 2000, 4000, 8000];
 const ENDED = 4401;
 
+/** The one line of a page, whoever of its modules listens. */
+const line = { socket: null, number: null, tries: 0, heardMs: performance.now(), parts: [] };
+
 /**
  * Listen to robots (null: all) and kinds (null: all). Returns `on(kind, fn(data, robot))`, and
- * `want({live: {robot: [variables]}})` to ask for something else.
+ * `want({live: {robot: [variables]}})` to ask for something else. All modules of a page share one
+ * socket; who joins later makes everybody hear a new snapshot.
  */
 export function listen({ robots = null, kinds = null, live = {} } = {}) {
-  const wanted = { robots, kinds, live };
-  const listeners = new Map();
-  const feed = { socket: null, number: null, tries: 0, heardMs: performance.now() };
+  const part = { wanted: { robots, kinds, live }, listeners: new Map() };
+  line.parts.push(part);
+  if (line.socket === null) start();
+  else say(null);
 
   function on(kind, fn) {
-    listeners.set(kind, [...(listeners.get(kind) ?? []), fn]);
+    part.listeners.set(kind, [...(part.listeners.get(kind) ?? []), fn]);
   }
 
   function want(change) {
-    Object.assign(wanted, change);
-    if (feed.socket?.readyState === WebSocket.OPEN) say();
+    Object.assign(part.wanted, change);
+    say();
   }
 
-  function say() {
-    feed.socket.send(JSON.stringify({ ...wanted, resume: feed.number }));
-  }
+  return { on, want };
+}
 
-  function open() {
-    const address = new URL("/api/v1/feed", location.href);
-    address.protocol = address.protocol.replace("http", "ws");
-    feed.socket = new WebSocket(address);
-    feed.socket.addEventListener("open", say);
-    feed.socket.addEventListener("message", (event) => hear(JSON.parse(event.data)));
-    feed.socket.addEventListener("close", (event) => closed(event.code));
-  }
-
-  function hear(messages) {
-    feed.heardMs = performance.now();
-    feed.tries = 0;
-    state("live");
-    for (const { number, kind, robot, data } of messages) {
-      if (kind !== "live") feed.number = number;
-      for (const fn of listeners.get(kind) ?? []) fn(data, robot);
-    }
-  }
-
-  function closed(code) {
-    if (code === ENDED) {
-      signIn();
-      return;
-    }
-    const wait = PATIENCE_MS[Math.min(feed.tries, PATIENCE_MS.length - 1)];
-    feed.tries += 1;
-    setTimeout(open, wait);
-  }
-
-  function watch() {
-    if (performance.now() - feed.heardMs < LOST_MS) return;
-    state("lost");
-    if (feed.socket.readyState === WebSocket.OPEN) feed.socket.close();
-  }
-
+function start() {
   open();
   setInterval(watch, 500);
-  return { on, want };
+}
+
+/** Ask for what all parts want together. */
+function say(resume = line.number) {
+  if (line.socket.readyState !== WebSocket.OPEN) return;
+  line.socket.send(JSON.stringify({ ...together(line.parts.map((part) => part.wanted)), resume }));
+}
+
+function together(wants) {
+  const of = (name) => (wants.some((one) => one[name] === null) ? null : [...new Set(wants.flatMap((one) => one[name]))]);
+  const live = {};
+  for (const [robot, names] of wants.flatMap((one) => Object.entries(one.live))) {
+    live[robot] = [...new Set([...(live[robot] ?? []), ...names])];
+  }
+  return { robots: of("robots"), kinds: of("kinds"), live };
+}
+
+function open() {
+  const address = new URL("/api/v1/feed", location.href);
+  address.protocol = address.protocol.replace("http", "ws");
+  line.socket = new WebSocket(address);
+  line.socket.addEventListener("open", () => say());
+  line.socket.addEventListener("message", (event) => hear(JSON.parse(event.data)));
+  line.socket.addEventListener("close", (event) => closed(event.code));
+}
+
+function hear(messages) {
+  line.heardMs = performance.now();
+  line.tries = 0;
+  state("live");
+  for (const message of messages) {
+    if (message.kind !== "live") line.number = message.number;
+    for (const part of line.parts) tell(part, message);
+  }
+}
+
+function tell({ wanted, listeners }, { kind, robot, data }) {
+  if (robot && wanted.robots !== null && !wanted.robots.includes(robot)) return;
+  for (const fn of listeners.get(kind) ?? []) fn(data, robot);
+}
+
+function closed(code) {
+  if (code === ENDED) {
+    signIn();
+    return;
+  }
+  const wait = PATIENCE_MS[Math.min(line.tries, PATIENCE_MS.length - 1)];
+  line.tries += 1;
+  setTimeout(open, wait);
+}
+
+function watch() {
+  if (performance.now() - line.heardMs < LOST_MS) return;
+  state("lost");
+  if (line.socket.readyState === WebSocket.OPEN) line.socket.close();
 }
 
 function state(now) {

@@ -20,10 +20,10 @@ export function histogram(element, { trace, from, to }) {
   const title = trace.label ?? trace.variable;
   const name = trace.unit ? `${title} [${trace.unit}]` : title;
   const shown = figure(element, { height: HEIGHT, label: t("plot.histogram", { name }),
-    draw: (pen) => draw(pen, state.bars, name) });
+    draw: (pen) => draw(pen, state.bars, name, trace.labels ?? {}) });
   const note = el("p", { class: "small muted", role: "status" });
-  const list = el("table", { class: "sr-only" });
-  shown.root.append(el("figcaption", {}, note), list);
+  const list = el("table", {});
+  shown.root.append(el("figcaption", {}, note), el("div", { class: "sr-only" }, list));
 
   /** Show another window. Throws AskError. */
   async function update(begin, end) {
@@ -50,11 +50,14 @@ function wordOf(sums, exact) {
   return exact ? "plot.histogram_of" : "plot.histogram_steps";
 }
 
-function draw(pen, bars, name) {
+function draw(pen, bars, name, labels) {
   if (!bars) return;
   const { edges, counts } = bars;
   const most = counts.reduce((high, count) => Math.max(high, count), 1);
-  const place = pen.axes({ low: edges[0], high: edges[edges.length - 1], label: name },
+  const [low, high] = [edges[0], edges[edges.length - 1]];
+  const named = Object.entries(labels).map(([value, text]) => [Number(value), text]);
+  const names = named.length ? named.filter(([value]) => value > low && value < high) : undefined;
+  const place = pen.axes({ low, high, label: name, names },
     { low: 0, high: most * 1.05, label: t("plot.count") });
   pen.context.fillStyle = pen.colours.plot[0];
   counts.forEach((count, n) => {

@@ -148,8 +148,9 @@ function members(stack) {
   const gapsOf = (trace) => {
     const until = trace.series?.completeTo;
     const holes = stack.gaps.of(trace);
-    if (until === null || until === undefined || until >= stack.view.to || trace.live) return holes;
-    return [...holes, { from: until, to: stack.view.to, kind: "tocome", reason: stack.frame.toCome }];
+    const to = trace.live ? trace.live.x[0] : stack.view.to;
+    if (until === null || until === undefined || until >= to) return holes;
+    return [...holes, { from: until, to, kind: "tocome", reason: stack.frame.toCome }];
   };
   return { add, remove, drop, gapsOf };
 }

@@ -51,7 +51,8 @@ function penOf(canvas, width, height, shades) {
 }
 
 /**
- * Draw axes. @param {{low: number, high: number, label: string}} x @param {typeof x} y
+ * Draw axes. @param {{low: number, high: number, label: string,
+ *   names?: [number, string][]}} x `names` of values stand where numbers would @param {typeof x} y
  * @returns {{x: function(number): number, y: function(number): number, bottom: number}}
  */
 function axes(context, shades, width, height, x, y) {
@@ -65,10 +66,11 @@ function axes(context, shades, width, height, x, y) {
   context.strokeStyle = shades.line;
   context.fillStyle = shades.ink;
   context.lineWidth = 1;
-  for (const value of ticks(x.low, x.high, (right - LEFT) / 80)) {
+  const names = x.names && new Map(x.names);
+  for (const value of names?.keys() ?? ticks(x.low, x.high, (right - LEFT) / 80)) {
     const at = Math.round(place.x(value)) + 0.5;
     rule(context, at, TOP, at, bottom);
-    write(context, plain(value), at, bottom + 16, "center");
+    write(context, names?.get(value) ?? plain(value), at, bottom + 16, "center");
   }
   for (const value of ticks(y.low, y.high, (bottom - TOP) / 34)) {
     const at = Math.round(place.y(value)) + 0.5;

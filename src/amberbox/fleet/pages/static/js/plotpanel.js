@@ -20,7 +20,7 @@ import { drawMoment, drawSeries, drawStretch } from "./plotdraw.js";
 const HEIGHT = 190;
 const WORDS_HEIGHT = 26;
 /** Pixels between the plot and the right edge of a panel. */
-export const EDGE = 14;
+export const EDGE = 20;
 const MARGIN = 0.06;
 
 /**
