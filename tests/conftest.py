@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import functools
 import gc
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from hypothesis import settings
+
+from amberbox.core import plugins
 
 SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 NO_DATA = "needs_data: the folder ../shared/data beside the repository is absent"
@@ -29,6 +33,14 @@ def shared_data() -> Path:
     if not SHARED_DATA.is_dir():
         pytest.skip(NO_DATA)
     return SHARED_DATA
+
+
+@pytest.fixture(scope="session", autouse=True)
+def parse_plugins_once() -> Iterator[None]:
+    """Read the syntax of a plugin's text once: that took most of the time of most verbs."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(plugins, "_parsed", functools.cache(plugins._parsed))
+        yield
 
 
 def pytest_configure(config: pytest.Config) -> None:
