@@ -204,7 +204,8 @@ def test_somebody_answers_and_says_what_it_was(tmp_path_factory: pytest.TempPath
         cause = {"failure_mode": "laser_front#silent", "note": HOSTILE}
         assert client.post(f"{API}/cause", json=cause).status_code == 201
         page = client.get(BASE).text
-        assert "It was this, says operator" in text_of(page) and HOSTILE in text_of(page)
+        assert "It was this, says operator: the front laser has no power" in text_of(page)
+        assert HOSTILE in text_of(page)
         assert HOSTILE not in page and "49" not in text_of(page).split("It was this")[1][:80]
         assert HOSTILE in part(client, "/cause") and "laser_front.lamp: no" in part(
             client, "/history")  # fmt: skip

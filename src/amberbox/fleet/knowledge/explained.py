@@ -67,6 +67,12 @@ class Explained:
         with self._lock:
             return self._known.get(key_of(robot, diagnosis, answers))
 
+    def newest(self, robot: str, diagnosis: str) -> Answer | None:
+        """Return the explanation of a diagnosis that was made last, of whichever revision."""
+        with self._lock:
+            fitting = (key for key in reversed(self._known) if key[:2] == (robot, diagnosis))
+            return next((self._known[key] for key in fitting), None)
+
     async def read(
         self, robot: str, diagnosis: Diagnosis, answers: Mapping[str, str], asker: str
     ) -> Answer:

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Iterator
 
 from amberbox.core.types import Output, Status, Symptom, SymptomState
 from amberbox.monitoring.engine.judging import holds
+from amberbox.monitoring.engine.symptoms import measured_from
 from amberbox.monitoring.plan import Expectation, ModePlan, Plan
 
 SOURCE = "monitor"
@@ -24,15 +25,23 @@ def symptoms_of(plan: Plan, statuses: Iterable[Status]) -> Iterator[Symptom]:
 
 
 def _of_mode(mode: ModePlan, status: Status) -> Iterator[Symptom]:
-    for output in (output for mapping in mode.mappings for output in mapping.outputs):
+    outputs = ((mapping, output) for mapping in mode.mappings for output in mapping.outputs)
+    for mapping, output in outputs:
         if output.expectation.value is None:
             continue
         address = f"{status.component}/{mode.id}/{output.name}"
         state = _state(output.expectation, status.outputs.get(output.name), status)
         onset_ns = status.since_ns if state == "present" else None
+        evidence = (
+            ()
+            if onset_ns is None
+            else tuple(
+                (name, onset_ns, status.measured_ns) for name in measured_from(mapping, output)
+            )
+        )
         yield Symptom(
             address, state, address, onset_ns, status.measured_ns, source=SOURCE,
-            blocked_by=status.blocked_by,
+            evidence=evidence, blocked_by=status.blocked_by,
         )  # fmt: skip
 
 

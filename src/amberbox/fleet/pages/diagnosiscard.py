@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal, TypeAlias
 from urllib.parse import quote, urlencode
 
@@ -81,7 +81,8 @@ class DiagnosisCard:
 
     ``state`` is ``none`` where nothing is known to be broken; then ``at`` is up to when that is
     known. ``complete`` is false while only the robot's own words are known, without explanation.
-    ``more`` counts what was seen beyond ``why``. ``number`` is empty where there is none.
+    ``more`` counts what was seen beyond ``why``. ``number`` is empty where there is none. ``names``
+    are failure modes in words, by id.
     """
 
     robot: str
@@ -101,6 +102,7 @@ class DiagnosisCard:
     next: Next | None = None
     complete: bool = True
     answers: Mapping[str, str] | None = None
+    names: Mapping[str, str] = field(default_factory=dict)
     notes: Sequence[str] = ()
 
 
@@ -128,7 +130,7 @@ def card_of(answer: Answer, until_ns: int | None = None) -> DiagnosisCard:
         told["use"]["severity"], _sentence(told["use"]["text"]),
         tuple(lost["text"] for lost in told["use"]["lost"]), _sentence(told["use"]["careful"]),
         _told_next(told["next"], answer["next_tests"]),
-        answers=answer.get("answers"), notes=tuple(answer.get("notes", ())),
+        answers=answer.get("answers"), names=names_in(told), notes=tuple(answer.get("notes", ())),
     )  # fmt: skip
 
 
@@ -164,6 +166,13 @@ def data_href(
         )
         query += [("from", _text(at_ns - BEFORE_NS)), ("to", _text(to_ns))]
     return f"/robots/{quote(robot, safe='')}/data?{urlencode(query)}"
+
+
+def names_in(told: Answer) -> dict[str, str]:
+    """Return what the failure modes are called that an explanation names."""
+    groups = [*([told["broken"]] if told["broken"] else ()), *told["others"]]
+    faults = (fault for group in groups for one in group["members"] for fault in one["faults"])
+    return {fault["id"]: fault["text"] for fault in faults}
 
 
 def _told_causes(broken: Answer | None) -> Iterator[Cause]:

@@ -109,6 +109,15 @@ def missing(fleet: Services, robot: str, ever_seen: bool) -> Missing:
     return "" if (fleet.folders.shelf.place(robot, kept[0]) / FILE).is_file() else "fmea"
 
 
+def leading_faults(fleet: Services, seen: Look) -> list[str]:
+    """Return the failure modes that the answer names, the most probable first."""
+    if seen.known is None:
+        return []
+    answer = _at_hand(fleet, seen)
+    found = answer["hypotheses"] if answer else revision_json(seen.known.peak)["hypotheses"]
+    return [fault for entry in found for fault in entry["faults"]]
+
+
 def _with_remarks(fleet: Services, seen: Look) -> Look:
     assert seen.known is not None
     of = seen.robot, seen.known.id

@@ -27,7 +27,7 @@ from amberbox.fleet.pages.diagnosiscard import (
     minutes,
     reason_of,
 )
-from amberbox.fleet.pages.diagnosislook import Look, answer_told, look
+from amberbox.fleet.pages.diagnosislook import Look, answer_told, leading_faults, look
 from amberbox.fleet.pages.strings import catalogue
 from amberbox.fleet.services import Services
 
@@ -151,7 +151,7 @@ async def cause(asked: Asked) -> Values:
         return {"seen": seen}
     texts = mode_texts(await asked.fmea())
     modes = [{"id": name, "text": text} for name, text in texts.items()]
-    named = [fault for h in seen.known.peak.hypotheses for fault in sorted(h.faults)]
+    named = leading_faults(asked.fleet, seen)
     leading = [{"id": name, "text": texts[name]} for name in dict.fromkeys(named) if name in texts]
     rest = sorted((m for m in modes if m not in leading), key=lambda mode: str(mode["id"]))
     return {"seen": seen, "modes": rest, "leading": leading, "texts": texts,

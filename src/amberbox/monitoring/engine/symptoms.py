@@ -117,10 +117,11 @@ def _is_word(said: Said) -> bool:
 
 def _measured_by(mappings: Iterable[MappingPlan]) -> list[list[str]]:
     """Return for each output of a mode the addresses that it is found from."""
-    return [_addresses(mapping, output) for mapping in mappings for output in mapping.outputs]
+    return [measured_from(mapping, output) for mapping in mappings for output in mapping.outputs]
 
 
-def _addresses(mapping: MappingPlan, output: OutputPlan) -> list[str]:
+def measured_from(mapping: MappingPlan, output: OutputPlan) -> list[str]:
+    """Return the addresses of what an output of a mapping is found from."""
     own = mapping.inputs if output.place is None else mapping.inputs[output.place :][:1]
     return list(dict.fromkeys(_address(entry) for entry in (*own, *mapping.reads)))
 
