@@ -28,7 +28,7 @@ class Catalogue:
 
     texts: Mapping[str, str]
 
-    def text(self, name: str, **fields: Any) -> str:
+    def text(self, name: str, /, **fields: Any) -> str:
         """Return a text with its fields filled in; raises MissingTextError."""
         found = self.texts.get(name)
         if found is None:

@@ -1,9 +1,11 @@
 // Forms and buttons that ask the API: `data-post` is the path, `data-method` the method (POST),
 // `data-body` more of what is sent, `data-confirm` what is asked before, `data-done` what comes
-// after: `reload`, `goto:/path`, `toast:text`, or `event`, which is told as `done` on the element.
+// after: `reload`, `goto:/path`, `toast:text`, `show:field` (of the answer, once, with `data-note`),
+// or `event`, which is told as `done` on the element.
 
 import { ask, clear, fail, toast } from "./ask.js";
 import { el } from "./dom.js";
+import { showOnce } from "./once.js";
 import { t } from "./strings.js";
 
 const READ = {
@@ -58,7 +60,7 @@ async function send(element, read, button) {
     const body = { ...JSON.parse(about.body ?? "{}"), ...read() };
     const method = about.method ?? "POST";
     const has = method !== "DELETE" || Object.keys(body).length > 0;
-    after(element, await ask(about.post, { method, body: has ? body : undefined }));
+    await after(element, await ask(about.post, { method, body: has ? body : undefined }));
   } catch (error) {
     fail(error, near);
   } finally {
@@ -66,11 +68,12 @@ async function send(element, read, button) {
   }
 }
 
-function after(element, answer) {
+async function after(element, answer) {
   const [what, ...rest] = (element.dataset.done ?? "reload").split(":");
   const more = rest.join(":");
   element.dispatchEvent(new CustomEvent("done", { bubbles: true, detail: answer }));
-  if (what === "reload") location.reload();
+  if (what === "show") await showOnce(answer[more], element.dataset.note);
+  if (what === "reload" || what === "show") location.reload();
   else if (what === "goto") location.assign(more);
   else if (what === "toast") toast(more || t("common.done"));
 }
