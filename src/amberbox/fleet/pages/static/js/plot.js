@@ -93,7 +93,7 @@ function published(stack, end) {
     },
     /** What is shown: window, cursor and variables; `settled` when everything for it has come. */
     now: () => ({ ...stack.view, cursor: stack.cursor, traces: [...stack.traces.values()],
-      settled: !stack.loader.isBusy() && !stack.around.isBusy() && !stack.drawing }),
+      settled: !stack.asking && !stack.drawing && !stack.loader.isBusy() && !stack.around.isBusy() }),
     destroy() {
       end.abort();
       stack.live.start(null);
@@ -184,11 +184,12 @@ function views(stack) {
     stack.view = view;
     stack.redraw();
     clearTimeout(stack.asking);
-    if (soft) stack.asking = setTimeout(settled, SOFT_MS);
-    else settled();
+    stack.asking = soft ? setTimeout(settled, SOFT_MS) : 0;
+    if (!soft) settled();
   }
 
   function settled() {
+    stack.asking = 0;
     want();
     stack.options.onWindow?.(stack.view.from, stack.view.to);
   }

@@ -8,6 +8,8 @@ import { moment, since, utc } from "./plottime.js";
 import { panned, zoomed } from "./plotview.js";
 import { t } from "./strings.js";
 
+const NOTHING = "–";
+
 /** Make the frame of a stack. @param {any} stack @param {HTMLElement} element */
 export function frameOf(stack, element) {
   const flags = flagStrip(stack);
@@ -79,7 +81,7 @@ function sentence(stack) {
   const { cursor, options } = stack;
   const values = [...stack.traces.values()].map((trace) => {
     const { text, note } = valueAt(trace, cursor, stack.gapsOf(trace));
-    return `${trace.label} ${text} ${trace.unit}${note ? ` (${note})` : ""}`;
+    return [trace.label, text, text === NOTHING ? "" : trace.unit, note && `(${note})`].filter(Boolean).join(" ");
   });
   return [options.relative ? since(cursor, 0.1) : moment(cursor, 0.1), ...values].join("; ");
 }

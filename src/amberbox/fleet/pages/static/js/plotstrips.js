@@ -84,9 +84,11 @@ function flag(strip, group) {
 }
 
 function placeFlag(element, x, width) {
-  element.style.left = `${x}px`;
+  const isLast = x > width - FLAG_PX;
+  element.style.left = isLast ? "auto" : `${x}px`;
+  element.style.right = isLast ? `${width - x}px` : "auto";
   element.classList.toggle("plot-flag-late", x > width / 2);
-  element.classList.toggle("plot-flag-last", x > width - FLAG_PX);
+  element.classList.toggle("plot-flag-last", isLast);
 }
 
 /** A bar from the beginning to the end of what lasts; the flag and the list say what it is. */
