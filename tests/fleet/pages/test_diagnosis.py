@@ -1,6 +1,5 @@
 """The page of a robot's diagnosis: what it shows to whom, and what is kept."""
 
-import asyncio
 import html
 import re
 from collections.abc import Iterator
@@ -209,25 +208,3 @@ def test_somebody_answers_and_says_what_it_was(tmp_path_factory: pytest.TempPath
         assert HOSTILE not in page and "49" not in text_of(page).split("It was this")[1][:80]
         assert HOSTILE in part(client, "/cause") and "laser_front.lamp: no" in part(
             client, "/history")  # fmt: skip
-
-
-def test_several_who_want_an_explanation_wait_for_the_same_one(
-    home: House, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    asked = []
-
-    async def ask(*about: object, **more: object) -> bytes:
-        asked.append(about)
-        await asyncio.sleep(0)
-        return b'{"state": "open"}'
-
-    monkeypatch.setattr(home.services.asking, "ask", ask)
-    explained, revision = home.services.explained, sim.diagnosis(7, sim.symptom(sim.NO_SCANS, 7))
-
-    async def all_of() -> list[object]:
-        wanted = (explained.read("ropod_009", revision, {}, "somebody") for _ in range(5))
-        return list(await asyncio.gather(*wanted))
-
-    assert asyncio.run(all_of()) == [{"state": "open"}] * 5
-    assert len(asked) == 1
-    assert explained.known("ropod_009", revision, {"lamp": "no"}) is None

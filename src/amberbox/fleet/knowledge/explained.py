@@ -10,21 +10,24 @@ from collections import OrderedDict
 from collections.abc import Mapping
 from typing import Any, TypeAlias
 
+from sqlalchemy import select
+
 from amberbox.core.clock import Clock
 from amberbox.core.errors import AmberboxError
 from amberbox.core.types import Diagnosis
+from amberbox.fleet.accounts.tables import ROBOTS
 from amberbox.fleet.archive.folder import FolderArchive
 from amberbox.fleet.asking.asking import Asking
 from amberbox.fleet.bus import Bus, Change
 from amberbox.fleet.database.database import Database
 from amberbox.fleet.knowledge import notebook
 from amberbox.fleet.knowledge.asked import AskDiagnosis, written
-from amberbox.fleet.knowledge.listing import Known, find
+from amberbox.fleet.knowledge.listing import Known, find, newest
 
 OP = "amberbox.fleet.knowledge.worker:diagnose"
 LIMIT_S = 20.0
 MEMORY_BYTES = 1 << 30
-_REMEMBERED = 500
+_REMEMBERED = 200
 
 Answer: TypeAlias = Mapping[str, Any]
 """What ``POST .../diagnose`` answers."""
@@ -92,14 +95,17 @@ class Explained:
         return await asyncio.shield(task)
 
     async def run(self) -> None:
-        """Explain what comes from robots, one after the other."""
-        end = self._bus.on("diagnosis", self._note)
+        """Explain what stands, then what comes from robots, one after the other."""
+        ends = [self._bus.on("diagnosis", self._note), self._bus.on("robot", self._robot)]
         try:
+            for robot in await asyncio.to_thread(self._robots):
+                self._wanted.put_nowait((robot, ""))
             while True:
                 robot, name = await self._wanted.get()
                 await self._prepare(robot, name)
         finally:
-            end()
+            for end in ends:
+                end()
 
     def close(self) -> None:
         """Let go of what is held."""
@@ -108,14 +114,30 @@ class Explained:
     def _note(self, change: Change) -> None:
         self._wanted.put_nowait((change.robot, str(change.data["id"])))
 
+    def _robot(self, change: Change) -> None:
+        """Look again when a robot's folder came."""
+        if change.robot:
+            self._wanted.put_nowait((change.robot, ""))
+
+    def _robots(self) -> list[str]:
+        with self.database.reading() as connection:
+            return list(connection.execute(select(ROBOTS.c.robot)).scalars())
+
     async def _prepare(self, robot: str, name: str) -> None:
+        """Explain a diagnosis that stands, the newest without a name."""
         try:
-            known = await asyncio.to_thread(find, self, robot, name)
+            known = await asyncio.to_thread(self._find, robot, name)
             if known is not None and known.last.state == "open":
-                answers = await asyncio.to_thread(given_answers, self.database, robot, name)
+                of = robot, known.id
+                answers = await asyncio.to_thread(given_answers, self.database, *of)
                 await self.read(robot, known.last, answers, robot)
         except AmberboxError as error:  # whoever looks at it is told, and asks again
             logging.getLogger(__name__).info("%s: %s", robot, error.what)
+        except Exception:  # of a robot whose files are damaged; the others have theirs
+            logging.getLogger(__name__).exception("the diagnoses of %s cannot be read", robot)
+
+    def _find(self, robot: str, name: str) -> Known | None:
+        return find(self, robot, name) if name else newest(self, robot)
 
     async def _ask(self, key: Key, answers: Mapping[str, str], asker: str) -> Answer:
         robot, name = key[0], key[1]

@@ -61,9 +61,13 @@ def show(
 
 @routes.get("/robots/{robot}/diagnosis/card", "diagnoses.read")
 async def show_card(
-    request: Request, robot: OfRobot, fleet: Fleet, who: Who, diagnosis: Id = "", at: At = ""
-) -> Response:
-    """Return the card alone, with its explanation: what the page puts in its place."""
+    request: Request, robot: OfRobot, fleet: Fleet, who: Who, diagnosis: Id = "", at: At = "",
+    link: bool = False,
+) -> Response:  # fmt: skip
+    """Return the card alone, with its explanation: what pages put in its place.
+
+    ``link``: it leads to the page of the diagnosis, because it stands on another one.
+    """
     may = who.may("diagnoses.write", robot)
     seen = await asyncio.to_thread(look, fleet, robot.id, diagnosis)
     try:
@@ -75,7 +79,7 @@ async def show_card(
     except AmberboxError as error:
         plain = None if at else await asyncio.to_thread(card_now, fleet, seen, None)
         return render(request, "diagnosis_trouble.html", error=error, plain=plain, may=may)
-    return render(request, "diagnosis_part.html", shown=card, seen=seen, may=may)
+    return render(request, "diagnosis_part.html", shown=card, seen=seen, may=may, link=link)
 
 
 @routes.get("/robots/{robot}/diagnosis/others", "diagnoses.read")

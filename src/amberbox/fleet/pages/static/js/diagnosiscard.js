@@ -12,13 +12,15 @@ import { t } from "./strings.js";
  */
 export function keep(place, { path, feed = null, renewed = null, robot }) {
   let asking = new AbortController();
+  const leads = one("[data-link]", place) !== null;
+  const linked = (address) => (leads ? `${address}${address.includes("?") ? "&" : "?"}link=1` : address);
 
   async function renew() {
     asking.abort();
     asking = new AbortController();
     place.setAttribute("aria-busy", "true");
     try {
-      replace(place, await fragment(path(), { signal: asking.signal }));
+      replace(place, await fragment(linked(path()), { signal: asking.signal }));
       place.removeAttribute("aria-busy");
       renewed?.();
     } catch (error) {
