@@ -13,6 +13,7 @@ const READ = {
   float: (text) => (text === "" ? null : Number.parseFloat(text)),
   list: (text) => text.split(/[\s,]+/).filter(Boolean),
   json: (text) => JSON.parse(text),
+  time: (text) => (text === "" ? "" : new Date(text).toISOString()), // of the viewer's zone
   text: (text) => text,
 };
 
@@ -63,6 +64,7 @@ async function send(element, read, button) {
     await after(element, await ask(about.post, { method, body: has ? body : undefined }));
   } catch (error) {
     fail(error, near);
+    element.dispatchEvent(new CustomEvent("refused", { bubbles: true, detail: error }));
   } finally {
     button?.removeAttribute("aria-busy");
   }
