@@ -69,9 +69,10 @@ class EndMission(Form):
 
 
 class NewNote(Form):
-    """A remark on a mission."""
+    """A remark on a mission, on a moment of it or on now."""
 
     text: Annotated[str, Field(min_length=1, max_length=4000)]
+    at: At = ""
 
 
 @routes.get("/robots/{robot}/missions", "missions.read")
@@ -137,9 +138,9 @@ def annotate_mission(
 ) -> Mission:
     """Remark something on a mission, a robot's own one too."""
     mission = _find(fleet, who, robot.id, id)
+    now_ns, at_ns = fleet.clock.wall_ns(), _at(fleet, robot.id, new.at)
     with fleet.database.begin() as connection:
-        now_ns = fleet.clock.wall_ns()
-        remarks.annotate(connection, now_ns, robot.id, id, str(who.principal), new.text)
+        remarks.annotate(connection, at_ns, robot.id, id, str(who.principal), new.text)
         details = {"id": id, "text": new.text}
         who.note(connection, now_ns, "missions.annotate", robot.id, details=details)
         found = _shown(connection, robot.id, [mission])[0]

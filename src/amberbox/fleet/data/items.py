@@ -31,19 +31,27 @@ def items_json(look: Look) -> list[dict[str, Any]]:
     return sorted(listed, key=lambda info: bool(info["source"] == reserved.SOURCE))
 
 
+def described_json(look: Look) -> list[dict[str, Any]]:
+    """Describe all items that have rows, each with its columns, the box's own at the end."""
+    return [{**info, **_columns(look, info["name"])} for info in items_json(look)]
+
+
 def item_json(look: Look, name: str) -> dict[str, Any] | None:
     """Describe an item and its columns; None where there is none of this name."""
     known = {table.casefold(): table for table in look.schemas}
     table = name if name in look.schemas else known.get(name.casefold())
     if table is None:
         return None
-    schema = union(look.schemas[table])
     children = [t for t, versions in look.schemas.items() if versions[-1].parent == table]
-    chosen = look.selection.get(table, [])
-    columns = [column_json(column) for column in schema.columns]
+    return {**_info(look, table), **_columns(look, table), "children": sorted(children)}
+
+
+def _columns(look: Look, table: str) -> dict[str, Any]:
+    schema = union(look.schemas[table])
     return {
-        **_info(look, table), "stamp": schema.stamp, "parent": schema.parent,
-        "children": sorted(children), "chosen": list(chosen), "columns": columns,
+        "stamp": schema.stamp, "parent": schema.parent,
+        "chosen": list(look.selection.get(table, [])),
+        "columns": [column_json(column) for column in schema.columns],
     }  # fmt: skip
 
 

@@ -13,7 +13,7 @@ from amberbox.fleet.archive.journal import sha256_of
 from amberbox.fleet.data import recorded
 from amberbox.fleet.data.asked import Asked
 from amberbox.fleet.data.forms import about_json, encoded
-from amberbox.fleet.data.items import item_json, items_json
+from amberbox.fleet.data.items import described_json, item_json, items_json
 from amberbox.fleet.data.look import look, open_catalogue
 from amberbox.fleet.data.missing import gaps_json
 from amberbox.fleet.data.rows import rows
@@ -42,6 +42,11 @@ def query(folder: Path, arguments: Arguments) -> Iterator[bytes]:
 def items(folder: Path, arguments: Arguments) -> bytes:
     """List the items of a robot, as JSON."""
     return msgspec.json.encode(look(folder, arguments["robot"], items_json))
+
+
+def described(folder: Path, arguments: Arguments) -> bytes:
+    """Describe all items of a robot with their columns, as JSON."""
+    return msgspec.json.encode(look(folder, arguments["robot"], described_json))
 
 
 def item(folder: Path, arguments: Arguments) -> bytes:

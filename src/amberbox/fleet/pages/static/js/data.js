@@ -1,0 +1,282 @@
+/** The data page: what the address says is shown, and what people do goes into the address. */
+
+import { ask, fail } from "./ask.js";
+import { comparing } from "./comparison.js";
+import { brush } from "./brush.js";
+import { read, tidy, write } from "./dataview.js";
+import { stage } from "./datastage.js";
+import { brought, one } from "./dom.js";
+import { listen } from "./feed.js";
+import { around, goTo, spanOf } from "./goto.js";
+import { marks } from "./marks.js";
+import { emptyStage, notes } from "./datanotes.js";
+import { recent, used } from "./recent.js";
+import { shownList } from "./shownlist.js";
+import { takeAlong } from "./takealong.js";
+import { nowMs } from "./time.js";
+import { stamp, timeOf } from "./timewords.js";
+import { tree } from "./variables.js";
+import { find, loadItems, reach, suggested } from "./variablelist.js";
+import * as view from "./view.js";
+import { windowForm } from "./windowform.js";
+import { works } from "./works.js";
+
+const HOUR_S = 3600;
+const { robot, named: fromDiagnosis } = brought("data-about");
+const path = `/api/v1/robots/${encodeURIComponent(robot)}`;
+const now = () => nowMs() / 1000;
+
+const page = {
+  look: read(), items: [], reach: { first: null, last: null }, cover: null, window: { from: now() - HOUR_S, to: now() },
+  missions: [], parts: {}, isEmpty: false, live: "off",
+};
+
+begin().catch((error) => fail(error, one("#plots")));
+
+async function begin() {
+  const covering = ask(`/robots/${encodeURIComponent(robot)}/data/coverage`).catch(() => null);
+  page.items = await loadItems(robot);
+  page.reach = reach(page.items);
+  if (!page.items.length) {
+    document.body.classList.add("data-none");
+    one("#data-nothing").hidden = false;
+    one("#data").hidden = true;
+    return;
+  }
+  build();
+  await follow(read());
+  view.on(() => follow(read()));
+  covered(await covering);
+}
+
+/** Make all parts; none of them shows anything yet. */
+function build() {
+  const { parts } = page;
+  parts.feed = listen({ robots: [robot], kinds: ["alarm", "job"] });
+  parts.stage = stage(one("#plots"), {
+    onWindow: (from, to) => move(from, to, "plots"), onRemove: (name) => toggle(name), onLive: showLive,
+    onEmpty: (isEmpty) => say({ isEmpty }), onMoved: followed, onDrop: dropped, onAxes: (x, y) => change({ x, y }),
+  });
+  parts.brush = brush(one("#brush"), (from, to, isMoving) => move(from, to, isMoving ? "moving" : "brush"));
+  parts.form = windowForm(one("#window"), {
+    newest, go: (from, to) => move(from, to), live: (isOn) => live(isOn), everything: () => move(...ends(whole())),
+    mode: (mode) => change({ mode }, true),
+  });
+  parts.shown = shownList(one("#shown"), { move: (name, plot) => arrange(name, plot), remove: toggle });
+  parts.tree = tree(one("#variables"), { robot, items: page.items, first: firstOnes(), toggle, open: page.look.named.length ? "" : `item:${page.items[0].name}` });
+  parts.notes = notes(one("#data-notes"), { newest, fetch: fetchWindow });
+  parts.works = works(one("#works"), robot, { fetched: renew });
+  one("#search").addEventListener("input", (event) => parts.tree.search(event.target.value));
+  goTo(one("#goto"), robot, (from, to, mission) => (mission ? change({ mission, from: "", to: "", live: false }, true).then(refollow) : move(from, to)));
+  const about = { window: () => page.window, cursor: () => parts.stage.plots()?.now().cursor ?? null };
+  marks(robot, { ...about, changed: rewatch });
+  takeAlong(robot, { ...about, chosen: () => chosen().map((one) => one.variable), began: parts.works.download });
+  comparing(robot, { begin: (pair) => change({ compare: pair, mode: "time", live: false }, true).then(refollow), end: () => change({ compare: [] }, true).then(refollow) });
+  parts.feed.on("job", ({ id }) => parts.works.look(id));
+  parts.feed.on("alarm", rewatch);
+}
+
+function firstOnes() {
+  return [
+    { id: "diagnosis", title: one("#variables").dataset.diagnosis, addresses: fromDiagnosis },
+    { id: "recent", title: one("#variables").dataset.recent, addresses: recent(robot) },
+  ];
+}
+
+/** Show what an address says. @param {import("./dataview.js").Look} look */
+async function follow(look) {
+  page.look = look;
+  page.missions = await Promise.all(look.compare.map((id) => ask(`${path}/missions/${encodeURIComponent(id)}`)));
+  page.window = await windowOf(look);
+  const known = look.named.map((one) => ({ ...one, name: find(page.items, one.name)?.address ?? one.name }));
+  const seen = new Set();
+  look.named = known.filter((one) => !seen.has(one.name) && seen.add(one.name));
+  used(robot, chosen().map((one) => one.name));
+  show();
+}
+
+const refollow = () => follow(read());
+
+/** The window that an address means: a mission, times, or the newest hour. */
+async function windowOf({ from, to, mission, live: isLive }) {
+  if (mission && !from && !to) {
+    const found = await ask(`${path}/missions/${encodeURIComponent(mission)}`);
+    const [begin, end] = around(spanOf(found));
+    return { from: begin, to: end };
+  }
+  const about = { now: now(), last: page.reach.last };
+  const end = (to && timeOf(to, about)) || (isLive || from.startsWith("now") ? now() : newestEnd(HOUR_S));
+  const begin = (from && timeOf(from, about)) || end - HOUR_S;
+  return begin < end ? { from: begin, to: end } : { from: end - HOUR_S, to: end };
+}
+
+/** Where a window ends that is to hold the newest data. */
+function newestEnd(width) {
+  const { last } = page.reach;
+  return last === null || now() - last < width / 4 ? now() : last;
+}
+
+const chosen = () => page.look.named.map((one) => ({ ...one, variable: find(page.items, one.name) })).filter((one) => one.variable?.kind);
+const ends = ({ from, to }) => [from, to];
+
+function whole() {
+  const { start, end } = page.cover ?? {};
+  return { from: Math.min(start ?? Infinity, page.reach.first ?? Infinity, page.window.from), to: Math.max(end ?? 0, page.reach.last ?? 0, page.window.to) };
+}
+
+/** Show everything as the page is now. */
+function show() {
+  const { look, parts } = page;
+  const scene = { robot, look, chosen: chosen(), window: page.window, whole: whole(), missions: page.missions };
+  one("#data").classList.toggle("data-comparing", look.compare.length > 0);
+  one("#comparing").hidden = !look.compare.length;
+  parts.stage.show(scene);
+  if (look.mode === "time" && !look.compare.length) live(look.live, false);
+  parts.tree.check(look.named.map((one) => one.name));
+  parts.shown.show(look.named, (name) => find(page.items, name)?.unit ?? "");
+  parts.form.mode(look.mode);
+  showWindow();
+  say({ isEmpty: false, unknown: look.named.filter((one) => !find(page.items, one.name)?.kind).map((one) => one.name) });
+  emptyStage(one("#data-empty"), look.named.length ? [] : suggestions(), toggle);
+  one("#data-empty").hidden = look.named.length > 0;
+}
+
+function suggestions() {
+  const named = fromDiagnosis.map((name) => find(page.items, name)).filter((one) => one?.kind);
+  return [...new Set([...named, ...suggested(page.items)])].slice(0, 8);
+}
+
+function showWindow() {
+  const { from, to } = page.window;
+  page.parts.brush.window(from, to);
+  page.parts.form.window(from, to);
+}
+
+/** Change what is looked at. @param {Partial<import("./dataview.js").Look>} changes */
+async function change(changes, push = false) {
+  Object.assign(page.look, changes);
+  write(page.look, { push });
+  show();
+}
+
+/** Show or do not show a variable. @param {string} name */
+function toggle(name) {
+  const { named } = page.look;
+  const isShown = named.some((one) => one.name === name);
+  const next = isShown ? named.filter((one) => one.name !== name) : [...named, { name, plot: Math.max(0, ...named.map((one) => one.plot)) + 1 }];
+  if (!isShown) used(robot, [name]);
+  change({ named: tidy(next) });
+}
+
+/** Put a variable into a plot; 0 is one of its own. */
+function arrange(name, plot) {
+  const rest = page.look.named.filter((one) => one.name !== name);
+  const own = Math.max(0, ...page.look.named.map((one) => one.plot)) + 1;
+  change({ named: tidy([...rest, { name, plot: plot || own }]) });
+}
+
+function dropped(name, plot) {
+  used(robot, [name]);
+  arrange(name, plot);
+}
+
+/** The window has moved, by the hand of the user. @param {"plots"|"brush"|"moving"} [by] */
+function move(from, to, by = "brush") {
+  page.window = { from, to };
+  const stack = page.parts.stage.plots();
+  if (by !== "plots" && stack && !page.look.compare.length) stack.window(from, to, { soft: by === "moving" });
+  if (by === "moving") {
+    page.parts.form.window(from, to);
+    return;
+  }
+  if (page.look.compare.length) return;
+  if (page.live !== "on") Object.assign(page.look, { from: stamp(from), to: stamp(to), mission: "" });
+  write(page.look);
+  showWindow();
+  if (!stack) show();
+  say({ isEmpty: false });
+}
+
+/** Go to the newest data. @param {number} [width] seconds */
+function newest(width = page.window.to - page.window.from) {
+  const lasts = chosen().map((one) => page.items.find((item) => item.name === one.variable.item)?.last).filter(Boolean);
+  const end = lasts.length && page.isEmpty ? Math.max(...lasts) + width * 0.02 : newestEnd(width);
+  move(end - width, end);
+}
+
+/** Plots have moved by themselves, with live values. */
+function followed() {
+  if (page.live !== "on") return;
+  const { from, to } = page.parts.stage.plots().now();
+  page.window = { from, to };
+  showWindow();
+}
+
+/** Go along with what comes, or stop it. */
+function live(isOn, isByHand = true) {
+  const stack = page.parts.stage.plots();
+  if (!stack || (isOn && page.live === "on")) return;
+  if (isOn && page.live === "paused") stack.follow();
+  else if (isOn || page.live !== "off") stack.live(isOn ? page.parts.feed : null);
+  if (!isByHand) return;
+  const width = Math.round(page.window.to - page.window.from);
+  if (isOn) {
+    page.window = { from: now() - width, to: now() };
+    stack.window(page.window.from, page.window.to, { silent: true });
+    showWindow();
+  }
+  Object.assign(page.look, isOn ? { live: true, from: `now-${width}s`, to: "now", mission: "" }
+    : { live: false, from: stamp(page.window.from), to: stamp(page.window.to) });
+  write(page.look);
+}
+
+function showLive(state) {
+  page.live = state;
+  page.parts.form.live(state);
+}
+
+/** Say above the plots what there is to say. */
+function say(changes) {
+  Object.assign(page, changes);
+  const { isEmpty, unknown = [], window } = page;
+  page.parts.notes.show({
+    isEmpty: isEmpty && page.look.mode === "time", unknown,
+    canFetch: page.cover !== null && lacks(window) && !page.parts.works.isAsking(),
+  });
+}
+
+/** Tell whether the robot may have something of a window that is not here. */
+function lacks({ from, to }) {
+  const behind = page.cover.end === null || to > page.cover.end;
+  const within = page.cover.missing.some((one) => /not on the server yet/i.test(one.reason) && one.start < to && one.end > from);
+  return (behind && from < now()) || within;
+}
+
+async function fetchWindow(near) {
+  const { from, to } = page.window;
+  try {
+    page.parts.works.fetch(await ask(`${path}/fetches`, { method: "POST", body: { from: stamp(from), to: stamp(to) } }));
+    say({});
+  } catch (error) {
+    fail(error, near);
+  }
+}
+
+/** Something has come from the robot: everything is asked for anew. */
+async function renew() {
+  covered(await ask(`/robots/${encodeURIComponent(robot)}/data/coverage`).catch(() => null));
+  page.parts.stage.plots()?.refresh();
+}
+
+function covered(cover) {
+  page.cover = cover?.start ? cover : { start: null, end: null, recorded: [], missing: [] };
+  const { from, to } = whole();
+  page.parts.brush.cover({ ...page.cover, start: from, end: Math.max(to, page.window.to) });
+  page.parts.stage.plots()?.setWhole(page.look.compare.length ? page.parts.stage.plots().now() : { from, to });
+  say({});
+}
+
+/** Ask anew what happened beside the values. */
+function rewatch() {
+  if (!page.look.compare.length) page.parts.stage.plots()?.watch({ robot, kinds: ["alarm", "incident", "mission"], components: [] });
+}
