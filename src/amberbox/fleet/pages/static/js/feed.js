@@ -70,13 +70,15 @@ function hear(messages) {
   line.heardMs = performance.now();
   line.tries = 0;
   state("live");
+  const isNews = ({ kind }) => kind === "alarm" || (kind === "snapshot" && line.number !== null);
+  if (messages.some(isNews)) dispatchEvent(new Event("alarmchange"));
   for (const message of messages) {
     if (message.kind !== "live") line.number = message.number;
-    for (const part of line.parts) tell(part, message);
+    for (const part of line.parts) hand(part, message);
   }
 }
 
-function tell({ wanted, listeners }, { kind, robot, data }) {
+function hand({ wanted, listeners }, { kind, robot, data }) {
   if (robot && wanted.robots !== null && !wanted.robots.includes(robot)) return;
   for (const fn of listeners.get(kind) ?? []) fn(data, robot);
 }
