@@ -27,7 +27,8 @@ ALLOWED: Mapping[str, frozenset[str]] = {
     "client": frozenset({"core", "blackbox"}),
     "robot": _UPPER,
     "fleet": _UPPER,
-    "cli": _UPPER | {"sim", "testing", "robot", "fleet", "client"},
+    "demo": _UPPER | {"sim", "robot", "fleet"},
+    "cli": _UPPER | {"sim", "testing", "robot", "fleet", "client", "demo"},
     "": frozenset({"core", "blackbox", "client"}),
     "__main__": frozenset({"cli"}),
 }

@@ -1,355 +1,70 @@
-"""Show the main job: record and monitor a simulated robot, kill the box once, lose nothing."""
+"""Show it all: a server, three simulated robots in the browser, and a button that breaks them."""
 
 from __future__ import annotations
 
 import argparse
-import atexit
-import json
 import os
 import shutil
-import signal
-import subprocess
 import sys
 import tempfile
-import time
-from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 from pathlib import Path
 
-import numpy as np
+from amberbox.core.errors import UsageError
 
-import amberbox
-from amberbox.blackbox.follow import read
-from amberbox.blackbox.incidents.incident import load_all
-from amberbox.blackbox.sources.sim import FOLDER
-from amberbox.blackbox.store import open_store
-from amberbox.core.clock import NS
-from amberbox.core.errors import AmberboxError, UsageError
-
-FAULT = "wheel_front_left_motor_weak"
-SILENCE, SILENT = "laser_rear_silent", "laser_rear"
-"""A fault that the monitors find within a second or two, and the component it is in."""
-SHOWN = ("sensors_front_left_current_1_q", "sensors_front_right_current_1_q")
-WEAK = " - ".join(f"abs(zmq_wheels.{name})" for name in SHOWN)
-TRIGGER = f"""triggers:
-- name: uneven_wheels
-  when: {WEAK} > 0.4 for 500ms
-  before: 2s
-  after: 2s
-  reason: a wheel draws more current than its neighbour
-"""
-PASSENGER = "recording_odom"
-SUSPECT = "laser_rear#silent"
-"""What is to be blamed for it, among others that look alike."""
-_LOST_AT_KILL_S = 0.15
+SECONDS = 45.0
+"""How long the story takes where nobody watches a terminal."""
+_LEAST_S, _RECORDER_S = 8.0, 20.0
+_PORT = 8443
+_EXIT = "exit status: 0 it was ended, or every step of the story worked; 1 one did not"
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
     parser.add_argument(
-        "--seconds", type=float, default=os.environ.get("DEMO_SECONDS", "20"),
-        help="how long the robot runs (default: 20, or DEMO_SECONDS)",
+        "--seconds", type=float, default=os.environ.get("DEMO_SECONDS") or None, metavar="N",
+        help="go through the story alone, in about so long (DEMO_SECONDS); without it and on a "
+        "terminal: stay until Ctrl-C",
     )  # fmt: skip
+    parser.add_argument("--port", type=int, default=_PORT,
+                        help=f"port to listen at, or the next that is free ({_PORT})")  # fmt: skip
     parser.add_argument("--keep", type=Path, metavar="DIR",
-                        help="folder for robot and record (default: a new one)")  # fmt: skip
+                        help="a new folder for server and robots, which stays (default: one that "
+                        "goes at the end)")  # fmt: skip
+    parser.add_argument("--recorder", action="store_true", help="show the black box alone: it is "
+                        "killed and loses nothing, its record proves itself")  # fmt: skip
+    parser.epilog = _EXIT
 
 
 def run(args: argparse.Namespace) -> int:
     """Run the demonstration; 0 only if every step worked."""
-    if args.seconds < 8:
-        raise UsageError("the demonstration needs at least 8 seconds", "DEMO_SECONDS=20")
-    place = args.keep or Path(tempfile.mkdtemp(prefix="amberbox-demo-"))
-    place.mkdir(parents=True, exist_ok=True)
-    if any(place.iterdir()):
-        raise UsageError(f"{place} is not empty", "name a new folder, or none")
-    demo = Demo(place, args.seconds)
-    steps = (demo.prepare, demo.record, demo.tell, demo.diagnose, demo.account, demo.show)
-    for step in (*steps, demo.defend):
-        step()
-    print(f"\nEverything is in {place}. Go on with:")
-    for verb in (
-        "items {}",
-        "watch {} --replay",
-        "query {} zmq_odom --points 5",
-        "sql {} 'select count(*) from zmq_imu'",
-        "query {} zmq_wheels --incident last --points 5",
-    ):
-        print("  amberbox " + verb.format(demo.folder))
-    return 0
+    if args.seconds is not None and args.seconds < _LEAST_S:
+        raise UsageError("the demonstration needs at least 8 seconds", "DEMO_SECONDS=45")
+    with _place(args.keep, keep=args.recorder) as place:
+        if args.recorder:
+            from amberbox.demo import recorder
+
+            return recorder.run(place, args.seconds or _RECORDER_S)
+        from amberbox.demo import show
+
+        return show.run(place, args.port, _seconds(args.seconds))
 
 
-@dataclass
-class Demo:
-    """The demonstration, step by step."""
-
-    place: Path
-    seconds: float
-    kills_ns: list[int] = field(default_factory=list)
-
-    @property
-    def folder(self) -> Path:
-        """The robot folder."""
-        return self.place / "robot"
-
-    @property
-    def watched(self) -> Path:
-        """What the monitors have printed."""
-        return self.place / "watched.txt"
-
-    @property
-    def truth(self) -> Path:
-        """What the robot says it has sent."""
-        return self.place / "truth.jsonl"
-
-    def prepare(self) -> None:
-        """Make a recording that will be replayed beside the robot."""
-        say("A recording is made: a minute of a simulated robot, as fast as the machine can.")
-        maker = self.place / "maker"
-        sim = "seed: 3\n    speed: max\n    duration_s: 60"
-        write_folder(
-            maker, "maker", f"- sim:\n    {sim}\n    topics: [{{topic: {{name: odom}}}}]\n"
-        )
-        amberbox_verb("record", str(maker), "--quiet")
-        journal = next(iter(sorted((maker / "store" / "journal").glob("*.mcap"))))
-        self.recording = self.place / "yesterday.mcap"
-        self.recording.write_bytes(journal.read_bytes())
-        rows = read.journal_file(self.recording).items.get("sim_odom", 0)
-        self.recorded_before = rows
-        check(rows > 0, f"{rows} messages in {self.recording.name}, an ordinary MCAP file")
-
-    def record(self) -> None:
-        """Record the live robot and the recording; kill the box once; make a part fail."""
-        say(
-            "A simulated robot speaks ZMQ; the black box listens, and replays the recording beside."
-        )
-        with robot(self.truth) as (process, endpoint):
-            write_folder(self.folder, "demo_robot", self._blocks(endpoint), TRIGGER)
-            write_knowledge(self.folder)
-            box = start_box(self.folder)
-            watcher = start_watcher(self.folder, self.watched)
-            time.sleep(self.seconds * 0.3)
-            tell_robot(process, f"fault {FAULT}")
-            print(f"  a fault begins: {FAULT}")
-            time.sleep(self.seconds * 0.2)
-            box.send_signal(signal.SIGKILL)
-            box.wait()
-            self.kills_ns.append(time.time_ns())
-            print("  the box is killed with kill -9, and started again")
-            box = start_box(self.folder)
-            time.sleep(self.seconds * 0.35)
-            tell_robot(process, f"fault {SILENCE}")
-            print(f"  another fault begins: {SILENCE}")
-            wait_until(lambda: bool(self.failures()), 60.0)
-            time.sleep(self.seconds * 0.1)
-            self.look()
-        time.sleep(0.5)
-        watcher.send_signal(signal.SIGTERM)
-        check(watcher.wait(60) == 0, "the monitors stopped cleanly")
-        box.send_signal(signal.SIGTERM)
-        check(box.wait(30) == 0, "the box stopped cleanly")
-
-    def look(self) -> None:
-        """Show how the robot is, while it runs."""
-        say("How is the robot? Its monitors follow the record while it is written.")
-        amberbox_verb("status", str(self.folder), expected=1)
-        amberbox_verb("alarm", str(self.folder))
-
-    def failures(self) -> list[str]:
-        """Return what the monitors have printed of the silence so far."""
-        lines = self.watched.read_text().splitlines()
-        return [line for line in lines if SILENT in line and "alive is false" in line]
-
-    def tell(self) -> None:
-        """Show what the monitors have said of the second fault, and since when."""
-        say("What the monitors said of the second fault, as it came:")
-        print("\n".join(f"  {line}" for line in self.failures()))
-        check(bool(self.failures()), f"the monitors saw that {SILENT} has fallen silent")
-
-    def diagnose(self) -> None:
-        """Show what is broken, why, and what to do next."""
-        say("What is broken? One answer from all that was seen, by the robot's failure modes:")
-        amberbox_verb("diagnose", str(self.folder), expected=1)
-        command = [sys.executable, "-m", "amberbox", "diagnose", str(self.folder), "--json"]
-        answer = json.loads(subprocess.run(command, stdout=subprocess.PIPE, check=False).stdout)
-        blamed = [faults for group in answer["groups"] for faults in group["faults"]]
-        check(any(SUSPECT in faults for faults in blamed), f"{SUSPECT} is among what may be broken")
-
-    def _blocks(self, endpoint: str) -> str:
-        return (
-            f"- zmq:\n    endpoint: {endpoint}\n    topics: []\n"
-            f"- recording:\n    path: {self.recording.resolve()}\n    speed: 20\n"
-        )
-
-    def account(self) -> None:
-        """Compare the record with what the robot says it has sent."""
-        say("Is anything lost? The robot's own account against the record:")
-        sent = sent_messages(self.truth)
-        kept = kept_messages(self.folder / "store")
-        gaps: dict[str, list[tuple[int, int]]] = {}
-        for gap in amberbox.open(self.folder).gaps():
-            gaps.setdefault(gap.item, []).append((gap.from_ns, gap.to_ns))
-        lost = {key: at for key, at in sent.items() if key not in kept}
-        explained = sum(
-            self._may_be_missing(at, gaps.get(f"zmq_{topic}", []))
-            for (topic, _), at in lost.items()
-        )
-        doubled = sum(count - 1 for count in kept.values())
-        lost_for_good = len(lost) - explained
-        print(f"  sent {len(sent)}, recorded {len(kept)}, missing while the box was dead"
-              f" {explained}, lost {lost_for_good}")  # fmt: skip
-        check(len(kept) > 0 and not doubled, "every message is there once")
-        check(explained == len(lost), "what is missing lies in the gap that the record names")
-
-    def _may_be_missing(self, at_ns: int, gaps: list[tuple[int, int]]) -> bool:
-        """Only what came in the last write interval before the kill, or until the restart, may."""
-        edge = round(_LOST_AT_KILL_S * NS)
-        in_gap = any(start - edge <= at_ns <= end + edge for start, end in gaps)
-        return in_gap or any(kill - edge <= at_ns <= kill for kill in self.kills_ns)
-
-    def show(self) -> None:
-        """Show the items, and the fault in a plot."""
-        say("What is in the record:")
-        amberbox_verb("items", str(self.folder))
-        for name in ("fault.png", "fault.html"):
-            plot = self.place / name
-            amberbox_verb("plot", str(self.folder), "zmq_wheels", *SHOWN, "-o", str(plot))
-            check(plot.stat().st_size > 1000, f"the currents of two wheels are drawn in {plot}")
-        record = amberbox.open(self.folder)
-        rows = sum(item.rows for item in record.items() if item.name == PASSENGER)
-        check(rows > 0, f"{rows} messages of the recording went the same way")
-
-    def defend(self) -> None:
-        """Show what the box has kept for good, and that nobody changes the record unseen."""
-        say("The fault was noticed: the seconds around it stay whatever else has to go.")
-        amberbox_verb("incident", "list", str(self.folder))
-        held = load_all(open_store(self.folder / "store"))
-        check(any(reason.trigger == "uneven_wheels" for i in held for reason in i.reasons),
-              "an incident was made by its trigger")  # fmt: skip
-        say("Is the record as the robot left it? One bit of a copy is changed as well.")
-        amberbox_verb("verify", str(self.folder))
-        forged = self.place / "forged"
-        shutil.copytree(self.folder / "store", forged)
-        flip_a_bit(max((forged / "journal").glob("*.mcap"), key=lambda path: path.stat().st_size))
-        amberbox_verb("verify", str(forged), expected=1)
-        shutil.rmtree(forged)
-        check(True, "the record is intact, and the bit was found in its copy")
-
-
-def say(text: str) -> None:
-    """Announce a step."""
-    print(f"\n== {text}", flush=True)
-
-
-def check(fine: bool, text: str) -> None:
-    """Print the outcome of a step; stop the demonstration when it failed."""
-    if not fine:
-        raise AmberboxError(f"the demonstration failed: not true that {text}", "please report this")
-    print(f"  ok: {text}", flush=True)
-
-
-def write_folder(folder: Path, name: str, blocks: str, more: str = "") -> None:
-    """Write a robot folder; ``more`` goes into its ``robot.yaml``."""
-    folder.mkdir(exist_ok=True)
-    (folder / "robot.yaml").write_text(f"id: {name}\n{more}")
-    (folder / "black_box.yaml").write_text(blocks)
-
-
-def write_knowledge(folder: Path) -> None:
-    """Give a robot what the simulated one has, whose messages come by ZMQ here."""
-    rooms = ("components/**/*.yaml", "rules/*.pl")
-    for path in (FOLDER / "fmea.yaml", *(path for room in rooms for path in FOLDER.glob(room))):
-        target = folder / path.relative_to(FOLDER)
-        target.parent.mkdir(parents=True, exist_ok=True)
-        target.write_text(path.read_text().replace("sim_", "zmq_"))
-
-
-def flip_a_bit(path: Path) -> None:
-    """Change one bit in the middle of a file."""
-    with path.open("r+b") as file:
-        file.seek(path.stat().st_size // 2)
-        byte = file.read(1)[0]
-        file.seek(-1, os.SEEK_CUR)
-        file.write(bytes([byte ^ 1]))
-
-
-def amberbox_verb(*arguments: str, expected: int = 0) -> None:
-    """Run a verb as a user would."""
-    print("  $ amberbox " + " ".join(arguments), flush=True)
-    done = subprocess.run([sys.executable, "-m", "amberbox", *arguments], check=False)
-    if done.returncode != expected:
-        raise AmberboxError(f"amberbox {arguments[0]} ended with {done.returncode}", "see above")
-
-
-def start_box(folder: Path) -> subprocess.Popen[bytes]:
-    """Start recording and wait until the first journal is there."""
-    before = journals(folder)
-    command = [sys.executable, "-m", "amberbox", "record", str(folder), "--quiet"]
-    box = subprocess.Popen(command, start_new_session=True)
-    atexit.register(box.kill)  # whatever ends the demonstration ends the box
-    wait_until(lambda: len(journals(folder)) > len(before) or box.poll() is not None)
-    check(box.poll() is None, "the box records")
-    return box
-
-
-def start_watcher(folder: Path, output: Path) -> subprocess.Popen[bytes]:
-    """Start the monitors; what they find goes to a file."""
-    command = [sys.executable, "-m", "amberbox", "watch", str(folder)]
-    with output.open("wb") as file:
-        watcher = subprocess.Popen(command, start_new_session=True, stdout=file)
-    atexit.register(watcher.kill)
-    return watcher
-
-
-def journals(folder: Path) -> list[Path]:
-    """Return the journal files of a robot folder."""
-    return sorted((folder / "store" / "journal").glob("*.mcap"))
-
-
-def wait_until(condition: Callable[[], bool], timeout_s: float = 30.0) -> None:
-    """Wait for something that another process does."""
-    end = time.monotonic() + timeout_s
-    while not condition():
-        if time.monotonic() > end:
-            raise AmberboxError("the demonstration waited in vain", "is the machine very busy?")
-        time.sleep(0.02)
+def _seconds(said: float | None) -> float | None:
+    """Return how long the story is; None where somebody watches."""
+    return SECONDS if said is None and not sys.stdout.isatty() else said
 
 
 @contextmanager
-def robot(truth: Path) -> Iterator[tuple[subprocess.Popen[str], str]]:
-    """Run the simulated robot; it begins to move when the box listens."""
-    command = [sys.executable, "-m", "amberbox.sim", "--zmq", "tcp://127.0.0.1:*", "--wait"]
-    process = subprocess.Popen(
-        [*command, "--seed", "7", "--truth", str(truth)],
-        stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True,
-    )  # fmt: skip
-    assert process.stdout is not None
+def _place(wanted: Path | None, *, keep: bool) -> Iterator[Path]:
+    """Give an empty folder; one that nobody has named goes afterwards."""
+    place = wanted or Path(tempfile.mkdtemp(prefix="amberbox-demo-"))
+    place.mkdir(parents=True, exist_ok=True)
+    if any(place.iterdir()):
+        raise UsageError(f"{place} is not empty", "name a new folder, or none")
     try:
-        yield process, process.stdout.readline().split()[-1]
+        yield place.resolve()
     finally:
-        process.terminate()
-        process.wait(10)
-
-
-def tell_robot(process: subprocess.Popen[str], line: str) -> None:
-    """Send the simulated robot a command."""
-    assert process.stdin is not None
-    process.stdin.write(line + "\n")
-    process.stdin.flush()
-
-
-def sent_messages(truth: Path) -> dict[tuple[str, int], int]:
-    """Return topic and number of every message sent, with its stamp."""
-    lines = [json.loads(line) for line in truth.read_text().splitlines() if line.endswith("}")]
-    return {(line["topic"], line["seq"]): line["stamp_ns"] for line in lines}
-
-
-def kept_messages(store: Path) -> Counter[tuple[str, int]]:
-    """Count topic and number of every message in the record."""
-    kept: Counter[tuple[str, int]] = Counter()
-    for batch in read.batches(store):
-        if batch.source == "zmq" and "header_seq" in batch.columns:
-            numbers = np.asarray(batch.columns["header_seq"]).tolist()
-            kept.update((batch.topic, number) for number in numbers)
-    return kept
+        if wanted is None and not keep:
+            shutil.rmtree(place, ignore_errors=True)

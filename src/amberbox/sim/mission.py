@@ -12,6 +12,7 @@ FLOORS = (0, 1, 2)
 SCENARIOS: dict[str, dict[str, Any]] = {
     "transport": {"place": "charging_station", "charge": (0.7, 0.95), "tasks": "transport"},
     "charging": {"place": "charging_station", "charge": (0.3, 0.4), "tasks": "charging"},
+    "shift": {"place": "charging_station", "charge": (0.7, 0.95), "tasks": "shift"},
     "standing": {"place": "ward_a", "charge": (0.7, 0.95), "tasks": "standing"},
 }
 _LOW_BATTERY_PERCENT = 30.0
@@ -54,14 +55,16 @@ class Planner:
         self._count += 1
         number = f"task_{self._count:04d}"
         kind = self._choose(battery_percent)
-        stages = {"transport": self._transport, "charging": _charge, "standing": _stand}[kind](
-            floor
-        )
+        stages = {
+            "transport": self._transport, "charging": _charge, "standing": _stand, "ready": _ready
+        }[kind](floor)  # fmt: skip
         cart = f"cart_{self._noise.integer(1, 20):02d}" if kind == "transport" else ""
         return Task(number, f"cart_{kind}" if cart else kind, cart, stages, now_s)
 
     def _choose(self, battery_percent: float) -> str:
-        if self._kind != "transport":
+        if self._kind == "shift" and self._count == 1:
+            return "ready"
+        if self._kind not in ("transport", "shift"):
             return str(self._kind)
         low = battery_percent < _LOW_BATTERY_PERCENT
         return "charging" if low or self._count % 4 == 0 else "transport"
@@ -102,3 +105,7 @@ def _charge(floor: int) -> list[Stage]:
 
 def _stand(floor: int) -> list[Stage]:
     return [Stage("wait", "stand_by", "ward_a", 60.0, floor)]
+
+
+def _ready(floor: int) -> list[Stage]:
+    return [Stage("wait", "get_ready", "charging_station", 8.0, floor)]

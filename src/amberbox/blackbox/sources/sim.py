@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 import time
 from collections.abc import Iterator, Sequence
@@ -19,6 +20,7 @@ from amberbox.core.source import Sink, TopicOptions
 from amberbox.core.timetext import parse_time
 from amberbox.core.types import Topic
 from amberbox.sim.catalogue import catalogue
+from amberbox.sim.live import obey
 from amberbox.sim.mission import SCENARIOS
 from amberbox.sim.robot import START_NS, Robot
 from amberbox.sim.topics import TOPIC_BY_NAME, TOPICS, TopicSpec
@@ -37,6 +39,7 @@ FOLDER = Path(__file__).parents[2] / "sim" / "folder"
 """What ``amberbox new`` writes for it: a block that records everything, and its monitors."""
 PASSIVE = "simulated in this process: there is no robot that could be disturbed"
 _NOT_WORTH_WAITING_NS = 500_000
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -69,7 +72,9 @@ class Config:
 
     robot: str = option("ropod_001", "name of the simulated robot")
     seed: int = option(1, "the same seed gives the same messages, byte for byte")
-    scenario: str = option("transport", "transport, charging or standing")
+    scenario: str = option(
+        "transport", "transport, charging, standing, or shift: it stands at first"
+    )
     speed: float | Literal["max"] = option(1.0, "times real time, or max for no waiting")
     start: str | None = option(None, "virtual start (RFC 3339); see times")
     times: Literal["now", "virtual"] | None = option(
@@ -77,6 +82,7 @@ class Config:
     )
     duration_s: float | None = option(None, "end after this much robot time", unit="s")
     faults: Sequence[FaultOptions] = option((), "faults to inject")
+    orders: str = option("", "file whose new lines are obeyed: fault ID [magnitude], or heal ID")
     topics: Sequence[TopicOptions] = option((), "topics to publish; all when absent")
 
     @property
@@ -159,6 +165,7 @@ class Source:
         """Yield messages when their time has come."""
         speed, end_s = self.config.speed, self.config.duration_s
         encode = msgspec.json.Encoder().encode
+        orders = Orders(Path(self.config.orders)) if self.config.orders else None
         began_ns = time.monotonic_ns()
         for topic, sent_ns, message in robot.step_until(float("inf") if end_s is None else end_s):
             if speed != "max":
@@ -168,9 +175,32 @@ class Source:
                     stop.wait(wait_ns / NS)
             if stop.is_set():
                 return
+            for line in orders.new() if orders else ():
+                _log.info("%s", obey(robot, line))
             if end_s is not None:
                 self.progress = robot.now_s / end_s
             yield topic, sent_ns, encode(message)
+
+
+class Orders:
+    """A file to which lines are added while the robot lives; those there at first are obeyed."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._read = 0
+
+    def new(self) -> list[str]:
+        """Return the lines that were added since, whole ones only; none while there is no file."""
+        try:
+            if self._path.stat().st_size <= self._read:
+                return []
+            with self._path.open("rb") as file:
+                file.seek(self._read)
+                whole = file.read().rpartition(b"\n")[0]
+        except OSError:
+            return []
+        self._read += len(whole) + 1 if whole else 0
+        return whole.decode("utf-8", "replace").splitlines()
 
 
 def _chosen(config: Config) -> Sequence[TopicSpec]:

@@ -1,0 +1,148 @@
+"""Run the demonstration: until Ctrl-C for people, or through its story, which judges itself."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+
+from amberbox.core.errors import AmberboxError
+from amberbox.demo.processes import start_tied
+from amberbox.demo.stage import Stage
+from amberbox.fleet.accounts.actions import Role
+from amberbox.fleet.accounts.signincodes import LASTS_NS
+from amberbox.fleet.serving import starting
+from amberbox.fleet.serving.binding import Wanted
+from amberbox.fleet.serving.starting import Start
+
+HOST = "127.0.0.1"
+PORT = 8443
+_PORTS = 50
+"""So many are tried."""
+_ON_S, _OFF_S = 60.0, 30.0
+_OF_STORY = 0.3
+"""Share of the story for which a robot keeps its way to the server; half as long it has none."""
+_MINUTES = LASTS_NS // 60_000_000_000
+
+
+def free_port(first: int) -> int:
+    """Return the first port from there on that nobody listens at; raises AmberboxError."""
+    for port in range(first, min(first + _PORTS, 65536)):
+        with closing(socket.socket()) as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            try:
+                probe.bind((HOST, port))
+            except OSError:
+                continue
+            return port
+    raise AmberboxError(f"the ports from {first} on are taken", "name another one with --port")
+
+
+def run(folder: Path, port: int, seconds: float | None) -> int:
+    """Run the demonstration below a folder; ``seconds`` is how long its story is, None for people.
+
+    Returns 0 when somebody ended it, or every step of the story worked.
+    """
+    free = free_port(port)
+    if free != port:
+        print(f"port {port} is taken, so it is {free}")
+    stage = Stage(folder, free)
+    stage.prepare()
+    show = Show(stage, seconds)
+    try:
+        starting.run(stage.data, Wanted(HOST, free), begun=show.begin, demo=stage)
+    finally:
+        stage.close()
+    show.raise_if_broken()
+    return show.status
+
+
+@dataclass(eq=False)
+class Show:
+    """What goes on beside the server, on its event loop."""
+
+    stage: Stage
+    seconds: float | None
+    status: int = 0
+    _task: asyncio.Task[None] | None = None
+
+    def begin(self, start: Start) -> None:
+        """Begin; the server answers by now."""
+        self.stage.begin()  # here, on the main thread: its children live as long as it does
+        self._task = asyncio.get_running_loop().create_task(self._go_on(start.settings.public_url))
+        self._task.add_done_callback(_end_if_broken)
+
+    def raise_if_broken(self) -> None:
+        """Raise what went wrong beside the server, if anything did."""
+        if self._task is not None and not self._task.cancelled():
+            error = self._task.exception()
+            if error is not None:
+                raise error
+
+    async def _go_on(self, url: str) -> None:
+        share = None if self.seconds is None else self.seconds * _OF_STORY
+        on_s, off_s = (_ON_S, _OFF_S) if share is None else (share, share / 2)
+        away = self.stage.come_and_go(on_s, off_s, say if share is None else _be_silent)
+        told = self._welcome(url) if share is None else self._tell(url)
+        await asyncio.gather(away, told)
+
+    async def _welcome(self, url: str) -> None:
+        """Print links, and new ones whenever somebody presses Enter."""
+        print(f"\nThree simulated robots run, recorded and watched, at {url}")
+        pressed = asyncio.Event()
+        asyncio.get_running_loop().add_reader(sys.stdin, _read_line, pressed)
+        try:
+            while True:
+                self._print_links(url)
+                await pressed.wait()
+                pressed.clear()
+        finally:
+            asyncio.get_running_loop().remove_reader(sys.stdin)
+
+    def _print_links(self, url: str) -> None:
+        print(f"\nSign in with one of these (each works once, within {_MINUTES} minutes):\n")
+        for role in reversed(Role):
+            print(f"  {role:<11} {url}/in#{self.stage.codes.make(str(role))}")
+        print("\nBreak a robot with the bar at the top of each page, and watch what follows."
+              "\nEnter prints new links, Ctrl-C ends everything.\n", flush=True)  # fmt: skip
+
+    async def _tell(self, url: str) -> None:
+        """Let the story be gone through, then end the server."""
+        codes = {str(role): self.stage.codes.make(str(role)) for role in Role}
+        story = start_tied(("amberbox.demo",), stdin=subprocess.PIPE)
+        try:
+            asked = json.dumps({"url": url, "codes": codes}).encode()
+            await asyncio.to_thread(story.communicate, asked)
+        finally:
+            story.terminate()
+        self.status = 1 if story.returncode else 0
+        os.kill(os.getpid(), signal.SIGTERM)
+
+
+def say(text: str) -> None:
+    """Tell whoever watches the terminal."""
+    print(text, flush=True)
+
+
+def _be_silent(text: str) -> None:
+    """Say nothing: the story tells what it sees itself."""
+
+
+def _read_line(pressed: asyncio.Event) -> None:
+    if sys.stdin.readline():
+        pressed.set()
+    else:
+        asyncio.get_running_loop().remove_reader(sys.stdin)  # closed: nobody presses anything
+
+
+def _end_if_broken(task: asyncio.Task[None]) -> None:
+    """End the server when what goes on beside it cannot go on; ``run`` raises why."""
+    if not task.cancelled() and task.exception() is not None:
+        os.kill(os.getpid(), signal.SIGTERM)
