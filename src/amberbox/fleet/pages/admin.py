@@ -57,7 +57,7 @@ def _steps(fleet: Services, who: Caller) -> Iterator[Step]:
     yield Step("robot", "/admin/robots", bool(cards))
     yield Step("connect", "/admin/robots", any(card.last_seen for card in cards))
     yield Step("people", "/admin/users", len(people) > 1)
-    yield Step("notify", "/admin/notifications", bool(_destinations(fleet)))
+    yield Step("notify", "/admin/settings/notifications", bool(_destinations(fleet)))
 
 
 def _destinations(fleet: Services) -> Sequence[object]:

@@ -57,6 +57,8 @@ def for_browser(parts: Sequence[str]) -> Mapping[str, str]:
 def _flat(found: Any, name: str) -> Iterator[tuple[str, str]]:
     if isinstance(found, dict):
         for key, value in found.items():
+            if not isinstance(key, str):
+                raise MissingTextError(f"{name}: {key!r} is no text in YAML: write it in quotes")
             yield from _flat(value, f"{name}.{key}")
     else:
         yield name, str(found)

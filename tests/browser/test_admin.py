@@ -1,0 +1,105 @@
+"""Accounts, people, teams and robots, in a browser."""
+
+import pytest
+
+from tests.browser.conftest import PageAs
+from tests.browser.expecting import expect
+from tests.browser.looks import axe, no_sideways_scroll, shot
+
+PAGES = (
+    "/account", "/admin", "/admin/users", "/admin/teams", "/admin/robots", "/admin/audit",
+    "/admin/health", "/admin/system", "/admin/settings/retention", "/admin/settings/alarms",
+    "/admin/settings/downloads", "/admin/settings/notifications",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(("theme", "width"), [("light", 1440), ("dark", 390)])
+def test_pages_of_admins(page_as: PageAs, theme: str, width: int) -> None:
+    page = page_as("admin", width=width, theme=theme)
+    for path in PAGES:
+        page.goto(path)
+        axe(page)
+        no_sideways_scroll(page)
+        shot(page, path.strip("/").replace("/", "-"))
+
+
+def test_somebody_is_invited_and_chooses_a_password(page_as: PageAs) -> None:
+    page = page_as("admin")
+    page.goto("/admin/users")
+    page.get_by_text("Invite somebody").first.click()
+    page.get_by_label("Name", exact=False).first.fill("berta")
+    page.locator("#invite button").click()
+    password = page.get_by_role("dialog").locator("textarea").input_value()
+    page.get_by_role("button", name="I have put it away").click()
+    expect(page.get_by_role("cell", name="berta")).to_be_visible()
+
+    other = page_as("")
+    other.goto("/knowledge")
+    other.get_by_label("Name").fill("berta")
+    other.get_by_label("Password").fill(password)
+    other.get_by_role("button", name="Sign in").click()
+    other.get_by_label("Password as it is").fill(password)
+    other.locator('[name=new]').fill("one long enough for me")
+    other.get_by_label("New password again").fill("one long enough for me")
+    other.get_by_role("button", name="Change the password").click()
+    expect(other.get_by_role("heading", name="Robots")).to_be_visible()
+
+
+def test_a_robot_is_added_and_its_line_shown_once(page_as: PageAs) -> None:
+    page = page_as("admin")
+    page.goto("/admin/robots")
+    page.get_by_text("Add a robot").first.click()
+    page.get_by_label("Name of the robot").fill("ropod_009")
+    page.locator("#add button").click()
+    line = page.get_by_role("dialog").locator("textarea").input_value()
+    assert "ropod_009" in line
+    page.get_by_role("button", name="I have put it away").click()
+    row = page.get_by_role("row").filter(has_text="ropod_009")
+    expect(row).to_contain_text("has never connected")
+    row.get_by_role("button", name="Switch off").click()
+    page.get_by_role("dialog").get_by_role("button", name="Yes").click()
+    expect(row).to_contain_text("switched off")
+
+
+def test_a_token_is_made_and_revoked(page_as: PageAs) -> None:
+    page = page_as("technician")
+    page.goto("/account")
+    page.get_by_text("Make a token").first.click()
+    page.get_by_label("What for").fill("wall board")
+    page.locator("#new-token form button").click()
+    assert page.get_by_role("dialog").locator("textarea").input_value()
+    page.get_by_role("button", name="I have put it away").click()
+    expect(page.get_by_role("cell", name="wall board")).to_be_visible()
+    page.get_by_role("button", name="Revoke").click()
+    page.get_by_role("dialog").get_by_role("button", name="Yes").click()
+    expect(page.get_by_text("You have no token.")).to_be_visible()
+
+
+def test_a_setting_is_changed_and_mistakes_lose_nothing(page_as: PageAs) -> None:
+    page = page_as("admin", expects=["422 PUT", "400 PUT"])
+    page.goto("/admin/settings/retention")
+    page.get_by_role("button", name="Add").click()
+    page.get_by_label("Class of recordings").fill("bulk")
+    page.get_by_label("Recordings go after a time").check()
+    page.locator(".duration input").first.fill("30")
+    page.locator(".duration select").first.select_option("d")
+    page.locator('.entry').get_by_label("Robot").first.fill("no robot!")
+    page.get_by_role("button", name="Save").click()
+    expect(page.get_by_role("alert").filter(has_text="no robot!")).to_be_visible()
+    expect(page.get_by_label("Class of recordings")).to_have_value("bulk")
+    page.locator('.entry').get_by_label("Robot").first.fill("*")
+    page.get_by_role("button", name="Save").click()
+    expect(page.get_by_text("Saved")).to_be_visible()
+    page.reload()
+    expect(page.locator(".duration input").first).to_have_value("30")
+    expect(page.locator(".duration select").first).to_have_value("d")
+    page.get_by_role("button", name="Remove").click()
+    page.get_by_role("button", name="Save").click()
+    expect(page.get_by_text("Saved")).to_be_visible()
+
+
+def test_the_audit_log_is_followed(page_as: PageAs) -> None:
+    page = page_as("admin")
+    page.goto("/admin/audit?action=settings.change")
+    page.get_by_role("button", name="Does it hold?").click()
+    expect(page.get_by_text("It holds:")).to_be_visible()
