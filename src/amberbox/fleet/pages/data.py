@@ -6,7 +6,8 @@ The address holds what is looked at, and the browser alone reads it (``static/js
   is its column's name, its path in the message, or the end of one path.
 - ``from``, ``to``: RFC 3339, an epoch, ``now-1h``, or ``-10m`` before what came last
 - ``mission=ID`` instead of them, ``live=1`` to go along with what comes
-- ``mode=time`` (or none), ``xy``, ``hist``; ``compare=M1,M2``: two missions from their beginnings on
+- ``mode=time`` (or none), ``xy`` (``x``, ``y`` name its variables), ``hist``
+- ``compare=M1,M2``: two missions, each from its beginning on
 """
 
 from __future__ import annotations

@@ -90,7 +90,7 @@ async function follow(look) {
   page.window = await windowOf(look);
   const known = look.named.map((one) => ({ ...one, name: find(page.items, one.name)?.address ?? one.name }));
   const seen = new Set();
-  look.named = known.filter((one) => !seen.has(one.name) && seen.add(one.name));
+  look.named = tidy(known.filter((one) => !seen.has(one.name) && seen.add(one.name)));
   used(robot, chosen().map((one) => one.name));
   show();
 }
@@ -139,6 +139,7 @@ function show() {
   say({ isEmpty: false, unknown: look.named.filter((one) => !find(page.items, one.name)?.kind).map((one) => one.name) });
   emptyStage(one("#data-empty"), look.named.length ? [] : suggestions(), toggle);
   one("#data-empty").hidden = look.named.length > 0;
+  one("#plots").hidden = !look.named.length;
 }
 
 function suggestions() {

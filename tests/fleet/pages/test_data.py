@@ -1,0 +1,134 @@
+"""The page of data: what it offers to whom, variables, what there is over all time."""
+
+from collections.abc import Iterator
+
+import pytest
+from starlette.testclient import TestClient
+
+from amberbox.core.clock import NS
+from amberbox.core.timetext import format_time, parse_time
+from amberbox.fleet.pages import data
+from amberbox.fleet.pages.datacoverage import Stretch, joined
+from amberbox.fleet.pages.diagnosiscard import DiagnosisCard, Reason, data_href
+from amberbox.testing.records import T0_NS
+from tests.fleet.data.filled import ROWS, fill
+from tests.fleet.house import House, house
+
+PAGE = "/robots/ropod_001/data"
+NOTES = "/api/v1/robots/ropod_001/missions/transport-1/notes"
+DIALOGS = ("mark", "note", "download")
+
+
+@pytest.fixture(scope="module")
+def home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[House]:
+    folder = tmp_path_factory.mktemp("data")
+    with house(folder / "server", shared=True) as found:
+        fill(found, folder)
+        yield found
+
+
+@pytest.fixture(scope="module")
+def viewer(home: House) -> TestClient:
+    return home.client("viewer")
+
+
+@pytest.mark.parametrize(
+    ("name", "offered", "may_fetch"),
+    [
+        ("viewer", [], False),
+        ("operator", ["mark", "note"], False),
+        ("technician", ["mark", "note", "download"], True),
+    ],
+)
+def test_the_page_offers_what_somebody_may_do(
+    home: House, name: str, offered: list[str], may_fetch: bool
+) -> None:
+    page = home.client(name).get(PAGE).text
+    assert [one for one in DIALOGS if f'<dialog id="{one}"' in page] == offered
+    assert [one for one in DIALOGS if f'data-open="{one}"' in page] == offered
+    assert ("data-fetch" in page) == may_fetch
+
+
+def test_the_page_needs_no_worker(
+    home: House, viewer: TestClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(home.services, "asking", None)
+    assert viewer.get(PAGE).status_code == 200
+
+
+def test_words_in_the_address_are_no_part_of_the_page(viewer: TestClient) -> None:
+    page = viewer.get(PAGE, params={"v": "<img src=x onerror=1>", "from": "'\"><script>"}).text
+    assert "onerror" not in page
+    assert "'\"><script>" not in page
+
+
+def test_variables_are_told_with_their_items(viewer: TestClient) -> None:
+    found = {one["name"]: one for one in viewer.get(f"{PAGE}/variables").json()}
+    listed = viewer.get("/api/v1/robots/ropod_001/items").json()
+    assert list(found) == [one["name"] for one in listed]
+    odom = viewer.get("/api/v1/robots/ropod_001/items/odom").json()
+    assert found["odom"]["columns"] == odom["columns"]
+    assert found["odom"]["chosen"] == odom["chosen"]
+    assert found["odom"]["rows"] == odom["rows"] == ROWS + 40
+
+
+def test_a_robot_that_sent_nothing_has_no_variables_and_no_time(viewer: TestClient) -> None:
+    assert viewer.get("/robots/ropod_002/data").status_code == 200
+    assert viewer.get("/robots/ropod_002/data/variables").json() == []
+    coverage = viewer.get("/robots/ropod_002/data/coverage").json()
+    assert coverage == {"start": None, "end": None, "recorded": [], "missing": []}
+
+
+def test_coverage_reaches_from_the_first_to_the_last_row(viewer: TestClient) -> None:
+    found = viewer.get(f"{PAGE}/coverage").json()
+    listed = viewer.get("/api/v1/robots/ropod_001/recordings").json()
+    first, last = min(one["from"] for one in listed), max(one["to"] for one in listed)
+    assert found["start"] == pytest.approx(_seconds(first), abs=1e-6)
+    assert found["end"] == pytest.approx(_seconds(last), abs=1e-6)
+    assert found["recorded"][0]["start"] == found["start"]
+    assert max(one["end"] for one in found["recorded"]) == found["end"]
+
+
+def test_stretches_of_one_reason_that_are_near_are_one() -> None:
+    lost = [Stretch(0, 1, "lost"), Stretch(1.5, 2, "lost"), Stretch(9, 10, "lost")]
+    other = Stretch(1, 3, "deleted")
+    found = joined([*lost, other], least=1)
+    assert found == [Stretch(0, 2, "lost"), other, Stretch(9, 10, "lost")]
+
+
+def test_a_stretch_inside_another_does_not_shorten_it() -> None:
+    assert joined([Stretch(0, 9), Stretch(1, 2)], least=0) == [Stretch(0, 9)]
+
+
+def test_variables_of_the_diagnosis_come_first(
+    viewer: TestClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    why = (
+        Reason("No scans.", None, data_href("ropod_001", ("odom.pose_x", "odom.pose_y"), T0_NS)),
+        Reason("It runs.", None, data_href("ropod_001", ("odom.pose_x",), None)),
+    )
+    card = DiagnosisCard("ropod_001", "open", None, why=why)
+    monkeypatch.setattr(data, "current_card", lambda *_: card)
+    assert '"named":["odom.pose_x","odom.pose_y"]' in viewer.get(PAGE).text
+
+
+def test_a_note_is_put_where_it_belongs(home: House) -> None:
+    at = format_time(T0_NS + 1_000_000)
+    operator = home.client("operator")
+    answer = operator.post(NOTES, json={"text": "it stopped here", "at": at})
+    assert answer.status_code == 201
+    assert [(note["at"], note["text"]) for note in answer.json()["notes"]] == [
+        (at, "it stopped here")
+    ]
+    late = operator.post(NOTES, json={"text": "and now"}).json()["notes"]
+    assert late[-1]["at"] == format_time(home.clock.wall_ns())
+
+
+def test_others_robots_are_not_there(home: House) -> None:
+    nurse = home.client("nurse")
+    for path in ("", "/variables", "/coverage"):
+        assert nurse.get(f"/robots/ropod_003/data{path}").status_code == 404
+
+
+def _seconds(text: str) -> float:
+    return parse_time(text, lambda: 0, lambda: None) / NS
