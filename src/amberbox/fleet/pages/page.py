@@ -18,6 +18,7 @@ from amberbox.core.timetext import format_time
 from amberbox.fleet.accounts.sessions import csrf_token
 from amberbox.fleet.api.access import Caller, Decorator, Open, Routes, caller_of, services_of
 from amberbox.fleet.pages import assets
+from amberbox.fleet.pages.alarmcount import OpenCount, open_count
 from amberbox.fleet.pages.strings import catalogue, for_browser
 
 TEMPLATES = Path(__file__).parent / "templates"
@@ -87,5 +88,6 @@ def _about(request: Request, template: str, also: tuple[str, ...]) -> Mapping[st
         "path": request.url.path,
         "now": format_time(services.clock.wall_ns()),
         "demo": getattr(services, "demo", None),
+        "open_alarms": lambda: open_count(services, me) if me else OpenCount(),
         "browser_strings": for_browser(("common", template.partition(".")[0], *also)),
     }

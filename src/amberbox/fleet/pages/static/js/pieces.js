@@ -44,10 +44,13 @@ export function put(old, fresh) {
 
 /**
  * Make a piece stay right: `stale()` asks for it anew, at once and then at most once in `everyMs`.
+ * `placed` is called when it came.
  * @param {() => Element | null} find
  * @param {() => string} address
+ * @param {number} [everyMs]
+ * @param {() => void} [placed]
  */
-export function keep(find, address, everyMs = 1000) {
+export function keep(find, address, everyMs = 1000, placed = () => {}) {
   let timer = null;
   let isAsked = false;
 
@@ -57,7 +60,9 @@ export function keep(find, address, everyMs = 1000) {
     const old = find();
     if (!old) return;
     const fresh = await piece(address()).catch(() => null); // the feed tells again when it is back
-    if (fresh && old.isConnected) put(old, fresh);
+    if (!fresh || !old.isConnected) return;
+    put(old, fresh);
+    placed();
   }
 
   function rest() {
