@@ -18,7 +18,7 @@ from amberbox.fleet.pages.strings import catalogue
 CUT_SETS = 20
 """So many sets are listed, those of fewest failures first."""
 IMPORTANT = 10
-DEPTH, PLACES = 4, 60
+DEPTH, PLACES = 3, 60
 """How much of a tree is drawn: gates above each other, and places in all."""
 
 
@@ -74,6 +74,7 @@ def _named(near: Sequence[Mapping[str, Any]], texts: Mapping[str, str]) -> list[
             "share": percent(one["probability"]),
         }
         for one in near
+        if one["happened"]
     ]  # fmt: skip
 
 

@@ -36,6 +36,7 @@ export function start({ part, renewed }) {
     try {
       replace(place, await fragment(part(name, about), { signal: asking.signal }));
       shown = name;
+      for (const drawing of all(".dx-drawing", place)) drawing.scrollLeft = middle(drawing, one("svg.faulttree", drawing));
       place.removeAttribute("aria-busy");
     } catch (error) {
       if (error.name === "AbortError") return;
@@ -114,6 +115,11 @@ export function start({ part, renewed }) {
   mark(current());
   if (around.open) load(current());
   return { show, renew: () => around.open && FOLLOWING.includes(current()) && load(current()) };
+}
+
+/** Return how far to scroll: the top of a tree stands in the middle, all else begins on the left. */
+function middle(drawing, tree) {
+  return tree ? (drawing.scrollWidth - drawing.clientWidth) / 2 : 0;
 }
 
 /** Return the fields of a form that have a name, as the address has them. */

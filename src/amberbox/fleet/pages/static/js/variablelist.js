@@ -41,11 +41,14 @@ function variableOf(item, column) {
 }
 
 /**
- * Find a variable by its address: ITEM.COLUMN, ITEM.PATH, or the end of one path only.
+ * Find a variable by its address: ITEM.COLUMN, ITEM.PATH, or the end of one path only. An ITEM alone
+ * is the first of its variables that can be drawn: whoever says so means that it comes at all.
  * @param {Item[]} items @param {string} address @returns {?Variable}
  */
 export function find(items, address) {
   const low = address.toLowerCase();
+  const whole = items.find((item) => item.name.toLowerCase() === low);
+  if (whole) return whole.variables.find((one) => one.kind && one.name !== "timestamp") ?? null;
   const fitting = items.filter((item) => low.startsWith(`${item.name.toLowerCase()}.`))
     .sort((one, other) => other.name.length - one.name.length);
   for (const item of fitting) {
