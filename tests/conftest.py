@@ -7,6 +7,7 @@ import gc
 import os
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import settings
@@ -14,6 +15,7 @@ from hypothesis import settings
 from amberbox.core import plugins
 
 SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+PEERS = "tests/peers/"
 NO_DATA = "needs_data: the folder ../shared/data beside the repository is absent"
 SKIPS: pytest.StashKey[Skips] = pytest.StashKey()
 
@@ -48,6 +50,17 @@ def pytest_configure(config: pytest.Config) -> None:
     config.pluginmanager.register(config.stash[SKIPS])
     if in_ci() and not config.option.durations:
         config.option.durations = 10
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    """Give each process whole files; one at a time has real peers, who keep to the clock."""
+    from xdist.scheduler import LoadFileScheduling  # type: ignore[import-untyped]  # has no types
+
+    scheduling = LoadFileScheduling(config, log)
+    of_file = scheduling._split_scope
+    scheduling._split_scope = lambda node: PEERS if node.startswith(PEERS) else of_file(node)
+    return scheduling
 
 
 def pytest_collection_finish(session: pytest.Session) -> None:
