@@ -132,14 +132,15 @@ def _open(browser: Browser, url: str, secret: str, path: str) -> Page:
 
 @contextmanager
 def served(folder: Path) -> Iterator[tuple[str, str]]:
-    """Serve a month of a robot; yield the address and the session of a technician."""
+    """Serve a month of a robot; yield the address and the session of an admin."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
     url = f"http://localhost:{port}"
     secret = _filled(folder, url)
     words = ("--data", str(folder), "--port", str(port), "--quiet")
-    process = subprocess.Popen([sys.executable, "-m", "amberbox", "serve", *words])
+    command = [sys.executable, "-m", "amberbox", "serve", *words]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
     try:
         _await(url, process)
         yield url, secret
@@ -155,8 +156,8 @@ def _filled(folder: Path, url: str) -> str:
     with services.database.begin() as connection:
         add_robot(connection, now_ns, "r1", ())
         hashed = services.passwords.hash("a long enough passphrase")
-        add_user(connection, now_ns, "technician", Role.TECHNICIAN, hashed)
-        owner = find_user(connection, "technician")
+        add_user(connection, now_ns, "admin", Role.ADMIN, hashed)
+        owner = find_user(connection, "admin")
         began = begin_session(connection, now_ns, owner.user_id, "127.0.0.1", "benchmark")
     assembly.close(services)
     return began.secret
