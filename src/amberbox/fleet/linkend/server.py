@@ -276,13 +276,20 @@ class LinkServer:
 
     async def _left(self, one: Connected) -> None:
         await one.socket.close()
-        if self.robots.get(one.robot) is one:
+        was_here = self.robots.get(one.robot) is one
+        if was_here:
             del self.robots[one.robot]
-            self._hooks.gone(one.robot)
-        if one.end.epoch is not None:
-            self._writes.submit(partial(
-                presence.gone, robot=one.robot, epoch=one.end.epoch, last_seen_ns=one.last_seen_ns
-            ))  # fmt: skip
+        try:
+            if one.end.epoch is not None:
+                written = self._writes.submit(partial(
+                    presence.gone, robot=one.robot, epoch=one.end.epoch,
+                    last_seen_ns=one.last_seen_ns,
+                ))  # fmt: skip
+                with suppress(AmberboxError):  # the database is busy: the rest is told all the same
+                    await asyncio.shield(asyncio.wrap_future(written))
+        finally:
+            if was_here:  # who is told finds in the database when it was seen last
+                self._hooks.gone(one.robot)
 
 
 def _fitting(variables: Sequence[str]) -> Iterator[str]:

@@ -72,7 +72,7 @@ def show(
     look = Look(q, show, chosen, window, lanes, kind)
     tree, card = read_status(fleet, robot), read_card(fleet, robot)
     may = {name: who.may(name, robot) for name in _ACTIONS}
-    return render(
+    return _show(
         request, "robot.html", card=card, look=look, may=may, **_tree(tree, look),
         **_graph(tree), **_panels(tree), **_now(fleet, who, robot),
         files=_files(fleet, who, robot, card), robot=robot,
@@ -85,7 +85,7 @@ def show(
 @routes.get("/pieces/robots/{robot}/head", "status.read")
 def show_head(request: Request, fleet: Fleet, robot: OfRobot) -> Response:
     """Show how a robot is and whether it is there: the head of all its pages."""
-    return render(request, "robot_head.html", card=read_card(fleet, robot))
+    return _show(request, "robot_head.html", card=read_card(fleet, robot))
 
 
 @routes.get("/pieces/robots/{robot}/tree", "status.read")
@@ -95,14 +95,14 @@ def show_tree(
 ) -> Response:  # fmt: skip
     """Show the tree alone."""
     tree, card = read_status(fleet, robot), read_card(fleet, robot)
-    return render(request, "robot_tree.html", card=card, **_tree(tree, Look(q, show, chosen)))
+    return _show(request, "robot_tree.html", card=card, **_tree(tree, Look(q, show, chosen)))
 
 
 @routes.get("/pieces/robots/{robot}/graph", "status.read")
 def show_graph(request: Request, fleet: Fleet, robot: OfRobot) -> Response:
     """Show what needs what alone."""
     tree = read_status(fleet, robot)
-    return render(request, "robot_graph.html", tree=tree, **_graph(tree))
+    return _show(request, "robot_graph.html", tree=tree, **_graph(tree))
 
 
 @routes.get("/pieces/robots/{robot}/timeline", "status.read")
@@ -112,29 +112,27 @@ def show_timeline(
     """Show what was when alone."""
     look = Look(window=window, lanes=lanes)
     seen = _times(fleet, robot, window, lanes)
-    return render(request, "robot_timeline.html", robot=robot, look=look, seen=seen)
+    return _show(request, "robot_timeline.html", robot=robot, look=look, seen=seen)
 
 
 @routes.get("/pieces/robots/{robot}/events", "items.read")
 def show_events(request: Request, fleet: Fleet, robot: OfRobot, kind: Text = "") -> Response:
     """Show the newest events alone."""
     found = _events(fleet, robot, kind, may=True)
-    return render(request, "robot_events.html", robot=robot, **found)
+    return _show(request, "robot_events.html", robot=robot, **found)
 
 
 @routes.get("/pieces/robots/{robot}/now", "status.read")
 def show_now(request: Request, fleet: Fleet, who: Who, robot: OfRobot) -> Response:
     """Show what it is doing and how it is linked, alone."""
-    return render(
-        request, "robot_now.html", card=read_card(fleet, robot), **_now(fleet, who, robot)
-    )
+    return _show(request, "robot_now.html", card=read_card(fleet, robot), **_now(fleet, who, robot))
 
 
 @routes.get("/pieces/robots/{robot}/panels", "status.read")
 def show_panels(request: Request, fleet: Fleet, robot: OfRobot) -> Response:
     """Show battery and components that are alike, alone."""
     tree, card = read_status(fleet, robot), read_card(fleet, robot)
-    return render(request, "robot_panels.html", card=card, **_panels(tree))
+    return _show(request, "robot_panels.html", card=card, **_panels(tree))
 
 
 @routes.get("/pieces/robots/{robot}/battery", "items.read")
@@ -144,12 +142,16 @@ async def show_battery(request: Request, fleet: Fleet, who: Who, robot: OfRobot)
         found = await trend(fleet, who, robot.id)
     except AmberboxError:  # too much is asked at the moment: the value itself is on the page
         found = None
-    return render(request, "robot_trend.html", trend=found)
+    return _show(request, "robot_trend.html", trend=found)
+
+
+def _show(request: Request, template: str, **values: Any) -> Response:
+    return render(request, template, rt=robottree, **values)
 
 
 def _tree(tree: StatusTree, look: Look) -> Mapping[str, Any]:
     return {
-        "tree": tree, "rt": robottree,
+        "tree": tree,
         "branches": robottree.branches(tree, look.q, look.show, look.chosen),
     }  # fmt: skip
 
@@ -194,7 +196,7 @@ def _now(fleet: Services, who: Who, robot: KnownRobot) -> Mapping[str, Any]:
 
 
 def _panels(tree: StatusTree) -> Mapping[str, Any]:
-    return {"groups": groups(tree.components), "battery": _battery(tree), "rt": robottree}
+    return {"groups": groups(tree.components), "battery": _battery(tree)}
 
 
 def _battery(tree: StatusTree) -> Component | None:

@@ -42,7 +42,7 @@ async def trend(fleet: Services, who: Caller, robot: str) -> Trend | None:
     ask = _Asking(fleet, who, robot)
     items = [one["name"] for one in await ask("items") if "battery" in one["name"].casefold()]
     for item in items:
-        variable = _charge((await ask("item", item=item))["variables"])
+        variable = _charge((await ask("item", item=item))["columns"])
         values = await ask.values(item, variable["name"]) if variable else []
         known = [value for value in values if value is not None]
         if variable and known:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from amberbox.fleet.state.views import Component, Output
 
-COLUMNS = 4
+COLUMNS = 3
 """Outputs that are compared; the tree has all of them."""
 _FEW = 2
 _FIRST = re.compile(r"[^\W\d_]+")

@@ -68,7 +68,6 @@ function filter() {
     const fits = query.every((word) => wordsOf(branch).includes(word)) && !(isTrouble && branch.dataset.level === "ok");
     if (branch.hidden === fits) branch.hidden = !fits;
   }
-  if (!look) return;
   one("#nothing-fits").hidden = branches.length === 0 || branches.some((branch) => !branch.hidden);
   setText(one("#trouble-count"), String(branches.filter((branch) => branch.dataset.level !== "ok").length));
 }
@@ -165,8 +164,9 @@ function startAround() {
 
 /** Show how the battery went; it changes slowly. */
 async function showTrend() {
-  const place = one("#trend");
-  if (place) place.replaceWith(await piece(`${base}/battery`));
+  if (!one("#trend")) return;
+  const fresh = await piece(`${base}/battery`).catch(() => null); // the value itself is there without
+  if (fresh) one("#trend")?.replaceWith(fresh);
 }
 
 // -- what people do
@@ -252,6 +252,7 @@ function count() {
 function restructure() {
   stale.tree();
   stale.panels();
+  showTrend();
 }
 
 function contact(data) {
@@ -281,16 +282,29 @@ function startFeed() {
   return feed;
 }
 
-function start() {
+function startDiagnosis(feed) {
   const place = one("#diagnosis");
-  const feed = startFeed();
-  if (place) diagnosis.keep(place, { path: () => `/robots/${encodeURIComponent(robot)}/diagnosis/card`, feed, robot });
-  if (look) startLook();
+  if (!place) return;
+  feed.on("diagnosis", () => {
+    place.hidden = false;
+  });
+  diagnosis.keep(place, { path: () => `/robots/${encodeURIComponent(robot)}/diagnosis/card`, feed, robot });
+}
+
+/** What was put in place of rows and cells is found anew. */
+function indexAnew() {
+  live.index();
+  page.classList.toggle("is-empty", one(".branch", section) === null);
+  filter();
+  count();
+}
+
+function start() {
+  startDiagnosis(startFeed());
+  startLook();
   startAround();
   startActs();
-  // what was put in place of rows and cells is found anew
-  new MutationObserver(() => live.index()).observe(section, { childList: true });
-  new MutationObserver(() => live.index()).observe(one(".robot-side"), { childList: true });
+  for (const place of [section, one(".robot-side")]) new MutationObserver(indexAnew).observe(place, { childList: true });
   setInterval(() => {
     live.tick();
     saySilence();

@@ -6,7 +6,8 @@ import { t } from "./strings.js";
 
 const TICK_MS = 1000;
 const STEPS = [["d", 86400], ["h", 3600], ["min", 60], ["s", 1]];
-const loadedMs = performance.now();
+// the page says when it was made: that was when its first byte came, however long modules take
+const loadedMs = performance.getEntriesByType("navigation")[0]?.responseStart || performance.now();
 const serverMs = Date.parse(document.querySelector('meta[name="now"]')?.content ?? "") || Date.now();
 
 /** Return the server's time now, in ms since the epoch. */
