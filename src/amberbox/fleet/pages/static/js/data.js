@@ -22,6 +22,8 @@ import { windowForm } from "./windowform.js";
 import { works } from "./works.js";
 
 const HOUR_S = 3600;
+/** So much of a window may be without data at its end before one is told. */
+const EDGE = 0.05;
 const { robot, named: fromDiagnosis } = brought("data-about");
 const path = `/api/v1/robots/${encodeURIComponent(robot)}`;
 const now = () => nowMs() / 1000;
@@ -67,11 +69,11 @@ function build() {
   parts.notes = notes(one("#data-notes"), { newest, fetch: fetchWindow });
   parts.works = works(one("#works"), robot, { fetched: renew });
   one("#search").addEventListener("input", (event) => parts.tree.search(event.target.value));
-  goTo(one("#goto"), robot, (from, to, mission) => (mission ? change({ mission, from: "", to: "", live: false }, true).then(refollow) : move(from, to)));
+  goTo(one("#goto"), robot, (from, to, mission) => (mission ? turn({ mission, from: "", to: "", live: false }) : move(from, to)));
   const about = { window: () => page.window, cursor: () => parts.stage.plots()?.now().cursor ?? null };
   marks(robot, { ...about, changed: rewatch });
   takeAlong(robot, { ...about, chosen: () => chosen().map((one) => one.variable), began: parts.works.download });
-  comparing(robot, { begin: (pair) => change({ compare: pair, mode: "time", live: false }, true).then(refollow), end: () => change({ compare: [] }, true).then(refollow) });
+  comparing(robot, { begin: (pair) => turn({ compare: pair, mode: "time", live: false }), end: () => turn({ compare: [] }) });
   parts.feed.on("job", ({ id }) => parts.works.look(id));
   parts.feed.on("alarm", rewatch);
 }
@@ -95,7 +97,11 @@ async function follow(look) {
   show();
 }
 
-const refollow = () => follow(read());
+/** Look at something else, for which the server has to be asked first. */
+function turn(changes) {
+  write({ ...page.look, ...changes }, { push: true });
+  return follow(read());
+}
 
 /** The window that an address means: a mission, times, or the newest hour. */
 async function windowOf({ from, to, mission, live: isLive }) {
@@ -248,7 +254,7 @@ function say(changes) {
 
 /** Tell whether the robot may have something of a window that is not here. */
 function lacks({ from, to }) {
-  const behind = page.cover.end === null || to > page.cover.end;
+  const behind = page.cover.end === null || to - page.cover.end > EDGE * (to - from);
   const within = page.cover.missing.some((one) => /not on the server yet/i.test(one.reason) && one.start < to && one.end > from);
   return (behind && from < now()) || within;
 }

@@ -223,7 +223,8 @@ function choices(select, numbers, name) {
 
 function howOften(element, { robot }) {
   const few = el("p", { class: "notice" }, t("data.hist.none"));
-  element.append(few);
+  const bars = el("div", { class: "data-bars" });
+  element.append(few, bars);
   const shown = new Map();
 
   function drop(name) {
@@ -240,7 +241,7 @@ function howOften(element, { robot }) {
       for (const one of numbers) {
         if (!shown.has(one.name)) {
           const place = el("div");
-          element.append(place);
+          bars.append(place);
           shown.set(one.name, { place, view: following(place, (span) => histogram(place, { trace: traceOf(robot, one), ...span })) });
         }
         shown.get(one.name).view.show(one.name, window);

@@ -1,7 +1,7 @@
 /** Marking: the window as an incident that is kept, or a moment of a mission by a note. */
 
 import { ask, toast } from "./ask.js";
-import { el, one } from "./dom.js";
+import { all, el, one } from "./dom.js";
 import { dialogForm } from "./dialogs.js";
 import { spanOf } from "./goto.js";
 import { moment } from "./plottime.js";
@@ -55,5 +55,6 @@ async function missionsAt(form, path, at) {
   });
   form.elements.mission.replaceChildren(...fitting.map((mission) => el("option", { value: mission.id }, `${mission.name} · ${mission.id}`)));
   one("[data-none]", form).hidden = fitting.length > 0;
+  for (const part of all("[data-some]", form)) part.hidden = !fitting.length;
   one('button[type="submit"]', form).disabled = !fitting.length;
 }
