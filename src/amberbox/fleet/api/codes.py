@@ -13,13 +13,13 @@ from amberbox.fleet.api.access import Fleet, Open, Routes
 from amberbox.fleet.api.demo import InDemo, demonstration_of
 from amberbox.fleet.api.forms import Form
 from amberbox.fleet.api.session import (
+from amberbox.fleet.api.who import is_here
     Myself,
     came_from,
     from_our_pages,
     myself,
     set_cookie,
 )
-from amberbox.fleet.api.setup import is_here
 
 routes = Routes("session")
 
@@ -33,7 +33,7 @@ class Code(Form):
 def from_here(request: Request, fleet: Fleet) -> None:
     """Refuse who is not on the machine itself; where no demonstration runs, everybody."""
     demonstration_of(fleet)
-    if not is_here(request, fleet):
+    if not is_here(request):
         raise HTTPException(403, "these links are for who is on the machine itself")
 
 

@@ -17,7 +17,7 @@ from amberbox.fleet.accounts.tokens import find_token, touch_token
 from amberbox.fleet.api.access import Caller, services_of
 from amberbox.fleet.api.origins import is_own_page
 from amberbox.fleet.services import Services
-from amberbox.fleet.serving.forwarded import client_address
+from amberbox.fleet.serving.forwarded import client_address, is_loopback
 
 COOKIE = "amberbox_session"
 CSRF_HEADER = "x-csrf-token"
@@ -45,6 +45,13 @@ def address_of(connection: HTTPConnection) -> str:
     if not proxies:
         return peer
     return client_address(peer, connection.headers.getlist("x-forwarded-for"), proxies)
+
+
+def is_here(connection: HTTPConnection) -> bool:
+    """Tell whether somebody on the machine asks: behind a proxy nobody can know."""
+    peer = connection.client.host if connection.client else ""
+    by_proxy = any(name in connection.headers for name in ("x-forwarded-for", "forwarded", "via"))
+    return is_loopback(peer) and not services_of(connection).settings.proxies and not by_proxy
 
 
 def _by_header(connection: HTTPConnection, services: Services, header: str) -> Caller:

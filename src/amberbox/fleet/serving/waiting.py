@@ -10,7 +10,7 @@ from amberbox.fleet.database.database import Database
 from amberbox.fleet.serving.asgi import ASGIApp, Receive, Scope, Send, headers_of, refuse
 from amberbox.link import limits
 
-OPEN = ("/setup", "/setup/style.css", f"{PREFIX}/health", f"{limits.PATH}/ca.pem")
+OPEN = ("/setup", f"{PREFIX}/health", f"{limits.PATH}/ca.pem")
 STATIC = "/static/"
 
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Mapping
-from functools import lru_cache, partial
-from pathlib import Path
+from functools import partial
 from typing import Any
 from urllib.parse import parse_qs
 
@@ -20,29 +19,27 @@ from amberbox.fleet.accounts.setupcode import (
     use_setup_code,
 )
 from amberbox.fleet.accounts.signin import Caller, MustWaitError
-from amberbox.fleet.api.access import Fleet, Open, Routes
+from amberbox.fleet.api.access import Fleet, Open
 from amberbox.fleet.api.errors import status_of
 from amberbox.fleet.api.origins import is_own_page
-from amberbox.fleet.api.who import address_of
+from amberbox.fleet.api.who import address_of, is_here
 from amberbox.fleet.bus import Change
+from amberbox.fleet.pages.page import Pages, render
 from amberbox.fleet.services import Services
-from amberbox.fleet.serving.forwarded import is_loopback
 
-routes = Routes("setup", prefix="")
+routes = Pages()
 
 _WHY = Open("makes the first admin, for who is on the machine or has its code; 404 afterwards")
-_PAGES = Path(__file__).parent.parent / "serving" / "pages"
 _MOST = 10_000
-_ASKS: dict[str, Any] = {"include_in_schema": False, "response_class": HTMLResponse}
 
 
-@routes.get("/setup", _WHY, **_ASKS)
+@routes.get("/setup", _WHY)
 def ask(request: Request, fleet: Fleet) -> Response:
     """Show the form."""
-    return _page(fleet, **_situation(request, fleet))
+    return _page(request, fleet, **_situation(request, fleet))
 
 
-@routes.post("/setup", _WHY, **_ASKS)
+@routes.post("/setup", _WHY, include_in_schema=False, response_class=HTMLResponse)
 async def make(request: Request, fleet: Fleet) -> Response:
     """Make the admin; what is wrong is said on the page."""
     situation = await asyncio.to_thread(_situation, request, fleet)
@@ -54,16 +51,13 @@ async def make(request: Request, fleet: Fleet) -> Response:
     try:
         await _made(request, fleet, form, needs_code=situation["needs_code"])
     except AmberboxError as error:
-        wait = {"Retry-After": str(error.seconds)} if isinstance(error, MustWaitError) else None
-        return _page(fleet, status_of(error), wait, **known, problem=error.what, hint=error.hint)
+        said = {**known, "problem": error.what, "hint": error.hint}
+        answer = _page(request, fleet, status_of(error), **said)
+        if isinstance(error, MustWaitError):
+            answer.headers["Retry-After"] = str(error.seconds)
+        return answer
     fleet.bus.publish(Change("account", data={"name": name}))
-    return _page(fleet, made=name)
-
-
-@routes.get("/setup/style.css", Open("how the page looks"), include_in_schema=False)
-def style() -> Response:
-    """Return the style of the page."""
-    return Response((_PAGES / "setup.css").read_bytes(), media_type="text/css")
+    return _page(request, fleet, made=name)
 
 
 async def _made(
@@ -88,14 +82,7 @@ def _situation(request: Request, fleet: Services) -> dict[str, Any]:
         waits = code_waits(connection, fleet.clock.wall_ns())
     if not is_first and not waits:
         raise HTTPException(404, "this server is set up")
-    return {"is_first": is_first, "needs_code": not (is_first and is_here(request, fleet))}
-
-
-def is_here(request: Request, fleet: Services) -> bool:
-    """Tell whether somebody on the machine asks: behind a proxy nobody can know."""
-    peer = request.client.host if request.client else ""
-    by_proxy = any(name in request.headers for name in ("x-forwarded-for", "forwarded", "via"))
-    return is_loopback(peer) and not fleet.settings.proxies and not by_proxy
+    return {"is_first": is_first, "needs_code": not (is_first and is_here(request))}
 
 
 async def _form(request: Request) -> dict[str, str]:
@@ -107,15 +94,7 @@ async def _form(request: Request) -> dict[str, str]:
     return {name: values[-1] for name, values in found.items()}
 
 
-def _page(
-    fleet: Services, status: int = 200, headers: Mapping[str, str] | None = None, **about: Any
-) -> Response:
-    text = _template().render(folder=fleet.folder, **about)
-    return HTMLResponse(text, status, headers)
-
-
-@lru_cache
-def _template() -> Any:
-    from jinja2 import Environment, FileSystemLoader
-
-    return Environment(loader=FileSystemLoader(_PAGES), autoescape=True).get_template("setup.html")
+def _page(request: Request, fleet: Services, status: int = 200, **about: Any) -> Response:
+    nothing = {"made": "", "problem": "", "hint": "", "name": "", "is_first": True,
+               "needs_code": False}  # fmt: skip
+    return render(request, "setup.html", status, folder=fleet.folder, **{**nothing, **about})
