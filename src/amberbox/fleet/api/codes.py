@@ -13,13 +13,13 @@ from amberbox.fleet.api.access import Fleet, Open, Routes
 from amberbox.fleet.api.demo import InDemo, demonstration_of
 from amberbox.fleet.api.forms import Form
 from amberbox.fleet.api.session import (
-from amberbox.fleet.api.who import is_here
     Myself,
     came_from,
     from_our_pages,
     myself,
     set_cookie,
 )
+from amberbox.fleet.api.who import is_here
 
 routes = Routes("session")
 
