@@ -108,8 +108,8 @@ def assert_all_accounted_for(ros: Ros, box: Box, *, invisible: bool = False) -> 
 def running(ros: Ros, *, invisible: bool = False) -> Iterator[Box]:
     box = Box(ros, invisible)
     box.start()
-    wait_until(lambda: box.rows("amberbox_run"), 20, "the box records")
     try:
+        wait_until(lambda: box.rows("amberbox_run"), 20, "the box records")
         yield box
     finally:
         if box.process is not None and box.process.poll() is None:
