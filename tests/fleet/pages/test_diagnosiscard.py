@@ -19,6 +19,7 @@ from amberbox.fleet.pages.diagnosiscard import (
     minutes,
     plain_card_of,
 )
+from amberbox.fleet.pages.page import environment
 from tests.fleet.knowledge import robot as sim
 
 NOW = sim.AT_NS
@@ -130,6 +131,20 @@ def test_a_revision_without_any_hypothesis_has_a_card() -> None:
     shown = revision_json(sim.diagnosis(NOW, seen(sim.NO_SCANS)))
     found = plain_card_of({**shown, "hypotheses": [], "groups": [], "next_tests": []})
     assert (found.causes, found.sure, found.next) == ((), "", None)
+
+
+def test_whatever_stands_in_a_robots_folder_is_shown_as_text(knowledge: Knowledge) -> None:
+    hostile = '"><img src=x onerror=alert(1)>{{7*7}}'
+    answer = answer_of(knowledge, seen(sim.NO_SCANS, hostile))
+    told = answer["explanation"]
+    told["broken"]["members"][0]["text"] = told["because"][0]["text"] = hostile
+    told["next"].update(text=hostile, test=hostile, by=hostile)
+    told["next"]["answers"][0]["answer"] = told["use"]["text"] = hostile
+    answer["id"] = answer["robot"] = answer["notes"] = hostile
+    template = environment().get_template("diagnosis_part.html")
+    page = template.render(shown=card_of(answer), seen=None, may=True, link=True)
+    assert "<img" not in page and "49" not in page
+    assert page.count("&lt;img src=x onerror=alert(1)&gt;{{7*7}}") >= 6
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ const input = one("#help-search");
 function show(text) {
   const wanted = text.trim().toLowerCase();
   for (const word of all(".word-entry")) word.hidden = !word.textContent.toLowerCase().includes(wanted);
-  for (const part of all("main section.panel")) part.hidden = !one(".word-entry:not([hidden])", part);
+  for (const part of all("main section.panel:has(.words)")) part.hidden = !one(".word-entry:not([hidden])", part);
   one("#help-none").hidden = one(".word-entry:not([hidden])") !== null;
 }
 
