@@ -10,10 +10,11 @@ from amberbox.demo.telling import Telling, check
 
 _OPEN = ("/in", "/sign-in", "/licences", "/help")
 _SEEN = ("/", "/robots/{robot}", "/robots/{robot}/data", "/robots/{robot}/diagnosis",
-         "/recordings", "/downloads", "/alarms", "/alarms/{alarm}", "/knowledge",
+         "/recordings",
+    "/recordings/{robot}", "/downloads", "/alarms", "/alarms/{alarm}", "/knowledge",
          "/knowledge/{robot}", "/account")  # fmt: skip
-_ADMIN = ("/admin", "/admin/users", "/admin/robots", "/admin/tokens", "/admin/retention",
-          "/admin/notifications", "/admin/audit", "/admin/health")  # fmt: skip
+_ADMIN = ("/admin", "/admin/users", "/admin/robots", "/admin/teams", "/admin/system",
+          "/admin/audit", "/admin/health")  # fmt: skip
 _ASSET = re.compile(rb"(?:src|href)=\"(/static/[^\"#]+)")
 
 

@@ -49,5 +49,5 @@ function shown(form, fault) {
   one("[data-broken]", form).hidden = !option;
   if (!option) return;
   setText(one("[data-what]", form), option.textContent);
-  setText(one("[data-watch]", form), option.dataset.watch);
+  setText(one("[data-then]", form), option.dataset.watch);
 }

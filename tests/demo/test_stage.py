@@ -1,0 +1,136 @@
+"""The parts of the demonstration: the port, the way that is cut, orders to a robot, its folder."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+
+from amberbox.blackbox.folder.folder import load_folder
+from amberbox.blackbox.sources.sim import Orders
+from amberbox.core.errors import AmberboxError, UsageError
+from amberbox.demo.relay import Relay
+from amberbox.demo.robots import IDS
+from amberbox.demo.show import free_port
+from amberbox.demo.stage import Stage
+
+
+def test_a_port_that_is_taken_is_passed_over() -> None:
+    with closing(socket.create_server(("127.0.0.1", 0))) as taken:
+        port = int(taken.getsockname()[1])
+        found = free_port(port)
+        assert port < found < port + 50
+    with pytest.raises(AmberboxError, match="are taken"):
+        free_port(65536)
+
+
+def test_nobody_gets_through_while_the_way_is_cut() -> None:
+    asyncio.run(_cut_and_mend())
+
+
+async def _cut_and_mend() -> None:
+    async def echo(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        while piece := await reader.read(100):
+            writer.write(piece)
+        writer.close()
+
+    server = await asyncio.start_server(echo, "127.0.0.1", 0)
+    relay = Relay()
+    await relay.begin(int(server.sockets[0].getsockname()[1]))
+    reader, writer = await asyncio.open_connection("127.0.0.1", relay.port)
+    writer.write(b"hello")
+    assert await reader.readexactly(5) == b"hello"
+    assert relay.used.is_set()
+    relay.cut()
+    with pytest.raises((ConnectionError, asyncio.IncompleteReadError)):
+        await reader.readexactly(1)
+    assert await _answers(relay.port) is False
+    relay.mend()
+    assert await _answers(relay.port) is True
+    relay.close()
+    server.close()
+
+
+async def _answers(port: int) -> bool:
+    try:
+        reader, writer = await asyncio.open_connection("127.0.0.1", port)
+        writer.write(b"x")
+        return await reader.read(1) == b"x"
+    except ConnectionError:
+        return False
+
+
+def test_the_robots_folders_are_right_and_report_to_the_server(tmp_path: Path) -> None:
+    stage = Stage(tmp_path, 18999)
+    stage.prepare()
+    for robot in IDS:
+        folder = load_folder(tmp_path / robot)
+        assert folder.robot.id == robot
+        assert folder.robot.server is not None
+        assert folder.robot.server.url.startswith("http://127.0.0.1:")
+        assert (tmp_path / robot / "server.key").stat().st_mode & 0o077 == 0
+        assert (tmp_path / robot / "fmea.yaml").exists()
+    stage.close()
+
+
+def test_what_is_not_offered_or_does_not_run_is_refused(tmp_path: Path) -> None:
+    stage = Stage(tmp_path, 18999)
+    with pytest.raises(UsageError, match="no fault 'host_clock_jump'"):
+        stage.damage(IDS[0], "host_clock_jump")
+    with pytest.raises(UsageError, match="does not run"):
+        stage.damage(IDS[0], stage.faults[0])
+    assert stage.broken() == {}
+    stage.close()
+
+
+def test_orders_are_read_line_by_line_as_they_are_added(tmp_path: Path) -> None:
+    path = tmp_path / "orders"
+    orders = Orders(path)
+    assert orders.new() == []
+    path.write_text("fault a\nfault b\nhea")
+    assert orders.new() == ["fault a", "fault b"]
+    assert orders.new() == []
+    path.write_text("fault a\nfault b\nheal a\n")
+    assert orders.new() == ["heal a"]
+
+
+@pytest.mark.timeout(60)
+def test_nothing_is_left_when_the_demonstration_is_killed(tmp_path: Path) -> None:
+    place = tmp_path / "place"
+    command = [sys.executable, "-m", "amberbox", "demo", "--seconds", "60", "--keep", str(place)]
+    process = subprocess.Popen(
+        [*command, "--port", "18543"], stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL
+    )
+    _until(lambda: len(_working_below(place)) > 4, 30)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    _until(lambda: _working_below(place) == [], 30)
+
+
+def _until(is_so: Callable[[], bool], within_s: float) -> None:
+    end_s = time.monotonic() + within_s
+    while not is_so():
+        assert time.monotonic() < end_s
+        time.sleep(0.1)
+
+
+def _working_below(place: Path) -> list[str]:
+    found = []
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdigit() and int(entry.name) != os.getpid():
+            try:
+                command = (entry / "cmdline").read_bytes().replace(b"\0", b" ").decode()
+            except OSError:  # it ended meanwhile
+                continue
+            if str(place) in command:
+                found.append(command)
+    return found
