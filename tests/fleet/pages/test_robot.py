@@ -1,0 +1,273 @@
+"""The page of a robot: what it shows of components, times, missions, and to whom."""
+
+from __future__ import annotations
+
+import html
+import re
+from collections.abc import Iterator
+
+import pytest
+
+from amberbox.core.clock import NS
+from amberbox.fleet.api.timelines import Lane, Stretch, Timeline
+from amberbox.fleet.data import remarks
+from amberbox.fleet.pages import robottree
+from amberbox.fleet.pages.robotgraph import as_list, edges, graph
+from amberbox.fleet.pages.robotgroups import groups
+from amberbox.fleet.pages.robottimes import times
+from amberbox.fleet.state.views import Component, Condition, Mode, Need, Output, StatusTree
+from tests.fleet.house import START_NS, House, house
+from tests.fleet.state import lives
+
+PAGE = "/robots/ropod_001"
+PIECES = "/pieces/robots/ropod_001"
+HOSTILE = '"><img src=x onerror=alert(1)>{{7*7}}'
+
+
+@pytest.fixture(scope="module")
+def home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[House]:
+    """One robot has a laser that is dead, one no folder, one was never there."""
+    with house(tmp_path_factory.mktemp("house"), shared=True) as found:
+        lives.keep_folder(found, "ropod_001")
+        lives.connect(found, "ropod_001", config_hash=lives.HASH)
+        lives.connect(found, "ropod_002", config_hash="cd" * 32)
+        working = {"name": "front_laser_working", "type": "bool", "value": 0}
+        rate = {"name": "rate_hz", "type": "float", "value": 9.87654}
+        said = [
+            lives.status("laser", "error", START_NS, reason="the device is gone"),
+            lives.status("laser", "error", START_NS, mode="laser_device_monitor",
+                         state="front_laser_working", outputs=[working, rate]),
+            lives.status("navigation", "error", START_NS, blocked_by=["laser"],
+                         reason="needs laser"),
+        ]  # fmt: skip
+        for seq, values in enumerate(said, 1):
+            lives.say(found, "ropod_001", lives.STATUS, START_NS, seq, values)
+        event = lives.transition("laser", "ok", "error", START_NS - 600 * NS)
+        lives.say(found, "ropod_001", lives.EVENT, START_NS - 600 * NS, 4, event)
+        odd = lives.status(HOSTILE, "warn", START_NS, reason=HOSTILE)
+        lives.say(found, "ropod_002", lives.STATUS, START_NS, 1, odd)
+        remark = {"kind": "remark", "text": HOSTILE, "source": "watch", "details": ""}
+        lives.say(found, "ropod_002", lives.EVENT, START_NS - NS, 2, remark)
+        yield found
+
+
+def page(home: House, path: str = PAGE, name: str = "viewer") -> str:
+    answer = home.client(name).get(path)
+    assert answer.status_code == 200, answer.text
+    return answer.text
+
+
+def text_of(markup: str) -> str:
+    return " ".join(html.unescape(re.sub(r"<[^>]+>", " ", markup)).split())
+
+
+def branch(markup: str, component: str) -> str:
+    """Return the markup of a component with what is inside."""
+    found = re.search(rf'data-component="{component}".*?(?=<div class="branch"|id="tree-keys")',
+                      markup, re.DOTALL)  # fmt: skip
+    assert found, component
+    return found[0]
+
+
+def test_a_component_shows_its_checks_values_and_what_was_expected(home: House) -> None:
+    words = text_of(branch(page(home), "laser"))
+    assert "laser error the device is gone" in words
+    assert "What it is sees obstacles" in words
+    assert "front_laser_working no expected true" in words
+    assert "rate_hz 9.877 Hz" in words
+
+
+def test_who_suffers_names_what_is_in_the_way_and_what_it_needs(home: House) -> None:
+    words = text_of(branch(page(home), "navigation"))
+    assert "Blocked by What “blocked” means" in words or "Blocked by laser" in words
+    assert "Needs laser error" in words
+
+
+def test_where_nobody_chose_the_root_of_trouble_is_open(home: House) -> None:
+    shown = page(home)
+    assert 'aria-expanded="true"' in branch(shown, "laser")
+    assert 'aria-expanded="true"' not in branch(shown, "navigation")
+
+
+def test_what_is_open_stands_in_the_address(home: House) -> None:
+    shown = page(home, f"{PAGE}?open=navigation")
+    assert 'aria-expanded="true"' in branch(shown, "navigation")
+    assert 'aria-expanded="true"' not in branch(shown, "laser")
+    assert 'aria-expanded="true"' not in page(home, f"{PAGE}?open=-")
+
+
+@pytest.mark.parametrize(
+    ("query", "seen"),
+    [("q=front_laser_work", ["laser"]), ("show=trouble", ["laser", "navigation"]),
+     ("q=nowhere", []), ("q=NAVI&show=trouble", ["navigation"])],
+)  # fmt: skip
+def test_one_finds_what_one_looks_for(home: House, query: str, seen: list[str]) -> None:
+    shown = page(home, f"{PAGE}?{query}")
+    found = re.findall(r'data-component="(\w+)" data-level="\w+">', shown)
+    assert sorted(found) == seen
+    assert ('id="nothing-fits">' in shown) == (not seen)
+
+
+def test_the_graph_marks_the_root_and_leads_to_the_tree(home: House) -> None:
+    shown = page(home, f"{PIECES}/graph")
+    assert 'class="node level-error root"' in shown
+    assert 'href="#c-laser"' in shown
+    assert "laser (cause) error navigation" in text_of(shown)
+
+
+def test_what_was_when_leads_to_the_data_of_that_time(home: House) -> None:
+    shown = page(home, f"{PIECES}/timeline?window=6h")
+    assert 'class="stretch state-error"' in shown
+    assert "/robots/ropod_001/data?from=2027-01-15T07" in shown
+
+
+def test_events_can_be_chosen_by_their_kind(home: House) -> None:
+    assert "laser: ok -> error" in text_of(page(home, f"{PIECES}/events?kind=component_state"))
+    none = page(home, f"{PIECES}/events?kind=bump")
+    assert "No event of this kind" in none
+
+
+def test_a_robot_that_never_connected_says_what_to_do(home: House) -> None:
+    path = "/robots/ropod_003"
+    assert "This robot has never connected" in page(home, path)
+    assert 'href="/admin/robots"' not in page(home, path).split("<main")[1]
+    assert 'href="/admin/robots"' in page(home, path, "admin").split("<main")[1]
+
+
+def test_a_robot_without_its_folder_says_so(home: House) -> None:
+    words = text_of(page(home, "/robots/ropod_002"))
+    assert "The robot's folder is not here yet." in words
+    assert "What needs what stands in the robot's folder" in words
+
+
+def test_hostile_names_and_reasons_are_text(home: House) -> None:
+    for path in ("", "/tree", "/graph", "/timeline", "/events", "/panels", "/now", "/head"):
+        base = "/robots/ropod_002" if not path else "/pieces/robots/ropod_002"
+        shown = page(home, f"{base}{path}")
+        assert "<img" not in shown, path
+        assert "49" not in text_of(shown).split(), path
+    assert HOSTILE in html.unescape(page(home, "/robots/ropod_002"))
+
+
+def test_operators_act_and_viewers_look(home: House) -> None:
+    assert "data-dialog" not in page(home)
+    acts = set(re.findall(r'data-dialog="(\w+)"', page(home, PAGE, "operator")))
+    assert acts == {"incident", "begin"}
+
+
+def test_a_mission_that_people_began_can_be_ended_and_noted(home: House) -> None:
+    with home.services.database.begin() as connection:
+        begun = remarks.begin(connection, START_NS, "ropod_001", "demo", "operator", {})
+    shown = page(home, f"{PIECES}/now", "operator")
+    base = f"/api/v1/robots/ropod_001/missions/{begun.id}"
+    assert f'data-path="{base}/end"' in shown
+    assert f'data-path="{base}/notes"' in shown
+    assert f"{base}/end" not in page(home, f"{PIECES}/now")
+    with home.services.database.begin() as connection:
+        remarks.end(connection, START_NS + 1, "ropod_001", begun.id, "done", failed=None)
+
+
+def test_files_of_the_folder_are_for_technicians(home: House) -> None:
+    file = f"/api/v1/robots/ropod_001/folder/{lives.HASH}/robot.yaml"
+    assert file not in page(home, PAGE, "operator")
+    assert file in page(home, PAGE, "technician")
+
+
+def test_a_token_for_statuses_alone_sees_neither_events_nor_diagnoses(home: House) -> None:
+    shown = home.token_client("technician", "read:status").get(PAGE)
+    assert shown.status_code == 200
+    assert 'id="tree"' in shown.text
+    assert 'id="events"' not in shown.text
+    assert 'id="diagnosis"' not in shown.text
+
+
+def test_the_head_says_that_a_robot_is_silent(home: House) -> None:
+    link = home.services.links.robots["ropod_001"]
+    heard_s = link.heard_s
+    link.heard_s -= 60
+    try:
+        assert "silent since" in page(home, f"{PIECES}/head")
+        assert "is-silent" in page(home)
+    finally:
+        link.heard_s = heard_s
+    assert "online" in page(home, f"{PIECES}/head")
+
+
+# -- what it is made of
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(0.0, "0.000"), (0.01, "0.010"), (24.2, "24.20"), (-64.5, "-64.50"), (999.96, "1000.0"),
+     (5400.0, "5400"), (123456.7, "123457"), (2.5e6, "2.50e+06"), (1.5e-5, "1.50e-05")],
+)  # fmt: skip
+def test_numbers_have_digits_that_tell_something(value: float, text: str) -> None:
+    assert robottree.number(value) == text
+
+
+@pytest.mark.parametrize(
+    ("name", "unit"),
+    [("rate_hz", "Hz"), ("volts", "V"), ("time_to_empty", ""), ("m", ""), ("left_m", "m"),
+     ("charge_percent", "%"), ("a", "")],
+)  # fmt: skip
+def test_units_are_read_from_names(name: str, unit: str) -> None:
+    assert robottree.unit(name) == unit
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"), [(0.0, "1 s"), (59.9, "59 s"), (61, "1 min"), (7300, "2 h"), (9e5, "10 d")]
+)
+def test_ages_are_told_in_one_unit(seconds: float, text: str) -> None:
+    assert robottree.span_text(seconds) == text
+
+
+def condition(level: str, *blocked_by: str) -> Condition:
+    return Condition(level, level, "", blocked_by, None, None, 0.0, 0.0)
+
+
+def component(
+    name: str, level: str = "ok", *, needs: tuple[str, ...] = (), part_of: str = "",
+    blocked_by: tuple[str, ...] = (), outputs: tuple[Output, ...] = (),
+) -> Component:  # fmt: skip
+    modes = [Mode("m", "m", condition(level), outputs)] if outputs else []
+    needed = [Need(one, one, "ok") for one in needs]
+    said = condition(level, *blocked_by)
+    return Component(name, name, 0, "", part_of, needed, "", (), said, modes)
+
+
+def test_of_many_in_trouble_the_worst_roots_are_open() -> None:
+    parts = [component("a", "warn"), component("b", "error", blocked_by=("a",)), component("c"),
+             *(component(f"d{n}", "error") for n in range(3))]  # fmt: skip
+    tree = StatusTree("r", True, "", "", None, parts)
+    opened = [
+        one.component.component for one in robottree.branches(tree, "", "all", ()) if one.is_open
+    ]
+    assert opened == ["d0", "d1", "d2"]
+
+
+def test_components_that_are_alike_stand_side_by_side() -> None:
+    volts, on = Output("volts", "float", 24.0, "", "", ""), Output("on", "bool", True, "", "", "")
+    wheels = [component(f"wheel_{name}", outputs=(on, volts)) for name in ("left", "right")]
+    (group,) = groups([*wheels, component("wheelhouse", outputs=(on,)), component("imu")])
+    assert (group.name, [one.rest for one in group.members]) == ("wheel", ["left", "right"])
+    assert group.columns == [("m", "volts"), ("m", "on")]
+
+
+def test_the_graph_has_each_line_once_and_none_to_itself() -> None:
+    parts = [component("a", needs=("b", "b", "a", "nowhere"), part_of="b"), component("b")]
+    assert [(one.start, one.end, one.kind) for one in edges(parts)] == [("a", "b", "needs")]
+    assert [line.needed_by for line in as_list(parts)] == [[], ["a"]]
+    assert graph([component("a"), component("b")], "x") is None
+
+
+def test_lanes_that_were_fine_are_counted_and_shown_on_demand() -> None:
+    def lane(name: str, level: str) -> Lane:
+        one = Stretch(from_="2027-01-15T07:00:00Z", to="2027-01-15T08:00:00Z", level=level,
+                      state=level, reason="", changes=0)  # fmt: skip
+        return Lane(component=name, mode="", stretches=[one])
+
+    found = Timeline(from_="2027-01-15T07:00:00Z", to="2027-01-15T08:00:00Z", complete=True,
+                     lanes=[lane("a", "ok"), lane("b", "stale")])  # fmt: skip
+    some, every = times("r", found, "", "1h"), times("r", found, "all", "1h")
+    assert (some.shown, some.fine, every.shown) == (1, 1, 2)
+    assert [row.component for row in every.rows] == ["b"]
