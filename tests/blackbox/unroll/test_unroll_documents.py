@@ -183,6 +183,19 @@ def test_objects_used_as_maps_become_text() -> None:
     assert cells(task.rows(messages), "by_id")[7] == '{"id7":7}'
 
 
+@pytest.mark.parametrize("key", ['a"b', "a\\b", "a\nb", "\0"])
+def test_objects_with_keys_that_cannot_be_columns_become_text(key: str) -> None:
+    _, task, messages = learn([{"o": {"x": 1}, "n": 2}, {"o": {key: 1}, "n": 3}])
+    assert kinds(task.schema) == {"o": "string", "n": "int64"}
+    assert [json.loads(cell) for cell in cells(task.rows(messages), "o")] == [{"x": 1}, {key: 1}]
+
+
+def test_messages_with_keys_that_cannot_be_columns_become_text() -> None:
+    _, task, messages = learn([{'a"b': 1}])
+    (column,) = task.schema.columns
+    assert json.loads(cells(task.rows(messages), column.name)[0]) == {'a"b': 1}
+
+
 def test_deep_values_become_text() -> None:
     value: Any = 1
     for _ in range(DEEPEST + 4):

@@ -7,7 +7,7 @@ from typing import Any
 
 import msgspec
 
-from amberbox.blackbox.unroll.shapes import Shape, nullable, places
+from amberbox.blackbox.unroll.shapes import Shape, is_nameable, nullable, places
 from amberbox.blackbox.unroll.viewerform import ALSO_TEXT, viewer_form
 from amberbox.core.types import Schema
 
@@ -90,8 +90,12 @@ def _from_json(document: Mapping[str, Any], table: bool = False) -> Shape:
         shape.kinds.add("binary")
         if not document.get(ALSO_TEXT):
             shape.kinds.discard("string")
-    shape.open = document.get("additionalProperties") is True
-    shape.properties = {k: _nullable(v) for k, v in document.get("properties", {}).items()}
+    properties = document.get("properties", {})
+    shape.open = document.get("additionalProperties") is True or not all(
+        map(is_nameable, properties)
+    )
+    if not shape.open:
+        shape.properties = {k: _nullable(v) for k, v in properties.items()}
     if "items" in document:
         shape.items = _from_json(document["items"] or {}, table=True)
     if table:

@@ -5,6 +5,7 @@ Observing only ever adds kinds, so the shape in the end does not depend on the o
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -14,6 +15,7 @@ DEEPEST = 16
 """Objects with more keys, and values nested deeper, are kept as JSON text in one column."""
 
 _INT64 = range(-(2**63), 2**63)
+_UNNAMEABLE = re.compile(r'["\\\x00-\x1f\ud800-\udfff]')
 
 
 @dataclass(slots=True)
@@ -85,11 +87,19 @@ def _observe_object(shape: Shape, value: Mapping[str, Any], depth: int) -> None:
     for key, item in value.items():
         if key not in shape.properties:
             shape.properties[key] = nullable()
-        if depth >= DEEPEST or len(shape.properties) > MOST_PROPERTIES:
+        if depth >= DEEPEST or len(shape.properties) > MOST_PROPERTIES or not is_nameable(key):
             shape.open = True
             shape.properties, shape.items = {}, None
             return
         observe(shape.properties[key], item, depth + 1)
+
+
+def is_nameable(key: str) -> bool:
+    """Tell whether a property can become a column: one with quotes or control characters cannot.
+
+    The decoder that is made for a shape refuses them; such an object is kept as text.
+    """
+    return not _UNNAMEABLE.search(key)
 
 
 def _observe_array(shape: Shape, value: list[Any], depth: int) -> None:
