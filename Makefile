@@ -19,11 +19,11 @@ SYSTEM := systemd swi-prolog-nox chromium fonts-dejavu-core
 help:  ## say what there is
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /\1\t/' | expand -t 10
 
-demo: $(ALL)  ## record a simulated robot, break it, show that nothing is lost (DEMO_SECONDS=20)
+demo: $(ALL)  ## the whole story in the browser: three robots, a button that breaks them (DEMO_SECONDS=45: by itself)
 	$(BIN)/amberbox demo
 
 test: $(TEST) debian  ## run all tests (PYTEST_ARGS="-k journal")
-	$(BIN)/python -m pytest $(PYTEST_ARGS)
+	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder $(PYTEST_ARGS)
 
 check: lint types rules  ## lint, types, import directions, files, documentation (make -k check: all at once)
 
