@@ -46,15 +46,18 @@ function showDiagnosis(fresh) {
   startDiagnosis();
 }
 
+/** Renew without a word if that fails: the feed tells again when it is back. */
+function quietly() {
+  return renew().catch(() => null);
+}
+
 function startDiagnosis() {
   const place = one("#alarm-diagnosis");
   const { diagnosis } = place.dataset;
   if (!diagnosis) return;
   const path = () => `/robots/${encodeURIComponent(robot)}/diagnosis/card?diagnosis=${encodeURIComponent(diagnosis)}`;
-  keepCard(place, { path, feed, robot });
+  keepCard(place, { path, feed, robot, renewed: quietly });
 }
-
-const quietly = () => renew().catch(() => null); // the feed tells again when it is back
 
 page.addEventListener("done", ({ target }) => {
   if (!target.closest("#alarm-act")) return;

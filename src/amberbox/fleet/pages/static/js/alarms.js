@@ -15,6 +15,7 @@ const form = one("#look");
 const bulk = one("#bulk");
 const choice = chosen(bulk);
 let typing = null;
+let looking = new AbortController();
 
 const find = () => one("#alarms");
 const address = () => `/pieces/alarms${location.search}`;
@@ -28,14 +29,16 @@ function placed() {
 
 async function look(changes, { push = true } = {}) {
   view.set({ n: null, ...changes }, { push });
+  mark();
   clear(form);
+  looking.abort();
+  looking = new AbortController();
   try {
-    put(find(), await piece(address()));
+    put(find(), await piece(address(), { signal: looking.signal }));
     placed();
   } catch (error) {
-    fail(error, form);
+    if (error.name !== "AbortError") fail(error, form);
   }
-  mark();
 }
 
 /** Show in the form what the address says. */
