@@ -2,6 +2,7 @@
 
 import { ask, fail } from "./ask.js";
 import { comparing } from "./comparison.js";
+import { askCoverage, lacks } from "./coverage.js";
 import { brush } from "./brush.js";
 import { read, tidy, write } from "./dataview.js";
 import { stage } from "./datastage.js";
@@ -22,8 +23,8 @@ import { windowForm } from "./windowform.js";
 import { works } from "./works.js";
 
 const HOUR_S = 3600;
-/** So much of a window may be without data at its end before one is told. */
-const EDGE = 0.05;
+const AGAIN_MS = 60_000;
+const NARROW = "(max-width: 60rem)";
 const { robot, named: fromDiagnosis } = brought("data-about");
 const path = `/api/v1/robots/${encodeURIComponent(robot)}`;
 const now = () => nowMs() / 1000;
@@ -33,22 +34,29 @@ const page = {
   missions: [], parts: {}, isEmpty: false, live: "off",
 };
 
-begin().catch((error) => fail(error, one("#plots")));
+start();
+
+function start() {
+  begin().catch((error) => fail(error, one(".data-main")));
+}
 
 async function begin() {
-  const covering = ask(`/robots/${encodeURIComponent(robot)}/data/coverage`).catch(() => null);
+  const covering = askCoverage(robot);
   page.items = await loadItems(robot);
   page.reach = reach(page.items);
-  if (!page.items.length) {
-    document.body.classList.add("data-none");
-    one("#data-nothing").hidden = false;
-    one("#data").hidden = true;
+  const isEmpty = !page.items.length;
+  one("#data-nothing").hidden = !isEmpty;
+  one("#data").hidden = isEmpty;
+  if (isEmpty) {
+    setTimeout(start, AGAIN_MS);
     return;
   }
   build();
+  if (page.look.named.length && matchMedia(NARROW).matches) one("#data-side").open = false;
   await follow(read());
   view.on(() => follow(read()));
   covered(await covering);
+  setInterval(renewIfNewer, AGAIN_MS);
 }
 
 /** Make all parts; none of them shows anything yet. */
@@ -62,7 +70,7 @@ function build() {
   parts.brush = brush(one("#brush"), (from, to, isMoving) => move(from, to, isMoving ? "moving" : "brush"));
   parts.form = windowForm(one("#window"), {
     newest, go: (from, to) => move(from, to), live: (isOn) => live(isOn), everything: () => move(...ends(whole())),
-    mode: (mode) => change({ mode }, true),
+    mode: (mode) => (page.look.compare.length ? turn({ mode, compare: [] }) : change({ mode }, true)),
   });
   parts.shown = shownList(one("#shown"), { move: (name, plot) => arrange(name, plot), remove: toggle });
   parts.tree = tree(one("#variables"), { robot, items: page.items, first: firstOnes(), toggle, open: page.look.named.length ? "" : `item:${page.items[0].name}` });
@@ -248,15 +256,8 @@ function say(changes) {
   const { isEmpty, unknown = [], window } = page;
   page.parts.notes.show({
     isEmpty: isEmpty && page.look.mode === "time", unknown,
-    canFetch: page.cover !== null && lacks(window) && !page.parts.works.isAsking(),
+    canFetch: page.cover !== null && lacks(page.cover, window, now()) && !page.parts.works.isAsking(),
   });
-}
-
-/** Tell whether the robot may have something of a window that is not here. */
-function lacks({ from, to }) {
-  const behind = page.cover.end === null || to - page.cover.end > EDGE * (to - from);
-  const within = page.cover.missing.some((one) => /not on the server yet/i.test(one.reason) && one.start < to && one.end > from);
-  return (behind && from < now()) || within;
 }
 
 async function fetchWindow(near) {
@@ -271,12 +272,23 @@ async function fetchWindow(near) {
 
 /** Something has come from the robot: everything is asked for anew. */
 async function renew() {
-  covered(await ask(`/robots/${encodeURIComponent(robot)}/data/coverage`).catch(() => null));
+  covered(await askCoverage(robot));
   page.parts.stage.plots()?.refresh();
 }
 
+/** Look whether more has come meanwhile; plots that reach so far are drawn anew. */
+async function renewIfNewer() {
+  if (document.hidden) return;
+  const before = page.cover?.end ?? 0;
+  covered(await askCoverage(robot));
+  if (page.cover?.end > before && page.window.to > before && !page.look.compare.length) page.parts.stage.plots()?.refresh();
+}
+
+/** @param {?import("./coverage.js").Coverage} cover */
 function covered(cover) {
-  page.cover = cover?.start ? cover : { start: null, end: null, recorded: [], missing: [] };
+  if (!cover) return; // asked again in a minute
+  page.cover = cover;
+  page.reach.last = Math.max(page.reach.last ?? 0, cover.end ?? 0);
   const { from, to } = whole();
   page.parts.brush.cover({ ...page.cover, start: from, end: Math.max(to, page.window.to) });
   page.parts.stage.plots()?.setWhole(page.look.compare.length ? page.parts.stage.plots().now() : { from, to });

@@ -13,9 +13,10 @@ import { fail } from "./ask.js";
 import { el } from "./dom.js";
 import { histogram } from "./histogram.js";
 import { plots } from "./plot.js";
-import { seconds } from "./plotdata.js";
+import { maybeSeconds, seconds } from "./plotdata.js";
 import { moment } from "./plottime.js";
 import { t } from "./strings.js";
+import { nowMs, span } from "./time.js";
 import { droppedAddress, isVariable } from "./variables.js";
 import { xyView } from "./xy.js";
 
@@ -154,13 +155,13 @@ function check(stack, to) {
 
 function compared(element, { robot, missions }) {
   const begins = missions.map((one) => seconds(one.from));
-  const lengths = missions.map((one, n) => (one.to ? seconds(one.to) : Date.now() / 1000) - begins[n]);
+  const lengths = missions.map((one, n) => (maybeSeconds(one.to) ?? nowMs() / 1000) - begins[n]);
   const whole = { from: 0, to: Math.max(...lengths) };
   const stack = plots(element, { ...whole, whole, relative: true, fixed: true });
   const placed = placing(stack);
   const tracesOf = (one) => missions.map((mission, n) => ({
     ...traceOf(robot, one), id: `${one.name} ${mission.id}`, origin: begins[n],
-    label: t("data.compare.label", { name: one.name, mission: mission.name, at: moment(begins[n], 60) }),
+    label: t("data.compare.label", { name: one.name, mission: mission.name, at: moment(begins[n], 60), length: span(lengths[n]) }),
   }));
   return { stack, show: ({ chosen }) => placed.show(chosen.flatMap(tracesOf)), destroy: stack.destroy };
 }

@@ -18,6 +18,7 @@ import { kindOf } from "./plottrace.js";
 
 const UNDRAWN = /^(list<|binary|time$|duration$)/;
 const TELLING = [/charge|soc\b|percent/i, /volt|battery/i, /wheel|odom|velocity|twist_linear_x|speed/i, /temperature|current/i];
+const DULL = /^(timestamp|received|stamp|seq|index)$|stamp_|_stamp$/i;
 const OWN = "amberbox";
 
 /** Ask for all variables of a robot. @returns {Promise<Item[]>} */
@@ -80,7 +81,7 @@ export function search(items, text) {
 /** Suggest variables to begin with. @param {Item[]} items @returns {Variable[]} */
 export function suggested(items, most = 6) {
   const drawn = items.filter((item) => !item.isOwn).flatMap((item) => item.variables)
-    .filter((one) => one.kind && one.name !== "timestamp");
+    .filter((one) => one.kind && !DULL.test(one.name));
   const chosen = items.flatMap((item) => item.variables.filter((one) => item.chosen.includes(one.name) && one.kind));
   const telling = TELLING.flatMap((words) => drawn.filter((one) => words.test(one.address)).slice(0, 2));
   return [...new Set([...telling, ...chosen, ...drawn])].slice(0, most);
