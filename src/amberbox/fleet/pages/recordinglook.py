@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 from amberbox.core.clock import NS
@@ -86,15 +86,20 @@ class Cover:
         return format_time(int(self.axis.to))
 
 
-def record(fleet: Services, who: Caller, robot: KnownRobot) -> Record:
+def record(
+    fleet: Services, who: Caller, robot: KnownRobot, *, missions: bool = True,
+    incidents: bool = True,
+) -> Record:  # fmt: skip
     """Return what there is of a robot; workers are asked for missions and incidents."""
     found = Record(robot.id, fleet.clock.wall_ns(), journals(fleet, robot))
     try:
-        missions = list_missions(fleet, who, robot, limit=_MOST)
-        incidents = list_incidents(fleet, who, robot, limit=_MOST)
+        return replace(
+            found,
+            missions=list_missions(fleet, who, robot, limit=_MOST) if missions else (),
+            incidents=list_incidents(fleet, who, robot, limit=_MOST) if incidents else (),
+        )
     except AmberboxError as error:  # too much is asked at the moment: the rest can be shown
-        return Record(robot.id, found.now_ns, found.journals, trouble=error)
-    return Record(robot.id, found.now_ns, found.journals, missions, incidents)
+        return replace(found, trouble=error)
 
 
 def journals(fleet: Services, robot: KnownRobot) -> Sequence[Recording]:
@@ -104,9 +109,7 @@ def journals(fleet: Services, robot: KnownRobot) -> Sequence[Recording]:
     return sorted(found, key=lambda one: (-one.from_ns, one.store_id, one.journal))
 
 
-def cover(
-    fleet: Services, who: Caller, robot: KnownRobot, found: Record, window: Window
-) -> Cover:
+def cover(fleet: Services, who: Caller, robot: KnownRobot, found: Record, window: Window) -> Cover:
     """Return what a robot's bar shows of a window; a worker is asked for what is missing."""
     axis = axis_of(window, found.journals, found.now_ns)
     from_, to = (format_time(int(at)) for at in (axis.start, axis.to))

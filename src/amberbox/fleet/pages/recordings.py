@@ -76,13 +76,16 @@ def show_states(request: Request, fleet: Fleet, who: Who, robot: Name = "") -> R
 
 @routes.get("/pieces/recordings/{robot}", "items.read")
 def show_card(
-    request: Request, fleet: Fleet, who: Who, robot: OfRobot, window: Window = "7d"
-) -> Response:
-    """Show what there is of one robot: its bar, whether it holds, missions and incidents."""
-    found = record(fleet, who, robot)
+    request: Request, fleet: Fleet, who: Who, robot: OfRobot, window: Window = "7d",
+    link: bool = True,
+) -> Response:  # fmt: skip
+    """Show what there is of one robot: its bar, whether it holds; with ``link`` also how many
+    missions and incidents there are, and where more is.
+    """
+    found = record(fleet, who, robot, missions=link)
     seen = cover(fleet, who, robot, found, window)
     return render(
-        request, "recordings_card.html", found=found, link=True,
+        request, "recordings_card.html", found=found, link=link,
         **_drawn(seen, robot.id, window), **_words(),
     )  # fmt: skip
 
@@ -92,16 +95,13 @@ def show_robot(
     request: Request, fleet: Fleet, who: Who, robot: OfRobot, window: Window = "7d",
     show: Show = "all", after: After = "", mission: After = "",
 ) -> Response:  # fmt: skip
-    """Show the recordings of a robot."""
+    """Show the recordings of a robot: what costs little at once, the rest when workers answer."""
     look = Look(window, show, after, mission)
-    found = record(fleet, who, robot)
-    seen = cover(fleet, who, robot, found, window)
     return render(
         request, "recordings_robot.html", strings=("recordings",), card=read_card(fleet, robot),
-        robot=robot.id, held=_held(fleet, [robot.id])[robot.id], look=look, found=found, windows=tuple(WINDOWS),
-        swatches=_swatches(), link=False, **_drawn(seen, robot.id, window),
-        **_may(who, robot), **_missions(found, mission), **_fetches(fleet, robot),
-        **_journals(fleet, robot, found.journals, look), **_words(),
+        robot=robot.id, held=_held(fleet, [robot.id])[robot.id], look=look, windows=tuple(WINDOWS),
+        swatches=_swatches(), **_may(who, robot), **_fetches(fleet, robot),
+        **_journals(fleet, robot, journals(fleet, robot), look), **_words(),
     )  # fmt: skip
 
 
@@ -110,7 +110,7 @@ def show_missions(
     request: Request, fleet: Fleet, who: Who, robot: OfRobot, mission: After = ""
 ) -> Response:
     """Show the missions of a robot alone."""
-    found = record(fleet, who, robot)
+    found = record(fleet, who, robot, incidents=False)
     return render(
         request, "recordings_missions.html", found=found, look=Look(mission=mission),
         **_missions(found, mission), **_may(who, robot), **_words(),
@@ -120,10 +120,8 @@ def show_missions(
 @routes.get("/pieces/recordings/{robot}/incidents", "items.read")
 def show_incidents(request: Request, fleet: Fleet, who: Who, robot: OfRobot) -> Response:
     """Show the incidents of a robot alone."""
-    found = record(fleet, who, robot)
-    return render(
-        request, "recordings_incidents.html", found=found, **_may(who, robot), **_words()
-    )
+    found = record(fleet, who, robot, missions=False)
+    return render(request, "recordings_incidents.html", found=found, **_may(who, robot), **_words())
 
 
 @routes.get("/pieces/recordings/{robot}/fetches", "data.query")

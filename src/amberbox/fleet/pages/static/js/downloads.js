@@ -5,7 +5,10 @@ import { all, el, one } from "./dom.js";
 import { listen } from "./feed.js";
 import { keep } from "./pieces.js";
 import { t } from "./strings.js";
+import { local } from "./time.js";
 
+const MOST_ROBOTS = 5;
+const MOST_MISSIONS = 12;
 const form = one("#ask");
 const words = (text) => text.split(/[\s,]+/).filter(Boolean);
 const known = new Set();
@@ -13,25 +16,33 @@ const stale = keep(() => one("#jobs"), () => `/pieces/downloads${location.search
 
 /** Show a time of the address in the viewer's zone. */
 function localise(field) {
-  const ms = Date.parse(field.dataset.at ?? "");
-  if (Number.isNaN(ms)) return;
+  const exact = Date.parse(field.dataset.at ?? "");
+  if (Number.isNaN(exact)) return;
+  const ms = field.name === "to" ? Math.ceil(exact / 1000) * 1000 : exact; // nothing is cut off
   field.value = new Date(ms - new Date(ms).getTimezoneOffset() * 60_000).toISOString().slice(0, 19);
 }
 
 const utc = (field) => (field.value ? new Date(field.value).toISOString() : "");
 const chosen = (name) => all(`input[name="${name}"]:checked`, form).map((box) => box.value);
 
+/** Return the chips that are pressed, and what was typed beside them. */
+function picked(kind) {
+  const pressed = all(`[data-chips="${kind}"] [aria-pressed="true"]`, form).map((button) => button.value);
+  return [...new Set([...pressed, ...words(form.elements[kind].value)])];
+}
+
 /** Read the form as the API wants it; throws AskError. */
 function wanted() {
-  const { items, missions, from, to } = form.elements;
+  const { from, to } = form.elements;
   const [span] = chosen("span");
   const robots = chosen("robot");
   if (!robots.length) throw new AskError(t("downloads.no_robot"), t("downloads.no_robot_hint"), 0);
-  const body = { robots, items: words(items.value), format: chosen("format")[0] };
+  const body = { robots, items: picked("items"), format: chosen("format")[0] };
   if (span === "range") return { ...body, from: utc(from), to: utc(to) };
   if (span === "all") return body;
-  if (!words(missions.value).length) throw new AskError(t("downloads.no_mission"), t("downloads.no_mission_hint"), 0);
-  return { ...body, missions: words(missions.value) };
+  const missions = picked("missions");
+  if (!missions.length) throw new AskError(t("downloads.no_mission"), t("downloads.no_mission_hint"), 0);
+  return { ...body, missions };
 }
 
 async function send(button) {
@@ -55,34 +66,26 @@ function showSpan() {
 
 /** Offer what the chosen robots have, each name once. */
 async function offer() {
-  for (const robot of chosen("robot").slice(0, 5)) {
+  for (const robot of chosen("robot").slice(0, MOST_ROBOTS)) {
     if (known.has(robot)) continue;
     known.add(robot);
     const base = `/api/v1/robots/${encodeURIComponent(robot)}`;
-    const items = await ask(`${base}/items`).catch(() => []); // names can be typed as well
-    const missions = await ask(`${base}/missions?limit=20`).catch(() => []); // as above
-    for (const { name } of items.filter((item) => item.source !== "amberbox")) offerItem(name);
-    one("#missions-known").append(...missions.map(({ id, name }) => el("option", { value: id }, name)));
+    const missions = await ask(`${base}/missions?limit=${MOST_MISSIONS}`).catch(() => []); // ids can be typed
+    for (const one of missions) chip("missions", one.id, t("downloads.mission", { name: one.name || one.id, at: local(Date.parse(one.from)) }));
+    const items = await ask(`${base}/items`).catch(() => []); // as above
+    for (const { name } of items.filter((item) => item.source !== "amberbox")) chip("items", name, name);
   }
 }
 
-function offerItem(name) {
-  const place = one("[data-items]", form);
-  if (all("button", place).some((button) => button.value === name)) return;
-  const add = () => {
-    const { items } = form.elements;
-    const there = words(items.value);
-    items.value = (there.includes(name) ? there.filter((other) => other !== name) : [...there, name]).join(" ");
-    showItems();
-  };
-  place.append(el("button", { class: "chip", type: "button", value: name, onclick: add }, name));
-  place.hidden = false;
-  showItems();
+function chip(kind, value, text) {
+  const place = one(`[data-chips="${kind}"]`, form);
+  const there = all("button", place).find((button) => button.value === value);
+  if (there) there.replaceChildren(text);
+  else place.append(el("button", { class: "chip", type: "button", value, "aria-pressed": "false" }, text));
 }
 
-function showItems() {
-  const there = words(form.elements.items.value);
-  for (const button of all("[data-items] button", form)) button.setAttribute("aria-pressed", String(there.includes(button.value)));
+function press(button) {
+  button.setAttribute("aria-pressed", String(button.getAttribute("aria-pressed") !== "true"));
 }
 
 function start() {
@@ -94,7 +97,10 @@ function start() {
   form.addEventListener("change", ({ target }) => {
     if (target.name === "span") showSpan();
     if (target.name === "robot") offer();
-    if (target.name === "items") showItems();
+  });
+  form.addEventListener("click", ({ target }) => {
+    const pressed = target.closest("[data-chips] button");
+    if (pressed) press(pressed);
   });
   one("[data-all]", form)?.addEventListener("click", () => {
     for (const box of all('input[name="robot"]', form)) box.checked = true;

@@ -11,6 +11,7 @@ import * as view from "./view.js";
 
 const PARTS = ["missions", "incidents", "fetches", "journals"];
 const WINDOW_MS = 600_000;
+const LATE_MS = 5000;
 const page = one("#recordings");
 const { robot } = page.dataset;
 const base = `/pieces/recordings/${encodeURIComponent(robot)}`;
@@ -29,10 +30,17 @@ async function reload(name) {
     late.add(name);
     return;
   }
-  const fresh = await piece(address(name)).catch(() => null); // asked again when something changes
-  if (!fresh || !old.isConnected || isBusy(old)) return;
+  const fresh = await piece(address(name)).catch((error) => error);
+  if (fresh instanceof Error) return unreachable(old, fresh);
+  if (!old.isConnected || isBusy(old)) return;
   put(old, fresh);
   mark();
+}
+
+/** Say what is wrong where nothing is yet; what is there already stays, and is asked for again. */
+function unreachable(part, error) {
+  late.add(part.dataset.part);
+  if (part.getAttribute("aria-busy") === "true") fail(error, part);
 }
 
 function isBusy(part) {
@@ -41,17 +49,16 @@ function isBusy(part) {
 }
 
 async function reloadCard() {
-  const query = new URLSearchParams({ window: view.get("window", "7d") });
+  const query = new URLSearchParams({ window: view.get("window", "7d"), link: "false" });
   const fresh = await piece(`${base}?${query}`).catch(() => null); // as above
   const old = one("[data-more]");
   if (!fresh || !old) return;
-  all("p.row.no-print", fresh).forEach((row) => row.remove()); // links to this very page
   put(old, fresh);
 }
 
 /** Show what is chosen and what is altered, on parts that may be new. */
 function mark() {
-  for (const box of all('[data-chosen] input[type="checkbox"]')) box.checked = chosen.has(box.value);
+  for (const box of all('input[form="chosen"]')) box.checked = chosen.has(box.value);
   for (const button of all("[data-needs]")) {
     const needs = Number(button.dataset.needs);
     button.disabled = "compare" in button.dataset ? chosen.size !== needs : chosen.size < needs;
@@ -105,8 +112,16 @@ async function offerItems(list) {
   list.append(...items.filter((item) => item.source !== "amberbox").map((item) => el("option", { value: item.name })));
 }
 
+/** Ask for what workers have to be asked for, one after the other; then go where the address says. */
+async function start() {
+  mark();
+  for (const name of ["missions", "incidents"]) await reload(name);
+  await reloadCard();
+  if (location.hash) document.getElementById(decodeURIComponent(location.hash.slice(1)))?.scrollIntoView();
+}
+
 page.addEventListener("change", ({ target }) => {
-  if (!target.matches('[data-chosen] input[type="checkbox"]')) return;
+  if (!target.matches('input[form="chosen"]')) return;
   if (target.checked) chosen.add(target.value);
   else chosen.delete(target.value);
   mark();
@@ -127,14 +142,16 @@ page.addEventListener("done", ({ target }) => {
   if (!part) return;
   if (target.tagName === "FORM") {
     target.reset();
-    target.closest("details[id]").open = target.closest("details[id]").id.startsWith("notes-");
+    const details = target.closest("details.recordings-forms");
+    if (details) details.open = false;
   }
   reload(part.dataset.part);
+  look();
 });
 
-followStates(`/pieces/recordings?${new URLSearchParams({ robot })}`, (_, isAll) => {
+const look = followStates(`/pieces/recordings?${new URLSearchParams({ robot })}`, (_, isAll) => {
   for (const name of isAll ? PARTS : ["journals"]) reload(name);
   if (isAll) reloadCard();
 });
-setInterval(() => late.forEach(reload), WINDOW_MS / 100);
-mark();
+setInterval(() => late.forEach(reload), LATE_MS);
+start();

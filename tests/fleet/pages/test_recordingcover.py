@@ -1,0 +1,82 @@
+"""What a bar of recordings shows: what lies close together is one, reasons have kinds."""
+
+from amberbox.core.clock import NS
+from amberbox.core.timetext import format_time
+from amberbox.fleet.api.incidents import Incident
+from amberbox.fleet.api.query import Gap
+from amberbox.fleet.data.journals import Integrity, Recording, State
+from amberbox.fleet.drawing.axis import Axis
+from amberbox.fleet.pages.recordingcover import axis_of, share, spans, stretches
+
+HOUR_NS = 3600 * NS
+AXIS = Axis(0, 24 * HOUR_NS)
+
+
+def journal(
+    start: float, to: float, integrity: Integrity = "intact", state: State = "in_columns",
+    keeping: str = "main",
+) -> Recording:  # fmt: skip
+    return Recording("s", f"journal/{start}.mcap", keeping, "", state, integrity, "", 1, 1, 1,
+                     int(start * HOUR_NS), int(to * HOUR_NS), 0)  # fmt: skip
+
+
+def gap(start: float, to: float, reason: str, item: str = "") -> Gap:
+    at = (format_time(int(hour * HOUR_NS)) for hour in (start, to))
+    return Gap(item=item, writer="main", run=1, from_=next(at), to=next(at), reason=reason, count=1)
+
+
+def incident(state: str) -> Incident:
+    return Incident(id="i", origin="robot", state=state, reason="bump", who="", trigger="",
+                    from_=format_time(HOUR_NS), to=format_time(2 * HOUR_NS))  # fmt: skip
+
+
+def test_files_that_follow_each_other_are_one_stretch() -> None:
+    found = stretches([journal(1, 2), journal(2, 3), journal(5, 6)], [], [], AXIS)
+    assert [(s.start // HOUR_NS, s.to // HOUR_NS) for s in found] == [(1, 3), (5, 6)]
+
+
+def test_what_is_not_here_is_not_recorded() -> None:
+    found = stretches(
+        [journal(1, 2, "missing"), journal(3, 4, state="refused"),
+         journal(5, 6, "unknown", "copying"), journal(7, 8, keeping="keep"),
+         journal(9, 10, "deleted")], [], [], AXIS,
+    )  # fmt: skip
+    assert [(one.kind, one.start // HOUR_NS) for one in found] == [("deleted", 9)]
+
+
+def test_reasons_have_kinds() -> None:
+    reasons = {
+        "dropped: the queue was full": "lost", "lost at a power cut": "lost",
+        "deleted: older than its lifetime": "deleted", "unchanged": "filtered",
+        "deleted on the robot before it was copied: the disk was full": "deleted",
+        "not on the server yet": None, "no messages from the driver": None,
+    }  # fmt: skip
+    for reason, kind in reasons.items():
+        found = stretches([], [gap(1, 2, reason, "odom")], [], AXIS)
+        assert [one.kind for one in found] == ([kind] if kind else []), reason
+        assert all(one.text == f"odom: {reason}" for one in found)
+
+
+def test_released_incidents_are_not_drawn() -> None:
+    found = stretches([], [], [incident("complete"), incident("released")], AXIS)
+    assert [(one.kind, one.text) for one in found] == [("incident", "bump")]
+
+
+def test_thousands_of_files_are_a_few_stretches() -> None:
+    files = [journal(n / 200, (n + 0.9) / 200) for n in range(4800)]
+    assert len(stretches(files, [], [], AXIS)) == 1
+
+
+def test_all_time_begins_with_the_first_file() -> None:
+    now_ns = 100 * HOUR_NS
+    assert axis_of("all", [journal(3, 4), journal(9, 10)], now_ns) == Axis(3 * HOUR_NS, now_ns)
+    assert axis_of("all", [], now_ns) == Axis(99 * HOUR_NS, now_ns)
+    assert axis_of("24h", [journal(3, 4)], now_ns) == Axis(76 * HOUR_NS, now_ns)
+
+
+def test_the_share_of_a_mission_counts_nothing_twice() -> None:
+    known = spans([journal(1, 3), journal(2, 4, keeping="bulk"), journal(6, 7)])
+    assert share(known, HOUR_NS, 4 * HOUR_NS) == 1
+    assert share(known, 3 * HOUR_NS, 7 * HOUR_NS) == 0.5
+    assert share(known, 8 * HOUR_NS, 9 * HOUR_NS) == 0
+    assert share(known, HOUR_NS, HOUR_NS) == 0
