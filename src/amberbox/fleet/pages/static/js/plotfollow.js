@@ -34,7 +34,7 @@ export function following(stack) {
     const newest = take(traces(), robot, data);
     if (newest === null) return;
     stack.whole = { ...stack.whole, to: Math.max(stack.whole.to, newest) };
-    if (state.following) move(newest);
+    if (state.following && newest >= stack.view.from) move(newest); // what was last said may be old
     stack.redraw();
   }
 
