@@ -43,6 +43,9 @@ class Pretended:
     def repair(self, robot: str) -> None:
         self.acting.pop(robot, None)
 
+    def end(self) -> None:
+        self.acting.clear()
+
 
 @pytest.fixture(scope="module")
 def home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[House]:

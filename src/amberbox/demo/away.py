@@ -23,9 +23,9 @@ def watch_the_absence(telling: Telling, browser: Browser, feed: Listener) -> Non
     came = feed.wait(_is_presence(online=True), PATIENCE_S, went.at_s)
     telling.worked(f"{SOMETIMES_AWAY} came back after {came.at_s - went.at_s:.0f} s")
     span = {"from": _time_of(went), "to": _time_of(came)}
-    count = until(lambda: _lanes(browser, span), "what it found meanwhile is here")
+    count = until(lambda: _lanes(browser, span), lambda: "what it found meanwhile is here")
     telling.worked(f"{SOMETIMES_AWAY} has told how {count} parts of it were meanwhile")
-    rows = until(lambda: _rows(browser, span), "what was recorded meanwhile is here")
+    rows = until(lambda: _rows(browser, span), lambda: "what was recorded meanwhile is here")
     telling.worked(f"{rows} rows of {_ITEM} of that time are here")
 
 

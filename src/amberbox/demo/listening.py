@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import threading
 import time
@@ -61,17 +62,22 @@ class Listener:
             return self._heard[seen:]
 
     def _listen(self) -> None:
-        for message in self._socket:
-            now_s = time.monotonic()
-            told = [
-                Heard(now_s, one["kind"], one.get("robot") or "", one.get("data"))
-                for one in json.loads(message)
-            ]
-            with self._new:
-                self._heard += told
-                self._new.notify_all()
+        from websockets.exceptions import ConnectionClosed
+
+        with contextlib.suppress(ConnectionClosed):
+            for message in self._socket:
+                self._take(json.loads(message))
         with self._new:
             self._is_over = True
+            self._new.notify_all()
+
+    def _take(self, changes: Any) -> None:
+        now_s = time.monotonic()
+        with self._new:
+            self._heard += [
+                Heard(now_s, one["kind"], one.get("robot") or "", one.get("data"))
+                for one in changes
+            ]
             self._new.notify_all()
 
 

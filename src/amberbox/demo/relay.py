@@ -17,8 +17,7 @@ class Relay:
         self._socket.setblocking(False)
         self.port = int(self._socket.getsockname()[1])
         self.is_cut = False
-        self.used = asyncio.Event()
-        """Set once somebody came through."""
+        self._is_used = False
         self._open: set[asyncio.StreamWriter] = set()
         self._server: asyncio.Server | None = None
         self._to = 0
@@ -27,6 +26,10 @@ class Relay:
         """Begin to pass on to a port."""
         self._to = port
         self._server = await asyncio.start_server(self._pass_on, sock=self._socket)
+
+    def was_used(self) -> bool:
+        """Tell whether somebody came through."""
+        return self._is_used
 
     def cut(self) -> None:
         """Cut the way: what is open ends at once, and nothing new gets through."""
@@ -50,7 +53,7 @@ class Relay:
             writer.transport.abort()
             return
         self._open.add(writer)
-        self.used.set()
+        self._is_used = True
         with contextlib.suppress(OSError):
             there = await asyncio.open_connection("127.0.0.1", self._to)
             self._open.add(there[1])

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from amberbox.core.errors import AmberboxError
 from amberbox.demo.processes import start_tied
-from amberbox.demo.stage import Stage
+from amberbox.demo.stage import Absence, Stage
 from amberbox.fleet.accounts.actions import Role
 from amberbox.fleet.accounts.signincodes import LASTS_NS
 from amberbox.fleet.serving import starting
@@ -26,9 +26,9 @@ HOST = "127.0.0.1"
 PORT = 8443
 _PORTS = 50
 """So many are tried."""
-_ON_S, _OFF_S = 60.0, 30.0
-_OF_STORY = 0.3
-"""Share of the story for which a robot keeps its way to the server; half as long it has none."""
+_NOW_AND_THEN = Absence(60.0, 30.0, 90.0)
+_OF_STORY = 0.15
+"""Share of the story for which a robot has no way to the server."""
 _MINUTES = LASTS_NS // 60_000_000_000
 
 
@@ -87,10 +87,13 @@ class Show:
                 raise error
 
     async def _go_on(self, url: str) -> None:
-        share = None if self.seconds is None else self.seconds * _OF_STORY
-        on_s, off_s = (_ON_S, _OFF_S) if share is None else (share, share / 2)
-        away = self.stage.come_and_go(on_s, off_s, say if share is None else _be_silent)
-        told = self._welcome(url) if share is None else self._tell(url)
+        if self.seconds is None:
+            away = self.stage.come_and_go(_NOW_AND_THEN, say, self.stage.relay.was_used)
+        else:
+            off_s = self.seconds * _OF_STORY
+            once = Absence(off_s / 2, off_s, self.seconds)
+            away = self.stage.come_and_go(once, _be_silent, self.stage.broken)
+        told = self._welcome(url) if self.seconds is None else self._tell(url)
         await asyncio.gather(away, told)
 
     async def _welcome(self, url: str) -> None:

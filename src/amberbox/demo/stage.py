@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import threading
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from amberbox.core.clock import SystemClock
@@ -17,6 +18,16 @@ from amberbox.fleet.accounts.signincodes import SignInCodes
 
 DATA = "server"
 """The server's data folder, below that of the demonstration."""
+_LOOK_S = 0.2
+
+
+@dataclass(frozen=True, slots=True)
+class Absence:
+    """When the way of a robot is cut first, for how long, and how long it holds in between."""
+
+    first_s: float
+    away_s: float
+    there_s: float
 
 
 class Stage:
@@ -76,23 +87,31 @@ class Stage:
         with self._lock:
             self._heal(robot)
 
-    async def come_and_go(self, on_s: float, off_s: float, say: Callable[[str], None]) -> None:
-        """Cut the way of one robot for a while, again and again, from its first use on."""
+    async def come_and_go(
+        self, plan: Absence, say: Callable[[str], None], begins: Callable[[], object]
+    ) -> None:
+        """Cut the way of one robot for a while, again and again, once something begins that."""
         await self.relay.begin(self._port)
-        await self.relay.used.wait()
+        while not begins():
+            await asyncio.sleep(_LOOK_S)
+        await asyncio.sleep(plan.first_s)
         while True:
-            await asyncio.sleep(on_s)
             self.relay.cut()
-            say(f"{SOMETIMES_AWAY} has no way to the server for {off_s:.0f} s; it records on")
-            await asyncio.sleep(off_s)
+            say(f"{SOMETIMES_AWAY} has no way to the server for {plan.away_s:.0f} s; it records on")
+            await asyncio.sleep(plan.away_s)
             self.relay.mend()
             say(f"{SOMETIMES_AWAY} has its way to the server again")
+            await asyncio.sleep(plan.there_s)
+
+    def end(self) -> None:
+        """Ask the robots to end."""
+        for robot in self._running.values():
+            robot.stop()
 
     def close(self) -> None:
         """End the robots, and wait for them."""
+        self.end()
         self.relay.close()
-        for robot in self._running.values():
-            robot.stop()
         for robot in self._running.values():
             robot.wait()
 

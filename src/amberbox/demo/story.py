@@ -73,7 +73,7 @@ class Broken:
 
     def see_robots(self) -> None:
         """Wait until all are there, and their monitors have seen that they are well."""
-        until(self._all_well, "three robots are there and well")
+        until(self._all_well, lambda: f"all are well; but {'; '.join(self._troubles())}")
         self.telling.worked(f"{', '.join(IDS)} are online and well")
 
     def damage(self) -> None:
@@ -132,13 +132,16 @@ class Broken:
         self.telling.worked(f"{what} after {heard.at_s - self.broken_s:.1f} s: {which}")
 
     def _all_well(self) -> bool | None:
+        return None if self._troubles() else True
+
+    def _troubles(self) -> list[str]:
+        """Say of each robot that is not there, or not well, why."""
         cards = {card["robot"]: card for card in self.browser.get("/robots")}
-        fine = [
-            card["online"] and card["components"].get("ok", 0) >= _LEAST_WELL
-            and not card["components"].get("error", 0)
-            for card in map(cards.get, IDS) if card is not None
-        ]  # fmt: skip
-        return True if len(fine) == len(IDS) and all(fine) else None
+        return [
+            f"{robot}: {cards[robot]['cause']} {cards[robot]['components']}"
+            for robot in IDS
+            if not _is_well(cards[robot])
+        ]
 
     def _alarm(self) -> Any:
         return self.browser.get(f"/alarms/{self.alarm}")["alarm"]
@@ -158,6 +161,14 @@ class Broken:
         detail = self.browser.get(f"/robots/{ROBOT}/diagnoses/{self.diagnosis}")
         revisions: list[Any] = detail["revisions"]
         return revisions
+
+
+def _is_well(card: Any) -> bool:
+    """Tell whether a robot is there, and nothing is in error."""
+    levels = card["components"]
+    return bool(
+        card["online"] and levels.get("ok", 0) >= _LEAST_WELL and not levels.get("error", 0)
+    )
 
 
 def _leading(revision: Any) -> list[str]:

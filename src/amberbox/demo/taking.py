@@ -21,11 +21,11 @@ def take_home(telling: Telling, browser: Browser, robot: str, broken_ns: int) ->
         "from": format_time(broken_ns - _AROUND_NS),
         "to": format_time(broken_ns + _AROUND_NS),
     }
-    rows = until(lambda: _rows(browser, robot, window), "the data of the fault are here")
+    rows = until(lambda: _rows(browser, robot, window), lambda: "the data of the fault are here")
     telling.worked(f"{rows} rows of {ITEM}.{VARIABLE} show the fault: {WELL}, then {BROKEN}")
     asked = {"robots": [robot], "items": [ITEM], "variables": {ITEM: [VARIABLE]}, **window}
     number = browser.send("POST", "/downloads", {**asked, "format": "csv"})["id"]
-    made = until(lambda: _made(browser, number), "the download is made")
+    made = until(lambda: _made(browser, number), lambda: "the download is made")
     text = browser.fetch(f"/downloads/{number}/file").decode()
     check(f",{BROKEN}" in text and f",{WELL}" in text, "the file shows the fault as well")
     telling.worked(f"downloaded {made['file']}: {len(text.splitlines()) - 1} rows")

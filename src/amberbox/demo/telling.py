@@ -37,12 +37,12 @@ class Telling:
         self.say(f"ok: {text}")
 
 
-def until(find: Callable[[], T | None], what: str, within_s: float = PATIENCE_S) -> T:
+def until(find: Callable[[], T | None], what: Callable[[], str], within_s: float = PATIENCE_S) -> T:
     """Ask again and again until something is found; raises FailedError when it never is."""
     end_s = time.monotonic() + within_s
     while (found := find()) is None:
         if time.monotonic() > end_s:
-            raise FailedError(f"{what}: waited {within_s:.0f} s in vain", "is the machine busy?")
+            raise FailedError(f"{what()}: waited {within_s:.0f} s in vain", "is the machine busy?")
         time.sleep(_POLL_S)
     return found
 

@@ -34,3 +34,6 @@ class Demonstration(Protocol):
 
     def repair(self, robot: str) -> None:
         """Let a robot be well again; raises UsageError for an unknown one."""
+
+    def end(self) -> None:
+        """Hear that the server is about to end: robots may end as well."""

@@ -60,7 +60,10 @@ def run(
         services.demo = demo
         try:
             code = _prepared(services, new_code=new_code)
-            told = Told(ready=lambda _: begun(Start(settings, code, renewed)))
+            told = Told(
+                ready=lambda _: begun(Start(settings, code, renewed)),
+                stopping=(lambda: None) if demo is None else demo.end,
+            )
             asyncio.run(process.serve(services, port, told))
         finally:
             port.close()
