@@ -29,7 +29,7 @@ from amberbox.fleet.state.said import SaidStatus, status_data
 from amberbox.fleet.state.standing import Moment, clock_offsets_ns
 from amberbox.fleet.state.state import Snapshot, State
 
-GATHER_S = 0.04
+GATHER_S = 0.05
 """Changes of statuses are gathered for so long: many of one robot go as one."""
 CHECK_S = 30.0
 ENDED, FORBIDDEN = 4401, 4403
