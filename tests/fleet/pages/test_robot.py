@@ -54,7 +54,7 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[House]:
 def page(home: House, path: str = PAGE, name: str = "viewer") -> str:
     answer = home.client(name).get(path)
     assert answer.status_code == 200, answer.text
-    return answer.text
+    return str(answer.text)
 
 
 def text_of(markup: str) -> str:

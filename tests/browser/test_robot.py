@@ -1,0 +1,204 @@
+"""The page of a robot in a browser: it follows the robot, and nothing on it jumps."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+import pytest
+
+from amberbox.fleet.pages import assets, robottree
+from amberbox.fleet.pages.robottree import key
+from tests.browser import hostile
+from tests.browser.conftest import PageAs
+from tests.browser.expecting import expect
+from tests.browser.looks import axe, no_sideways_scroll, shot
+from tests.browser.site import Site
+from tests.browser.watching import RESTART
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Locator, Page
+
+PAGE = "/robots/ropod_001"
+SHIFTS = """() => {
+    window.shifted = []
+    new PerformanceObserver((list) => {
+        for (const one of list.getEntries()) {
+            if (!one.hadRecentInput) window.shifted.push(one.sources.map((s) => s.node?.className ?? s.node?.nodeName))
+        }
+    }).observe({type: "layout-shift"})
+}"""  # noqa: E501 - it is JavaScript
+NUMBERS = (0.0, 0.01, 0.5, 1.0, 9.9996, 24.2, -64.5, 999.96, 5400.0, 123456.7, 2.5e6, 1.5e-5)
+
+
+@pytest.fixture
+def robot(site: Site) -> Iterator[Site]:
+    """Put right again what a test lets ``ropod_001`` say and do."""
+    yield site
+    one = site.robots["ropod_001"]
+    one.wake()
+    one.repeats = True
+    site.say("ropod_001", "wifi", "ok")
+
+
+def is_live(page: Page) -> None:
+    expect(page.locator("html")).to_have_attribute("data-feed", "live", timeout=15_000)
+
+
+def row(page: Page, component: str, mode: str = "", output: str = "") -> Locator:
+    return page.locator(f'#tree [data-k="{key(component, mode, output)}"]')
+
+
+@pytest.mark.parametrize("theme", ["light", "dark"])
+@pytest.mark.parametrize("width", [390, 1440])
+def test_a_robot_in_trouble(page_as: PageAs, theme: str, width: int) -> None:
+    page = page_as("technician", width=width, theme=theme)
+    page.goto(PAGE)
+    is_live(page)
+    expect(row(page, "laser_front")).to_have_attribute("aria-expanded", "true")
+    expect(row(page, "laser_front").locator(".level")).to_have_text("error")
+    axe(page)
+    no_sideways_scroll(page)
+    shot(page, f"robot-{theme}-{width}")
+
+
+def test_values_levels_and_reasons_change_where_they_stand(page_as: PageAs, robot: Site) -> None:
+    page = page_as("viewer")
+    page.goto(f"{PAGE}?open=wifi&open=battery")
+    is_live(page)
+    page.wait_for_timeout(300)
+    page.evaluate(SHIFTS)
+    one = robot.robots["ropod_001"]
+    one.status("battery", mode="charge", not_empty=False, charge=7.25, time_to_empty=60.0)
+    expect(row(page, "battery", "charge", "charge")).to_contain_text("7.250")
+    expect(row(page, "battery", "charge", "not_empty")).to_contain_text("no")
+    robot.say("ropod_001", "wifi", "stale", reason="nothing heard for 6 s")
+    expect(row(page, "wifi").locator(".level")).to_have_text("stale")
+    expect(row(page, "wifi")).to_contain_text("nothing heard for 6 s")
+    expect(page.locator('[data-count-level="stale"] b')).to_have_text("1")
+    assert (
+        page.evaluate("() => window.shifted.flat().filter((one) => /td|tr|age|val/.test(one))")
+        == []
+    )
+    robot.say("ropod_001", "wifi", "ok")
+    expect(row(page, "wifi").locator(".level")).to_have_text("fine")
+    one.status("battery", mode="charge", not_empty=True, charge=64.5, time_to_empty=5400.0)
+
+
+def test_the_tree_by_keys_alone(page_as: PageAs) -> None:
+    page = page_as("viewer")
+    page.goto(f"{PAGE}?open=-")
+    row(page, "base").focus()
+    for pressed, there in (("ArrowDown", "base_controller"), ("End", "wifi"), ("Home", "base"),
+                           ("l", "laser_front")):  # fmt: skip
+        page.keyboard.press(pressed)
+        expect(row(page, there)).to_be_focused()
+    page.keyboard.press("ArrowRight")
+    expect(row(page, "laser_front")).to_have_attribute("aria-expanded", "true")
+    page.keyboard.press("ArrowRight")
+    page.keyboard.press("ArrowDown")
+    expect(row(page, "laser_front", "heartbeat")).to_be_focused()
+    page.keyboard.press("ArrowLeft")
+    expect(row(page, "laser_front")).to_be_focused()
+    expect(page).to_have_url(re.compile(r"\?open=laser_front$"))
+    page.keyboard.press("Enter")
+    expect(page).to_have_url(re.compile(r"\?open=-$"))
+
+
+def test_one_finds_trouble_and_what_is_in_the_way(page_as: PageAs) -> None:
+    page = page_as("viewer")
+    page.goto(PAGE)
+    is_live(page)
+    page.get_by_role("button", name="Only trouble").click()
+    expect(page.locator(".branch:visible")).to_have_count(4)
+    page.get_by_role("searchbox").fill("nothing is called so")
+    expect(page.get_by_text("Nothing fits.")).to_be_visible()
+    page.get_by_role("link", name="Show all components").click()
+    row(page, "navigation").click()
+    page.locator(".about:visible [data-blockers] a", has_text="localisation").click()
+    expect(row(page, "localisation")).to_be_focused()
+    page.locator("#graph a", has_text="host").click()
+    expect(row(page, "host")).to_have_attribute("aria-expanded", "true")
+    page.get_by_role("link", name="6 hours").click()
+    expect(page.locator("#timeline")).to_contain_text("6 h ago")
+    expect(page).to_have_url(re.compile("window=6h"))
+
+
+def test_a_silent_robot_is_known_within_three_heartbeats(page_as: PageAs, robot: Site) -> None:
+    page = page_as("viewer")
+    page.goto(PAGE)
+    is_live(page)
+    expect(row(page, "base").locator(".age")).to_have_text("1 s")
+    robot.robots["ropod_001"].silence()
+    expect(page.locator("#silence")).to_contain_text("robot silent since", timeout=4500)
+    expect(page.locator("#robot-state")).to_contain_text("silent since")
+    expect(page.locator("#robot")).to_have_class(re.compile("is-silent"))
+    expect(row(page, "base").locator(".age")).to_have_text(re.compile(r"[4-9] s"))
+    robot.robots["ropod_001"].wake()
+    expect(page.locator("#robot")).not_to_have_class(re.compile("is-silent"), timeout=15_000)
+    expect(page.locator("#robot-state")).to_contain_text("online")
+
+
+def test_a_restart_of_the_server_loses_nothing(page_as: PageAs, site: Site) -> None:
+    page = page_as("viewer", expects=RESTART)
+    page.goto(f"{PAGE}?open=wifi&open=host")
+    is_live(page)
+    site.kill()
+    expect(page.locator("html")).to_have_attribute("data-feed", "lost", timeout=6000)
+    expect(page.locator(".lost-banner")).to_be_visible()
+    expect(row(page, "base").locator(".age")).to_have_text(re.compile(r"[3-9] s"))
+    site.start()
+    is_live(page)
+    expect(row(page, "wifi")).to_have_attribute("aria-expanded", "true")
+    expect(row(page, "laser_front")).to_have_attribute("aria-expanded", "false")
+    expect(row(page, "base").locator(".age")).to_have_text(re.compile("[12] s"), timeout=20_000)
+
+
+def test_an_operator_marks_begins_and_ends(page_as: PageAs, site: Site) -> None:
+    page = page_as("operator")
+    page.goto(PAGE)
+    page.get_by_role("button", name="Mark an incident").click()
+    page.get_by_label("What happened").fill(hostile.NOTE)
+    axe(page, "#dialog-incident")
+    page.get_by_role("button", name="Mark", exact=True).click()
+    expect(page.get_by_text("The incident is marked.")).to_be_visible()
+    assert any(one["reason"] == hostile.NOTE for one in site.ask("/robots/ropod_001/incidents"))
+    page.get_by_role("button", name="Begin a mission").click()
+    page.get_by_label("Name").fill("round_trip")
+    page.get_by_role("button", name="Begin", exact=True).click()
+    mission = page.locator("#now .spread", has_text="round_trip")
+    expect(mission).to_be_visible()
+    mission.get_by_role("button", name="Note").click()
+    page.get_by_label("Note", exact=True).fill("the floor is wet")
+    page.get_by_role("button", name="Keep").click()
+    expect(page.get_by_text("The note is kept.")).to_be_visible()
+    mission.get_by_role("button", name="End").click()
+    page.get_by_role("button", name="End it").click()
+    expect(mission).to_have_count(0)
+    (found,) = site.ask("/robots/ropod_001/missions?name=round_trip")
+    assert found["to"] and found["notes"][0]["text"] == "the floor is wet"
+
+
+@pytest.mark.parametrize(("robot", "said"), [("ropod_002", hostile.OUTPUT), ("ropod_003", "")])
+def test_odd_names_and_a_robot_that_is_away(page_as: PageAs, robot: str, said: str) -> None:
+    page = page_as("viewer", theme="dark")
+    page.goto(f"/robots/{robot}")
+    is_live(page)
+    if said:
+        expect(row(page, hostile.COMPONENT, "m", hostile.OUTPUT)).to_contain_text(said)
+    else:
+        expect(page.get_by_text("Nothing is known of its components yet")).to_be_visible()
+    axe(page)
+    shot(page, robot)
+    assert robot in page.title()
+
+
+def test_browser_and_server_write_numbers_alike(page_as: PageAs) -> None:
+    page = page_as("viewer")
+    page.goto(PAGE)
+    told = page.evaluate(
+        "async ([path, values]) => values.map((await import(path)).number)",
+        [assets.address("js/robotlive.js"), list(NUMBERS)],
+    )
+    assert told == [robottree.number(value) for value in NUMBERS]
