@@ -46,7 +46,7 @@ def broken(site: Site, request: pytest.FixtureRequest) -> Iterator[str]:
 
 
 def opened(page: Page, path: str) -> Page:
-    page.goto(path)
+    page.goto(path, timeout=PATIENT_MS)
     page.locator("#dx-card [data-complete=yes]").wait_for(timeout=PATIENT_MS)
     return page
 
