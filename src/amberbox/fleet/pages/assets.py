@@ -14,6 +14,8 @@ from functools import lru_cache
 from importlib.resources import files
 from pathlib import Path
 
+from amberbox.fleet.pages.joining import joined
+
 FOLDER = Path(__file__).parent / "static"
 PLOT = "vendor/uplot.js"
 """uPlot, https://github.com/leeoniya/uPlot, MIT: as the package ``youplot`` carries it."""
@@ -62,8 +64,8 @@ def _contents() -> Iterator[tuple[str, bytes]]:
     yield STYLE, b"\n".join(_styles())
     yield PLOT, uplot("uplot.iife.min.js")
     yield "icons.svg", (FOLDER / "icons.svg").read_bytes()
-    for file in sorted((FOLDER / "js").glob("*.js")):
-        yield f"js/{file.name}", file.read_bytes()
+    modules = {file.name: file.read_text("utf-8") for file in sorted((FOLDER / "js").glob("*.js"))}
+    yield from ((f"js/{name}", text.encode()) for name, text in joined(modules))
 
 
 def _styles() -> Iterator[bytes]:
