@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from amberbox.cli.serve import check_installed
 from amberbox.core.errors import UsageError
 
 SECONDS = 45.0
@@ -46,6 +47,7 @@ def run(args: argparse.Namespace) -> int:
             from amberbox.demo import recorder
 
             return recorder.run(place, args.seconds or _RECORDER_S)
+        check_installed()
         from amberbox.demo import show
 
         return show.run(place, args.port, _seconds(args.seconds))

@@ -63,7 +63,7 @@ def _serve(args: argparse.Namespace) -> int:
         raise UsageError("--group is for add-robot, --head for verify-audit", _USAGE)
     if args.host is not None and len(args.host) > 1:
         raise UsageError("a server listens at one address", "--host 0.0.0.0 for all of them")
-    _check_installed()
+    check_installed()
     gc.disable()  # until it answers: nothing that is loaded now goes away again
     from amberbox.fleet.serving.binding import Wanted
     from amberbox.fleet.serving.starting import run as start
@@ -91,7 +91,8 @@ def _told(folder: Path, *, quiet: bool) -> Callable[[Start], None]:
     return tell
 
 
-def _check_installed() -> None:
+def check_installed() -> None:
+    """Raise UsageError where a package is missing that a server needs."""
     from importlib.util import find_spec
 
     missing = [name for name in ("fastapi", "uvicorn", "sqlalchemy", "deltalake", "argon2")

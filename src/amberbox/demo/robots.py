@@ -20,7 +20,7 @@ GROUPS: Mapping[str, str] = {"ropod_001": "ward", "ropod_002": "ward", "ropod_00
 SOMETIMES_AWAY = "ropod_003"
 """Its way to the server is cut now and then."""
 KNOWLEDGE = Path(amberbox.sim.__file__).parent / "folder"
-_END_S = 15.0
+_END_S = 30.0
 _ROBOT = """\
 id: {id}
 model: Ropod (simulated)

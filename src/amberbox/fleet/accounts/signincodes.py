@@ -25,7 +25,7 @@ from amberbox.fleet.database.database import Database
 LASTS_NS = 15 * 60 * NS
 LONGEST = 64
 """No code has more letters than this."""
-_BYTES = 18
+_BYTES = 16
 _WRONG = {"why": "wrong code"}
 _ACCOUNT = "\0code"
 """Under this name wrong codes are counted: no account can be called so."""
@@ -55,8 +55,8 @@ class SignInCodes:
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
     def make(self, name: str) -> str:
-        """Make a code for an account (144 random bits); others of it go on to hold."""
-        code = secrets.token_urlsafe(_BYTES)
+        """Make a code for an account (128 random bits); others of it go on to hold."""
+        code = secrets.token_hex(_BYTES)
         now_ns = self.clock.boot_ns()
         with self._lock:
             self._held = {key: one for key, one in self._held.items() if now_ns < one.until_ns}
