@@ -16,6 +16,7 @@ from amberbox.fleet.alarms.tables import ALARM, ALARM_ROBOT, CONSEQUENCE, HISTOR
 from amberbox.fleet.api.alarmlines import AlarmLine, Happening, line_of
 from amberbox.fleet.notifying.tables import OUTBOX
 from amberbox.fleet.pages.alarmsearch import Look
+from amberbox.fleet.pages.alarmview import Item
 from amberbox.fleet.pages.alarmwords import Words, events, lasted
 from tests.fleet.house import START_NS, House, house
 
@@ -173,6 +174,17 @@ def test_an_alarm_in_words(home: House) -> None:
         assert text in found, text
 
 
+@pytest.mark.parametrize(
+    ("origin", "title"),
+    [("access point", "Access point: offline: ropod_001"), ("connection", "offline: ropod_001")],
+)
+def test_robots_that_are_away_in_words(home: House, origin: str, title: str) -> None:
+    away = replace(ALARMS[-1], origin=origin, robot="ropod_001", reason="offline: ropod_001")
+    line = line_of(away, [])
+    assert Item(line, Words(home.services).what(line), "", "", (), may=True).title == title
+    assert "while it is away" in page(home, f"/alarms/{SEVERAL}")
+
+
 @pytest.mark.parametrize("path", ["/alarms", "/alarms/3", "/pieces/alarms/3", "/alarms/2"])
 def test_what_robots_and_people_say_is_text(home: House, path: str) -> None:
     found = page(home, path, "admin")
@@ -299,7 +311,7 @@ def test_history_in_words_the_newest_first(home: House) -> None:
         ("Closed", "over", ""),
         ("Over by itself", "it came 3 times", ""),
         ("Came back by itself", "its time is over", ""),
-        ("Put aside until", "until 5: spare", "2027-01-15T08:00:00Z"),
+        ("Put aside", "until 5: spare", "2027-01-15T08:00:00Z"),
         ("The diagnosis says", "Laser front: silent (likely)", ""),
         ("It got worse", "critical: it cannot go on with what it does", ""),
     ]

@@ -80,7 +80,7 @@ def found(connection: Connection, wanted: Wanted) -> Found:
     """Return the alarms that fit; those that became part of another one are left out."""
     where = list(_where(wanted))
     counted = select(ALARM.c.state, func.count()).where(*where).group_by(ALARM.c.state)
-    by_state: dict[str, int] = {state: number for state, number in connection.execute(counted)}
+    by_state: dict[str, int] = {str(state): number for state, number in connection.execute(counted)}
     counts: dict[Tab, int] = {tab: by_state.get(tab, 0) for tab in TABS}
     counts["all"] = sum(by_state.values())
     look = wanted.look

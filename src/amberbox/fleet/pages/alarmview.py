@@ -15,6 +15,7 @@ from amberbox.fleet.accounts.robots import KnownRobot
 from amberbox.fleet.accounts.users import list_users
 from amberbox.fleet.alarms import listing
 from amberbox.fleet.alarms.alarm import Alarm
+from amberbox.fleet.alarms.offline import CONNECTION
 from amberbox.fleet.alarms.tables import CONSEQUENCE
 from amberbox.fleet.api.access import Caller
 from amberbox.fleet.api.alarmlines import AlarmLine, line_of
@@ -57,7 +58,14 @@ class Item:
     @property
     def title(self) -> str:
         """Return what is wrong in one line."""
-        return f"{self.what}: {self.line.reason}" if self.line.reason else self.what
+        if not self.line.reason:
+            return self.what
+        return f"{self.what}: {self.line.reason}" if self.has_part else self.line.reason
+
+    @property
+    def has_part(self) -> bool:
+        """Tell whether it is about a part, or something that robots which are away share."""
+        return self.line.kind == "robot" or self.line.origin != CONNECTION
 
     @property
     def is_choosable(self) -> bool:

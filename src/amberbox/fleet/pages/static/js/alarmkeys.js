@@ -4,10 +4,17 @@ import { all, one } from "./dom.js";
 
 const WRITES = "input:not([type=checkbox]), select, textarea, [contenteditable], dialog";
 const rows = () => all("#alarms .alarm");
-const here = { id: null };
+const here = { id: null, place: 0 };
 
 /** Return the line that one is at. */
 const at = () => document.activeElement?.closest("#alarms .alarm") ?? null;
+
+/** Note where one went by oneself: not where the focus falls when the list comes anew. */
+function note() {
+  const row = at();
+  if (row) Object.assign(here, { id: row.dataset.alarm, place: rows().indexOf(row) });
+  else if (document.activeElement !== document.body) here.id = null;
+}
 
 function go(step) {
   const list = rows();
@@ -15,15 +22,17 @@ function go(step) {
   const now = list.indexOf(at() ?? one(`#alarms .alarm[data-alarm="${here.id}"]`));
   const next = now < 0 ? (step > 0 ? 0 : list.length - 1) : Math.min(Math.max(now + step, 0), list.length - 1);
   list[next].focus();
+  note();
 }
 
-/** After the list came anew: be at the alarm where one was, wherever it stands now. */
+/** After the list came anew: be at the alarm where one was; if it is gone, at the next one. */
 export function stay() {
-  const isLost = document.activeElement === document.body || at() !== null;
-  if (here.id === null || !isLost || at()?.dataset.alarm === here.id) return;
-  const row = one(`#alarms .alarm[data-alarm="${here.id}"]`);
-  if (row) row.focus({ preventScroll: true });
-  else if (at() === null) here.id = null;
+  const isMine = document.activeElement === document.body || at() !== null;
+  if (here.id === null || !isMine) return;
+  const list = rows();
+  const row = list.find((one) => one.dataset.alarm === here.id) ?? list[Math.min(here.place, list.length - 1)];
+  if (row && !row.contains(document.activeElement)) row.focus({ preventScroll: true });
+  note();
 }
 
 /**
@@ -47,7 +56,5 @@ export function start({ acknowledge, choose }) {
     else return;
     event.preventDefault();
   });
-  document.addEventListener("focusin", () => {
-    here.id = at()?.dataset.alarm ?? (document.activeElement === document.body ? here.id : null);
-  });
+  for (const kind of ["keyup", "pointerup"]) document.addEventListener(kind, note);
 }
