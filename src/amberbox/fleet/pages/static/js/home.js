@@ -2,10 +2,12 @@
 
 import { all, one, setText } from "./dom.js";
 import { listen } from "./feed.js";
+import { levels } from "./levels.js";
 import { keep, piece, put } from "./pieces.js";
 import * as view from "./view.js";
 
 const LIST_MS = 5000;
+const VALUES_MS = 30000;
 const form = one("#look");
 const cards = new Map();
 
@@ -58,10 +60,13 @@ form.addEventListener("click", (event) => {
 view.on(() => look({}));
 
 const feed = listen({ kinds: ["presence", "status", "alarm", "diagnosis"] });
+const news = levels();
 for (const kind of ["presence", "status", "alarm", "diagnosis"]) {
-  feed.on(kind, (_, robot) => {
+  feed.on(kind, (data, robot) => {
+    if (kind === "status" && !news(robot, data)) return; // values alone: the list brings them
     if (robot) staleCard(robot);
     if (kind !== "status") staleList();
   });
 }
 feed.on("snapshot", staleList);
+setInterval(staleList, VALUES_MS);
