@@ -14,15 +14,14 @@ from typing import Annotated
 from fastapi import Query, Request, Response
 
 from amberbox.core.errors import AmberboxError
-from amberbox.core.timetext import format_time
 from amberbox.fleet.accounts.robots import KnownRobot
 from amberbox.fleet.api.access import Fleet, OfRobot, Who
 from amberbox.fleet.knowledge.asked import SymptomWord
 from amberbox.fleet.pages import diagnosisasking as asking
 from amberbox.fleet.pages import diagnosisparts as parts
 from amberbox.fleet.pages import diagnosistree as trees
-from amberbox.fleet.pages.diagnosiscard import card_of
-from amberbox.fleet.pages.diagnosislook import card_now, card_told, look, missing
+from amberbox.fleet.pages.diagnosiscard import DiagnosisCard, card_of
+from amberbox.fleet.pages.diagnosislook import Look, card_now, card_told, look, missing
 from amberbox.fleet.pages.page import Pages, render
 from amberbox.fleet.services import Services
 from amberbox.fleet.state.views import Card
@@ -55,7 +54,7 @@ def show(
     return render(
         request, "diagnosis.html", card=card, seen=seen, shown=shown, at=at, lacks=lacks,
         tabs=tabs, tab=tab if tab in tabs else tabs[0], may=may,
-        last=format_time(seen.known.last.at_ns) if seen.known else None,
+        before=_before(fleet, seen),
     )  # fmt: skip
 
 
@@ -162,6 +161,13 @@ async def _part(
     except AmberboxError as error:
         return render(request, "diagnosis_trouble.html", error=error, plain=None, may=may)
     return render(request, f"diagnosis_{tab}.html", asked=asked, may=may, **values)
+
+
+def _before(fleet: Services, seen: Look) -> DiagnosisCard | None:
+    """Return the card of what was found last, where nothing is known to be broken any more."""
+    if seen.known is None or seen.stands:
+        return None
+    return card_now(fleet, replace(seen, is_newest=False), None)
 
 
 def _robot(fleet: Services, robot: KnownRobot) -> Card:
