@@ -12,7 +12,7 @@ from amberbox.demo.robots import SOMETIMES_AWAY
 from amberbox.demo.telling import PATIENCE_S, Telling, until
 
 _ITEM = "sim_odom"
-_LEAST_ROWS = 10
+_RATE_HZ, _MOST_OF_IT = 50, 0.8
 _LEAST_LANES = 50
 
 
@@ -25,7 +25,8 @@ def watch_the_absence(telling: Telling, browser: Browser, feed: Listener) -> Non
     span = {"from": _time_of(went), "to": _time_of(came)}
     count = until(lambda: _lanes(browser, span), lambda: "what it found meanwhile is here")
     telling.worked(f"{SOMETIMES_AWAY} has told how {count} parts of it were meanwhile")
-    rows = until(lambda: _rows(browser, span), lambda: "what was recorded meanwhile is here")
+    least = round((came.at_s - went.at_s) * _RATE_HZ * _MOST_OF_IT)
+    rows = until(lambda: _rows(browser, span, least), lambda: "what was recorded meanwhile is here")
     telling.worked(f"{rows} rows of {_ITEM} of that time are here")
 
 
@@ -45,10 +46,10 @@ def _lanes(browser: Browser, span: dict[str, str]) -> int | None:
     return len(well) if len(well) >= _LEAST_LANES else None
 
 
-def _rows(browser: Browser, span: dict[str, str]) -> int | None:
+def _rows(browser: Browser, span: dict[str, str], least: int) -> int | None:
     path = f"/robots/{SOMETIMES_AWAY}/query?item={_ITEM}&from={span['from']}&to={span['to']}"
     found = int(browser.get(path)["rows"])
-    return found if found >= _LEAST_ROWS else None
+    return found if found >= least else None
 
 
 def _time_of(heard: Heard) -> str:
