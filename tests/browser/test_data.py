@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 PATH = "/robots/ropod_001/data"
 VOLTS, SPEED, STATE = "battery.volts", "ros_ropod_odom.twist_linear_x", "ros_ropod_drive.state"
+PATIENCE_MS = 30_000
 _DRAWN = """(n) => {
     const cells = [...document.querySelectorAll(".plot-readout tbody tr td:nth-of-type(6)")];
     return cells.length === n && cells.every((cell) => cell.textContent);
@@ -29,15 +30,15 @@ _DRAWN = """(n) => {
 def open_data(page: Page, *names: str, robot: str = "ropod_001", **more: str) -> None:
     """Show variables of a robot and wait until they are drawn."""
     query = [*(f"v={name}" for name in names), *(f"{key}={value}" for key, value in more.items())]
-    page.goto(f"/robots/{robot}/data?{'&'.join(query)}")
-    expect(page.get_by_role("tree")).to_be_attached()
+    page.goto(f"/robots/{robot}/data?{'&'.join(query)}", timeout=PATIENCE_MS)
+    page.locator(".tree").wait_for(state="attached", timeout=PATIENCE_MS)
     if names and "mode" not in more:
         drawn(page, len(names))
 
 
 def drawn(page: Page, number: int) -> None:
     """Wait until so many variables are drawn."""
-    page.wait_for_function(_DRAWN, arg=number)
+    page.wait_for_function(_DRAWN, arg=number, timeout=PATIENCE_MS)
 
 
 def stamp(site: Site, minutes: float) -> str:
@@ -179,9 +180,13 @@ def test_live_values_move_the_window(page_as: PageAs, site: Site) -> None:
     page.get_by_role("button", name="Live").click()
     expect(page.locator("#live")).to_have_attribute("data-state", "on")
     expect(page).to_have_url(re.compile("live=1"))
+    end = page.get_by_label("to", exact=True)
+    before = end.input_value()
+    page.wait_for_timeout(1100)  # the fields tell whole seconds
     site.robots["ropod_001"].measure(
         record.BATTERY, volts=21.5, charge_percent=50.0, charging=False
     )
+    expect(end).not_to_have_value(before)
     page.locator(".plot-hands").focus()
     page.keyboard.press("-")
     expect(page.locator("#live")).to_have_text("Go on live")

@@ -8,14 +8,15 @@ import { read, tidy, write } from "./dataview.js";
 import { stage } from "./datastage.js";
 import { brought, one } from "./dom.js";
 import { listen } from "./feed.js";
-import { around, goTo, spanOf } from "./goto.js";
+import { newestEnd, whole, windowOf } from "./datawindow.js";
+import { goTo } from "./goto.js";
 import { marks } from "./marks.js";
 import { emptyStage, notes } from "./datanotes.js";
 import { recent, used } from "./recent.js";
 import { shownList } from "./shownlist.js";
 import { takeAlong } from "./takealong.js";
 import { nowMs } from "./time.js";
-import { stamp, timeOf } from "./timewords.js";
+import { stamp } from "./timewords.js";
 import { tree } from "./variables.js";
 import { find, loadItems, reach, suggested } from "./variablelist.js";
 import * as view from "./view.js";
@@ -24,6 +25,7 @@ import { works } from "./works.js";
 
 const HOUR_S = 3600;
 const AGAIN_MS = 60_000;
+const FOLLOW_MS = 1000;
 const NARROW = "(max-width: 60rem)";
 const { robot, named: fromDiagnosis } = brought("data-about");
 const path = `/api/v1/robots/${encodeURIComponent(robot)}`;
@@ -54,9 +56,10 @@ async function begin() {
   build();
   if (page.look.named.length && matchMedia(NARROW).matches) one("#data-side").open = false;
   await follow(read());
-  view.on(() => follow(read()));
+  view.on(again);
   covered(await covering);
   setInterval(renewIfNewer, AGAIN_MS);
+  setInterval(followed, FOLLOW_MS);
 }
 
 /** Make all parts; none of them shows anything yet. */
@@ -69,7 +72,7 @@ function build() {
   });
   parts.brush = brush(one("#brush"), (from, to, isMoving) => move(from, to, isMoving ? "moving" : "brush"));
   parts.form = windowForm(one("#window"), {
-    newest, go: (from, to) => move(from, to), live: (isOn) => live(isOn), everything: () => move(...ends(whole())),
+    newest, go: (from, to) => move(from, to), live: (isOn) => live(isOn), everything: () => move(...ends(everything())),
     mode: (mode) => (page.look.compare.length ? turn({ mode, compare: [] }) : change({ mode }, true)),
   });
   parts.shown = shownList(one("#shown"), { move: (name, plot) => arrange(name, plot), remove: toggle });
@@ -96,8 +99,9 @@ function firstOnes() {
 /** Show what an address says. @param {import("./dataview.js").Look} look */
 async function follow(look) {
   page.look = look;
+  if (!look.live) live(false, false);
   page.missions = await Promise.all(look.compare.map((id) => ask(`${path}/missions/${encodeURIComponent(id)}`)));
-  page.window = await windowOf(look);
+  page.window = await windowOf(look, path, times());
   const known = look.named.map((one) => ({ ...one, name: find(page.items, one.name)?.address ?? one.name }));
   const seen = new Set();
   look.named = tidy(known.filter((one) => !seen.has(one.name) && seen.add(one.name)));
@@ -108,40 +112,25 @@ async function follow(look) {
 /** Look at something else, for which the server has to be asked first. */
 function turn(changes) {
   write({ ...page.look, ...changes }, { push: true });
-  return follow(read());
+  return again();
 }
 
-/** The window that an address means: a mission, times, or the newest hour. */
-async function windowOf({ from, to, mission, live: isLive }) {
-  if (mission && !from && !to) {
-    const found = await ask(`${path}/missions/${encodeURIComponent(mission)}`);
-    const [begin, end] = around(spanOf(found));
-    return { from: begin, to: end };
-  }
-  const about = { now: now(), last: page.reach.last };
-  const end = (to && timeOf(to, about)) || (isLive || from.startsWith("now") ? now() : newestEnd(HOUR_S));
-  const begin = (from && timeOf(from, about)) || end - HOUR_S;
-  return begin < end ? { from: begin, to: end } : { from: end - HOUR_S, to: end };
-}
-
-/** Where a window ends that is to hold the newest data. */
-function newestEnd(width) {
-  const { last } = page.reach;
-  return last === null || now() - last < width / 4 ? now() : last;
+/** Show what the address says now. */
+function again() {
+  return follow(read()).catch((error) => fail(error, one(".data-main")));
 }
 
 const chosen = () => page.look.named.map((one) => ({ ...one, variable: find(page.items, one.name) })).filter((one) => one.variable?.kind);
 const ends = ({ from, to }) => [from, to];
 
-function whole() {
-  const { start, end } = page.cover ?? {};
-  return { from: Math.min(start ?? Infinity, page.reach.first ?? Infinity, page.window.from), to: Math.max(end ?? 0, page.reach.last ?? 0, page.window.to) };
-}
+const everything = () => whole(page.cover, page.reach, page.window);
+const times = () => ({ now: now(), last: page.reach.last });
 
 /** Show everything as the page is now. */
 function show() {
   const { look, parts } = page;
-  const scene = { robot, look, chosen: chosen(), window: page.window, whole: whole(), missions: page.missions };
+  followed();
+  const scene = { robot, look, chosen: chosen(), window: page.window, whole: everything(), missions: page.missions };
   one("#data").classList.toggle("data-comparing", look.compare.length > 0);
   one("#comparing").hidden = !look.compare.length;
   parts.stage.show(scene);
@@ -205,7 +194,7 @@ function move(from, to, by = "brush") {
     return;
   }
   if (page.look.compare.length) return;
-  if (page.live !== "on") Object.assign(page.look, { from: stamp(from), to: stamp(to), mission: "" });
+  if (page.live !== "on") Object.assign(page.look, { from: stamp(from), to: stamp(to), mission: "", live: false });
   write(page.look);
   showWindow();
   if (!stack) show();
@@ -215,14 +204,16 @@ function move(from, to, by = "brush") {
 /** Go to the newest data. @param {number} [width] seconds */
 function newest(width = page.window.to - page.window.from) {
   const lasts = chosen().map((one) => page.items.find((item) => item.name === one.variable.item)?.last).filter(Boolean);
-  const end = lasts.length && page.isEmpty ? Math.max(...lasts) + width * 0.02 : newestEnd(width);
+  const end = lasts.length && page.isEmpty ? Math.max(...lasts) + width * 0.02 : newestEnd(width, times());
   move(end - width, end);
 }
 
 /** Plots have moved by themselves, with live values. */
 function followed() {
-  if (page.live !== "on") return;
-  const { from, to } = page.parts.stage.plots().now();
+  const stack = page.parts.stage.plots();
+  if (page.live !== "on" || !stack) return;
+  const { from, to } = stack.now();
+  if (to === page.window.to) return;
   page.window = { from, to };
   showWindow();
 }
@@ -255,7 +246,7 @@ function say(changes) {
   Object.assign(page, changes);
   const { isEmpty, unknown = [], window } = page;
   page.parts.notes.show({
-    isEmpty: isEmpty && page.look.mode === "time", unknown,
+    isEmpty: isEmpty && page.look.mode === "time" && page.live !== "on", unknown,
     canFetch: page.cover !== null && lacks(page.cover, window, now()) && !page.parts.works.isAsking(),
   });
 }
@@ -289,7 +280,7 @@ function covered(cover) {
   if (!cover) return; // asked again in a minute
   page.cover = cover;
   page.reach.last = Math.max(page.reach.last ?? 0, cover.end ?? 0);
-  const { from, to } = whole();
+  const { from, to } = everything();
   page.parts.brush.cover({ ...page.cover, start: from, end: Math.max(to, page.window.to) });
   page.parts.stage.plots()?.setWhole(page.look.compare.length ? page.parts.stage.plots().now() : { from, to });
   say({});

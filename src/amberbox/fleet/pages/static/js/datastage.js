@@ -58,7 +58,9 @@ function traceOf(robot, { name, plot, variable }) {
 }
 
 function overTime(element, { robot, window, whole }, to) {
-  const stack = plots(element, { ...window, whole, onWindow: to.onWindow, onRemove: to.onRemove, onLive: to.onLive });
+  let isOwn = false;
+  const onWindow = (...moved) => isOwn || to.onWindow(...moved);
+  const stack = plots(element, { ...window, whole, onWindow, onRemove: to.onRemove, onLive: to.onLive });
   stack.watch({ robot, kinds: KINDS, components: [] });
   const placed = placing(stack);
   const end = new AbortController();
@@ -68,8 +70,9 @@ function overTime(element, { robot, window, whole }, to) {
     stack,
     show(scene) {
       stack.setWhole(scene.whole);
-      const { from, to: until } = stack.now();
-      if (from !== scene.window.from || until !== scene.window.to) stack.window(scene.window.from, scene.window.to);
+      isOwn = true;
+      stack.window(scene.window.from, scene.window.to);
+      isOwn = false;
       placed.show(scene.chosen.map((one) => traceOf(robot, one)));
     },
     destroy() {
