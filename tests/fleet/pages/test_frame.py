@@ -33,7 +33,18 @@ def test_who_is_not_signed_in_is_led_to_sign_in_and_back(home: House) -> None:
     assert answer.headers["location"] == "/sign-in?next=%2Fapi%2Fdocs%3Fx%3D1%26y%3D2"
 
 
-@pytest.mark.parametrize("next", ["//evil.example", "https://evil.example", "/\\evil.example", ""])
+@pytest.mark.parametrize(
+    "next",
+    [
+        "//evil.example",
+        "https://evil.example",
+        "/\\evil.example",
+        "/\t/evil.example",
+        "/\r/e",
+        "/\n/e",
+        "",
+    ],
+)
 def test_nobody_is_led_elsewhere(home: House, next: str) -> None:
     answer = home.client("viewer").get("/sign-in", params={"next": next}, follow_redirects=False)
     assert (answer.status_code, answer.headers["location"]) == (303, "/")

@@ -27,9 +27,10 @@ def add_handlers(app: FastAPI) -> None:
 
 
 def is_page(request: Request) -> bool:
-    """Tell whether a person waits for a page."""
+    """Tell whether a person waits for a page: modules that ask for JSON say so."""
     method = request.scope.get("method")  # a robot's WebSocket has none
-    return method == "GET" and not request.url.path.startswith(PROGRAMS)
+    wants_json = request.headers.get("accept", "").startswith("application/json")
+    return method == "GET" and not wants_json and not request.url.path.startswith(PROGRAMS)
 
 
 async def _known(request: Request, found: Exception) -> Response:

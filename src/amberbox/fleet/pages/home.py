@@ -101,7 +101,7 @@ def _order(sort: Sort) -> Callable[[Card], tuple[Any, ...]]:
     keys: Mapping[Sort, Callable[[Card], tuple[Any, ...]]] = {
         "worst": lambda c: (_SEVERITIES.index(c.severity), _LEVELS.index(c.level), c.robot),
         "name": lambda c: (c.robot,),
-        "battery": lambda c: (c.battery is None, c.battery.value if c.battery else 0.0, c.robot),
+        "battery": lambda c: (c.battery is None, c.battery.percent if c.battery else 0.0, c.robot),
         "seen": lambda c: (c.online, c.last_seen or "", c.robot),
     }
     return keys[sort]

@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 from urllib.parse import quote
 
 from fastapi import Query, Request, Response
+from fastapi.concurrency import run_in_threadpool
 
 from amberbox.core.errors import AmberboxError
 from amberbox.fleet.accounts.robots import KnownRobot
@@ -65,7 +66,15 @@ async def show(
     try:
         found = await read_fmea(robot, fleet, who, "", "", None)
     except AmberboxError as error:
-        return render(request, "knowledge_robot.html", robot=robot.id, problem=error, found=None)
+        nothing: dict[str, Any] = {"robot": robot.id, "problem": error, "found": None}
+        return await run_in_threadpool(render, request, "knowledge_robot.html", **nothing)
+    return await run_in_threadpool(_sheet, request, fleet, who, robot, found, look)
+
+
+def _sheet(
+    request: Request, fleet: Services, who: Caller, robot: KnownRobot, found: Mapping[str, Any],
+    look: Look,
+) -> Response:  # fmt: skip
     modes = modes_of(found)
     return render(
         request, "knowledge_robot.html", robot=robot.id, problem=None, found=found, look=look,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 from fastapi import Request, Response
 from starlette.responses import RedirectResponse
 
@@ -9,6 +11,8 @@ from amberbox.fleet.api.access import Open
 from amberbox.fleet.pages.page import Pages, render, visitor
 
 routes = Pages()
+
+_PATH = re.compile(r"/(?![/\\])[^\x00-\x20\\\x7f]*")
 
 
 @routes.get("/sign-in", Open("asks for name and password; shows nothing"))
@@ -21,5 +25,8 @@ def show(request: Request, next: str = "/") -> Response:
 
 
 def _is_here(address: str) -> bool:
-    """Tell whether an address is a path of this server: nobody is led elsewhere."""
-    return address.startswith("/") and not address.startswith(("//", "/\\")) and "\n" not in address
+    """Tell whether an address is a path of this server: nobody is led elsewhere.
+
+    Browsers drop tabs and line ends, and take a backslash for a slash.
+    """
+    return _PATH.fullmatch(address) is not None

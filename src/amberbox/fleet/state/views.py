@@ -15,6 +15,12 @@ class Battery:
     output: str
     value: float
 
+    @property
+    def percent(self) -> float:
+        """Return it in percent: an output that is not called so may be a share of 1."""
+        is_share = self.value <= 1.0 and "percent" not in self.output.casefold()
+        return self.value * 100.0 if is_share else self.value
+
 
 @dataclass(frozen=True, slots=True)
 class OnMission:

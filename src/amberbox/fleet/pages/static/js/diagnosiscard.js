@@ -2,7 +2,7 @@
 
 import { fail, toast } from "./ask.js";
 import { one } from "./dom.js";
-import { fragment, replace } from "./fragment.js";
+import { pieces, replace } from "./pieces.js";
 import { t } from "./strings.js";
 
 /**
@@ -20,7 +20,7 @@ export function keep(place, { path, feed = null, renewed = null, robot }) {
     asking = new AbortController();
     place.setAttribute("aria-busy", "true");
     try {
-      replace(place, await fragment(linked(path()), { signal: asking.signal }));
+      replace(place, await pieces(linked(path()), { signal: asking.signal }));
       place.removeAttribute("aria-busy");
       renewed?.();
     } catch (error) {

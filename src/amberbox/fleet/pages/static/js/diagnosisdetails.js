@@ -3,7 +3,7 @@
 
 import { fail } from "./ask.js";
 import { all, el, one } from "./dom.js";
-import { fragment, replace } from "./fragment.js";
+import { pieces, replace } from "./pieces.js";
 import { t } from "./strings.js";
 import * as view from "./view.js";
 
@@ -34,7 +34,7 @@ export function start({ part, renewed }) {
     if (name !== shown) place.replaceChildren(el("p", { class: "muted", role: "status" }, t("diagnosis.working")));
     place.setAttribute("aria-busy", "true");
     try {
-      replace(place, await fragment(part(name, about), { signal: asking.signal }));
+      replace(place, await pieces(part(name, about), { signal: asking.signal }));
       shown = name;
       for (const drawing of all(".dx-drawing", place)) drawing.scrollLeft = middle(drawing, one("svg.faulttree", drawing));
       place.removeAttribute("aria-busy");

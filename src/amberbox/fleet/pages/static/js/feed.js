@@ -8,11 +8,13 @@ import { all, one } from "./dom.js";
 import { nowMs, refresh, rfc3339 } from "./time.js";
 
 const LOST_MS = 3000;
+const HANGS_MS = 10000;
 const PATIENCE_MS = [250, 500, 1000, 2000, 4000, 8000];
 const ENDED = 4401;
+const FORBIDDEN = 4403;
 
 /** The one line of a page, whoever of its modules listens. */
-const line = { socket: null, number: null, tries: 0, heardMs: performance.now(), parts: [] };
+const line = { socket: null, number: null, tries: 0, heardMs: performance.now(), openedMs: 0, parts: [] };
 
 /**
  * Listen to robots (null: all) and kinds (null: all). Returns `on(kind, fn(data, robot))`, and
@@ -61,6 +63,7 @@ function open() {
   const address = new URL("/api/v1/feed", location.href);
   address.protocol = address.protocol.replace("http", "ws");
   line.socket = new WebSocket(address);
+  line.openedMs = performance.now();
   line.socket.addEventListener("open", () => say());
   line.socket.addEventListener("message", (event) => hear(JSON.parse(event.data)));
   line.socket.addEventListener("close", (event) => closed(event.code));
@@ -88,6 +91,10 @@ function closed(code) {
     signIn();
     return;
   }
+  if (code === FORBIDDEN) {
+    location.reload(); // the page itself says what is not allowed any more
+    return;
+  }
   const wait = PATIENCE_MS[Math.min(line.tries, PATIENCE_MS.length - 1)];
   line.tries += 1;
   setTimeout(open, wait);
@@ -96,7 +103,8 @@ function closed(code) {
 function watch() {
   if (performance.now() - line.heardMs < LOST_MS) return;
   state("lost");
-  if (line.socket.readyState === WebSocket.OPEN) line.socket.close();
+  const isHanging = line.socket.readyState === WebSocket.CONNECTING && performance.now() - line.openedMs > HANGS_MS;
+  if (line.socket.readyState === WebSocket.OPEN || isHanging) line.socket.close();
 }
 
 function state(now) {

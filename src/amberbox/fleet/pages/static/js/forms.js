@@ -76,8 +76,14 @@ async function after(element, answer) {
   element.dispatchEvent(new CustomEvent("done", { bubbles: true, detail: answer }));
   if (what === "show") await showOnce(answer[more], element.dataset.note);
   if (what === "reload" || what === "show") location.reload();
-  else if (what === "goto") location.assign(more);
+  else if (what === "goto") go(more);
   else if (what === "toast") toast(more || t("common.done"));
+}
+
+/** Go to a page of this server; nowhere else. @param {string} address */
+function go(address) {
+  const to = new URL(address, location.href);
+  location.assign(to.origin === location.origin ? to : "/");
 }
 
 /** Ask a person; true for yes. @param {string} question @returns {Promise<boolean>} */

@@ -3,9 +3,10 @@
 import { all, one, setText } from "./dom.js";
 import { listen } from "./feed.js";
 import { levels } from "./levels.js";
-import { keep, piece, put } from "./pieces.js";
+import { keep, put, swapper } from "./pieces.js";
 import * as view from "./view.js";
 
+const CARD_MS = 1000;
 const LIST_MS = 5000;
 const VALUES_MS = 30000;
 const form = one("#look");
@@ -15,13 +16,13 @@ const query = () => {
   const known = new URLSearchParams(location.search);
   return known.size ? `?${known}` : "";
 };
-const staleList = keep(() => one("#robots"), () => `/pieces/robots${query()}`, LIST_MS);
+const list = [() => one("#robots"), () => `/pieces/robots${query()}`];
+const staleList = keep(...list, LIST_MS, mark);
+const showList = swapper(...list, { placed: mark });
 
-async function look(changes) {
+function look(changes) {
   view.set(changes, { push: !("q" in changes) });
-  const list = one("#robots");
-  put(list, await piece(`/pieces/robots${query()}`));
-  mark();
+  showList();
 }
 
 /** Show in the form what the address says. */
@@ -38,8 +39,9 @@ function mark() {
 /** Ask for a robot's card anew, in whichever teams it stands. */
 function staleCard(robot) {
   if (!cards.has(robot)) {
-    const selector = `[data-robot="${CSS.escape(robot)}"]`;
-    cards.set(robot, keep(() => one(selector), () => `/pieces/robots/${encodeURIComponent(robot)}`));
+    const selector = `.robot-card[data-robot="${CSS.escape(robot)}"]`;
+    const others = (fresh) => all(selector).forEach((card) => card !== fresh && put(card, fresh.cloneNode(true)));
+    cards.set(robot, keep(() => one(selector), () => `/pieces/robots/${encodeURIComponent(robot)}`, CARD_MS, others));
   }
   cards.get(robot)();
 }
@@ -65,8 +67,11 @@ for (const kind of ["presence", "status", "alarm", "diagnosis"]) {
   feed.on(kind, (data, robot) => {
     if (kind === "status" && !news(robot, data)) return; // values alone: the list brings them
     if (robot) staleCard(robot);
-    if (kind !== "status") staleList();
+    staleList(); // its place and the counts may be others now
   });
 }
-feed.on("snapshot", staleList);
+feed.on("snapshot", ({ statuses }) => {
+  for (const [robot, all] of Object.entries(statuses)) news(robot, all);
+  staleList();
+});
 setInterval(staleList, VALUES_MS);
