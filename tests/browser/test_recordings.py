@@ -139,7 +139,7 @@ def test_a_download_is_made_fetched_and_deleted(page_as: PageAs, tmp_path: Path)
     page.get_by_role("button", name="Make it").click()
     job = page.locator(".download").first
     expect(job).to_have_attribute("data-state", "done", timeout=15_000)
-    expect(job).to_contain_text("missions last:1")
+    expect(job).to_contain_text("missions: the last one")
     with page.expect_download() as taken:
         job.get_by_role("link", name="Download").click()
     taken.value.save_as(tmp_path / "file")

@@ -100,6 +100,18 @@ def test_missions_have_folders(home: House) -> None:
     assert len(odom.splitlines()) == 1 + 50
 
 
+def test_robots_without_such_a_mission_are_noted(home: House) -> None:
+    robots = ["ropod_001", "ropod_002"]
+    told, content = made(home, robots=robots, missions=["failed:1"], items=["odom"])
+    assert told["state"] == "done", told
+    assert told["notes"] == ["ropod_002: there is no mission 'failed:1'"]
+    assert "ropod_001/transport-1/odom.csv" in zipfile.ZipFile(io.BytesIO(content)).namelist()
+    alone, _ = made(home, robots=["ropod_002"], missions=["failed:1"])
+    assert (alone["state"], alone["error"]) == ("failed", "there is no mission 'failed:1'")
+    by_id, _ = made(home, robots=robots, missions=["transport-1"], items=["odom"])
+    assert (by_id["state"], by_id["notes"]) == ("done", [])  # it is the other robot's
+
+
 def test_journals_come_as_they_are(home: House) -> None:
     _, content = made(home, format="journals", **{"from": format_time(T0_NS + NS)})
     with zipfile.ZipFile(io.BytesIO(content)) as file:

@@ -156,7 +156,7 @@ def test_downloads_are_ones_own(home: House) -> None:
     body = {"robots": [ROBOT], "missions": ["last:1"], "items": ["pose"], "format": "mcap"}
     assert home.client("technician").post("/api/v1/downloads", json=body).status_code == 202
     mine = text_of(home.client("technician"), "/downloads")
-    assert "waits for its turn" in mine and "missions last:1" in mine and "pose" in mine
+    assert "waits for its turn" in mine and "missions: the last one" in mine and "pose" in mine
     assert "No download yet" in text_of(home.client("admin"), "/downloads")
     assert "by technician" in text_of(home.client("admin"), "/downloads?all=true")
     assert "No download yet" in text_of(home.client("nurse"), "/downloads?all=true")

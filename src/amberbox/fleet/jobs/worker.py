@@ -37,7 +37,7 @@ def make(folder: Path, arguments: Mapping[str, Any]) -> Iterator[bytes]:
     path.mkdir(parents=True, mode=0o700)
     wanted = msgspec.convert(arguments["wanted"], Wanted)
     workshop = Workshop(folder, path, wanted, arguments["most_bytes"])
-    chosen = list(pieces(folder, wanted))
+    chosen = list(pieces(folder, wanted, workshop.note))
     for number, piece in enumerate(chosen):
         for share in _WRITE[wanted.format](workshop, piece):
             yield _told(_MADE * (number + share) / len(chosen))

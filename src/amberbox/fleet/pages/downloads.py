@@ -21,6 +21,7 @@ from amberbox.fleet.jobs.wanted import Downloads, Format, Wanted
 from amberbox.fleet.options.options import read
 from amberbox.fleet.pages import figures
 from amberbox.fleet.pages.page import Pages, render
+from amberbox.fleet.pages.strings import catalogue
 from amberbox.fleet.services import Services
 
 routes = Pages()
@@ -103,9 +104,15 @@ def _listed(fleet: Services, who: Caller, after: str, *, all: bool) -> Mapping[s
     lines = [_line(one, job, options) for one in found[:_PAGE] if (job := jobs[one.id])]
     return {
         "lines": lines, "more": found[_PAGE - 1].id if len(found) > _PAGE else "",
-        "after": after, "all": all, "is_admin": who.may("users.read"), "size": figures.size,
+        "after": after, "all": all, "called": _called, "is_admin": who.may("users.read"), "size": figures.size,
         "percent": figures.percent,
     }  # fmt: skip
+
+
+def _called(missions: Sequence[str]) -> list[str]:
+    """Return what missions are called on the page: those that can be chosen there, in words."""
+    words = catalogue().texts
+    return [words.get(f"downloads.quick.{name.replace(':', '_')}", name) for name in missions]
 
 
 def _line(one: Download, job: Job, options: Downloads) -> Line:
