@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Iterator
 from dataclasses import asdict, replace
@@ -9,16 +10,22 @@ from typing import Any
 
 import pytest
 
+from amberbox.consult.case import Case, answered
+from amberbox.consult.declared import declared
+from amberbox.consult.telling import explained, json_of
 from amberbox.core.clock import NS
 from amberbox.core.timetext import format_time
+from amberbox.diagnosis.situation import Situation
 from amberbox.fleet.alarms.alarm import Alarm
 from amberbox.fleet.alarms.tables import ALARM, ALARM_ROBOT, CONSEQUENCE, HISTORY
 from amberbox.fleet.api.alarmlines import AlarmLine, Happening, line_of
+from amberbox.fleet.knowledge.notebook import Given, keep_answer
 from amberbox.fleet.notifying.tables import OUTBOX
 from amberbox.fleet.pages.alarmsearch import Look
 from amberbox.fleet.pages.alarmview import Item
-from amberbox.fleet.pages.alarmwords import Words, events, lasted
+from amberbox.fleet.pages.alarmwords import Words, events, lasted, words_of
 from tests.fleet.house import START_NS, House, house
+from tests.fleet.knowledge import robot as sim
 
 HOSTILE = '"><script>alert(1)</script> {{7*7}}'
 HOUR_NS = 3600 * NS
@@ -48,6 +55,7 @@ ALARMS = (
     alarm(6, "", "access point ward-4", "urgent", kind="offline",
           reason="offline: ropod_001, ropod_003"),
 )  # fmt: skip
+LAMP_OFF = {"laser_front.lamp": "no"}
 SEVERAL = 6
 """The alarm of a robot of the ward and one of the kitchen."""
 
@@ -172,6 +180,36 @@ def test_an_alarm_in_words(home: House) -> None:
                  "Laser front: silent or Laser front: no power (very likely)", "7 times",
                  "happened while offline", "1 part suffers from it", "Task executor"):  # fmt: skip
         assert text in found, text
+
+
+def explained_answer(revision: int, **answers: str) -> dict[str, Any]:
+    """Return what the server says of a silent laser after answers to tests."""
+    knowledge = declared(sim.FOLDER, "ropod_001", sim.HASH).knowledge()
+    silent = Situation((sim.symptom(sim.NO_SCANS, sim.AT_NS),), watched=True, answers=answers)
+    case = Case(sim.AT_NS, silent)
+    found = answered(knowledge, case)
+    told = json_of(knowledge, case, found, explained(knowledge, case, found))
+    return {**told, "revision": revision}
+
+
+def cause_of(home: House, line: AlarmLine) -> str:
+    with home.services.database.reading() as connection:
+        of = [("ropod_001", line.diagnosis)]
+        return words_of(connection, home.services, of).cause(line)
+
+
+def test_the_cause_is_told_as_on_the_card_of_the_diagnosis(home: House) -> None:
+    services, line = home.services, line_of(replace(ALARMS[1], diagnosis="d-1"), [])
+    assert cause_of(home, line) == "Laser front: silent or Laser front: no power (very likely)"
+    first = explained_answer(1)
+    services.explained._keep(("ropod_001", "d-1", 1, "open", ()), first)
+    assert cause_of(home, line).startswith("one of these: The ")
+    given, more = Given("laser_front.lamp", "no", "anna", 1), explained_answer(1, **LAMP_OFF)
+    with services.database.begin() as connection:
+        keep_answer(connection, "ropod_001", "d-1", given, json.dumps(more).encode())
+    assert re.fullmatch(r"The front laser has no power \(\d\d %\)", cause_of(home, line))
+    services.explained._keep(("ropod_001", "d-1", 2, "open", ()), {**first, "revision": 2})
+    assert cause_of(home, line).startswith("one of these: The ")
 
 
 @pytest.mark.parametrize(

@@ -102,7 +102,7 @@ def items(
     connection: Connection, fleet: Services, who: Caller, alarms: Sequence[Alarm]
 ) -> list[Item]:
     """Return alarms as people read them, of their robots those that the caller may see."""
-    words = words_of(fleet)
+    words = words_of(connection, fleet, ((alarm.robot, alarm.diagnosis) for alarm in alarms))
     numbers = [alarm.number for alarm in alarms]
     about = listing.robots_of(connection, numbers)
     suffering = _suffering(connection, numbers)
@@ -118,8 +118,9 @@ def items(
 def whole(fleet: Services, who: Caller, number: int) -> Whole:
     """Return all of one alarm; raises 404 for one that is not there, or not for the caller."""
     page = show_alarm(fleet, who, number)
-    words = words_of(fleet)
+    of = page.alarm.window.robot, page.alarm.diagnosis
     with fleet.database.reading() as connection:
+        words = words_of(connection, fleet, [of])
         rows = _suffering(connection, [number]).get(number, ())
         about = listing.robots_of(connection, [number])[number]
         mine = _names(connection, who, "alarms.write")

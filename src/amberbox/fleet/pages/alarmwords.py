@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
+
+from sqlalchemy import Connection
 
 from amberbox.core.clock import NS
 from amberbox.fleet.api.alarmlines import AlarmLine, Happening
+from amberbox.fleet.knowledge import notebook
 from amberbox.fleet.knowledge.explained import Answer
 from amberbox.fleet.linkend.presence import presences
 from amberbox.fleet.pages.diagnosiscard import card_of
@@ -29,6 +32,7 @@ class Words:
 
     fleet: Services
     folders: Mapping[str, str] = field(default_factory=dict)
+    told: Mapping[tuple[str, str], Answer] = field(default_factory=dict)
 
     def part(self, robot: str, component: str) -> str:
         """Return what a component is called."""
@@ -48,7 +52,7 @@ class Words:
         """Return what the diagnosis says it comes from; empty where nobody knows."""
         if not line.cause:
             return ""
-        answer = self.fleet.explained.newest(line.window.robot, line.diagnosis)
+        answer = self.told.get((line.window.robot, line.diagnosis))
         return (_told(answer) if answer else "") or self.plain(line.window.robot, line.cause)
 
     def plain(self, robot: str, cause: str) -> str:
@@ -58,11 +62,24 @@ class Words:
         return named.replace(_UNDESCRIBED, catalogue().text("alarms.cause_other"))
 
 
-def words_of(fleet: Services) -> Words:
-    """Return the words of all robots as their folders have them now."""
-    with fleet.database.reading() as connection:
-        folders = {one.robot: one.config_hash for one in presences(connection)}
-    return Words(fleet, folders)
+def words_of(
+    connection: Connection, fleet: Services, diagnoses: Iterable[tuple[str, str]]
+) -> Words:
+    """Return the words of all robots as their folders have them now, and of some diagnoses."""
+    folders = {one.robot: one.config_hash for one in presences(connection)}
+    told = {one: _explained(connection, fleet, *one) for one in set(diagnoses) if one[1]}
+    return Words(fleet, folders, {one: answer for one, answer in told.items() if answer})
+
+
+def _explained(
+    connection: Connection, fleet: Services, robot: str, diagnosis: str
+) -> Answer | None:
+    """Return what is known of a diagnosis: by the last answer to a test, if that is not older."""
+    found = fleet.explained.newest(robot, diagnosis)
+    made = notebook.revisions(connection, robot, diagnosis)
+    if made and (found is None or made[-1].body["revision"] >= found["revision"]):
+        return made[-1].body
+    return found
 
 
 @dataclass(frozen=True, slots=True)

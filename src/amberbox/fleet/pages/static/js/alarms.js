@@ -10,6 +10,8 @@ import { t } from "./strings.js";
 import * as view from "./view.js";
 
 const TYPING_MS = 250;
+/** So long it takes at most times until a diagnosis that came is put into words. */
+const EXPLAINED_MS = 3000;
 const USUAL = { severity: "warning", sort: "worst" };
 const form = one("#look");
 const bulk = one("#bulk");
@@ -146,5 +148,6 @@ view.on(() => look({}, { push: false }));
 keys.start({ acknowledge: (row) => acknowledge([row]), choose: choice.turn });
 markPeriod();
 
-const feed = listen({ kinds: ["alarm"] });
+const feed = listen({ kinds: ["alarm", "diagnosis"] });
+feed.on("diagnosis", () => setTimeout(stale, EXPLAINED_MS));
 for (const kind of ["alarm", "snapshot"]) feed.on(kind, stale);
