@@ -43,7 +43,6 @@ function start() {
 }
 
 async function begin() {
-  const covering = askCoverage(robot);
   page.items = await loadItems(robot);
   page.reach = reach(page.items);
   const isEmpty = !page.items.length;
@@ -57,7 +56,7 @@ async function begin() {
   if (page.look.named.length && matchMedia(NARROW).matches) one("#data-side").open = false;
   await follow(read());
   view.on(again);
-  covered(await covering);
+  covered(await askCoverage(robot)); // behind the first plot
   setInterval(renewIfNewer, AGAIN_MS);
   setInterval(followed, FOLLOW_MS);
 }
