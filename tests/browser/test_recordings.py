@@ -1,6 +1,5 @@
 """The pages about recordings in a browser: coverage, missions, incidents, files, downloads."""
 
-import json
 import re
 from pathlib import Path
 
@@ -13,6 +12,9 @@ from tests.browser.looks import axe, no_sideways_scroll, shot
 from tests.browser.site import Site
 
 ROBOT = "/recordings/ropod_001"
+_POST = """async ([path, body]) => (await fetch(path, {method: 'POST', body: JSON.stringify(body),
+  headers: {'Content-Type': 'application/json',
+            'X-CSRF-Token': document.querySelector('meta[name=csrf]').content}})).json()"""
 
 
 @pytest.mark.parametrize(("theme", "width"), [("light", 1440), ("dark", 390)])
@@ -55,7 +57,7 @@ def test_missions_are_chosen_compared_and_downloaded(page_as: PageAs) -> None:
     expect(page.get_by_text("2 chosen")).to_be_visible()
     expect(compare).to_be_enabled()
     page.get_by_role("button", name="Download", exact=True).click()
-    expect(page).to_have_url(re.compile(r"/downloads\?robot=ropod_001&mission=.+&mission=.+#new"))
+    expect(page).to_have_url(re.compile(r"/downloads\?mission=.+&mission=.+&robot=ropod_001"))
     expect(page.get_by_role("checkbox", name="ropod_001")).to_be_checked()
     expect(page.locator('[data-chips="missions"] [aria-pressed="true"]')).to_have_count(2)
 
@@ -85,6 +87,20 @@ def test_an_incident_is_marked_and_released(page_as: PageAs) -> None:
     row.get_by_role("button", name="Release").click()
     page.get_by_role("button", name="Yes").click()
     expect(row).to_contain_text("released")
+
+
+def test_what_others_do_appears_by_itself(page_as: PageAs) -> None:
+    page, other = page_as("viewer"), page_as("operator")
+    page.goto("/recordings/ropod_002")
+    other.goto("/recordings/ropod_002")
+    expect(page.get_by_text("No incident")).to_be_visible()
+    window = {"from": "now-5m", "to": "now", "reason": "it smells burnt"}
+    posted = other.evaluate(_POST, ["/api/v1/robots/ropod_002/incidents", window])
+    page.evaluate("() => document.dispatchEvent(new Event('visibilitychange'))")  # not in 10 s: now
+    expect(page.locator("#incidents")).to_contain_text("it smells burnt")
+    other.evaluate(_POST, [f"/api/v1/robots/ropod_002/incidents/{posted['id']}/release", {}])
+    page.evaluate("() => document.dispatchEvent(new Event('visibilitychange'))")
+    expect(page.locator("#incidents")).to_contain_text("released")
 
 
 def test_a_mission_is_begun_and_ended(page_as: PageAs) -> None:
@@ -165,11 +181,7 @@ def test_what_is_missing_in_the_form_is_said_beside_it(page_as: PageAs) -> None:
 def test_a_download_of_somebody_else_is_not_shown(page_as: PageAs, site: Site) -> None:
     page = page_as("nurse")
     page.goto("/downloads")
-    body = json.dumps({"robots": ["ropod_001"], "from": "now-1h", "to": "now", "format": "csv"})
-    mine = page.evaluate(
-        """async body => (await fetch('/api/v1/downloads', {method: 'POST', body, headers: {
-          'Content-Type': 'application/json',
-          'X-CSRF-Token': document.querySelector('meta[name=csrf]').content}})).json()""", body,
-    )  # fmt: skip
+    body = {"robots": ["ropod_001"], "from": "now-1h", "to": "now", "format": "csv"}
+    mine = page.evaluate(_POST, ["/api/v1/downloads", body])
     expect(page.locator(f'[data-job="{mine["id"]}"]')).to_be_visible()  # the feed told of it
     assert mine["id"] not in [one["id"] for one in site.ask("/downloads", "technician")]
