@@ -56,6 +56,14 @@ def test_who_is_for_the_ward_sees_its_robots_only(home: House) -> None:
     assert "ropod_003" not in home.client("nurse").get("/pieces/recordings", headers=HTML).text
 
 
+@pytest.mark.parametrize(("name", "may"), [("viewer", False), ("nurse", True)])
+def test_downloads_are_offered_to_those_who_may(home: House, name: str, may: bool) -> None:
+    page = home.client(name).get("/recordings", headers=HTML).text
+    assert ('href="/downloads"' in page) is may
+    answer = home.client(name).get("/downloads", headers=HTML)
+    assert (answer.status_code == 200) is may
+
+
 def test_the_card_tells_whether_files_hold(home: House) -> None:
     text = text_of(home.client("viewer"), f"/pieces/recordings/{ROBOT}?window=24h")
     assert "3 not signed for yet" in text

@@ -104,8 +104,8 @@ def _listed(fleet: Services, who: Caller, after: str, *, all: bool) -> Mapping[s
     lines = [_line(one, job, options) for one in found[:_PAGE] if (job := jobs[one.id])]
     return {
         "lines": lines, "more": found[_PAGE - 1].id if len(found) > _PAGE else "",
-        "after": after, "all": all, "called": _called, "is_admin": who.may("users.read"), "size": figures.size,
-        "percent": figures.percent,
+        "after": after, "all": all, "called": _called,
+        "is_admin": who.may("users.read"), "size": figures.size, "percent": figures.percent,
     }  # fmt: skip
 
 

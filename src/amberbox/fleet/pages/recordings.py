@@ -63,7 +63,8 @@ def show(request: Request, fleet: Fleet, who: Who, window: Window = "7d") -> Res
     lines = _lines(fleet, who)
     return render(
         request, "recordings.html", lines=lines, window=window, windows=tuple(WINDOWS),
-        swatches=_swatches(), total=_total(lines), **_words(),
+        swatches=_swatches(), total=_total(lines), may_download=_may_download(fleet, who),
+        **_words(),
     )  # fmt: skip
 
 
@@ -151,6 +152,11 @@ def _lines(fleet: Services, who: Caller) -> list[Line]:
     cards = [card for card in list_cards(fleet, who, "", "", _MOST) if card.robot in mine]
     known = _held(fleet, [card.robot for card in cards])
     return [Line(card, known[card.robot]) for card in cards]
+
+
+def _may_download(fleet: Services, who: Caller) -> bool:
+    with fleet.database.reading() as connection:
+        return bool(who.robots(connection, "data.download"))
 
 
 def _held(fleet: Services, robots: Sequence[str]) -> Mapping[str, Held]:
