@@ -48,7 +48,7 @@ def open_plots(
     page.goto(PATH)
     page.evaluate(
         """async ([module, options, traces]) => {
-            const { plots } = await import(module);
+            const { plots } = (await import(module)).$need("plot.js");
             window.heard = [];
             window.stack = plots(document.getElementById("place"),
               {...options, onWindow: (...w) => window.heard.push(w)});
@@ -56,7 +56,7 @@ def open_plots(
             document.addEventListener("plotdrawn", (e) => window.drawn.push(e.detail.id));
             traces.forEach(window.stack.add);
         }""",
-        [address("js/plot.js"), {"from": from_s, "to": to_s, **more}, list(traces)],
+        [address("all.js"), {"from": from_s, "to": to_s, **more}, list(traces)],
     )
     settle(page)
 

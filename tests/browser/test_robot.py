@@ -200,7 +200,7 @@ def test_browser_and_server_write_numbers_alike(page_as: PageAs) -> None:
     page = page_as("viewer")
     page.goto(PAGE)
     told = page.evaluate(
-        "async ([path, values]) => values.map((await import(path)).number)",
-        [assets.address("js/robotlive.js"), list(NUMBERS)],
+        "async ([path, values]) => values.map((await import(path)).$need('robotlive.js').number)",
+        [assets.address("all.js"), list(NUMBERS)],
     )
     assert told == [robottree.number(value) for value in NUMBERS]

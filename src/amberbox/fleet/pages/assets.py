@@ -20,6 +20,7 @@ FOLDER = Path(__file__).parent / "static"
 PLOT = "vendor/uplot.js"
 """uPlot, https://github.com/leeoniya/uPlot, MIT: as the package ``youplot`` carries it."""
 STYLE = "site.css"
+MODULES = "all.js"
 _FIRST = ("tokens.css", "base.css")
 _TYPES = {".js": "text/javascript; charset=utf-8", ".css": "text/css; charset=utf-8",
           ".svg": "image/svg+xml"}  # fmt: skip
@@ -65,7 +66,7 @@ def _contents() -> Iterator[tuple[str, bytes]]:
     yield PLOT, uplot("uplot.iife.min.js")
     yield "icons.svg", (FOLDER / "icons.svg").read_bytes()
     modules = {file.name: file.read_text("utf-8") for file in sorted((FOLDER / "js").glob("*.js"))}
-    yield from ((f"js/{name}", text.encode()) for name, text in joined(modules))
+    yield MODULES, joined(modules).encode()
 
 
 def _styles() -> Iterator[bytes]:

@@ -56,5 +56,5 @@ function filled(element, about, inside) {
 }
 
 function sprite() {
-  return new URL("../icons.svg", import.meta.url).pathname;
+  return new URL("icons.svg", import.meta.url).pathname;
 }

@@ -27,13 +27,16 @@ function closeHelp() {
   one(".popover[data-of-help]")?.remove();
 }
 
+/** Explain a word where it stands; where that fails, on the page of all words. */
 async function explain(event) {
   const link = event.target.closest("a[data-help]");
   if (!link || event.ctrlKey || event.metaKey) return;
   event.preventDefault();
   closeHelp();
-  const { title, text } = await ask(`/help/${encodeURIComponent(link.dataset.help)}`);
-  const shown = el("div", { class: "popover", role: "note", "data-of-help": true }, el("strong", {}, title), el("p", {}, text));
+  const said = await ask(`/help/${encodeURIComponent(link.dataset.help)}`).catch(() => null);
+  if (!said) return location.assign(link.href);
+  const { title, text } = said;
+  const shown = el("div", { class: "popover", role: "status", "data-of-help": true }, el("strong", {}, title), el("p", {}, text));
   document.body.append(shown);
   place(shown, link);
 }

@@ -1,0 +1,112 @@
+"""Every page there is: for those who cannot see it, on a phone, in the dark, with hostile texts."""
+
+from __future__ import annotations
+
+import re
+import urllib.error
+import urllib.request
+from collections.abc import Iterable, Mapping
+from html import unescape
+
+import pytest
+
+from amberbox.fleet.api.who import COOKIE
+from amberbox.fleet.serving.app import rooms
+from tests.browser.conftest import PageAs
+from tests.browser.expecting import expect
+from tests.browser.looks import axe, no_sideways_scroll, shot
+from tests.browser.site import Site
+
+PAGES: Mapping[str, str] = {
+    "/": "/",
+    "/robots/{robot}": "/robots/ropod_002",
+    "/robots/{robot}/data": "/robots/ropod_001/data?v=hostile&from=now-2h",
+    "/robots/{robot}/diagnosis": "/robots/ropod_001/diagnosis?details=1",
+    "/alarms": "/alarms?state=all",
+    "/alarms/{id}": "/alarms/1",
+    "/recordings": "/recordings",
+    "/recordings/{robot}": "/recordings/ropod_001",
+    "/downloads": "/downloads",
+    "/knowledge": "/knowledge",
+    "/knowledge/{robot}": "/knowledge/ropod_001",
+    "/account": "/account",
+    "/admin": "/admin",
+    "/admin/users": "/admin/users",
+    "/admin/teams": "/admin/teams",
+    "/admin/robots": "/admin/robots",
+    "/admin/settings/{setting}": "/admin/settings/notifications",
+    "/admin/audit": "/admin/audit",
+    "/admin/health": "/admin/health",
+    "/admin/system": "/admin/system",
+    "/help": "/help",
+    "/licences": "/licences",
+    "/sign-in": "/sign-in",
+}
+"""Each page by its route, and where to find one of it that shows much."""
+ELSEWHERE = {"/setup", "/in"}
+"""Pages that a server of its own shows: test_foundation.py, tests/demo."""
+LOOKS = [("light", 1440), ("dark", 390)]
+
+
+def is_page(path: str) -> bool:
+    """Tell a page from parts of pages and what is taken along."""
+    parts = ("/pieces/", "/static/", "/help/")
+    return not path.startswith(parts) and "." not in path and path.count("/") < 4
+
+
+def test_no_page_is_left_out() -> None:
+    routes = [routes for name, routes in rooms().items() if name.startswith("pages.")]
+    paths = {path for one in routes for method, path in one.rules if method == "GET"}
+    assert {path for path in paths if is_page(path)} == set(PAGES) | ELSEWHERE
+
+
+@pytest.mark.parametrize(("theme", "width"), LOOKS)
+@pytest.mark.parametrize("route", PAGES)
+def test_page(page_as: PageAs, route: str, theme: str, width: int) -> None:
+    who = "" if route == "/sign-in" else "admin"
+    page = page_as(who, width=width, theme=theme)
+    page.goto(PAGES[route])
+    expect(page.locator("h1").first).to_be_visible()
+    axe(page)
+    no_sideways_scroll(page)
+    assert not page.title().startswith("1"), "a text of somebody has run as a script"
+    shot(
+        page,
+        route.strip("/").replace("/", "-").replace("{", "").replace("}", "") or "home",
+        whole=False,
+    )
+
+
+def test_no_link_leads_nowhere(site: Site) -> None:
+    led = links(site, "admin", PAGES.values())
+    broken = {f"{href} on {path}: {status}" for href, path in led.items()
+              if (status := got(site, "admin", href)[0]) >= 400}  # fmt: skip
+    assert broken == set()
+
+
+def test_what_a_viewer_is_led_to_a_viewer_may_see(site: Site) -> None:
+    pages = [path for path in PAGES.values() if not path.startswith(("/admin", "/downloads"))]
+    led = links(site, "viewer", pages)
+    refused = {f"{href} on {path}" for href, path in led.items()
+               if got(site, "viewer", href)[0] in (401, 403)}  # fmt: skip
+    assert refused == set()
+
+
+def links(site: Site, name: str, paths: Iterable[str]) -> Mapping[str, str]:
+    """Return where pages lead on this server, and on which page that stands."""
+    found: dict[str, str] = {}
+    for path in paths:
+        for href in re.findall(r'<a [^>]*href="(/[^"#]*)', got(site, name, path)[1]):
+            found.setdefault(unescape(href), path)
+    return found
+
+
+def got(site: Site, name: str, path: str) -> tuple[int, str]:
+    """Ask for a page as somebody; return the status and what it says."""
+    headers = {"Cookie": f"{COOKIE}={site.session(name)}", "Accept": "text/html"}
+    request = urllib.request.Request(site.url + path, headers=headers)
+    try:
+        with urllib.request.urlopen(request, timeout=20) as answer:
+            return answer.status, answer.read().decode("utf-8", "replace")
+    except urllib.error.HTTPError as error:
+        return error.code, ""
