@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
@@ -14,11 +15,11 @@ from tests.browser import hostile
 from tests.browser.conftest import PageAs
 from tests.browser.expecting import expect
 from tests.browser.looks import axe, no_sideways_scroll, shot
-from tests.browser.site import Site
+from tests.browser.site import Site, until
 from tests.browser.watching import RESTART
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Locator, Page
+    from playwright.sync_api import Locator, Page, WebSocketRoute
 
 PAGE = "/robots/ropod_001"
 SHIFTS = """() => {
@@ -155,6 +156,57 @@ def test_a_restart_of_the_server_loses_nothing(page_as: PageAs, site: Site) -> N
     expect(row(page, "wifi")).to_have_attribute("aria-expanded", "true")
     expect(row(page, "laser_front")).to_have_attribute("aria-expanded", "false")
     expect(row(page, "base").locator(".age")).to_have_text(re.compile("[12] s"), timeout=20_000)
+
+
+def test_what_was_missed_is_asked_for_behind_a_new_beginning(page_as: PageAs, site: Site) -> None:
+    page = page_as("viewer")
+    line = Line(page)
+    page.goto(PAGE)
+    is_live(page)
+    line.cut()
+    expect(page.locator("html")).to_have_attribute("data-feed", "lost", timeout=6000)
+    site.robots["ropod_001"].tell("note", "it came while nobody heard")
+    until(lambda: "while nobody heard" in str(site.ask("/robots/ropod_001/events")), "it is there")
+    with page.expect_response(lambda answer: "/diagnosis/card" in answer.url, timeout=15_000):
+        line.mend()
+        expect(page.locator("#events")).to_contain_text("while nobody heard", timeout=15_000)
+
+
+class Line:
+    """The feed of a page, which can be cut; behind a cut everything begins anew."""
+
+    def __init__(self, page: Page) -> None:
+        self._is_cut = False
+        self._open: list[WebSocketRoute] = []
+        page.route_web_socket(re.compile("/api/v1/feed$"), self._begin)
+
+    def cut(self) -> None:
+        self._is_cut = True
+        for one in self._open:
+            one.close()
+
+    def mend(self) -> None:
+        self._is_cut = False
+
+    def _begin(self, line: WebSocketRoute) -> None:
+        if self._is_cut:
+            line.close()
+            return
+        self._open.append(line)
+        server = line.connect_to_server()
+        line.on_message(lambda said: server.send(json.dumps({**json.loads(said), "resume": None})))
+
+
+def test_tab_leads_into_a_tree_whose_first_row_is_hidden(page_as: PageAs) -> None:
+    page = page_as("viewer")
+    page.goto(f"{PAGE}?q=wifi")
+    is_live(page)
+    expect(row(page, "wifi")).to_have_attribute("tabindex", "0")
+    page.get_by_role("searchbox").fill("host")
+    expect(row(page, "host")).to_have_attribute("tabindex", "0")
+    page.locator("#close-all").focus()
+    page.keyboard.press("Tab")
+    expect(row(page, "host")).to_be_focused()
 
 
 def test_an_operator_marks_begins_and_ends(page_as: PageAs, site: Site) -> None:

@@ -38,9 +38,21 @@ export function keep(place, { path, feed = null, renewed = null, robot }) {
   place.addEventListener("click", (event) => {
     if (event.target.closest("[data-again]")) renew();
   });
-  feed?.on("diagnosis", (_, of) => {
-    if (of === robot) renew();
-  });
+  if (feed) follow(feed, place, robot, renew);
   if (one("[data-complete='yes']", place) === null) renew();
   return renew;
+}
+
+/** Renew at each diagnosis and after an absence, for as long as the place is on the page. */
+function follow(feed, place, robot, renew) {
+  let snapshots = 0;
+  const ends = [
+    feed.on("diagnosis", (_, of) => hear(of === robot)),
+    feed.on("snapshot", () => hear((snapshots += 1) > 1)),
+  ];
+
+  function hear(isNews) {
+    if (!place.isConnected) ends.forEach((end) => end());
+    else if (isNews) renew();
+  }
 }

@@ -17,9 +17,9 @@ const FORBIDDEN = 4403;
 const line = { socket: null, number: null, tries: 0, heardMs: performance.now(), openedMs: 0, parts: [] };
 
 /**
- * Listen to robots (null: all) and kinds (null: all). Returns `on(kind, fn(data, robot))`, and
- * `want({live: {robot: [variables]}})` to ask for something else. All modules of a page share one
- * socket; who joins later makes everybody hear a new snapshot.
+ * Listen to robots (null: all) and kinds (null: all). Returns `on(kind, fn(data, robot))`, which
+ * returns what ends that, and `want({live: {robot: [variables]}})` to ask for something else. All
+ * modules of a page share one socket; who joins later makes everybody hear a new snapshot.
  */
 export function listen({ robots = null, kinds = null, live = {} } = {}) {
   const part = { wanted: { robots, kinds, live }, listeners: new Map() };
@@ -29,6 +29,7 @@ export function listen({ robots = null, kinds = null, live = {} } = {}) {
 
   function on(kind, fn) {
     part.listeners.set(kind, [...(part.listeners.get(kind) ?? []), fn]);
+    return () => part.listeners.set(kind, part.listeners.get(kind).filter((other) => other !== fn));
   }
 
   function want(change) {

@@ -5,9 +5,10 @@ import { all, one, setText } from "./dom.js";
 import { listen } from "./feed.js";
 import { levels } from "./levels.js";
 import { keep, piece, put } from "./pieces.js";
+import { startActs } from "./robotacts.js";
 import { robotLive } from "./robotlive.js";
 import { t } from "./strings.js";
-import { ago, local, nowMs, refresh, rfc3339, span } from "./time.js";
+import { local, nowMs, refresh, rfc3339 } from "./time.js";
 import { tree } from "./tree.js";
 import * as view from "./view.js";
 
@@ -31,6 +32,8 @@ const live = robotLive(page);
 const news = levels();
 const words = new WeakMap();
 let snapshots = 0;
+/** Since when the watcher has said nothing. @type {number | null} */
+let quietMs = null;
 
 const stale = {
   tree: keep(() => one("#tree"), () => `${base}/tree?${treeQuery()}`, GRAPH_MS),
@@ -69,6 +72,7 @@ function filter() {
     if (branch.hidden === fits) branch.hidden = !fits;
   }
   one("#nothing-fits").hidden = branches.length === 0 || branches.some((branch) => !branch.hidden);
+  rows.tabbable();
   setText(one("#trouble-count"), String(branches.filter((branch) => branch.dataset.level !== "ok").length));
 }
 
@@ -102,6 +106,7 @@ function showAll() {
 
 function openAll(isOpen) {
   for (const row of all(".node", section)) rows.open(row, isOpen);
+  rows.tabbable();
   remember();
 }
 
@@ -169,30 +174,9 @@ async function showTrend() {
   if (fresh) one("#trend")?.replaceWith(fresh);
 }
 
-// -- what people do
-
-function startActs() {
-  page.addEventListener("click", (event) => {
-    const button = event.target.closest("button[data-dialog]");
-    if (!button) return;
-    const dialog = one(`#dialog-${button.dataset.dialog}`);
-    const form = one("form", dialog);
-    if (button.dataset.path) form.dataset.post = button.dataset.path;
-    form.reset();
-    dialog.showModal();
-  });
-  for (const dialog of all("dialog")) {
-    one("[data-close]", dialog)?.addEventListener("click", () => dialog.close());
-    dialog.addEventListener("done", () => {
-      dialog.close();
-      stale.now();
-    });
-  }
-}
-
 // -- what comes
 
-/** Say why nothing counts, if so; the words stand in a line that is always there. */
+/** Say why nothing counts, if so: since when, not for how long, as it is read aloud at each change. */
 function saySilence() {
   const why = silence();
   page.classList.toggle("is-silent", why !== "");
@@ -202,10 +186,11 @@ function saySilence() {
 }
 
 function silence() {
-  if (!presence.online) return presence.seenMs ? t("robot.offline", { text: ago(presence.seenMs) }) : "";
+  if (!presence.online) return presence.seenMs ? t("robot.offline", { text: local(presence.seenMs) }) : "";
   if (presence.silent) return t("robot.silent_link", { text: local(presence.seenMs, "time") });
   const age = live.newest();
-  return age !== null && age > SILENT_S ? t("robot.silent_watcher", { text: span(age) }) : "";
+  quietMs = age !== null && age > SILENT_S ? (quietMs ?? nowMs() - age * 1000) : null;
+  return quietMs === null ? "" : t("robot.silent_watcher", { text: local(quietMs, "time") });
 }
 
 function setPresence({ online, silent = false, seen = null }) {
@@ -268,6 +253,7 @@ function startFeed() {
     const card = robots.find((known) => known.robot === robot);
     if (card) setPresence({ online: card.online, silent: card.silent, seen: card.last_seen });
     takeAll(statuses[robot] ?? []);
+    if (snapshots > 1) renewAround();
   });
   feed.on("status", take);
   feed.on("ages", contact);
@@ -275,11 +261,14 @@ function startFeed() {
     setPresence({ online, silent, seen: since });
     stale.now();
   });
-  feed.on("event", () => {
-    if (one("#events")) stale.events();
-    stale.now();
-  });
+  feed.on("event", renewAround);
   return feed;
+}
+
+/** Something has happened, or may have while nothing was heard. */
+function renewAround() {
+  if (one("#events")) stale.events();
+  stale.now();
 }
 
 function startDiagnosis(feed) {
@@ -301,9 +290,10 @@ function indexAnew() {
 
 function start() {
   startDiagnosis(startFeed());
+  rows.tabbable();
   startLook();
   startAround();
-  startActs();
+  startActs(page, stale.now);
   for (const place of [section, one(".robot-side")]) new MutationObserver(indexAnew).observe(place, { childList: true });
   setInterval(() => {
     live.tick();

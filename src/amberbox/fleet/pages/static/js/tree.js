@@ -8,7 +8,8 @@ const ROWS = ".tr[aria-level]";
 
 /**
  * Make the rows below `place` a tree. `toggled()` is called after somebody opened or closed one.
- * Returns `open(row, isOpen)`, `go(row)` and `opened()`, the names of the open branches.
+ * Returns `open(row, isOpen)`, `go(row)`, `opened()`, the names of the open branches, and
+ * `tabbable()`, to be called after rows were hidden or replaced.
  * @param {HTMLElement} place
  * @param {{toggled: () => void}} about
  */
@@ -26,6 +27,7 @@ export function tree(place, { toggled }) {
 
   function toggle(row) {
     open(row, row.getAttribute("aria-expanded") !== "true");
+    tabbable();
     toggled();
   }
 
@@ -39,6 +41,12 @@ export function tree(place, { toggled }) {
   function mark(row) {
     for (const other of all(`${ROWS}[tabindex="0"]`, place)) other.tabIndex = -1;
     row.tabIndex = 0;
+  }
+
+  /** Let Tab lead to a row that is seen: to the first one, if that of before is hidden now. */
+  function tabbable() {
+    const known = rows();
+    if (known.length && !known.some((row) => row.tabIndex === 0)) mark(known[0]);
   }
 
   function inward(row) {
@@ -102,5 +110,5 @@ export function tree(place, { toggled }) {
   });
 
   const opened = () => all('[aria-expanded="true"]', place).map((row) => row.parentElement.dataset.component);
-  return { open, go, opened };
+  return { open, go, opened, tabbable };
 }
