@@ -52,6 +52,13 @@ class Caller:
             seen = Robot(self.principal.id)
         return allowed(self.principal, action, seen)
 
+    def may_some(self, action: str) -> bool:
+        """Tell whether an action is allowed to robots of one's groups, if there are any."""
+        groups = self.principal.groups
+        if groups is None:
+            return self.may(action)
+        return bool(groups) and self.may(action, Robot("", groups))
+
     def robots(self, connection: Connection, action: str = "status.read") -> list[KnownRobot]:
         """Return the robots to which an action is allowed, disabled ones too."""
         return [robot for robot in list_robots(connection) if self.may(action, robot)]
@@ -194,15 +201,8 @@ class Guard:
         name = connection.path_params.get("robot")
         if name is not None:
             connection.state.robot = self._robot(connection, caller, str(name))
-        elif not (self._may_some(caller) if self.each else caller.may(self.action)):
+        elif not (caller.may_some(self.action) if self.each else caller.may(self.action)):
             raise HTTPException(403, f"{caller.principal.role or caller.principal.kind} may not")
-
-    def _may_some(self, caller: Caller) -> bool:
-        """Tell whether the action is allowed to robots of the caller's groups, if there are any."""
-        groups = caller.principal.groups
-        return caller.may(self.action, Robot("", groups or frozenset())) if groups else (
-            groups is None and caller.may(self.action)
-        )  # fmt: skip
 
     def _robot(self, connection: HTTPConnection, caller: Caller, name: str) -> KnownRobot:
         """Look a robot up; whoever may not even see it learns nothing of it."""

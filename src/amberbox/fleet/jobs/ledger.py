@@ -61,6 +61,12 @@ def find(connection: Connection, job_id: str) -> Job | None:
     return None if row is None else _job(row)
 
 
+def find_all(connection: Connection, ids: Sequence[str]) -> dict[str, Job]:
+    """Return downloads by their ids."""
+    rows = connection.execute(select(JOB).where(JOB.c.id.in_(ids)))
+    return {row.id: _job(row) for row in rows}
+
+
 def listed(
     connection: Connection, owner: str | None, after: str = "", limit: int = 100
 ) -> list[Job]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -56,6 +57,17 @@ def causes(connection: Connection, robot: str, diagnosis: str) -> list[Cause]:
     """Return what it was, by everybody who has said so."""
     rows = _rows(connection, CAUSE, robot, diagnosis)
     return [Cause(row.failure_mode, row.note, row.who, row.at_ns) for row in rows]
+
+
+def modes_named(
+    connection: Connection, robot: str, diagnoses: Sequence[str]
+) -> dict[str, list[str]]:
+    """Return by diagnosis which failure modes people said it was, in order."""
+    chosen = select(CAUSE).where(CAUSE.c.robot == robot, CAUSE.c.diagnosis.in_(diagnoses))
+    found: dict[str, list[str]] = {one: [] for one in diagnoses}
+    for row in connection.execute(chosen.order_by(CAUSE.c.number)):
+        found[row.diagnosis].append(row.failure_mode)
+    return found
 
 
 def revisions(connection: Connection, robot: str, diagnosis: str) -> list[Revision]:

@@ -246,13 +246,8 @@ def remarks(seen: Look) -> Values:
 def _history(asked: Asked, seen: Look) -> Values:
     found = diagnoses(asked.fleet, asked.robot)[:SHOWN]
     with asked.fleet.database.reading() as connection:
-        said = {
-            one.id: notebook.causes(connection, asked.robot, one.id) for one in found
-        }  # fmt: skip
-    lines = [
-        {"line": line_of(one), "causes": [cause.failure_mode for cause in said[one.id]]}
-        for one in found
-    ]
+        said = notebook.modes_named(connection, asked.robot, [one.id for one in found])
+    lines = [{"line": line_of(one), "causes": said[one.id]} for one in found]
     return {"lines": lines, "seen": seen, "revisions": _revisions(seen.known), **remarks(seen)}
 
 

@@ -70,11 +70,12 @@ def show(
     format: Text = "csv", after: Text = "", all: bool = False,
 ) -> Response:  # fmt: skip
     """Show one's downloads, and the form for a new one."""
+    options = _options(fleet)
     begun = Begun(robot, mission, item, from_, to, format if format in FORMATS else "csv")
     return render(
         request, "downloads.html", begun=begun, formats=FORMATS, robots=_robots(fleet, who),
-        is_begun=bool(robot or mission or item or from_), options=_options(fleet),
-        **_listed(fleet, who, after, all=all),
+        is_begun=bool(robot or mission or item or from_), options=options,
+        **_listed(fleet, who, options, after, all=all),
     )  # fmt: skip
 
 
@@ -83,7 +84,8 @@ def show_list(
     request: Request, fleet: Fleet, who: Who, after: Text = "", all: bool = False
 ) -> Response:
     """Show the list of downloads alone."""
-    return render(request, "downloads_list.html", **_listed(fleet, who, after, all=all))
+    shown = _listed(fleet, who, _options(fleet), after, all=all)
+    return render(request, "downloads_list.html", **shown)
 
 
 def _robots(fleet: Services, who: Caller) -> list[str]:
@@ -96,12 +98,13 @@ def _options(fleet: Services) -> Downloads:
         return read(connection, SETTING, Downloads)
 
 
-def _listed(fleet: Services, who: Caller, after: str, *, all: bool) -> Mapping[str, Any]:
+def _listed(
+    fleet: Services, who: Caller, options: Downloads, after: str, *, all: bool
+) -> Mapping[str, Any]:
     found = list_downloads(fleet, who, limit=_PAGE + 1, after=after, all=all)
-    options = _options(fleet)
     with fleet.database.reading() as connection:
-        jobs = {one.id: ledger.find(connection, one.id) for one in found[:_PAGE]}
-    lines = [_line(one, job, options) for one in found[:_PAGE] if (job := jobs[one.id])]
+        jobs = ledger.find_all(connection, [one.id for one in found[:_PAGE]])
+    lines = [_line(one, jobs[one.id], options) for one in found[:_PAGE] if one.id in jobs]
     return {
         "lines": lines, "more": found[_PAGE - 1].id if len(found) > _PAGE else "",
         "after": after, "all": all, "called": _called,

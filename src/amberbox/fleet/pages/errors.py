@@ -5,6 +5,7 @@ from __future__ import annotations
 from urllib.parse import quote
 
 from fastapi import FastAPI, Request
+from fastapi.concurrency import run_in_threadpool
 from fastapi.exceptions import RequestValidationError
 from starlette.exceptions import HTTPException
 from starlette.responses import RedirectResponse, Response
@@ -37,7 +38,7 @@ async def _known(request: Request, found: Exception) -> Response:
     assert isinstance(found, AmberboxError)
     if not is_page(request):
         return await api.say_known(request, found)
-    return _page(request, api.status_of(found), found.what, found.hint)
+    return await run_in_threadpool(_page, request, api.status_of(found), found.what, found.hint)
 
 
 async def _http(request: Request, found: Exception) -> Response:
@@ -46,11 +47,11 @@ async def _http(request: Request, found: Exception) -> Response:
         return await api.say_http(request, found)
     if found.status_code == 401:
         return RedirectResponse(f"/sign-in?next={quote(_wanted(request), safe='')}", 303)
-    me = visitor(request)
+    me = await run_in_threadpool(visitor, request)
     if found.status_code == 403 and me is not None and me.principal.must_change:
         return RedirectResponse("/account", 303)
     what = str(found.detail) if found.detail != "Not Found" else catalogue().text("error.no_page")
-    return _page(request, found.status_code, what, "")
+    return await run_in_threadpool(_page, request, found.status_code, what, "")
 
 
 async def _invalid(request: Request, found: Exception) -> Response:
@@ -59,7 +60,7 @@ async def _invalid(request: Request, found: Exception) -> Response:
         return await api.say_invalid(request, found)
     first = found.errors()[0]
     place = ".".join(str(part) for part in first["loc"][1:])
-    return _page(request, 400, f"{place}: {first['msg']}", "")
+    return await run_in_threadpool(_page, request, 400, f"{place}: {first['msg']}", "")
 
 
 def _page(request: Request, status: int, what: str, hint: str) -> Response:

@@ -63,7 +63,7 @@ def show(request: Request, fleet: Fleet, who: Who, window: Window = "7d") -> Res
     lines = _lines(fleet, who)
     return render(
         request, "recordings.html", lines=lines, window=window, windows=tuple(WINDOWS),
-        swatches=_swatches(), total=_total(lines), may_download=_may_download(fleet, who),
+        swatches=_swatches(), total=_total(lines), may_download=who.may_some("data.download"),
         **_words(),
     )  # fmt: skip
 
@@ -71,8 +71,7 @@ def show(request: Request, fleet: Fleet, who: Who, window: Window = "7d") -> Res
 @routes.get("/pieces/recordings", "items.read", each=True)
 def show_states(request: Request, fleet: Fleet, who: Who, robot: Name = "") -> Response:
     """Show of each robot (or of one) how far its copying is; what is asked for every 10 s."""
-    lines = [line for line in _lines(fleet, who) if robot in ("", line.card.robot)]
-    return render(request, "recordings_states.html", lines=lines, **_words())
+    return render(request, "recordings_states.html", lines=_lines(fleet, who, robot), **_words())
 
 
 @routes.get("/pieces/recordings/{robot}", "items.read")
@@ -146,17 +145,13 @@ def show_journals(
     )  # fmt: skip
 
 
-def _lines(fleet: Services, who: Caller) -> list[Line]:
+def _lines(fleet: Services, who: Caller, only: str = "") -> list[Line]:
     with fleet.database.reading() as connection:
-        mine = {robot.id for robot in who.robots(connection, "items.read")}
+        seen = who.robots(connection, "items.read")
+    mine = {robot.id for robot in seen if only in ("", robot.id)}
     cards = [card for card in list_cards(fleet, who, "", "", _MOST) if card.robot in mine]
     known = _held(fleet, [card.robot for card in cards])
     return [Line(card, known[card.robot]) for card in cards]
-
-
-def _may_download(fleet: Services, who: Caller) -> bool:
-    with fleet.database.reading() as connection:
-        return bool(who.robots(connection, "data.download"))
 
 
 def _held(fleet: Services, robots: Sequence[str]) -> Mapping[str, Held]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -45,16 +45,16 @@ def held(connection: Connection, folder: Path, robots: Sequence[str]) -> Mapping
     coming = _coming(connection, folder, robots)
     stamps = _stamps(connection, robots)
     return {
-        robot: Held(
-            *(_figures(sums[robot]) if robot in sums else ()),
+        robot: replace(
+            _figures(sums[robot]) if robot in sums else Held(),
             copying=coming.get(robot, Copying()), stamp="-".join(stamps[robot]),
         )
         for robot in robots
     }  # fmt: skip
 
 
-def _figures(row: Any) -> tuple[int, int, int, int]:
-    return int(row.files), int(row.size), int(row.lines), int(row.waiting)
+def _figures(row: Any) -> Held:
+    return Held(int(row.files), int(row.size), int(row.lines), int(row.waiting))
 
 
 def _sums(robots: Sequence[str]) -> Select[Any]:

@@ -52,12 +52,12 @@ async def make(request: Request, fleet: Fleet) -> Response:
         await _made(request, fleet, form, needs_code=situation["needs_code"])
     except AmberboxError as error:
         said = {**known, "problem": error.what, "hint": error.hint}
-        answer = _page(request, fleet, status_of(error), **said)
+        answer = await asyncio.to_thread(_page, request, fleet, status_of(error), **said)
         if isinstance(error, MustWaitError):
             answer.headers["Retry-After"] = str(error.seconds)
         return answer
     fleet.bus.publish(Change("account", data={"name": name}))
-    return _page(request, fleet, made=name)
+    return await asyncio.to_thread(_page, request, fleet, made=name)
 
 
 async def _made(

@@ -1,7 +1,7 @@
 // The bar of the demonstration: break a robot, repair it, and say what to watch for.
 
 import { ask, fail } from "./ask.js";
-import { one, setText } from "./dom.js";
+import { el, one, setText } from "./dom.js";
 
 /**
  * @typedef {{robots: {robot: string, fault: string}[], faults: string[]}} View what can be broken, and what is
@@ -18,6 +18,7 @@ function begin(form) {
   /** @param {View} view */
   const take = (view) => {
     for (const { robot, fault } of view.robots) broken.set(robot, fault);
+    offer(form.robot, view.robots.map(({ robot }) => robot));
     show();
   };
   const change = (method, body) => changed(form, method, body).then(take, (error) => fail(error, form));
@@ -28,6 +29,13 @@ function begin(form) {
   });
   one("[data-repair]", form).addEventListener("click", () => change("DELETE"));
   ask("/api/v1/demo").then(take, (error) => fail(error, form));
+}
+
+/** Offer the robots that one may see; at first the one that the page is about is chosen. */
+function offer(select, robots) {
+  const now = select.value || decodeURIComponent(location.pathname.split("/")[2] ?? "");
+  select.replaceChildren(...robots.map((robot) => el("option", { value: robot, selected: robot === now }, robot)));
+  select.closest("form").hidden = robots.length === 0;
 }
 
 /** Break or repair the robot that is chosen. @returns {Promise<View>} */

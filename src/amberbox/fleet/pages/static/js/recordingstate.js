@@ -5,6 +5,8 @@ import { listen } from "./feed.js";
 import { piece, put } from "./pieces.js";
 
 const EVERY_MS = 10_000;
+/** Many robots come at once when a server or a network is back. */
+const SOON_MS = 500;
 
 /**
  * Keep the states of robots right; `changed(robot, isAll)` hears of those of which something is
@@ -26,9 +28,23 @@ export function followStates(path, changed) {
   setInterval(look, EVERY_MS);
   document.addEventListener("visibilitychange", look);
   const feed = listen({ kinds: ["presence"] });
-  feed.on("presence", look);
-  feed.on("snapshot", look);
+  const soon = once(look, SOON_MS);
+  feed.on("presence", (_, robot) => {
+    if (one(`[data-state="${CSS.escape(robot)}"]`)) soon();
+  });
+  feed.on("snapshot", soon);
   return look;
+}
+
+/** Return what calls something after a while, once for all that asked for it meanwhile. */
+function once(fn, afterMs) {
+  let timer = null;
+  return () => {
+    timer ??= setTimeout(() => {
+      timer = null;
+      fn();
+    }, afterMs);
+  };
 }
 
 function place(fresh, changed) {
