@@ -122,6 +122,30 @@ def test_one_instant_is_the_same_among_many(
     assert bits(float(expression.numbers(samples, np.array([at_ns]))[0])) == bits(float(number))
 
 
+@settings(max_examples=150, deadline=None)
+@given(numbers | conditions, numbers | conditions, recordings(), st.integers(-2, 14))
+def test_what_expressions_share_changes_nothing(
+    first: str, text: str, samples: dict[str, Samples], at_ns: int
+) -> None:
+    for at in (at_ns, np.array([at_ns - 1, at_ns, at_ns + 2])):
+        windows: dict[str, Any] = {}
+        parse(f"{first} == {first}").numbers(samples, at, windows)
+        shared = np.atleast_1d(parse(text).numbers(samples, at, windows))
+        alone = np.atleast_1d(parse(text).numbers(samples, at))
+        assert list(map(bits, shared.tolist())) == list(map(bits, alone.tolist()))
+
+
+def test_equal_windows_are_worked_out_once() -> None:
+    samples = {"f.x": Samples()}
+    samples["f.x"].extend(np.array([1, 2, 3]), np.array([1.0, 2.0, 6.0]))
+    windows: dict[str, Any] = {}
+    there = parse("mean(f.x over 9ns) < 4 and  mean(f.x  over 9ns) > 2")
+    assert there.numbers(samples, 3, windows) == 1
+    assert list(windows.values()) == [3.0]
+    assert parse("mean(f.x over 2ns)").numbers(samples, 3, windows) == 4
+    assert len(windows) == 2
+
+
 @settings(max_examples=100, deadline=None)
 @given(
     numbers | conditions, st.fixed_dictionaries({n: v | st.none() for n, (_, v) in TYPES.items()})

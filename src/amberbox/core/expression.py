@@ -150,14 +150,23 @@ class Expression:
         with _located(self.text):
             return self._value([_track(a, samples[a.name]) for a in self._reads], at_ns)
 
-    def numbers(self, samples: Mapping[str, Samples], at_ns: int | IntArray) -> Any:
-        """Return the same as numbers, bools as 0 and 1: NaN where it is unknown."""
+    def numbers(
+        self,
+        samples: Mapping[str, Samples],
+        at_ns: int | IntArray,
+        windows: dict[str, Any] | None = None,
+    ) -> Any:
+        """Return the same as numbers, bools as 0 and 1: NaN where it is unknown.
+
+        ``windows`` is filled with what windows give: expressions over the same samples at the
+        same instants work out each once if they share it.
+        """
         tracks = [_track(address, samples[address.name]) for address in self._reads]
         with _located(self.text):
             if np.ndim(at_ns) == 0:
-                value = self._at_instant(tracks, int(at_ns))
+                value = self._at_instant(tracks, int(at_ns), windows=windows)
                 return np.float64(np.nan if value is None else value)
-            values = self._at_instants(tracks, at_ns)
+            values = self._at_instants(tracks, at_ns, windows)
         return np.where(values.null, np.nan, values.data.astype(np.float64))
 
     def _value(self, tracks: list[Track], at_ns: int | IntArray) -> Any:
@@ -168,12 +177,21 @@ class Expression:
     def _tracks(self, series: Mapping[str, Series]) -> list[Track]:
         return [_track_of(address, series[address.name]) for address in self._reads]
 
-    def _at_instants(self, tracks: list[Track], at_ns: int | IntArray) -> Values:
+    def _at_instants(
+        self, tracks: list[Track], at_ns: int | IntArray, windows: dict[str, Any] | None = None
+    ) -> Values:
         series = {name: t.series() for name, t in zip(self._names, tracks, strict=True)}
-        return evaluate(self.tree, Instants(series, np.asarray(at_ns, np.int64)))
+        known = {} if windows is None else windows
+        return evaluate(self.tree, Instants(series, np.asarray(at_ns, np.int64), windows=known))
 
-    def _at_instant(self, tracks: list[Track], at_ns: int, has_time: bool = True) -> Value:
-        look = Look(at_ns, dict(zip(self._names, tracks, strict=True)), has_time)
+    def _at_instant(
+        self,
+        tracks: list[Track],
+        at_ns: int,
+        has_time: bool = True,
+        windows: dict[str, Any] | None = None,
+    ) -> Value:
+        look = Look(at_ns, dict(zip(self._names, tracks, strict=True)), has_time, windows)
         kinds = look.take(self._current)
         function = self._functions.get(kinds)
         if function is None:

@@ -61,6 +61,8 @@ class Instants:
     has_time: bool = True
     looked_up: dict[str, Values] = field(default_factory=dict)
     """Values of addresses at the instants, each found once."""
+    windows: dict[str, Values] = field(default_factory=dict)
+    """Values of windows at the instants, likewise; by what they say."""
 
     def __len__(self) -> int:
         return len(self.times_ns)
@@ -190,6 +192,13 @@ def _age(tree: Age, where: Instants) -> Values:
 
 def _window(tree: Window, where: Instants) -> Values:
     _require_time(tree, where)
+    found = where.windows.get(tree.saying)
+    if found is None:
+        found = where.windows[tree.saying] = _reduced(tree, where)
+    return found
+
+
+def _reduced(tree: Window, where: Instants) -> Values:
     if not len(where):
         return on.constant(None, 0)
     times_ns, values = _samples(tree, where)

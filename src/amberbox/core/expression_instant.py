@@ -73,10 +73,18 @@ class Track(NamedTuple):
 class Look:
     """What an expression looks at: an instant of time, and tracks by address."""
 
-    def __init__(self, at_ns: int, tracks: Mapping[str, Track], has_time: bool = True) -> None:
+    def __init__(
+        self,
+        at_ns: int,
+        tracks: Mapping[str, Track],
+        has_time: bool = True,
+        windows: dict[str, Any] | None = None,
+    ) -> None:
         self.at_ns = at_ns
         self.tracks = tracks
         self.has_time = has_time
+        self.windows = {} if windows is None else windows
+        """Values of windows at the instant, each worked out once; by what they say."""
         self.values: dict[str, Any] = {}
 
     @cached_property
@@ -231,6 +239,11 @@ def _age(tree: Age, kinds: Kinds) -> tuple[At, Kind]:
 def _window(tree: Window, kinds: Kinds) -> tuple[At, Kind]:
     def window(look: Look) -> Any:
         _require_time(tree, look)
+        if tree.saying not in look.windows:
+            look.windows[tree.saying] = worked_out(look)
+        return look.windows[tree.saying]
+
+    def worked_out(look: Look) -> Any:
         clock = None if tree.is_nested else _one_clock([look.tracks[name] for name in tree.reads])
         if clock is None:
             return value_of(tree, look.whole).scalar(0)

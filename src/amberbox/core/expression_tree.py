@@ -113,6 +113,11 @@ class Window(Tree):
         """Whether what is below looks back in time itself."""
         return needs_history(self.inner)
 
+    @cached_property
+    def saying(self) -> str:
+        """What it says, wherever it stands: the same for windows that are the same."""
+        return _saying(self)
+
 
 @dataclass(frozen=True)
 class Held(Tree):
@@ -199,6 +204,16 @@ def delays_ns(tree: Tree) -> frozenset[int]:
 def needs_history(tree: Tree) -> bool:
     """Tell whether a tree cannot be judged from the values of one instant."""
     return any(isinstance(part, Window | Held | Age) for part in walk(tree))
+
+
+def _saying(value: object) -> str:
+    """Return a part as text, without its place."""
+    if isinstance(value, tuple):
+        return f"({','.join(map(_saying, value))})"
+    if not isinstance(value, Tree):
+        return repr(value)
+    parts = (getattr(value, one.name) for one in dataclasses.fields(value) if one.name != "at")
+    return f"{type(value).__name__}({','.join(map(_saying, parts))})"
 
 
 def addresses_of(tree: Tree) -> tuple[str, ...]:

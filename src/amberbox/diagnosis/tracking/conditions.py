@@ -139,7 +139,7 @@ class Condition:
         if self._stays(fresh):
             return
         states = np.full(len(instants), 2)
-        states[fresh] = self._codes(instants[fresh])
+        states[fresh] = self._codes(instants[fresh], known)
         self._looked_ns = int(instants[-1])
         before = _STATES.index(self.state)
         changed = np.flatnonzero(states != np.concatenate([[before], states[:-1]]))
@@ -155,22 +155,23 @@ class Condition:
         newest = (int(s.times_ns[-1]) for s in self._samples.values() if len(s))
         return max(newest, default=0) <= self._looked_ns
 
-    def _codes(self, instants: IntArray) -> Any:
+    def _codes(self, instants: IntArray, known: Fresh) -> Any:
         """Return the places in ``_STATES`` at instants."""
         if len(instants) > _FEW:
             try:
-                numbers = self._expression.numbers(self._samples, instants)
+                windows = known.windows(instants.tobytes())
+                numbers = self._expression.numbers(self._samples, instants, windows)
             except _WRONG:
                 pass  # one by one shows at which instants
             else:
                 self.trouble = ""
                 return np.where(np.isnan(numbers), 2, (numbers != 0).astype(np.int64))
-        return [self._code(now) for now in instants.tolist()]
+        return [self._code(now, known.windows(now)) for now in instants.tolist()]
 
-    def _code(self, now: int) -> int:
+    def _code(self, now: int, windows: dict[str, Any]) -> int:
         """Evaluate at an instant; a value of a wrong type makes it unknown."""
         try:
-            value = self._expression.numbers(self._samples, now)
+            value = self._expression.numbers(self._samples, now, windows)
         except _WRONG as error:
             self.trouble = str(error)
             return 2
@@ -192,12 +193,20 @@ class Condition:
 
 
 class Fresh:
-    """Where samples are fresh enough to count, worked out once for all that share their times."""
+    """What conditions share at some instants: each part of it is worked out once.
+
+    It is where samples are fresh enough to count, and what windows give.
+    """
 
     def __init__(self, instants: IntArray) -> None:
         self._instants = instants
         self._always = np.ones(len(instants), bool)
         self._of: dict[str, Any] = {}
+        self._windows: dict[int | bytes, dict[str, Any]] = {}
+
+    def windows(self, instants: int | bytes) -> dict[str, Any]:
+        """Return what windows give at an instant, or at some; whoever works one out adds it."""
+        return self._windows.setdefault(instants, {})
 
     def all_of(self, wanted: Mapping[str, Samples]) -> Any:
         """Return at which instants all samples are fresh; they are named by what times them."""
