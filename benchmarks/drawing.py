@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 from amberbox.fleet.drawing.graph import Component, Edge, dependency_graph
 from amberbox.fleet.drawing.layers import Box, layered
+from amberbox.fleet.pages.drawingwords import drawing_words
 from benchmarks.common import Row, cpu_s
 
 NODES = 500
@@ -21,7 +22,9 @@ def measure() -> list[Row]:
     rows = [_row(f"layout, {kind}", boxes, links) for kind, links in graphs.items()]
     components = [Component(box.id, f"component {box.id}", "error") for box in boxes]
     edges = [Edge(start, end) for start, end in _wide()]
-    seconds = cpu_s(lambda: str(dependency_graph(components, edges, label="all")))
+    seconds = cpu_s(
+        lambda: str(dependency_graph(components, edges, label="all", words=drawing_words()))
+    )
     return [*rows, Row("layout and SVG, wide", seconds * 1e3, "ms")]
 
 

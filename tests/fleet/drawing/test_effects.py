@@ -9,6 +9,7 @@ import pytest
 
 from amberbox.fleet.drawing.effects import Edge, Effects, Node, effect_graph, effects_of
 from tests.fleet.drawing.parsed import HOSTILE, frames, of_class, overlapping, parsed, texts
+from tests.fleet.drawing.said import WORDS
 
 GRAPH: dict[str, Any] = {
     "nodes": [
@@ -37,7 +38,7 @@ GRAPH: dict[str, Any] = {
 
 
 def _drawn(*chosen: str) -> ElementTree.Element:
-    return parsed(effect_graph(effects_of(GRAPH), label="Why", chosen=chosen))
+    return parsed(effect_graph(effects_of(GRAPH), label="Why", chosen=chosen, words=WORDS))
 
 
 def test_json_of_an_explanation_is_drawn_whole() -> None:
@@ -103,7 +104,7 @@ def test_what_is_missing_is_dashed_and_counted() -> None:
 def test_long_text_is_broken_into_lines() -> None:
     """Write three lines rather than one and an ellipsis."""
     node = Node("cause:x", "cause", "the plug of the front laser has come loose on the way")
-    tree = parsed(effect_graph(Effects((node,), ()), label="x"))
+    tree = parsed(effect_graph(Effects((node,), ()), label="x", words=WORDS))
     assert " ".join(part.text or "" for part in of_class(tree, "name")) == node.text
 
 
@@ -115,7 +116,10 @@ def test_hostile_texts_are_text(hostile: str) -> None:
         Node("symptom:x", "symptom", hostile, hostile, "unknown", href="/x"),
     )
     drawn = effect_graph(
-        Effects(nodes, (Edge(nodes[0].id, nodes[1].id),)), label=hostile, chosen=[hostile]
+        Effects(nodes, (Edge(nodes[0].id, nodes[1].id),)),
+        label=hostile,
+        chosen=[hostile],
+        words=WORDS,
     )
     assert {part.tag.rpartition("}")[2] for part in parsed(drawn).iter()} <= {
         "svg", "g", "a", "title", "rect", "path", "text",
@@ -125,7 +129,9 @@ def test_hostile_texts_are_text(hostile: str) -> None:
 def test_links_and_states_come_along() -> None:
     """Link a node, show a symptom that nobody knows."""
     effects = effects_of(GRAPH, {"symptom:scans": "/robots/r/data?from=1"})
-    linked = [link.get("href") for link in parsed(effect_graph(effects, label="x")).iter()]
+    linked = [
+        link.get("href") for link in parsed(effect_graph(effects, label="x", words=WORDS)).iter()
+    ]
     assert "/robots/r/data?from=1" in linked
     node = Node("symptom:x", "symptom", "x", state="unknown")
-    assert "not known" in texts(parsed(effect_graph(Effects((node,), ()), label="x")))
+    assert "not known" in texts(parsed(effect_graph(Effects((node,), ()), label="x", words=WORDS)))

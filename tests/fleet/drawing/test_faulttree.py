@@ -29,6 +29,7 @@ from amberbox.fleet.drawing.faulttree import fault_tree
 from amberbox.fleet.drawing.numbers import chance
 from amberbox.fleet.drawing.tidy import GATE, LEAF, ROW, TRUNK, elbow, tidy
 from tests.fleet.drawing.parsed import HOSTILE, Frame, of_class, overlapping, parsed, texts, titles
+from tests.fleet.drawing.said import WORDS
 
 TREE = Tree(
     "stranded",
@@ -46,7 +47,7 @@ TREE = Tree(
 
 
 def _drawn(*cut_set: str, tree: Tree = TREE, depth: int = 9) -> ElementTree.Element:
-    return parsed(fault_tree(tree, label="Stranded", cut_set=cut_set, depth=depth))
+    return parsed(fault_tree(tree, label="Stranded", cut_set=cut_set, depth=depth, words=WORDS))
 
 
 def _ids(tree: ElementTree.Element, kind: str) -> list[str]:
@@ -254,5 +255,5 @@ def test_tree_of_a_real_robot_is_drawn() -> None:
     assert fmea is not None
     for effect in effects(fmea):
         tree = tree_of(fault_tree_of(fmea, effect))
-        drawn = parsed(fault_tree(tree, label=effect))
+        drawn = parsed(fault_tree(tree, label=effect, words=WORDS))
         assert len(set(_ids(drawn, "gate"))) == len(_ids(drawn, "gate"))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from xml.etree import ElementTree
 
 import pytest
@@ -10,7 +11,6 @@ from hypothesis import strategies as some
 
 from amberbox.fleet.drawing.collapse import bridges, kept
 from amberbox.fleet.drawing.graph import Component, Edge, dependency_graph
-from amberbox.fleet.drawing.words import Words
 from tests.fleet.drawing.parsed import (
     HOSTILE,
     frames,
@@ -21,6 +21,7 @@ from tests.fleet.drawing.parsed import (
     texts,
     titles,
 )
+from tests.fleet.drawing.said import WORDS
 
 LASER = Component("laser", "front laser", "error", "silent", "no scans", "/laser", root=True)
 NAVIGATION = Component("navigation", "navigation", "stale")
@@ -30,7 +31,7 @@ NEEDS = (Edge("navigation", "laser"), Edge("navigation", "wifi"), Edge("laser", 
 
 
 def _drawn() -> ElementTree.Element:
-    return parsed(dependency_graph(ROBOT, NEEDS, label="What ropod_001 needs"))
+    return parsed(dependency_graph(ROBOT, NEEDS, label="What ropod_001 needs", words=WORDS))
 
 
 def test_every_node_and_edge_stands_once() -> None:
@@ -55,7 +56,9 @@ def test_level_is_sign_word_and_class() -> None:
 def test_signs_differ_by_shape() -> None:
     """Draw another outline or sign for each level."""
     levels = ("ok", "warn", "error", "stale", "unknown")
-    tree = parsed(dependency_graph([Component(x, x, x) for x in levels], (), label="x"))
+    tree = parsed(
+        dependency_graph([Component(x, x, x) for x in levels], (), label="x", words=WORDS)
+    )
     signs = {tuple(part.get("d") for part in icon) for icon in of_class(tree, "icon")}
     assert len(signs) == len(levels)
 
@@ -82,14 +85,14 @@ def test_legend_explains_the_lines_there_are() -> None:
 def test_both_ways_are_no_circle() -> None:
     """Take no offence at parts that are needed by the whole."""
     edges = (Edge("base", "wheel"), Edge("wheel", "base", "part of"))
-    tree = parsed(dependency_graph((), edges, label="x"))
+    tree = parsed(dependency_graph((), edges, label="x", words=WORDS))
     assert not of_class(tree, "broken")
     assert len(of_class(tree, "edge")) == 2
 
 
 def test_circle_is_marked() -> None:
     """Say which need closes a circle."""
-    tree = parsed(dependency_graph((), (Edge("a", "b"), Edge("b", "a")), label="x"))
+    tree = parsed(dependency_graph((), (Edge("a", "b"), Edge("b", "a")), label="x", words=WORDS))
     assert len(of_class(tree, "edge")) == 2
     assert len(of_class(of_class(tree, "edge")[0], "line")) == 1
     assert "b needs a (closes a circle)" in titles(tree)
@@ -99,7 +102,7 @@ def test_much_that_is_fine_is_counted() -> None:
     """Draw what is wrong and what is near to it, count the rest, keep the way between."""
     chain = [Component(f"c{n}", f"c{n}", "error" if n in (0, 99) else "ok") for n in range(100)]
     edges = [Edge(f"c{n}", f"c{n + 1}") for n in range(99)]
-    tree = parsed(dependency_graph(chain, edges, label="x", most=10, more_href="/all"))
+    tree = parsed(dependency_graph(chain, edges, label="x", most=10, more_href="/all", words=WORDS))
     drawn = [node for node in of_class(tree, "node") if node.get("data-id")]
     assert len(drawn) == 10
     assert "+90 fine" in texts(tree)
@@ -112,7 +115,7 @@ def test_much_that_is_fine_is_counted() -> None:
 def test_all_that_is_wrong_is_drawn() -> None:
     """Never leave out what is not fine."""
     broken = [Component(f"c{n}", f"c{n}", "error") for n in range(80)]
-    tree = parsed(dependency_graph(broken, (), label="x", most=60))
+    tree = parsed(dependency_graph(broken, (), label="x", most=60, words=WORDS))
     assert len(of_class(tree, "node")) == 80
 
 
@@ -122,7 +125,7 @@ def test_boxes_do_not_overlap(pairs: list[tuple[int, int]]) -> None:
     """Give each card room of its own, inside the drawing."""
     edges = [Edge(f"c{start}", f"c{end}") for start, end in pairs]
     components = [Component(f"c{n}", "x" * n, "ok") for n in range(16)]
-    drawing = parsed(dependency_graph(components, edges, label="x"))
+    drawing = parsed(dependency_graph(components, edges, label="x", words=WORDS))
     found = frames(drawing, "node")
     assert len(found) == 16
     assert not overlapping(found)
@@ -132,7 +135,9 @@ def test_boxes_do_not_overlap(pairs: list[tuple[int, int]]) -> None:
 def test_hostile_names_are_text(hostile: str) -> None:
     """Draw any name as text; elements are only our own."""
     component = Component(hostile, hostile, hostile, hostile, hostile, root=True)
-    tree = parsed(dependency_graph([component], [Edge(hostile, hostile + "2")], label=hostile))
+    tree = parsed(
+        dependency_graph([component], [Edge(hostile, hostile + "2")], label=hostile, words=WORDS)
+    )
     assert {part.tag.rpartition("}")[2] for part in tree.iter()} <= {
         "svg", "g", "title", "rect", "path", "text",
     }  # fmt: skip
@@ -141,7 +146,7 @@ def test_hostile_names_are_text(hostile: str) -> None:
 
 def test_words_come_from_the_caller() -> None:
     """Speak the words of a catalogue."""
-    words = Words(error="kaputt", cause="Ursache", needs="braucht")
+    words = replace(WORDS, error="kaputt", cause="Ursache", needs="braucht")
     said = shown(parsed(dependency_graph(ROBOT, NEEDS, label="x", words=words)))
     assert "kaputt" in said
     assert "Ursache" in said
@@ -150,7 +155,7 @@ def test_words_come_from_the_caller() -> None:
 
 def test_same_data_same_drawing() -> None:
     """Draw the same thing the same way, with its name."""
-    one, two = (dependency_graph(ROBOT, NEEDS, label="Needs") for _ in range(2))
+    one, two = (dependency_graph(ROBOT, NEEDS, label="Needs", words=WORDS) for _ in range(2))
     assert str(one) == str(two)
     assert one.get("aria-label") == "Needs"
 

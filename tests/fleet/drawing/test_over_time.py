@@ -11,6 +11,7 @@ from amberbox.fleet.drawing import timeline as lanes_
 from amberbox.fleet.drawing.axis import Axis
 from amberbox.fleet.drawing.timeline import Lane, Marker, Stretch, Tick, timeline
 from tests.fleet.drawing.parsed import HOSTILE, of_class, parsed, shown, texts, titles
+from tests.fleet.drawing.said import WORDS
 
 START = 1799998995000000000
 SECOND = 1_000_000_000
@@ -28,7 +29,7 @@ LASER = Lane(
 
 
 def _drawn(*lanes: Lane, **more: object) -> ElementTree.Element:
-    return parsed(timeline(lanes or (LASER,), AXIS, label="States", **more))  # type: ignore[arg-type]  # forwarded as they are
+    return parsed(timeline(lanes or (LASER,), AXIS, label="States", words=WORDS, **more))  # type: ignore[arg-type]  # forwarded as they are
 
 
 def _bar(tree: ElementTree.Element, level: str) -> ElementTree.Element:
@@ -108,9 +109,9 @@ def test_ids_begin_with_the_name() -> None:
 
 def test_swatches_show_every_look() -> None:
     """Give legends a sample with its word."""
-    drawn = [parsed(lanes_.swatch(level, name="s")) for level in lanes_.ORDER]
+    drawn = [parsed(lanes_.swatch(level, name="s", words=WORDS)) for level in lanes_.ORDER]
     assert len({tree.get("aria-label") for tree in drawn}) == len(lanes_.ORDER)
-    kinds = [parsed(covering.swatch(kind, name="s")) for kind in covering.KINDS]
+    kinds = [parsed(covering.swatch(kind, name="s", words=WORDS)) for kind in covering.KINDS]
     assert len({tree.get("aria-label") for tree in kinds}) == len(covering.KINDS)
 
 
@@ -135,7 +136,7 @@ def test_coverage_is_told_apart_without_colours() -> None:
         covering.Stretch(START + n * 9 * SECOND, START + (n + 1) * 9 * SECOND, kind, "why")
         for n, kind in enumerate(covering.KINDS)
     ]
-    drawing = covering.coverage(spans, AXIS, label="What is there", name="c")
+    drawing = covering.coverage(spans, AXIS, label="What is there", name="c", words=WORDS)
     tree = parsed(drawing)
     looks = {(bar.get("fill"), bar.get("y")) for bar in of_class(tree, "bar")}
     assert len(looks) == len(covering.KINDS)
@@ -147,4 +148,4 @@ def test_coverage_is_told_apart_without_colours() -> None:
 def test_coverage_outside_is_left_out() -> None:
     """Draw what lies on the axis only."""
     spans = [covering.Stretch(START - 9, START - 5, "recorded")]
-    assert not of_class(parsed(covering.coverage(spans, AXIS, label="x")), "stretch")
+    assert not of_class(parsed(covering.coverage(spans, AXIS, label="x", words=WORDS)), "stretch")

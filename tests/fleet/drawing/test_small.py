@@ -14,6 +14,7 @@ from amberbox.diagnosis.fmea.model import SEVERITIES
 from amberbox.fleet.drawing.matrix import Cell, Matrix, criticality_matrix, zone
 from amberbox.fleet.drawing.spark import spark
 from tests.fleet.drawing.parsed import HOSTILE, frames, of_class, overlapping, parsed, texts, titles
+from tests.fleet.drawing.said import WORDS
 
 ROWS = [level for level, _ in LEVELS]
 MATRIX = Matrix(
@@ -24,7 +25,7 @@ MATRIX = Matrix(
 
 def test_every_cell_is_drawn() -> None:
     """Draw a box for each pair, with its count, its words and its link."""
-    tree = parsed(criticality_matrix(MATRIX, label="How critical"))
+    tree = parsed(criticality_matrix(MATRIX, label="How critical", words=WORDS))
     cells = frames(tree, "cell")
     assert len(cells) == len(ROWS) * len(SEVERITIES)
     assert not overlapping(cells)
@@ -49,7 +50,7 @@ def test_zones_grow_towards_the_worst_corner() -> None:
 def test_hostile_labels_are_text(hostile: str) -> None:
     """Draw any label as text."""
     matrix = Matrix([hostile], [hostile], {(hostile, hostile): Cell(1)})
-    tree = parsed(criticality_matrix(matrix, label=hostile))
+    tree = parsed(criticality_matrix(matrix, label=hostile, words=WORDS))
     assert not {"script", "img"} & {part.tag.rpartition("}")[2] for part in tree.iter()}
 
 

@@ -9,7 +9,7 @@ from typing import Literal, TypeAlias
 from amberbox.fleet.drawing.axis import Axis
 from amberbox.fleet.drawing.marks import bars, dots, hatching
 from amberbox.fleet.drawing.svg import Element, Value, element, fluid, group, linked, title
-from amberbox.fleet.drawing.words import WORDS, Words
+from amberbox.fleet.drawing.words import Words
 
 BAR, STRIP = 14.0, 5.0
 """How high what was recorded is drawn, and the strip below it with incidents."""
@@ -33,7 +33,7 @@ class Stretch:
 
 def coverage(
     stretches: Sequence[Stretch], axis: Axis, *, label: str, name: str = "coverage",
-    words: Words = WORDS,
+    words: Words,
 ) -> Element:  # fmt: skip
     """Draw a bar; where nothing is drawn nothing is there.
 
@@ -46,7 +46,7 @@ def coverage(
     return fluid("coverage", BAR + STRIP + 2, label, (_patterns(name), ground, *parts))
 
 
-def swatch(kind: Kind, *, name: str, words: Words = WORDS) -> Element:
+def swatch(kind: Kind, *, name: str, words: Words) -> Element:
     """Return a sample of a kind for a legend; ``name`` begins its ids."""
     bar = _bar(kind, name, x=0, width=24)
     return element(

@@ -21,7 +21,7 @@ from amberbox.fleet.drawing.svg import (
     root,
     title,
 )  # fmt: skip
-from amberbox.fleet.drawing.words import WORDS, Words
+from amberbox.fleet.drawing.words import Words
 
 MARGIN = 14.0
 TOP = 24.0
@@ -92,7 +92,7 @@ def _state(node: Mapping[str, Any]) -> State:
 
 
 def effect_graph(
-    effects: Effects, *, label: str, chosen: Collection[str] = (), words: Words = WORDS
+    effects: Effects, *, label: str, chosen: Collection[str] = (), words: Words
 ) -> Element:
     """Draw causes on the left, what they cost in the middle, symptoms on the right.
 

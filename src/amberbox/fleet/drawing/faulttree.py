@@ -21,7 +21,7 @@ from amberbox.fleet.drawing.svg import (
     title,
 )  # fmt: skip
 from amberbox.fleet.drawing.tidy import GATE, LEAF, ROW, TRUNK, Item, Wire, elbow, tidy
-from amberbox.fleet.drawing.words import WORDS, Words
+from amberbox.fleet.drawing.words import Words
 
 MARGIN = 14.0
 BOX = 50.0
@@ -53,7 +53,7 @@ class _Scene:
 
 def fault_tree(
     tree: Tree, *, label: str, cut_set: Collection[str] = (), depth: int = 5, most: int = 150,
-    words: Words = WORDS,
+    words: Words,
 ) -> Element:  # fmt: skip
     """Draw a fault tree top down; the way of a cut set up to the top is highlighted.
 

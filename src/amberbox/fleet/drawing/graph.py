@@ -21,7 +21,7 @@ from amberbox.fleet.drawing.svg import (
     root,
     title,
 )  # fmt: skip
-from amberbox.fleet.drawing.words import WORDS, Words
+from amberbox.fleet.drawing.words import Words
 
 MARGIN = 14.0
 HIGH = 46.0
@@ -63,7 +63,7 @@ class Edge:
 
 def dependency_graph(
     components: Sequence[Component], edges: Sequence[Edge], *, label: str, most: int = 60,
-    more_href: str = "", down: bool = False, words: Words = WORDS,
+    more_href: str = "", down: bool = False, words: Words,
 ) -> Element:  # fmt: skip
     """Draw components and what they need, left to right or top down.
 

@@ -17,7 +17,7 @@ from amberbox.fleet.drawing.svg import (
     root,
     title,
 )  # fmt: skip
-from amberbox.fleet.drawing.words import WORDS, Words
+from amberbox.fleet.drawing.words import Words
 
 MARGIN = 4.0
 CELL = (66.0, 42.0)
@@ -47,7 +47,7 @@ class Matrix:
     cells: Mapping[tuple[str, str], Cell]
 
 
-def criticality_matrix(matrix: Matrix, *, label: str, words: Words = WORDS) -> Element:
+def criticality_matrix(matrix: Matrix, *, label: str, words: Words) -> Element:
     """Draw the matrix; a cell is the darker the worse and the more frequent it is."""
     left = _left(matrix, words)
     wide = left + len(matrix.columns) * (CELL[0] + APART)

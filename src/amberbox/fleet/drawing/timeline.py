@@ -19,7 +19,7 @@ from amberbox.fleet.drawing.svg import (
     linked,
     title,
 )  # fmt: skip
-from amberbox.fleet.drawing.words import WORDS, Words
+from amberbox.fleet.drawing.words import Words
 
 LEFT = 180.0
 """How wide the names are: the style sheet pads the drawing by as much, names stand left of 0."""
@@ -75,7 +75,7 @@ class Marker:
 
 def timeline(
     lanes: Sequence[Lane], axis: Axis, *, label: str, ticks: Sequence[Tick] = (),
-    markers: Sequence[Marker] = (), name: str = "timeline", words: Words = WORDS,
+    markers: Sequence[Marker] = (), name: str = "timeline", words: Words,
 ) -> Element:  # fmt: skip
     """Draw lanes of states over time, as wide as there is room.
 
@@ -95,7 +95,7 @@ def timeline(
     return fluid("timeline", high + 8, label, parts)
 
 
-def swatch(level: str, *, name: str, words: Words = WORDS) -> Element:
+def swatch(level: str, *, name: str, words: Words) -> Element:
     """Return a sample of a level (or ``gap``) for a legend; ``name`` begins its ids."""
     known = level if level in ORDER else "unknown"
     bar = _bar(known, name, 13, x=1, width=22)

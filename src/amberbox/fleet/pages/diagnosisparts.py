@@ -28,6 +28,7 @@ from amberbox.fleet.pages.diagnosiscard import (
     reason_of,
 )
 from amberbox.fleet.pages.diagnosislook import Look, answer_told, leading_faults, look
+from amberbox.fleet.pages.drawingwords import drawing_words
 from amberbox.fleet.pages.strings import catalogue
 from amberbox.fleet.services import Services
 
@@ -129,7 +130,10 @@ async def effects(asked: Asked) -> Values:
     texts = {node["id"]: node["text"] for node in graph["nodes"]}
     label = catalogue().text("diagnosis.details.effects.label", robot=asked.robot)
     return {
-        "answer": answer, "drawing": effect_graph(effects_of(graph, _links(answer)), label=label),
+        "answer": answer,
+        "drawing": effect_graph(
+            effects_of(graph, _links(answer)), label=label, words=drawing_words()
+        ),
         "rows": [
             {"start": texts[e["start"]], "end": texts[e["end"]], "missing": e["missing"]}
             for e in graph["edges"]

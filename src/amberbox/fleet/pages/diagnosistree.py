@@ -13,6 +13,7 @@ from amberbox.fleet.drawing.branches import Tree
 from amberbox.fleet.drawing.faulttree import fault_tree
 from amberbox.fleet.knowledge.asked import AskTrees
 from amberbox.fleet.pages.diagnosisparts import Asked, Values
+from amberbox.fleet.pages.drawingwords import drawing_words
 from amberbox.fleet.pages.strings import catalogue
 
 CUT_SETS = 20
@@ -42,7 +43,8 @@ async def tree(asked: Asked, effect: str) -> Values:
         "important": _important(found, texts),
         "sets": [[texts.get(name, name) for name in one] for one in found["cut_sets"][:CUT_SETS]],
         "drawing": fault_tree(
-            shown, label=label, depth=DEPTH, most=PLACES, cut_set=_happened(near)
+            shown, label=label, depth=DEPTH, most=PLACES, cut_set=_happened(near),
+            words=drawing_words(),
         ),
     }  # fmt: skip
 

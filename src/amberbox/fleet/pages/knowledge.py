@@ -19,6 +19,7 @@ from amberbox.fleet.api.folders import list_folders
 from amberbox.fleet.api.knowledge import read_fmea
 from amberbox.fleet.api.robots import list_cards
 from amberbox.fleet.drawing.matrix import criticality_matrix
+from amberbox.fleet.pages.drawingwords import drawing_words
 from amberbox.fleet.pages.page import Pages, render
 from amberbox.fleet.pages.sheet import (
     COLUMNS,
@@ -80,7 +81,8 @@ def _sheet(
         request, "knowledge_robot.html", robot=robot.id, problem=None, found=found, look=look,
         modes=chosen(modes, look), all=modes, severities=SEVERITIES, alike=_alike(found, modes),
         matrix=criticality_matrix(matrix_of(modes, look),
-                                  label=catalogue().text("knowledge.matrix.label")),
+                                  label=catalogue().text("knowledge.matrix.label"),
+                                  words=drawing_words()),
         rules=list(_rules(fleet, robot, who)), may_read=who.may("folder.read", robot),
     )  # fmt: skip
 

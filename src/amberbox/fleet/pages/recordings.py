@@ -15,8 +15,8 @@ from amberbox.fleet.api.fetches import list_fetches
 from amberbox.fleet.api.robots import list_cards, read_card
 from amberbox.fleet.data.journals import Recording
 from amberbox.fleet.drawing.coverage import KINDS, Stretch, coverage, swatch
-from amberbox.fleet.drawing.words import Words
 from amberbox.fleet.pages import figures
+from amberbox.fleet.pages.drawingwords import drawing_words
 from amberbox.fleet.pages.page import Pages, render
 from amberbox.fleet.pages.recordingcover import WINDOWS, Window, parts
 from amberbox.fleet.pages.recordinglook import Cover, Record, Retaining, cover, journals, record
@@ -167,7 +167,7 @@ def _total(lines: Sequence[Line]) -> Held:
 def _drawn(seen: Cover, robot: str, window: Window) -> Mapping[str, Any]:
     label = catalogue().text("recordings.cover.label", robot=robot)
     told = [_told(one) for one in seen.stretches]
-    bar = coverage(told, seen.axis, label=label, name=f"cover-{robot}", words=_coverage_words())
+    bar = coverage(told, seen.axis, label=label, name=f"cover-{robot}", words=drawing_words())
     recorded = any(one.kind == "recorded" for one in seen.stretches)
     return {"cover": seen, "bar": bar, "recorded": recorded, "window": window,
             "parts": parts(seen.stretches, _LISTED)}  # fmt: skip
@@ -183,13 +183,8 @@ def _utc(time_ns: int) -> str:
     return format_time(time_ns)[:16].replace("T", " ")
 
 
-def _coverage_words() -> Words:
-    return Words(**{kind: catalogue().text(f"recordings.kind.{kind}") for kind in KINDS})
-
-
 def _swatches() -> Sequence[tuple[str, Any]]:
-    words = _coverage_words()
-    return [(kind, swatch(kind, name=f"key-{kind}", words=words)) for kind in KINDS]
+    return [(kind, swatch(kind, name=f"key-{kind}", words=drawing_words())) for kind in KINDS]
 
 
 def _missions(found: Record, after: str) -> Mapping[str, Any]:

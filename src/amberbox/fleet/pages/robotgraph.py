@@ -4,18 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 
 from amberbox.fleet.drawing.graph import Component as Box
 from amberbox.fleet.drawing.graph import Edge, dependency_graph
 from amberbox.fleet.drawing.svg import Element
-from amberbox.fleet.drawing.words import Words
+from amberbox.fleet.pages.drawingwords import drawing_words
 from amberbox.fleet.pages.robottree import branch_id, is_root, level_of
-from amberbox.fleet.pages.strings import catalogue
 from amberbox.fleet.state.views import Component
-
-_LEVELS = ("ok", "warn", "error", "stale", "unknown")
-_WORDS = ("cause", "needs", "part_of", "indirect", "circle", "more_fine")
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,15 +23,6 @@ class Line:
     root: bool
     needs: Sequence[str]
     needed_by: Sequence[str]
-
-
-@lru_cache
-def words() -> Words:
-    """Return what drawings say, out of the catalogue."""
-    text = catalogue().text
-    levels = {name: text(f"common.level.{name}") for name in _LEVELS}
-    own = {name: text(f"robot.graph.{name}") for name in _WORDS}
-    return Words(**levels, **own, gap=text("robot.time.gap"))
 
 
 def edges(components: Sequence[Component]) -> list[Edge]:
@@ -56,7 +42,9 @@ def graph(components: Sequence[Component], label: str) -> Element | None:
     lines = edges(components)
     if not lines:
         return None
-    return dependency_graph([_box(one) for one in components], lines, label=label, words=words())
+    return dependency_graph(
+        [_box(one) for one in components], lines, label=label, words=drawing_words()
+    )
 
 
 def as_list(components: Sequence[Component]) -> list[Line]:

@@ -13,7 +13,7 @@ from amberbox.fleet.api.timelines import Lane, Stretch, Timeline
 from amberbox.fleet.drawing import timeline as drawing
 from amberbox.fleet.drawing.axis import Axis
 from amberbox.fleet.drawing.svg import Element
-from amberbox.fleet.pages.robotgraph import words
+from amberbox.fleet.pages.drawingwords import drawing_words
 from amberbox.fleet.pages.robottree import branch_id
 from amberbox.fleet.pages.strings import catalogue
 
@@ -68,7 +68,7 @@ def _drawn(robot: str, found: Timeline, lanes: Sequence[Lane], window: Window) -
     label = catalogue().text("robot.time.label", n=len(lanes))
     return drawing.timeline(
         [_lane(robot, lane) for lane in lanes], Axis(start, to), label=label, ticks=ticks,
-        name="states", words=words(),
+        name="states", words=drawing_words(),
     )  # fmt: skip
 
 
