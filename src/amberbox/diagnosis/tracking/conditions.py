@@ -22,7 +22,7 @@ FRESH_NS = 5 * NS
 _MARGIN_NS = NS
 _BLOCK_NS = 30 * NS
 """So much of the record is looked at together."""
-_FEW = 4
+_FEW = 2
 """Up to so many instants are evaluated one by one."""
 _FORGET_NS = 2 * NS
 _WRONG = (ExpressionError, ValueError, TypeError)
