@@ -1,0 +1,127 @@
+"""Try whether a new technician finds out what is broken: a minute, five clicks, and rightly.
+
+``python -m tools.tour`` runs the demonstration, breaks a robot in one way after the other, and
+goes through the real pages each time; clicks and seconds are from the server's access log.
+``--shots docs/tour`` takes the pictures of docs/tour.md on the way.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from amberbox.core.errors import AmberboxError
+from amberbox.demo.faults import OFFERS
+from tools.tour.colleague import Colleague
+from tools.tour.notes import Notes
+from tools.tour.shots import take
+from tools.tour.stage import Demonstration, demonstration
+from tools.tour.technician import find_out, opened
+from tools.tour.trail import Trail, trail_of
+from tools.tour.truth import truth_of
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser
+
+MOST_S, MOST_CLICKS = 60.0, 5
+FAULTS = (
+    "localisation_crash",
+    "laser_rear_motor_slow",
+    "wheel_front_left_bus_disconnected",
+)
+"""The last one is that of the pictures."""
+NUMBER, ROBOT = 2, "ropod_002"
+_WHO = "technician"
+_PORT = 8643
+_ARGUMENTS = ("--no-sandbox", "--disable-dev-shm-usage")
+
+
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """One time: what was broken, what was written down, what the log says of the way there."""
+
+    fault: str
+    notes: Notes
+    trail: Trail
+
+    def wrong(self) -> Iterator[str]:
+        """Yield what is not as it has to be."""
+        yield from truth_of(self.fault).wrong(self.notes)
+        if self.trail.seconds > MOST_S:
+            yield f"{self.trail.seconds:.1f} s are more than {MOST_S:.0f} s"
+        if self.trail.clicks > MOST_CLICKS:
+            yield f"{self.trail.clicks} clicks are more than {MOST_CLICKS}"
+
+    def row(self) -> str:
+        """Write a row of the table."""
+        causes = "; or: ".join(self.notes.causes)
+        cells = (
+            f"`{self.fault}`", f"{causes} ({self.notes.sure})", self.notes.why[0], self.notes.use,
+            self.notes.next, str(self.trail.clicks), f"{self.trail.seconds:.1f}",
+        )  # fmt: skip
+        return f"| {' | '.join(cells)} |"
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Try, and print a table; 1 if something took too long, too much, or was wrong."""
+    asked = _parser().parse_args(arguments)
+    try:
+        trials = _tried(asked.faults, asked.port, asked.shots)
+    except AmberboxError as error:
+        print(f"error: {error.what}\nhint: {error.hint}", file=sys.stderr)
+        return 1
+    print("\n| what was broken | cause | why | can it be used? | next step | clicks | seconds |")
+    print("|---|---|---|---|---|---|---|")
+    print("\n".join(trial.row() for trial in trials))
+    wrong = [f"{trial.fault}: {what}" for trial in trials for what in trial.wrong()]
+    print("\n".join(wrong), file=sys.stderr)
+    return 1 if wrong else 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="python -m tools.tour", description=__doc__)
+    parser.add_argument("--faults", nargs="+", choices=tuple(OFFERS), default=FAULTS)
+    parser.add_argument("--port", type=int, default=_PORT)
+    parser.add_argument("--shots", type=Path, help="folder for pictures of the last fault")
+    return parser
+
+
+def _tried(faults: Sequence[str], port: int, shots: Path | None) -> list[Trial]:
+    from playwright.sync_api import sync_playwright
+
+    with demonstration(port) as demo, sync_playwright() as playwright:
+        chromium = shutil.which("chromium") or shutil.which("chromium-browser")
+        browser = playwright.chromium.launch(executable_path=chromium, args=list(_ARGUMENTS))
+        colleague = Colleague.arrived(demo.links()["admin"])
+        trials = []
+        for fault in faults:
+            colleague.damage(ROBOT, fault)
+            trials.append(_tell(_try(browser, demo, fault)))
+            if fault == faults[-1] and shots is not None:
+                take(browser, demo, NUMBER, shots)
+            colleague.repair(ROBOT)
+        browser.close()
+        return trials
+
+
+def _try(browser: Browser, demo: Demonstration, fault: str) -> Trial:
+    """Find out once; the lines of the log from its beginning to its end are its way."""
+    link, before = demo.links()[_WHO], len(demo.log())
+    with opened(browser, link) as page:
+        notes = find_out(page, NUMBER)
+    return Trial(fault, notes, trail_of(demo.log()[before:], f"user:{_WHO}"))
+
+
+def _tell(trial: Trial) -> Trial:
+    print(f"{trial.fault}: {' > '.join(trial.trail.pages)}, {trial.trail.seconds:.1f} s\n"
+          f"{trial.notes}\n", flush=True)  # fmt: skip
+    return trial
+
+
+if __name__ == "__main__":
+    sys.exit(main())
