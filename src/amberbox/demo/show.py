@@ -57,6 +57,7 @@ def run(folder: Path, port: int, seconds: float | None) -> int:
     stage.prepare()
     show = Show(stage, seconds)
     try:
+        stage.begin()  # robots and server start together, and nearly take the same time
         starting.run(stage.data, Wanted(HOST, free), begun=show.begin, demo=stage)
     finally:
         stage.close()
@@ -75,7 +76,6 @@ class Show:
 
     def begin(self, start: Start) -> None:
         """Begin; the server answers by now."""
-        self.stage.begin()  # here, on the main thread: its children live as long as it does
         self._task = asyncio.get_running_loop().create_task(self._go_on(start.settings.public_url))
         self._task.add_done_callback(_end_if_broken)
 

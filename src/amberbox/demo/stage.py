@@ -64,7 +64,10 @@ class Stage:
             write_folder(place_of(robot, self._folder), line)
 
     def begin(self) -> None:
-        """Let the robots run; the server answers by now."""
+        """Let the robots run; they look for the server until it answers.
+
+        Call it on the main thread: its children live as long as it does.
+        """
         for robot in IDS:
             self._running[robot] = DemoRobot(place_of(robot, self._folder))
 

@@ -8,6 +8,7 @@ import logging
 import threading
 from collections import OrderedDict
 from collections.abc import Mapping
+from functools import partial
 from typing import Any, TypeAlias
 
 from sqlalchemy import select
@@ -91,8 +92,14 @@ class Explained:
         if task is None:
             task = asyncio.create_task(self._ask(key, answers, asker))
             self._asked[key] = task
-            task.add_done_callback(lambda _: self._asked.pop(key, None))
+            task.add_done_callback(partial(self._over, key))
         return await asyncio.shield(task)
+
+    def _over(self, key: Key, task: asyncio.Task[Answer]) -> None:
+        """Forget who worked on it; whoever waited, if still there, is told what went wrong."""
+        self._asked.pop(key, None)
+        if not task.cancelled():
+            task.exception()  # looked at, so that nobody complains when all have gone
 
     async def run(self) -> None:
         """Explain what stands, then what comes from robots, one after the other."""
