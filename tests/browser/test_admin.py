@@ -2,6 +2,8 @@
 
 from tests.browser.conftest import PageAs
 from tests.browser.expecting import expect
+from tests.browser.looks import axe, shot
+from tests.browser.site import Site
 
 
 def test_somebody_is_invited_and_chooses_a_password(page_as: PageAs) -> None:
@@ -54,6 +56,22 @@ def test_a_token_is_made_and_revoked(page_as: PageAs) -> None:
     page.get_by_role("button", name="Revoke").click()
     page.get_by_role("dialog").get_by_role("button", name="Yes").click()
     expect(page.get_by_text("You have no token.")).to_be_visible()
+
+
+def test_an_admin_revokes_a_token_of_somebody(page_as: PageAs, site: Site) -> None:
+    secret = site.token("operator", "read:status")
+    prefix = "_".join(secret.split("_")[:2])
+    page = page_as("admin")
+    page.goto("/admin/users")
+    row = page.locator("tr", has=page.locator("b", has_text="operator"))
+    row.get_by_text("Change", exact=True).click()
+    expect(row.get_by_text(prefix)).to_be_visible()
+    axe(page)
+    shot(page, "admin-tokens")
+    row.get_by_role("button", name="Revoke").click()
+    page.get_by_role("dialog").get_by_role("button", name="Yes").click()
+    expect(row.get_by_text(prefix)).to_have_count(0)
+    assert all(one["revoked"] for one in site.ask("/users/operator/tokens"))
 
 
 def test_a_setting_is_changed_and_mistakes_lose_nothing(page_as: PageAs) -> None:

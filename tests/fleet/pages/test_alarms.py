@@ -23,7 +23,8 @@ from amberbox.fleet.knowledge.notebook import Given, keep_answer
 from amberbox.fleet.notifying.tables import OUTBOX
 from amberbox.fleet.pages.alarmsearch import Look
 from amberbox.fleet.pages.alarmview import Item
-from amberbox.fleet.pages.alarmwords import Words, events, lasted, words_of
+from amberbox.fleet.pages.alarmwords import Words, events, words_of
+from amberbox.fleet.pages.figures import span
 from tests.fleet.house import START_NS, House, house
 from tests.fleet.knowledge import robot as sim
 
@@ -359,4 +360,4 @@ def test_history_in_words_the_newest_first(home: House) -> None:
     ("seconds", "text"), [(0, "0 s"), (59.9, "59 s"), (60, "1 min"), (7200, "2 h"), (200000, "2 d")]
 )
 def test_how_long_it_lasted(seconds: float, text: str) -> None:
-    assert lasted(seconds) == text
+    assert span(seconds) == text

@@ -131,6 +131,19 @@ def list_tokens(connection: Connection, user_id: int) -> list[Token]:
     return [_token(connection, row) for row in found]
 
 
+def working_tokens(connection: Connection, now_ns: int) -> dict[str, list[Token]]:
+    """Return everybody's tokens that work, by their owners' names, newest first."""
+    chosen = select(TOKENS, USERS.c.name.label("owner")).join(
+        USERS, USERS.c.user_id == TOKENS.c.user_id
+    )
+    working = chosen.where(TOKENS.c.revoked_ns.is_(None), TOKENS.c.expires_ns > now_ns)
+    ordered = working.order_by(TOKENS.c.created_ns.desc(), TOKENS.c.token_id)
+    found: dict[str, list[Token]] = {}
+    for row in connection.execute(ordered).mappings().all():
+        found.setdefault(row["owner"], []).append(_token(connection, row))
+    return found
+
+
 def revoke_token(connection: Connection, now_ns: int, user_id: int, token_id: str) -> bool:
     """Revoke a token of somebody, at once; False when there is none of that id that works."""
     chosen = update(TOKENS).where(TOKENS.c.token_id == token_id, TOKENS.c.user_id == user_id)

@@ -5,7 +5,9 @@ from __future__ import annotations
 from fastapi import Request, Response
 
 from amberbox.fleet.accounts.actions import Role
+from amberbox.fleet.accounts.tokens import working_tokens
 from amberbox.fleet.api.access import Fleet, Who
+from amberbox.fleet.api.forms import shown
 from amberbox.fleet.api.groups import list_groups
 from amberbox.fleet.api.robots import list_cards
 from amberbox.fleet.api.users import list_people
@@ -20,8 +22,10 @@ _MOST = 1000
 def show_people(request: Request, fleet: Fleet, who: Who) -> Response:
     """Show who may sign in."""
     people = list_people(fleet, "", _MOST)
-    return render(request, "admin_users.html", people=people, roles=list(Role),
-                  may=who.may("users.write"))  # fmt: skip
+    with fleet.database.reading() as connection:
+        tokens = working_tokens(connection, fleet.clock.wall_ns())
+    return render(request, "admin_users.html", people=people, roles=list(Role), tokens=tokens,
+                  rfc3339=shown, may=who.may("users.write"))  # fmt: skip
 
 
 @routes.get("/admin/teams", "users.read")

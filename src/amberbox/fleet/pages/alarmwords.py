@@ -13,13 +13,15 @@ from amberbox.fleet.api.alarmlines import AlarmLine, Happening
 from amberbox.fleet.knowledge import notebook
 from amberbox.fleet.knowledge.explained import Answer
 from amberbox.fleet.linkend.presence import presences
+from amberbox.fleet.pages import wording
 from amberbox.fleet.pages.diagnosiscard import card_of
+from amberbox.fleet.pages.figures import span
 from amberbox.fleet.pages.strings import catalogue
+from amberbox.fleet.pages.wording import capital
 from amberbox.fleet.services import Services
 
 _SHELVED = re.compile(r"until (\d{4}-\d\d-\d\dT[\d:]+Z): (.*)", re.DOTALL)
 _WORSE = re.compile(r"(\w+) -> (\w+)")
-_UNITS = (("d", 86_400), ("h", 3_600), ("min", 60), ("s", 1))
 _OVER = "over"
 _UNDESCRIBED = "not in the FMEA"
 _FAULT = re.compile(r"([^\s#()]+)#([^\s#()]+)")
@@ -39,7 +41,7 @@ class Words:
         facts = self.fleet.feed.state.cards.facts.known(robot, self.folders.get(robot, ""))
         for one in facts.components if facts else ():
             if one.id == component and one.name not in ("", component):
-                return _capital(one.name)
+                return capital(one.name)
         return readable(component)
 
     def what(self, line: AlarmLine) -> str:
@@ -100,20 +102,14 @@ def events(history: list[Happening], words: Words, line: AlarmLine) -> Iterator[
         yield Event(one.at, one.who, _what(one), text, until)
 
 
-def lasted(seconds: float) -> str:
-    """Write how long something lasted, in one unit."""
-    unit, size = next(((u, s) for u, s in _UNITS if seconds >= s), _UNITS[-1])
-    return catalogue().text(f"common.js.span.{unit}", n=int(seconds // size))
-
-
 def lasted_ns(from_ns: int, to_ns: int) -> str:
     """Write how long it is from one time to another."""
-    return lasted(max(0, to_ns - from_ns) / NS)
+    return span((to_ns - from_ns) / NS)
 
 
 def readable(name: str) -> str:
     """Write an id as people write a name: ``laser_front`` is "Laser front"."""
-    return _capital(name.replace("_", " ").strip()) or name
+    return capital(wording.readable(name)) or name
 
 
 def _told(answer: Answer) -> str:
@@ -149,7 +145,3 @@ def _said(one: Happening, words: Words, line: AlarmLine) -> tuple[str, str]:
     if one.what == "resolved" and not one.who:
         return one.text.removeprefix(_OVER).removeprefix(", "), ""
     return one.text, ""
-
-
-def _capital(text: str) -> str:
-    return text[:1].upper() + text[1:]

@@ -6,7 +6,6 @@ used, what to do next. Texts about the robot come from its own list of what can 
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal, TypeAlias
@@ -15,6 +14,7 @@ from urllib.parse import quote, urlencode
 from amberbox.core.clock import NS
 from amberbox.core.sureness import percent
 from amberbox.core.timetext import format_time
+from amberbox.fleet.pages.wording import capital, readable, sentence
 
 REASONS = 3
 """How many sentences say why."""
@@ -28,7 +28,6 @@ Sure: TypeAlias = Literal["", "likely", "possible", "cannot_tell_apart"]
 Kind: TypeAlias = Literal["fault", "false_alarm", "other"]
 Answer: TypeAlias = Mapping[str, Any]
 
-_SEVERITIES = ("warning", "urgent", "critical", "fatal")
 _UNKNOWN = "unknown#other"
 
 
@@ -127,8 +126,8 @@ def card_of(answer: Answer, until_ns: int | None = None) -> DiagnosisCard:
         _sure(causes, probability), percent(probability) if causes else "",
         tuple(reason_of(robot, one, until_ns) for one in seen[:REASONS]),
         max(0, len(seen) - REASONS),
-        told["use"]["severity"], _sentence(told["use"]["text"]),
-        tuple(lost["text"] for lost in told["use"]["lost"]), _sentence(told["use"]["careful"]),
+        told["use"]["severity"], sentence(told["use"]["text"]),
+        tuple(lost["text"] for lost in told["use"]["lost"]), sentence(told["use"]["careful"]),
         _told_next(told["next"], answer["next_tests"]),
         answers=answer.get("answers"), names=names_in(told), notes=tuple(answer.get("notes", ())),
     )  # fmt: skip
@@ -148,7 +147,7 @@ def plain_card_of(revision: Answer) -> DiagnosisCard:
     return DiagnosisCard(
         robot, revision["state"], revision["at"], revision["id"], revision["revision"], causes,
         _sure(causes, probability), percent(probability) if causes else "",
-        tuple(Reason(_sentence(_readable(name)), revision["at"],
+        tuple(Reason(sentence(readable(name.replace("/", " "))), revision["at"],
                      data_href(robot, (), revision["at_ns"])) for name in names[:REASONS]),
         max(0, len(names) - REASONS),
         next=_plain_next(revision["next_tests"]), complete=False,
@@ -179,12 +178,12 @@ def _told_causes(broken: Answer | None) -> Iterator[Cause]:
     for member in broken["members"] if broken else ():
         ids = [fault["id"] for fault in member["faults"]]
         comes_from = "; ".join(fault["cause"] for fault in member["faults"] if fault["cause"])
-        yield Cause(member["id"], _capital(member["text"]), percent(member["probability"]),
+        yield Cause(member["id"], capital(member["text"]), percent(member["probability"]),
                     _kind(ids), comes_from)  # fmt: skip
 
 
 def _plain_cause(ids: Sequence[str], probability: float | None) -> Cause:
-    text = " + ".join(_capital(_readable(name.replace("#", ": "))) for name in ids)
+    text = " + ".join(capital(readable(name.replace("#", ": ").replace("/", " "))) for name in ids)
     share = "" if probability is None else percent(probability)
     return Cause(" ".join(ids), text, share, _kind(ids))
 
@@ -207,7 +206,7 @@ def reason_of(robot: str, seen: Answer, until_ns: int | None = None) -> Reason:
     """Return what was seen, with a link to the data of its beginning."""
     onset_ns = seen["onset_ns"]
     return Reason(
-        _sentence(seen["text"]), None if onset_ns is None else format_time(onset_ns),
+        sentence(seen["text"]), None if onset_ns is None else format_time(onset_ns),
         data_href(robot, seen["measured_from"], onset_ns, until_ns),
     )  # fmt: skip
 
@@ -227,10 +226,10 @@ def choices_of(test: Answer, step: Answer | None = None) -> tuple[Choice, ...]:
 def _told_next(step: Answer, tests: Sequence[Answer]) -> Next:
     test = next((test for test in tests if test["id"] == step["test"]), None)
     return Next(
-        _sentence(step["text"]), step["test"], step["by"],
+        sentence(step["text"]), step["test"], step["by"],
         minutes(test["cost_s"]) if test else step["takes"], step["risk"],
         choices_of({}, step) if step["test"] else (),
-        tuple(_sentence(text) for text in step["remedies"]),
+        tuple(sentence(text) for text in step["remedies"]),
     )  # fmt: skip
 
 
@@ -238,7 +237,7 @@ def _plain_next(tests: Sequence[Answer]) -> Next | None:
     if not tests:
         return None
     test = tests[0]
-    return Next(_sentence(test["text"]), test["id"], test["role"], minutes(test["cost_s"]),
+    return Next(sentence(test["text"]), test["id"], test["role"], minutes(test["cost_s"]),
                 choices=choices_of(test))  # fmt: skip
 
 
@@ -255,18 +254,6 @@ def minutes(seconds: float) -> str:
     if seconds <= 45:
         return "½"
     return f"{max(1, round(seconds / 60))}"
-
-
-def _readable(name: str) -> str:
-    return re.sub(r"[_/\s]+", " ", name).strip()
-
-
-def _capital(text: str) -> str:
-    return text[:1].upper() + text[1:]
-
-
-def _sentence(text: str) -> str:
-    return _capital(text) + ("" if not text or text[-1] in ".!?" else ".")
 
 
 def _text(at_ns: int) -> str:

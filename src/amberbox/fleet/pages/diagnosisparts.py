@@ -30,6 +30,7 @@ from amberbox.fleet.pages.diagnosiscard import (
 from amberbox.fleet.pages.diagnosislook import Look, answer_told, leading_faults, look
 from amberbox.fleet.pages.drawingwords import drawing_words
 from amberbox.fleet.pages.strings import catalogue
+from amberbox.fleet.pages.wording import capital
 from amberbox.fleet.services import Services
 
 SHOWN = 50
@@ -175,7 +176,7 @@ def _candidates(answer: Answer) -> Iterator[Candidate]:
                 [_evidence(robot, seen, name) for name in entry.get(kind, ())] for kind in kinds
             )
             yield Candidate(
-                _capital(member["text"]), percent(member["probability"]),
+                capital(member["text"]), percent(member["probability"]),
                 place == 0 and bool(told["broken"]),
                 [fault["cause"] for fault in member["faults"] if fault["cause"]],
                 [fault["remedy"] for fault in member["faults"] if fault["remedy"]],
@@ -266,7 +267,3 @@ def _revisions(known: Known | None) -> list[Values]:
         }
         for one in reversed(shown)
     ]  # fmt: skip
-
-
-def _capital(text: str) -> str:
-    return text[:1].upper() + text[1:]

@@ -1,7 +1,10 @@
-"""Numbers as people read them: sizes, counts, shares."""
+"""Numbers as people read them: sizes, counts, shares, how long something lasts."""
 
 from __future__ import annotations
 
+from amberbox.fleet.pages.strings import catalogue
+
+_SPANS = (("d", 86_400), ("h", 3600), ("min", 60), ("s", 1))
 _UNITS = ("B", "kB", "MB", "GB", "TB", "PB")
 
 
@@ -21,7 +24,17 @@ def count(number: int) -> str:
 
 
 def percent(share: float) -> int:
-    """Return percent of a share; 0 and 100 are kept for none and all of it."""
+    """Return percent of a share of something that is counted; 0 and 100 are none and all of it.
+
+    How sure a diagnosis is stands in words of its own: ``core.sureness.percent``.
+    """
     if share <= 0 or share >= 1:
         return 0 if share <= 0 else 100
     return min(99, max(1, round(100 * share)))
+
+
+def span(seconds: float) -> str:
+    """Write how long something lasts, in one unit: ``5 min``."""
+    whole = max(0, int(seconds))
+    unit, size = next((one for one in _SPANS if whole >= one[1]), _SPANS[-1])
+    return catalogue().text(f"common.js.span.{unit}", n=whole // size)

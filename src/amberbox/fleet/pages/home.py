@@ -16,13 +16,14 @@ from amberbox.fleet.api.system import read_status as read_system
 from amberbox.fleet.pages.page import Pages, render
 from amberbox.fleet.services import Services
 from amberbox.fleet.state.views import Card
+from amberbox.monitoring.engine.outputs import SEVERITIES
 
 routes = Pages()
 
 Show = Literal["all", "trouble", "alarms", "offline"]
 Sort = Literal["worst", "name", "battery", "seen"]
 _LEVELS = ("error", "warn", "stale", "unknown", "ok")
-_SEVERITIES = ("fatal", "critical", "urgent", "warning", "")
+_SEVERITIES = (*reversed(SEVERITIES), "")
 _MOST = 10_000
 
 

@@ -23,7 +23,6 @@ from amberbox.fleet.pages.drawingwords import drawing_words
 from amberbox.fleet.pages.page import Pages, render
 from amberbox.fleet.pages.sheet import (
     COLUMNS,
-    SEVERITIES,
     Look,
     Mode,
     as_csv_rows,
@@ -79,7 +78,7 @@ def _sheet(
     modes = modes_of(found)
     return render(
         request, "knowledge_robot.html", robot=robot.id, problem=None, found=found, look=look,
-        modes=chosen(modes, look), all=modes, severities=SEVERITIES, alike=_alike(found, modes),
+        modes=chosen(modes, look), all=modes, alike=_alike(found, modes),
         matrix=criticality_matrix(matrix_of(modes, look),
                                   label=catalogue().text("knowledge.matrix.label"),
                                   words=drawing_words()),

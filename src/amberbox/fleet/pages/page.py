@@ -17,9 +17,10 @@ from amberbox import __version__
 from amberbox.core.timetext import format_time
 from amberbox.fleet.accounts.sessions import csrf_token
 from amberbox.fleet.api.access import Caller, Decorator, Open, Routes, caller_of, services_of
-from amberbox.fleet.pages import assets
+from amberbox.fleet.pages import assets, figures, wording
 from amberbox.fleet.pages.alarmcount import OpenCount, open_count
 from amberbox.fleet.pages.strings import catalogue, for_browser
+from amberbox.monitoring.engine.outputs import SEVERITIES
 
 TEMPLATES = Path(__file__).parent / "templates"
 THEMES = ("light", "dark")
@@ -66,8 +67,14 @@ def environment() -> Environment:
         loader=FileSystemLoader(TEMPLATES), autoescape=True, undefined=StrictUndefined,
         trim_blocks=True, lstrip_blocks=True,
     )  # fmt: skip
-    made.globals.update(t=catalogue().text, asset=assets.address, version=__version__)
-    made.filters["json"] = as_json
+    made.globals.update(
+        t=catalogue().text, asset=assets.address, version=__version__, severities=SEVERITIES
+    )
+    made.filters.update(
+        json=as_json, size=figures.size, count=figures.count, percent=figures.percent,
+        span=figures.span, capital=wording.capital, sentence=wording.sentence,
+        readable=wording.readable,
+    )  # fmt: skip
     made.globals["m"] = made.get_template("macros.html").module
     return made
 

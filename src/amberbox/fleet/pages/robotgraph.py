@@ -10,6 +10,7 @@ from amberbox.fleet.drawing.graph import Edge, dependency_graph
 from amberbox.fleet.drawing.svg import Element
 from amberbox.fleet.pages.drawingwords import drawing_words
 from amberbox.fleet.pages.robottree import branch_id, is_root, level_of
+from amberbox.fleet.pages.wording import readable
 from amberbox.fleet.state.views import Component
 
 
@@ -63,8 +64,8 @@ def as_list(components: Sequence[Component]) -> list[Line]:
 
 def _box(one: Component) -> Box:
     said = one.condition
-    state = said.state.replace("_", " ") if said and said.level != "ok" else ""
+    state = readable(said.state) if said and said.level != "ok" else ""
     return Box(
-        one.component, one.component.replace("_", " "), level_of(one), state,
+        one.component, readable(one.component), level_of(one), state,
         said.reason if said else "", f"#{branch_id(one.component)}", is_root(one),
     )  # fmt: skip

@@ -16,6 +16,7 @@ from amberbox.fleet.drawing.svg import Element
 from amberbox.fleet.pages.drawingwords import drawing_words
 from amberbox.fleet.pages.robottree import branch_id
 from amberbox.fleet.pages.strings import catalogue
+from amberbox.fleet.pages.wording import readable
 
 Window = Literal["1h", "6h", "24h"]
 WINDOWS: Mapping[Window, int] = {"1h": 3600 * NS, "6h": 6 * 3600 * NS, "24h": 24 * 3600 * NS}
@@ -88,12 +89,12 @@ def _lane(robot: str, lane: Lane) -> drawing.Lane:
         drawing.Stretch(_ns(one.from_), _ns(one.to), one.level, _said(one), _data(robot, one))
         for one in lane.stretches
     )
-    name = lane.component.replace("_", " ")
+    name = readable(lane.component)
     return drawing.Lane(lane.component, name, stretches, f"#{branch_id(lane.component)}")
 
 
 def _said(one: Stretch) -> str:
-    words_ = [one.reason or one.state.replace("_", " ")]
+    words_ = [one.reason or readable(one.state)]
     if one.changes:
         words_.append(catalogue().text("robot.time.changes", n=one.changes))
     return ", ".join(filter(None, words_))

@@ -8,6 +8,7 @@ from math import floor, isfinite, log10
 from typing import Literal
 from urllib.parse import quote
 
+from amberbox.fleet.pages.figures import span
 from amberbox.fleet.pages.strings import catalogue
 from amberbox.fleet.state.views import Component, Mode, Output, StatusTree
 
@@ -107,11 +108,7 @@ def unit(name: str) -> str:
 
 def span_text(seconds: float) -> str:
     """Write how long something lasts, as pages do: in one unit, at least 1 s."""
-    whole = max(1, int(seconds))
-    for name, size in (("d", 86_400), ("h", 3600), ("min", 60), ("s", 1)):
-        if whole >= size:
-            return catalogue().text(f"common.js.span.{name}", n=whole // size)
-    raise AssertionError("a second is the least")
+    return span(max(1, seconds))
 
 
 def _in_trouble(components: Sequence[Component]) -> Iterator[str]:

@@ -8,9 +8,9 @@ from typing import Any
 from urllib.parse import urlencode
 
 from amberbox.fleet.drawing.matrix import Cell, Matrix
+from amberbox.monitoring.engine.outputs import SEVERITIES
 
 OCCURRENCES = ("A frequent", "B probable", "C occasional", "D remote", "E extremely unlikely")
-SEVERITIES = ("warning", "urgent", "critical", "fatal")
 COLUMNS = ("Item", "Failure mode", "Severity", "S", "O", "D", "RPN", "Rate (1/h)", "Cm")
 """Columns by which one may sort; numbers go from the greatest."""
 _NUMBERS = ("S", "O", "D", "RPN", "Rate (1/h)", "Cm", "Probability")

@@ -1,7 +1,7 @@
 // The forms about an alarm while it changes: what one writes stays, and so does what one saw.
 
 import { all, one } from "./dom.js";
-import { refresh } from "./time.js";
+import { fieldStamp, refresh, rfc3339 } from "./time.js";
 
 const MORNING_H = 7;
 
@@ -17,8 +17,8 @@ export function start(act) {
 function fill(shelve) {
   const own = one("[data-own-time]", shelve);
   const radio = one('[data-until="own"]', shelve);
-  one('[data-until="tomorrow"]', shelve).value = tomorrow().toISOString();
-  if (own.value) radio.value = new Date(own.value).toISOString();
+  one('[data-until="tomorrow"]', shelve).value = rfc3339(tomorrow());
+  if (own.value) radio.value = fieldStamp(own.value);
   own.hidden = !radio.checked;
   own.required = radio.checked;
 }

@@ -7,6 +7,7 @@ import { all, one } from "./dom.js";
 import { listen } from "./feed.js";
 import { keep, piece, put } from "./pieces.js";
 import { t } from "./strings.js";
+import { fieldStamp, fieldText } from "./time.js";
 import * as view from "./view.js";
 
 const TYPING_MS = 250;
@@ -60,14 +61,7 @@ function markPeriod() {
   if (isOffered && !(from === "" && form.elements.from.value === "own")) form.elements.from.value = from;
   else form.elements.from.value = "own";
   one("#own-period").hidden = form.elements.from.value !== "own";
-  for (const input of all("[data-end]")) input.value = forField(view.get(input.dataset.end));
-}
-
-/** Write an instant as a field for date and time takes it, in the viewer's zone. */
-function forField(stamp) {
-  const at = new Date(stamp);
-  if (Number.isNaN(at.getTime())) return "";
-  return new Date(at.getTime() - at.getTimezoneOffset() * 60000).toISOString().slice(0, 16);
+  for (const input of all("[data-end]")) input.value = fieldText(Date.parse(view.get(input.dataset.end))).slice(0, 16);
 }
 
 function choosePeriod(value) {
@@ -85,7 +79,7 @@ function change({ target }) {
 
 function stampOf(end) {
   const { value } = one(`[data-end="${end}"]`);
-  return value ? new Date(value).toISOString() : null;
+  return fieldStamp(value) || null;
 }
 
 function type({ target }) {

@@ -4,6 +4,7 @@ import { one } from "./dom.js";
 import { keep } from "./diagnosiscard.js";
 import * as details from "./diagnosisdetails.js";
 import { listen } from "./feed.js";
+import { fieldStamp, fieldText } from "./time.js";
 import * as view from "./view.js";
 
 const page = one("#dx");
@@ -19,26 +20,20 @@ function part(name, more = []) {
   return `${base}/${name}${text ? `?${text}` : ""}`;
 }
 
-/** Write an instant as a field for date and time takes it, in the viewer's zone. @param {string} stamp */
-function forField(stamp) {
-  const at = new Date(stamp);
-  return new Date(at.getTime() - at.getTimezoneOffset() * 60000).toISOString().slice(0, 19);
-}
-
 /** Show the diagnosis as of another moment: the whole page is about that. */
 function chooseMoment(event) {
   event.preventDefault();
   const { value } = event.target.elements.at;
   const query = new URLSearchParams(location.search);
   for (const key of ["diagnosis", "at"]) query.delete(key);
-  if (value) query.set("at", new Date(value).toISOString());
+  if (value) query.set("at", fieldStamp(value));
   location.assign(`${base}?${query}`);
 }
 
 function startMoment() {
   const form = one("#dx-moment");
   const { at } = one("[name=at]", form).dataset;
-  if (at && !Number.isNaN(Date.parse(at))) form.elements.at.value = forField(at);
+  form.elements.at.value = fieldText(Date.parse(at));
   form.addEventListener("submit", chooseMoment);
 }
 

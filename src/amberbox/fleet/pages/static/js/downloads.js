@@ -5,7 +5,7 @@ import { all, el, one } from "./dom.js";
 import { listen } from "./feed.js";
 import { keep } from "./pieces.js";
 import { t } from "./strings.js";
-import { local } from "./time.js";
+import { fieldStamp, fieldText, local } from "./time.js";
 
 const MOST_ROBOTS = 5;
 const MOST_MISSIONS = 12;
@@ -19,10 +19,10 @@ function localise(field) {
   const exact = Date.parse(field.dataset.at ?? "");
   if (Number.isNaN(exact)) return;
   const ms = field.name === "to" ? Math.ceil(exact / 1000) * 1000 : exact; // nothing is cut off
-  field.value = new Date(ms - new Date(ms).getTimezoneOffset() * 60_000).toISOString().slice(0, 19);
+  field.value = fieldText(ms);
 }
 
-const utc = (field) => (field.value ? new Date(field.value).toISOString() : "");
+const utc = (field) => fieldStamp(field.value);
 const chosen = (name) => all(`input[name="${name}"]:checked`, form).map((box) => box.value);
 
 /** Return the chips that are pressed, and what was typed beside them. */

@@ -7,13 +7,14 @@ import { ask, clear, fail, toast } from "./ask.js";
 import { el } from "./dom.js";
 import { showOnce } from "./once.js";
 import { t } from "./strings.js";
+import { fieldStamp } from "./time.js";
 
 const READ = {
   int: (text) => (text === "" ? null : Number.parseInt(text, 10)),
   float: (text) => (text === "" ? null : Number.parseFloat(text)),
   list: (text) => text.split(/[\s,]+/).filter(Boolean),
   json: (text) => JSON.parse(text),
-  time: (text) => (text === "" ? "" : new Date(text).toISOString()), // of the viewer's zone
+  time: fieldStamp,
   text: (text) => text,
 };
 

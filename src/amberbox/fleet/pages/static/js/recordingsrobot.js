@@ -6,7 +6,7 @@ import { piece, put } from "./pieces.js";
 import { check } from "./recordingcheck.js";
 import { followStates } from "./recordingstate.js";
 import { t } from "./strings.js";
-import { nowMs } from "./time.js";
+import { fieldText, nowMs } from "./time.js";
 import * as view from "./view.js";
 
 const PARTS = ["missions", "incidents", "fetches", "journals"];
@@ -97,13 +97,8 @@ function prefill(details) {
   const ends = { from: nowMs() - WINDOW_MS, to: nowMs() };
   for (const [name, ms] of Object.entries(ends)) {
     const field = one(`input[type="datetime-local"][name="${name}"]`, details);
-    if (field && !field.value) field.value = field.defaultValue = local(ms);
+    if (field && !field.value) field.value = field.defaultValue = fieldText(ms);
   }
-}
-
-function local(ms) {
-  const zone = new Date(ms).getTimezoneOffset() * 60_000;
-  return new Date(ms - zone).toISOString().slice(0, 19);
 }
 
 async function offerItems(list) {

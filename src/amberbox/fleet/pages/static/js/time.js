@@ -16,6 +16,15 @@ export const nowMs = () => serverMs + performance.now() - loadedMs;
 /** Return a time as RFC 3339. @param {number} ms */
 export const rfc3339 = (ms) => new Date(ms).toISOString();
 
+/** Write a time for a field of the type datetime-local, in the viewer's zone. @param {number} ms */
+export function fieldText(ms) {
+  if (Number.isNaN(ms)) return "";
+  return new Date(ms - new Date(ms).getTimezoneOffset() * 60_000).toISOString().slice(0, 19);
+}
+
+/** Read such a field as RFC 3339; empty if it is. @param {string} text */
+export const fieldStamp = (text) => (text ? rfc3339(Date.parse(text)) : "");
+
 /** Return how long something lasts, in one unit: "5 min". @param {number} seconds */
 export function span(seconds) {
   const whole = Math.max(0, Math.floor(seconds));

@@ -1,6 +1,7 @@
 /** Times as people write them into addresses and fields. All times are seconds since 1970. */
 
 import { seconds } from "./plotdata.js";
+import { fieldText as fieldTextMs, rfc3339 } from "./time.js";
 
 const UNITS = { ns: 1e-9, us: 1e-6, ms: 1e-3, s: 1, m: 60, min: 60, h: 3600, d: 86400 };
 const PART = /(\d+(?:\.\d+)?)(ns|us|ms|min|s|m|h|d)/g;
@@ -30,13 +31,10 @@ function shifted(from, by) {
 }
 
 /** Write a time for an address or the API. @param {number} time */
-export const stamp = (time) => new Date(Math.round(time * 1000)).toISOString();
+export const stamp = (time) => rfc3339(Math.round(time * 1000));
 
 /** Write a time for a field of the type datetime-local, in the viewer's zone. @param {number} time */
-export function fieldText(time) {
-  const there = new Date(time * 1000);
-  return new Date(time * 1000 - there.getTimezoneOffset() * 60000).toISOString().slice(0, 19);
-}
+export const fieldText = (time) => fieldTextMs(time * 1000);
 
 /** Read such a field; null for an empty one. @param {string} text */
 export function fieldTime(text) {

@@ -1,0 +1,39 @@
+"""The catalogue holds what pages say, and nothing that no page says any more."""
+
+import re
+from collections.abc import Iterator
+
+from amberbox.fleet.pages.page import TEMPLATES
+from amberbox.fleet.pages.strings import catalogue
+
+PAGES = TEMPLATES.parent
+NAMED = re.compile(r"""["'`]([a-z][\w-]*(?:\.[\w-]+)+)["'`]""")
+"""A name of a text that stands in a source as it is."""
+BEGUN = re.compile(r"""["'`]([a-z][\w-]*\.[\w.-]*)(?:["'] ~|\$?\{)""")
+"""A name whose end is worked out: ``"alarms.tabs." ~ tab``, ``f"error.hint.{name}"``."""
+WHOLE = ("words.", "robot.time.windows.")
+"""Every word stands on the page of help; chips are put together of two names."""
+ONE_OR_MANY = ("alarms.acknowledged_one", "alarms.not_acknowledged_one")
+"""Names that modules put together from two ends."""
+
+
+def sources() -> Iterator[str]:
+    for pattern in ("*.py", "templates/*.html", "static/js/*.js"):
+        for path in sorted(PAGES.glob(pattern)):
+            yield path.read_text(encoding="utf-8")
+
+
+def asked(name: str) -> str:
+    """Return how sources ask for a text: in the browser without ``js``."""
+    return name.replace(".js.", ".", 1)
+
+
+def test_every_text_is_used() -> None:
+    code = "\n".join(sources())
+    named, heads = set(NAMED.findall(code)), tuple(set(BEGUN.findall(code)))
+    unused = {
+        name for name in catalogue().texts
+        if not {name, asked(name)} & {*named, *ONE_OR_MANY}
+        and not name.startswith((*heads, *WHOLE)) and not asked(name).startswith(heads)
+    }  # fmt: skip
+    assert unused == set()
