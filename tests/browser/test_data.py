@@ -5,13 +5,13 @@ from __future__ import annotations
 import re
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING
+from urllib.parse import urlsplit
 
 import pytest
 
 from tests.browser import hostile, record
 from tests.browser.conftest import PageAs
 from tests.browser.expecting import expect
-from tests.browser.looks import axe, no_sideways_scroll, shot
 from tests.browser.site import Site
 from tests.browser.watching import RESTART
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from playwright.sync_api import Page
 
 PATH = "/robots/ropod_001/data"
-VOLTS, SPEED, STATE = "battery.volts", "ros_ropod_odom.twist_linear_x", "ros_ropod_drive.state"
+VOLTS, SPEED = "battery.volts", "ros_ropod_odom.twist_linear_x"
 PATIENCE_MS = 30_000
 _DRAWN = """(n) => {
     const cells = [...document.querySelectorAll(".plot-readout tbody tr td:nth-of-type(6)")];
@@ -47,17 +47,6 @@ def stamp(site: Site, minutes: float) -> str:
     return datetime.fromtimestamp(at_s, UTC).strftime("%Y-%m-%dT%H:%M:%S.%fZ")
 
 
-@pytest.mark.parametrize(("width", "theme"), [(390, "dark"), (1440, "light")])
-def test_variables_over_time(page_as: PageAs, width: int, theme: str) -> None:
-    page = page_as("technician", width=width, theme=theme)
-    open_data(page, VOLTS, SPEED, STATE)
-    expect(page.locator(".brush-recorded").first).to_be_attached()
-    expect(page.locator(".plot-panel")).to_have_count(3)
-    axe(page)
-    no_sideways_scroll(page)
-    shot(page, "data")
-
-
 def test_choosing_variables_by_keys_and_words(page_as: PageAs) -> None:
     page = page_as("viewer")
     open_data(page)
@@ -75,19 +64,15 @@ def test_choosing_variables_by_keys_and_words(page_as: PageAs) -> None:
     plot = page.get_by_role("combobox", name=f"Plot of {SPEED}")
     plot.select_option("1")
     expect(page.locator(".plot-panel")).to_have_count(1)
-    page.locator("#shown li").first.drag_to(page.locator(".data-window"))
+    plot.select_option(label="New plot")
+    expect(page.locator(".plot-panel")).to_have_count(2)
+    page.locator("#shown li").nth(1).drag_to(page.locator(".plot-panel").first)
+    expect(page.locator(".plot-panel")).to_have_count(1)
+    expect(page).to_have_url(re.compile("v=1%3A"))
     page.get_by_role("button", name=f"Take {VOLTS} away").first.click()
     expect(page).to_have_url(re.compile(rf"\?v={SPEED}$"))
     page.get_by_role("searchbox").fill("no such thing")
     expect(page.get_by_text("Nothing is called so")).to_be_visible()
-
-
-def test_a_variable_is_dropped_onto_a_plot(page_as: PageAs) -> None:
-    page = page_as("viewer")
-    open_data(page, VOLTS, SPEED)
-    page.locator("#shown li").nth(1).drag_to(page.locator(".plot-panel").first)
-    expect(page.locator(".plot-panel")).to_have_count(1)
-    expect(page).to_have_url(re.compile("v=1%3A"))
 
 
 def test_the_window_by_bar_fields_and_menu(page_as: PageAs, site: Site) -> None:
@@ -107,6 +92,30 @@ def test_the_window_by_bar_fields_and_menu(page_as: PageAs, site: Site) -> None:
     expect(begin).not_to_have_attribute(
         "aria-valuenow", str(round(site.now_ns / 1e9 - 36 * 60 - 6))
     )
+
+
+def test_few_questions_for_the_first_plot_and_all_around_it(page_as: PageAs) -> None:
+    page = page_as("technician")
+    asked: list[str] = []
+    page.on("request", lambda request: asked.append(request.url))
+    open_data(page, VOLTS)
+    expect(page.locator(".brush-recorded").first).to_be_attached()
+    expect(page.locator(".plot-lane").first).to_be_attached()
+    paths = [urlsplit(url).path.rpartition("/")[2] for url in asked]
+    assert len(paths) <= 15
+    for once in ("variables", "query", "coverage", "around", "statistics"):
+        assert paths.count(once) == 1
+    assert "alarm-count" not in paths
+    assert paths.index("query") < paths.index("coverage")
+
+
+def test_a_mission_that_is_not_there_is_said(page_as: PageAs) -> None:
+    page = page_as("viewer", expects=["404"])
+    open_data(page, VOLTS, mission="no-such-mission")
+    expect(page.locator("#data-problem")).to_contain_text("no such mission")
+    page.get_by_role("button", name="The newest 10 min").click()
+    expect(page).to_have_url(re.compile("from="))
+    assert "mission=" not in page.url
 
 
 def test_one_against_another_and_how_often(page_as: PageAs) -> None:

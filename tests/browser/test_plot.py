@@ -36,7 +36,6 @@ from tests.browser.site import Site
 if TYPE_CHECKING:
     from playwright.sync_api import Page, Route
 
-ALL_KINDS = ["alarm", "incident", "mission", "event"]
 INK_BETWEEN = """([from, to]) => {
     const canvas = document.querySelector(".plot-canvas canvas");
     const over = document.querySelector(".plot-canvas .u-over").getBoundingClientRect();
@@ -64,11 +63,8 @@ def at(site: Site, offset_ns: int) -> float:
     return (site.now_ns + offset_ns) / 1e9
 
 
-@pytest.mark.parametrize("width", [390, 1440])
-def test_a_spike_of_one_row_is_drawn_however_far_one_zooms_out(
-    page_as: PageAs, site: Site, width: int
-) -> None:
-    page = page_as("viewer", width)
+def test_a_spike_of_one_row_is_drawn_however_far_one_zooms_out(page_as: PageAs, site: Site) -> None:
+    page = page_as("viewer")
     open_plots(page, *hour(site), SPEED)
     for factor in (1, 24, 24 * 30):
         _, to = hour(site)
@@ -170,6 +166,21 @@ def test_gaps_are_hatched_and_say_why(page_as: PageAs, site: Site) -> None:
     expect(page.locator(".plot-key").first).to_contain_text("No values in this window")
 
 
+def test_gaps_that_cannot_be_had_are_asked_for_again(page_as: PageAs, site: Site) -> None:
+    page = page_as("viewer", expects=["503"])
+    page.route("**/data/around?*", lambda route: route.fulfill(status=503, json={}))
+    open_plots(page, *hour(site), SPEED)
+    legend = page.get_by_role("list", name="What is missing")
+    expect(legend).to_contain_text("cannot tell at the moment")
+    page.unroute("**/data/around?*")
+    from_s, to_s = hour(site)
+    page.evaluate("([from, to]) => stack.window(from, to)", [from_s - 60, to_s])
+    assert page.evaluate("() => stack.now().traces[0].sums") is None  # those were of another window
+    settle(page)
+    expect(legend).to_contain_text("lost or damaged")
+    expect(legend).not_to_contain_text("cannot tell")
+
+
 def test_names_of_values_bools_and_texts_are_steps_with_names(page_as: PageAs, site: Site) -> None:
     page = page_as("viewer")
     open_plots(page, at(site, -50 * 60 * 10**9), at(site, -45 * 60 * 10**9), STATE, ENABLED, REMARK)
@@ -183,13 +194,10 @@ def test_names_of_values_bools_and_texts_are_steps_with_names(page_as: PageAs, s
     assert drawn["enabled"]["high"] == 1
 
 
-@pytest.mark.parametrize(("width", "theme"), [(1440, "dark"), (390, "light")])
-def test_what_happened_stands_around_the_plots(
-    page_as: PageAs, site: Site, width: int, theme: str
-) -> None:
-    page = page_as("operator", width, theme)
+def test_what_happened_stands_around_the_plots(page_as: PageAs, site: Site) -> None:
+    page = page_as("operator", 390)
     open_plots(page, *hour(site), SPEED, VOLTS, CHARGE)
-    page.evaluate("(kinds) => stack.watch({robot: 'ropod_001', kinds, components: []})", ALL_KINDS)
+    page.evaluate("() => stack.watch('ropod_001')")
     settle(page)
     page.get_by_text(re.compile(r"What happened in this window \(\d+\)")).click()
     happened = page.locator(".plot-list")
@@ -210,7 +218,7 @@ def test_what_happened_stands_around_the_plots(
 def test_flags_keep_their_place_and_focus_while_plots_move(page_as: PageAs, site: Site) -> None:
     page = page_as("viewer")
     open_plots(page, *hour(site), SPEED)
-    page.evaluate("() => stack.watch({robot: 'ropod_001', kinds: ['incident']})")
+    page.evaluate("() => stack.watch('ropod_001')")
     settle(page)
     flag = page.get_by_role("button", name=re.compile("bumper pressed")).first
     flag.focus()
@@ -325,8 +333,6 @@ def test_one_against_the_other_and_how_often(page_as: PageAs, site: Site) -> Non
     counts = {name: int(table.get_by_role("row", name=name).get_by_role("cell").inner_text())
               for name in ("IDLE", "DRIVING", "BLOCKED")}  # fmt: skip
     assert counts == {"IDLE": 105, "DRIVING": 105, "BLOCKED": 90}
-    axe(page)
-    shot(page, "plots-xy")
 
 
 def test_an_older_answer_never_covers_a_newer_one(page_as: PageAs, site: Site) -> None:

@@ -7,7 +7,8 @@ from starlette.testclient import TestClient
 
 from amberbox.core.clock import NS
 from amberbox.core.timetext import format_time, parse_time
-from amberbox.fleet.pages import data
+from amberbox.fleet.asking.errors import BusyError
+from amberbox.fleet.pages import data, dataaround
 from amberbox.fleet.pages.datacoverage import Stretch, joined
 from amberbox.fleet.pages.diagnosiscard import DiagnosisCard, Reason, data_href
 from amberbox.testing.records import T0_NS
@@ -126,8 +127,62 @@ def test_a_note_is_put_where_it_belongs(home: House) -> None:
 
 def test_others_robots_are_not_there(home: House) -> None:
     nurse = home.client("nurse")
-    for path in ("", "/variables", "/coverage"):
+    for path in ("", "/variables", "/coverage", "/around?from=0&to=1"):
         assert nurse.get(f"/robots/ropod_003/data{path}").status_code == 404
+
+
+def test_one_question_tells_what_is_around_values(viewer: TestClient) -> None:
+    api = "/api/v1/robots/ropod_001"
+    span = {"from": format_time(T0_NS), "to": format_time(T0_NS + 100 * NS)}
+    found = viewer.get(f"{PAGE}/around", params={**span, "item": "odom"}).json()
+    assert sorted(found) == ["alarms", "gaps", "incidents", "missions", "refused", "timeline"]
+    assert found["refused"] == {}
+    for name in ("incidents", "missions"):
+        assert found[name] == viewer.get(f"{api}/{name}", params=span).json()
+    assert found["missions"]
+    lanes = viewer.get(f"{api}/timeline", params={**span, "points": 400}).json()
+    assert found["timeline"] == lanes
+    gaps = found["gaps"]
+    assert (gaps["from"], gaps["to"]) == (T0_NS / NS - 50, T0_NS / NS + 150)
+    wide = {"from": gaps["from"], "to": gaps["to"], "item": "odom"}
+    assert gaps["items"] == {"odom": viewer.get(f"{api}/gaps", params=wide).json()}
+
+
+def test_what_is_not_asked_for_is_not_told(viewer: TestClient) -> None:
+    span = {"from": "now-1h", "to": "now", "marks": "false"}
+    assert viewer.get(f"{PAGE}/around", params=span).json() == {"refused": {}}
+    assert viewer.get(f"{PAGE}/around", params={"from": "", "to": ""}).status_code == 400
+
+
+def test_a_part_that_is_refused_takes_no_other_with_it(
+    viewer: TestClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def busy(*_: object, **__: object) -> None:
+        raise BusyError("too many questions wait")
+
+    monkeypatch.setattr(dataaround, "list_gaps", busy)
+    span = {"from": "now-1h", "to": "now", "item": "odom"}
+    found = viewer.get(f"{PAGE}/around", params=span).json()
+    assert found["refused"] == {"gaps": "too many questions wait"}
+    assert "gaps" not in found
+    assert "timeline" in found
+
+
+def test_parts_that_somebody_may_not_see_are_left_out(home: House) -> None:
+    tokens = home.client("viewer").post(
+        "/api/v1/tokens", json={"name": "x", "scopes": ["read:data"]}
+    )
+    token = tokens.json()["token"]
+    found = (
+        home.client()
+        .get(
+            f"{PAGE}/around",
+            params={"from": "now-1h", "to": "now", "item": "odom"},
+            headers={"Authorization": f"Bearer {token}", "Accept": "application/json"},
+        )
+        .json()
+    )
+    assert sorted(found) == ["gaps", "incidents", "missions", "refused"]
 
 
 def _seconds(text: str) -> float:

@@ -1,14 +1,14 @@
 /** The data page: what the address says is shown, and what people do goes into the address. */
 
-import { ask, fail } from "./ask.js";
+import { ask, clear, fail } from "./ask.js";
 import { comparing } from "./comparison.js";
 import { askCoverage, lacks } from "./coverage.js";
 import { brush } from "./brush.js";
 import { read, tidy, write } from "./dataview.js";
-import { stage } from "./datastage.js";
+import { drawn, stage } from "./datastage.js";
 import { brought, one } from "./dom.js";
 import { listen } from "./feed.js";
-import { newestEnd, whole, windowOf } from "./datawindow.js";
+import { meaning, newestEnd, whole } from "./datawindow.js";
 import { goTo } from "./goto.js";
 import { marks } from "./marks.js";
 import { emptyStage, notes } from "./datanotes.js";
@@ -33,13 +33,13 @@ const now = () => nowMs() / 1000;
 
 const page = {
   look: read(), items: [], reach: { first: null, last: null }, cover: null, window: { from: now() - HOUR_S, to: now() },
-  missions: [], parts: {}, isEmpty: false, live: "off",
+  missions: [], parts: {}, isEmpty: false, live: "off", follows: 0,
 };
 
 start();
 
 function start() {
-  begin().catch((error) => fail(error, one(".data-main")));
+  begin().catch(refused);
 }
 
 async function begin() {
@@ -54,11 +54,16 @@ async function begin() {
   }
   build();
   if (page.look.named.length && matchMedia(NARROW).matches) one("#data-side").open = false;
-  await follow(read());
+  await again();
   view.on(again);
-  covered(await askCoverage(robot)); // behind the first plot
   setInterval(renewIfNewer, AGAIN_MS);
   setInterval(followed, FOLLOW_MS);
+  if (chosen().length && page.look.mode === "time") await drawn(one("#plots"));
+  covered(await askCoverage(robot));
+}
+
+function refused(error) {
+  fail(error, one("#data-problem"));
 }
 
 /** Make all parts; none of them shows anything yet. */
@@ -95,12 +100,14 @@ function firstOnes() {
   ];
 }
 
-/** Show what an address says. @param {import("./dataview.js").Look} look */
-async function follow(look) {
-  page.look = look;
+/** Show what an address says. @param {import("./dataview.js").Look} asked */
+async function follow(asked) {
+  const number = (page.follows += 1);
+  clear(one("#data-problem"));
+  const meant = await meaning(asked, path, times(), refused);
+  if (number !== page.follows) return; // something else is looked at meanwhile
+  const { look } = Object.assign(page, meant);
   if (!look.live) live(false, false);
-  page.missions = await Promise.all(look.compare.map((id) => ask(`${path}/missions/${encodeURIComponent(id)}`)));
-  page.window = await windowOf(look, path, times());
   const known = look.named.map((one) => ({ ...one, name: find(page.items, one.name)?.address ?? one.name }));
   const seen = new Set();
   look.named = tidy(known.filter((one) => !seen.has(one.name) && seen.add(one.name)));
@@ -116,7 +123,7 @@ function turn(changes) {
 
 /** Show what the address says now. */
 function again() {
-  return follow(read()).catch((error) => fail(error, one(".data-main")));
+  return follow(read()).catch(refused);
 }
 
 const chosen = () => page.look.named.map((one) => ({ ...one, variable: find(page.items, one.name) })).filter((one) => one.variable?.kind);
@@ -287,5 +294,5 @@ function covered(cover) {
 
 /** Ask anew what happened beside the values. */
 function rewatch() {
-  if (!page.look.compare.length) page.parts.stage.plots()?.watch({ robot, kinds: ["alarm", "incident", "mission"], components: [] });
+  if (!page.look.compare.length) page.parts.stage.plots()?.watch(robot);
 }

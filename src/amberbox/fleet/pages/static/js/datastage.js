@@ -20,8 +20,8 @@ import { nowMs, span } from "./time.js";
 import { droppedAddress, isVariable } from "./variables.js";
 import { xyView } from "./xy.js";
 
-const KINDS = ["alarm", "incident", "mission"];
 const CHECK_MS = 60;
+const PATIENCE_MS = 2000;
 
 /**
  * Make the stage inside an element.
@@ -49,6 +49,14 @@ export function stage(element, to) {
   return { show, plots: () => way?.stack ?? null };
 }
 
+/** Wait for the first plot: people look for it before the server is to do anything else. */
+export function drawn(element) {
+  return new Promise((done) => {
+    element.addEventListener("plotdrawn", done, { once: true });
+    setTimeout(done, PATIENCE_MS);
+  });
+}
+
 const WAYS = { time: overTime, xy: oneAgainstAnother, hist: howOften };
 
 /** What `plots` needs to know of a variable. @param {string} robot @param {Chosen} chosen */
@@ -61,7 +69,7 @@ function overTime(element, { robot, window, whole }, to) {
   let isOwn = false;
   const onWindow = (...moved) => isOwn || to.onWindow(...moved);
   const stack = plots(element, { ...window, whole, onWindow, onRemove: to.onRemove, onLive: to.onLive });
-  stack.watch({ robot, kinds: KINDS, components: [] });
+  stack.watch(robot);
   const placed = placing(stack);
   const end = new AbortController();
   element.addEventListener("plotdrawn", () => setTimeout(() => check(stack, to), CHECK_MS), { signal: end.signal });

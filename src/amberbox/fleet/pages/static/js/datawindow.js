@@ -8,13 +8,32 @@ const HOUR_S = 3600;
 const RECENT = 0.25;
 
 /**
+ * What an address means: its window and the missions it compares. Of a mission that cannot be had
+ * `refused` is told, and the newest hour takes its place.
+ * @param {import("./dataview.js").Look} look @param {string} path of the robot in the API
+ * @param {{now: number, last: ?number}} marks @param {function(Error): void} refused
+ */
+export async function meaning(look, path, marks, refused) {
+  try {
+    const missions = await Promise.all(look.compare.map((id) => ask(missionPath(path, id))));
+    return { look, missions, window: await windowOf(look, path, marks) };
+  } catch (error) {
+    refused(error);
+    const rest = { ...look, mission: "", compare: [] };
+    return { look: rest, missions: [], window: await windowOf(rest, path, marks) };
+  }
+}
+
+const missionPath = (path, id) => `${path}/missions/${encodeURIComponent(id)}`;
+
+/**
  * The window that an address means: a mission, two times, or the newest hour.
  * @param {import("./dataview.js").Look} look @param {string} path of the robot in the API
  * @param {{now: number, last: ?number}} marks
  */
-export async function windowOf({ from, to, mission, live }, path, marks) {
+async function windowOf({ from, to, mission, live }, path, marks) {
   if (mission && !from && !to) {
-    const [begin, end] = around(spanOf(await ask(`${path}/missions/${encodeURIComponent(mission)}`)));
+    const [begin, end] = around(spanOf(await ask(missionPath(path, mission))));
     return { from: begin, to: end };
   }
   const newest = live || from.startsWith("now") ? marks.now : newestEnd(HOUR_S, marks);

@@ -14,7 +14,7 @@ const ENDED = 4401;
 const FORBIDDEN = 4403;
 
 /** The one line of a page, whoever of its modules listens. */
-const line = { socket: null, number: null, tries: 0, heardMs: performance.now(), openedMs: 0, parts: [] };
+const line = { socket: null, number: null, tries: 0, isBack: false, heardMs: performance.now(), openedMs: 0, parts: [] };
 
 /**
  * Listen to robots (null: all) and kinds (null: all). Returns `on(kind, fn(data, robot))`, which
@@ -74,8 +74,9 @@ function hear(messages) {
   line.heardMs = performance.now();
   line.tries = 0;
   state("live");
-  const isNews = ({ kind }) => kind === "alarm" || (kind === "snapshot" && line.number !== null);
+  const isNews = ({ kind }) => kind === "alarm" || (kind === "snapshot" && line.isBack);
   if (messages.some(isNews)) dispatchEvent(new Event("alarmchange"));
+  line.isBack = false;
   for (const message of messages) {
     if (message.kind !== "live") line.number = message.number;
     for (const part of line.parts) hand(part, message);
@@ -98,6 +99,7 @@ function closed(code) {
   }
   const wait = PATIENCE_MS[Math.min(line.tries, PATIENCE_MS.length - 1)];
   line.tries += 1;
+  line.isBack = true; // what was missed meanwhile comes with a snapshot
   setTimeout(open, wait);
 }
 

@@ -33,10 +33,10 @@ import { EDGE, destroy, draw, fit, panel, point, scalesOf } from "./plotpanel.js
 import { frameOf, showAround } from "./plotframe.js";
 import { surroundings } from "./plotaround.js";
 import { traceOf } from "./plottrace.js";
+import { watchSize } from "./plotsize.js";
 import { isSame, remember, sane } from "./plotview.js";
 import { fill } from "./plottable.js";
 
-const NARROW_PX = 620;
 const SOFT_MS = 120;
 const SOFT_PAUSE_MS = 700;
 const MOST_POINTS = 5000;
@@ -56,7 +56,7 @@ export function plots(element, options) {
   Object.assign(stack, views(stack), pointers(stack), members(stack));
   stack.frame = frameOf(stack, element);
   stack.colours = { now: colours(stack.frame.root) };
-  stack.gaps = gapKeeper(() => stack.redraw());
+  stack.gaps = gapKeeper();
   stack.around = surroundings(stack);
   stack.live = following(stack);
   stack.loader = loader({
@@ -182,6 +182,7 @@ function views(stack) {
 
   function show(view, soft) {
     stack.view = view;
+    for (const trace of stack.traces.values()) trace.sums = null; // they were of another window
     stack.redraw();
     clearTimeout(stack.asking);
     stack.asking = soft ? setTimeout(settled, SOFT_MS) : 0;
@@ -292,18 +293,3 @@ function arrived(stack, trace) {
   drawAll(stack);
   stack.frame.root.dispatchEvent(new CustomEvent("plotdrawn", { bubbles: true, detail: { id: trace.id } }));
 }
-
-function watchSize(stack, signal) {
-  const look = () => {
-    const width = Math.floor(stack.frame.panels.clientWidth);
-    if (width === stack.width) return;
-    stack.width = width;
-    stack.narrow = width < NARROW_PX;
-    stack.redraw();
-  };
-  const watcher = new ResizeObserver(look);
-  watcher.observe(stack.frame.panels);
-  signal.addEventListener("abort", () => watcher.disconnect());
-  look();
-}
-

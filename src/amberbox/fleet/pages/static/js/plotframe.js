@@ -40,12 +40,14 @@ export function showAround(stack) {
       if (hole.to > stack.view.from && hole.from < stack.view.to) found.set(hole.kind, hole.reason);
     }
   }
-  holes.hidden = !found.size;
-  const key = [...found.keys()].sort().join();
+  const isUnsure = stack.around.isUnsure();
+  holes.hidden = !found.size && !isUnsure;
+  const key = [...found.keys(), isUnsure].sort().join();
   if (holes.dataset.shown === key) return;
   holes.dataset.shown = key;
   holes.replaceChildren(...KINDS.filter((kind) => found.has(kind)).map((kind) =>
-    el("li", {}, el("span", { class: `plot-hatch plot-hatch-${kind}`, "aria-hidden": "true" }), t(`plot.hole.${kind}`))));
+    el("li", {}, el("span", { class: `plot-hatch plot-hatch-${kind}`, "aria-hidden": "true" }), t(`plot.hole.${kind}`))),
+  ...(isUnsure ? [el("li", {}, icon("info"), t("plot.unsure"))] : []));
 }
 
 function tools(stack) {

@@ -4,8 +4,7 @@
  * @typedef {{from: number, to: number, kind: string, reason: string}} Hole seconds
  */
 
-import { ask } from "./ask.js";
-import { asked, seconds } from "./plotdata.js";
+import { seconds } from "./plotdata.js";
 
 /** The kinds, as the legend lists them. */
 export const KINDS = ["filtered", "lost", "deleted", "uncovered", "tocome"];
@@ -15,8 +14,6 @@ const WORDS = [
   ["filtered", /filter|unchanged|rate.?limit/i],
   ["lost", /lost|dropped|queue|damaged|torn|refused|corrupt|decode|columns/i],
 ];
-const LIMIT = 1000;
-const AROUND = 0.5;
 
 /** Sort a reason into its kind. @param {string} reason */
 export function kindOf(reason) {
@@ -24,41 +21,31 @@ export function kindOf(reason) {
 }
 
 /**
- * Ask for gaps of items as windows change; what was asked for a wider window is asked once.
- * `of(trace)` gives what is known, `want(traces, view)` asks, `changed` is called with news.
- * @param {function(): void} changed
+ * Keep the gaps of items as windows change: only what came is known. `lacking(traces, view)` are
+ * the traces of which something is to be asked, `keep(trace, span, answer)` takes what came,
+ * `of(trace)` gives what is known.
  */
-export function gapKeeper(changed) {
+export function gapKeeper() {
   /** @type {Map<string, {from: number, to: number, whole: boolean, holes: Hole[]}>} */
   const known = new Map();
 
-  async function load(trace, { from, to }) {
-    const around = AROUND * (to - from);
-    const span = { from: from - around + trace.origin, to: to + around + trace.origin };
-    const path = `/api/v1/robots/${encodeURIComponent(trace.robot)}/gaps`;
-    const query = new URLSearchParams({
-      item: trace.item, from: asked(Math.max(span.from, 0)), to: asked(span.to), limit: LIMIT,
+  function isKnown(trace, view) {
+    const entry = known.get(keyOf(trace));
+    return entry && entry.from <= view.from && entry.to >= view.to && (entry.whole || isNear(entry, view));
+  }
+
+  /** @param {{from: number, to: number}} span by the clock of the robot */
+  function keep(trace, { from, to }, { gaps, more }) {
+    known.set(keyOf(trace), {
+      from: from - trace.origin, to: to - trace.origin, whole: !more,
+      holes: gaps.map((gap) => holeOf(gap, trace.origin)),
     });
-    const entry = { from: from - around, to: to + around, whole: true, holes: known.get(keyOf(trace))?.holes ?? [] };
-    known.set(keyOf(trace), entry);
-    const answer = await ask(`${path}?${query}`);
-    entry.whole = !answer.more;
-    entry.holes = answer.gaps.map((gap) => holeOf(gap, trace.origin));
-    changed();
   }
 
-  function want(traces, view) {
-    const missing = new Map();
-    for (const trace of traces) {
-      const entry = known.get(keyOf(trace));
-      const enough = entry && entry.from <= view.from && entry.to >= view.to
-        && (entry.whole || isNear(entry, view));
-      if (!enough) missing.set(keyOf(trace), trace);
-    }
-    return Promise.all([...missing.values()].map((trace) => load(trace, view)));
-  }
-
-  return { want, of: (trace) => known.get(keyOf(trace))?.holes ?? [], forget: () => known.clear() };
+  return {
+    keep, lacking: (traces, view) => traces.filter((trace) => !isKnown(trace, view)),
+    of: (trace) => known.get(keyOf(trace))?.holes ?? [], forget: () => known.clear(),
+  };
 }
 
 const keyOf = (trace) => `${trace.robot}\n${trace.item}\n${trace.origin}`;

@@ -4,7 +4,7 @@ import { el, icon, setText } from "./dom.js";
 import { moment, since } from "./plottime.js";
 import { t } from "./strings.js";
 
-const ICONS = { alarm: "bell", incident: "flag", mission: "robot", note: "note", event: "info" };
+const ICONS = { alarm: "bell", incident: "flag", mission: "robot", note: "note" };
 /** Levels with which there is nothing to see. */
 const CALM = new Set(["ok", "unknown"]);
 const LASTING = new Set(["mission", "incident"]);

@@ -109,7 +109,15 @@ function branchOf(state, branch) {
 function fillBranch(state, item, branch) {
   if (one("ul", item)) return;
   const leaves = branch.variables.slice(0, MOST_SHOWN).map((variable) => leafOf(state, branch, variable));
+  if (branch.variables.length > MOST_SHOWN) leaves.push(restOf(branch));
   item.append(el("ul", { role: "group" }, ...leaves));
+}
+
+/** Say that there are more than one can look through. */
+function restOf({ id, variables }) {
+  const text = t("data.tree.rest", { shown: MOST_SHOWN, n: variables.length });
+  return el("li", { role: "treeitem", "aria-disabled": "true", tabindex: "-1", "data-node": `${id} rest` },
+    el("div", { class: "tree-row muted small" }, text));
 }
 
 function leafOf(state, branch, variable) {

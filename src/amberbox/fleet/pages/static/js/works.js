@@ -4,7 +4,7 @@
  */
 
 import { ask, fail } from "./ask.js";
-import { el, icon } from "./dom.js";
+import { el, icon, setText } from "./dom.js";
 import { t } from "./strings.js";
 
 const EVERY_MS = 2000;
@@ -19,34 +19,41 @@ export function works(list, robot, { fetched }) {
   const lines = new Map();
 
   function line(path, about, write, over, ended) {
-    const known = lines.get(about.id) ?? { root: el("li", { class: "work", "data-work": about.id }), path, write, over, ended };
+    const known = lines.get(about.id) ?? { ...made(about.id, leave), path, write, over, ended };
     if (!lines.has(about.id)) list.append(known.root);
     lines.set(about.id, known);
     list.hidden = false;
     show(known, about);
   }
 
+  /** Change what has changed and nothing else: the button keeps the focus, no text is said twice. */
   function show(known, about) {
     known.state = about.state;
-    const isOver = known.over.includes(about.state);
-    const button = el("button", { class: "button quiet small", type: "button", onclick: () => leave(known, about.id, isOver) },
-      t(isOver ? "data.works.close" : "data.works.stop"));
-    const text = el("span", { role: "status" }, ...known.write(about));
-    known.root.replaceChildren(icon(isOver ? "check" : "time"), text, button);
-    if (!isOver) return;
+    const { text, progress = null, link = null } = known.write(about);
+    setText(known.text, text);
+    known.bar.hidden = progress === null;
+    known.bar.value = progress ?? 0;
+    known.bar.setAttribute("aria-label", text);
+    if (!isOver(known)) return;
+    known.picture.replaceChildren(icon("check"));
+    if (link && !known.text.nextElementSibling.matches("a")) known.text.after(link);
+    setText(known.button, t("data.works.close"));
     known.ended?.(about);
   }
 
+  const isOver = (known) => known.over.includes(known.state);
+
   async function look(id) {
     const known = lines.get(id);
-    if (!known || known.over.includes(known.state)) return;
+    if (!known || isOver(known)) return;
     const about = await ask(known.path).catch(() => null); // asked again in a moment
     if (about && lines.has(id)) show(known, about);
   }
 
-  async function leave(known, id, isOver) {
+  async function leave(id) {
+    const known = lines.get(id);
     try {
-      if (!isOver) await ask(known.path, { method: "DELETE" });
+      if (!isOver(known)) await ask(known.path, { method: "DELETE" });
     } catch (error) {
       fail(error, known.root);
       return;
@@ -65,23 +72,30 @@ export function works(list, robot, { fetched }) {
       ({ state }) => state === "ready" && fetched()),
     /** The feed has told of a download. @param {string} id */
     look,
-    isAsking: () => [...lines.values()].some((one) => one.over === FETCH_OVER && !one.over.includes(one.state)),
+    isAsking: () => [...lines.values()].some((one) => one.over === FETCH_OVER && !isOver(one)),
   };
 }
 
+/** Make the parts of a line. @param {string} id @param {function(string): void} leave */
+function made(id, leave) {
+  const picture = el("span", {}, icon("time"));
+  const text = el("span", { class: "work-text", role: "status" });
+  const bar = el("progress", { max: 1 });
+  const button = el("button", { class: "button quiet small", type: "button", onclick: () => leave(id) }, t("data.works.stop"));
+  return { root: el("li", { class: "work", "data-work": id }, picture, text, bar, button), picture, text, bar, button };
+}
+
+/** What a line says: `progress` from 0 to 1 while it is being made, `link` to what was made. */
 function writeDownload(about) {
   const name = about.missions.length ? t("data.works.missions", { n: about.missions.length }) : t("data.works.view");
   const words = t(`data.works.download.${about.state}`, { name: `${name} (${about.format})` });
   if (about.state === "done") {
-    return [`${words} `, el("a", { href: `/api/v1/downloads/${about.id}/file`, download: about.file ?? "" }, about.file ?? t("data.works.file"))];
+    return { text: words, link: el("a", { href: `/api/v1/downloads/${about.id}/file`, download: about.file ?? "" }, about.file ?? t("data.works.file")) };
   }
-  if (about.state === "failed") return [words, " ", about.error];
-  if (DOWNLOAD_OVER.includes(about.state)) return [words];
-  const bar = el("progress", { max: 1, value: about.progress, "aria-label": words });
-  return [words, " ", bar];
+  if (about.state === "failed") return { text: `${words} ${about.error}` };
+  return { text: words, progress: DOWNLOAD_OVER.includes(about.state) ? null : about.progress };
 }
 
 function writeFetch(about) {
-  const words = t(`data.works.fetch.${about.state}`, { copied: about.copied, n: about.journals.length });
-  return [words];
+  return { text: t(`data.works.fetch.${about.state}`, { copied: about.copied, n: about.journals.length }) };
 }
