@@ -74,7 +74,7 @@ def _held(connection: Connection, folder: Path, robot: str) -> dict[str, Recordi
 
 
 def _of_archive(row: Row[Any], layout: Layout, signed: bool) -> Recording:
-    reason = decode(row.facts).refused
+    reason = decode(row.facts).refused if row.state == REFUSED else ""
     states: dict[str, State] = {COMMITTED: "in_columns", REFUSED: "refused"}
     path = layout.journal(row.robot, row.store_id, row.file)
     return Recording(

@@ -2,8 +2,8 @@
 
 import { clockLabels, since } from "./plottime.js";
 
-export const AXIS_WIDTH = 76;
-export const NARROW_AXIS_WIDTH = 56;
+const AXIS_WIDTH = 76;
+const NARROW_AXIS_WIDTH = 56;
 export const TIME_HEIGHT = 44;
 const LABEL_SIZE = 16;
 const FONT = "12px system-ui, -apple-system, 'Segoe UI', Roboto, sans-serif";

@@ -25,6 +25,7 @@ function closeMenus(event) {
 
 function closeHelp() {
   one(".popover[data-of-help]")?.remove();
+  one("[data-help][aria-describedby]")?.removeAttribute("aria-describedby");
 }
 
 /** Explain a word where it stands; where that fails, on the page of all words. */
@@ -36,8 +37,9 @@ async function explain(event) {
   const said = await ask(`/help/${encodeURIComponent(link.dataset.help)}`).catch(() => null);
   if (!said) return location.assign(link.href);
   const { title, text } = said;
-  const shown = el("div", { class: "popover", role: "status", "data-of-help": true }, el("strong", {}, title), el("p", {}, text));
+  const shown = el("div", { class: "popover", role: "status", id: "help-said", "data-of-help": true }, el("strong", {}, title), el("p", {}, text));
   document.body.append(shown);
+  link.setAttribute("aria-describedby", shown.id);
   place(shown, link);
 }
 

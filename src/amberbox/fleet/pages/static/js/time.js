@@ -53,7 +53,7 @@ const styles = {
 export const local = (ms, as = "at") => styles[as].format(ms);
 
 /** Return a time in UTC, for those who compare. @param {number} ms */
-export const utc = (ms) => t("common.shown_utc", { text: new Date(ms).toISOString().replace("T", " ").slice(0, 23) });
+const utc = (ms) => t("common.shown_utc", { text: new Date(ms).toISOString().replace("T", " ").slice(0, 23) });
 
 /** Make an element that shows a time and stays right. @param {string} stamp @param {string} as */
 export function when(stamp, as = "at") {
