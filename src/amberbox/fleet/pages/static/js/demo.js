@@ -2,6 +2,7 @@
 
 import { ask, fail } from "./ask.js";
 import { el, one, setText } from "./dom.js";
+import { listen } from "./feed.js";
 
 /**
  * @typedef {{robots: {robot: string, fault: string}[], faults: string[]}} View what can be broken, and what is
@@ -14,7 +15,10 @@ if (form) begin(form);
 function begin(form) {
   /** @type {Map<string, string>} */
   const broken = new Map();
-  const show = () => shown(form, broken.get(form.robot.value) ?? "");
+  const show = () => {
+    shown(form, broken.get(form.robot.value) ?? "");
+    answered(form);
+  };
   /** @param {View} view */
   const take = (view) => {
     for (const { robot, fault } of view.robots) broken.set(robot, fault);
@@ -29,6 +33,9 @@ function begin(form) {
   });
   one("[data-repair]", form).addEventListener("click", () => change("DELETE"));
   ask("/api/v1/demo").then(take, (error) => fail(error, form));
+  listen({ kinds: ["diagnosis"] }).on("diagnosis", (_, robot) => {
+    if (robot === form.robot.value) answered(form);
+  });
 }
 
 /** Offer the robots that one may see; at first the one that the page is about is chosen. */
@@ -56,6 +63,26 @@ function shown(form, fault) {
   one("[data-well]", form).hidden = Boolean(option);
   one("[data-broken]", form).hidden = !option;
   if (!option) return;
+  option.selected = true;
+  const see = one("[data-see]", form);
+  see.href = pageOf(form.robot.value);
+  see.hidden = location.pathname === see.pathname;
   setText(one("[data-what]", form), option.textContent);
   setText(one("[data-then]", form), option.dataset.watch);
+}
+
+/** Lead to the diagnosis of the robot that is chosen, once it is broken and there is one. */
+async function answered(form) {
+  const robot = form.robot.value;
+  const link = one("[data-found]", form);
+  const isBroken = robot && !one("[data-broken]", form).hidden;
+  const card = isBroken ? await ask(`/api/v1/robots/${encodeURIComponent(robot)}`).catch(() => null) : null;
+  if (robot !== form.robot.value) return;
+  link.href = `${pageOf(robot)}/diagnosis`;
+  link.hidden = !card?.diagnosis;
+}
+
+/** @param {string} robot */
+function pageOf(robot) {
+  return `/robots/${encodeURIComponent(robot)}`;
 }
