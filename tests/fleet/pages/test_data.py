@@ -169,7 +169,7 @@ def test_a_part_that_is_refused_takes_no_other_with_it(
 
 
 def test_parts_that_somebody_may_not_see_are_left_out(home: House) -> None:
-    tokens = home.client("viewer").post(
+    tokens = home.client("technician").post(
         "/api/v1/tokens", json={"name": "x", "scopes": ["read:data"]}
     )
     token = tokens.json()["token"]
