@@ -80,6 +80,7 @@ async function answered(form) {
   if (robot !== form.robot.value) return;
   link.href = `${pageOf(robot)}/diagnosis`;
   link.hidden = !card?.diagnosis;
+  if (!link.hidden) one("[data-see]", form).hidden = true; // one way on is enough
 }
 
 /** @param {string} robot */
