@@ -1,8 +1,8 @@
 """Try whether a new technician finds out what is broken: a minute, five clicks, and rightly.
 
-``python -m tools.tour`` runs the demonstration, breaks a robot in one way after the other, and
-goes through the real pages each time; clicks and seconds are from the server's access log.
-``--shots docs/tour`` takes the pictures of docs/tour.md on the way.
+``python -m tools.tour`` runs the demonstration for each of some faults, breaks a robot once all
+are well, and goes through the real pages; clicks and seconds are from the server's access log.
+``--shots docs/tour`` takes the pictures of docs/tour.md of the last fault.
 """
 
 from __future__ import annotations
@@ -29,12 +29,7 @@ if TYPE_CHECKING:
     from playwright.sync_api import Browser
 
 MOST_S, MOST_CLICKS = 60.0, 5
-FAULTS = (
-    "localisation_crash",
-    "laser_rear_motor_slow",
-    "wheel_front_left_bus_disconnected",
-)
-"""The last one is that of the pictures."""
+FAULTS = ("localisation_crash", "laser_rear_motor_slow", "wheel_front_left_bus_disconnected")
 NUMBER, ROBOT = 2, "ropod_002"
 _WHO = "technician"
 _PORT = 8643
@@ -92,19 +87,19 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _tried(faults: Sequence[str], port: int, shots: Path | None) -> list[Trial]:
+    """Try each fault on robots that were well until then; pictures are of the last one."""
     from playwright.sync_api import sync_playwright
 
-    with demonstration(port) as demo, sync_playwright() as playwright:
+    with sync_playwright() as playwright:
         chromium = shutil.which("chromium") or shutil.which("chromium-browser")
         browser = playwright.chromium.launch(executable_path=chromium, args=list(_ARGUMENTS))
-        colleague = Colleague.arrived(demo.links()["admin"])
         trials = []
         for fault in faults:
-            colleague.damage(ROBOT, fault)
-            trials.append(_tell(_try(browser, demo, fault)))
-            if fault == faults[-1] and shots is not None:
-                take(browser, demo, NUMBER, shots)
-            colleague.repair(ROBOT)
+            with demonstration(port) as demo:
+                Colleague.arrived(demo.links()["admin"]).damage(ROBOT, fault)
+                trials.append(_tell(_try(browser, demo, fault)))
+                if fault == faults[-1] and shots is not None:
+                    take(browser, demo, NUMBER, shots)
         browser.close()
         return trials
 

@@ -1,4 +1,4 @@
-"""Whoever breaks the robot and repairs it, without telling the technician what it is."""
+"""Whoever breaks the robot, without telling the technician what it is."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from typing import Any
 from amberbox.demo.browser import Browser
 from amberbox.demo.telling import check, until
 
-_PATIENCE_S = 400.0
-"""A robot is well as long after its repair as its monitors say; on a busy machine still later."""
+_PATIENCE_S = 240.0
+"""All is well, and wrong, within seconds, unless the machine is very busy."""
 _LEAST_WELL = 15
 """So many components are well before anything is broken; the others wait for a first message."""
 
@@ -30,13 +30,9 @@ class Colleague:
 
     def damage(self, robot: str, fault: str) -> None:
         """Break a robot that is well; return when there is an alarm: it "misbehaves"."""
-        until(lambda: self._is_well(robot) or None, lambda: str(self._card(robot)), _PATIENCE_S)
+        until(lambda: self._is_well(robot) or None, lambda: f"{robot} is well", _PATIENCE_S)
         self.browser.send("POST", f"/demo/{robot}/fault", {"fault": fault})
         until(lambda: self._card(robot)["alarms"] or None, lambda: "there is an alarm", _PATIENCE_S)
-
-    def repair(self, robot: str) -> None:
-        """Repair it."""
-        self.browser.send("DELETE", f"/demo/{robot}/fault")
 
     def _is_well(self, robot: str) -> bool:
         card = self._card(robot)

@@ -42,7 +42,7 @@ def _walk(page: Page, number: int, folder: Path) -> None:
     page.wait_for_url("**/data?*")
     _shot(page, folder, "data")
     page.get_by_role("link", name="Status", exact=True).click()
-    page.get_by_role("tree").first.wait_for()
+    page.get_by_role("treegrid").first.wait_for()
     _shot(page, folder, "robot", height=900)
     page.get_by_role("main").get_by_role("link", name="1 alarm").first.click()
     page.get_by_role("heading", name="Alarms").wait_for()

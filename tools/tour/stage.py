@@ -74,7 +74,10 @@ class Demonstration:
 @contextmanager
 def demonstration(port: int) -> Iterator[Demonstration]:
     """Run ``amberbox demo`` in a terminal of its own and a folder that goes at the end."""
-    with tempfile.TemporaryDirectory(prefix="amberbox-tour-") as place:
+    with tempfile.TemporaryDirectory(
+        prefix="amberbox-tour-",
+        ignore_cleanup_errors=True,  # a keeper that outlives its box may still write something
+    ) as place:
         folder = Path(place) / "demo"
         command = ["amberbox", "demo", "--port", str(port), "--keep", str(folder)]
         master, slave = pty.openpty()
