@@ -23,11 +23,9 @@ def take(browser: Browser, demo: Demonstration, number: int, folder: Path) -> No
     with opened(browser, demo.links()[_WHO]) as page:
         _walk(page, number, folder)
     with opened(browser, demo.links()[_WHO], theme="dark") as page:
-        _shot(page, folder, "robots-dark", height=420)
         _to_answer(page, number)
         _shot(page, folder, "diagnosis-dark")
     with opened(browser, demo.links()[_WHO], width=390, height=844) as page:
-        _shot(page, folder, "robots-narrow")
         _to_answer(page, number)
         _shot(page, folder, "diagnosis-narrow", height=1100)
 
@@ -43,7 +41,7 @@ def _walk(page: Page, number: int, folder: Path) -> None:
     _shot(page, folder, "data")
     page.get_by_role("link", name="Status", exact=True).click()
     page.get_by_role("treegrid").first.wait_for()
-    _shot(page, folder, "robot", height=900)
+    _shot(page, folder, "robot", height=500)
     page.get_by_role("main").get_by_role("link", name="1 alarm").first.click()
     page.get_by_role("heading", name="Alarms").wait_for()
     _shot(page, folder, "alarms")
