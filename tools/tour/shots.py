@@ -11,7 +11,6 @@ from tools.tour.technician import answer_of, opened, robot_card
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, FloatRect, Page
 
-LARGEST_BYTES = 120_000
 _SETTLE_MS = 2500
 """So long a page is left alone before it is looked at: plots and values have come by then."""
 _WHO = "technician"
