@@ -48,7 +48,7 @@ def open_plots(
     page.goto(PATH)
     page.evaluate(
         """async ([module, options, traces]) => {
-            const { plots } = (await import(module)).$need("plot.js");
+            const { plots } = (await import(module)).$need("plot/plot.js");
             window.heard = [];
             window.stack = plots(document.getElementById("place"),
               {...options, onWindow: (...w) => window.heard.push(w)});

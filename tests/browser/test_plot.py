@@ -324,10 +324,10 @@ def test_one_against_the_other_and_how_often(page_as: PageAs, site: Site) -> Non
     whole = address("all.js")
     span = {"from": at(site, -50 * 60 * 10**9), "to": at(site, -40 * 60 * 10**9)}
     pose = [SPEED | {"variable": f"pose_{axis}", "label": axis, "unit": "m"} for axis in "xy"]
-    page.evaluate(made, [whole, "xy.js", "xyView", {"x": pose[0], "y": pose[1], **span}])
+    page.evaluate(made, [whole, "plot/xy.js", "xyView", {"x": pose[0], "y": pose[1], **span}])
     expect(page.get_by_role("img", name="y [m] against x [m]")).to_be_visible()
     expect(page.get_by_text(re.compile(r"points out of 30,000"))).to_be_visible()
-    page.evaluate(made, [whole, "histogram.js", "histogram", {"trace": STATE, **span}])
+    page.evaluate(made, [whole, "plot/histogram.js", "histogram", {"trace": STATE, **span}])
     expect(page.get_by_text("300 values")).to_be_visible()
     table = page.get_by_role("table", name="How often State had which value")
     counts = {name: int(table.get_by_role("row", name=name).get_by_role("cell").inner_text())

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from amberbox.fleet.pages import assets, robottree
-from amberbox.fleet.pages.robottree import key
+from amberbox.fleet.pages import assets
+from amberbox.fleet.pages.robot import tree as robottree
+from amberbox.fleet.pages.robot.tree import key
 from tests.browser import hostile
 from tests.browser.conftest import PageAs
 from tests.browser.expecting import expect
@@ -252,7 +253,7 @@ def test_browser_and_server_write_numbers_alike(page_as: PageAs) -> None:
     page = page_as("viewer")
     page.goto(PAGE)
     told = page.evaluate(
-        "async ([path, values]) => values.map((await import(path)).$need('robotlive.js').number)",
+        "async ([path, values]) => values.map((await import(path)).$need('robot/live.js').number)",
         [assets.address("all.js"), list(NUMBERS)],
     )
     assert told == [robottree.number(value) for value in NUMBERS]

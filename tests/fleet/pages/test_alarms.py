@@ -21,9 +21,9 @@ from amberbox.fleet.alarms.tables import ALARM, ALARM_ROBOT, CONSEQUENCE, HISTOR
 from amberbox.fleet.api.alarmlines import AlarmLine, Happening, line_of
 from amberbox.fleet.knowledge.notebook import Given, keep_answer
 from amberbox.fleet.notifying.tables import OUTBOX
-from amberbox.fleet.pages.alarmsearch import Look
-from amberbox.fleet.pages.alarmview import Item
-from amberbox.fleet.pages.alarmwords import Words, events, words_of
+from amberbox.fleet.pages.alarms.search import Look
+from amberbox.fleet.pages.alarms.view import Item
+from amberbox.fleet.pages.alarms.wording import Words, events, words_of
 from amberbox.fleet.pages.figures import span
 from tests.fleet.house import START_NS, House, house
 from tests.fleet.knowledge import robot as sim

@@ -8,9 +8,10 @@ from starlette.testclient import TestClient
 from amberbox.core.clock import NS
 from amberbox.core.timetext import format_time, parse_time
 from amberbox.fleet.asking.errors import BusyError
-from amberbox.fleet.pages import data, dataaround
-from amberbox.fleet.pages.datacoverage import Stretch, joined
-from amberbox.fleet.pages.diagnosiscard import DiagnosisCard, Reason, data_href
+from amberbox.fleet.pages.data import around as dataaround
+from amberbox.fleet.pages.data import data
+from amberbox.fleet.pages.data.coverage import Stretch, joined
+from amberbox.fleet.pages.diagnosis.card import DiagnosisCard, Reason, data_href
 from amberbox.testing.records import T0_NS
 from tests.fleet.data.filled import ROWS, fill
 from tests.fleet.house import House, house

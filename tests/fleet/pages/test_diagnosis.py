@@ -11,7 +11,8 @@ from starlette.testclient import TestClient
 from amberbox.core.clock import NS
 from amberbox.fleet.api import diagnoses
 from amberbox.fleet.knowledge import explained
-from amberbox.fleet.pages import diagnosislook, diagnosisparts
+from amberbox.fleet.pages.diagnosis import look as diagnosislook
+from amberbox.fleet.pages.diagnosis import parts as diagnosisparts
 from tests.fleet.house import House, house
 from tests.fleet.knowledge import robot as sim
 

@@ -11,7 +11,7 @@ from amberbox.core.types import Symptom
 from amberbox.diagnosis.knowledge import Knowledge
 from amberbox.diagnosis.situation import Situation
 from amberbox.fleet.api.diagnoses import revision_json
-from amberbox.fleet.pages.diagnosiscard import (
+from amberbox.fleet.pages.diagnosis.card import (
     REASONS,
     DiagnosisCard,
     card_of,

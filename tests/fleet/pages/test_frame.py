@@ -4,6 +4,7 @@ import hashlib
 import json
 import re
 from collections.abc import Iterator
+from posixpath import join, normpath
 
 import pytest
 
@@ -93,12 +94,13 @@ def test_nothing_but_assets_is_served(home: House, path: str) -> None:
 
 
 def test_every_module_that_is_imported_or_started_is_there() -> None:
-    names = {file.name for file in SCRIPTS.glob("*.js")}
-    for file in SCRIPTS.glob("*.js"):
-        asked = re.findall(r'^(?:import|export) .*?from "\./([^"]+)"', file.read_text(), re.M)
-        assert set(asked) <= names, file.name
+    names = {file.relative_to(SCRIPTS).as_posix() for file in SCRIPTS.rglob("*.js")}
+    for file in SCRIPTS.rglob("*.js"):
+        asked = re.findall(r'^(?:import|export) .*?from "(\.[^"]+)"', file.read_text(), re.M)
+        found = {normpath(join(file.parent.relative_to(SCRIPTS).as_posix(), one)) for one in asked}
+        assert found <= names, file.name
     for file in TEMPLATES.glob("*.html"):
-        started = re.findall(r'm\.module\("([\w-]+)"\)', file.read_text())
+        started = re.findall(r'm\.module\("([\w/-]+)"\)', file.read_text())
         assert {f"{name}.js" for name in started} <= names, file.name
 
 
@@ -107,7 +109,7 @@ def test_every_picture_that_is_used_is_in_the_sprite() -> None:
     names = set(re.findall(r'<symbol id="([^"]+)"', sprite))
     used = {name for file in TEMPLATES.glob("*.html")
             for name in re.findall(r'icon\("([\w-]+)"\)', file.read_text())}  # fmt: skip
-    used |= {name for file in SCRIPTS.glob("*.js")
+    used |= {name for file in SCRIPTS.rglob("*.js")
              for name in re.findall(r'icon\("([\w-]+)"\)', file.read_text())}  # fmt: skip
     assert sorted(used - names) == []
 
@@ -133,7 +135,7 @@ def test_every_text_that_is_named_is_in_the_catalogue() -> None:
 def test_every_text_that_modules_name_reaches_some_browser() -> None:
     parts = tuple(file.stem for file in (assets.FOLDER.parent / "strings" / "en").glob("*.yaml"))
     texts = for_browser(parts)
-    for file in SCRIPTS.glob("*.js"):
+    for file in SCRIPTS.rglob("*.js"):
         for name in re.findall(r'\bt\("([\w.]+)"', file.read_text()):
             assert name in texts or name.endswith((".", "_")), f"{file.name}: {name}"
 

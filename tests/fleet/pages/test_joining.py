@@ -35,9 +35,12 @@ def test_what_cannot_be_joined_is_refused(text: str) -> None:
 
 def test_all_modules_of_the_pages_can_be_joined() -> None:
     folder = assets.FOLDER / "js"
-    modules = {file.name: file.read_text("utf-8") for file in folder.glob("*.js")}
+    modules = {
+        file.relative_to(folder).as_posix(): file.read_text("utf-8")
+        for file in folder.rglob("*.js")
+    }
     whole = joined(modules)
     for name in modules:
         assert whole.count(f"\n{name!r}($out) {{") == 1
-    needed = set(re.findall(r"\$need\('([\w-]+\.js)'\)", whole))
+    needed = set(re.findall(r"\$need\('([\w/-]+\.js)'\)", whole))
     assert needed <= set(modules)

@@ -6,7 +6,7 @@ from amberbox.fleet.api.incidents import Incident
 from amberbox.fleet.api.query import Gap
 from amberbox.fleet.data.journals import Integrity, Recording, State
 from amberbox.fleet.drawing.axis import Axis
-from amberbox.fleet.pages.recordingcover import axis_of, share, spans, stretches
+from amberbox.fleet.pages.recordings.cover import axis_of, share, spans, stretches
 
 HOUR_NS = 3600 * NS
 AXIS = Axis(0, 24 * HOUR_NS)

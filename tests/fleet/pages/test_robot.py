@@ -11,10 +11,10 @@ import pytest
 from amberbox.core.clock import NS
 from amberbox.fleet.api.timelines import Lane, Stretch, Timeline
 from amberbox.fleet.data import remarks
-from amberbox.fleet.pages import robottree
-from amberbox.fleet.pages.robotgraph import as_list, edges, graph
-from amberbox.fleet.pages.robotgroups import groups
-from amberbox.fleet.pages.robottimes import times
+from amberbox.fleet.pages.robot import tree as robottree
+from amberbox.fleet.pages.robot.graph import as_list, edges, graph
+from amberbox.fleet.pages.robot.groups import groups
+from amberbox.fleet.pages.robot.times import times
 from amberbox.fleet.state.views import Component, Condition, Mode, Need, Output, StatusTree
 from tests.fleet.house import START_NS, House, house
 from tests.fleet.state import lives

@@ -65,7 +65,9 @@ def _contents() -> Iterator[tuple[str, bytes]]:
     yield STYLE, b"\n".join(_styles())
     yield PLOT, uplot("uplot.iife.min.js")
     yield "icons.svg", (FOLDER / "icons.svg").read_bytes()
-    modules = {file.name: file.read_text("utf-8") for file in sorted((FOLDER / "js").glob("*.js"))}
+    folder = FOLDER / "js"
+    found = sorted(folder.rglob("*.js"))
+    modules = {file.relative_to(folder).as_posix(): file.read_text("utf-8") for file in found}
     yield MODULES, joined(modules).encode()
 
 

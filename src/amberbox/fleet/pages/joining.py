@@ -9,11 +9,13 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from posixpath import dirname, join, normpath
 
-_FROM = r'\s+from\s+"\./([\w-]+\.js)";'
+_PATH = r'"(\.{1,2}/[\w/-]+\.js)";'
+_FROM = r"\s+from\s+" + _PATH
 _NAMED = re.compile(r"^import\s*\{([^}]*)\}" + _FROM, re.MULTILINE)
 _WHOLE = re.compile(r"^import\s*\*\s*as\s+(\w+)" + _FROM, re.MULTILINE)
-_ONLY = re.compile(r'^import\s+"\./([\w-]+\.js)";', re.MULTILINE)
+_ONLY = re.compile(r"^import\s+" + _PATH, re.MULTILINE)
 _PASSED = re.compile(r"^export\s*\{([^}]*)\}" + _FROM, re.MULTILINE)
 _EXPORT = re.compile(r"^export\s+((?:async\s+)?function\*?|const|let|class)\s+(\w+)", re.MULTILINE)
 _LEFT = re.compile(r"^(?:import|export)\b(?!\s*[.(]).*", re.MULTILINE)
@@ -44,10 +46,10 @@ def joined(modules: Mapping[str, str]) -> str:
 
 
 def _function(name: str, text: str) -> str:
-    exports = _exports(text)
-    body = _NAMED.sub(lambda m: f"const {{{_renamed(m[1])}}} = $need({m[2]!r});", text)
-    body = _WHOLE.sub(lambda m: f"const {m[1]} = $need({m[2]!r});", body)
-    body = _ONLY.sub(lambda m: f"$need({m[1]!r});", body)
+    exports = _exports(name, text)
+    body = _NAMED.sub(lambda m: f"const {{{_renamed(m[1])}}} = $need({_at(name, m[2])!r});", text)
+    body = _WHOLE.sub(lambda m: f"const {m[1]} = $need({_at(name, m[2])!r});", body)
+    body = _ONLY.sub(lambda m: f"$need({_at(name, m[1])!r});", body)
     body = _PASSED.sub("", body)
     body = _EXPORT.sub(r"\1 \2", body)
     left = _LEFT.search(body)
@@ -57,13 +59,18 @@ def _function(name: str, text: str) -> str:
     return f"{name!r}($out) {{ $tell($out, {{ {told} }});\n{body}\n}},\n"
 
 
-def _exports(text: str) -> dict[str, str]:
+def _exports(name: str, text: str) -> dict[str, str]:
     """Return what a module exports: the name, and the expression that has its value."""
-    found = {name: name for _, name in _EXPORT.findall(text)}
+    found = {export: export for _, export in _EXPORT.findall(text)}
     for names, module in _PASSED.findall(text):
         for inner, outer in _pairs(names):
-            found[outer] = f"$need({module!r}).{inner}"
+            found[outer] = f"$need({_at(name, module)!r}).{inner}"
     return found
+
+
+def _at(name: str, path: str) -> str:
+    """Return the name of what a module imports by a path that begins beside it."""
+    return normpath(join(dirname(name), path))
 
 
 def _renamed(names: str) -> str:

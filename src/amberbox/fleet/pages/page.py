@@ -18,7 +18,7 @@ from amberbox.core.timetext import format_time
 from amberbox.fleet.accounts.sessions import csrf_token
 from amberbox.fleet.api.access import Caller, Decorator, Open, Routes, caller_of, services_of
 from amberbox.fleet.pages import assets, figures, wording
-from amberbox.fleet.pages.alarmcount import OpenCount, open_count
+from amberbox.fleet.pages.alarms.count import OpenCount, open_count
 from amberbox.fleet.pages.strings import catalogue, for_browser
 from amberbox.monitoring.engine.outputs import SEVERITIES
 

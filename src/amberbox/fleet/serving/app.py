@@ -19,7 +19,7 @@ ROOMS = ("amberbox.fleet.api", "amberbox.fleet.pages")
 
 
 def rooms() -> Mapping[str, Routes]:
-    """Return the routes of all rooms, found by file name: ``routes`` in the files of ``ROOMS``."""
+    """Return the routes of all rooms: ``routes`` of each file below ``ROOMS``, by its name."""
     found = (import_module(name) for package in ROOMS for name in _modules(package))
     return {_short(module.__name__): module.routes for module in found if hasattr(module, "routes")}
 
@@ -35,7 +35,8 @@ def rules() -> dict[tuple[str, str], Rule]:
 
 def _modules(package: str) -> Sequence[str]:
     path = import_module(package).__path__
-    return sorted(f"{package}.{info.name}" for info in pkgutil.iter_modules(path))
+    found = pkgutil.walk_packages(path, f"{package}.")
+    return sorted(info.name for info in found if not info.ispkg)
 
 
 def make_app(services: Services) -> FastAPI:

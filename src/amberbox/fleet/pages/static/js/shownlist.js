@@ -2,7 +2,7 @@
 
 import { el, icon } from "./dom.js";
 import { t } from "./strings.js";
-import { asDragged } from "./variables.js";
+import { asDragged } from "./data/variables.js";
 
 const MOST_PLOTS = 12;
 
@@ -22,7 +22,7 @@ export function shownList(element, { move, remove }) {
   });
   element.addEventListener("dragstart", (event) => asDragged(event, event.target.dataset.name));
 
-  /** @param {import("./dataview.js").Named[]} named @param {function(string): string} unitOf */
+  /** @param {import("./data/view.js").Named[]} named @param {function(string): string} unitOf */
   function show(named, unitOf) {
     const focused = document.activeElement?.closest?.("[data-name]");
     const held = focused && element.contains(focused) ? focused.dataset.name : null;

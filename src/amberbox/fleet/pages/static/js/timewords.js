@@ -1,6 +1,6 @@
 /** Times as people write them into addresses and fields. All times are seconds since 1970. */
 
-import { seconds } from "./plotdata.js";
+import { seconds } from "./plot/data.js";
 import { fieldText as fieldTextMs, rfc3339 } from "./time.js";
 
 const UNITS = { ns: 1e-9, us: 1e-6, ms: 1e-3, s: 1, m: 60, min: 60, h: 3600, d: 86400 };

@@ -1,0 +1,1 @@
+"""Who one is: the first admin, signing in, one's own account."""

@@ -1,0 +1,1 @@
+"""The page that says what is broken, and all it rests on."""

@@ -1,0 +1,1 @@
+"""What robots know before anything breaks."""

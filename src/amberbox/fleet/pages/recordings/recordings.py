@@ -1,0 +1,247 @@
+"""Recordings: what there is of all robots; missions, incidents and journals of one."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal
+
+from fastapi import Query, Request, Response
+
+from amberbox.core.timetext import format_time
+from amberbox.fleet.accounts.robots import KnownRobot
+from amberbox.fleet.api.access import Caller, Fleet, OfRobot, Who
+from amberbox.fleet.api.fetches import list_fetches
+from amberbox.fleet.api.robots import list_cards, read_card
+from amberbox.fleet.data.journals import Recording
+from amberbox.fleet.drawing.coverage import KINDS, Stretch, coverage, swatch
+from amberbox.fleet.pages import figures
+from amberbox.fleet.pages.drawingwords import drawing_words
+from amberbox.fleet.pages.page import Pages, render
+from amberbox.fleet.pages.recordings.cover import WINDOWS, Window, parts
+from amberbox.fleet.pages.recordings.look import Cover, Record, Retaining, cover, journals, record
+from amberbox.fleet.pages.recordings.state import Held, held
+from amberbox.fleet.pages.strings import catalogue
+from amberbox.fleet.services import Services
+from amberbox.fleet.state.views import Card
+
+routes = Pages()
+
+Show = Literal["all", "trouble", "coming", "deleted"]
+SHOWS: Sequence[Show] = ("all", "trouble", "coming", "deleted")
+_MOST = 10_000
+_PAGE = 50
+_LISTED = 100
+"""Stretches in the list beside a bar."""
+_COMING = ("copying", "waiting", "aside")
+
+After = Annotated[str, Query(max_length=400)]
+Name = Annotated[str, Query(max_length=64)]
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """A robot in the overview."""
+
+    card: Card
+    held: Held
+
+
+@dataclass(frozen=True, slots=True)
+class Look:
+    """What somebody wants to see of a robot's recordings; it stands in the address."""
+
+    window: Window = "7d"
+    show: Show = "all"
+    after: str = ""
+    mission: str = ""
+
+
+@routes.get("/recordings", "items.read", each=True)
+def show(request: Request, fleet: Fleet, who: Who, window: Window = "7d") -> Response:
+    """Show what there is of all robots: cheap figures at once, the rest as it is asked for."""
+    lines = _lines(fleet, who)
+    return render(
+        request, "recordings.html", lines=lines, window=window, windows=tuple(WINDOWS),
+        swatches=_swatches(), total=_total(lines), may_download=who.may_some("data.download"),
+        **_words(),
+    )  # fmt: skip
+
+
+@routes.get("/pieces/recordings", "items.read", each=True)
+def show_states(request: Request, fleet: Fleet, who: Who, robot: Name = "") -> Response:
+    """Show of each robot (or of one) how far its copying is; what is asked for every 10 s."""
+    return render(request, "recordings_states.html", lines=_lines(fleet, who, robot), **_words())
+
+
+@routes.get("/pieces/recordings/{robot}", "items.read")
+def show_card(
+    request: Request, fleet: Fleet, who: Who, robot: OfRobot, window: Window = "7d",
+    link: bool = True,
+) -> Response:  # fmt: skip
+    """Show what there is of one robot: its bar, whether it holds; with ``link`` also how many
+    missions and incidents there are, and where more is.
+    """
+    found = record(fleet, who, robot, missions=link)
+    seen = cover(fleet, who, robot, found, window)
+    return render(
+        request, "recordings_card.html", found=found, link=link,
+        **_drawn(seen, robot.id, window), **_words(),
+    )  # fmt: skip
+
+
+@routes.get("/recordings/{robot}", "items.read")
+def show_robot(
+    request: Request, fleet: Fleet, who: Who, robot: OfRobot, window: Window = "7d",
+    show: Show = "all", after: After = "", mission: After = "",
+) -> Response:  # fmt: skip
+    """Show the recordings of a robot: what costs little at once, the rest when workers answer."""
+    look = Look(window, show, after, mission)
+    return render(
+        request, "recordings_robot.html", strings=("recordings",), card=read_card(fleet, robot),
+        robot=robot.id, held=_held(fleet, [robot.id])[robot.id], look=look, windows=tuple(WINDOWS),
+        swatches=_swatches(), **_may(who, robot), **_fetches(fleet, robot),
+        **_journals(fleet, robot, journals(fleet, robot), look), **_words(),
+    )  # fmt: skip
+
+
+@routes.get("/pieces/recordings/{robot}/missions", "items.read")
+def show_missions(
+    request: Request, fleet: Fleet, who: Who, robot: OfRobot, mission: After = ""
+) -> Response:
+    """Show the missions of a robot alone."""
+    found = record(fleet, who, robot, incidents=False)
+    return render(
+        request, "recordings_missions.html", found=found, look=Look(mission=mission),
+        **_missions(found, mission), **_may(who, robot), **_words(),
+    )  # fmt: skip
+
+
+@routes.get("/pieces/recordings/{robot}/incidents", "items.read")
+def show_incidents(request: Request, fleet: Fleet, who: Who, robot: OfRobot) -> Response:
+    """Show the incidents of a robot alone."""
+    found = record(fleet, who, robot, missions=False)
+    return render(request, "recordings_incidents.html", found=found, **_may(who, robot), **_words())
+
+
+@routes.get("/pieces/recordings/{robot}/fetches", "data.query")
+def show_fetches(request: Request, fleet: Fleet, who: Who, robot: OfRobot) -> Response:
+    """Show alone what was asked of a robot."""
+    return render(
+        request, "recordings_fetches.html", robot=robot.id, **_fetches(fleet, robot),
+        **_may(who, robot), **_words(),
+    )  # fmt: skip
+
+
+@routes.get("/pieces/recordings/{robot}/journals", "items.read")
+def show_journals(
+    request: Request, fleet: Fleet, who: Who, robot: OfRobot, show: Show = "all", after: After = ""
+) -> Response:
+    """Show the journals of a robot alone."""
+    look = Look(show=show, after=after)
+    return render(
+        request, "recordings_journals.html", robot=robot.id, look=look,
+        **_journals(fleet, robot, journals(fleet, robot), look), **_may(who, robot), **_words(),
+    )  # fmt: skip
+
+
+def _lines(fleet: Services, who: Caller, only: str = "") -> list[Line]:
+    with fleet.database.reading() as connection:
+        seen = who.robots(connection, "items.read")
+    mine = {robot.id for robot in seen if only in ("", robot.id)}
+    cards = [card for card in list_cards(fleet, who, "", "", _MOST) if card.robot in mine]
+    known = _held(fleet, [card.robot for card in cards])
+    return [Line(card, known[card.robot]) for card in cards]
+
+
+def _held(fleet: Services, robots: Sequence[str]) -> Mapping[str, Held]:
+    with fleet.database.reading() as connection:
+        return held(connection, fleet.folder, robots)
+
+
+def _total(lines: Sequence[Line]) -> Held:
+    found = [line.held for line in lines]
+    return Held(sum(one.files for one in found), sum(one.bytes for one in found))
+
+
+def _drawn(seen: Cover, robot: str, window: Window) -> Mapping[str, Any]:
+    label = catalogue().text("recordings.cover.label", robot=robot)
+    told = [_told(one) for one in seen.stretches]
+    bar = coverage(told, seen.axis, label=label, name=f"cover-{robot}", words=drawing_words())
+    recorded = any(one.kind == "recorded" for one in seen.stretches)
+    return {"cover": seen, "bar": bar, "recorded": recorded, "window": window,
+            "parts": parts(seen.stretches, _LISTED)}  # fmt: skip
+
+
+def _told(one: Stretch) -> Stretch:
+    """Return a stretch whose text also says when it was, for a pointer that rests on it."""
+    when = catalogue().text("recordings.cover.when", start=_utc(one.start), to=_utc(one.to))
+    return Stretch(one.start, one.to, one.kind, f"{one.text} {when}".strip())
+
+
+def _utc(time_ns: int) -> str:
+    return format_time(time_ns)[:16].replace("T", " ")
+
+
+def _swatches() -> Sequence[tuple[str, Any]]:
+    return [(kind, swatch(kind, name=f"key-{kind}", words=drawing_words())) for kind in KINDS]
+
+
+def _missions(found: Record, after: str) -> Mapping[str, Any]:
+    ids = [one.id for one in found.missions]
+    start = ids.index(after) + 1 if after in ids else 0
+    page = found.missions[start : start + _PAGE]
+    more = page[-1].id if len(found.missions) > start + _PAGE else ""
+    return {
+        "missions": [(one, found.share(one)) for one in page], "missions_more": more,
+        "missions_all": len(ids),
+    }  # fmt: skip
+
+
+def _fetches(fleet: Services, robot: KnownRobot) -> Mapping[str, Any]:
+    return {"fetches": list_fetches(fleet, robot, limit=_PAGE)}
+
+
+def _journals(
+    fleet: Services, robot: KnownRobot, found: Sequence[Recording], look: Look
+) -> Mapping[str, Any]:
+    fitting = [one for one in found if _fits(one, look.show)]
+    names = [_name(one) for one in fitting]
+    start = names.index(look.after) + 1 if look.after in names else 0
+    page = fitting[start : start + _PAGE]
+    retaining = Retaining(fleet, robot.id)
+    return {
+        "journals": [(_name(one), one, retaining.until(one)) for one in page],
+        "journals_first": start, "journals_all": len(fitting), "files_all": len(found),
+        "journals_more": names[start + _PAGE - 1] if len(names) > start + _PAGE else "",
+        "counts": {name: sum(_fits(one, name) for one in found) for name in SHOWS},
+        "shows": SHOWS, "days_kept": retaining.days,
+    }  # fmt: skip
+
+
+def _name(one: Recording) -> str:
+    return f"{one.store_id}/{one.journal}"
+
+
+def _fits(one: Recording, show: Show) -> bool:
+    return {
+        "all": True,
+        "trouble": one.integrity in ("altered", "missing")
+        or one.state in ("refused", "quarantined"),
+        "coming": one.state in _COMING,
+        "deleted": one.integrity == "deleted",
+    }[show]
+
+
+def _may(who: Caller, robot: KnownRobot) -> Mapping[str, bool]:
+    return {
+        "may_mark": who.may("incidents.write", robot),
+        "may_begin": who.may("missions.write", robot),
+        "may_download": who.may("data.download", robot),
+        "may_fetch": who.may("data.fetch", robot),
+    }
+
+
+def _words() -> Mapping[str, Any]:
+    return {"size": figures.size, "count": figures.count, "percent": figures.percent,
+            "rfc3339": format_time}  # fmt: skip

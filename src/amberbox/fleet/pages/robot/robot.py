@@ -1,0 +1,212 @@
+"""The page of one robot: how all of its parts are, what happened, what can be done."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+from fastapi import Query, Request, Response
+
+from amberbox.core.errors import AmberboxError
+from amberbox.fleet.accounts.robots import KnownRobot
+from amberbox.fleet.api.access import Fleet, OfRobot, Who
+from amberbox.fleet.api.forms import time_of
+from amberbox.fleet.api.robots import (
+    Event,
+    list_events,
+    read_card,
+    read_link,
+    read_status,
+    read_timeline,
+)
+from amberbox.fleet.data import remarks
+from amberbox.fleet.folders.shelf import FileInfo
+from amberbox.fleet.pages.diagnosis.card import data_href
+from amberbox.fleet.pages.diagnosis.look import current_card
+from amberbox.fleet.pages.page import Pages, render
+from amberbox.fleet.pages.robot import graph as robotgraph
+from amberbox.fleet.pages.robot import tree as robottree
+from amberbox.fleet.pages.robot.battery import trend
+from amberbox.fleet.pages.robot.groups import groups
+from amberbox.fleet.pages.robot.times import Lanes, Times, Window, times
+from amberbox.fleet.pages.robot.tree import Show
+from amberbox.fleet.pages.strings import catalogue
+from amberbox.fleet.services import Services
+from amberbox.fleet.state.said import moment
+from amberbox.fleet.state.views import Card, Component, StatusTree
+
+routes = Pages()
+
+EVENTS = 30
+_KINDS_OF = 300
+"""Newest events among which the kinds are looked for that one can choose."""
+_POINTS = 300
+_NOTED = 5
+"""What was noticed of a link, the newest."""
+_ACTIONS = ("items.read", "diagnoses.read", "diagnoses.write", "incidents.write", "missions.write",
+            "robots.write")  # fmt: skip
+NOTHING: list[str] = []
+
+Text = Annotated[str, Query(max_length=128)]
+Chosen = Annotated[list[Annotated[str, Query(max_length=256)]], Query(alias="open", max_length=500)]
+
+
+@dataclass(frozen=True, slots=True)
+class Look:
+    """What somebody wants to see of a robot; it stands in the address."""
+
+    q: str = ""
+    show: Show = "all"
+    chosen: Sequence[str] = ()
+    window: Window = "1h"
+    lanes: Lanes = ""
+    kind: str = ""
+
+
+@routes.get("/robots/{robot}", "status.read")
+def show(
+    request: Request, fleet: Fleet, who: Who, robot: OfRobot, q: Text = "", show: Show = "all",
+    chosen: Chosen = NOTHING, window: Window = "1h", lanes: Lanes = "", kind: Text = "",
+) -> Response:  # fmt: skip
+    """Show a robot."""
+    look = Look(q, show, chosen, window, lanes, kind)
+    tree, card = read_status(fleet, robot), read_card(fleet, robot)
+    may = {name: who.may(name, robot) for name in _ACTIONS}
+    return _show(
+        request, "robot.html", card=card, look=look, may=may, **_tree(tree, look),
+        **_graph(tree), **_panels(tree), **_now(fleet, who, robot),
+        files=_files(fleet, who, robot, card), robot=robot,
+        seen=_times(fleet, robot, window, lanes), **_events(fleet, robot, kind, may["items.read"]),
+        diagnosis=current_card(fleet, robot.id, card.last_seen) if may["diagnoses.read"] else None,
+        strings=("diagnosis",),
+    )  # fmt: skip
+
+
+@routes.get("/pieces/robots/{robot}/head", "status.read")
+def show_head(request: Request, fleet: Fleet, robot: OfRobot) -> Response:
+    """Show how a robot is and whether it is there: the head of all its pages."""
+    return _show(request, "robot_head.html", card=read_card(fleet, robot))
+
+
+@routes.get("/pieces/robots/{robot}/tree", "status.read")
+def show_tree(
+    request: Request, fleet: Fleet, robot: OfRobot, q: Text = "", show: Show = "all",
+    chosen: Chosen = NOTHING,
+) -> Response:  # fmt: skip
+    """Show the tree alone."""
+    tree, card = read_status(fleet, robot), read_card(fleet, robot)
+    return _show(request, "robot_tree.html", card=card, **_tree(tree, Look(q, show, chosen)))
+
+
+@routes.get("/pieces/robots/{robot}/graph", "status.read")
+def show_graph(request: Request, fleet: Fleet, robot: OfRobot) -> Response:
+    """Show what needs what alone."""
+    tree = read_status(fleet, robot)
+    return _show(request, "robot_graph.html", tree=tree, **_graph(tree))
+
+
+@routes.get("/pieces/robots/{robot}/timeline", "status.read")
+def show_timeline(
+    request: Request, fleet: Fleet, robot: OfRobot, window: Window = "1h", lanes: Lanes = ""
+) -> Response:
+    """Show what was when alone."""
+    look = Look(window=window, lanes=lanes)
+    seen = _times(fleet, robot, window, lanes)
+    return _show(request, "robot_timeline.html", robot=robot, look=look, seen=seen)
+
+
+@routes.get("/pieces/robots/{robot}/events", "items.read")
+def show_events(request: Request, fleet: Fleet, robot: OfRobot, kind: Text = "") -> Response:
+    """Show the newest events alone."""
+    found = _events(fleet, robot, kind, may=True)
+    return _show(request, "robot_events.html", robot=robot, **found)
+
+
+@routes.get("/pieces/robots/{robot}/now", "status.read")
+def show_now(request: Request, fleet: Fleet, who: Who, robot: OfRobot) -> Response:
+    """Show what it is doing and how it is linked, alone."""
+    return _show(request, "robot_now.html", card=read_card(fleet, robot), **_now(fleet, who, robot))
+
+
+@routes.get("/pieces/robots/{robot}/panels", "status.read")
+def show_panels(request: Request, fleet: Fleet, robot: OfRobot) -> Response:
+    """Show battery and components that are alike, alone."""
+    tree, card = read_status(fleet, robot), read_card(fleet, robot)
+    return _show(request, "robot_panels.html", card=card, **_panels(tree))
+
+
+@routes.get("/pieces/robots/{robot}/battery", "items.read")
+async def show_battery(request: Request, fleet: Fleet, who: Who, robot: OfRobot) -> Response:
+    """Show how the battery went in the last hour."""
+    try:
+        found = await trend(fleet, who, robot.id)
+    except AmberboxError:  # too much is asked at the moment: the value itself is on the page
+        found = None
+    return _show(request, "robot_trend.html", trend=found)
+
+
+def _show(request: Request, template: str, **values: Any) -> Response:
+    return render(request, template, rt=robottree, **values)
+
+
+def _tree(tree: StatusTree, look: Look) -> Mapping[str, Any]:
+    return {
+        "tree": tree,
+        "branches": robottree.branches(tree, look.q, look.show, look.chosen),
+    }  # fmt: skip
+
+
+def _graph(tree: StatusTree) -> Mapping[str, Any]:
+    label = catalogue().text("robot.graph.label", robot=tree.robot)
+    return {
+        "drawn": robotgraph.graph(tree.components, label),
+        "lines": robotgraph.as_list(tree.components),
+    }
+
+
+def _times(fleet: Services, robot: KnownRobot, window: Window, lanes: Lanes) -> Times:
+    found = read_timeline(fleet, robot, f"now-{window}", "now", points=_POINTS)
+    return times(robot.id, found, lanes, window)
+
+
+def _events(fleet: Services, robot: KnownRobot, kind: str, may: bool) -> Mapping[str, Any]:
+    if not may:
+        return {"events": None, "kinds": [], "kind": ""}
+    newest = list_events(fleet, robot, limit=_KINDS_OF)
+    found = newest if not kind else list_events(fleet, robot, kind=kind, limit=EVENTS)
+    kinds = sorted({one.kind for one in newest} | ({kind} if kind else set()))
+    shown = [(one, _href(fleet, robot.id, one)) for one in reversed(found[-EVENTS:])]
+    return {"events": shown, "kinds": kinds, "kind": kind}
+
+
+def _href(fleet: Services, robot: str, event: Event) -> str:
+    """Return where the data around an event are shown."""
+    at_ns = time_of(event.at or "", fleet.clock)
+    return "" if at_ns is None else data_href(robot, (), at_ns)
+
+
+def _now(fleet: Services, who: Who, robot: KnownRobot) -> Mapping[str, Any]:
+    with fleet.database.reading() as connection:
+        ours = [one for one in remarks.missions(connection, robot.id) if one.to_ns is None]
+    return {
+        "link": read_link(fleet, robot, limit=_NOTED),
+        "missions": [(one, moment(one.from_ns)) for one in reversed(ours)],
+        "may_begin": who.may("missions.write", robot),
+    }  # fmt: skip
+
+
+def _panels(tree: StatusTree) -> Mapping[str, Any]:
+    return {"groups": groups(tree.components), "battery": _battery(tree)}
+
+
+def _battery(tree: StatusTree) -> Component | None:
+    found = (one for one in tree.components if "battery" in one.component.casefold())
+    return next(found, None)
+
+
+def _files(fleet: Services, who: Who, robot: KnownRobot, card: Card) -> Sequence[FileInfo] | None:
+    """Return the files of the robot's folder for those who may read them, if it is here."""
+    if not card.config_hash or not who.may("folder.read", robot):
+        return None
+    return fleet.folders.files(robot.id, card.config_hash)

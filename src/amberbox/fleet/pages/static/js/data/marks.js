@@ -1,0 +1,60 @@
+/** Marking: the window as an incident that is kept, or a moment of a mission by a note. */
+
+import { ask, toast } from "../ask.js";
+import { all, el, one } from "../dom.js";
+import { dialogForm } from "../dialogs.js";
+import { spanOf } from "./goto.js";
+import { moment } from "../plot/time.js";
+import { t } from "../strings.js";
+import { stamp } from "../timewords.js";
+
+/**
+ * Make the two dialogs work. @param {string} robot
+ * @param {{window: function(): {from: number, to: number}, cursor: function(): ?number,
+ *   changed: function(): void}} about
+ */
+export function marks(robot, { window, cursor, changed }) {
+  const path = `/api/v1/robots/${encodeURIComponent(robot)}`;
+  const noted = { at: 0 };
+
+  dialogForm("mark", {
+    opened(form) {
+      const { from, to } = window();
+      one("[data-span]", form).textContent = t("data.span", { from: moment(from, 1), to: moment(to, 1) });
+    },
+    async send({ reason }) {
+      const { from, to } = window();
+      await ask(`${path}/incidents`, { method: "POST", body: { reason, from: stamp(from), to: stamp(to) } });
+      toast(t("data.mark.done"));
+      changed();
+    },
+  });
+
+  dialogForm("note", {
+    async opened(form) {
+      const { from, to } = window();
+      noted.at = cursor() ?? (from + to) / 2;
+      one("[data-at]", form).textContent = moment(noted.at, 0.1);
+      await missionsAt(form, path, noted.at);
+    },
+    async send({ text, mission }) {
+      await ask(`${path}/missions/${encodeURIComponent(mission)}/notes`, { method: "POST", body: { text, at: stamp(noted.at) } });
+      toast(t("data.note.done"));
+      changed();
+    },
+  });
+}
+
+/** Offer the missions that were under way at a moment. */
+async function missionsAt(form, path, at) {
+  const query = new URLSearchParams({ from: stamp(at - 1), to: stamp(at + 1) });
+  const found = await ask(`${path}/missions?${query}`).catch(() => []);
+  const fitting = found.filter((mission) => {
+    const [from, to] = spanOf(mission);
+    return from <= at && at <= to;
+  });
+  form.elements.mission.replaceChildren(...fitting.map((mission) => el("option", { value: mission.id }, `${mission.name} · ${mission.id}`)));
+  one("[data-none]", form).hidden = fitting.length > 0;
+  for (const part of all("[data-some]", form)) part.hidden = !fitting.length;
+  one('button[type="submit"]', form).disabled = !fitting.length;
+}

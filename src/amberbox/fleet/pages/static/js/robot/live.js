@@ -1,0 +1,143 @@
+// What changes many times a second on a robot's page: levels, values, ages. Each is written where
+// it stands, found by its key; nothing is fetched, and nothing moves.
+
+import { all, el, level as levelOf, one, setText } from "../dom.js";
+import { t } from "../strings.js";
+import { nowMs, span, when } from "../time.js";
+
+const DIGITS = 4;
+
+/** Return the name by which something is found: as robottree.py makes it. */
+export const key = (component, mode = "", output = "") => [component, mode, output].map(encodeURIComponent).join("/");
+
+/** Write a number with four digits that count, as robottree.py does. @param {number} value */
+export function number(value) {
+  const size = Math.abs(value);
+  if (!Number.isFinite(value) || size >= 1e6 || (size > 0 && size < 1e-3)) return value.toExponential(2).replace(/e([+-])(\d)$/, "e$10$2");
+  const whole = size >= 1 ? Math.floor(Math.log10(size)) : 0;
+  return value.toFixed(Math.max(0, DIGITS - 1 - whole));
+}
+
+/** Write a value of an output. @param {unknown} value @param {string} type */
+export function shown(value, type) {
+  if (value === null || value === undefined) return t("robot.value.none");
+  if (typeof value === "boolean") return t(value ? "robot.value.yes" : "robot.value.no");
+  return typeof value === "number" && type === "float" ? number(value) : String(value);
+}
+
+/**
+ * Write what changes below `page`. `index()` looks anew at what stands there.
+ * @param {HTMLElement} page
+ */
+export function robotLive(page) {
+  /** @type {Map<string, {row: HTMLElement, level: Element, why: Element, age: HTMLElement, mode: boolean}>} */
+  const rows = new Map();
+  /** @type {Map<string, HTMLElement[]>} */
+  const cells = new Map();
+  /** @type {Map<string, HTMLElement[]>} */
+  const levels = new Map();
+  /** When each was measured, by the server's clock in ms. @type {Map<string, number>} */
+  const measured = new Map();
+
+  function index() {
+    for (const map of [rows, cells, levels]) map.clear();
+    for (const element of all("[data-k]", page)) enter(element);
+    for (const element of all("[data-level-of]", page)) add(levels, element.dataset.levelOf, element);
+  }
+
+  function enter(element) {
+    const { k } = element.dataset;
+    const age = one(".age", element);
+    if (!age) {
+      add(cells, k, element);
+      return;
+    }
+    rows.set(k, { row: element, level: one(".level", element), why: one(".why", element), age, mode: element.matches(".mode") });
+    if (age.dataset.age && !measured.has(k)) measured.set(k, nowMs() - 1000 * Number(age.dataset.age));
+  }
+
+  /** Write statuses; false where one has no place here: then the tree is another one. */
+  function write(statuses) {
+    return statuses.map(writeOne).every(Boolean);
+  }
+
+  function writeOne(said) {
+    const k = key(said.component, said.mode);
+    const known = rows.get(k);
+    if (!known) return false;
+    measured.set(k, nowMs());
+    setLevel(known.level, said.level);
+    const why = said.level === "ok" ? "" : said.reason || said.state.replaceAll("_", " ");
+    setText(known.why, why);
+    if (known.why.title !== said.reason) known.why.title = said.reason;
+    if (!said.mode) writeComponent(known.row.parentElement, said, k);
+    return Object.entries(said.outputs).every(([name, value]) => writeValue(said, name, value));
+  }
+
+  function writeComponent(branch, said, k) {
+    branch.dataset.level = said.level;
+    for (const element of levels.get(k) ?? []) setLevel(one(".level", element), said.level);
+    const blockers = one("[data-blockers]", branch);
+    const names = said.blocked_by.join("\n");
+    if (blockers.dataset.blockers !== names) {
+      blockers.dataset.blockers = names;
+      blockers.replaceChildren(...(said.blocked_by.length ? joined(said.blocked_by.map(link)) : [t("robot.nothing")]));
+    }
+    const since = one("[data-since] time", branch);
+    if (since && said.since && since.dateTime !== said.since) since.replaceWith(when(said.since));
+  }
+
+  function writeValue(said, name, value) {
+    const found = cells.get(key(said.component, said.mode, name));
+    for (const element of found ?? []) {
+      const cell = one(".val", element);
+      setText(cell, shown(value, cell.dataset.type));
+      element.classList.toggle("wrong", said.level !== "ok" && said.state === name);
+    }
+    return found !== undefined;
+  }
+
+  /** Take what the server says about ages. */
+  function take({ age_s: newest, older }) {
+    const now = nowMs();
+    const old = new Map(older.map(([component, mode, age]) => [key(component, mode), age]));
+    for (const k of measured.keys()) measured.set(k, now - 1000 * (old.get(k) ?? newest));
+  }
+
+  /** Write all ages: they count on, whether something comes or not. */
+  function tick() {
+    const now = nowMs();
+    for (const [k, { age }] of rows) {
+      if (measured.has(k)) setText(age, span(Math.max(1, (now - measured.get(k)) / 1000)));
+    }
+  }
+
+  /** Return how old the newest of all is, in s; null where nothing was measured. */
+  function newest() {
+    return measured.size ? (nowMs() - Math.max(...measured.values())) / 1000 : null;
+  }
+
+  index();
+  return { index, write, take, tick, newest };
+}
+
+function add(map, name, element) {
+  map.set(name, [...(map.get(name) ?? []), element]);
+}
+
+/** Write a level into the element that shows one. */
+function setLevel(element, name) {
+  if (element.dataset.level === name) return;
+  const fresh = levelOf(name, t(`common.level.${name}`));
+  element.className = fresh.className;
+  element.dataset.level = name;
+  element.replaceChildren(...fresh.childNodes);
+}
+
+function link(name) {
+  return el("a", { href: `#c-${encodeURIComponent(name)}`, "data-go": name }, name);
+}
+
+function joined(links) {
+  return links.flatMap((one, place) => (place ? [", ", one] : [one]));
+}
