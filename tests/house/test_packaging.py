@@ -74,7 +74,12 @@ def test_what_we_import_is_what_we_declare() -> None:
     sometimes |= {"pandas", "polars"}  # users who ask for their tables have them
     own = {
         package: always | {_package(text) for text in EXTRAS[extra]}
-        for package, extra in {"fleet": "server", "link": "link", "robot": "link"}.items()
+        for package, extra in {
+            "fleet": "server",
+            "demo": "server",
+            "link": "link",
+            "robot": "link",
+        }.items()
     }  # who runs these has installed their extra
     known = modules(ROOT / "src")
     undeclared = {
@@ -127,7 +132,8 @@ import amberbox
 for name in {SERVER}:
     sys.modules[name] = None
 for info in pkgutil.walk_packages(amberbox.__path__, "amberbox."):
-    if not info.name.endswith("__main__") and not info.name.startswith("amberbox.fleet."):
+    servers = info.name.startswith(("amberbox.fleet.", "amberbox.demo."))
+    if not servers and not info.name.endswith("__main__"):
         importlib.import_module(info.name)
 """
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)

@@ -26,6 +26,7 @@ EXPECTED = """
     missions.write  no     yes      yes        yes    no     robot   write:missions
     diagnoses.read  yes    yes      yes        yes    no     robot   read:diagnoses
     diagnoses.write no     yes      yes        yes    no     robot   write:diagnoses
+    demo.break      yes    yes      yes        yes    no     robot   -
     folder.read     no     no       yes        yes    no     robot   -
     robots.write    no     no       no         yes    no     server  -
     retention.write no     no       no         yes    no     server  -

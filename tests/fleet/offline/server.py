@@ -20,6 +20,7 @@ from amberbox.fleet.accounts.users import add_user
 from amberbox.fleet.api.who import COOKIE
 from amberbox.fleet.database.database import FILE, Database
 from amberbox.fleet.serving import starting
+from amberbox.fleet.serving.app import rules
 from amberbox.fleet.serving.binding import Wanted
 
 
@@ -51,7 +52,8 @@ def _prepare(folder: Path) -> str:
 def _ask(port: int, secret: str, found: dict[str, int]) -> None:
     try:
         paths = json.loads(_get(port, secret, "/api/v1/openapi.json", found))["paths"]
-        for path in ["/api/docs", "/api/docs.css", "/setup", "/", *paths]:
+        pages = [path for method, path in rules() if method == "GET" and "{" not in path]
+        for path in [*pages, *paths]:
             if path not in found and (path not in paths or "get" in paths[path]):
                 _get(port, secret, path, found)
     finally:

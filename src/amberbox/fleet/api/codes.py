@@ -40,7 +40,6 @@ def from_here(request: Request, fleet: Fleet) -> None:
 @routes.post(
     "/session/code",
     Open("to sign in by a one-time link, in a demonstration; 404 anywhere else"),
-    include_in_schema=False,
 )
 async def begin_by_code(
     _here: Annotated[None, Depends(from_here)],

@@ -19,8 +19,6 @@ from amberbox.fleet.services import Services
 
 routes = Routes("demo")
 
-_HIDDEN = {"include_in_schema": False}
-
 
 @dataclass(frozen=True, slots=True)
 class DemoRobot:
@@ -54,20 +52,20 @@ def demonstration_of(fleet: Fleet) -> Demonstration:
 InDemo = Annotated[Demonstration, Depends(demonstration_of)]
 
 
-@routes.get("/demo", "status.read", each=True, **_HIDDEN)
+@routes.get("/demo", "status.read", each=True)
 def read(demo: InDemo, fleet: Fleet, who: Who) -> DemoView:
     """Return which robots there are, what is broken in them, and what can be."""
     return _view(fleet, who, demo)
 
 
-@routes.post("/demo/{robot}/fault", "demo.break", **_HIDDEN)
+@routes.post("/demo/{robot}/fault", "demo.break")
 def damage(demo: InDemo, fleet: Fleet, who: Who, robot: OfRobot, wanted: Damage) -> DemoView:
     """Break a robot."""
     demo.damage(robot.id, wanted.fault)
     return _noted(fleet, who, demo, robot.id, {"fault": wanted.fault})
 
 
-@routes.delete("/demo/{robot}/fault", "demo.break", **_HIDDEN)
+@routes.delete("/demo/{robot}/fault", "demo.break")
 def repair(demo: InDemo, fleet: Fleet, who: Who, robot: OfRobot) -> DemoView:
     """Repair a robot."""
     demo.repair(robot.id)
