@@ -175,7 +175,7 @@ def test_taking_along_what_is_seen(page_as: PageAs, site: Site) -> None:
 
 def test_asking_the_robot_for_more(page_as: PageAs, site: Site) -> None:
     page = page_as("technician")
-    open_data(page, VOLTS, **{"from": stamp(site, 1), "to": stamp(site, 2)})
+    open_data(page, VOLTS, **{"from": stamp(site, 0.02), "to": stamp(site, 0.1)})
     page.get_by_role("button", name="Ask the robot for it").click()
     expect(page.locator(".work")).to_contain_text("Data from the robot")
     assert site.ask("/robots/ropod_001/fetches")[0]["who"].endswith("technician")
