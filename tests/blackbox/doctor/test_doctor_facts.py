@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from amberbox.blackbox.doctor import service as checked
 from amberbox.blackbox.doctor.checkup import CHECKS, checkup
 from amberbox.blackbox.doctor.finding import Finding
 from amberbox.blackbox.doctor.host import Host
@@ -19,6 +20,7 @@ from amberbox.blackbox.doctor.subject import subject
 from amberbox.blackbox.doctor.traffic import traffic
 from amberbox.blackbox.doctor.wear import read_disk
 from amberbox.blackbox.folder.folder import load_folder
+from amberbox.blackbox.journal.head import read_head
 from amberbox.blackbox.store import open_store
 from amberbox.blackbox.unitfile import service_of, unit_text
 from amberbox.core.plugins import find
@@ -233,6 +235,24 @@ def test_while_recording_and_after(folder: Path, host: Host) -> None:
     box.close()
     assert one(folder, "recorder", host).level == "warn"
     assert writer_pid(open_store(folder / "store")) is None
+
+
+def test_a_head_that_cannot_be_read_at_once_is_read_again(
+    folder: Path, host: Host, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock = ManualClock()
+    host = replace(host, clock=clock)
+    box = record(folder, clock=clock)
+    head = read_head(open_store(folder / "store").folder("main"))
+    assert head is not None
+    answers = iter([None, None, head])
+    monkeypatch.setattr(checked, "read_head", lambda _: next(answers))
+    assert one(folder, "recorder", host).level == "ok"
+    monkeypatch.setattr(checked, "read_head", lambda _: None)
+    monkeypatch.setattr(checked, "_PATIENCE_S", 0.05)
+    assert "hangs: no last write" in one(folder, "recorder", host).found
+    box.close()
+    assert "not running" in one(folder, "recorder", host).found
 
 
 def test_keys(folder: Path, host: Host) -> None:

@@ -98,6 +98,8 @@ def test_thinned_rows_keep_extremes(
 @given(WINDOWS, st.integers(1, 400))
 @example((777, 778), 1)
 @example((0, _ROWS), 1)
+@example((0, 3335), 1)
+@example((0, 3335), 2)
 def test_envelopes_keep_extremes(
     folder: Path, values: Values, window: tuple[int, int], points: int
 ) -> None:
@@ -110,7 +112,9 @@ def test_envelopes_keep_extremes(
         return
     assert np.nanmin(low) <= np.nanmin(inside)
     assert np.nanmax(high) >= np.nanmax(inside)
-    around = LEVELS["1s"] // _EVERY_NS + 2  # a bucket that a range cuts is in it as a whole
+    step_ns = len(inside) * _EVERY_NS / points
+    level_ns = max((width for width in LEVELS.values() if width <= step_ns), default=LEVELS["1s"])
+    around = level_ns // _EVERY_NS + 2  # a bucket that a range cuts is in it as a whole
     near = values[max(window[0] - around, 0) : window[1] + around]
     assert (np.nanmin(low), np.nanmax(high)) >= (np.nanmin(near), np.nanmax(inside))
     assert np.nanmax(high) <= np.nanmax(near)

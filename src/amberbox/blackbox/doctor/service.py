@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import time
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
@@ -18,6 +19,7 @@ from amberbox.blackbox.unitfile import UNITS, argument
 from amberbox.core.clock import NS
 
 _PATIENCE_S = 2.0
+_AGAIN_S = 0.02
 
 
 def recorder(subject: Subject, host: Host) -> Iterator[Finding]:
@@ -26,7 +28,7 @@ def recorder(subject: Subject, host: Host) -> Iterator[Finding]:
     if store is None:
         yield warn("recorder", "nothing has been recorded yet", f"amberbox record {subject.path}")
         return
-    head = read_head(store.folder("main"))
+    head = _newest_head(store)
     late_s = max(_PATIENCE_S, 20 * subject.options.write_s)
     found = judged_recorder(writer_pid(store), head, host.clock.wall_ns(), late_s, subject.path)
     why = why_only_events(store, subject.options.reserve)
@@ -34,6 +36,16 @@ def recorder(subject: Subject, host: Host) -> Iterator[Finding]:
         hint = "amberbox events tells since when; make room, raise store.quota or lower keep_min"
         found = error("recorder", f"{found.found}, but only events are recorded: {why}", hint)
     yield found
+
+
+def _newest_head(store: Store) -> Head | None:
+    """Read the head; one that just began has none yet, and one that is being written is torn."""
+    until_s = time.monotonic() + _PATIENCE_S
+    while (head := read_head(store.folder("main"))) is None:
+        if not is_locked(store, "main") or time.monotonic() >= until_s:
+            return None
+        time.sleep(_AGAIN_S)
+    return head
 
 
 def why_only_events(store: Store, reserve: int) -> str:
