@@ -62,7 +62,7 @@ def demo(home: Path, *words: str) -> subprocess.CompletedProcess[str]:
 
 @pytest.mark.timeout(300)
 def test_the_story_goes_through_by_itself_and_leaves_nothing_behind(tmp_path: Path) -> None:
-    done = demo(tmp_path, "--seconds", "16", "--port", "18443")
+    done = demo(tmp_path, "--seconds", "30", "--port", "18443")
     assert done.returncode == 0, done.stdout + done.stderr
     assert re.search(".*".join(STORY), done.stdout, re.DOTALL), done.stdout
     assert "Traceback" not in done.stderr

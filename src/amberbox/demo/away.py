@@ -48,7 +48,8 @@ def _lanes(browser: Browser, span: dict[str, str]) -> int | None:
 
 def _rows(browser: Browser, span: dict[str, str], least: int) -> int | None:
     path = f"/robots/{SOMETIMES_AWAY}/query?item={_ITEM}&from={span['from']}&to={span['to']}"
-    found = int(browser.get(path)["rows"])
+    answer = browser.get_data(path)
+    found = int(answer["rows"]) if answer else 0
     return found if found >= least else None
 
 

@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
 _TIMEOUT_S = 30.0
 _MOST_BYTES = 64 << 20
+_NOT_HERE = 400
+"""The answer about an item that no journal had so far."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,6 +61,11 @@ class Browser:
         """Ask the API; raises AmberboxError for any answer but 200."""
         return self._checked("GET", path, None).value
 
+    def get_data(self, path: str) -> Any:
+        """Ask the API for data; None while no journal that has them has come."""
+        reply = self.page(PREFIX + path)
+        return None if reply.status == _NOT_HERE else _of(reply, "GET", path).value
+
     def send(self, method: str, path: str, body: Any = None) -> Any:
         """Change something; raises AmberboxError when it is refused."""
         reply = self._checked(method, path, body)
@@ -81,11 +88,7 @@ class Browser:
         return socket
 
     def _checked(self, method: str, path: str, body: Any) -> Reply:
-        reply = self._once(method, PREFIX + path, body)
-        if reply.status >= 300:
-            what = reply.body.decode("utf-8", "replace")[:300]
-            raise AmberboxError(f"{method} {path} answered {reply.status}: {what}")
-        return reply
+        return _of(self._once(method, PREFIX + path, body), method, path)
 
     def _once(self, method: str, target: str, body: Any) -> Reply:
         headers = {"Origin": self.url, "Cookie": f"{COOKIE}={self._cookie}" if self._cookie else ""}
@@ -104,3 +107,11 @@ class Browser:
             raise AmberboxError(f"{self.url} does not answer: {error}") from error
         finally:
             connection.close()
+
+
+def _of(reply: Reply, method: str, path: str) -> Reply:
+    """Return an answer; raises AmberboxError when it is a refusal."""
+    if reply.status >= 300:
+        what = reply.body.decode("utf-8", "replace")[:300]
+        raise AmberboxError(f"{method} {path} answered {reply.status}: {what}")
+    return reply

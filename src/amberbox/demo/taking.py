@@ -34,7 +34,9 @@ def take_home(telling: Telling, browser: Browser, robot: str, broken_ns: int) ->
 def _rows(browser: Browser, robot: str, window: dict[str, str]) -> int | None:
     """Count the rows once both values are among them: journals come when they are closed."""
     span = f"from={window['from']}&to={window['to']}"
-    answer = browser.get(f"/robots/{robot}/query?item={ITEM}&variables={VARIABLE}&{span}")
+    answer = browser.get_data(f"/robots/{robot}/query?item={ITEM}&variables={VARIABLE}&{span}")
+    if answer is None:
+        return None
     names = [column["name"] for column in answer["columns"]]
     at = names.index(VARIABLE) if VARIABLE in names else -1
     values = {row[at] for row in answer["data"]}
