@@ -6,10 +6,15 @@ import json
 import threading
 from pathlib import Path
 
+import pytest
+
+from amberbox.blackbox.journal import reserved
 from amberbox.blackbox.keeper.keeper import Keeper
 from amberbox.blackbox.keeper.options import KeeperOptions
-from amberbox.blackbox.store import create_store
+from amberbox.blackbox.keeper.ownstreams import Own
+from amberbox.blackbox.store import Store, WriterLock, create_store, is_locked, open_store
 from amberbox.link.positions import Place
+from amberbox.robot.link import reaching
 from amberbox.robot.link.live import LiveValues
 from amberbox.robot.link.reaching import Reaches
 from amberbox.robot.link.remarks import Remarks
@@ -57,6 +62,47 @@ def test_only_what_was_synced_is_durable_until_the_run_is_over(tmp_path: Path) -
     assert [run.closed for run in both.runs] == [True, False]
     assert both.durable.run > over.end.run and not both.problem()
     again.close()
+
+
+def test_what_can_be_read_is_within_the_end_though_the_head_does_not_tell_yet(
+    tmp_path: Path,
+) -> None:
+    watcher = Watcher(tmp_path)
+    watcher.write(3)
+    before = Reaches(watcher.store).of("watch")
+    watcher.journal._write([Own(reserved.EVENT, b"{}")])  # it waits for its disk, or is killed
+    rows = RawTail(watcher.store, "watch", Place()).pull(100)
+    reach = Reaches(watcher.store).of("watch")
+    assert before.end <= rows[-1].place < reach.end
+    assert reach.durable == before.durable and not reach.runs[-1].closed
+    watcher.lock.release()
+    again = WriterLock(watcher.store, "watch")  # the next one, before its first row
+    assert Reaches(watcher.store).of("watch").end == reach.end
+    again.release()
+
+
+def test_a_run_that_begins_while_it_is_looked_for_is_not_over(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    Watcher(tmp_path).close()
+    begun: list[Watcher] = []
+
+    def look(store: Store, writer: str) -> bool:
+        found = is_locked(store, writer)
+        if not begun:
+            begun.append(Watcher(tmp_path))
+            begun[0].write(1)
+        return found
+
+    monkeypatch.setattr(reaching, "is_locked", look)
+    reaches = Reaches(open_store(tmp_path))
+    assert not reaches.of("watch").runs[-1].closed
+    begun[0].write(5)
+    end = reaches.of("watch").end
+    begun[0].lock.release()
+    over = reaches.of("watch")
+    assert over.end == end and over.runs[-1].closed
+    begun[0].journal.close()
 
 
 def test_the_newest_value_of_each_watched_variable(tmp_path: Path) -> None:

@@ -27,9 +27,11 @@ class Reaches:
 
     def of(self, writer: str) -> Reach:
         """Return how far a writer's journal reaches."""
-        alive = is_locked(self._store, LOCKS.get(writer, writer))  # before the files
+        lock = LOCKS.get(writer, writer)
+        alive = is_locked(self._store, lock)  # before the files: they may grow until it is free
         head = read_head(self._store.folder(writer))
         last = {run_and_number(path)[0]: path for path in self._store.journal_files(writer)}
+        alive = alive or is_locked(self._store, lock)  # the newest run may have begun in between
         runs = sorted(last)
         if not runs:
             at = START if head is None else Place(head.run, head.next_seq)
@@ -51,7 +53,7 @@ class Reaches:
             return closed, closed.end_seq
         if head is not None and head.run == run and head.store_id == self._store.id:
             durable = min(head.durable_seq, head.next_seq)
-            return RunEnd(run, _boot(path), head.next_seq, closed=False), durable
+            return RunEnd(run, _boot(path), _open_end(path, head), closed=False), durable
         return RunEnd(run, _boot(path), _end_of(path), closed=False), 0
 
     def _closed_run(self, writer: str, run: int, path: Path) -> RunEnd:
@@ -65,6 +67,19 @@ class Reaches:
 
 def _boot(path: Path) -> str:
     return path.stem.split("-")[1]
+
+
+def _open_end(path: Path, head: Head) -> int:
+    """Return where a run ends that is being written.
+
+    The head follows the file, after a sync at times, and never for a writer that was killed before.
+    Rows are sent as they stand in the file: an end before them would tell that they were lost.
+    """
+    try:
+        is_all = head.file == path.name and path.stat().st_size <= head.size
+    except FileNotFoundError:
+        is_all = True
+    return head.next_seq if is_all else max(head.next_seq, _end_of(path))
 
 
 def _end_of(path: Path) -> int:
