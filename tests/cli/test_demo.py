@@ -60,6 +60,7 @@ def demo(home: Path, *words: str) -> subprocess.CompletedProcess[str]:
     )  # fmt: skip
 
 
+@pytest.mark.alone
 @pytest.mark.timeout(300)
 def test_the_story_goes_through_by_itself_and_leaves_nothing_behind(tmp_path: Path) -> None:
     done = demo(tmp_path, "--seconds", "30", "--port", "18443")
@@ -73,6 +74,7 @@ def test_the_story_goes_through_by_itself_and_leaves_nothing_behind(tmp_path: Pa
     assert still_running(tmp_path) == []
 
 
+@pytest.mark.alone
 @pytest.mark.timeout(180)
 def test_the_recorder_alone_loses_nothing_when_it_is_killed(tmp_path: Path) -> None:
     done = demo(tmp_path, "--recorder", "--seconds", "8", "--keep", str(tmp_path / "kept"))

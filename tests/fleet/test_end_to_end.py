@@ -9,6 +9,7 @@ import pytest
 from tests.fleet.endtoend import ordeal
 
 
+@pytest.mark.alone
 @pytest.mark.timeout(300)
 def test_nothing_is_lost_whatever_is_killed(tmp_path: Path) -> None:
     result = ordeal.run(tmp_path, robots=3, seconds=20, kills=20, seed=6)

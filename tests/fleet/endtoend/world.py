@@ -60,6 +60,8 @@ class Robot:
     link: subprocess.Popen[bytes] | None = None
     old: list[Path] = field(default_factory=list)
     """Stores that it had before."""
+    written: set[Path] = field(default_factory=set)
+    """What its watcher had written before this life."""
 
     @property
     def store(self) -> Path:
@@ -72,6 +74,7 @@ class Robot:
     def start_box(self) -> None:
         """Begin to write."""
         self.lives += 1
+        self.written = set(self.store.glob("watch/*.mcap"))
         words = (str(self.store), self.name, self.boot, str(self.lives))
         self.box = start("tests.fleet.endtoend.robotprocess", *words, log=self.log)
 
@@ -100,9 +103,9 @@ class Robot:
         self.start_link()
 
     def wait(self) -> None:
-        """Wait until it writes."""
+        """Wait until it writes in this life."""
         end_s = time.monotonic() + 40
-        while not any(self.store.glob("watch/*.mcap")):
+        while not set(self.store.glob("watch/*.mcap")) - self.written:
             assert time.monotonic() < end_s, self.log.read_text()[-3000:]
             time.sleep(0.05)
 
