@@ -59,6 +59,14 @@ def parse_time(text: str, now_ns: Callable[[], int], last_ns: Callable[[], int |
     return time_ns
 
 
+def ns_of(stamp: str) -> int:
+    """Read a time as `format_time` writes it; raises UsageError for any other."""
+    iso = _ISO.fullmatch(stamp)
+    if iso is None:
+        raise UsageError(f"not a time: {stamp!r}", _HINT)
+    return _iso_ns(iso, stamp)
+
+
 def any_time(text: str, now_ns: Callable[[], int], last_ns: Callable[[], int | None]) -> int:
     """Return what ``parse_time`` does of times that 64 bits cannot hold, too."""
     compact = text.strip()

@@ -11,7 +11,8 @@ from amberbox.fleet.asking.errors import BusyError
 from amberbox.fleet.pages.data import around as dataaround
 from amberbox.fleet.pages.data import data
 from amberbox.fleet.pages.data.coverage import Stretch, joined
-from amberbox.fleet.pages.diagnosis.card import DiagnosisCard, Reason, data_href
+from amberbox.fleet.pages.datalinks import moment_href
+from amberbox.fleet.pages.diagnosis.card import DiagnosisCard, Reason
 from amberbox.testing.records import T0_NS
 from tests.fleet.data.filled import ROWS, fill
 from tests.fleet.house import House, house
@@ -106,8 +107,8 @@ def test_variables_of_the_diagnosis_come_first(
     viewer: TestClient, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     why = (
-        Reason("No scans.", None, data_href("ropod_001", ("odom.pose_x", "odom.pose_y"), T0_NS)),
-        Reason("It runs.", None, data_href("ropod_001", ("odom.pose_x",), None)),
+        Reason("No scans.", None, moment_href("ropod_001", ("odom.pose_x", "odom.pose_y"), T0_NS)),
+        Reason("It runs.", None, moment_href("ropod_001", ("odom.pose_x",), None)),
     )
     card = DiagnosisCard("ropod_001", "open", None, why=why)
     monkeypatch.setattr(data, "current_card", lambda *_: card)

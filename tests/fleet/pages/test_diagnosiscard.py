@@ -11,11 +11,11 @@ from amberbox.core.types import Symptom
 from amberbox.diagnosis.knowledge import Knowledge
 from amberbox.diagnosis.situation import Situation
 from amberbox.fleet.api.diagnoses import revision_json
+from amberbox.fleet.pages.datalinks import moment_href
 from amberbox.fleet.pages.diagnosis.card import (
     REASONS,
     DiagnosisCard,
     card_of,
-    data_href,
     minutes,
     plain_card_of,
 )
@@ -141,7 +141,7 @@ def test_whatever_stands_in_a_robots_folder_is_shown_as_text(knowledge: Knowledg
     told["next"].update(text=hostile, test=hostile, by=hostile)
     told["next"]["answers"][0]["answer"] = told["use"]["text"] = hostile
     answer["id"] = answer["robot"] = answer["notes"] = hostile
-    template = environment().get_template("diagnosis_part.html")
+    template = environment().get_template("diagnosis/part.html")
     page = template.render(shown=card_of(answer), seen=None, may=True, link=True)
     assert "<img" not in page and "49" not in page
     assert page.count("&lt;img src=x onerror=alert(1)&gt;{{7*7}}") >= 6
@@ -156,5 +156,5 @@ def test_minutes_are_whole_but_for_a_half(seconds: float, text: str) -> None:
 
 def test_addresses_of_data_are_quoted_and_those_of_monitors_left_out() -> None:
     hostile = '"><script>'
-    found = data_href("a/b", [hostile, "laser/heartbeat/alive"], None)
+    found = moment_href("a/b", [hostile, "laser/heartbeat/alive"], None)
     assert found == "/robots/a%2Fb/data?v=%22%3E%3Cscript%3E"

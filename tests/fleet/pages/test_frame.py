@@ -99,7 +99,7 @@ def test_every_module_that_is_imported_or_started_is_there() -> None:
         asked = re.findall(r'^(?:import|export) .*?from "(\.[^"]+)"', file.read_text(), re.M)
         found = {normpath(join(file.parent.relative_to(SCRIPTS).as_posix(), one)) for one in asked}
         assert found <= names, file.name
-    for file in TEMPLATES.glob("*.html"):
+    for file in TEMPLATES.rglob("*.html"):
         started = re.findall(r'm\.module\("([\w/-]+)"\)', file.read_text())
         assert {f"{name}.js" for name in started} <= names, file.name
 
@@ -107,7 +107,7 @@ def test_every_module_that_is_imported_or_started_is_there() -> None:
 def test_every_picture_that_is_used_is_in_the_sprite() -> None:
     sprite = assets.assets()["icons.svg"].data.decode()
     names = set(re.findall(r'<symbol id="([^"]+)"', sprite))
-    used = {name for file in TEMPLATES.glob("*.html")
+    used = {name for file in TEMPLATES.rglob("*.html")
             for name in re.findall(r'icon\("([\w-]+)"\)', file.read_text())}  # fmt: skip
     used |= {name for file in SCRIPTS.rglob("*.js")
              for name in re.findall(r'icon\("([\w-]+)"\)', file.read_text())}  # fmt: skip
@@ -127,7 +127,7 @@ def test_what_is_shown_is_escaped_everywhere() -> None:
 
 def test_every_text_that_is_named_is_in_the_catalogue() -> None:
     texts = catalogue().texts
-    for file in TEMPLATES.glob("*.html"):
+    for file in TEMPLATES.rglob("*.html"):
         for name in re.findall(r'\bt\("([\w.]+)"', file.read_text()):
             assert name in texts or name.endswith((".", "_")), f"{file.name}: {name}"
 
@@ -146,7 +146,7 @@ def test_a_text_that_is_missing_is_an_error() -> None:
 
 
 def test_no_page_has_scripts_or_styles_inside() -> None:
-    for file in TEMPLATES.glob("*.html"):
+    for file in TEMPLATES.rglob("*.html"):
         text = file.read_text()
         assert not re.search(r"<style|\sstyle=|\son\w+=", text), file.name
         for script in re.findall(r"<script([^>]*)>", text):

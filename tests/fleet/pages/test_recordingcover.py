@@ -1,10 +1,15 @@
 """What a bar of recordings shows: what lies close together is one, reasons have kinds."""
 
+from __future__ import annotations
+
+import pytest
+
 from amberbox.core.clock import NS
 from amberbox.core.timetext import format_time
 from amberbox.fleet.api.incidents import Incident
 from amberbox.fleet.api.query import Gap
 from amberbox.fleet.data.journals import Integrity, Recording, State
+from amberbox.fleet.data.missing import GapKind
 from amberbox.fleet.drawing.axis import Axis
 from amberbox.fleet.pages.recordings.cover import axis_of, share, spans, stretches
 
@@ -20,9 +25,10 @@ def journal(
                      int(start * HOUR_NS), int(to * HOUR_NS), 0)  # fmt: skip
 
 
-def gap(start: float, to: float, reason: str, item: str = "") -> Gap:
+def gap(start: float, to: float, kind: GapKind, item: str = "") -> Gap:
     at = (format_time(int(hour * HOUR_NS)) for hour in (start, to))
-    return Gap(item=item, writer="main", run=1, from_=next(at), to=next(at), reason=reason, count=1)
+    return Gap(item=item, writer="main", run=1, from_=next(at), to=next(at), kind=kind,
+               reason="as it was said", count=1)  # fmt: skip
 
 
 def incident(state: str) -> Incident:
@@ -44,17 +50,15 @@ def test_what_is_not_here_is_not_recorded() -> None:
     assert [(one.kind, one.start // HOUR_NS) for one in found] == [("deleted", 9)]
 
 
-def test_reasons_have_kinds() -> None:
-    reasons = {
-        "dropped: the queue was full": "lost", "lost at a power cut": "lost",
-        "deleted: older than its lifetime": "deleted", "unchanged": "filtered",
-        "deleted on the robot before it was copied: the disk was full": "deleted",
-        "not on the server yet": None, "no messages from the driver": None,
-    }  # fmt: skip
-    for reason, kind in reasons.items():
-        found = stretches([], [gap(1, 2, reason, "odom")], [], AXIS)
-        assert [one.kind for one in found] == ([kind] if kind else []), reason
-        assert all(one.text == f"odom: {reason}" for one in found)
+@pytest.mark.parametrize(
+    ("kind", "drawn"),
+    [("lost", ["lost"]), ("deleted", ["deleted"]), ("filtered", ["filtered"]),
+     ("to_come", []), ("uncovered", [])],
+)  # fmt: skip
+def test_what_is_missing_is_drawn(kind: GapKind, drawn: list[str]) -> None:
+    found = stretches([], [gap(1, 2, kind, "odom")], [], AXIS)
+    assert [one.kind for one in found] == drawn
+    assert all(one.text == "odom: as it was said" for one in found)
 
 
 def test_released_incidents_are_not_drawn() -> None:

@@ -18,7 +18,7 @@ ONE_OR_MANY = ("alarms.acknowledged_one", "alarms.not_acknowledged_one")
 
 
 def sources() -> Iterator[str]:
-    for pattern in ("**/*.py", "templates/*.html", "static/js/**/*.js"):
+    for pattern in ("**/*.py", "templates/**/*.html", "static/js/**/*.js"):
         for path in sorted(PAGES.glob(pattern)):
             yield path.read_text(encoding="utf-8")
 

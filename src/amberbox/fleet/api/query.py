@@ -27,6 +27,7 @@ from amberbox.fleet.data.asked import (
     Form,
     arguments,
 )
+from amberbox.fleet.data.missing import GapKind
 
 routes = Routes("data")
 
@@ -68,13 +69,18 @@ class Rows:
 
 
 class Gap(Shown):
-    """A range without data, and why; ``count`` is None when nobody can know."""
+    """A range without data, and why; ``count`` is None when nobody can know.
+
+    ``kind``: ``to_come`` (the robot has it), ``deleted``, ``filtered`` (the value did not change),
+    ``lost``, ``uncovered`` (nothing was recorded).
+    """
 
     item: str
     writer: str
     run: int
     from_: str = FROM
     to: str
+    kind: GapKind
     reason: str
     count: int | None
 

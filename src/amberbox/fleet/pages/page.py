@@ -19,6 +19,7 @@ from amberbox.fleet.accounts.sessions import csrf_token
 from amberbox.fleet.api.access import Caller, Decorator, Open, Routes, caller_of, services_of
 from amberbox.fleet.pages import assets, figures, wording
 from amberbox.fleet.pages.alarms.count import OpenCount, open_count
+from amberbox.fleet.pages.datalinks import data_href, mission_href
 from amberbox.fleet.pages.strings import catalogue, for_browser
 from amberbox.monitoring.engine.outputs import SEVERITIES
 
@@ -43,8 +44,8 @@ class Pages(Routes):
 def render(request: Request, template: str, status: int = 200, **values: Any) -> Response:
     """Make a page of a template; ``values`` are what it shows.
 
-    The browser gets the strings below ``js`` of the page's own part of the catalogue, and of the
-    parts that ``strings`` names.
+    The browser gets the strings below ``js`` of the parts of the catalogue that the template's
+    path and ``strings`` name.
     """
     known = _about(request, template, values.pop("strings", ()))
     text = environment().get_template(template).render({**known, **values})
@@ -68,8 +69,9 @@ def environment() -> Environment:
         trim_blocks=True, lstrip_blocks=True,
     )  # fmt: skip
     made.globals.update(
-        t=catalogue().text, asset=assets.address, version=__version__, severities=SEVERITIES
-    )
+        t=catalogue().text, asset=assets.address, version=__version__, severities=SEVERITIES,
+        data_href=data_href, mission_href=mission_href,
+    )  # fmt: skip
     made.filters.update(
         json=as_json, size=figures.size, count=figures.count, percent=figures.percent,
         span=figures.span, capital=wording.capital, sentence=wording.sentence,
@@ -87,6 +89,7 @@ def as_json(value: Any) -> Markup:
 def _about(request: Request, template: str, also: tuple[str, ...]) -> Mapping[str, Any]:
     services = services_of(request)
     me = visitor(request)
+    parts = template.removesuffix(".html").split("/")
     theme = request.cookies.get("theme", "")
     return {
         "me": me,
@@ -96,5 +99,5 @@ def _about(request: Request, template: str, also: tuple[str, ...]) -> Mapping[st
         "now": format_time(services.clock.wall_ns()),
         "demo": getattr(services, "demo", None),
         "open_alarms": lambda: open_count(services, me) if me else OpenCount(),
-        "browser_strings": for_browser(("common", template.partition(".")[0], *also)),
+        "browser_strings": for_browser(("common", *parts, *also)),
     }

@@ -17,7 +17,7 @@ routes = Pages()
 def show(request: Request, fleet: Fleet, who: Who) -> Response:
     """Show one's own account; who has to change the password first sees nothing else."""
     if who.principal.must_change:
-        return render(request, "account.html", sessions=[], tokens=[], scopes={})
+        return render(request, "account/account.html", sessions=[], tokens=[], scopes={})
     tokens = [token for token in list_tokens(fleet, who) if token.revoked is None]
     sessions = list_sessions(who, fleet)
-    return render(request, "account.html", sessions=sessions, tokens=tokens, scopes=SCOPES)
+    return render(request, "account/account.html", sessions=sessions, tokens=tokens, scopes=SCOPES)

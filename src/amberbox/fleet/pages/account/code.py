@@ -14,4 +14,4 @@ routes = Pages()
 @routes.get("/in", Open("signs in by a link, in a demonstration; 404 anywhere else"))
 def show(request: Request, demo: InDemo) -> Response:
     """Show that somebody is being signed in; the code never comes here."""
-    return render(request, "in.html")
+    return render(request, "account/in.html")

@@ -97,4 +97,6 @@ async def _form(request: Request) -> dict[str, str]:
 def _page(request: Request, fleet: Services, status: int = 200, **about: Any) -> Response:
     nothing = {"made": "", "problem": "", "hint": "", "name": "", "is_first": True,
                "needs_code": False}  # fmt: skip
-    return render(request, "setup.html", status, folder=fleet.folder, **{**nothing, **about})
+    return render(
+        request, "account/setup.html", status, folder=fleet.folder, **{**nothing, **about}
+    )

@@ -21,7 +21,7 @@ def show(request: Request, next: str = "/") -> Response:
     onward = next if _is_here(next) else "/"
     if visitor(request) is not None:
         return RedirectResponse(onward, 303)
-    return render(request, "signin.html", onward=onward)
+    return render(request, "account/signin.html", onward=onward)
 
 
 def _is_here(address: str) -> bool:

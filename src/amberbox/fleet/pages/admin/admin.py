@@ -46,7 +46,7 @@ def show(request: Request, fleet: Fleet, who: Who) -> Response:
     steps = list(_steps(fleet, who)) if who.may("users.write") else []
     troubles = fleet.keeping.troubles() if who.may("metrics.read") else []
     health = read_health(fleet, Response()).status
-    return render(request, "admin.html", pages=pages, steps=steps, health=health,
+    return render(request, "admin/admin.html", pages=pages, steps=steps, health=health,
                   troubles=troubles, is_new=not all(step.is_done for step in steps))  # fmt: skip
 
 

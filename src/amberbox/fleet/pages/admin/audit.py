@@ -28,6 +28,6 @@ def show(
     chosen = urlencode({name: value for name, value in query.items() if value})
     older = f"?{chosen}&after={rows[-1].seq}" if len(rows) == _SHOWN else ""
     return render(
-        request, "admin_audit.html", strings=("audit",), rows=rows, wanted=wanted, chosen=chosen,
+        request, "admin/audit.html", rows=rows, wanted=wanted, chosen=chosen,
         older=older, head=read_head(fleet),
     )  # fmt: skip

@@ -38,7 +38,7 @@ def show_health(request: Request, fleet: Fleet) -> Response:
     """Show the server's own figures."""
     found = _figures(request)
     disk = Disk(found["amberbox_disk_free_bytes"], found["amberbox_disk_bytes"])
-    return render(request, "admin_health.html", figures=found, disk=disk,
+    return render(request, "admin/health.html", figures=found, disk=disk,
                   health=read_health(fleet, Response()).status,
                   troubles=fleet.keeping.troubles())  # fmt: skip
 
@@ -46,7 +46,7 @@ def show_health(request: Request, fleet: Fleet) -> Response:
 @routes.get("/admin/system", "status.read")
 def show_system(request: Request, fleet: Fleet) -> Response:
     """Show teams and the system as the server watches them."""
-    return render(request, "admin_system.html", folders=read_status(fleet))
+    return render(request, "admin/system.html", folders=read_status(fleet))
 
 
 def _figures(request: Request) -> Mapping[str, float]:

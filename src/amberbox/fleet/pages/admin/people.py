@@ -24,7 +24,7 @@ def show_people(request: Request, fleet: Fleet, who: Who) -> Response:
     people = list_people(fleet, "", _MOST)
     with fleet.database.reading() as connection:
         tokens = working_tokens(connection, fleet.clock.wall_ns())
-    return render(request, "admin_users.html", people=people, roles=list(Role), tokens=tokens,
+    return render(request, "admin/users.html", people=people, roles=list(Role), tokens=tokens,
                   rfc3339=shown, may=who.may("users.write"))  # fmt: skip
 
 
@@ -32,10 +32,10 @@ def show_people(request: Request, fleet: Fleet, who: Who) -> Response:
 def show_teams(request: Request, fleet: Fleet, who: Who) -> Response:
     """Show the groups of robots and people."""
     groups = list_groups(fleet, "", _MOST)
-    return render(request, "admin_teams.html", groups=groups, may=who.may("users.write"))
+    return render(request, "admin/teams.html", groups=groups, may=who.may("users.write"))
 
 
 @routes.get("/admin/robots", "robots.write")
 def show_robots(request: Request, fleet: Fleet, who: Who) -> Response:
     """Show which robots may connect, and whether they do."""
-    return render(request, "admin_robots.html", cards=list_cards(fleet, who, "", "", _MOST))
+    return render(request, "admin/robots.html", cards=list_cards(fleet, who, "", "", _MOST))

@@ -27,8 +27,8 @@ def show(request: Request, fleet: Fleet, who: Who, setting: Name) -> Response:
     tells = setting == "notifications"
     messages = list_notifications(fleet, None, 0, 0, _LISTED) if tells else []
     return render(
-        request, "setting.html", setting=asdict(read_setting(fleet, setting)), messages=messages,
-        destinations=_destinations(fleet) if tells else [],
+        request, "admin/setting.html", setting=asdict(read_setting(fleet, setting)),
+        messages=messages, destinations=_destinations(fleet) if tells else [],
     )  # fmt: skip
 
 

@@ -45,32 +45,32 @@ Looked = Annotated[Look, Depends(looked_for)]
 @routes.get("/alarms", "alarms.read", each=True)
 def show(request: Request, fleet: Fleet, who: Who, look: Looked) -> Response:
     """Show the alarms that fit, by what people made of them."""
-    return render(request, "alarms.html", strings=("alarms",), **_listed(fleet, who, look))
+    return render(request, "alarms/alarms.html", **_listed(fleet, who, look))
 
 
 @routes.get("/pieces/alarms", "alarms.read", each=True)
 def show_list(request: Request, fleet: Fleet, who: Who, look: Looked) -> Response:
     """Show the list of alarms alone."""
-    return render(request, "alarms_list.html", **_listed(fleet, who, look))
+    return render(request, "alarms/list.html", **_listed(fleet, who, look))
 
 
 @routes.get("/pieces/alarm-count", "alarms.read", each=True)
 def show_count(request: Request) -> Response:
     """Show alone how many alarms are open."""
-    return render(request, "alarms_count.html")
+    return render(request, "alarms/count.html")
 
 
 @routes.get("/alarms/{id}", "alarms.read", each=True)
 def show_one(request: Request, fleet: Fleet, who: Who, id: Number) -> Response:
     """Show all of one alarm, with the diagnosis that explains it."""
     more = ("alarms", "diagnosis")
-    return render(request, "alarm.html", strings=more, **_all_of(fleet, who, id))
+    return render(request, "alarms/alarm.html", strings=more, **_all_of(fleet, who, id))
 
 
 @routes.get("/pieces/alarms/{id}", "alarms.read", each=True)
 def show_parts(request: Request, fleet: Fleet, who: Who, id: Number) -> Response:
     """Show the parts of an alarm that change, alone."""
-    return render(request, "alarm_parts.html", **_all_of(fleet, who, id))
+    return render(request, "alarms/alarm_parts.html", **_all_of(fleet, who, id))
 
 
 def _all_of(fleet: Services, who: Caller, number: int) -> Mapping[str, Any]:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from urllib.parse import parse_qs, quote, urlencode, urlsplit
+from urllib.parse import parse_qs, quote, urlsplit
 
 from fastapi import HTTPException
 from sqlalchemy import Connection, RowMapping, func, select
 
-from amberbox.core.timetext import format_time, parse_time
+from amberbox.core.timetext import format_time, ns_of
 from amberbox.fleet.accounts.actions import Role
 from amberbox.fleet.accounts.robots import KnownRobot
 from amberbox.fleet.accounts.users import list_users
@@ -24,6 +24,7 @@ from amberbox.fleet.api.forms import shown
 from amberbox.fleet.api.notifications import Notification, list_notifications
 from amberbox.fleet.notifying.tables import OUTBOX
 from amberbox.fleet.pages.alarms.wording import Event, Words, events, lasted_ns, words_of
+from amberbox.fleet.pages.datalinks import data_href
 from amberbox.fleet.pages.diagnosis.card import DiagnosisCard
 from amberbox.fleet.pages.diagnosis.look import card_now, look
 from amberbox.fleet.services import Services
@@ -154,10 +155,9 @@ def links_of(line: AlarmLine, card: DiagnosisCard | None, now: str) -> Links:
         return Links("", "")
     hrefs = [reason.href for reason in card.why] if card else []
     names = [name for href in hrefs for name in parse_qs(urlsplit(href).query).get("v", ())]
-    span = [("from", line.window.from_), ("to", line.window.to or now)]
-    query = [("v", name) for name in dict.fromkeys(names)] + span
-    path = f"/robots/{quote(line.window.robot, safe='')}"
-    return Links(f"{path}/data?{urlencode(query)}", f"{path}#timeline")
+    robot, to = line.window.robot, line.window.to or now
+    timeline = f"/robots/{quote(robot, safe='')}#timeline"
+    return Links(data_href(robot, line.window.from_, to, names), timeline)
 
 
 def _item(
@@ -184,11 +184,7 @@ def _lasted(line: AlarmLine) -> str:
     if line.active:
         return ""
     ends = line.cleared or (line.resolved.at if line.resolved else None) or line.changed
-    return lasted_ns(_ns(line.opened), _ns(ends))
-
-
-def _ns(stamp: str) -> int:
-    return parse_time(stamp, lambda: 0, lambda: None)
+    return lasted_ns(ns_of(line.opened), ns_of(ends))
 
 
 def _suffering(

@@ -25,11 +25,12 @@ _HELD = ("in_columns", "waiting")
 
 @dataclass(frozen=True, slots=True)
 class Stretch:
-    """A stretch of time in seconds since 1970; ``reason`` says why something is missing."""
+    """A stretch of time in seconds since 1970; of what is missing its kind, and why."""
 
     start: float
     end: float
     reason: str = ""
+    kind: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +63,7 @@ def joined(stretches: Iterable[Stretch], least: float) -> list[Stretch]:
     for one in sorted(stretches, key=lambda s: (s.reason, s.start)):
         last = found[-1] if found else None
         if last and last.reason == one.reason and one.start - last.end <= least:
-            found[-1] = Stretch(last.start, max(last.end, one.end), one.reason)
+            found[-1] = Stretch(last.start, max(last.end, one.end), one.reason, one.kind)
         else:
             found.append(one)
     return sorted(found, key=lambda s: s.start)
@@ -73,8 +74,8 @@ def _missing(fleet: Services, who: Caller, robot: str) -> list[Stretch]:
     answer = fleet.asking.ask_now(f"{WORKER}:gaps", question, asker=who.asker)
     gaps: list[dict[str, Any]] = msgspec.json.decode(answer)["gaps"]
     starts, ends = (_seconds([gap[name] for gap in gaps]) for name in ("from", "to"))
-    reasons = [gap["reason"] for gap in gaps]
-    return [Stretch(*one) for one in zip(starts, ends, reasons, strict=True)]
+    reasons, kinds = ([gap[name] for gap in gaps] for name in ("reason", "kind"))
+    return [Stretch(*one) for one in zip(starts, ends, reasons, kinds, strict=True)]
 
 
 def _seconds(stamps: Sequence[str]) -> list[float]:

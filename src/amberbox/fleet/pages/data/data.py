@@ -41,7 +41,7 @@ def show(request: Request, robot: OfRobot, fleet: Fleet, who: Who) -> Response:
     """Show the page; what is in it follows, so that nothing here waits for a worker."""
     may = {name: who.may(action, robot) for name, action in _MAY.items()}
     return render(
-        request, "data.html", strings=("plot",), card=read_card(fleet, robot), may=may,
+        request, "data/data.html", strings=("plot",), card=read_card(fleet, robot), may=may,
         named=_named(fleet, robot),
     )  # fmt: skip
 

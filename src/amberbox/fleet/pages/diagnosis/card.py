@@ -9,19 +9,16 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal, TypeAlias
-from urllib.parse import quote, urlencode
 
-from amberbox.core.clock import NS
 from amberbox.core.sureness import percent
 from amberbox.core.timetext import format_time
+from amberbox.fleet.pages.datalinks import moment_href
 from amberbox.fleet.pages.wording import capital, readable, sentence
 
 REASONS = 3
 """How many sentences say why."""
 LIKELY = 0.5
 """From which probability on one cause is called likely."""
-BEFORE_NS, AFTER_NS = 60 * NS, 60 * NS
-"""So much of the data is shown around the moment at which something was seen."""
 CANNOT = "cannot"
 
 Sure: TypeAlias = Literal["", "likely", "possible", "cannot_tell_apart"]
@@ -148,23 +145,10 @@ def plain_card_of(revision: Answer) -> DiagnosisCard:
         robot, revision["state"], revision["at"], revision["id"], revision["revision"], causes,
         _sure(causes, probability), percent(probability) if causes else "",
         tuple(Reason(sentence(readable(name.replace("/", " "))), revision["at"],
-                     data_href(robot, (), revision["at_ns"])) for name in names[:REASONS]),
+                     moment_href(robot, (), revision["at_ns"])) for name in names[:REASONS]),
         max(0, len(names) - REASONS),
         next=_plain_next(revision["next_tests"]), complete=False,
     )  # fmt: skip
-
-
-def data_href(
-    robot: str, addresses: Sequence[str], at_ns: int | None, until_ns: int | None = None
-) -> str:
-    """Return where the data of a moment are shown, with these variables."""
-    query = [("v", address) for address in dict.fromkeys(addresses) if "/" not in address]
-    if at_ns is not None:
-        to_ns = (
-            at_ns + AFTER_NS if until_ns is None else max(at_ns, min(until_ns, at_ns + AFTER_NS))
-        )
-        query += [("from", _text(at_ns - BEFORE_NS)), ("to", _text(to_ns))]
-    return f"/robots/{quote(robot, safe='')}/data?{urlencode(query)}"
 
 
 def names_in(told: Answer) -> dict[str, str]:
@@ -207,7 +191,7 @@ def reason_of(robot: str, seen: Answer, until_ns: int | None = None) -> Reason:
     onset_ns = seen["onset_ns"]
     return Reason(
         sentence(seen["text"]), None if onset_ns is None else format_time(onset_ns),
-        data_href(robot, seen["measured_from"], onset_ns, until_ns),
+        moment_href(robot, seen["measured_from"], onset_ns, until_ns),
     )  # fmt: skip
 
 
@@ -254,7 +238,3 @@ def minutes(seconds: float) -> str:
     if seconds <= 45:
         return "½"
     return f"{max(1, round(seconds / 60))}"
-
-
-def _text(at_ns: int) -> str:
-    return f"{format_time(at_ns)[:23]}Z"

@@ -51,7 +51,7 @@ def show(
     tabs = [name for name in TABS if may or name not in ASKING]
     lacks = missing(fleet, robot.id, card.last_seen is not None) if not seen.stands else ""
     return render(
-        request, "diagnosis.html", card=card, seen=seen, shown=shown, at=at, lacks=lacks,
+        request, "diagnosis/diagnosis.html", card=card, seen=seen, shown=shown, at=at, lacks=lacks,
         tabs=tabs, tab=tab if tab in tabs else tabs[0], may=may,
         before=_before(fleet, seen),
     )  # fmt: skip
@@ -76,8 +76,8 @@ async def show_card(
             card = await card_told(fleet, who, seen, await asyncio.to_thread(_seen, fleet, robot))
     except AmberboxError as error:
         plain = None if at else await asyncio.to_thread(card_now, fleet, seen, None)
-        return render(request, "diagnosis_trouble.html", error=error, plain=plain, may=may)
-    return render(request, "diagnosis_part.html", shown=card, seen=seen, may=may, link=link)
+        return render(request, "diagnosis/trouble.html", error=error, plain=plain, may=may)
+    return render(request, "diagnosis/part.html", shown=card, seen=seen, may=may, link=link)
 
 
 @routes.get("/robots/{robot}/diagnosis/others", "diagnoses.read")
@@ -158,8 +158,8 @@ async def _part(
     try:
         values = await made
     except AmberboxError as error:
-        return render(request, "diagnosis_trouble.html", error=error, plain=None, may=may)
-    return render(request, f"diagnosis_{tab}.html", asked=asked, may=may, **values)
+        return render(request, "diagnosis/trouble.html", error=error, plain=None, may=may)
+    return render(request, f"diagnosis/{tab}.html", asked=asked, may=may, **values)
 
 
 def _before(fleet: Services, seen: Look) -> DiagnosisCard | None:

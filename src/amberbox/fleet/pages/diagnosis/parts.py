@@ -18,12 +18,12 @@ from amberbox.fleet.knowledge import notebook
 from amberbox.fleet.knowledge.asked import AboutRobot, AskDiagnosis, written
 from amberbox.fleet.knowledge.explained import Answer
 from amberbox.fleet.knowledge.listing import Known, diagnoses
+from amberbox.fleet.pages.datalinks import moment_href
 from amberbox.fleet.pages.diagnosis.card import (
     Next,
     Reason,
     card_of,
     choices_of,
-    data_href,
     minutes,
     reason_of,
 )
@@ -213,7 +213,7 @@ def _tests(answer: Answer) -> Iterator[Next]:
 def _links(answer: Answer) -> dict[str, str]:
     robot = str(answer["robot"])
     return {
-        f"symptom:{name}": data_href(robot, entry["measured_from"], entry["onset_ns"])
+        f"symptom:{name}": moment_href(robot, entry["measured_from"], entry["onset_ns"])
         for name, entry in _seen(answer).items() if "measured_from" in entry
     }  # fmt: skip
 

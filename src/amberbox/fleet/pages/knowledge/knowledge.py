@@ -52,7 +52,7 @@ class RuleFile:
 def show_all(request: Request, fleet: Fleet, who: Who) -> Response:
     """Show of which robots failure modes are known."""
     cards = [card for card in list_cards(fleet, who, "", "", _MOST) if card.config_hash]
-    return render(request, "knowledge.html", cards=cards)
+    return render(request, "knowledge/knowledge.html", cards=cards)
 
 
 @routes.get("/knowledge/{robot}", "diagnoses.read")
@@ -67,7 +67,7 @@ async def show(
         found = await read_fmea(robot, fleet, who, "", "", None)
     except AmberboxError as error:
         nothing: dict[str, Any] = {"robot": robot.id, "problem": error, "found": None}
-        return await run_in_threadpool(render, request, "knowledge_robot.html", **nothing)
+        return await run_in_threadpool(render, request, "knowledge/robot.html", **nothing)
     return await run_in_threadpool(_sheet, request, fleet, who, robot, found, look)
 
 
@@ -77,7 +77,7 @@ def _sheet(
 ) -> Response:  # fmt: skip
     modes = modes_of(found)
     return render(
-        request, "knowledge_robot.html", robot=robot.id, problem=None, found=found, look=look,
+        request, "knowledge/robot.html", robot=robot.id, problem=None, found=found, look=look,
         modes=chosen(modes, look), all=modes, alike=_alike(found, modes),
         matrix=criticality_matrix(matrix_of(modes, look),
                                   label=catalogue().text("knowledge.matrix.label"),

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 from amberbox.core.clock import NS
-from amberbox.core.timetext import format_time, parse_time
+from amberbox.core.timetext import format_time, ns_of
 from amberbox.fleet.api.incidents import Incident
 from amberbox.fleet.api.query import Gap
 from amberbox.fleet.data.journals import Recording
+from amberbox.fleet.data.missing import GapKind
 from amberbox.fleet.drawing.axis import Axis
 from amberbox.fleet.drawing.coverage import Kind, Stretch
 
@@ -27,11 +27,8 @@ _HOUR_NS = 3600 * NS
 _ASIDE = ("watch", "keep")
 """Journals of what the box and its watcher say themselves: not what the robot's data cover."""
 _HELD = ("in_columns", "waiting")
-_REASONS: Sequence[tuple[Kind, re.Pattern[str]]] = (
-    ("deleted", re.compile("^deleted", re.IGNORECASE)),
-    ("filtered", re.compile("filter|unchanged|rate.?limit", re.IGNORECASE)),
-    ("lost", re.compile("lost|dropped|queue|damaged|torn|refused|corrupt|decode", re.IGNORECASE)),
-)
+_DRAWN: Mapping[GapKind, Kind] = {"deleted": "deleted", "filtered": "filtered", "lost": "lost"}
+"""What of gaps has a look of its own; where nothing was recorded, nothing is drawn."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,11 +85,6 @@ def share(recorded: Sequence[tuple[int, int]], from_ns: int, to_ns: int) -> floa
     return min(1.0, here / (to_ns - from_ns))
 
 
-def ns_of(stamp: str) -> int:
-    """Read a time of an answer."""
-    return parse_time(stamp, lambda: 0, lambda: None)
-
-
 def _data(journals: Iterable[Recording]) -> Iterator[Recording]:
     return (one for one in journals if one.keeping not in _ASIDE)
 
@@ -107,7 +99,7 @@ def _recorded(journals: Iterable[Recording]) -> Iterator[Stretch]:
 
 def _missing(gaps: Iterable[Gap]) -> Iterator[Stretch]:
     for gap in gaps:
-        kind = next((kind for kind, words in _REASONS if words.search(gap.reason)), None)
+        kind = _DRAWN.get(gap.kind)
         if kind is not None:
             text = f"{gap.item}: {gap.reason}" if gap.item else gap.reason
             yield Stretch(ns_of(gap.from_), ns_of(gap.to), kind, text)

@@ -73,9 +73,9 @@ def show(
     options = _options(fleet)
     begun = Begun(robot, mission, item, from_, to, format if format in FORMATS else "csv")
     return render(
-        request, "downloads.html", begun=begun, formats=FORMATS, robots=_robots(fleet, who),
-        is_begun=bool(robot or mission or item or from_), options=options,
-        **_listed(fleet, who, options, after, all=all),
+        request, "recordings/downloads.html", begun=begun, formats=FORMATS,
+        robots=_robots(fleet, who), is_begun=bool(robot or mission or item or from_),
+        options=options, **_listed(fleet, who, options, after, all=all),
     )  # fmt: skip
 
 
@@ -85,7 +85,7 @@ def show_list(
 ) -> Response:
     """Show the list of downloads alone."""
     shown = _listed(fleet, who, _options(fleet), after, all=all)
-    return render(request, "downloads_list.html", **shown)
+    return render(request, "recordings/downloads_list.html", **shown)
 
 
 def _robots(fleet: Services, who: Caller) -> list[str]:

@@ -9,7 +9,7 @@ from functools import cached_property
 
 from amberbox.core.clock import NS
 from amberbox.core.errors import AmberboxError
-from amberbox.core.timetext import format_time
+from amberbox.core.timetext import format_time, ns_of
 from amberbox.fleet.accounts.robots import KnownRobot
 from amberbox.fleet.api.access import Caller
 from amberbox.fleet.api.forms import shown
@@ -22,7 +22,7 @@ from amberbox.fleet.data.journals import Integrity, Recording, recordings
 from amberbox.fleet.drawing.axis import Axis
 from amberbox.fleet.drawing.coverage import Stretch
 from amberbox.fleet.options.options import read
-from amberbox.fleet.pages.recordings.cover import Window, axis_of, ns_of, share, spans, stretches
+from amberbox.fleet.pages.recordings.cover import Window, axis_of, share, spans, stretches
 from amberbox.fleet.services import Services
 
 INTEGRITIES: Sequence[Integrity] = (

@@ -62,7 +62,7 @@ def show(request: Request, fleet: Fleet, who: Who, window: Window = "7d") -> Res
     """Show what there is of all robots: cheap figures at once, the rest as it is asked for."""
     lines = _lines(fleet, who)
     return render(
-        request, "recordings.html", lines=lines, window=window, windows=tuple(WINDOWS),
+        request, "recordings/recordings.html", lines=lines, window=window, windows=tuple(WINDOWS),
         swatches=_swatches(), total=_total(lines), may_download=who.may_some("data.download"),
         **_words(),
     )  # fmt: skip
@@ -71,7 +71,7 @@ def show(request: Request, fleet: Fleet, who: Who, window: Window = "7d") -> Res
 @routes.get("/pieces/recordings", "items.read", each=True)
 def show_states(request: Request, fleet: Fleet, who: Who, robot: Name = "") -> Response:
     """Show of each robot (or of one) how far its copying is; what is asked for every 10 s."""
-    return render(request, "recordings_states.html", lines=_lines(fleet, who, robot), **_words())
+    return render(request, "recordings/states.html", lines=_lines(fleet, who, robot), **_words())
 
 
 @routes.get("/pieces/recordings/{robot}", "items.read")
@@ -85,7 +85,7 @@ def show_card(
     found = record(fleet, who, robot, missions=link)
     seen = cover(fleet, who, robot, found, window)
     return render(
-        request, "recordings_card.html", found=found, link=link,
+        request, "recordings/card.html", found=found, link=link,
         **_drawn(seen, robot.id, window), **_words(),
     )  # fmt: skip
 
@@ -98,7 +98,7 @@ def show_robot(
     """Show the recordings of a robot: what costs little at once, the rest when workers answer."""
     look = Look(window, show, after, mission)
     return render(
-        request, "recordings_robot.html", strings=("recordings",), card=read_card(fleet, robot),
+        request, "recordings/robot.html", card=read_card(fleet, robot),
         robot=robot.id, held=_held(fleet, [robot.id])[robot.id], look=look, windows=tuple(WINDOWS),
         swatches=_swatches(), **_may(who, robot), **_fetches(fleet, robot),
         **_journals(fleet, robot, journals(fleet, robot), look), **_words(),
@@ -112,7 +112,7 @@ def show_missions(
     """Show the missions of a robot alone."""
     found = record(fleet, who, robot, incidents=False)
     return render(
-        request, "recordings_missions.html", found=found, look=Look(mission=mission),
+        request, "recordings/missions.html", found=found, look=Look(mission=mission),
         **_missions(found, mission), **_may(who, robot), **_words(),
     )  # fmt: skip
 
@@ -121,14 +121,14 @@ def show_missions(
 def show_incidents(request: Request, fleet: Fleet, who: Who, robot: OfRobot) -> Response:
     """Show the incidents of a robot alone."""
     found = record(fleet, who, robot, missions=False)
-    return render(request, "recordings_incidents.html", found=found, **_may(who, robot), **_words())
+    return render(request, "recordings/incidents.html", found=found, **_may(who, robot), **_words())
 
 
 @routes.get("/pieces/recordings/{robot}/fetches", "data.query")
 def show_fetches(request: Request, fleet: Fleet, who: Who, robot: OfRobot) -> Response:
     """Show alone what was asked of a robot."""
     return render(
-        request, "recordings_fetches.html", robot=robot.id, **_fetches(fleet, robot),
+        request, "recordings/fetches.html", robot=robot.id, **_fetches(fleet, robot),
         **_may(who, robot), **_words(),
     )  # fmt: skip
 
@@ -140,7 +140,7 @@ def show_journals(
     """Show the journals of a robot alone."""
     look = Look(show=show, after=after)
     return render(
-        request, "recordings_journals.html", robot=robot.id, look=look,
+        request, "recordings/journals.html", robot=robot.id, look=look,
         **_journals(fleet, robot, journals(fleet, robot), look), **_may(who, robot), **_words(),
     )  # fmt: skip
 

@@ -22,7 +22,7 @@ from amberbox.fleet.api.robots import (
 )
 from amberbox.fleet.data import remarks
 from amberbox.fleet.folders.shelf import FileInfo
-from amberbox.fleet.pages.diagnosis.card import data_href
+from amberbox.fleet.pages.datalinks import moment_href
 from amberbox.fleet.pages.diagnosis.look import current_card
 from amberbox.fleet.pages.page import Pages, render
 from amberbox.fleet.pages.robot import graph as robotgraph
@@ -74,7 +74,7 @@ def show(
     tree, card = read_status(fleet, robot), read_card(fleet, robot)
     may = {name: who.may(name, robot) for name in _ACTIONS}
     return _show(
-        request, "robot.html", card=card, look=look, may=may, **_tree(tree, look),
+        request, "robot/robot.html", card=card, look=look, may=may, **_tree(tree, look),
         **_graph(tree), **_panels(tree), **_now(fleet, who, robot),
         files=_files(fleet, who, robot, card), robot=robot,
         seen=_times(fleet, robot, window, lanes), **_events(fleet, robot, kind, may["items.read"]),
@@ -86,7 +86,7 @@ def show(
 @routes.get("/pieces/robots/{robot}/head", "status.read")
 def show_head(request: Request, fleet: Fleet, robot: OfRobot) -> Response:
     """Show how a robot is and whether it is there: the head of all its pages."""
-    return _show(request, "robot_head.html", card=read_card(fleet, robot))
+    return _show(request, "robot/head.html", card=read_card(fleet, robot))
 
 
 @routes.get("/pieces/robots/{robot}/tree", "status.read")
@@ -96,14 +96,14 @@ def show_tree(
 ) -> Response:  # fmt: skip
     """Show the tree alone."""
     tree, card = read_status(fleet, robot), read_card(fleet, robot)
-    return _show(request, "robot_tree.html", card=card, **_tree(tree, Look(q, show, chosen)))
+    return _show(request, "robot/tree.html", card=card, **_tree(tree, Look(q, show, chosen)))
 
 
 @routes.get("/pieces/robots/{robot}/graph", "status.read")
 def show_graph(request: Request, fleet: Fleet, robot: OfRobot) -> Response:
     """Show what needs what alone."""
     tree = read_status(fleet, robot)
-    return _show(request, "robot_graph.html", tree=tree, **_graph(tree))
+    return _show(request, "robot/graph.html", tree=tree, **_graph(tree))
 
 
 @routes.get("/pieces/robots/{robot}/timeline", "status.read")
@@ -113,27 +113,27 @@ def show_timeline(
     """Show what was when alone."""
     look = Look(window=window, lanes=lanes)
     seen = _times(fleet, robot, window, lanes)
-    return _show(request, "robot_timeline.html", robot=robot, look=look, seen=seen)
+    return _show(request, "robot/timeline.html", robot=robot, look=look, seen=seen)
 
 
 @routes.get("/pieces/robots/{robot}/events", "items.read")
 def show_events(request: Request, fleet: Fleet, robot: OfRobot, kind: Text = "") -> Response:
     """Show the newest events alone."""
     found = _events(fleet, robot, kind, may=True)
-    return _show(request, "robot_events.html", robot=robot, **found)
+    return _show(request, "robot/events.html", robot=robot, **found)
 
 
 @routes.get("/pieces/robots/{robot}/now", "status.read")
 def show_now(request: Request, fleet: Fleet, who: Who, robot: OfRobot) -> Response:
     """Show what it is doing and how it is linked, alone."""
-    return _show(request, "robot_now.html", card=read_card(fleet, robot), **_now(fleet, who, robot))
+    return _show(request, "robot/now.html", card=read_card(fleet, robot), **_now(fleet, who, robot))
 
 
 @routes.get("/pieces/robots/{robot}/panels", "status.read")
 def show_panels(request: Request, fleet: Fleet, robot: OfRobot) -> Response:
     """Show battery and components that are alike, alone."""
     tree, card = read_status(fleet, robot), read_card(fleet, robot)
-    return _show(request, "robot_panels.html", card=card, **_panels(tree))
+    return _show(request, "robot/panels.html", card=card, **_panels(tree))
 
 
 @routes.get("/pieces/robots/{robot}/battery", "items.read")
@@ -143,7 +143,7 @@ async def show_battery(request: Request, fleet: Fleet, who: Who, robot: OfRobot)
         found = await trend(fleet, who, robot.id)
     except AmberboxError:  # too much is asked at the moment: the value itself is on the page
         found = None
-    return _show(request, "robot_trend.html", trend=found)
+    return _show(request, "robot/trend.html", trend=found)
 
 
 def _show(request: Request, template: str, **values: Any) -> Response:
@@ -183,7 +183,7 @@ def _events(fleet: Services, robot: KnownRobot, kind: str, may: bool) -> Mapping
 def _href(fleet: Services, robot: str, event: Event) -> str:
     """Return where the data around an event are shown."""
     at_ns = time_of(event.at or "", fleet.clock)
-    return "" if at_ns is None else data_href(robot, (), at_ns)
+    return "" if at_ns is None else moment_href(robot, (), at_ns)
 
 
 def _now(fleet: Services, who: Who, robot: KnownRobot) -> Mapping[str, Any]:

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
-from urllib.parse import quote, urlencode
 
 from amberbox.core.clock import NS
-from amberbox.core.timetext import format_time, parse_time
+from amberbox.core.timetext import format_time, ns_of
 from amberbox.fleet.api.timelines import Lane, Stretch, Timeline
 from amberbox.fleet.drawing import timeline as drawing
 from amberbox.fleet.drawing.axis import Axis
 from amberbox.fleet.drawing.svg import Element
+from amberbox.fleet.pages.datalinks import data_href
 from amberbox.fleet.pages.drawingwords import drawing_words
 from amberbox.fleet.pages.robot.tree import branch_id
 from amberbox.fleet.pages.strings import catalogue
@@ -61,7 +61,7 @@ def times(robot: str, found: Timeline, lanes: Lanes, window: Window) -> Times:
 
 
 def _drawn(robot: str, found: Timeline, lanes: Sequence[Lane], window: Window) -> Element:
-    start, to = _ns(found.from_), _ns(found.to)
+    start, to = ns_of(found.from_), ns_of(found.to)
     ticks = [
         drawing.Tick(start + (to - start) * part // _PARTS, _ago(window, _PARTS - part))
         for part in range(_PARTS + 1)
@@ -86,7 +86,7 @@ def _ago(window: Window, parts: int) -> str:
 
 def _lane(robot: str, lane: Lane) -> drawing.Lane:
     stretches = tuple(
-        drawing.Stretch(_ns(one.from_), _ns(one.to), one.level, _said(one), _data(robot, one))
+        drawing.Stretch(ns_of(one.from_), ns_of(one.to), one.level, _said(one), _data(robot, one))
         for one in lane.stretches
     )
     name = readable(lane.component)
@@ -102,11 +102,6 @@ def _said(one: Stretch) -> str:
 
 def _data(robot: str, one: Stretch) -> str:
     """Return where the data of a stretch are shown, with some of what was before and behind."""
-    start, to = _ns(one.from_), _ns(one.to)
+    start, to = ns_of(one.from_), ns_of(one.to)
     around = max(int((to - start) * _AROUND), _LEAST_NS)
-    query = urlencode({"from": format_time(start - around), "to": format_time(to + around)})
-    return f"/robots/{quote(robot, safe='')}/data?{query}"
-
-
-def _ns(text: str) -> int:
-    return parse_time(text, lambda: 0, lambda: None)
+    return data_href(robot, format_time(start - around), format_time(to + around))

@@ -4,7 +4,6 @@
  */
 
 import { all, el } from "../dom.js";
-import { kindOf } from "../plot/gaps.js";
 import { moment } from "../plot/time.js";
 import { t } from "../strings.js";
 
@@ -68,16 +67,15 @@ function place(state) {
 
 function showCover(state, { start, end, recorded, missing }) {
   Object.assign(state, { start, end });
-  const holes = missing.map((one) => ({ ...one, kind: kindOf(one.reason) }));
   state.cover.replaceChildren(
     ...recorded.map((one) => stretch(state, one, "brush-recorded", t("data.brush.recorded"))),
-    ...holes.map((one) => stretch(state, one, `brush-missing brush-${one.kind} plot-hatch-${one.kind}`, one.reason)));
+    ...missing.map((one) => stretch(state, one, `brush-missing brush-${one.kind} plot-hatch-${one.kind}`, one.reason)));
   state.ends[0].textContent = moment(start, 60);
   state.ends[1].textContent = moment(end, 60);
-  const kinds = [...new Set(holes.map((one) => one.kind))];
+  const kinds = [...new Set(missing.map((one) => one.kind))];
   state.legend.replaceChildren(keyOf("brush-recorded", t("data.brush.recorded")),
     ...kinds.map((kind) => keyOf(`brush-missing brush-${kind} plot-hatch-${kind}`, t(`plot.hole.${kind}`))));
-  const lines = [...recorded.map((one) => [one, t("data.brush.recorded")]), ...holes.map((one) => [one, one.reason])];
+  const lines = [...recorded.map((one) => [one, t("data.brush.recorded")]), ...missing.map((one) => [one, one.reason])];
   state.list.replaceChildren(...lines.map(([one, text]) => el("li", {},
     t("data.brush.stretch", { from: moment(one.start, 1), to: moment(one.end, 1), text }))));
   place(state);

@@ -6,7 +6,6 @@
  */
 
 import { ask } from "../ask.js";
-import { kindOf } from "../plot/gaps.js";
 
 /** So much of a window may be without data at its end before one is told. */
 const EDGE = 0.05;
@@ -24,6 +23,6 @@ export async function askCoverage(robot) {
  */
 export function lacks(cover, { from, to }, now) {
   const behind = cover.end === null || to - cover.end > EDGE * (to - from);
-  const within = cover.missing.some((one) => kindOf(one.reason) === "tocome" && one.start < to && one.end > from);
+  const within = cover.missing.some((one) => one.kind === "to_come" && one.start < to && one.end > from);
   return (behind && from < now) || within;
 }

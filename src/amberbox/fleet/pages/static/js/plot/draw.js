@@ -22,7 +22,7 @@ const HATCHES = {
   lost: [[0, 8, 8, 0]],
   deleted: [[0, 8, 8, 0], [0, 0, 8, 8]],
   uncovered: [[0, 0, 8, 8]],
-  tocome: [[4, 0, 4, 8]],
+  to_come: [[4, 0, 4, 8]],
 };
 
 /** @param {Frame} frame */

@@ -7,18 +7,7 @@
 import { seconds } from "./data.js";
 
 /** The kinds, as the legend lists them. */
-export const KINDS = ["filtered", "lost", "deleted", "uncovered", "tocome"];
-const WORDS = [
-  ["tocome", /not on the server yet|its columns are to come/i],
-  ["deleted", /^deleted/i],
-  ["filtered", /filter|unchanged|rate.?limit/i],
-  ["lost", /lost|dropped|queue|damaged|torn|refused|corrupt|decode|columns/i],
-];
-
-/** Sort a reason into its kind. @param {string} reason */
-export function kindOf(reason) {
-  return WORDS.find(([, words]) => words.test(reason))?.[0] ?? "uncovered";
-}
+export const KINDS = ["filtered", "lost", "deleted", "uncovered", "to_come"];
 
 /**
  * Keep the gaps of items as windows change: only what came is known. `lacking(traces, view)` are
@@ -56,6 +45,5 @@ function isNear(entry, view) {
 }
 
 function holeOf(gap, origin) {
-  return { from: seconds(gap.from) - origin, to: seconds(gap.to) - origin, reason: gap.reason,
-    kind: kindOf(gap.reason) };
+  return { from: seconds(gap.from) - origin, to: seconds(gap.to) - origin, reason: gap.reason, kind: gap.kind };
 }

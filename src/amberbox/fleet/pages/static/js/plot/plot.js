@@ -150,7 +150,7 @@ function members(stack) {
     const holes = stack.gaps.of(trace);
     const to = trace.live ? trace.live.x[0] : stack.view.to;
     if (until === null || until === undefined || until >= to) return holes;
-    return [...holes, { from: until, to, kind: "tocome", reason: stack.frame.toCome }];
+    return [...holes, { from: until, to, kind: "to_come", reason: stack.frame.toCome }];
   };
   return { add, remove, drop, gapsOf };
 }

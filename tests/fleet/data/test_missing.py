@@ -1,0 +1,32 @@
+"""What kind of a gap a reason names: pages draw by it, and records of all years must fit."""
+
+from __future__ import annotations
+
+import pytest
+
+from amberbox.fleet.archive.gaps import OLD, TO_COME, WAITING
+from amberbox.fleet.data.missing import GapKind, kind_of
+
+
+@pytest.mark.parametrize(
+    ("reason", "kind"),
+    [
+        (TO_COME, "to_come"),
+        (WAITING, "to_come"),
+        (OLD, "deleted"),
+        (f"{OLD}, the journal is kept", "deleted"),
+        ("deleted on the robot before it was copied: lost patience", "deleted"),
+        ("filtered: unchanged", "filtered"),
+        ("lost at a power cut", "lost"),
+        ("delivered, then lost in a power cut", "lost"),
+        ("dropped: the disk is too slow", "lost"),
+        ("damaged: main-000001.mcap", "lost"),
+        ("undecodable: the message ends early", "lost"),
+        ("refused: its signature is not right", "lost"),
+        ("no columns, only in main-000001.mcap: unknown type", "lost"),
+        ("the box was not recording", "uncovered"),
+        ("publisher not connected yet", "uncovered"),
+    ],
+)
+def test_the_kind_of_a_gap(reason: str, kind: GapKind) -> None:
+    assert kind_of(reason) == kind
