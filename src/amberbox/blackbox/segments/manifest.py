@@ -136,7 +136,8 @@ class Manifest:
 
     ``columns_gone`` and ``raw_gone`` name the journals of which one or the other was deleted, as
     far as the manifest has not been condensed since; ``gone_segments`` are files that went thus.
-    ``incidents`` is what was said last of each; ``lines`` is how many there are.
+    ``incidents`` is what was said last of each; ``lines`` is how many there are. ``unsigned`` are
+    the journals that were sealed after the last signature.
     """
 
     schemas: Mapping[str, TableSchema] = field(default_factory=dict)
@@ -153,6 +154,7 @@ class Manifest:
     gone_segments: frozenset[str] = frozenset()
     lines: int = 0
     incidents: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    unsigned: frozenset[str] = frozenset()
 
     def complete(self, item: str, existing: Container[str] | None = None) -> frozenset[str]:
         """Return the journals whose rows of this item are all in segments.
@@ -192,6 +194,7 @@ class _State:
     raw_gone: set[str] = field(default_factory=set)
     gone_segments: set[str] = field(default_factory=set)
     incidents: dict[str, Mapping[str, Any]] = field(default_factory=dict)
+    unsigned: set[str] = field(default_factory=set)
 
     def take(self, record: Mapping[str, Any]) -> None:
         """Add one record."""
@@ -224,8 +227,10 @@ class _State:
     def _take_entry(self, entry: Sealed | Tombstone | Signature | None) -> None:
         if isinstance(entry, Sealed):
             self.sealed[entry.journal] = entry
+            self.unsigned.add(entry.journal)
         elif isinstance(entry, Signature):
             self.signatures.append(entry)
+            self.unsigned.clear()
         elif isinstance(entry, Tombstone):
             self.tombstones.append(entry)
             if entry.what != "columns":
@@ -256,7 +261,7 @@ class _State:
             dict(self.sealed), tuple(self.tombstones),
             frozenset(self.confirmed), tuple(self.signatures), tuple(read.damage), read.last_hash,
             frozenset(self.columns_gone), frozenset(self.raw_gone), frozenset(self.gone_segments),
-            read.number, dict(self.incidents),
+            read.number, dict(self.incidents), frozenset(self.unsigned),
         )  # fmt: skip
 
 

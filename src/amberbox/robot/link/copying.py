@@ -24,6 +24,7 @@ from amberbox.blackbox.deletion.confirm import confirm
 from amberbox.blackbox.follow.read import journal_file
 from amberbox.blackbox.incidents.incident import Incident, load_all
 from amberbox.blackbox.segments import manifest
+from amberbox.blackbox.signing.keys import public_key
 from amberbox.blackbox.store import FOLDERS, INCIDENTS, Store, is_locked, run_and_number
 from amberbox.link import uploads
 from amberbox.link.bucket import TokenBucket
@@ -40,8 +41,8 @@ _VERIFY_S = 300.0
 _READ_BYTES = 1 << 20
 _TRIES = 5
 """How often one piece is begun anew before the file waits for another time."""
-
-
+SIGNATURE_S = 900.0
+"""A seal is signed within moments, those of a whole disk after minutes; then it is not to come."""
 LEAST_BYTES = 16 << 10
 """Pieces get no smaller than this, however bad the network is."""
 
@@ -126,6 +127,7 @@ class Copier:
     backlog_bytes: int = 0
     """How much is to be copied, as of the last step."""
     _refused: set[str] = field(default_factory=set)
+    _unsigned_since: float | None = None
     _piece_bytes: int = PIECE_BYTES
 
     def waiting(self) -> list[str]:
@@ -141,7 +143,17 @@ class Copier:
         names = [*(name for name in held if name not in known), *names]
         asked = _of_ring(self.store, self.situation().requested - known)
         names = [*asked, *(name for name in names if name not in asked)]
-        return [name for name in names if name not in self._refused]
+        awaited = self._awaited(found.unsigned)
+        return [name for name in names if name not in self._refused and name not in awaited]
+
+    def _awaited(self, unsigned: Collection[str]) -> Collection[str]:
+        """Return the journals whose signature is about to come: without it they are refused."""
+        if not unsigned or public_key(self.store.path) is None:
+            self._unsigned_since = None
+            return ()
+        now_s = time.monotonic()
+        self._unsigned_since = now_s if self._unsigned_since is None else self._unsigned_since
+        return unsigned if now_s - self._unsigned_since < SIGNATURE_S else ()
 
     def is_settled(self, name: str) -> bool:
         """Tell whether nothing more will be done about a journal by this copier."""
