@@ -1,0 +1,1 @@
+"""What the benchmarks of the feed have in common: robots that talk, a server, people who look."""
