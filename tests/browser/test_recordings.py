@@ -31,6 +31,21 @@ def test_what_there_is_of_all_robots(page_as: PageAs, theme: str, width: int) ->
     shot(page, "recordings")
 
 
+def test_only_robots_that_one_sees_are_asked_for(page_as: PageAs) -> None:
+    page = page_as("viewer", width=390)
+    page.set_viewport_size({"width": 390, "height": 200})
+    asked: list[str] = []
+    page.on("request", lambda request: asked.append(request.url))
+    page.goto("/recordings?window=24h")
+    expect(page.locator('[data-robot="ropod_001"] .cover .drawing')).to_be_visible()
+    with page.expect_request(lambda request: "/pieces/recordings?robot=ropod_001" in request.url):
+        page.evaluate("() => document.dispatchEvent(new Event('visibilitychange'))")
+    assert not [url for url in asked if "ropod_003" in url]
+    last = page.locator('[data-robot="ropod_003"]')
+    last.scroll_into_view_if_needed()
+    expect(last.locator(".cover .drawing")).to_be_visible()
+
+
 @pytest.mark.parametrize(("theme", "width"), [("dark", 1440), ("light", 390)])
 def test_the_recordings_of_one_robot(page_as: PageAs, theme: str, width: int) -> None:
     page = page_as("technician", width=width, theme=theme)

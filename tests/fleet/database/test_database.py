@@ -31,10 +31,14 @@ import amberbox.fleet
 from amberbox.core.errors import AmberboxError, UsageError
 from amberbox.fleet.database.database import Database, DatabaseBusyError
 from amberbox.fleet.database.metadata import METADATA, complete
+from amberbox.fleet.database.migrations import MIGRATIONS
 from amberbox.fleet.database.schema import SCHEMA_VERSION, Migration, version
 from amberbox.fleet.database.upsert import upsert
 from amberbox.testing.clock import ManualClock
 from tests.fleet.database.portable import POSTGRESQL
+
+NOW = MIGRATIONS[-1].number
+"""The version of databases that are made now."""
 
 
 def _things() -> tuple[MetaData, Table]:
@@ -177,7 +181,7 @@ def _reopened(
     database: Database, apply: Callable[[Connection], None], metadata: MetaData
 ) -> Database:
     database.close()
-    migrations = [Migration(2, "colours", apply)]
+    migrations = [*MIGRATIONS, Migration(NOW + 1, "colours", apply)]
     return Database(database.path, ManualClock(), metadata=metadata, migrations=migrations)
 
 
@@ -194,7 +198,7 @@ def test_a_migration_changes_what_is_there(database: Database, things: Table) ->
     newer = _reopened(database, _add_colour, coloured)
     assert _rows(newer, coloured.tables["things"]) == [("a", 1, None)]
     with newer.reading() as connection:
-        assert version(connection) == 2
+        assert version(connection) == NOW + 1
     again = _reopened(newer, _fail_half_way, coloured)  # it is not applied a second time
     assert _rows(again, things) == [("a", 1)]
 
@@ -205,15 +209,15 @@ def test_a_migration_is_done_whole_or_not_at_all(database: Database, metadata: M
     same = Database(database.path, ManualClock(), metadata=metadata)
     with same.reading() as connection:
         columns = [column["name"] for column in inspect(connection).get_columns("things")]
-        assert (version(connection), columns) == (1, ["name", "number"])
+        assert (version(connection), columns) == (NOW, ["name", "number"])
 
 
 def test_a_newer_database_is_refused(database: Database, metadata: MetaData) -> None:
     newer = _reopened(database, _add_colour, _coloured())
     newer.close()
-    with pytest.raises(UsageError, match="version 2, this Amberbox knows 1"):
+    with pytest.raises(UsageError, match=f"version {NOW + 1}, this Amberbox knows {NOW}"):
         Database(database.path, ManualClock(), metadata=metadata)
-    with pytest.raises(UsageError, match="version 2, this Amberbox reads 1"):
+    with pytest.raises(UsageError, match=f"version {NOW + 1}, this Amberbox reads {NOW}"):
         Database(database.path, read_only=True)
 
 
@@ -238,7 +242,7 @@ def test_holes_in_the_numbers_are_a_mistake(database: Database, metadata: MetaDa
             database.path,
             ManualClock(),
             metadata=metadata,
-            migrations=[Migration(3, "colours", _add_colour)],
+            migrations=[*MIGRATIONS, Migration(NOW + 2, "colours", _add_colour)],
         )
 
 

@@ -10,6 +10,7 @@ from starlette.testclient import TestClient
 from amberbox.core.clock import NS
 from amberbox.core.timetext import format_time
 from amberbox.fleet.archive.files import Layout
+from amberbox.fleet.data import journals
 from tests.browser import hostile
 from tests.fleet.archive.recordings import Robot
 from tests.fleet.house import START_NS, House, house
@@ -83,6 +84,49 @@ def test_a_file_that_was_changed_is_named(home: House) -> None:
         assert "With trouble 1" in text and journal["journal"] in text and "1 to 1 of 1" in text
     finally:
         path.write_bytes(whole)
+
+
+def looked_at(home: House, path: str, monkeypatch: pytest.MonkeyPatch) -> int:
+    """Return how many files a page looks at."""
+    found: list[str] = []
+
+    def look(_: object, path: str) -> str:
+        found.append(path)
+        return "intact"
+
+    monkeypatch.setattr(journals, "_integrity", look)
+    assert home.client("viewer").get(path, headers=HTML).status_code == 200
+    return len(found)
+
+
+@pytest.mark.parametrize(
+    ("path", "files"),
+    [("/recordings", 0), ("/pieces/recordings?robot=ropod_001", 0),
+     (f"/pieces/recordings/{ROBOT}?window=24h", 3), ("/pieces/recordings/ropod_002", 0),
+     (f"/pieces/recordings/{ROBOT}/incidents", 0)],
+)  # fmt: skip
+def test_only_files_that_are_shown_are_looked_at(
+    home: House, monkeypatch: pytest.MonkeyPatch, path: str, files: int
+) -> None:
+    assert looked_at(home, path, monkeypatch) == files
+
+
+def test_files_of_another_time_are_not_looked_at(
+    home: House, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    home.clock.advance(48 * 3600)
+    try:
+        path = f"/pieces/recordings/{ROBOT}"
+        assert looked_at(home, f"{path}?window=24h", monkeypatch) == 0
+        assert "no file in this time" in text_of(home.client("viewer"), f"{path}?window=24h")
+        assert looked_at(home, f"{path}?window=all", monkeypatch) == 3
+    finally:
+        home.clock.advance(-48 * 3600)
+
+
+def test_only_robots_that_are_named_are_told_of(home: House) -> None:
+    answer = home.client("viewer").get("/pieces/recordings?robot=ropod_001&robot=ropod_003")
+    assert re.findall('data-state="([^"]+)"', answer.text) == ["ropod_001", "ropod_003"]
 
 
 def test_a_bar_without_recordings_says_so(home: House) -> None:

@@ -2,12 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from sqlalchemy import Connection, Row, select
+from sqlalchemy import (
+    ColumnElement,
+    Connection,
+    Row,
+    Select,
+    Table,
+    and_,
+    case,
+    exists,
+    or_,
+    select,
+    true,
+)
 
 from amberbox.fleet.archive.catalogue import COMMITTED, REFUSED
 from amberbox.fleet.archive.files import Layout
@@ -16,6 +28,8 @@ from amberbox.fleet.archive.tables import JOURNALS
 from amberbox.fleet.uploads.tables import UPLOAD
 
 Integrity = Literal["intact", "altered", "missing", "deleted", "unsigned", "unknown"]
+Span = tuple[int | None, int | None]
+"""From and to, in ns; None is open."""
 State = Literal["copying", "waiting", "in_columns", "refused", "quarantined", "aside"]
 
 
@@ -44,71 +58,87 @@ class Recording:
 
 
 def recordings(
-    connection: Connection, folder: Path, robot: str, after: str = "", limit: int = 100
-) -> list[Recording]:
-    """List journals by name (``store/folder/file``), behind that of a name."""
-    held = _held(connection, folder, robot)
-    coming = [one for one in _coming(connection, robot, folder) if _name(one) not in held]
-    found = {**held, **{_name(one): one for one in coming}}
-    names = sorted(name for name in found if name > after)
-    return [found[name] for name in names[:limit]]
+    connection: Connection, folder: Path, robot: str, after: str = "", limit: int = 100,
+    span: Span = (None, None),
+) -> list[Recording]:  # fmt: skip
+    """List journals by name (``store/folder/file``), behind that of a name.
 
-
-def _name(one: Recording) -> str:
-    return f"{one.store_id}/{one.journal}"
-
-
-def _held(connection: Connection, folder: Path, robot: str) -> dict[str, Recording]:
-    signed = {
-        (row.store_id, row.journal)
-        for row in connection.execute(
-            select(UPLOAD.c.store_id, UPLOAD.c.journal).where(
-                UPLOAD.c.robot == robot, UPLOAD.c.signed.is_(True)
-            )
-        )
+    With a span those that meet it, and those that are being copied: what they cover is not known
+    yet. Only the files of those that are listed are looked at.
+    """
+    held = {_name(row.store_id, row.file): row for row in connection.execute(_held(robot, span))}
+    coming = {
+        _name(row.store_id, row.journal): row for row in connection.execute(_not_held(robot, span))
     }
-    rows = connection.execute(select(JOURNALS).where(JOURNALS.c.robot == robot)).all()
-    layout = Layout(folder)
-    found = (_of_archive(row, layout, (row.store_id, row.file) in signed) for row in rows)
-    return {_name(one): one for one in found}
+    names = sorted(name for name in (*held, *coming) if name > after)[:limit]
+    base = Layout(folder).journals / robot
+    return [
+        _of_archive(held[name], f"{base}/{name}") if name in held else _coming(coming[name], folder)
+        for name in names
+    ]
 
 
-def _of_archive(row: Row[Any], layout: Layout, signed: bool) -> Recording:
-    reason = decode(row.facts).refused if row.state == REFUSED else ""
+def _name(store_id: str, journal: str) -> str:
+    return f"{store_id}/{journal}"
+
+
+def _held(robot: str, span: Span) -> Select[Any]:
+    """Choose the journals of the archive; ``why`` is there only where one was refused."""
+    j, u = JOURNALS.c, UPLOAD.c
+    signed = exists().where(
+        u.robot == j.robot, u.store_id == j.store_id, u.journal == j.file, u.signed.is_(True)
+    )
+    return select(
+        j.store_id, j.file, j.keeping, j.sha256, j.state, j.bytes, j.rows, j.raw_gone, j.start_ns,
+        j.end_ns, j.put_ns, case((j.state == REFUSED, j.facts), else_="").label("why"),
+        signed.label("signed"),
+    ).where(j.robot == robot, *_meets(JOURNALS, span))  # fmt: skip
+
+
+def _not_held(robot: str, span: Span) -> Select[Any]:
+    """Choose the journals that the archive does not have: on their way, aside, refused at once."""
+    j, u = JOURNALS.c, UPLOAD.c
+    held = exists().where(j.robot == u.robot, j.store_id == u.store_id, j.file == u.journal)
+    meets = and_(true(), *_meets(UPLOAD, span))
+    return select(UPLOAD).where(u.robot == robot, ~held, or_(u.state == "incoming", meets))
+
+
+def _meets(table: Table, span: Span) -> list[ColumnElement[bool]]:
+    from_ns, to_ns = span
+    found = [] if from_ns is None else [table.c.end_ns >= from_ns]
+    return found + ([] if to_ns is None else [table.c.start_ns < to_ns])
+
+
+def _of_archive(row: Row[Any], path: str) -> Recording:
     states: dict[str, State] = {COMMITTED: "in_columns", REFUSED: "refused"}
-    path = layout.journal(row.robot, row.store_id, row.file)
     return Recording(
         row.store_id, row.file, row.keeping, row.sha256, states.get(row.state, "waiting"),
-        _integrity(row, path, signed), reason, row.bytes, row.bytes, row.rows, row.start_ns,
-        row.end_ns, row.put_ns,
+        _integrity(row, path), decode(row.why).refused if row.why else "", row.bytes, row.bytes,
+        row.rows, row.start_ns, row.end_ns, row.put_ns,
     )  # fmt: skip
 
 
-def _integrity(row: Row[Any], path: Path, signed: bool) -> Integrity:
+def _integrity(row: Row[Any], path: str) -> Integrity:
     if row.raw_gone:
         return "deleted"
     try:
-        size = path.stat().st_size
+        size = os.stat(path).st_size  # noqa: PTH116  # thousands at a time
     except FileNotFoundError:
         return "missing"
     if row.state == REFUSED or size != row.bytes:
         return "altered"
-    return "intact" if signed else "unsigned"
+    return "intact" if row.signed else "unsigned"
 
 
-def _coming(connection: Connection, robot: str, folder: Path) -> Sequence[Recording]:
+def _coming(row: Row[Any], folder: Path) -> Recording:
     states: dict[str, State] = {
         "incoming": "copying", "quarantined": "quarantined", "aside": "aside", "verified": "waiting"
     }  # fmt: skip
-    rows = connection.execute(select(UPLOAD).where(UPLOAD.c.robot == robot)).all()
-    return [
-        Recording(
-            row.store_id, row.journal, row.writer, row.sha256, states.get(row.state, "copying"),
-            "altered" if row.state == "quarantined" else "unknown", row.reason, row.bytes,
-            _copied(folder / row.path, row), 0, row.start_ns, row.end_ns, row.ended_ns,
-        )
-        for row in rows
-    ]  # fmt: skip
+    return Recording(
+        row.store_id, row.journal, row.writer, row.sha256, states.get(row.state, "copying"),
+        "altered" if row.state == "quarantined" else "unknown", row.reason, row.bytes,
+        _copied(folder / row.path, row), 0, row.start_ns, row.end_ns, row.ended_ns,
+    )  # fmt: skip
 
 
 def _copied(path: Path, row: Row[Any]) -> int:

@@ -18,7 +18,8 @@ from sqlalchemy.exc import DatabaseError, OperationalError
 from amberbox.core.clock import Clock, SystemClock
 from amberbox.core.errors import AmberboxError
 from amberbox.fleet.database.metadata import complete
-from amberbox.fleet.database.schema import MIGRATIONS, Migration, check_version, prepare
+from amberbox.fleet.database.migrations import MIGRATIONS
+from amberbox.fleet.database.schema import Migration, check_version, prepare
 
 FILE = "server.db"
 BUSY_S = 10.0

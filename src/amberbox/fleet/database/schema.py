@@ -35,10 +35,6 @@ class Migration:
     apply: Callable[[Connection], None]
 
 
-MIGRATIONS: Sequence[Migration] = ()
-"""Every change since the first version, in order."""
-
-
 def prepare(
     connection: Connection, metadata: MetaData, migrations: Sequence[Migration], now_ns: int
 ) -> None:

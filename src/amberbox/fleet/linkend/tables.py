@@ -82,6 +82,7 @@ ROW = Table(
     Column("log_ns", BigInteger, nullable=False),
     Column("data", LargeBinary, nullable=False),
     Column("received_ns", Time, nullable=False),
+    Index(None, "robot", "channel", "log_ns"),
 )
 """Rows as they stand in the robot's journals, until the journal itself is committed."""
 

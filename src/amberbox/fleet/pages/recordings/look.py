@@ -18,11 +18,18 @@ from amberbox.fleet.api.missions import Mission, list_missions
 from amberbox.fleet.api.query import Gaps, list_gaps
 from amberbox.fleet.archive.retaining import rule_of
 from amberbox.fleet.archive.store import Retention
-from amberbox.fleet.data.journals import Integrity, Recording, recordings
+from amberbox.fleet.data.journals import Integrity, Recording, Span, recordings
 from amberbox.fleet.drawing.axis import Axis
 from amberbox.fleet.drawing.coverage import Stretch
 from amberbox.fleet.options.options import read
-from amberbox.fleet.pages.recordings.cover import Window, axis_of, share, spans, stretches
+from amberbox.fleet.pages.recordings.cover import (
+    WINDOWS,
+    Window,
+    axis_of,
+    share,
+    spans,
+    stretches,
+)
 from amberbox.fleet.services import Services
 
 INTEGRITIES: Sequence[Integrity] = (
@@ -36,7 +43,10 @@ _GAPS = 1000
 
 @dataclass(frozen=True)
 class Record:
-    """Journals, missions and incidents of a robot; ``trouble`` says why some could not be had."""
+    """Missions and incidents of a robot, and journals of the time that is looked at.
+
+    ``trouble`` says why some could not be had.
+    """
 
     robot: str
     now_ns: int
@@ -90,8 +100,8 @@ def record(
     fleet: Services, who: Caller, robot: KnownRobot, *, missions: bool = True,
     incidents: bool = True,
 ) -> Record:  # fmt: skip
-    """Return what there is of a robot; workers are asked for missions and incidents."""
-    found = Record(robot.id, fleet.clock.wall_ns(), journals(fleet, robot))
+    """Return missions and incidents of a robot, of which workers are asked; no journals."""
+    found = Record(robot.id, fleet.clock.wall_ns(), ())
     try:
         return replace(
             found,
@@ -102,10 +112,28 @@ def record(
         return replace(found, trouble=error)
 
 
-def journals(fleet: Services, robot: KnownRobot) -> Sequence[Recording]:
-    """Return the journals of a robot, the newest first."""
+def with_journals(fleet: Services, robot: KnownRobot, found: Record, window: Window) -> Record:
+    """Return a record with the journals that a bar over a window shows."""
+    back = WINDOWS[window]
+    span = None if back is None else found.now_ns - back, None
+    return replace(found, journals=journals(fleet, robot, span))
+
+
+def with_journals_of(
+    fleet: Services, robot: KnownRobot, found: Record, shown: Sequence[Mission]
+) -> Record:
+    """Return a record with the journals of the time of some missions."""
+    if not shown:
+        return found
+    ends = [found.now_ns if one.to is None else ns_of(one.to) for one in shown]
+    span = min(ns_of(one.from_) for one in shown), max(ends)
+    return replace(found, journals=journals(fleet, robot, span))
+
+
+def journals(fleet: Services, robot: KnownRobot, span: Span = (None, None)) -> Sequence[Recording]:
+    """Return the journals of a robot that meet a span, the newest first."""
     with fleet.database.reading() as connection:
-        found = recordings(connection, fleet.folder, robot.id, limit=_JOURNALS)
+        found = recordings(connection, fleet.folder, robot.id, limit=_JOURNALS, span=span)
     return sorted(found, key=lambda one: (-one.from_ns, one.store_id, one.journal))
 
 

@@ -12,6 +12,7 @@ from amberbox.core.timetext import format_time
 from amberbox.fleet.accounts.robots import KnownRobot
 from amberbox.fleet.api.access import Caller, Fleet, OfRobot, Who
 from amberbox.fleet.api.fetches import list_fetches
+from amberbox.fleet.api.missions import Mission
 from amberbox.fleet.api.robots import list_cards, read_card
 from amberbox.fleet.data.journals import Recording
 from amberbox.fleet.drawing.coverage import KINDS, Stretch, coverage, swatch
@@ -19,7 +20,16 @@ from amberbox.fleet.pages import figures
 from amberbox.fleet.pages.drawingwords import drawing_words
 from amberbox.fleet.pages.page import Pages, render
 from amberbox.fleet.pages.recordings.cover import WINDOWS, Window, parts
-from amberbox.fleet.pages.recordings.look import Cover, Record, Retaining, cover, journals, record
+from amberbox.fleet.pages.recordings.look import (
+    Cover,
+    Record,
+    Retaining,
+    cover,
+    journals,
+    record,
+    with_journals,
+    with_journals_of,
+)
 from amberbox.fleet.pages.recordings.state import Held, held
 from amberbox.fleet.pages.strings import catalogue
 from amberbox.fleet.services import Services
@@ -36,7 +46,8 @@ _LISTED = 100
 _COMING = ("copying", "waiting", "aside")
 
 After = Annotated[str, Query(max_length=400)]
-Name = Annotated[str, Query(max_length=64)]
+Names = Annotated[list[Annotated[str, Query(max_length=64)]], Query(max_length=200)]
+NOTHING: list[str] = []
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,8 +80,8 @@ def show(request: Request, fleet: Fleet, who: Who, window: Window = "7d") -> Res
 
 
 @routes.get("/pieces/recordings", "items.read", each=True)
-def show_states(request: Request, fleet: Fleet, who: Who, robot: Name = "") -> Response:
-    """Show of each robot (or of one) how far its copying is; what is asked for every 10 s."""
+def show_states(request: Request, fleet: Fleet, who: Who, robot: Names = NOTHING) -> Response:
+    """Show of robots (all, if none is named) how far their copying is; asked for every 10 s."""
     return render(request, "recordings/states.html", lines=_lines(fleet, who, robot), **_words())
 
 
@@ -82,7 +93,7 @@ def show_card(
     """Show what there is of one robot: its bar, whether it holds; with ``link`` also how many
     missions and incidents there are, and where more is.
     """
-    found = record(fleet, who, robot, missions=link)
+    found = with_journals(fleet, robot, record(fleet, who, robot, missions=link), window)
     seen = cover(fleet, who, robot, found, window)
     return render(
         request, "recordings/card.html", found=found, link=link,
@@ -111,9 +122,11 @@ def show_missions(
 ) -> Response:
     """Show the missions of a robot alone."""
     found = record(fleet, who, robot, incidents=False)
+    page = _page_of(found.missions, mission)
+    found = with_journals_of(fleet, robot, found, page)
     return render(
         request, "recordings/missions.html", found=found, look=Look(mission=mission),
-        **_missions(found, mission), **_may(who, robot), **_words(),
+        **_missions(found, page), **_may(who, robot), **_words(),
     )  # fmt: skip
 
 
@@ -145,10 +158,10 @@ def show_journals(
     )  # fmt: skip
 
 
-def _lines(fleet: Services, who: Caller, only: str = "") -> list[Line]:
+def _lines(fleet: Services, who: Caller, only: Sequence[str] = ()) -> list[Line]:
     with fleet.database.reading() as connection:
         seen = who.robots(connection, "items.read")
-    mine = {robot.id for robot in seen if only in ("", robot.id)}
+    mine = {robot.id for robot in seen if not only or robot.id in only}
     cards = [card for card in list_cards(fleet, who, "", "", _MOST) if card.robot in mine]
     known = _held(fleet, [card.robot for card in cards])
     return [Line(card, known[card.robot]) for card in cards]
@@ -187,14 +200,18 @@ def _swatches() -> Sequence[tuple[str, Any]]:
     return [(kind, swatch(kind, name=f"key-{kind}", words=drawing_words())) for kind in KINDS]
 
 
-def _missions(found: Record, after: str) -> Mapping[str, Any]:
-    ids = [one.id for one in found.missions]
+def _page_of(missions: Sequence[Mission], after: str) -> Sequence[Mission]:
+    ids = [one.id for one in missions]
     start = ids.index(after) + 1 if after in ids else 0
-    page = found.missions[start : start + _PAGE]
-    more = page[-1].id if len(found.missions) > start + _PAGE else ""
+    return missions[start : start + _PAGE]
+
+
+def _missions(found: Record, page: Sequence[Mission]) -> Mapping[str, Any]:
+    last = page[-1].id if page else ""
+    more = last if page and found.missions[-1].id != last else ""
     return {
         "missions": [(one, found.share(one)) for one in page], "missions_more": more,
-        "missions_all": len(ids),
+        "missions_all": len(found.missions),
     }  # fmt: skip
 
 

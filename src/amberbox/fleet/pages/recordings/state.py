@@ -114,7 +114,7 @@ def _questions() -> Iterator[Select[Any]]:
     yield select(FETCH.c.robot, count, func.max(FETCH.c.ended_ns), _states(FETCH.c.state),
                  func.sum(func.length(FETCH.c.files)))  # fmt: skip
     told = ROW.c.channel.in_((reserved.MISSION, reserved.INCIDENT))
-    yield select(ROW.c.robot, count, func.max(ROW.c.received_ns)).where(told)
+    yield select(ROW.c.robot, count, func.max(ROW.c.log_ns)).where(told)
 
 
 def _states(column: Any) -> Any:

@@ -144,7 +144,7 @@ page.addEventListener("done", ({ target }) => {
   look();
 });
 
-const look = followStates(`/pieces/recordings?${new URLSearchParams({ robot })}`, (_, isAll) => {
+const { look } = followStates(() => [robot], (_, isAll) => {
   for (const name of isAll ? PARTS : ["journals"]) reload(name);
   if (isAll) reloadCard();
 });

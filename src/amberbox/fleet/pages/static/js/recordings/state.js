@@ -10,17 +10,20 @@ const SOON_MS = 500;
 
 /**
  * Keep the states of robots right; `changed(robot, isAll)` hears of those of which something is
- * new: with `isAll` more than how many bytes have come. Returns what asks at once.
- * @param {string} path
+ * new: with `isAll` more than how many bytes have come. Returns what asks at once, and what
+ * asks soon.
+ * @param {() => string[]} shown the robots that one looks at
  * @param {(robot: string, isAll: boolean) => void} changed
  */
-export function followStates(path, changed) {
+export function followStates(shown, changed) {
   let isAsking = false;
 
   async function look() {
-    if (isAsking || document.visibilityState === "hidden") return;
+    const robots = shown();
+    if (isAsking || !robots.length || document.visibilityState === "hidden") return;
     isAsking = true;
-    const fresh = await piece(path).catch(() => null); // the next time it may be there again
+    const query = new URLSearchParams(robots.map((robot) => ["robot", robot]));
+    const fresh = await piece(`/pieces/recordings?${query}`).catch(() => null); // the next time it may be there again
     isAsking = false;
     for (const state of fresh ? all("[data-state]", fresh) : []) place(state, changed);
   }
@@ -30,10 +33,10 @@ export function followStates(path, changed) {
   const feed = listen({ kinds: ["presence"] });
   const soon = once(look, SOON_MS);
   feed.on("presence", (_, robot) => {
-    if (one(`[data-state="${CSS.escape(robot)}"]`)) soon();
+    if (shown().includes(robot)) soon();
   });
   feed.on("snapshot", soon);
-  return look;
+  return { look, soon };
 }
 
 /** Return what calls something after a while, once for all that asked for it meanwhile. */
