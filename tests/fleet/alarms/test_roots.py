@@ -11,8 +11,10 @@ from amberbox.core.clock import NS
 from amberbox.fleet.alarms import machine
 from amberbox.fleet.alarms.register import Register
 from amberbox.fleet.bus import Change
+from amberbox.fleet.notifying.settings import NAME, Notifications
 from tests.fleet.alarms.stand import (
     EARLIER,
+    EVERYTHING,
     STORE,
     Stand,
     alarm,
@@ -47,6 +49,21 @@ def test_it_opens_is_told_once_and_is_over_when_it_was_quiet(home: Stand) -> Non
     assert (home.only().state, home.only().resolution) == ("resolved", "over")
     assert len(home.told) == 1
     assert home.history(one.number) == ["opened", "notified", "resolved"]
+
+
+def test_nobody_was_told_where_there_is_nobody_to_tell(home: Stand) -> None:
+    home.set(NAME, Notifications())
+    home.say("r1", alarm(home))
+    home.wait(12)
+    one = home.only()
+    assert (home.history(one.number), one.told, one.notify_ns) == (["opened"], "", None)
+    home.set(NAME, EVERYTHING)
+    home.say("r1", alarm(home, state="healed"))
+    home.wait(62)
+    home.say("r1", alarm(home))  # it comes back when there is somebody: that is news
+    home.wait(12)
+    assert home.history(one.number) == ["opened", "resolved", "reopened", "notified"]
+    assert len(home.told) == 1
 
 
 def test_what_failed_first_folds_into_its_root_and_keeps_its_id(home: Stand) -> None:

@@ -87,8 +87,9 @@ def _tell(
         return
     setting = read(register.connection, NAME, Notifications)
     robots = _robots(register, alarm.number)
-    put(register.connection, Told(alarm, robots), now_ns, setting, url)
-    register.keep(alarm, machine.told(alarm, now_ns))
+    sent = put(register.connection, Told(alarm, robots), now_ns, setting, url)
+    untold = replace(alarm, notify_ns=None)
+    register.keep(alarm, machine.told(alarm, now_ns) if sent else (untold, []))
 
 
 def _robots(register: Register, number: int) -> dict[str, frozenset[str]]:

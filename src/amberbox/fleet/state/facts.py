@@ -3,19 +3,28 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TypeVar
 
 import msgspec
 
 from amberbox.core.errors import AmberboxError
 from amberbox.fleet.asking.asking import Asking
-from amberbox.fleet.asking.errors import BusyError
+from amberbox.fleet.asking.errors import BrokenError, BusyError, CancelledError, LimitError
 from amberbox.fleet.folders.folders import Folders
 
 OP = "amberbox.fleet.state.worker:facts"
 _LIMIT_S = 20.0
 _MEMORY_BYTES = 512 << 20
 _REMEMBERED = 2000
+AGAIN_S = 60.0
+"""After so long a folder is read again where time, memory or a worker was lacking."""
+_PASSING = (LimitError, BrokenError, CancelledError)
+_Key = tuple[str, str]
+_T = TypeVar("_T")
 
 
 class NeedFacts(msgspec.Struct, frozen=True):
@@ -59,40 +68,76 @@ class Facts(msgspec.Struct, frozen=True):
     note: str = ""
 
 
-class FactsBook:
-    """Facts by robot and hash of its folder; threads may share it."""
+@dataclass(frozen=True, slots=True)
+class _Failed:
+    """Why a folder was not read, and when it is tried again."""
 
-    def __init__(self, folders: Folders, asking: Asking) -> None:
+    facts: Facts
+    again_s: float
+
+
+class FactsBook:
+    """Facts by robot and hash of its folder; threads may share it.
+
+    A folder that is wrong stays so. What could not be read for lack of time, memory or a worker is
+    asked for again after ``AGAIN_S``; until then the facts say why nothing is known.
+    """
+
+    def __init__(
+        self, folders: Folders, asking: Asking, now_s: Callable[[], float] = time.monotonic
+    ) -> None:
         self._folders = folders
         self._asking = asking
+        self._now_s = now_s
         self._lock = threading.Lock()
-        self._known: OrderedDict[tuple[str, str], Facts] = OrderedDict()
+        self._known: OrderedDict[_Key, Facts] = OrderedDict()
+        self._failed: OrderedDict[_Key, _Failed] = OrderedDict()
 
     def known(self, robot: str, config_hash: str) -> Facts | None:
         """Return what was read before; never waits."""
         return self._known.get((robot, config_hash))
 
-    def read(self, robot: str, config_hash: str) -> Facts:
-        """Return what a folder says; blocks the first time. Without one, facts with a note."""
+    def at_once(self, robot: str, config_hash: str) -> Facts | None:
+        """Return what is known, or why nothing is; None where ``read`` would ask a worker."""
         known = self.known(robot, config_hash)
         if known is not None:
             return known
         if not config_hash or self._folders.wants(robot, config_hash):
             return Facts(note="the robot's folder is not here yet")
-        found, is_lasting = self._asked(robot, config_hash)
-        if is_lasting:
-            with self._lock:
-                self._known[robot, config_hash] = found
-                while len(self._known) > _REMEMBERED:
-                    self._known.popitem(last=False)
-        return found
+        failed = self._failed.get((robot, config_hash))
+        return failed.facts if failed and self._now_s() < failed.again_s else None
 
-    def _asked(self, robot: str, config_hash: str) -> tuple[Facts, bool]:
+    def read(self, robot: str, config_hash: str) -> Facts:
+        """Return what a folder says; blocks the first time. Without one, facts with a note."""
+        found = self.at_once(robot, config_hash)
+        return self._ask(robot, config_hash) if found is None else found
+
+    def _ask(self, robot: str, config_hash: str) -> Facts:
         arguments = {"robot": robot, "config_hash": config_hash}
+        key = robot, config_hash
         try:
             answer = self._asking.ask_now(OP, arguments, _LIMIT_S, _MEMORY_BYTES, asker=robot)
-            return msgspec.json.decode(answer, type=Facts), True
+            found = msgspec.json.decode(answer, type=Facts)
+        except BusyError as error:
+            return _unread(error)
+        except _PASSING as error:
+            found = _unread(error)
+            with self._lock:
+                _enter(self._failed, key, _Failed(found, self._now_s() + AGAIN_S))
+            return found
         except AmberboxError as error:
-            first = error.what.splitlines()[0]
-            note = f"the robot's folder cannot be read: {first}"
-            return Facts(note=note), not isinstance(error, BusyError)
+            found = _unread(error)
+        with self._lock:
+            self._failed.pop(key, None)
+            _enter(self._known, key, found)
+        return found
+
+
+def _unread(error: AmberboxError) -> Facts:
+    return Facts(note=f"the robot's folder cannot be read: {error.what.splitlines()[0]}")
+
+
+def _enter(known: OrderedDict[_Key, _T], key: _Key, value: _T) -> None:
+    known[key] = value
+    while len(known) > _REMEMBERED:
+        known.popitem(last=False)

@@ -35,14 +35,19 @@ class Words:
     fleet: Services
     folders: Mapping[str, str] = field(default_factory=dict)
     told: Mapping[tuple[str, str], Answer] = field(default_factory=dict)
+    _names: dict[str, Mapping[str, str]] = field(default_factory=dict)
 
     def part(self, robot: str, component: str) -> str:
         """Return what a component is called."""
+        if robot not in self._names:
+            self._names[robot] = self._names_of(robot)
+        return self._names[robot].get(component) or readable(component)
+
+    def _names_of(self, robot: str) -> Mapping[str, str]:
+        """Return what components are called that have a name beside their id."""
         facts = self.fleet.feed.state.cards.facts.known(robot, self.folders.get(robot, ""))
-        for one in facts.components if facts else ():
-            if one.id == component and one.name not in ("", component):
-                return capital(one.name)
-        return readable(component)
+        named = facts.components if facts else ()
+        return {one.id: capital(one.name) for one in named if one.name not in ("", one.id)}
 
     def what(self, line: AlarmLine) -> str:
         """Return what an alarm is about: a component, or what robots share that are away."""

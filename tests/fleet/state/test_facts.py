@@ -1,0 +1,84 @@
+"""What folders say is remembered; what a worker was too slow for is asked for again."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, cast
+
+import msgspec
+import pytest
+
+from amberbox.core.errors import AmberboxError, UsageError
+from amberbox.fleet.asking.asking import Asking
+from amberbox.fleet.asking.errors import BrokenError, BusyError, too_long
+from amberbox.fleet.folders.folders import Folders
+from amberbox.fleet.state.facts import AGAIN_S, Facts, FactsBook
+
+GOOD = msgspec.json.encode(Facts(model="Ropod 2"))
+
+
+@dataclass
+class Desk:
+    """A worker that answers what it is told to, and the folders of a robot."""
+
+    answers: list[bytes | AmberboxError]
+    now_s: float = 0.0
+    asked: int = 0
+    book: FactsBook = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.book = FactsBook(cast("Folders", self), cast("Asking", self), lambda: self.now_s)
+
+    def wants(self, robot: str, config_hash: str) -> bool:
+        return config_hash == "unknown"
+
+    def ask_now(self, op: str, arguments: Mapping[str, Any], *limits: float, asker: str) -> bytes:
+        self.asked += 1
+        answer = self.answers.pop(0)
+        if isinstance(answer, AmberboxError):
+            raise answer
+        return answer
+
+    def read(self) -> Facts:
+        return self.book.read("r1", "abab")
+
+
+def test_a_folder_is_read_once() -> None:
+    desk = Desk([GOOD])
+    assert desk.book.at_once("r1", "abab") is None
+    assert [desk.read().model for _ in range(3)] == ["Ropod 2"] * 3
+    assert desk.asked == 1
+    assert desk.book.at_once("r1", "abab") == desk.book.known("r1", "abab") == desk.read()
+
+
+@pytest.mark.parametrize("config_hash", ["", "unknown"])
+def test_a_folder_that_is_not_here_is_not_asked_for(config_hash: str) -> None:
+    desk = Desk([])
+    assert desk.book.read("r1", config_hash).note == "the robot's folder is not here yet"
+
+
+@pytest.mark.parametrize("error", [too_long(20), BrokenError("the worker ended")])
+def test_what_took_too_long_is_tried_again_after_a_while(error: AmberboxError) -> None:
+    desk = Desk([error, GOOD])
+    assert error.what in desk.read().note
+    desk.now_s = AGAIN_S - 1
+    assert error.what in desk.read().note
+    assert desk.asked == 1
+    desk.now_s = AGAIN_S
+    assert desk.book.at_once("r1", "abab") is None
+    assert desk.read() == Facts(model="Ropod 2")
+
+
+def test_a_busy_server_is_asked_again_at_once() -> None:
+    desk = Desk([BusyError("too many questions"), GOOD])
+    assert "too many questions" in desk.read().note
+    assert desk.read().model == "Ropod 2"
+
+
+def test_a_folder_that_is_wrong_stays_wrong() -> None:
+    desk = Desk([UsageError("robot.yaml:3: there is no model")])
+    assert "there is no model" in desk.read().note
+    desk.now_s = 10 * AGAIN_S
+    assert "there is no model" in desk.read().note
+    assert desk.asked == 1
