@@ -94,6 +94,23 @@ def test_the_window_by_bar_fields_and_menu(page_as: PageAs, site: Site) -> None:
     )
 
 
+def test_back_undoes_what_was_moved_and_chosen(page_as: PageAs, site: Site) -> None:
+    page = page_as("viewer")
+    open_data(page, VOLTS, mission="transport-1")
+    begin = page.get_by_role("slider", name="Beginning of the window")
+    first = begin.get_attribute("aria-valuenow") or ""
+    for _ in range(3):  # keys that follow each other fast are one step
+        begin.press("ArrowRight")
+    page.get_by_role("button", name=re.compile("Take .*volts away")).first.click()
+    expect(page.get_by_text("Choose what you want to see")).to_be_visible()
+    page.go_back()
+    drawn(page, 1)
+    expect(begin).not_to_have_attribute("aria-valuenow", first)
+    page.go_back()
+    expect(page).to_have_url(re.compile("mission=transport-1"))
+    expect(begin).to_have_attribute("aria-valuenow", first)
+
+
 def test_few_questions_for_the_first_plot_and_all_around_it(page_as: PageAs) -> None:
     page = page_as("technician")
     asked: list[str] = []

@@ -26,6 +26,7 @@ import { works } from "../works.js";
 const HOUR_S = 3600;
 const AGAIN_MS = 60_000;
 const FOLLOW_MS = 1000;
+const GESTURE_MS = 1500;
 const NARROW = "(max-width: 60rem)";
 const { robot, named: fromDiagnosis } = brought("data-about");
 const path = `/api/v1/robots/${encodeURIComponent(robot)}`;
@@ -33,7 +34,7 @@ const now = () => nowMs() / 1000;
 
 const page = {
   look: read(), items: [], reach: { first: null, last: null }, cover: null, window: { from: now() - HOUR_S, to: now() },
-  missions: [], parts: {}, isEmpty: false, live: "off", follows: 0,
+  missions: [], parts: {}, isEmpty: false, live: "off", follows: 0, movedMs: -GESTURE_MS,
 };
 
 start();
@@ -77,7 +78,7 @@ function build() {
   parts.brush = brush(one("#brush"), (from, to, isMoving) => move(from, to, isMoving ? "moving" : "brush"));
   parts.form = windowForm(one("#window"), {
     newest, go: (from, to) => move(from, to), live: (isOn) => live(isOn), everything: () => move(...ends(everything())),
-    mode: (mode) => (page.look.compare.length ? turn({ mode, compare: [] }) : change({ mode }, true)),
+    mode: (mode) => (page.look.compare.length ? turn({ mode, compare: [] }) : change({ mode })),
   });
   parts.shown = shownList(one("#shown"), { move: (name, plot) => arrange(name, plot), remove: toggle });
   parts.tree = tree(one("#variables"), { robot, items: page.items, first: firstOnes(), toggle, open: page.look.named.length ? "" : `item:${page.items[0].name}` });
@@ -162,10 +163,10 @@ function showWindow() {
   page.parts.form.window(from, to);
 }
 
-/** Change what is looked at. @param {Partial<import("./view.js").Look>} changes */
-async function change(changes, push = false) {
+/** Change what is looked at: one step that "back" undoes. @param {Partial<import("./view.js").Look>} changes */
+function change(changes) {
   Object.assign(page.look, changes);
-  write(page.look, { push });
+  write(page.look, { push: true });
   show();
 }
 
@@ -201,10 +202,17 @@ function move(from, to, by = "brush") {
   }
   if (page.look.compare.length) return;
   if (page.live !== "on") Object.assign(page.look, { from: stamp(from), to: stamp(to), mission: "", live: false });
-  write(page.look);
+  write(page.look, { push: isNewMove() });
   showWindow();
   if (!stack) show();
   say({ isEmpty: false });
+}
+
+/** Tell whether a move is one of its own: those that follow each other fast are one step back. */
+function isNewMove() {
+  const before = page.movedMs;
+  page.movedMs = performance.now();
+  return page.movedMs - before > GESTURE_MS;
 }
 
 /** Go to the newest data. @param {number} [width] seconds */
@@ -239,7 +247,7 @@ function live(isOn, isByHand = true) {
   }
   Object.assign(page.look, isOn ? { live: true, from: `now-${width}s`, to: "now", mission: "" }
     : { live: false, from: stamp(page.window.from), to: stamp(page.window.to) });
-  write(page.look);
+  write(page.look, { push: true });
 }
 
 function showLive(state) {
