@@ -1,4 +1,4 @@
-"""The feed: 20 people with open pages at 10 robots of 40 components that change five times a second.
+"""The feed: 20 people with open pages, 10 robots of 40 components that change at 5 Hz.
 
 Half of them look at the fleet, the others at robots; a level changes every 10 s, which lets pages
 fetch pieces. They are a process of their own. What they cost the server is its processor time with
@@ -46,7 +46,7 @@ def measure() -> list[Row]:
             note=f"at most {_MOST_MS:g} ms"),
         Row("receipt to socket, longest", max(heard.late_ms), "ms"),
         Row("changes heard", len(heard.late_ms) / heard.seconds, "per s", note="by all together"),
-        Row("sent to viewers", heard.bytes / heard.seconds / 1e3, "kB/s", note="by the feed, to all"),
+        Row("sent to viewers", heard.bytes / heard.seconds / 1e3, "kB/s", note="by the feed"),
         Row("pieces fetched", heard.pieces / heard.seconds, "per s", note="by all together"),
     ]  # fmt: skip
 

@@ -10,7 +10,7 @@ import asyncio
 import json
 import sys
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import repeat
 from typing import Any
@@ -41,11 +41,10 @@ class Viewer:
     """Somebody who looks at a page."""
 
     page: Page
-    client: httpx.AsyncClient
     cookie: str
+    client: httpx.AsyncClient
     heard: Heard
     group: asyncio.TaskGroup
-    levels: dict[tuple[str, str, str], str] = field(default_factory=dict)
     waiting: set[str] = field(default_factory=set)
     again: set[str] = field(default_factory=set)
 
@@ -57,6 +56,12 @@ class Viewer:
             self.heard.bytes += len(text)
             for message in msgspec.json.decode(text):
                 self._take(message, now_ns)
+
+    async def begin(self) -> None:
+        """Fetch everything once, as the page did when it was opened: the server is warm then."""
+        page = self.page
+        for piece in (*page.regular, *page.news, *page.events, *page.resting):
+            await self._fetch(piece.path.format(robot=(page.robots or ["r0"])[0]))
 
     async def repeat(self, piece: Piece, phase: float) -> None:
         """Fetch what is fetched again and again; ``phase`` from 0 to 1 is when it begins."""
@@ -70,26 +75,20 @@ class Viewer:
         if kind == "status":
             sent_us = data[-1]["outputs"][SENT]
             self.heard.late_ms.append((now_ns / 1000 - sent_us) / 1000)
-        if kind == "levels" or (kind == "status" and self._is_news(robot, data)):
-            self._stale(self.page.news, robot)
+        if kind == "levels" and not self._stale(self.page.news, robot):
+            self._stale(self.page.resting, robot)
         if kind == "event":
             self._stale(self.page.events, robot)
 
-    def _is_news(self, robot: str, statuses: Iterable[Mapping[str, Any]]) -> bool:
-        found = {(robot, one["component"], one["mode"]): one["level"] for one in statuses}
-        before = {key: self.levels.get(key, level) for key, level in found.items()}
-        self.levels.update(found)
-        return found != before
-
-    def _stale(self, pieces: Sequence[Piece], robot: str) -> None:
-        """Fetch pieces at once, and what becomes stale meanwhile when its time has come."""
-        for piece in pieces:
-            path = piece.path.format(robot=robot)
-            if path in self.waiting:
-                self.again.add(path)
-            else:
-                self.waiting.add(path)
-                self.group.create_task(self._keep(path, piece.every_s))
+    def _stale(self, pieces: Sequence[Piece], robot: str) -> bool:
+        """Fetch pieces at once, or when their time has come; tell whether all are at once."""
+        paths = {piece.path.format(robot=robot): piece.every_s for piece in pieces}
+        waiting = self.waiting & paths.keys()
+        self.again |= waiting
+        for path in paths.keys() - waiting:
+            self.waiting.add(path)
+            self.group.create_task(self._keep(path, paths[path]))
+        return not waiting
 
     async def _keep(self, path: str, every_s: float) -> None:
         while True:
@@ -123,12 +122,14 @@ async def _main(url: str, count: int, sessions: Sequence[str]) -> None:
 async def _look(url: str, count: int, sessions: Sequence[str], heard: Heard) -> None:
     opened = pages(count)
     cookies = [f"{COOKIE}={sessions[number % len(sessions)]}" for number in range(count)]
-    lines = await asyncio.gather(*map(_line, repeat(url), cookies, opened))
     async with httpx.AsyncClient(base_url=url, timeout=20) as client, asyncio.TaskGroup() as group:
-        for number, (page, cookie, line) in enumerate(zip(opened, cookies, lines, strict=True)):
-            viewer = Viewer(page, client, cookie, heard, group)
+        viewers = [Viewer(*one, client, heard, group) for one in zip(opened, cookies, strict=True)]
+        await asyncio.gather(*(viewer.begin() for viewer in viewers))
+        lines = await asyncio.gather(*map(_line, repeat(url), cookies, opened))
+        heard.pieces = 0
+        for number, (viewer, line) in enumerate(zip(viewers, lines, strict=True)):
             group.create_task(viewer.look(line))
-            for piece in page.regular:
+            for piece in viewer.page.regular:
                 group.create_task(viewer.repeat(piece, number / count))
         heard.began_s = time.monotonic()
         print("ready", flush=True)

@@ -32,7 +32,8 @@ class Page:
     """An open page: what it listens to, and what it fetches when.
 
     ``regular`` is fetched again and again, ``news`` when a level has changed, ``events`` when
-    something happened; ``{robot}`` is the robot that the news are about.
+    something happened, ``resting`` when a level has changed and the news cannot be fetched at once;
+    ``{robot}`` is the robot that the news are about.
     """
 
     robots: Sequence[str] | None
@@ -40,6 +41,7 @@ class Page:
     regular: Sequence[Piece]
     news: Sequence[Piece] = ()
     events: Sequence[Piece] = ()
+    resting: Sequence[Piece] = ()
 
 
 def pages(count: int) -> list[Page]:
@@ -52,7 +54,7 @@ def _home() -> Page:
     path = "/pieces/robots"
     return Page(
         None, _kinds("home.js"), (Piece(path, 30), Piece("/pieces/alarm-count", 60)),
-        news=(Piece(path, 5), Piece(f"{path}/{{robot}}", 1)),
+        news=(Piece(path, 5),), resting=(Piece(f"{path}/{{robot}}", 1),),
     )  # fmt: skip
 
 

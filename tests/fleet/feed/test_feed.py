@@ -117,6 +117,61 @@ def test_kinds_and_robots_are_chosen(home: House) -> None:
     asyncio.run(scene())
 
 
+def test_values_alone_are_no_news_of_levels(home: House) -> None:
+    volts = {"name": "volts", "type": "float", "value": 24.0}
+
+    async def scene() -> None:
+        async with stage(home) as on, on.browser("viewer") as socket:
+            await ask(socket, kinds=["levels"])
+            assert (await hear(socket, "snapshot"))["data"]["statuses"] == {}
+            on.status("ropod_001", "warn", state="weak", reason="24 volts for 3.2 s")
+            news = await hear(socket, "levels")
+            assert news["data"] == [
+                {"component": "laser", "mode": "", "level": "warn", "state": "weak"}
+            ]
+            for reason in ("23.5 volts for 4.2 s", "22 volts for 5 s"):
+                on.status("ropod_001", "warn", state="weak", reason=reason, outputs=[volts])
+            assert await heard_within(socket, 0.2) == []
+            for more in ({"reason": "none"}, {"blocked_by": ["power"]}, {"state": "off"}):
+                on.status("ropod_001", "warn", **more)
+                assert (await hear(socket, "levels"))["robot"] == "ropod_001"
+
+    asyncio.run(scene())
+
+
+def test_who_looks_at_everything_hears_each_change_once(home: House) -> None:
+    async def scene() -> None:
+        async with stage(home) as on, on.browser("viewer") as socket:
+            await ask(socket)
+            await hear(socket, "snapshot")
+            on.status("ropod_001", "warn")
+            assert [m["kind"] for m in await heard_within(socket, 0.2)] == ["status"]
+            await ask(socket, kinds=["levels", "status"])
+            await hear(socket, "snapshot")
+            on.status("ropod_001", "error")
+            found = await heard_within(socket, 0.2)
+            assert [m["kind"] for m in found] == ["status", "levels"]
+
+    asyncio.run(scene())
+
+
+def test_who_hears_nothing_for_a_while_goes_on_without_a_hole(home: House) -> None:
+    async def scene() -> None:
+        async with stage(home) as on, on.browser("viewer") as socket:
+            await ask(socket, kinds=["levels"])
+            await hear(socket, "snapshot")
+            for value in range(30):
+                volts = {"name": "volts", "type": "float", "value": value}
+                on.status("ropod_001", outputs=[volts])
+                await asyncio.sleep(0.06)
+            kinds = {m["kind"] for m in await heard_within(socket, 0.1)}
+            assert kinds <= {"ping", "levels"} and "ping" in kinds
+            on.status("ropod_001", "error")
+            assert (await hear(socket, "levels"))["data"][0]["level"] == "error"
+
+    asyncio.run(scene())
+
+
 def test_of_jobs_only_the_owner_hears(home: House) -> None:
     async def scene() -> None:
         async with (

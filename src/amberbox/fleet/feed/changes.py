@@ -5,9 +5,10 @@ A robot says all of its statuses every second; most are as they were.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 from sqlalchemy import Connection, select
 
@@ -19,12 +20,14 @@ from amberbox.fleet.state.said import (
     SaidStatus,
     heard,
     moment,
+    status_data,
 )
 from amberbox.fleet.state.standing import Standing
 from amberbox.link.frames import Row
 
 _MOST = 2000
 """Statuses that are remembered of one robot."""
+_NUMBER = re.compile(r"\d+(?:[.,]\d+)?")
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,6 +42,14 @@ class _Known:
     @property
     def said(self) -> SaidStatus:
         return self.standing.said
+
+
+@dataclass(frozen=True, slots=True)
+class Changed:
+    """A status that is not as it was; ``is_news``: not only in its values."""
+
+    said: SaidStatus
+    is_news: bool
 
 
 class StatusMemory:
@@ -61,21 +72,23 @@ class StatusMemory:
 
     def changed(
         self, robot: str, store_id: str, rows: Iterable[Row], now_ns: int
-    ) -> list[SaidStatus]:
+    ) -> dict[tuple[str, str], Changed]:
         """Return the statuses that are not as they were; those that came late are none."""
-        found: dict[tuple[str, str], SaidStatus] = {}
+        found: dict[tuple[str, str], Changed] = {}
         for row in rows:
             said = heard(row.data, SaidStatus) if row.channel == reserved.STATUS else None
             if said is None:
                 continue
-            before = self._known.get(robot, {}).get((said.component, said.mode))
+            key = said.component, said.mode
+            before = self._known.get(robot, {}).get(key)
             if before is not None and _is_late(before, store_id, row):
                 continue
             standing = Standing(said, row.log_ns, now_ns)
             self._enter(robot, _Known(store_id, row.run, row.seq, standing))
             if before is None or not _is_same(before.said, said):
-                found[said.component, said.mode] = said
-        return list(found.values())
+                is_news = before is None or not _is_alike(before.said, said)
+                found[key] = Changed(said, is_news or (key in found and found[key].is_news))
+        return found
 
     def _enter(self, robot: str, known: _Known) -> None:
         statuses = self._known.setdefault(robot, {})
@@ -94,6 +107,39 @@ def _is_same(one: SaidStatus, other: SaidStatus) -> bool:
         and one.blocked_by == other.blocked_by
         and one.outputs == other.outputs
     )
+
+
+def _is_alike(one: SaidStatus, other: SaidStatus) -> bool:
+    """Tell whether statuses differ in values alone: numbers in reasons count on all the time."""
+    return (
+        (one.level, one.state) == (other.level, other.state)
+        and one.blocked_by == other.blocked_by
+        and (one.reason == other.reason or _plain(one.reason) == _plain(other.reason))
+    )
+
+
+def _plain(reason: str) -> str:
+    return _NUMBER.sub("#", reason)
+
+
+def statuses_data(
+    changed: Iterable[Mapping[tuple[str, str], Changed]],
+) -> Iterator[tuple[Literal["status", "levels"], list[Mapping[str, Any]]]]:
+    """Yield what is sent of statuses of a robot that have changed: of each its newest."""
+    newest: dict[tuple[str, str], SaidStatus] = {}
+    news: set[tuple[str, str]] = set()
+    for some in changed:
+        newest.update((key, one.said) for key, one in some.items())
+        news.update(key for key, one in some.items() if one.is_news)
+    yield "status", [status_data(said) for said in newest.values()]
+    if news:
+        yield "levels", [level_data(newest[key]) for key in newest if key in news]
+
+
+def level_data(said: SaidStatus) -> Mapping[str, Any]:
+    """Return a status without its values, as it is sent."""
+    return {"component": said.component, "mode": said.mode, "level": said.level,
+            "state": said.state}  # fmt: skip
 
 
 def event_data(rows: Sequence[Row]) -> list[Mapping[str, Any]]:

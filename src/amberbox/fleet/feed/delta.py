@@ -9,9 +9,11 @@ from typing import Any, Final, Literal, TypeAlias, get_args
 
 import msgspec
 
-Kind: TypeAlias = Literal["presence", "status", "ages", "event", "diagnosis", "alarm", "job"]
+Kind: TypeAlias = Literal[
+    "presence", "status", "levels", "ages", "event", "diagnosis", "alarm", "job"
+]  # fmt: skip
 KINDS: Final[frozenset[str]] = frozenset(get_args(Kind))
-PLAIN: Final[frozenset[str]] = KINDS - {"ages"}
+PLAIN: Final[frozenset[str]] = KINDS - {"ages", "levels"}
 """The kinds that somebody hears who names none."""
 HELD = 10_000
 HELD_BYTES = 64 << 20

@@ -15,9 +15,11 @@ from amberbox.fleet.database.database import Database
 from amberbox.fleet.feed.ages import EVERY_S as AGES_S
 from amberbox.fleet.feed.ages import ages_data
 from amberbox.fleet.feed.changes import (
+    Changed,
     StatusMemory,
     diagnosis_data,
     event_data,
+    statuses_data,
 )
 from amberbox.fleet.feed.delta import Delta, Kind, Ring
 from amberbox.fleet.feed.gate import permission
@@ -25,7 +27,6 @@ from amberbox.fleet.feed.listener import Filter, Listener
 from amberbox.fleet.feed.live import EVERY_S, Live
 from amberbox.fleet.feed.silence import LOOK_S, Silence
 from amberbox.fleet.linkend.server import LinkServer
-from amberbox.fleet.state.said import SaidStatus, status_data
 from amberbox.fleet.state.standing import Moment, clock_offsets_ns
 from amberbox.fleet.state.state import Snapshot, State
 
@@ -57,7 +58,7 @@ class Feed:
         self._memory = StatusMemory()
         self._silence = Silence()
         self._repeated: set[str] = set()
-        self._pending: dict[str, dict[tuple[str, str], SaidStatus]] = {}
+        self._pending: dict[str, list[dict[tuple[str, str], Changed]]] = {}
         self._is_due = False
         self._last_s = 0.0
         self._check = asyncio.Event()
@@ -106,8 +107,7 @@ class Feed:
 
     def add(self, kind: Kind, robot: str, data: Any, owner: str = "") -> None:
         """Hold a change and wake those who listen."""
-        self.ring.add(kind, robot, data, time.monotonic(), owner)
-        self._wake()
+        self._wake([self.ring.add(kind, robot, data, time.monotonic(), owner)])
 
     def _hears(self) -> Iterator[tuple[Any, Callable[[Change], None]]]:
         yield from (("rows", self._rows), ("live", self._values))
@@ -130,8 +130,7 @@ class Feed:
         now_ns = self._clock.wall_ns()
         changed = self._memory.changed(robot, change.data["store_id"], rows, now_ns)
         if changed:
-            pending = self._pending.setdefault(robot, {})
-            pending.update({(said.component, said.mode): said for said in changed})
+            self._pending.setdefault(robot, []).append(changed)
             self._plan()
 
     def _plan(self) -> None:
@@ -144,14 +143,18 @@ class Feed:
     def _flush(self) -> None:
         self._is_due, self._last_s = False, time.monotonic()
         pending, self._pending = self._pending, {}
-        for robot, statuses in pending.items():
-            data = [status_data(said) for said in statuses.values()]
-            self.ring.add("status", robot, data, self._last_s)
-        self._wake()
+        added = [
+            self.ring.add(kind, robot, data, self._last_s)
+            for robot, changed in pending.items()
+            for kind, data in statuses_data(changed)
+        ]
+        self._wake(added)
 
-    def _wake(self) -> None:
+    def _wake(self, deltas: Sequence[Delta]) -> None:
+        """Wake who hears one of these changes; the others pass over them at their next ping."""
         for listener in self.listeners:
-            listener.wake.set()
+            if any(map(listener.filter.hears, deltas)):
+                listener.wake.set()
 
     def _connected(self, change: Change) -> None:
         self.add("presence", change.robot, {"online": True})
@@ -265,7 +268,7 @@ class Feed:
         if self._joined_at != self.ring.number:
             self._joined, self._joined_at = {}, self.ring.number
         texts, size, number = [], 0, listener.number
-        chosen = {delta.number for delta in listener.filter.chosen(deltas)}
+        chosen = {delta.number for delta in deltas if listener.filter.hears(delta)}
         for delta in deltas:
             if size and delta.number in chosen and size + len(delta.text) > most:
                 break

@@ -17,6 +17,7 @@ ACTION = "status.read"
 _NEEDS = {
     "presence": ACTION,
     "status": ACTION,
+    "levels": ACTION,
     "ages": ACTION,
     "event": "items.read",
     "diagnosis": "diagnoses.read",

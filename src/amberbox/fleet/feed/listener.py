@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from amberbox.fleet.feed.asked import Asked
@@ -15,21 +15,22 @@ from amberbox.fleet.feed.gate import Credential, Permission
 class Filter:
     """What of all changes somebody hears; equal ones hear the same, but for their own jobs.
 
-    ``reach`` are the robots of each kind.
+    ``reach`` are the robots of each kind, ``robots`` the same to look into.
     """
 
     reach: frozenset[tuple[str, frozenset[str]]]
     owners: frozenset[str] = field(compare=False)
+    robots: Mapping[str, frozenset[str]] = field(init=False, compare=False, repr=False)
 
-    def chosen(self, deltas: Iterable[Delta]) -> list[Delta]:
-        """Return the changes that are heard: of a job only by its owner."""
-        reach = dict(self.reach)
-        return [
-            delta
-            for delta in deltas
-            if (robots := reach.get(delta.kind)) is not None
-            and (delta.owner in self.owners if delta.kind == "job" else delta.robot in robots)
-        ]
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "robots", dict(self.reach))
+
+    def hears(self, delta: Delta) -> bool:
+        """Tell whether a change is heard: of a job only by its owner."""
+        robots = self.robots.get(delta.kind)
+        if robots is None:
+            return False
+        return delta.owner in self.owners if delta.kind == "job" else delta.robot in robots
 
 
 @dataclass(slots=True, eq=False)
@@ -71,7 +72,7 @@ class Listener:
 
     def robots_of(self, kind: str) -> frozenset[str]:
         """Return the robots of which somebody hears changes of a kind."""
-        return dict(self.filter.reach).get(kind, frozenset())
+        return self.filter.robots.get(kind, frozenset())
 
     def settle(self) -> None:
         """Work out what is heard; after each change of what is asked or allowed."""

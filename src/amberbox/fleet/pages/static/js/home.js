@@ -2,7 +2,6 @@
 
 import { all, one, setText } from "./dom.js";
 import { listen } from "./feed.js";
-import { levels } from "./levels.js";
 import { keep, put, swapper } from "./pieces.js";
 import * as view from "./view.js";
 
@@ -61,17 +60,13 @@ form.addEventListener("click", (event) => {
 });
 view.on(() => look({}));
 
-const feed = listen({ kinds: ["presence", "status", "alarm", "diagnosis"] });
-const news = levels();
-for (const kind of ["presence", "status", "alarm", "diagnosis"]) {
-  feed.on(kind, (data, robot) => {
-    if (kind === "status" && !news(robot, data)) return; // values alone: the list brings them
-    if (robot) staleCard(robot);
-    staleList(); // its place and the counts may be others now
+// not of values alone: the list brings them
+const feed = listen({ kinds: ["presence", "levels", "alarm", "diagnosis"] });
+for (const kind of ["presence", "levels", "alarm", "diagnosis"]) {
+  feed.on(kind, (_, robot) => {
+    const isComing = staleList(); // its place and the counts may be others now
+    if (robot && !isComing) staleCard(robot);
   });
 }
-feed.on("snapshot", ({ statuses }) => {
-  for (const [robot, all] of Object.entries(statuses)) news(robot, all);
-  staleList();
-});
+feed.on("snapshot", () => staleList());
 setInterval(staleList, VALUES_MS);

@@ -75,8 +75,8 @@ export function swapper(find, address, { near = () => null, placed = () => {} } 
 }
 
 /**
- * Make a piece stay right: `stale()` asks for it anew, at once and then at most once in `everyMs`.
- * `placed` is called when it came.
+ * Make a piece stay right: `stale()` asks for it anew, at once and then at most once in `everyMs`;
+ * it returns whether that is at once. `placed` is called when it came.
  * @param {() => Element | null} find
  * @param {() => string} address
  * @param {number} [everyMs]
@@ -102,7 +102,9 @@ export function keep(find, address, everyMs = 1000, placed = () => {}) {
 
   return function stale() {
     isAsked = true;
-    if (timer === null) load();
+    const isFree = timer === null;
+    if (isFree) load();
+    return isFree;
   };
 }
 

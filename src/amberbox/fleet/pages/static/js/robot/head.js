@@ -2,11 +2,9 @@
 
 import { one } from "../dom.js";
 import { listen } from "../feed.js";
-import { levels } from "../levels.js";
 import { keep } from "../pieces.js";
 
 const { robot } = one(".robot-head").dataset;
-const news = levels();
 const stale = keep(() => one("#robot-state"), () => `/pieces/robots/${encodeURIComponent(robot)}/head`);
 
 /** Tell whether the head shows something else than the server knows now. */
@@ -15,14 +13,9 @@ function isOther(card) {
   return Object.entries(shown).some(([name, value]) => card[name] !== value);
 }
 
-const feed = listen({ robots: [robot], kinds: ["presence", "status", "alarm"] });
-feed.on("snapshot", ({ robots, statuses }) => {
-  news(robot, statuses[robot]);
+const feed = listen({ robots: [robot], kinds: ["presence", "levels", "alarm"] });
+feed.on("snapshot", ({ robots }) => {
   const card = robots.find((known) => known.robot === robot);
   if (card && isOther(card)) stale();
 });
-feed.on("presence", () => stale());
-feed.on("alarm", () => stale());
-feed.on("status", (statuses) => {
-  if (news(robot, statuses)) stale();
-});
+for (const kind of ["presence", "levels", "alarm"]) feed.on(kind, () => stale());

@@ -3,7 +3,6 @@
 import * as diagnosis from "../diagnosis/card.js";
 import { all, one, setText } from "../dom.js";
 import { listen } from "../feed.js";
-import { levels } from "../levels.js";
 import { keep, piece, put } from "../pieces.js";
 import { startActs } from "./acts.js";
 import { robotLive } from "./live.js";
@@ -29,7 +28,6 @@ const presence = {
 const base = `/pieces/robots/${encodeURIComponent(robot)}`;
 const rows = tree(section, { toggled: remember });
 const live = robotLive(page);
-const news = levels();
 const words = new WeakMap();
 let snapshots = 0;
 /** Since when the watcher has said nothing. @type {number | null} */
@@ -202,15 +200,13 @@ function setPresence({ online, silent = false, seen = null }) {
 
 function take(statuses) {
   if (!live.write(statuses)) restructure();
-  if (news(robot, statuses)) changed();
 }
 
 /** Take how everything is: at first the page shows it already, unless something came in between. */
 function takeAll(statuses) {
   const before = levelsNow().join();
   if (!live.write(statuses)) restructure();
-  const isNews = news(robot, statuses);
-  if (snapshots > 0 ? isNews : before !== levelsNow().join()) changed();
+  if (snapshots > 0 || before !== levelsNow().join()) changed();
   snapshots += 1;
 }
 
@@ -248,7 +244,7 @@ function contact(data) {
 }
 
 function startFeed() {
-  const feed = listen({ robots: [robot], kinds: ["presence", "status", "ages", "event", "diagnosis"] });
+  const feed = listen({ robots: [robot], kinds: ["presence", "status", "levels", "ages", "event", "diagnosis"] });
   feed.on("snapshot", ({ robots, statuses }) => {
     const card = robots.find((known) => known.robot === robot);
     if (card) setPresence({ online: card.online, silent: card.silent, seen: card.last_seen });
@@ -256,6 +252,7 @@ function startFeed() {
     if (snapshots > 1) renewAround();
   });
   feed.on("status", take);
+  feed.on("levels", changed);
   feed.on("ages", contact);
   feed.on("presence", ({ online, silent, since }) => {
     setPresence({ online, silent, seen: since });
