@@ -5,16 +5,20 @@ from __future__ import annotations
 import html
 import re
 from collections.abc import Iterator
+from dataclasses import replace
+from typing import cast
 
 import pytest
 
 from amberbox.core.clock import NS
 from amberbox.fleet.api.timelines import Lane, Stretch, Timeline
+from amberbox.fleet.asking.asking import Asking
 from amberbox.fleet.data import remarks
 from amberbox.fleet.pages.robot import tree as robottree
 from amberbox.fleet.pages.robot.graph import as_list, edges, graph
 from amberbox.fleet.pages.robot.groups import groups
 from amberbox.fleet.pages.robot.times import times
+from amberbox.fleet.state.facts import FactsBook
 from amberbox.fleet.state.views import Component, Condition, Mode, Need, Output, StatusTree
 from tests.fleet.house import START_NS, House, house
 from tests.fleet.state import lives
@@ -48,6 +52,7 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[House]:
         lives.say(found, "ropod_002", lives.STATUS, START_NS, 1, odd)
         remark = {"kind": "remark", "text": HOSTILE, "source": "watch", "details": ""}
         lives.say(found, "ropod_002", lives.EVENT, START_NS - NS, 2, remark)
+        page(found, f"{PIECES}/tree")  # now its folder is known
         yield found
 
 
@@ -167,10 +172,30 @@ def test_a_mission_that_people_began_can_be_ended_and_noted(home: House) -> None
         remarks.end(connection, START_NS + 1, "ropod_001", begun.id, "done", failed=None)
 
 
-def test_files_of_the_folder_are_for_technicians(home: House) -> None:
-    file = f"/api/v1/robots/ropod_001/folder/{lives.HASH}/robot.yaml"
-    assert file not in page(home, PAGE, "operator")
-    assert file in page(home, PAGE, "technician")
+def test_files_of_the_folder_are_for_technicians_when_they_open_them(home: House) -> None:
+    piece = f"{PIECES}/files"
+    link = f'href="/api/v1/robots/ropod_001/folder/{lives.HASH}/robot.yaml"'
+    shown = page(home, name="technician")
+    assert f'data-fill="{piece}"' in shown and link not in shown
+    assert link in page(home, piece, "technician")
+    assert piece not in page(home) and home.client("viewer").get(piece).status_code == 403
+
+
+def test_a_page_waits_for_no_worker(home: House, monkeypatch: pytest.MonkeyPatch) -> None:
+    state = home.services.feed.state
+    unread = FactsBook(home.services.folders, cast("Asking", None))
+    monkeypatch.setattr(state, "facts", unread)
+    monkeypatch.setattr(state, "cards", replace(state.cards, facts=unread))
+    shown = page(home, f"{PAGE}?q=las&open=laser")
+    assert 'data-component="laser"' in shown and "The robot's folder is not here" not in shown
+    assert f'data-fill="{PIECES}/tree?q=las&amp;open=laser"' in shown
+    assert all(f'data-fill="{PIECES}/{name}"' in shown for name in ("panels", "graph"))
+
+
+def test_what_is_filled_in_waits_for_nothing_more(home: House) -> None:
+    for name in ("tree", "panels", "graph"):
+        assert "data-fill" not in page(home, f"{PIECES}/{name}")
+    assert "data-fill" not in page(home)
 
 
 def test_a_token_for_statuses_alone_sees_neither_events_nor_diagnoses(home: House) -> None:

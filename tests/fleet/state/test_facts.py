@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Any, cast
 
@@ -68,6 +70,22 @@ def test_what_took_too_long_is_tried_again_after_a_while(error: AmberboxError) -
     desk.now_s = AGAIN_S
     assert desk.book.at_once("r1", "abab") is None
     assert desk.read() == Facts(model="Ropod 2")
+
+
+def test_those_who_ask_at_the_same_time_wait_for_one_answer() -> None:
+    desk = Desk([GOOD])
+    slow, answer = threading.Event(), desk.ask_now
+
+    def ask_now(*words: Any, **more: Any) -> bytes:
+        slow.wait(5)
+        return answer(*words, **more)
+
+    desk.ask_now = ask_now  # type: ignore[method-assign]  # the same, later
+    with ThreadPoolExecutor(3) as pool:
+        asked = [pool.submit(desk.read) for _ in range(3)]
+        slow.set()
+        assert [one.result().model for one in asked] == ["Ropod 2"] * 3
+    assert desk.asked == 1
 
 
 def test_a_busy_server_is_asked_again_at_once() -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -20,6 +20,7 @@ from amberbox.fleet.conclusions.reading import entries
 from amberbox.fleet.linkend.presence import Presence, presences
 from amberbox.fleet.services import Services
 from amberbox.fleet.state import links
+from amberbox.fleet.state.facts import Facts
 from amberbox.fleet.state.said import SaidEvent, moment, taken
 from amberbox.fleet.state.standing import Moment, clock_offsets_ns, silence, standings
 from amberbox.fleet.state.timeline import timeline
@@ -83,13 +84,29 @@ def read_card(fleet: Fleet, robot: OfRobot) -> Card:
 @routes.get("/robots/{robot}/status", "status.read")
 def read_status(fleet: Fleet, robot: OfRobot) -> StatusTree:
     """Return the components of a robot as a tree, with modes, outputs and what they need."""
+    return _status(fleet, robot, fleet.feed.state.facts.read)
+
+
+def status_now(fleet: Services, robot: KnownRobot) -> StatusTree | None:
+    """Return the tree of a robot; None where its folder has to be read first."""
+    facts = fleet.feed.state.facts
+    is_known = facts.at_once(robot.id, fleet.folders.current(robot.id)) is not None
+    return read_status(fleet, robot) if is_known else None
+
+
+def status_without_folder(fleet: Services, robot: KnownRobot) -> StatusTree:
+    """Return the tree of a robot as it is known without its folder."""
+    return _status(fleet, robot, lambda *_: Facts())
+
+
+def _status(fleet: Services, robot: KnownRobot, read: Callable[[str, str], Facts]) -> StatusTree:
     now_ns = fleet.clock.wall_ns()
     with fleet.database.reading() as connection:
         statuses = standings(connection, [robot.id]).get(robot.id, [])
         seen = _presence(connection, robot.id)
         offset_ns = clock_offsets_ns(connection, [robot.id]).get(robot.id)
     online = robot.id in fleet.links.robots
-    facts = fleet.feed.state.facts.read(robot.id, seen.config_hash if seen else "")
+    facts = read(robot.id, seen.config_hash if seen else "")
     when = Moment(now_ns, offset_ns)
     silent = silence(seen, online, statuses, when)
     return status_tree(robot.id, online, silent, statuses, facts, when)

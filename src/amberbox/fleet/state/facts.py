@@ -92,6 +92,7 @@ class FactsBook:
         self._lock = threading.Lock()
         self._known: OrderedDict[_Key, Facts] = OrderedDict()
         self._failed: OrderedDict[_Key, _Failed] = OrderedDict()
+        self._turns: dict[_Key, threading.Lock] = {}
 
     def known(self, robot: str, config_hash: str) -> Facts | None:
         """Return what was read before; never waits."""
@@ -110,7 +111,16 @@ class FactsBook:
     def read(self, robot: str, config_hash: str) -> Facts:
         """Return what a folder says; blocks the first time. Without one, facts with a note."""
         found = self.at_once(robot, config_hash)
-        return self._ask(robot, config_hash) if found is None else found
+        if found is not None:
+            return found
+        key = robot, config_hash
+        with self._lock:
+            turn = self._turns.setdefault(key, threading.Lock())
+        with turn:  # one asks, the others wait for its answer
+            found = self.at_once(robot, config_hash) or self._ask(robot, config_hash)
+        with self._lock:
+            self._turns.pop(key, None)
+        return found
 
     def _ask(self, robot: str, config_hash: str) -> Facts:
         arguments = {"robot": robot, "config_hash": config_hash}

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any
+from urllib.parse import quote
 
 from fastapi import Query, Request, Response
 
@@ -19,9 +20,10 @@ from amberbox.fleet.api.robots import (
     read_link,
     read_status,
     read_timeline,
+    status_now,
+    status_without_folder,
 )
 from amberbox.fleet.data import remarks
-from amberbox.fleet.folders.shelf import FileInfo
 from amberbox.fleet.pages.datalinks import moment_href
 from amberbox.fleet.pages.diagnosis.look import current_card
 from amberbox.fleet.pages.page import Pages, render
@@ -47,6 +49,7 @@ _NOTED = 5
 _ACTIONS = ("items.read", "diagnoses.read", "diagnoses.write", "incidents.write", "missions.write",
             "robots.write")  # fmt: skip
 NOTHING: list[str] = []
+NO_FILLS: Mapping[str, str] = {}
 
 Text = Annotated[str, Query(max_length=128)]
 Chosen = Annotated[list[Annotated[str, Query(max_length=256)]], Query(alias="open", max_length=500)]
@@ -71,12 +74,14 @@ def show(
 ) -> Response:  # fmt: skip
     """Show a robot."""
     look = Look(q, show, chosen, window, lanes, kind)
-    tree, card = read_status(fleet, robot), read_card(fleet, robot)
+    known, card = status_now(fleet, robot), read_card(fleet, robot)
+    tree = known or status_without_folder(fleet, robot)
     may = {name: who.may(name, robot) for name in _ACTIONS}
     return _show(
         request, "robot/robot.html", card=card, look=look, may=may, **_tree(tree, look),
         **_graph(tree), **_panels(tree), **_now(fleet, who, robot),
-        files=_files(fleet, who, robot, card), robot=robot,
+        fill=_fills(request, robot) if known is None else {},
+        has_files=_has_files(fleet, who, robot, card), robot=robot,
         seen=_times(fleet, robot, window, lanes), **_events(fleet, robot, kind, may["items.read"]),
         diagnosis=current_card(fleet, robot.id, card.last_seen) if may["diagnoses.read"] else None,
         strings=("diagnosis",),
@@ -136,6 +141,15 @@ def show_panels(request: Request, fleet: Fleet, robot: OfRobot) -> Response:
     return _show(request, "robot/panels.html", card=card, **_panels(tree))
 
 
+@routes.get("/pieces/robots/{robot}/files", "folder.read")
+def show_files(request: Request, fleet: Fleet, robot: OfRobot) -> Response:
+    """Show the files of the folder that the robot has now, alone."""
+    config_hash = fleet.folders.current(robot.id)
+    files = fleet.folders.files(robot.id, config_hash) or ()
+    values = {"robot": robot.id, "config_hash": config_hash, "files": files}
+    return _show(request, "robot/files.html", **values)
+
+
 @routes.get("/pieces/robots/{robot}/battery", "items.read")
 async def show_battery(request: Request, fleet: Fleet, who: Who, robot: OfRobot) -> Response:
     """Show how the battery went in the last hour."""
@@ -147,7 +161,7 @@ async def show_battery(request: Request, fleet: Fleet, who: Who, robot: OfRobot)
 
 
 def _show(request: Request, template: str, **values: Any) -> Response:
-    return render(request, template, rt=robottree, **values)
+    return render(request, template, rt=robottree, **{"fill": NO_FILLS, **values})
 
 
 def _tree(tree: StatusTree, look: Look) -> Mapping[str, Any]:
@@ -205,8 +219,14 @@ def _battery(tree: StatusTree) -> Component | None:
     return next(found, None)
 
 
-def _files(fleet: Services, who: Who, robot: KnownRobot, card: Card) -> Sequence[FileInfo] | None:
-    """Return the files of the robot's folder for those who may read them, if it is here."""
-    if not card.config_hash or not who.may("folder.read", robot):
-        return None
-    return fleet.folders.files(robot.id, card.config_hash)
+def _fills(request: Request, robot: KnownRobot) -> Mapping[str, str]:
+    """Return where the parts come from that wait for the robot's folder."""
+    base = f"/pieces/robots/{quote(robot.id, safe='')}"
+    tree = f"{base}/tree?{request.url.query}"
+    return {"tree": tree, "panels": f"{base}/panels", "graph": f"{base}/graph"}
+
+
+def _has_files(fleet: Services, who: Who, robot: KnownRobot, card: Card) -> bool:
+    """Tell whether the robot's folder is here, and may be read."""
+    is_here = card.config_hash and not fleet.folders.wants(robot.id, card.config_hash)
+    return bool(is_here) and who.may("folder.read", robot)
