@@ -68,6 +68,7 @@ class Card(Answer, frozen=True):
     battery: Battery | None = None
     mission: OnMission | None = None
     diagnosis: Lead | None = None
+    alarms_over: int = 0
 
 
 class Output(Answer, frozen=True):

@@ -91,7 +91,7 @@ def _fits(card: Card, look: Look) -> bool:
         all(word in words for word in look.q.casefold().split())
         and {
             "all": True,
-            "trouble": card.level in ("error", "warn") or card.alarms > 0,
+            "trouble": card.level in ("error", "warn") or card.severity != "" or card.alarms > 0,
             "alarms": card.alarms > 0,
             "offline": not card.online,
         }[look.show]

@@ -88,7 +88,7 @@ class Cards:
             silent or _cause(worst), dict(Counter(status.level for status in components)),
             alarms.count,
             _battery(statuses), _mission(recent), _lead(recent),
-            link is not None and link.is_silent,
+            link is not None and link.is_silent, alarms.over,
         )  # fmt: skip
 
 

@@ -46,8 +46,9 @@ class Card:
     """A robot at a glance.
 
     ``level`` is ``unknown`` where nobody can know; ``last_level`` is what it was then. ``cause``
-    says in words what is worst. ``severity`` is the highest of the alarms that it has open.
-    ``silent``: its link holds, and three heartbeats are missing.
+    says in words what is worst. ``alarms`` are those that nobody has said anything about yet, of
+    which ``alarms_over`` have stopped; ``severity`` is the highest of those that last, also of
+    acknowledged ones. ``silent``: its link holds, and three heartbeats are missing.
     """
 
     robot: str
@@ -71,6 +72,7 @@ class Card:
     mission: OnMission | None
     diagnosis: Lead | None
     silent: bool = False
+    alarms_over: int = 0
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,6 +10,7 @@ from amberbox.fleet.alarms.alarm import rank_of
 from amberbox.fleet.alarms.tables import ALARM, ALARM_ROBOT
 from amberbox.fleet.api.access import Caller
 from amberbox.fleet.services import Services
+from amberbox.fleet.state.openalarms import is_open
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,9 +26,7 @@ def open_count(fleet: Services, who: Caller) -> OpenCount:
     every = who.principal.groups is None
     if every and not who.may("alarms.read"):
         return OpenCount()
-    wanted = select(ALARM.c.severity, func.count()).where(
-        ALARM.c.state == "open", ALARM.c.merged_into.is_(None)
-    )
+    wanted = select(ALARM.c.severity, func.count()).where(is_open())
     with fleet.database.reading() as connection:
         if not every:
             mine = [robot.id for robot in who.robots(connection, "alarms.read")]
