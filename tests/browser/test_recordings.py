@@ -118,6 +118,16 @@ def test_what_others_do_appears_by_itself(page_as: PageAs) -> None:
     expect(page.locator("#incidents")).to_contain_text("released")
 
 
+def test_what_is_asked_of_a_robot_is_told_at_once(page_as: PageAs) -> None:
+    page, other = page_as("viewer"), page_as("technician")
+    page.goto("/recordings/ropod_003")
+    other.goto("/recordings/ropod_003")
+    expect(page.locator("html")).to_have_attribute("data-feed", "live")
+    window = {"item": "odom", "from": "now-50m", "to": "now-40m"}
+    asked = other.evaluate(_POST, ["/api/v1/robots/ropod_003/fetches", window])
+    expect(page.locator(f"#fetch-{asked['id']}")).to_contain_text("odom", timeout=3000)
+
+
 def test_a_mission_is_begun_and_ended(page_as: PageAs) -> None:
     page = page_as("operator")
     page.goto("/recordings/ropod_002")

@@ -191,6 +191,25 @@ def test_of_jobs_only_the_owner_hears(home: House) -> None:
     asyncio.run(scene())
 
 
+def test_who_may_ask_for_data_hears_of_windows_from_robots(home: House) -> None:
+    async def scene() -> None:
+        async with stage(home) as on, on.browser("viewer") as socket:
+            await ask(socket, kinds=["fetch"])
+            await hear(socket, "snapshot")
+            client = home.client("technician")
+            window = {"from": "now-1h", "to": "now-30m"}
+            made = await asyncio.to_thread(
+                client.post, "/api/v1/robots/ropod_001/fetches", json=window
+            )
+            id = made.json()["id"]
+            told = await hear(socket, "fetch")
+            assert (told["robot"], told["data"]) == ("ropod_001", {"id": id})
+            await asyncio.to_thread(client.delete, f"/api/v1/robots/ropod_001/fetches/{id}")
+            assert (await hear(socket, "fetch"))["data"] == {"id": id}
+
+    asyncio.run(scene())
+
+
 def test_a_token_hears_what_its_scopes_allow(home: House) -> None:
     async def scene() -> None:
         async with stage(home) as on:

@@ -10,7 +10,7 @@ from typing import Any, Final, Literal, TypeAlias, get_args
 import msgspec
 
 Kind: TypeAlias = Literal[
-    "presence", "status", "levels", "ages", "event", "diagnosis", "alarm", "job"
+    "presence", "status", "levels", "ages", "event", "diagnosis", "alarm", "job", "fetch"
 ]  # fmt: skip
 KINDS: Final[frozenset[str]] = frozenset(get_args(Kind))
 PLAIN: Final[frozenset[str]] = KINDS - {"ages", "levels"}

@@ -115,6 +115,7 @@ class Feed:
         yield from (("account", self._accounts), ("robot", self._accounts))
         yield "alarm", self._alarm
         yield "job", lambda c: self.add("job", c.robot, dict(c.data), str(c.data.get("owner", "")))
+        yield "fetch", lambda c: self.add("fetch", c.robot, {"id": c.data["id"]})
         yield "diagnosis", lambda c: self.add("diagnosis", c.robot, [dict(c.data)])
 
     def _load(self) -> None:

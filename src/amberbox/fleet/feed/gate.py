@@ -23,6 +23,7 @@ _NEEDS = {
     "diagnosis": "diagnoses.read",
     "alarm": "alarms.read",
     "job": "data.download",
+    "fetch": "data.query",
 }
 """What each kind of change takes."""
 

@@ -7,7 +7,7 @@ import { ask, fail } from "./ask.js";
 import { el, icon, setText } from "./dom.js";
 import { t } from "./strings.js";
 
-const EVERY_MS = 2000;
+const AGAIN_MS = 5000;
 const DOWNLOAD_OVER = ["done", "failed", "cancelled", "expired"];
 const FETCH_OVER = ["ready", "gone", "cancelled"];
 
@@ -46,8 +46,9 @@ export function works(list, robot, { fetched }) {
   async function look(id) {
     const known = lines.get(id);
     if (!known || isOver(known)) return;
-    const about = await ask(known.path).catch(() => null); // asked again in a moment
-    if (about && lines.has(id)) show(known, about);
+    const about = await ask(known.path).catch(() => null);
+    if (!about) setTimeout(look, AGAIN_MS, id);
+    else if (lines.has(id)) show(known, about);
   }
 
   async function leave(id) {
@@ -63,15 +64,16 @@ export function works(list, robot, { fetched }) {
     list.hidden = lines.size === 0;
   }
 
-  setInterval(() => [...lines.keys()].forEach(look), EVERY_MS);
   return {
     /** Follow a download. @param {any} about as the server told it */
     download: (about) => line(`/api/v1/downloads/${about.id}`, about, writeDownload, DOWNLOAD_OVER),
     /** Follow a window that the robot was asked for. */
     fetch: (about) => line(`/api/v1/robots/${encodeURIComponent(robot)}/fetches/${about.id}`, about, writeFetch, FETCH_OVER,
       ({ state }) => state === "ready" && fetched()),
-    /** The feed has told of a download. @param {string} id */
+    /** The feed has told of a download or a window. @param {string} id */
     look,
+    /** Something may have been missed. */
+    lookAll: () => [...lines.keys()].forEach(look),
     isAsking: () => [...lines.values()].some((one) => one.over === FETCH_OVER && !isOver(one)),
   };
 }

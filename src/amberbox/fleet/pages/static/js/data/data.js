@@ -70,7 +70,7 @@ function refused(error) {
 /** Make all parts; none of them shows anything yet. */
 function build() {
   const { parts } = page;
-  parts.feed = listen({ robots: [robot], kinds: ["alarm", "job"] });
+  parts.feed = listen({ robots: [robot], kinds: ["alarm", "job", "fetch"] });
   parts.stage = stage(one("#plots"), {
     onWindow: (from, to) => move(from, to, "plots"), onRemove: (name) => toggle(name), onLive: showLive,
     onEmpty: (isEmpty) => say({ isEmpty }), onMoved: followed, onDrop: dropped, onAxes: (x, y) => change({ x, y }),
@@ -90,7 +90,8 @@ function build() {
   marks(robot, { ...about, changed: rewatch });
   takeAlong(robot, { ...about, chosen: () => chosen().map((one) => one.variable), began: parts.works.download });
   comparing(robot, { begin: (pair) => turn({ compare: pair, mode: "time", live: false }), end: () => turn({ compare: [] }) });
-  parts.feed.on("job", ({ id }) => parts.works.look(id));
+  for (const kind of ["job", "fetch"]) parts.feed.on(kind, ({ id }) => parts.works.look(id));
+  parts.feed.on("snapshot", () => parts.works.lookAll());
   parts.feed.on("alarm", rewatch);
 }
 

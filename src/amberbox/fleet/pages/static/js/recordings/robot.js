@@ -2,6 +2,7 @@
 
 import { ask, fail } from "../ask.js";
 import { all, el, one, setText } from "../dom.js";
+import { listen } from "../feed.js";
 import { piece, put } from "../pieces.js";
 import { check } from "./check.js";
 import { followStates } from "./state.js";
@@ -148,5 +149,6 @@ const { look } = followStates(() => [robot], (_, isAll) => {
   for (const name of isAll ? PARTS : ["journals"]) reload(name);
   if (isAll) reloadCard();
 });
+listen({ robots: [robot], kinds: ["fetch"] }).on("fetch", () => reload("fetches"));
 setInterval(() => late.forEach(reload), LATE_MS);
 start();

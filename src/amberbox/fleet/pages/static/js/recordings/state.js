@@ -1,4 +1,4 @@
-// How far copying is: nobody tells of it, so it is asked for every ten seconds while one looks.
+// How far copying is: nobody tells of bytes that come, so it is asked for every ten seconds while one looks.
 
 import { all, one } from "../dom.js";
 import { listen } from "../feed.js";
