@@ -257,3 +257,12 @@ def test_browser_and_server_write_numbers_alike(page_as: PageAs) -> None:
         [assets.address("all.js"), list(NUMBERS)],
     )
     assert told == [robottree.number(value) for value in NUMBERS]
+
+
+def test_files_of_the_folder_come_when_they_are_opened(page_as: PageAs) -> None:
+    page = page_as("technician")
+    page.goto("/robots/ropod_001")
+    files = page.locator("#files")
+    expect(files.locator("a")).to_have_count(0)
+    files.locator("summary").click()
+    expect(files.get_by_role("link", name="robot.yaml")).to_be_visible()
