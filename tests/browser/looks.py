@@ -26,6 +26,19 @@ _WIDER = """() => {
     return document.documentElement.scrollWidth > room ? [...found.slice(0, 8), "(page)"] : []
 }"""
 
+_SQUEEZED = """() => {
+    const whole = (element) => {
+        for (const part of [element, ...element.querySelectorAll("*")]) {
+            part.style.setProperty("overflow-wrap", "normal", "important")
+            part.style.setProperty("word-break", "normal", "important")
+        }
+        return element.scrollWidth > element.clientWidth + 1
+    }
+    const hasRoomBeside = (dd) => dd.clientWidth < 0.9 * dd.closest("dl").clientWidth
+    const found = [...document.querySelectorAll("dd")].filter((dd) => dd.checkVisibility())
+    return found.filter(hasRoomBeside).filter(whole).map((dd) => dd.textContent.trim())
+}"""
+
 
 def axe(page: Page, within: str | None = None) -> None:
     """Fail where people with impairments would be stopped (impact serious or critical)."""
@@ -47,6 +60,11 @@ def _in_words(violation: dict[str, Any]) -> str:
 def no_sideways_scroll(page: Page) -> None:
     """Fail when the page is wider than its window; tables scroll in a ``.scroll`` of their own."""
     assert page.evaluate(_WIDER) == [], f"{page.url} is wider than its window"
+
+
+def no_squeezed_values(page: Page) -> None:
+    """Fail when a value of a list is narrower than its longest word while its key takes room."""
+    assert page.evaluate(_SQUEEZED) == [], f"{page.url} has values broken within words"
 
 
 def shot(page: Page, name: str, *, whole: bool = True) -> Path:

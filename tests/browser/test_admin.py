@@ -102,3 +102,17 @@ def test_the_audit_log_is_followed(page_as: PageAs) -> None:
     page.goto("/admin/audit?action=settings.change")
     page.get_by_role("button", name="Does it hold?").click()
     expect(page.get_by_text("It holds:")).to_be_visible()
+
+
+def test_rows_are_cards_where_there_is_no_room(page_as: PageAs) -> None:
+    page = page_as("admin", width=390)
+    page.goto("/admin/users")
+    row = page.get_by_role("row").filter(has_text="nurse")
+    change = row.get_by_text("Change", exact=True)
+    expect(change).to_be_visible()
+    shown = change.bounding_box()
+    assert shown and shown["x"] + shown["width"] <= 390, "the last column is off to the right"
+    role = row.get_by_role("cell", name="technician").first
+    assert role.evaluate("one => getComputedStyle(one, '::before').content") == '"Role"'
+    page.set_viewport_size({"width": 1440, "height": 900})
+    assert role.evaluate("one => getComputedStyle(one, '::before').content") == "none"

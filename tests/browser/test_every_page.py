@@ -14,7 +14,7 @@ from amberbox.fleet.api.who import COOKIE
 from amberbox.fleet.serving.app import rooms
 from tests.browser.conftest import PageAs
 from tests.browser.expecting import expect
-from tests.browser.looks import axe, no_sideways_scroll, shot
+from tests.browser.looks import axe, no_sideways_scroll, no_squeezed_values, shot
 from tests.browser.site import Site
 
 PAGES: Mapping[str, str] = {
@@ -69,6 +69,8 @@ def test_page(page_as: PageAs, route: str, theme: str, width: int) -> None:
     expect(page.locator("h1").first).to_be_visible()
     axe(page)
     no_sideways_scroll(page)
+    if width < 600:
+        no_squeezed_values(page)
     assert not page.title().startswith("1"), "a text of somebody has run as a script"
     shot(
         page,

@@ -1,6 +1,7 @@
 // What every page has: its theme, menus, help, times, forms.
 
 import { ask } from "./ask.js";
+import { label } from "./cards.js";
 import { all, el, one } from "./dom.js";
 import * as forms from "./forms.js";
 import { refresh } from "./time.js";
@@ -73,3 +74,4 @@ document.addEventListener("keydown", onKey);
 all("details[data-view]").forEach(remember);
 forms.start();
 refresh();
+label();

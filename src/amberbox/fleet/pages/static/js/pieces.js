@@ -2,6 +2,7 @@
 // What is in them was escaped by the server; scripts in them never run.
 
 import { AskError, fail, signIn } from "./ask.js";
+import { label } from "./cards.js";
 import { one } from "./dom.js";
 import { t } from "./strings.js";
 import { refresh } from "./time.js";
@@ -34,6 +35,7 @@ export async function piece(path, how = {}) {
  */
 export function put(old, fresh) {
   refresh(fresh);
+  label(fresh);
   for (const details of old.querySelectorAll("details[id][open]")) {
     fresh.querySelector(`details[id="${CSS.escape(details.id)}"]`)?.setAttribute("open", "");
   }
@@ -49,6 +51,7 @@ export function replace(place, nodes) {
   const held = place.contains(document.activeElement) ? handle(place, document.activeElement) : null;
   place.replaceChildren(...nodes);
   refresh(place);
+  label(place);
   if (held) (held(place) ?? one("[tabindex]", place) ?? place).focus({ preventScroll: true });
 }
 
