@@ -20,10 +20,11 @@ from amberbox.core.errors import AmberboxError
 from amberbox.fleet.archive import keeping, settling
 from amberbox.fleet.archive.folder import FolderArchive
 from amberbox.fleet.archive.keeping import RETENTION, Keeping
-from amberbox.fleet.archive.store import Retention
+from amberbox.fleet.archive.store import OWN, Retention
 from amberbox.fleet.archive.tables import BATCHES
 from amberbox.fleet.bus import Bus, Change
 from amberbox.fleet.database.database import FILE, Database
+from amberbox.fleet.linkend.events import note
 from amberbox.fleet.linkend.tables import ASIDE, COMMITTED, EVENT, ROW
 from amberbox.fleet.options import options
 from amberbox.fleet.uploads.pieces import Incoming
@@ -229,17 +230,26 @@ def test_what_was_deleted_before_the_copy_is_a_gap_with_its_reason(
     assert (gap.run, gap.from_seq, gap.to_seq) == (2, 100, 200) and "no room" in gap.reason
 
 
+def noted(scene: Scene) -> list[str]:
+    with scene.database.reading() as connection:
+        return list(connection.scalars(select(EVENT.c.text)))
+
+
 def test_data_go_by_the_rules_of_the_setting(scene: Scene) -> None:
     scene.robot.record(0, files=3)
     scene.robot.hand_in_all(scene.archive)
     scene.archive.commit(0)
     scene.clock.advance(3 * 24 * 3600)
     with scene.database.begin() as connection:
-        options.write(connection, 0, RETENTION, [Retention(journals_s=3600.0)])
+        rules = [Retention(journals_s=3600.0), Retention(keeping=OWN, columns_s=3600.0)]
+        options.write(connection, 0, RETENTION, rules)
+        note(connection, "r1", 0, "connected", "long ago")
     before = len(list(scene.archive.layout.journals.rglob("*.mcap")))
     scene.keeping.tidy(is_daily=False)
+    assert "long ago" in noted(scene)
     assert len(list(scene.archive.layout.journals.rglob("*.mcap"))) == before
     scene.keeping.tidy(is_daily=True)
+    assert "long ago" not in noted(scene)
     assert len(list(scene.archive.layout.journals.rglob("*.mcap"))) < before
 
 

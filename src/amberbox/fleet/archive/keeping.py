@@ -20,6 +20,7 @@ from amberbox.core.clock import NS, Clock
 from amberbox.core.errors import AmberboxError
 from amberbox.fleet.archive import settling
 from amberbox.fleet.archive.folder import FolderArchive
+from amberbox.fleet.archive.forgetting import forget
 from amberbox.fleet.archive.room import Room, Usage, room_of
 from amberbox.fleet.archive.store import Retention
 from amberbox.fleet.archive.worker import Worker
@@ -188,11 +189,13 @@ class Keeping:
 
     def tidy(self, *, is_daily: bool) -> None:
         """Tidy the archive once; blocks. Raises AmberboxError when the worker could not."""
+        with self._database.reading() as connection:
+            rules = options.read(connection, RETENTION, tuple[Retention, ...])
+        if is_daily:
+            forget(self._database, rules, self._clock.wall_ns())
         if not self._archive.catalogue.revision():
             return
         if is_daily:
-            with self._database.reading() as connection:
-                rules = options.read(connection, RETENTION, tuple[Retention, ...])
             self._worker.retain(*rules)
         self._worker.compact()
         self._worker.sweep()

@@ -23,7 +23,8 @@ from amberbox.fleet.archive.segments import joined, segment_at
 from amberbox.fleet.archive.store import OWN, Retention
 from amberbox.fleet.data.remarks import pinned as marked
 
-_DATA = ("main", "bulk", "ring")
+DATA = ("main", "bulk", "ring")
+"""Classes that a rule for ``*`` is about."""
 _DAY_NS = 24 * 3600 * NS
 _RELEASED = "released"
 
@@ -69,7 +70,7 @@ def rule_of(robot: str, keeping: str, rules: Sequence[Retention]) -> Retention |
         rule
         for rule in rules
         if rule.robot in ("*", robot)
-        and (rule.keeping == keeping or (rule.keeping == "*" and keeping in _DATA))
+        and (rule.keeping == keeping or (rule.keeping == "*" and keeping in DATA))
     ]
     return max(fitting, key=lambda rule: (rule.robot != "*", rule.keeping != "*"), default=None)
 
