@@ -22,6 +22,11 @@ def integer(unit: str = "") -> Shape:
     return _unit({"type": "integer"}, unit)
 
 
+def code(names: Mapping[int, str]) -> Shape:
+    """A whole number whose values have names."""
+    return {"type": "integer", "labels": {str(value): name for value, name in names.items()}}
+
+
 def text() -> Shape:
     """A string."""
     return {"type": "string"}
@@ -74,4 +79,5 @@ def leaves(shape: Mapping[str, Any], path: str = "") -> list[tuple[str, str, str
         size = shape.get("maxItems", "")
         kind = f"{shape['items']['type']}[{size}]"
         return [(path, kind, shape["items"].get("unit", ""))]
-    return [(path, shape["type"], shape.get("unit", ""))]
+    named = ", ".join(f"{value} {name}" for value, name in shape.get("labels", {}).items())
+    return [(path, f"{shape['type']} ({named})" if named else shape["type"], shape.get("unit", ""))]

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 from amberbox.core.types import Schema, Topic
 from amberbox.sim import shapes
-from amberbox.sim.shapes import Shape, flag, integer, number, numbers, record, text, xyz
+from amberbox.sim.codes import LOG_LEVELS, STATUS
+from amberbox.sim.shapes import Shape, code, flag, integer, number, numbers, record, text, xyz
 
 WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
 NODES = (
@@ -55,13 +56,13 @@ def _drive(index: int) -> dict[str, Shape]:
         f"velocity_{index}": number("rad/s"),
         **currents,
         **voltages,
-        f"temperature_{index}": number("degC"),
+        f"temperature_{index}": number("°C"),
     }
 
 
 def _wheel_sensors() -> Shape:
     return record(
-        status1=integer(),
+        status1=code(STATUS),
         status2=integer(),
         sensor_ts=integer("us"),
         setpoint_ts=integer("us"),
@@ -71,9 +72,9 @@ def _wheel_sensors() -> Shape:
         velocity_pivot=number("rad/s"),
         voltage_bus=number("V"),
         imu_ts=integer("us"),
-        **{f"accel_{axis}": number("m/s2") for axis in "xyz"},
+        **{f"accel_{axis}": number("m/s^2") for axis in "xyz"},
         **{f"gyro_{axis}": number("rad/s") for axis in "xyz"},
-        temperature_imu=number("degC"),
+        temperature_imu=number("°C"),
         pressure=number("hPa"),
     )
 
@@ -123,8 +124,8 @@ TOPICS: tuple[TopicSpec, ...] = (
         record(
             orientation=_TURN,
             angular_velocity=xyz("rad/s"),
-            linear_acceleration=xyz("m/s2"),
-            temperature=number("degC"),
+            linear_acceleration=xyz("m/s^2"),
+            temperature=number("°C"),
         ),
     ),
     TopicSpec("scan_front", 10, "laser_front", "laser_front", "Front laser.", _scan()),
@@ -188,7 +189,7 @@ TOPICS: tuple[TopicSpec, ...] = (
             voltage=number("V"),
             current=number("A"),
             percentage=number("%"),
-            temperature=number("degC"),
+            temperature=number("°C"),
             charging=flag(),
             charger_voltage=number("V"),
             cell_voltage=numbers("V", CELLS),
@@ -263,7 +264,7 @@ TOPICS: tuple[TopicSpec, ...] = (
         "The robot's computer.",
         record(
             cpu_percent=number("%"),
-            cpu_temperature=number("degC"),
+            cpu_temperature=number("°C"),
             memory_used_mb=number("MB"),
             memory_total_mb=number("MB"),
             disk_used_mb=number("MB"),
@@ -285,8 +286,8 @@ TOPICS: tuple[TopicSpec, ...] = (
         0,
         "",
         "supervisor",
-        "Log messages (level 10 debug, 20 info, 30 warning, 40 error, 50 fatal).",
-        record(level=integer(), name=text(), msg=text()),
+        "Log messages.",
+        record(level=code(LOG_LEVELS), name=text(), msg=text()),
     ),
 )
 TOPIC_BY_NAME = {spec.name: spec for spec in TOPICS}

@@ -16,17 +16,6 @@ UNDERVOLTAGE_V = 21.0
 _HALF_M = WHEEL_DISTANCE_M / 2
 _IMU_DEGC = 34.0
 SUPPLY_OHM = 0.05
-
-STATUS_BITS = {
-    0: "operational",
-    1: "power stage on",
-    2: "emergency stop pressed",
-    3: "supply voltage low",
-    4: "winding warm",
-    5: "drive 1 at its current limit",
-    6: "drive 2 at its current limit",
-    7: "no setpoint",
-}
 _INERTIAL_NOISE = (*(3 * [0.08]), *(3 * [0.008]), 0.1)
 # sigma of the numbers that readings() returns, in their order
 SENSOR_NOISE = (*READING_NOISE, *READING_NOISE, 0.001, 0.03, 0.03, *_INERTIAL_NOISE, 0.01)
@@ -128,7 +117,7 @@ class WheelUnit:
         self._yaw_rate = yaw_rate
 
     def status(self) -> int:
-        """Return the status word (see ``STATUS_BITS``)."""
+        """Return the status word (see ``codes.STATUS_BITS``)."""
         warm = max(self.drive_1.temperature_degc, self.drive_2.temperature_degc) > _WARM_DEGC
         bits = (
             self.power > 0.5 and not self.voltage_v < UNDERVOLTAGE_V,

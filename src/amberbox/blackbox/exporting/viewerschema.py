@@ -5,6 +5,7 @@ from __future__ import annotations
 import msgspec
 
 from amberbox.blackbox.unroll.jsonschema import from_schema, is_ours, to_schema
+from amberbox.blackbox.unroll.notes import notes_of
 from amberbox.blackbox.unroll.viewerform import viewer_form
 from amberbox.core.types import Schema
 
@@ -21,7 +22,7 @@ def viewer_schema(schema: Schema | None) -> Schema | None:
     except msgspec.DecodeError:
         return None
     if is_ours(document):
-        return to_schema(from_schema(schema), schema.name)
+        return to_schema(from_schema(schema), schema.name, notes_of(schema))
     plain = viewer_form(document)
     if plain is None or plain["type"] != "object":
         return None

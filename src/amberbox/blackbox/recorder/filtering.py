@@ -60,7 +60,7 @@ def _infer(stream: Stream, messages: Sequence[bytes], tell: Tell) -> None:
     topic, item = stream.topic, stream.item
     if item.versions >= MOST_VERSIONS:
         return
-    schema, bad = widen(topic.schema, messages, topic.message_encoding, item.name)
+    schema, bad = widen(topic.schema, messages, topic.message_encoding, item.name, stream.told)
     if bad:
         _note_malformed(stream, len(bad), tell)
     if schema is topic.schema:

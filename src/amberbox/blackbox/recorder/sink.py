@@ -12,6 +12,7 @@ from typing import Any
 from amberbox.blackbox.follow import read
 from amberbox.blackbox.recorder.pipeline import Pipeline
 from amberbox.blackbox.recorder.streams import Stream, tell_unused
+from amberbox.blackbox.unroll.notes import notes_of
 from amberbox.core.files import replace_file
 from amberbox.core.source import Power, TopicOptions
 from amberbox.core.types import Topic
@@ -112,9 +113,10 @@ class BlockSink:
         item = self._pipeline.items[self._item(topic.name)]
         item.waits = self._waits
         infers = topic.message_encoding in INFERRED
+        told = notes_of(topic.schema) if infers else {}
         if infers:  # what is really sent counts, not what was declared
             topic = replace(topic, schema=None)
-        stream = Stream(item, topic, infers=infers)
+        stream = Stream(item, topic, infers=infers, told=told)
         known = [s for s in self._streams if s.item is item]
         if known and not stream.infers:
             self._tell_of_change(known[-1].topic, topic, item.name)

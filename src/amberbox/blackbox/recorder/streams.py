@@ -10,6 +10,7 @@ import msgspec
 from amberbox.blackbox.filters.change import ChangeFilter
 from amberbox.blackbox.filters.rate import RateLimit
 from amberbox.blackbox.unroll import Unroller, unroller
+from amberbox.blackbox.unroll.notes import Notes
 from amberbox.blackbox.unroll.select import select
 from amberbox.core.errors import AmberboxError
 from amberbox.core.source import TopicOptions
@@ -103,6 +104,8 @@ class Stream:
     channel: int = -1
     stamps: Unroller | None = None
     infers: bool = False
+    told: Notes = field(default_factory=dict)
+    """What its sender says of units and codes, where the schema is inferred."""
     change: ChangeFilter | None = None
 
     @property

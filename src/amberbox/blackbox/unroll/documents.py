@@ -18,6 +18,7 @@ from amberbox.blackbox.unroll.decode import (
     text_of,
 )
 from amberbox.blackbox.unroll.jsonschema import from_schema
+from amberbox.blackbox.unroll.notes import Note, notes_of
 from amberbox.blackbox.unroll.places import objects
 from amberbox.blackbox.unroll.shapes import Shape, column_kind, escape, places
 from amberbox.blackbox.unroll.stamps import stamp_of
@@ -28,6 +29,7 @@ _STAMPS = ("header/stamp", "header/timestamp", "stamp", "timestamp")
 _STAMP_KINDS = {"integer", "number", "string"}
 _STAMP_KEYS = {"secs", "sec"}
 _MISFITS = (MalformedError, msgspec.MsgspecError, ValueError)
+_NO_NOTE = Note()
 _DTYPES: Mapping[str, Any] = {"bool": np.bool_, "int64": np.int64, "float64": np.float64}
 
 
@@ -40,7 +42,8 @@ class DocumentUnroller:
         self._stamp_path = _own_stamp(self._shape, stamp)
         self._decode_stamp = _stamp_decoder(self._stamp_path, encoding)
         self._names: dict[int, dict[str, str]] = {}
-        self.schema = self._item_schema(self._shape, schema.name, self._stamp_path)
+        self._notes = notes_of(schema)
+        self.schema = self._item_schema(self._shape, schema.name, stamp=self._stamp_path)
 
     def rows(self, messages: Sequence[bytes]) -> Rows:
         """Unroll a batch of messages."""
@@ -69,15 +72,20 @@ class DocumentUnroller:
             return None
         return np.array([self.stamp_ns(message) or 0 for message in messages], np.int64)
 
-    def _item_schema(self, table: Shape, type_name: str, stamp: str = "") -> ItemSchema:
+    def _item_schema(
+        self, table: Shape, type_name: str, above: str = "", stamp: str = ""
+    ) -> ItemSchema:
         names = self._names[id(table)] = unique_names(table.names)
         columns = []
         children = {}
         for path, shape, kind in places(table):
             if kind == "children" and shape.items is not None:
-                children[path] = self._item_schema(shape.items, f"{type_name}/{path}")
+                children[path] = self._item_schema(
+                    shape.items, f"{type_name}/{path}", f"{above}{path}/"
+                )
             else:
-                columns.append(Column(names[path], path, kind.replace("text", "string")))
+                note = self._notes.get(f"{above}{path}", _NO_NOTE)
+                columns.append(_described(names[path], path, kind.replace("text", "string"), note))
         return ItemSchema(type_name, tuple(columns), children, stamp)
 
     def _table(self, table: Shape, values: Sequence[Any]) -> Rows:
@@ -98,6 +106,13 @@ class DocumentUnroller:
         parent_row = np.repeat(np.arange(len(values), dtype=np.int64), counts)
         index = np.arange(rows.count, dtype=np.int64) - offsets[parent_row]
         return Rows(rows.count, rows.columns, rows.children, None, parent_row, index)
+
+
+def _described(name: str, path: str, kind: str, note: Note) -> Column:
+    """Return a column with its unit if it holds numbers, with labels if these are whole."""
+    is_whole = "int" in kind
+    unit = note.unit if is_whole or "float" in kind else ""
+    return Column(name, path, kind, unit, note.labels if is_whole else {})
 
 
 def _found(

@@ -9,16 +9,22 @@ import msgspec
 
 from amberbox.blackbox.unroll.decode import MalformedError, decode_plain, is_exact, make_decoder
 from amberbox.blackbox.unroll.jsonschema import from_schema, to_schema
+from amberbox.blackbox.unroll.notes import Notes, notes_of
 from amberbox.blackbox.unroll.shapes import Shape, nullable, observe, remember_names
 from amberbox.core.types import Schema
 
 
 def widen(
-    schema: Schema | None, messages: Sequence[bytes], encoding: str, name: str
+    schema: Schema | None,
+    messages: Sequence[bytes],
+    encoding: str,
+    name: str,
+    told: Notes | None = None,
 ) -> tuple[Schema, tuple[int, ...]]:
     """Widen a schema so that all messages unroll under it.
 
-    ``encoding`` is ``json`` or ``msgpack``. Returns the same object when nothing has changed, and
+    ``encoding`` is ``json`` or ``msgpack``; ``told`` is what the sender says of units and codes,
+    which a schema keeps once it has it. Returns the same object when nothing has changed, and
     the numbers of the messages that are malformed. The kinds of value in the schema depend only
     on which messages were seen, not on their order; column names on which came first.
     """
@@ -29,7 +35,8 @@ def widen(
     shape = from_schema(schema) if schema is not None else nullable()
     bad = [n for n in unknown if not _observed(shape, messages[n], encoding)]
     remember_names(shape)
-    widened = to_schema(shape, name if schema is None else schema.name)
+    notes = notes_of(schema) if schema is not None else told
+    widened = to_schema(shape, name if schema is None else schema.name, notes)
     same = schema is not None and widened.data == schema.data
     return (schema if same and schema is not None else widened), tuple(bad)
 

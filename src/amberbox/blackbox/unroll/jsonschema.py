@@ -7,6 +7,7 @@ from typing import Any
 
 import msgspec
 
+from amberbox.blackbox.unroll.notes import Notes, notes_json
 from amberbox.blackbox.unroll.shapes import Shape, is_nameable, nullable, places
 from amberbox.blackbox.unroll.viewerform import ALSO_TEXT, viewer_form
 from amberbox.core.types import Schema
@@ -26,10 +27,11 @@ OURS = "every message fits: amberbox"
 _ORDER = ("array", "boolean", "integer", "number", "object", "string", "null")
 
 
-def to_schema(shape: Shape, name: str) -> Schema:
-    """Write a shape as a JSON Schema document that viewers take."""
+def to_schema(shape: Shape, name: str, notes: Notes | None = None) -> Schema:
+    """Write a shape as a JSON Schema document that viewers take, with notes on its places."""
     document = {"$schema": _DRAFT, "$comment": OURS, "title": name}
-    return Schema(name, "jsonschema", msgspec.json.encode(document | _for_viewers(shape)))
+    document |= _for_viewers(shape) | notes_json(notes or {})
+    return Schema(name, "jsonschema", msgspec.json.encode(document))
 
 
 def _for_viewers(shape: Shape) -> dict[str, Any]:
