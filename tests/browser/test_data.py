@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING
-from urllib.parse import urlsplit
+from urllib.parse import parse_qs, urlsplit
 
 import pytest
 
@@ -109,6 +109,24 @@ def test_back_undoes_what_was_moved_and_chosen(page_as: PageAs, site: Site) -> N
     page.go_back()
     expect(page).to_have_url(re.compile("mission=transport-1"))
     expect(begin).to_have_attribute("aria-valuenow", first)
+
+
+def test_a_window_is_shown_whole_and_everything_is_what_is_known(
+    page_as: PageAs, site: Site
+) -> None:
+    page = page_as("viewer")
+    asked: list[str] = []
+    page.on("request", lambda request: asked.append(request.url))
+    open_data(page, VOLTS, **{"from": "1970-01-01T00:00:00Z", "to": stamp(site, 0)})
+    (query,) = (parse_qs(urlsplit(url).query) for url in asked if "/query?" in url)
+    assert float(query["from"][0]) == 0
+    assert float(query["to"][0]) > site.now_ns / 1e9
+    expect(page.get_by_label("From", exact=True)).to_have_value(re.compile("^1970-01-01T01:00"))
+    expect(page.locator(".brush-recorded").first).to_be_attached()
+    page.get_by_role("button", name="Everything", exact=True).first.click()
+    begin = page.get_by_role("slider", name="Beginning of the window")
+    expect(begin).to_have_attribute("aria-valuenow", re.compile(r"^\d{10}$"))
+    assert int(begin.get_attribute("aria-valuenow") or 0) > site.now_ns / 1e9 - 2 * 3600
 
 
 def test_few_questions_for_the_first_plot_and_all_around_it(page_as: PageAs) -> None:

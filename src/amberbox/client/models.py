@@ -69,6 +69,8 @@ class Card(Answer, frozen=True):
     mission: OnMission | None = None
     diagnosis: Lead | None = None
     alarms_over: int = 0
+    damaged_files: int = 0
+    damaged_new: int = 0
 
 
 class Output(Answer, frozen=True):
@@ -286,7 +288,7 @@ class Incident(Answer, frozen=True):
 
 
 class Recording(Answer, frozen=True):
-    """A journal on the server, or on its way to it."""
+    """A journal on the server, or on its way to it; times are None where they are not known."""
 
     store_id: str
     journal: str
@@ -295,8 +297,8 @@ class Recording(Answer, frozen=True):
     state: str
     integrity: str
     bytes: int
-    from_: str
-    to: str
+    from_: str | None
+    to: str | None
     reason: str = ""
     copied: int = 0
     rows: int = 0

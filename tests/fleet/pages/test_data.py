@@ -14,6 +14,8 @@ from amberbox.fleet.pages.data.coverage import Stretch, joined
 from amberbox.fleet.pages.datalinks import moment_href
 from amberbox.fleet.pages.diagnosis.card import DiagnosisCard, Reason
 from amberbox.testing.records import T0_NS
+from tests.fleet.archive.recordings import Robot
+from tests.fleet.data.damaged import WHY, quarantined
 from tests.fleet.data.filled import ROWS, fill
 from tests.fleet.house import House, house
 
@@ -23,11 +25,20 @@ DIALOGS = ("mark", "note", "download")
 
 
 @pytest.fixture(scope="module")
-def home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[House]:
+def filled(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[House, Robot]]:
     folder = tmp_path_factory.mktemp("data")
     with house(folder / "server", shared=True) as found:
-        fill(found, folder)
-        yield found
+        yield found, fill(found, folder)
+
+
+@pytest.fixture(scope="module")
+def home(filled: tuple[House, Robot]) -> House:
+    return filled[0]
+
+
+@pytest.fixture(scope="module")
+def robot(filled: tuple[House, Robot]) -> Robot:
+    return filled[1]
 
 
 @pytest.fixture(scope="module")
@@ -90,6 +101,21 @@ def test_coverage_reaches_from_the_first_to_the_last_row(viewer: TestClient) -> 
     assert found["end"] == pytest.approx(_seconds(last), abs=1e-6)
     assert found["recorded"][0]["start"] == found["start"]
     assert max(one["end"] for one in found["recorded"]) == found["end"]
+
+
+def test_a_file_whose_times_are_not_known_counts_for_nothing(
+    home: House, robot: Robot, viewer: TestClient
+) -> None:
+    before = viewer.get(f"{PAGE}/coverage").json()
+    with quarantined(home, robot, "watch/000009-00000000-0000.mcap", came_ns=T0_NS + 3600 * NS):
+        assert viewer.get(f"{PAGE}/coverage").json() == before
+        recordings = viewer.get("/api/v1/robots/ropod_001/recordings").json()
+        (found,) = (one for one in recordings if one["state"] == "quarantined")
+        page = home.client("technician").get("/recordings/ropod_001?show=trouble").text
+    assert (found["from"], found["to"]) == (None, None)
+    assert (found["integrity"], found["reason"]) == ("altered", WHY)
+    assert '<span class="muted">unknown</span>' in page
+    assert "1970" not in page
 
 
 def test_stretches_of_one_reason_that_are_near_are_one() -> None:

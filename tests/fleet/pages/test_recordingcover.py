@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
 from amberbox.core.clock import NS
@@ -69,6 +71,16 @@ def test_released_incidents_are_not_drawn() -> None:
 def test_thousands_of_files_are_a_few_stretches() -> None:
     files = [journal(n / 200, (n + 0.9) / 200) for n in range(4800)]
     assert len(stretches(files, [], [], AXIS)) == 1
+
+
+def test_a_file_whose_times_are_not_known_covers_nothing() -> None:
+    damaged = replace(journal(0, 0, "altered", "quarantined"), from_ns=None, to_ns=None)
+    coming = replace(journal(0, 0, "unknown", "copying"), from_ns=None, to_ns=None)
+    assert stretches([damaged, coming, journal(1, 2)], [], [], AXIS) == stretches(
+        [journal(1, 2)], [], [], AXIS
+    )
+    now_ns = 100 * HOUR_NS
+    assert axis_of("all", [damaged, journal(3, 4)], now_ns) == Axis(3 * HOUR_NS, now_ns)
 
 
 def test_all_time_begins_with_the_first_file() -> None:

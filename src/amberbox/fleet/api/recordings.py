@@ -10,7 +10,6 @@ import msgspec
 from fastapi import HTTPException, Query
 
 from amberbox.core.clock import NS
-from amberbox.core.timetext import format_time
 from amberbox.fleet.api.access import Caller, Fleet, OfRobot, Routes, Who
 from amberbox.fleet.api.forms import Limit, shown
 from amberbox.fleet.api.windows import FROM, Shown
@@ -34,6 +33,7 @@ class Recording(Shown):
     ``refused``, ``quarantined``, or ``aside``: sound, but of another history of the same store.
     ``integrity``: ``intact``, ``unsigned`` (holds, but the robot has signed no head behind it yet),
     ``altered``, ``missing``, ``deleted`` by retention, ``unknown`` while it is copied.
+    ``from`` and ``to`` are null where they are not known: while it is copied, of what is damaged.
     ``journal_until`` and ``columns_until`` are when retention may take them; null is never.
     """
 
@@ -47,8 +47,8 @@ class Recording(Shown):
     bytes: int
     copied: int
     rows: int
-    from_: str = FROM
-    to: str
+    from_: str | None = FROM
+    to: str | None
     came: str | None
     journal_until: str | None
     columns_until: str | None
@@ -98,7 +98,7 @@ def _shown(one: Kept, robot: str, rules: Sequence[Retention]) -> Recording:
     return Recording(
         store_id=one.store_id, journal=one.journal, keeping=one.keeping, sha256=one.sha256,
         state=one.state, integrity=one.integrity, reason=one.reason, bytes=one.bytes,
-        copied=one.copied, rows=one.rows, from_=format_time(one.from_ns),
-        to=format_time(one.to_ns), came=shown(one.came_ns), journal_until=shown(until[0]),
+        copied=one.copied, rows=one.rows, from_=shown(one.from_ns),
+        to=shown(one.to_ns), came=shown(one.came_ns), journal_until=shown(until[0]),
         columns_until=shown(until[1]),
     )  # fmt: skip

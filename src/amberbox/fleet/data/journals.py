@@ -37,6 +37,8 @@ State = Literal["copying", "waiting", "in_columns", "refused", "quarantined", "a
 class Recording:
     """A journal on the server, or on its way; times are those of receipt on the robot.
 
+    They are None where they are not known: of what is being copied, and of most that is damaged.
+
     ``integrity``: ``unsigned`` is a journal that holds but stands behind the last head that the
     robot signed; ``deleted`` one that retention took. By size only: ``altered`` also comes from a
     check of its content.
@@ -52,8 +54,8 @@ class Recording:
     bytes: int
     copied: int
     rows: int
-    from_ns: int
-    to_ns: int
+    from_ns: int | None
+    to_ns: int | None
     came_ns: int | None
 
 
@@ -63,8 +65,8 @@ def recordings(
 ) -> list[Recording]:  # fmt: skip
     """List journals by name (``store/folder/file``), behind that of a name.
 
-    With a span those that meet it, and those that are being copied: what they cover is not known
-    yet. Only the files of those that are listed are looked at.
+    With a span those that meet it, and those of which it is not known what they cover, unless they
+    came before it. Only the files of those that are listed are looked at.
     """
     held = {_name(row.store_id, row.file): row for row in connection.execute(_held(robot, span))}
     coming = {
@@ -100,7 +102,14 @@ def _not_held(robot: str, span: Span) -> Select[Any]:
     j, u = JOURNALS.c, UPLOAD.c
     held = exists().where(j.robot == u.robot, j.store_id == u.store_id, j.file == u.journal)
     meets = and_(true(), *_meets(UPLOAD, span))
-    return select(UPLOAD).where(u.robot == robot, ~held, or_(u.state == "incoming", meets))
+    late = or_(u.ended_ns.is_(None), u.ended_ns >= (span[0] or 0))
+    unknown = and_(u.end_ns == 0, late)
+    return select(UPLOAD).where(u.robot == robot, ~held, or_(unknown, meets))
+
+
+def _times(row: Row[Any]) -> tuple[int | None, int | None]:
+    """Return from and to; a file of which they could not be read is entered with zeros."""
+    return (row.start_ns, row.end_ns) if row.end_ns else (None, None)
 
 
 def _meets(table: Table, span: Span) -> list[ColumnElement[bool]]:
@@ -114,7 +123,7 @@ def _of_archive(row: Row[Any], path: str) -> Recording:
     return Recording(
         row.store_id, row.file, row.keeping, row.sha256, states.get(row.state, "waiting"),
         _integrity(row, path), decode(row.why).refused if row.why else "", row.bytes, row.bytes,
-        row.rows, row.start_ns, row.end_ns, row.put_ns,
+        row.rows, *_times(row), row.put_ns,
     )  # fmt: skip
 
 
@@ -137,7 +146,7 @@ def _coming(row: Row[Any], folder: Path) -> Recording:
     return Recording(
         row.store_id, row.journal, row.writer, row.sha256, states.get(row.state, "copying"),
         "altered" if row.state == "quarantined" else "unknown", row.reason, row.bytes,
-        _copied(folder / row.path, row), 0, row.start_ns, row.end_ns, row.ended_ns,
+        _copied(folder / row.path, row), 0, *_times(row), row.ended_ns,
     )  # fmt: skip
 
 

@@ -15,6 +15,8 @@ from amberbox.core.errors import UsageError
 from amberbox.fleet.data.tables import INCIDENT, MISSION, MISSION_NOTE
 from amberbox.fleet.database.database import Database
 
+NO_MISSION = ""
+"""Stands in place of a mission where a remark is on a moment alone; no mission is called so."""
 _MOST = 10_000
 """Missions or incidents of one robot that people may write down."""
 
@@ -26,6 +28,17 @@ class Note:
     at_ns: int
     who: str
     text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Remark:
+    """A remark on a moment; ``mission`` is ``NO_MISSION`` where it is on none."""
+
+    number: int
+    at_ns: int
+    who: str
+    text: str
+    mission: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,11 +101,31 @@ def end(
 
 def annotate(
     connection: Connection, now_ns: int, robot: str, mission_id: str, who: str, text: str
-) -> None:
-    """Add a remark to a mission, of people or of the robot."""
+) -> Remark:
+    """Add a remark to a mission, of people or of the robot, or to a moment without one."""
     _refuse_too_many(connection, MISSION_NOTE, robot)
     row = {"robot": robot, "mission": mission_id, "at_ns": now_ns, "who": who, "text": text}
-    connection.execute(MISSION_NOTE.insert(), [row])
+    number = connection.scalar(MISSION_NOTE.insert().returning(MISSION_NOTE.c.number), [row])
+    return Remark(int(number or 0), now_ns, who, text, mission_id)
+
+
+def remarked(
+    connection: Connection, robot: str, span: tuple[int | None, int | None], after: int | None,
+    limit: int,
+) -> list[Remark]:  # fmt: skip
+    """Return the remarks on moments of a span, newest first, behind that of a number."""
+    of, (from_ns, to_ns) = MISSION_NOTE.c, span
+    chosen = select(MISSION_NOTE).where(of.robot == robot)
+    if from_ns is not None:
+        chosen = chosen.where(of.at_ns >= from_ns)
+    if to_ns is not None:
+        chosen = chosen.where(of.at_ns < to_ns)
+    last_ns = connection.scalar(select(of.at_ns).where(of.robot == robot, of.number == after))
+    if last_ns is not None:
+        same = (of.at_ns == last_ns) & (of.number < after)
+        chosen = chosen.where((of.at_ns < last_ns) | same)
+    rows = connection.execute(chosen.order_by(of.at_ns.desc(), of.number.desc()).limit(limit))
+    return [Remark(row.number, row.at_ns, row.who, row.text, row.mission) for row in rows]
 
 
 def notes(connection: Connection, robot: str, mission_ids: Sequence[str]) -> dict[str, list[Note]]:

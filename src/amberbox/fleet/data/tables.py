@@ -32,7 +32,8 @@ MISSION_NOTE = Table(
     Column("text", Text, nullable=False),
     Index(None, "robot", "mission"),
 )
-"""What people remarked on missions, the robots' own ones too."""
+"""What people remarked on missions, the robots' own ones too; ``mission`` is empty where it is on a
+moment alone."""
 
 INCIDENT = Table(
     "server_incident",

@@ -18,6 +18,7 @@ from amberbox.fleet.api.access import Caller, Fleet, OfRobot, Who
 from amberbox.fleet.api.alarms import list_alarms
 from amberbox.fleet.api.incidents import list_incidents
 from amberbox.fleet.api.missions import list_missions
+from amberbox.fleet.api.notes import MomentNote, list_notes
 from amberbox.fleet.api.query import list_gaps
 from amberbox.fleet.api.robots import read_timeline
 from amberbox.fleet.api.windows import ITEM, From, To, span_in
@@ -73,7 +74,13 @@ class _Window:
             "missions.read",
             lambda: list_missions(fleet, who, robot, **span, limit=_MARKS),
         )
+        yield "notes", "missions.read", lambda: self.notes(begin, end)
         yield "timeline", "status.read", lambda: read_timeline(fleet, robot, **span, points=_POINTS)
+
+    def notes(self, begin: str, end: str) -> Sequence[MomentNote]:
+        """Return the notes on moments alone; those on missions come with these."""
+        found = list_notes(self.fleet, self.robot, begin, end, limit=_MARKS)
+        return [one for one in found if not one.mission]
 
     def gaps(self, items: Sequence[str]) -> Mapping[str, Any]:
         more_ns = (self.to_ns - self.from_ns) // _HALF

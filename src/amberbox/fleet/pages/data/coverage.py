@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -35,7 +35,10 @@ class Stretch:
 
 @dataclass(frozen=True, slots=True)
 class Coverage:
-    """From the first to the last time of a robot: what is recorded, what is missing and why."""
+    """From the first to the last time of a robot: what is recorded, what is missing and why.
+
+    Files of which it is not known what they cover count for nothing; null where all are such.
+    """
 
     start: float | None
     end: float | None
@@ -47,10 +50,10 @@ def coverage(fleet: Services, who: Caller, robot: str) -> Coverage:
     """Return what there is of a robot; asks a worker for what is missing."""
     with fleet.database.reading() as connection:
         journals = recordings(connection, fleet.folder, robot, limit=_JOURNALS)
-    held = [_span(one) for one in journals if one.state in _HELD and one.integrity != "deleted"]
-    if not journals:
+    every = [*_spans(journals)]
+    if not every:
         return Coverage(None, None, (), ())
-    every = [_span(one) for one in journals]
+    held = _spans(o for o in journals if o.state in _HELD and o.integrity != "deleted")
     start, end = min(one.start for one in every), max(one.end for one in every)
     least = (end - start) / _STEPS
     missing = _missing(fleet, who, robot)
@@ -84,5 +87,8 @@ def _seconds(stamps: Sequence[str]) -> list[float]:
     return [float(one) for one in read / NS]
 
 
-def _span(one: Recording) -> Stretch:
-    return Stretch(one.from_ns / NS, one.to_ns / NS)
+def _spans(journals: Iterable[Recording]) -> Iterator[Stretch]:
+    """Yield what journals cover, where it is known."""
+    for one in journals:
+        if one.from_ns is not None and one.to_ns is not None:
+            yield Stretch(one.from_ns / NS, one.to_ns / NS)

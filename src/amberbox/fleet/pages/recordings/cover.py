@@ -46,7 +46,8 @@ def axis_of(window: Window, journals: Sequence[Recording], now_ns: int) -> Axis:
     back = WINDOWS[window]
     if back is not None:
         return Axis(now_ns - back, now_ns)
-    first = min((one.from_ns for one in _data(journals)), default=now_ns)
+    starts = (one.from_ns for one in _data(journals) if one.from_ns is not None)
+    first = min(starts, default=now_ns)
     return Axis(min(first, now_ns - _HOUR_NS), now_ns)
 
 
@@ -91,6 +92,8 @@ def _data(journals: Iterable[Recording]) -> Iterator[Recording]:
 
 def _recorded(journals: Iterable[Recording]) -> Iterator[Stretch]:
     for one in _data(journals):
+        if one.from_ns is None or one.to_ns is None:
+            continue
         if one.integrity == "deleted":
             yield Stretch(one.from_ns, one.to_ns, "deleted")
         elif one.state in _HELD and one.integrity != "missing":

@@ -131,10 +131,17 @@ def with_journals_of(
 
 
 def journals(fleet: Services, robot: KnownRobot, span: Span = (None, None)) -> Sequence[Recording]:
-    """Return the journals of a robot that meet a span, the newest first."""
+    """Return the journals of a robot that meet a span, the newest first.
+
+    Where it is not known what one covers, it counts from when it came.
+    """
     with fleet.database.reading() as connection:
         found = recordings(connection, fleet.folder, robot.id, limit=_JOURNALS, span=span)
-    return sorted(found, key=lambda one: (-one.from_ns, one.store_id, one.journal))
+    return sorted(found, key=lambda one: (-_since(one), one.store_id, one.journal))
+
+
+def _since(one: Recording) -> int:
+    return one.came_ns or 0 if one.from_ns is None else one.from_ns
 
 
 def cover(fleet: Services, who: Caller, robot: KnownRobot, found: Record, window: Window) -> Cover:

@@ -31,7 +31,7 @@ export function brush(element, moved) {
   return {
     /** Show what there is. @param {{start: number, end: number, recorded: any[], missing: any[]}} about */
     cover: (about) => showCover(state, about),
-    /** Show a window; the bar grows to hold it. */
+    /** Show a window: what of it lies on the bar. */
     window(from, to) {
       Object.assign(state, { from, to });
       if (!state.drag) place(state);
@@ -59,7 +59,8 @@ function place(state) {
   grips.to.style.setProperty("left", `${right}%`);
   const step = (to - from) / 100;
   for (const [name, time] of [["from", from], ["middle", (from + to) / 2], ["to", to]]) {
-    const values = { "aria-valuemin": Math.floor(state.start), "aria-valuemax": Math.ceil(state.end), "aria-valuenow": Math.round(time),
+    const [least, most] = [Math.min(state.start, time), Math.max(state.end, time)]; // the window may reach off the bar
+    const values = { "aria-valuemin": Math.floor(least), "aria-valuemax": Math.ceil(most), "aria-valuenow": Math.round(time),
       "aria-valuetext": moment(time, step) };
     for (const [key, value] of Object.entries(values)) grips[name].setAttribute(key, value);
   }
@@ -114,6 +115,12 @@ function set(state, [from, to], isMoving) {
   state.moved(from, to, isMoving);
 }
 
+/** The window as a drag finds it: an end that lies off the bar is taken where its grip is seen. */
+function seen({ start, end, from, to }, name) {
+  if (name === "from") return { from: Math.min(Math.max(from, start), end), to };
+  return name === "to" ? { from, to: Math.min(Math.max(to, start), end) } : { from, to };
+}
+
 /** Dragging: a grip, or a new window where there is none. */
 function listen(state) {
   const { bar } = state;
@@ -125,7 +132,7 @@ function listen(state) {
     if (event.button) return;
     const name = event.target.closest("[data-grip]")?.dataset.grip ?? "new";
     bar.setPointerCapture(event.pointerId);
-    state.drag = { name, at: timeAt(event), x: event.clientX, from: state.from, to: state.to, isMoved: false };
+    state.drag = { name, at: timeAt(event), x: event.clientX, isMoved: false, ...seen(state, name) };
   });
   bar.addEventListener("pointermove", (event) => {
     const { drag } = state;

@@ -13,6 +13,7 @@ import { goTo } from "./goto.js";
 import { marks } from "./marks.js";
 import { emptyStage, notes } from "./notes.js";
 import { recent, used } from "./recent.js";
+import { sane } from "../plot/view.js";
 import { shownList } from "../shownlist.js";
 import { takeAlong } from "./takealong.js";
 import { nowMs } from "../time.js";
@@ -193,8 +194,8 @@ function dropped(name, plot) {
 }
 
 /** The window has moved, by the hand of the user. @param {"plots"|"brush"|"moving"} [by] */
-function move(from, to, by = "brush") {
-  page.window = { from, to };
+function move(begin, end, by = "brush") {
+  const { from, to } = (page.window = sane({ from: begin, to: end }));
   const stack = page.parts.stage.plots();
   if (by !== "plots" && stack && !page.look.compare.length) stack.window(from, to, { soft: by === "moving" });
   if (by === "moving") {
@@ -294,9 +295,9 @@ async function renewIfNewer() {
 function covered(cover) {
   if (!cover) return; // asked again in a minute
   page.cover = cover;
-  page.reach.last = Math.max(page.reach.last ?? 0, cover.end ?? 0);
+  page.reach.last = cover.end === null ? page.reach.last : Math.max(page.reach.last ?? cover.end, cover.end);
   const { from, to } = everything();
-  page.parts.brush.cover({ ...page.cover, start: from, end: Math.max(to, page.window.to) });
+  page.parts.brush.cover({ ...page.cover, start: from, end: Math.max(to, Math.min(page.window.to, now())) });
   page.parts.stage.plots()?.setWhole(page.look.compare.length ? page.parts.stage.plots().now() : { from, to });
   say({});
 }

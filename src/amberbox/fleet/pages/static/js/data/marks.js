@@ -1,7 +1,7 @@
-/** Marking: the window as an incident that is kept, or a moment of a mission by a note. */
+/** Marking: the window as an incident that is kept, or a moment by a note. */
 
 import { ask, toast } from "../ask.js";
-import { all, el, one } from "../dom.js";
+import { el, one } from "../dom.js";
 import { dialogForm } from "../dialogs.js";
 import { spanOf } from "./goto.js";
 import { moment } from "../plot/time.js";
@@ -38,23 +38,26 @@ export function marks(robot, { window, cursor, changed }) {
       await missionsAt(form, path, noted.at);
     },
     async send({ text, mission }) {
-      await ask(`${path}/missions/${encodeURIComponent(mission)}/notes`, { method: "POST", body: { text, at: stamp(noted.at) } });
+      const place = mission ? `${path}/missions/${encodeURIComponent(mission)}` : path;
+      await ask(`${place}/notes`, { method: "POST", body: { text, at: stamp(noted.at) } });
       toast(t("data.note.done"));
       changed();
     },
   });
 }
 
-/** Offer the missions that were under way at a moment. */
+/** Offer the missions that were under way at a moment, where there were any. */
 async function missionsAt(form, path, at) {
+  const send = one('button[type="submit"]', form);
+  send.disabled = true;
   const query = new URLSearchParams({ from: stamp(at - 1), to: stamp(at + 1) });
   const found = await ask(`${path}/missions?${query}`).catch(() => []);
   const fitting = found.filter((mission) => {
     const [from, to] = spanOf(mission);
     return from <= at && at <= to;
   });
-  form.elements.mission.replaceChildren(...fitting.map((mission) => el("option", { value: mission.id }, `${mission.name} · ${mission.id}`)));
-  one("[data-none]", form).hidden = fitting.length > 0;
-  for (const part of all("[data-some]", form)) part.hidden = !fitting.length;
-  one('button[type="submit"]', form).disabled = !fitting.length;
+  const named = fitting.map((mission) => el("option", { value: mission.id }, `${mission.name} · ${mission.id}`));
+  form.elements.mission.replaceChildren(...named, el("option", { value: "" }, t("data.note.no_mission")));
+  one("[data-some]", form).hidden = !fitting.length;
+  send.disabled = false;
 }

@@ -2,6 +2,7 @@
 
 import { ask } from "../ask.js";
 import { around, spanOf } from "./goto.js";
+import { sane } from "../plot/view.js";
 import { timeOf } from "../timewords.js";
 
 const HOUR_S = 3600;
@@ -27,7 +28,7 @@ export async function meaning(look, path, marks, refused) {
 const missionPath = (path, id) => `${path}/missions/${encodeURIComponent(id)}`;
 
 /**
- * The window that an address means: a mission, two times, or the newest hour.
+ * The window that an address means: a mission, two times, or the newest hour; as plots can show it.
  * @param {import("./view.js").Look} look @param {string} path of the robot in the API
  * @param {{now: number, last: ?number}} marks
  */
@@ -37,9 +38,9 @@ async function windowOf({ from, to, mission, live }, path, marks) {
     return { from: begin, to: end };
   }
   const newest = live || from.startsWith("now") ? marks.now : newestEnd(HOUR_S, marks);
-  const end = (to && timeOf(to, marks)) || newest;
-  const begin = (from && timeOf(from, marks)) || end - HOUR_S;
-  return begin < end ? { from: begin, to: end } : { from: end - HOUR_S, to: end };
+  const end = timeOf(to, marks) ?? newest;
+  const begin = timeOf(from, marks) ?? end - HOUR_S;
+  return sane(begin < end ? { from: begin, to: end } : { from: end - HOUR_S, to: end });
 }
 
 /** Where a window ends that is to hold the newest data: now, unless they are older than that. */
@@ -47,7 +48,12 @@ export function newestEnd(width, { now, last }) {
   return last === null || now - last < width * RECENT ? now : last;
 }
 
-/** All time of which something is known. @param {?import("./coverage.js").Coverage} cover */
-export function whole(cover, { first, last }, { from, to }) {
-  return { from: Math.min(cover?.start ?? Infinity, first ?? Infinity, from), to: Math.max(cover?.end ?? 0, last ?? 0, to) };
+/**
+ * All time of which something is known; a window where nothing is.
+ * @param {?import("./coverage.js").Coverage} cover @param {{first: ?number, last: ?number}} reach
+ * @param {import("../plot/view.js").Span} window
+ */
+export function whole(cover, { first, last }, window) {
+  const known = [cover?.start, cover?.end, first, last].filter((time) => time !== null && time !== undefined);
+  return known.length ? sane({ from: Math.min(...known), to: Math.max(...known) }) : window;
 }

@@ -15,11 +15,12 @@ import { has, t } from "../strings.js";
 
 /**
  * The marks of a window; of what was not told there are none.
- * @param {{alarms?: any[], incidents?: any[], missions?: any[]}} around @returns {Mark[]}
+ * @param {{alarms?: any[], incidents?: any[], missions?: any[], notes?: any[]}} around @returns {Mark[]}
  */
-export function marksOf({ alarms = [], incidents = [], missions = [] }, { from, to }) {
+export function marksOf({ alarms = [], incidents = [], missions = [], notes = [] }, { from, to }) {
   const lines = alarms.map(alarmOf).filter((mark) => mark.from < to && (mark.to === null || mark.to >= from));
-  const others = [...incidents.map(incidentOf), ...missions.flatMap((one) => [missionOf(one), ...one.notes.map((note, n) => noteOf(one, note, n))])];
+  const ofMissions = missions.flatMap((one) => [missionOf(one), ...one.notes.map((note, n) => noteOf(`${one.id}-${n}`, note))]);
+  const others = [...incidents.map(incidentOf), ...ofMissions, ...notes.map((note) => noteOf(note.id, note))];
   return [...lines, ...others].sort((one, other) => one.from - other.from);
 }
 
@@ -59,7 +60,7 @@ function missionOf(one) {
     href: "", level: one.failed ? "error" : "" };
 }
 
-function noteOf(mission, note, n) {
-  return { id: `note-${mission.id}-${n}`, kind: "note", from: seconds(note.at), to: null,
+function noteOf(id, note) {
+  return { id: `note-${id}`, kind: "note", from: seconds(note.at), to: null,
     text: `${note.text} (${note.who})`, href: "", level: "" };
 }

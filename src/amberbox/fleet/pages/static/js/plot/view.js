@@ -5,7 +5,7 @@
  */
 
 const LEAST_S = 1e-3;
-const MOST_S = 50 * 366 * 86400;
+const MOST_S = 100 * 366 * 86400;
 const KEPT = 50;
 
 /** Zoom by a factor about a time that stays where it is. @param {Span} view @returns {Span} */
@@ -21,11 +21,17 @@ export function panned(view, part) {
   return { from: view.from + by, to: view.to + by };
 }
 
-/** A window that is neither empty nor endless. @param {Span} view @returns {Span} */
+/**
+ * A window that is neither empty nor endless: of one that is too wide its end counts. Whoever keeps
+ * a window beside the plots makes it sane first, so that both are the same.
+ * @param {Span} view @returns {Span}
+ */
 export function sane({ from, to }) {
   const width = bounded(to - from);
+  if (width === to - from) return { from, to };
+  if (width < to - from) return { from: to - width, to };
   const middle = (from + to) / 2;
-  return width === to - from ? { from, to } : { from: middle - width / 2, to: middle + width / 2 };
+  return { from: middle - width / 2, to: middle + width / 2 };
 }
 
 /** Put a window onto those where one was before. @param {Span[]} back @param {Span} view */
