@@ -13,7 +13,7 @@ from typing import Any, Literal, TypeAlias, get_args
 
 Kind: TypeAlias = Literal[
     "rows", "live", "connected", "gone", "journal", "committed", "robot", "alarm", "job", "fetch",
-    "account", "diagnosis", "has",
+    "account", "diagnosis", "explained", "has",
 ]  # fmt: skip
 """What a change is about.
 
@@ -23,6 +23,7 @@ values (data: values). ``connected`` (data: hello, admission) and ``gone``: a ro
 columns of journals are in the archive (data: robots). ``robot``: one was added, changed, given
 another folder. ``alarm`` (data: id), ``job`` (data: id, owner), ``fetch`` (data: id),
 ``account`` (data: name; its sessions may have ended), ``diagnosis`` (data: id).
+``explained``: a diagnosis was put into words (data: answer, as ``POST .../diagnose`` gives it).
 ``has``: a robot told which journals hold a window (data: store_id, id, files).
 """
 

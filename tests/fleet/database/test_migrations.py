@@ -18,7 +18,15 @@ from amberbox.fleet.pages.recordings.state import held
 from amberbox.testing.clock import ManualClock
 
 NEW = {
-    2: "DROP INDEX ix_link_row_robot_channel_log_ns",
+    2: "DROP INDEX ix_link_row_robot_channel_log_ns;",
+    3: "".join(
+        f"ALTER TABLE {table} DROP COLUMN {column};"
+        for table, columns in (
+            ("alarm", "revised effect worst words"),
+            ("alarm_roots", "effect words"),
+        )
+        for column in columns.split()
+    ),
 }
 """What undoes a migration, so that a database is as old as before it."""
 
@@ -32,7 +40,7 @@ def aged(path: Path) -> None:
     made(path).close()
     with sqlite3.connect(path) as connection:
         for number in sorted(NEW, reverse=True):
-            connection.execute(NEW[number])
+            connection.executescript(NEW[number])
         connection.execute("DELETE FROM schema_version")
         connection.execute("INSERT INTO schema_version VALUES (1, 'made', 0)")
     connection.close()
@@ -47,11 +55,33 @@ def indexes(database: Database) -> dict[str, set[str | None]]:
         }
 
 
+def columns(database: Database) -> dict[str, set[tuple[str, str, bool]]]:
+    """Return what each table has: names, kinds, whether they may be empty."""
+    with database.reading() as connection:
+        found = inspect(connection)
+        return {
+            table.name: {(one["name"], str(one["type"]), bool(one["nullable"]))
+                         for one in found.get_columns(table.name)}
+            for table in complete().sorted_tables
+        }  # fmt: skip
+
+
+def test_an_end_before_its_beginning_is_mended(tmp_path: Path) -> None:
+    aged(tmp_path / "old.db")
+    with sqlite3.connect(tmp_path / "old.db") as connection:
+        connection.execute("INSERT INTO alarm_consequence VALUES (1, 'loc', 'error', '', 50, 20)")
+    old = made(tmp_path / "old.db")
+    with old.reading() as found:
+        assert found.exec_driver_sql("SELECT to_ns FROM alarm_consequence").scalar() == 50
+    old.close()
+
+
 def test_an_old_database_becomes_as_a_new_one(tmp_path: Path) -> None:
     assert sorted(NEW) == [one.number for one in MIGRATIONS]
     aged(tmp_path / "old.db")
     old, new = made(tmp_path / "old.db"), made(tmp_path / "new.db")
     assert indexes(old) == indexes(new)
+    assert columns(old) == columns(new)
     old.close()
     new.close()
 

@@ -20,9 +20,14 @@ class Alarm:
 
     ``origin`` is the component that it comes from, or what offline robots share. ``active`` says
     whether what it is about lasts, ``state`` what people made of it; neither decides the other.
-    ``severity`` is the worst it has had. ``late`` is one that was told long after
-    it happened. ``told`` is the highest severity that was notified, ``notify_ns`` when the next
-    notification is due. ``revision`` counts what people should know before they change it.
+    ``late`` is one that was told long after it happened. ``told`` is the highest severity that was
+    notified, ``notify_ns`` when the next notification is due. ``revision`` counts what people
+    should know before they change it.
+
+    ``revised`` is the revision of its diagnosis that was last while it lasted (0: none is known),
+    ``effect`` the severity by that, ``words`` what that says, as ``Words`` writes it. ``severity``
+    is that of the effect where there is one, else the worst that the robot's monitors said.
+    ``worst`` is the highest it has had, empty if that is ``severity``.
     """
 
     number: int
@@ -53,6 +58,10 @@ class Alarm:
     told: Severity | Literal[""] = ""
     notify_ns: int | None = None
     revision: int = 1
+    revised: int = 0
+    effect: Severity | Literal[""] = ""
+    worst: Severity | Literal[""] = ""
+    words: str = ""
 
 
 @dataclass(frozen=True, slots=True)

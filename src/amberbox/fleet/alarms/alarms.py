@@ -17,8 +17,9 @@ from amberbox.fleet.alarms.offline import absent_since_start, miss, returned
 from amberbox.fleet.alarms.register import Register
 from amberbox.fleet.alarms.reports import Received, is_of_interest, reports
 from amberbox.fleet.alarms.settings import NAME, AlarmSettings
-from amberbox.fleet.alarms.taking import take
+from amberbox.fleet.alarms.taking import take, take_explanation
 from amberbox.fleet.alarms.timing import Lateness, is_due, pass_time
+from amberbox.fleet.alarms.words import Explanation, explanation_of
 from amberbox.fleet.bus import Bus, Change
 from amberbox.fleet.database.database import Database
 from amberbox.fleet.notifying.sending import Sender
@@ -47,7 +48,7 @@ class Alarms:
         self.sender = Sender(database, clock)
         self._forget: list[Callable[[], None]] = [
             bus.on("rows", self._rows), bus.on("connected", self._connected),
-            bus.on("gone", self._gone),
+            bus.on("gone", self._gone), bus.on("explained", self._explained),
         ]  # fmt: skip
 
     def _rows(self, change: Change) -> None:
@@ -63,6 +64,11 @@ class Alarms:
 
     def _gone(self, change: Change) -> None:
         self._inbox.put(Went(change.robot, self._clock.wall_ns()))
+
+    def _explained(self, change: Change) -> None:
+        found = explanation_of(change.robot, change.data["answer"])
+        if found is not None:
+            self._inbox.put(found)
 
     async def run(self) -> None:
         """Work until cancelled."""
@@ -131,6 +137,9 @@ class Alarms:
             known = boxes.offsets(connection, rows, self._offsets)
             told = list(reports(rows, known, settings.ns("late_s")))
             take(register, told, now_ns, settings)
+            for one in news:
+                if isinstance(one, Explanation):
+                    take_explanation(register, one, now_ns, settings)
             returned(register, back, now_ns)
             if rows:
                 boxes.mark(connection, max(one.received_ns for one in rows))

@@ -6,9 +6,9 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
-from sqlalchemy import select
+from sqlalchemy import RowMapping, select
 
-from amberbox.fleet.alarms.alarm import Part
+from amberbox.fleet.alarms.alarm import Alarm, Part
 from amberbox.fleet.alarms.register import Register
 from amberbox.fleet.alarms.reports import Report
 from amberbox.fleet.alarms.tables import ALARM, CONSEQUENCE
@@ -69,7 +69,7 @@ def show_consequences(register: Register, robot: str) -> None:
         for part in parts:
             if part.component not in own and part.active:
                 found[part.component] = (part.level, part.reason, part.opened_ns)
-        _keep(register, alarm.number, found, alarm.changed_ns)
+        _keep(register, alarm, found, blocked)
 
 
 def _below(roots: set[str], blocked: Mapping[str, Any]) -> dict[str, tuple[str, str, int]]:
@@ -89,20 +89,42 @@ def _below(roots: set[str], blocked: Mapping[str, Any]) -> dict[str, tuple[str, 
 
 
 def _keep(
-    register: Register, number: int, found: Mapping[str, tuple[str, str, int]], now_ns: int
-) -> None:
-    chosen = select(CONSEQUENCE).where(CONSEQUENCE.c.alarm == number)
+    register: Register, alarm: Alarm, found: Mapping[str, tuple[str, str, int]],
+    blocked: Mapping[str, Any],
+) -> None:  # fmt: skip
+    """Keep what suffers: since it began, whatever becomes of it; what is over with its end."""
+    chosen = select(CONSEQUENCE).where(CONSEQUENCE.c.alarm == alarm.number)
     known = {row["component"]: row for row in register.connection.execute(chosen).mappings()}
     rows = [
-        {"alarm": number, "component": name, "level": level, "reason": reason[:2000],
-         "from_ns": from_ns, "to_ns": None}
+        {"alarm": alarm.number, "component": name, "level": level, "reason": reason[:2000],
+         "from_ns": _beginning(known.get(name), from_ns), "to_ns": None}
         for name, (level, reason, from_ns) in found.items()
     ]  # fmt: skip
-    rows += [{**row, "to_ns": now_ns} for name, row in known.items()
+    rows += [{**row, "to_ns": _end(alarm, row, blocked.get(name))} for name, row in known.items()
              if name not in found and row["to_ns"] is None]  # fmt: skip
     changed = [row for row in rows if row != dict(known.get(row["component"], {}))]
     if changed:
         change = ("level", "reason", "from_ns", "to_ns")
         statement = upsert(register.connection.dialect, CONSEQUENCE, ("alarm", "component"), change)
         register.connection.execute(statement, changed)
-        register.touched.add(number)
+        register.touched.add(alarm.number)
+
+
+def _beginning(known: RowMapping | None, from_ns: int) -> int:
+    """Return since when something suffers that goes on, however its state changes meanwhile."""
+    lasts = known is not None and known["to_ns"] is None
+    return min(known["from_ns"], from_ns) if known is not None and lasts else from_ns
+
+
+def _end(alarm: Alarm, row: RowMapping, now: RowMapping | None) -> int:
+    """Return when something stopped to suffer: by its own last word, or with the alarm.
+
+    Never before it began: the alarm's last word can be older than that.
+    """
+    begun_ns: int = row["from_ns"]
+    ends = [] if now is None else [now["since_ns"]]
+    if not alarm.active:
+        ends.append(alarm.changed_ns if alarm.cleared_ns is None else alarm.cleared_ns)
+    return min(
+        (at_ns for at_ns in ends if at_ns > begun_ns), default=max(begun_ns, alarm.changed_ns)
+    )

@@ -11,6 +11,7 @@ from sqlalchemy import ColumnElement, Connection, and_, or_, select
 
 from amberbox.fleet.alarms.reports import CHANNELS, Offsets, Received, is_of_interest
 from amberbox.fleet.alarms.tables import MARK
+from amberbox.fleet.alarms.words import Explanation
 from amberbox.fleet.database.upsert import upsert
 from amberbox.fleet.linkend.presence import short
 from amberbox.fleet.linkend.tables import BOOT, ROBOT, ROW, RUN
@@ -40,7 +41,7 @@ class Went:
     at_ns: int
 
 
-News: TypeAlias = Received | Came | Went
+News: TypeAlias = Received | Came | Went | Explanation
 
 
 @dataclass(slots=True)

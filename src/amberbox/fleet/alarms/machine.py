@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Final
+from typing import Final, Literal
 
 from amberbox.core.errors import UsageError
 from amberbox.core.timetext import format_time
@@ -35,20 +35,41 @@ def judged(alarm: Alarm, parts: Sequence[Part], now_ns: int, settings: AlarmSett
     count = max(1, sum(part.count for part in root))
     came_back = count > alarm.count or (bool(lasting) and not alarm.active)
     alarm, entries = _reopened(alarm, now_ns, settings) if came_back and lasting else (alarm, [])
-    severity = worst([alarm.severity, *(part.severity for part in lasting)])
+    heard = worst([alarm.severity, *(part.severity for part in lasting)])
     changed = replace(
         alarm, count=max(count, alarm.count), reason=latest.reason, active=bool(lasting),
         level=max((part.level for part in lasting or root), key=lambda level: RANK[level]),
         cleared_ns=None if lasting else max(part.changed_ns for part in parts),
         changed_ns=max(alarm.changed_ns, *(part.changed_ns for part in parts)),
         cause=alarm.cause if named is None else named.cause,
-        diagnosis=alarm.diagnosis if named is None else named.diagnosis,
     )  # fmt: skip
+    if named is not None and named.diagnosis != alarm.diagnosis:
+        changed = replace(changed, diagnosis=named.diagnosis, revised=0, effect="", words="")
     if changed.cause != alarm.cause:
         entries = [*entries, Entry(now_ns, "cause", changed.cause)]
         changed = replace(changed, revision=changed.revision + 1)
-    worse, more = worsened(changed, severity, now_ns, settings)
+    worse, more = worsened(changed, changed.effect or heard, now_ns, settings)
     return worse, [*entries, *more]
+
+
+def revised(alarm: Alarm, revision: int) -> Alarm:
+    """Go over to a revision of its diagnosis; an alarm that is over keeps what was said last."""
+    return replace(alarm, revised=revision) if alarm.active else alarm
+
+
+def explained(
+    alarm: Alarm, effect: Severity | Literal[""], words: str, now_ns: int, settings: AlarmSettings
+) -> Step:
+    """Take what its diagnosis means: its severity is that of the effect, be it less or more."""
+    changed = replace(alarm, effect=effect, words=words)
+    if not effect or effect == alarm.severity:
+        return changed, []
+    highest = alarm.worst or alarm.severity
+    if alarm.active and is_worse(effect, highest):
+        return worsened(changed, effect, now_ns, settings, "effect")
+    entry = Entry(now_ns, "effect", f"{alarm.severity} -> {effect}")
+    changed = replace(changed, severity=effect, worst=worst([highest, effect]))
+    return replace(changed, revision=alarm.revision + 1), [entry]
 
 
 def _reopened(alarm: Alarm, now_ns: int, settings: AlarmSettings) -> Step:
@@ -64,17 +85,25 @@ def _reopened(alarm: Alarm, now_ns: int, settings: AlarmSettings) -> Step:
     return again, [Entry(now_ns, "reopened", "it came back")]
 
 
-def worsened(alarm: Alarm, severity: Severity, now_ns: int, settings: AlarmSettings) -> Step:
-    """Raise the severity: that is not what was acknowledged, and it is told again."""
+def worsened(
+    alarm: Alarm, severity: Severity, now_ns: int, settings: AlarmSettings, what: str = "worse"
+) -> Step:
+    """Raise the severity: that is not what was acknowledged, and it is told again.
+
+    What it has been as bad as before was acknowledged with it.
+    """
     if not is_worse(severity, alarm.severity):
         return alarm, []
+    entry = Entry(now_ns, what, f"{alarm.severity} -> {severity}")
+    if not is_worse(severity, alarm.worst or alarm.severity):
+        return replace(alarm, severity=severity, revision=alarm.revision + 1), [entry]
     alarm, entries = _reopened(alarm, now_ns, settings)
     worse = replace(
-        alarm, severity=severity, state="shelved" if alarm.state == "shelved" else "open",
+        alarm, severity=severity, worst=severity, state="shelved" if alarm.state == "shelved" else "open",
         acknowledged_by="", acknowledged_ns=None, revision=alarm.revision + 1,
         notify_ns=alarm.notify_ns or now_ns + settings.ns("settle_s"),
     )  # fmt: skip
-    return worse, [*entries, Entry(now_ns, "worse", f"{alarm.severity} -> {severity}")]
+    return worse, [*entries, entry]
 
 
 def lost_again(alarm: Alarm, reason: str, now_ns: int, settings: AlarmSettings) -> Step:
@@ -107,9 +136,10 @@ def settled(alarm: Alarm, now_ns: int, settings: AlarmSettings) -> Step:
 def merged(keep: Alarm, gone: Alarm, origin: str, now_ns: int) -> tuple[Step, Step]:
     """Make one alarm of two with the same root: the older one stays, with what people said."""
     told = keep.told if not is_worse(gone.told, keep.told) else gone.told
-    severity = worst([keep.severity, gone.severity])
+    effect = keep.effect or gone.effect
+    severity = effect or worst([keep.severity, gone.severity])
     one = replace(
-        keep, origin=origin, severity=severity, told=told, owner=keep.owner or gone.owner,
+        keep, origin=origin, severity=severity, effect=effect, told=told, owner=keep.owner or gone.owner,
         opened_ns=min(keep.opened_ns, gone.opened_ns), late=keep.late and gone.late,
         revision=keep.revision + 1,
     )  # fmt: skip
@@ -129,12 +159,16 @@ def merged(keep: Alarm, gone: Alarm, origin: str, now_ns: int) -> tuple[Step, St
     )
 
 
-def acknowledged(alarm: Alarm, who: str, now_ns: int, note: str = "") -> Step:
-    """Note that somebody sees to it; raises AlarmStateError when it is resolved."""
+def acknowledged(alarm: Alarm, who: str, now_ns: int, note: str = "", person: str = "") -> Step:
+    """Note that somebody sees to it; raises AlarmStateError when it is resolved.
+
+    What has no owner is that ``person``'s from now on.
+    """
     _refuse_resolved(alarm, "acknowledged")
     state: State = "shelved" if alarm.state == "shelved" else "acknowledged"
     changed = replace(alarm, state=state, acknowledged_by=who, acknowledged_ns=now_ns,
-                      notify_ns=None, revision=alarm.revision + 1)  # fmt: skip
+                      owner=alarm.owner or person, notify_ns=None,
+                      revision=alarm.revision + 1)  # fmt: skip
     return changed, [Entry(now_ns, "acknowledged", note, who)]
 
 

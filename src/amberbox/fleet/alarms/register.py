@@ -14,7 +14,7 @@ from amberbox.fleet.alarms.tables import ALARM, ALARM_ROBOT, BLOCKED, HISTORY, P
 from amberbox.fleet.database.upsert import upsert
 
 _TEXT = 2_000
-_LISTS = frozenset({"blocked_by", "components"})
+_LISTS = frozenset({"blocked_by", "components", "words"})
 """Columns with JSON, of which a part is nothing; who writes them bounds them."""
 
 
@@ -135,6 +135,11 @@ class Register:
             when=lambda new: new.revision >= ROOTS.c.revision,
         )  # fmt: skip
         self.connection.execute(statement, [_cut(row, ROOTS)])
+
+    def keep_words(self, robot: str, diagnosis: str, effect: str, words: str) -> None:
+        """Keep what a diagnosis means in words, if it is known."""
+        told = update(ROOTS).where(ROOTS.c.robot == robot, ROOTS.c.diagnosis == diagnosis)
+        self.connection.execute(told.values(effect=effect, words=words))
 
     def blocked(self, robot: str) -> dict[str, RowMapping]:
         """Return the last that is known of each component of a robot."""

@@ -41,12 +41,17 @@ ALARM = Table(
     Column("told", _Short, nullable=False),
     Column("notify_ns", Time),
     Column("revision", BigInteger, nullable=False),
+    Column("revised", BigInteger, nullable=False, server_default="0"),
+    Column("effect", _Short, nullable=False, server_default=""),
+    Column("worst", _Short, nullable=False, server_default=""),
+    Column("words", Text, nullable=False, server_default=""),
     Index(None, "robot", "origin"),
     Index(None, "state"),
     Index(None, "notify_ns"),
 )
 """Alarms. ``robot`` is empty where several robots are in one; ``told`` is the severity that was
-last notified, ``notify_ns`` when the next notification is due."""
+last notified, ``notify_ns`` when the next notification is due; ``revised``, ``effect`` and
+``words`` are of the diagnosis as it was last while the alarm lasted."""
 
 ALARM_ROBOT = Table(
     "alarm_robot",
@@ -128,8 +133,11 @@ ROOTS = Table(
     Column("revision", BigInteger, nullable=False),
     Column("components", Text, nullable=False),
     Column("probability", Float, nullable=False),
+    Column("effect", _Short, nullable=False, server_default=""),
+    Column("words", Text, nullable=False, server_default=""),
 )
-"""What the leading answer of a robot's diagnosis says has failed: components, as JSON."""
+"""What the leading answer of a robot's diagnosis says has failed: components, as JSON; ``effect``
+and ``words`` are those that were explained last, see ``words.py``."""
 
 MARK = Table(
     "alarm_mark",

@@ -13,6 +13,8 @@ from amberbox.fleet.alarms.consequences import note_blocked, root_of, show_conse
 from amberbox.fleet.alarms.register import Register
 from amberbox.fleet.alarms.reports import Report
 from amberbox.fleet.alarms.settings import AlarmSettings
+from amberbox.fleet.alarms.tables import ALARM
+from amberbox.fleet.alarms.words import Explanation, written
 from amberbox.monitoring.engine.alarms import FOLLOWS
 from amberbox.monitoring.engine.findings import AlarmChange
 from amberbox.monitoring.watcher.leading import leading
@@ -34,7 +36,7 @@ def take(
         if isinstance(report.told, AlarmChange):
             _take_alarm(register, report, report.told, now_ns, settings)
         elif isinstance(report.told, Diagnosis):
-            _take_diagnosis(register, report.robot, report.told)
+            _take_diagnosis(register, report.robot, report.told, now_ns, settings)
             _join(register, report.robot, report.told.id, now_ns, settings)
         else:
             note_blocked(register, report, report.told)
@@ -137,7 +139,9 @@ def _judge(
     changed, entries = machine.judged(alarm, register.parts(number), now_ns, settings)
     if changed.active and not late:
         changed = replace(changed, late=False)
-    register.keep(alarm, (changed, entries))
+    kept = register.keep(alarm, (changed, entries))
+    if kept.active and kept.diagnosis and not (kept.revised and alarm.active):
+        _follow_diagnosis(register, kept, now_ns, settings)
     register.touched.add(number)
 
 
@@ -172,7 +176,41 @@ def _merge(
         _judge(register, keep.number, now_ns, settings, late=keep.late)
 
 
-def _take_diagnosis(register: Register, robot: str, diagnosis: Diagnosis) -> None:
+def take_explanation(
+    register: Register, told: Explanation, now_ns: int, settings: AlarmSettings
+) -> None:
+    """Keep what a diagnosis means, with it and with the alarms of which it was the last word."""
+    text = written(told.words)
+    register.keep_words(told.robot, told.diagnosis[:128], told.effect, text)
+    for alarm in _explained_by(register, told.robot, told.diagnosis):
+        if alarm.revised == told.revision:
+            step = machine.explained(alarm, told.effect, text, now_ns, settings)
+            register.keep(alarm, step)
+
+
+def _explained_by(register: Register, robot: str, diagnosis: str) -> list[Alarm]:
+    return register.alarms(
+        ALARM.c.robot == robot, ALARM.c.diagnosis == diagnosis[:128], ALARM.c.kind == "robot",
+        ALARM.c.merged_into.is_(None),
+    )  # fmt: skip
+
+
+def _follow_diagnosis(
+    register: Register, alarm: Alarm, now_ns: int, settings: AlarmSettings
+) -> None:
+    """Take what is known of the diagnosis of an alarm already."""
+    roots = register.roots(alarm.robot, alarm.diagnosis)
+    if roots is None:
+        return
+    alarm = register.keep(alarm, (machine.revised(alarm, roots["revision"]), []))
+    if roots["words"]:
+        step = machine.explained(alarm, roots["effect"], roots["words"], now_ns, settings)
+        register.keep(alarm, step)
+
+
+def _take_diagnosis(
+    register: Register, robot: str, diagnosis: Diagnosis, now_ns: int, settings: AlarmSettings
+) -> None:
     """Note which component has failed, if the leading answer says one."""
     answers = leading(diagnosis)
     failed = [{fault.partition("#")[0] for fault in answer.faults} for answer in answers]
@@ -184,6 +222,10 @@ def _take_diagnosis(register: Register, robot: str, diagnosis: Diagnosis) -> Non
     )  # fmt: skip
     revision = _time(diagnosis.revision)
     register.keep_roots(robot, diagnosis.id[:128], revision, names, share)
+    if diagnosis.state == "open":
+        for alarm in _explained_by(register, robot, diagnosis.id):
+            if revision > alarm.revised:
+                register.keep(alarm, (machine.revised(alarm, revision), []))
 
 
 def _join(

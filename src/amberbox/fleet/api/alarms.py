@@ -131,7 +131,8 @@ def acknowledge_alarm(fleet: Fleet, who: Who, id: Number, body: Acknowledgement)
     """Say that one sees to it."""
 
     def step(_: Connection, alarm: Alarm, name: str, now_ns: int) -> Step:
-        return machine.acknowledged(alarm, name, now_ns, body.note)
+        person = who.principal.owner or who.principal.id
+        return machine.acknowledged(alarm, name, now_ns, body.note, person)
 
     return _do(fleet, who, Asked(id, "acknowledge", body.revision, step, {"note": body.note}))
 

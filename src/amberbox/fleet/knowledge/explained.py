@@ -161,6 +161,7 @@ class Explained:
             self._known[key] = answer
             while len(self._known) > _REMEMBERED:
                 self._known.popitem(last=False)
+        self._bus.publish(Change("explained", key[0], {"answer": answer}))
 
 
 def kept_answer(known: Known, made: list[notebook.Revision]) -> Answer | None:

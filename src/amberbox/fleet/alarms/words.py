@@ -1,0 +1,88 @@
+"""What the diagnosis of an alarm says, in words: kept with the alarm, also when it is over."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Final, Literal, TypeAlias
+
+import msgspec
+
+from amberbox.monitoring.engine.outputs import SEVERITIES
+from amberbox.monitoring.plan import Severity
+
+Kind: TypeAlias = Literal["fault", "false_alarm", "other"]
+_MOST: Final = 20
+"""Causes, and names of failure modes, that are kept."""
+_LONG: Final = 500
+_UNDESCRIBED: Final = "unknown#other"
+
+
+@dataclass(frozen=True, slots=True)
+class Cause:
+    """What may be broken; ``kind`` tells a failure from none, and from one nobody described."""
+
+    text: str
+    kind: Kind = "fault"
+
+
+@dataclass(frozen=True, slots=True)
+class Words:
+    """The leading causes, and the probability that it is one of them.
+
+    ``names`` are failure modes in words, by id.
+    """
+
+    causes: Sequence[Cause] = ()
+    probability: float = 0.0
+    names: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Explanation:
+    """What a revision of a robot's diagnosis means for the alarms that it explains."""
+
+    robot: str
+    diagnosis: str
+    revision: int
+    effect: Severity | Literal[""]
+    words: Words
+
+
+def explanation_of(robot: str, answer: Mapping[str, Any]) -> Explanation | None:
+    """Read an answer of ``POST .../diagnose``; None for one that explains nothing."""
+    told = answer["explanation"]
+    if told is None:
+        return None
+    broken, severity = told["broken"], told["use"]["severity"]
+    members = broken["members"] if broken else ()
+    causes = [
+        Cause(_cut(one["text"]), _kind([fault["id"] for fault in one["faults"]]))
+        for one in members[:_MOST]
+    ]
+    groups = [*([broken] if broken else ()), *told["others"]]
+    faults = [f for group in groups for one in group["members"] for f in one["faults"]]
+    names = {fault["id"]: _cut(fault["text"]) for fault in faults[:_MOST]}
+    effect: Severity | Literal[""] = severity if severity in SEVERITIES else ""
+    words = Words(causes, told["sure"]["probability"], names)
+    return Explanation(robot, answer["id"], answer["revision"], effect, words)
+
+
+def written(words: Words) -> str:
+    """Write words as a row keeps them."""
+    return msgspec.json.encode(words).decode()
+
+
+def read(text: str) -> Words | None:
+    """Read what ``written`` made; None for nothing."""
+    return msgspec.json.decode(text, type=Words) if text else None
+
+
+def _kind(ids: Sequence[str]) -> Kind:
+    if not ids:
+        return "false_alarm"
+    return "other" if list(ids) == [_UNDESCRIBED] else "fault"
+
+
+def _cut(text: str) -> str:
+    return text.replace("\0", "")[:_LONG]
