@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from html import unescape
 from typing import Any
 
@@ -24,7 +24,8 @@ OVER = {"active": False, "cleared_ns": START_NS}
 def home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[House]:
     """Alarms that last and that are over, and of which people have said something or not."""
     with house(tmp_path_factory.mktemp("house"), shared=True) as made:
-        for number, changes in enumerate(({}, OVER, SEEN_TO, SHELVED), 1):
+        happened: Sequence[Mapping[str, Any]] = ({}, OVER, SEEN_TO, SHELVED)
+        for number, changes in enumerate(happened, 1):
             put_alarm(made, number, "ropod_001")
             change(made, number, **changes)
         put_alarm(made, 5, "ropod_002", severity="fatal")

@@ -10,6 +10,7 @@ from sqlalchemy import select
 
 from amberbox.core.errors import AmberboxError
 from amberbox.fleet.api.access import Fleet, Open, Routes
+from amberbox.fleet.metrics.troubles import troubles
 
 routes = Routes("health")
 
@@ -28,7 +29,8 @@ _BAD: dict[int | str, dict[str, Any]] = {503: {"model": Health, "description": "
 def read_health(fleet: Fleet, response: Response) -> Health:
     """Return 200 if the server and its database answer, else 503.
 
-    ``poor``: it answers, and needs somebody soon (the disk is nearly full, nothing is committed).
+    ``poor``: it answers, and needs somebody soon (the disk is nearly full, nothing is committed,
+    files that robots copied are damaged).
     """
     try:
         with fleet.database.reading() as connection:
@@ -36,4 +38,4 @@ def read_health(fleet: Fleet, response: Response) -> Health:
     except AmberboxError:
         response.status_code = 503
         return Health("bad")
-    return Health("poor" if fleet.keeping.troubles() else "ok")
+    return Health("poor" if troubles(fleet) else "ok")

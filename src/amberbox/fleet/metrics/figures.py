@@ -18,6 +18,7 @@ from amberbox.fleet.database.database import FILE
 from amberbox.fleet.linkend.tables import ASIDE, ROBOT
 from amberbox.fleet.metrics.text import Family, Sample, counter, gauge
 from amberbox.fleet.services import Services
+from amberbox.fleet.state.damaged import damaged_files
 
 _PAGE = os.sysconf("SC_PAGE_SIZE")
 
@@ -43,6 +44,7 @@ def families(services: Services, received: Received) -> Iterator[Family]:
     yield from _robots(services)
     yield from _arrivals(received)
     yield from _archive(services)
+    yield from _damaged(services)
     yield from _disk(services.folder)
     yield from _feed(services)
     yield from process()
@@ -87,6 +89,13 @@ def _archive(services: Services) -> Iterator[Family]:
     yield Family("amberbox_archive_journals", "gauge", about, counts)
     sizes = [Sample(size, {"state": state}) for state, (_, size) in sorted(known.items())]
     yield Family("amberbox_archive_journal_bytes", "gauge", "Their bytes.", sizes)
+
+
+def _damaged(services: Services) -> Iterator[Family]:
+    with services.database.reading() as connection:
+        found = damaged_files(connection, services.clock.wall_ns()).values()
+    about = "Journals that were damaged when they came, and are set aside."
+    yield gauge("amberbox_files_damaged", about, sum(one.count for one in found))
 
 
 def _disk(folder: Path) -> Iterator[Family]:

@@ -11,6 +11,7 @@ from sqlalchemy import Connection
 from amberbox.fleet.accounts.robots import KnownRobot
 from amberbox.fleet.linkend.presence import Presence, presences
 from amberbox.fleet.linkend.server import LinkServer
+from amberbox.fleet.state.damaged import Damaged, damaged_files
 from amberbox.fleet.state.facts import FactsBook
 from amberbox.fleet.state.latest import Latest, Recent
 from amberbox.fleet.state.openalarms import OpenAlarms, open_alarms
@@ -51,11 +52,12 @@ class Cards:
             statuses = standings(connection, names if len(names) <= FEW else None)
         seen = {presence.robot: presence for presence in presences(connection)}
         alarms, offsets = open_alarms(connection), clock_offsets_ns(connection)
+        damaged = damaged_files(connection, now_ns)
         return [
             self._card(
                 robot, seen.get(robot.id), statuses.get(robot.id, []),
                 Moment(now_ns, offsets.get(robot.id)),
-                alarms.get(robot.id, OpenAlarms()),
+                alarms.get(robot.id, OpenAlarms()), damaged.get(robot.id, Damaged()),
             )
             for robot in robots
         ]  # fmt: skip
@@ -67,6 +69,7 @@ class Cards:
         statuses: Sequence[Standing],
         when: Moment,
         alarms: OpenAlarms,
+        damaged: Damaged,
     ) -> Card:
         link = self.links.robots.get(robot.id)
         online = link is not None
@@ -89,6 +92,7 @@ class Cards:
             alarms.count,
             _battery(statuses), _mission(recent), _lead(recent),
             link is not None and link.is_silent, alarms.over,
+            damaged.count, damaged.new,
         )  # fmt: skip
 
 

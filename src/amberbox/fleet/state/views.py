@@ -48,7 +48,8 @@ class Card:
     ``level`` is ``unknown`` where nobody can know; ``last_level`` is what it was then. ``cause``
     says in words what is worst. ``alarms`` are those that nobody has said anything about yet, of
     which ``alarms_over`` have stopped; ``severity`` is the highest of those that last, also of
-    acknowledged ones. ``silent``: its link holds, and three heartbeats are missing.
+    acknowledged ones. Of its files ``damaged_files`` are set aside as damaged, ``damaged_new``
+    of these in the last 24 hours. ``silent``: its link holds, and three heartbeats are missing.
     """
 
     robot: str
@@ -73,6 +74,8 @@ class Card:
     diagnosis: Lead | None
     silent: bool = False
     alarms_over: int = 0
+    damaged_files: int = 0
+    damaged_new: int = 0
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,6 +12,7 @@ from amberbox.fleet.api.groups import list_groups
 from amberbox.fleet.api.health import read_health
 from amberbox.fleet.api.robots import list_cards
 from amberbox.fleet.api.users import list_people
+from amberbox.fleet.metrics.troubles import troubles as find_troubles
 from amberbox.fleet.notifying.settings import Notifications
 from amberbox.fleet.options.options import read
 from amberbox.fleet.pages.page import Pages, render
@@ -44,7 +45,7 @@ def show(request: Request, fleet: Fleet, who: Who) -> Response:
     """Show what needs somebody, and the pages that one may open."""
     pages = [(name, picture) for name, picture, action in PAGES if who.may(action)]
     steps = list(_steps(fleet, who)) if who.may("users.write") else []
-    troubles = fleet.keeping.troubles() if who.may("metrics.read") else []
+    troubles = find_troubles(fleet) if who.may("metrics.read") else []
     health = read_health(fleet, Response()).status
     return render(request, "admin/admin.html", pages=pages, steps=steps, health=health,
                   troubles=troubles, is_new=not all(step.is_done for step in steps))  # fmt: skip

@@ -11,7 +11,9 @@ from amberbox.fleet.api.access import Fleet, services_of
 from amberbox.fleet.api.health import read_health
 from amberbox.fleet.api.system import read_status
 from amberbox.fleet.metrics.figures import families
+from amberbox.fleet.metrics.troubles import troubles
 from amberbox.fleet.pages.page import Pages, render
+from amberbox.fleet.state.damaged import damaged_files
 
 routes = Pages()
 
@@ -37,10 +39,12 @@ class Disk:
 def show_health(request: Request, fleet: Fleet) -> Response:
     """Show the server's own figures."""
     found = _figures(request)
+    with fleet.database.reading() as connection:
+        damaged = sorted(damaged_files(connection, fleet.clock.wall_ns()).items())
     disk = Disk(found["amberbox_disk_free_bytes"], found["amberbox_disk_bytes"])
     return render(request, "admin/health.html", figures=found, disk=disk,
                   health=read_health(fleet, Response()).status,
-                  troubles=fleet.keeping.troubles())  # fmt: skip
+                  troubles=troubles(fleet), damaged=damaged)  # fmt: skip
 
 
 @routes.get("/admin/system", "status.read")

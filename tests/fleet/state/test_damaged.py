@@ -1,0 +1,60 @@
+"""Files that are set aside as damaged: everybody who looks at the server is told of them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from html import unescape
+from pathlib import Path
+
+import pytest
+
+from amberbox.fleet.state.damaged import NEW_NS
+from tests.fleet.archive.recordings import Robot
+from tests.fleet.data.damaged import quarantined
+from tests.fleet.house import START_NS, House, house
+
+FILES = ("watch/000009-00000000-0000.mcap", "watch/000010-00000000-0000.mcap")
+
+
+@pytest.fixture(scope="module")
+def robot(tmp_path_factory: pytest.TempPathFactory) -> Robot:
+    made = Robot("ropod_001", tmp_path_factory.mktemp("robot"))
+    made.record(0, files=1, at_ns=START_NS)
+    return made
+
+
+@pytest.fixture
+def home(tmp_path: Path) -> Iterator[House]:
+    with house(tmp_path, shared=True) as made:
+        yield made
+
+
+def read(home: House, path: str, name: str = "admin") -> str:
+    return unescape(home.client(name).get(path).text)
+
+
+def test_new_ones_need_somebody_soon(home: House, robot: Robot) -> None:
+    assert home.client().get("/api/v1/health").json() == {"status": "ok"}
+    with quarantined(home, robot, *FILES, came_ns=START_NS - NEW_NS + 1):
+        assert home.client().get("/api/v1/health").json() == {"status": "poor"}
+        said = "2 files were damaged and set aside in the last 24 hours, of ropod_001"
+        assert said in read(home, "/admin") and said in read(home, "/admin/health")
+        shown = read(home, "/admin/health")
+        assert (
+            "/recordings/ropod_001?show=trouble#journals" in shown and "ropod_001: 2 files" in shown
+        )
+        assert "Nothing is known to be wrong." not in shown
+        card = read(home, "/pieces/robots/ropod_001", "viewer")
+        assert "2 files damaged" in card and "severity-warning" in card
+    assert "Nothing is known to be wrong." in read(home, "/admin/health")
+    assert "damaged" not in read(home, "/pieces/robots/ropod_001", "viewer")
+
+
+def test_old_ones_are_still_told_and_alarm_nobody(home: House, robot: Robot) -> None:
+    with quarantined(home, robot, FILES[0], came_ns=START_NS - NEW_NS - 1):
+        assert home.client().get("/api/v1/health").json() == {"status": "ok"}
+        assert "ropod_001: 1 file" in read(home, "/admin/health")
+        card = read(home, "/pieces/robots/ropod_001", "viewer")
+        assert "1 file damaged" in card and "severity-warning" not in card
+        metrics = home.client("admin").get("/api/v1/metrics").text
+        assert "amberbox_files_damaged 1" in metrics
