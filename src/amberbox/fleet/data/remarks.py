@@ -105,8 +105,8 @@ def annotate(
     """Add a remark to a mission, of people or of the robot, or to a moment without one."""
     _refuse_too_many(connection, MISSION_NOTE, robot)
     row = {"robot": robot, "mission": mission_id, "at_ns": now_ns, "who": who, "text": text}
-    number = connection.scalar(MISSION_NOTE.insert().returning(MISSION_NOTE.c.number), [row])
-    return Remark(int(number or 0), now_ns, who, text, mission_id)
+    made = connection.execute(MISSION_NOTE.insert().returning(MISSION_NOTE.c.number), row)
+    return Remark(made.scalar_one(), now_ns, who, text, mission_id)
 
 
 def remarked(
