@@ -58,3 +58,33 @@ def test_robots_by_team_and_by_name(page_as: PageAs) -> None:
     page.get_by_role("checkbox").uncheck()
     expect(page.locator("h2 .muted")).to_have_count(0)
     assert page.locator(".robot-card h3").all_inner_texts() == sorted(set(names))
+
+
+def test_a_card_holds_what_it_says(page_as: PageAs) -> None:
+    page = page_as("viewer", width=1440)
+    page.goto("/")
+    for card in page.locator(".robot-card").all():
+        inside = card.evaluate(
+            "one => [...one.querySelectorAll('.facts, .cause, .cause ~ *')].map(part =>"
+            " [part.scrollWidth - part.clientWidth, part.getBoundingClientRect().right])"
+        )
+        edge = card.evaluate("one => one.getBoundingClientRect().right")
+        assert all(over <= 1 and right <= edge for over, right in inside), inside
+
+
+def test_a_wall_screen_is_used(page_as: PageAs) -> None:
+    page = page_as("viewer", width=3840, height=2160)
+    page.goto("/")
+    brand, card = page.locator(".brand").bounding_box(), page.locator(".robot-card").last.bounding_box()  # fmt: skip
+    title = page.get_by_role("heading", name="Robots", exact=True).bounding_box()
+    assert brand and card and title and abs(brand["x"] - title["x"]) <= 4
+    assert card["x"] + card["width"] > 2 / 3 * 3840
+    assert page.evaluate("parseFloat(getComputedStyle(document.documentElement).fontSize)") >= 20
+
+
+def test_all_pages_can_be_reached_on_a_phone(page_as: PageAs) -> None:
+    page = page_as("admin", width=390)
+    page.goto("/")
+    for link in page.locator(".nav a").all():
+        box = link.bounding_box()
+        assert box and box["x"] >= 0 and box["x"] + box["width"] <= 390 and box["height"] >= 44

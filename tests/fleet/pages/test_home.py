@@ -89,3 +89,9 @@ def test_an_offline_alarm_of_several_counts_for_who_is_back_as_over(home: House)
         assert 'data-alarm-count="4"' in read(home)
     finally:
         change(home, 7, state="resolved", **OVER)
+
+
+def test_who_is_away_is_said_so_once_and_how_it_was(home: House) -> None:
+    away = card(home, "ropod_001")
+    assert away.count("never connected") == 1 and "Nothing is known of it." in away
+    assert "rows" not in away

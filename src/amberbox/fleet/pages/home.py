@@ -25,6 +25,8 @@ Sort = Literal["worst", "name", "battery", "seen"]
 _LEVELS = ("error", "warn", "stale", "unknown", "ok")
 _SEVERITIES = (*reversed(SEVERITIES), "")
 _MOST = 10_000
+BEHIND_ROWS = 5000
+"""More than that a robot records in some seconds: one that has so many to send was away."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,13 +72,16 @@ def show_list(
 @routes.get("/pieces/robots/{robot}", "status.read")
 def show_card(request: Request, fleet: Fleet, robot: OfRobot) -> Response:
     """Show one robot alone."""
-    return render(request, "home_card.html", card=read_card(fleet, robot))
+    return render(request, "home_card.html", card=read_card(fleet, robot), behind_rows=BEHIND_ROWS)
 
 
 def _listed(fleet: Services, who: Who, look: Look) -> Mapping[str, Any]:
     cards = list_cards(fleet, who, "", "", _MOST)
     shown = sorted((card for card in cards if _fits(card, look)), key=_order(look.sort))
-    return {"look": look, "all": cards, "teams": list(_teams(shown, look)), "counts": counts(cards)}
+    return {
+        "look": look, "all": cards, "teams": list(_teams(shown, look)), "counts": counts(cards),
+        "behind_rows": BEHIND_ROWS,
+    }  # fmt: skip
 
 
 def counts(cards: Sequence[Card]) -> Mapping[str, int]:

@@ -27,6 +27,7 @@ function begin(form) {
   };
   const change = (method, body) => changed(form, method, body).then(take, (error) => fail(error, form));
   form.robot.addEventListener("change", show);
+  one("[data-fold]", form).addEventListener("click", (event) => unfolded(form, event.currentTarget));
   form.addEventListener("submit", (event) => {
     event.preventDefault();
     change("POST", { fault: form.fault.value });
@@ -36,6 +37,12 @@ function begin(form) {
   listen({ kinds: ["diagnosis"] }).on("diagnosis", (_, robot) => {
     if (robot === form.robot.value) answered(form);
   });
+}
+
+/** Open or close the bar, which is one line on narrow screens. */
+function unfolded(form, button) {
+  const isOpen = form.toggleAttribute("data-open");
+  button.setAttribute("aria-expanded", String(isOpen));
 }
 
 /** Offer the robots that one may see; at first the one that the page is about is chosen. */
