@@ -21,8 +21,9 @@ from amberbox.client.remote import RemoteRecord
 from amberbox.client.times import time_ns
 from amberbox.client.wire import Wire
 from amberbox.core.errors import UsageError
+from amberbox.core.timetext import format_time
 from amberbox.core.tls import PinError
-from amberbox.fleet.archive.gaps import TO_COME
+from amberbox.fleet.archive.holes import TO_COME
 from amberbox.testing.records import T0_NS
 from tests.client.served import Served, free_port
 from tests.fleet.data.filled import FORMULAS, ROWS
@@ -94,6 +95,13 @@ def test_missions_incidents_journals_gaps_events(fleet: Fleet) -> None:
     assert [one.id for one in fleet.incidents(ROBOT) if one.origin == "robot"] == ["incident-1"]
     assert {one.integrity for one in fleet.recordings(ROBOT)} <= {"intact", "unsigned"}
     assert isinstance(fleet.gaps(ROBOT), list) and isinstance(fleet.events(ROBOT), list)
+
+
+def test_a_note_on_a_moment(fleet: Fleet) -> None:
+    made = fleet.annotate(ROBOT, "looked odd", T0_NS)
+    assert (made.text, made.mission, made.at) == ("looked odd", "", format_time(T0_NS))
+    assert fleet.notes(ROBOT, T0_NS, T0_NS + 1) == [made]
+    assert fleet.notes(ROBOT, T0_NS + 1, T0_NS + 2) == []
 
 
 def test_a_mission_and_an_incident_of_the_server(fleet: Fleet) -> None:

@@ -222,6 +222,7 @@ class Gap(Answer, frozen=True):
     from_: str
     to: str
     reason: str
+    kind: str = ""
     count: int | None = None
 
 
@@ -257,6 +258,16 @@ class Note(Answer, frozen=True):
     at: str
     who: str
     text: str
+
+
+class MomentNote(Answer, frozen=True):
+    """A remark on a moment of a robot; ``mission`` is empty where it is on no mission."""
+
+    id: int
+    at: str
+    who: str
+    text: str
+    mission: str = ""
 
 
 class Mission(Answer, frozen=True):

@@ -85,7 +85,7 @@ def test_a_journal_that_rots_on_the_server_is_left_out_and_said(
     assert (done.journals, done.refused) == (1, 1)
     assert len(archive.robot().query("odom")) == 40
     (gap,) = archive.robot().gaps()
-    assert gap.reason == "refused: the file changed after it was verified"
+    assert gap.reason == f"refused: {key.file}: the file changed after it was verified"
     assert gap.count == 81  # 40 poses, 40 batteries, what the run is
     assert robot.hand_in(archive, robot.files()[0]).is_new
     assert archive.commit(0.0).journals == 1

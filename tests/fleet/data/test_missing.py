@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from amberbox.fleet.archive.gaps import OLD, TO_COME, WAITING
+from amberbox.fleet.archive.gaps import OLD, WAITING
+from amberbox.fleet.archive.holes import TO_COME
 from amberbox.fleet.data.missing import GapKind, kind_of
 
 
@@ -12,7 +13,7 @@ from amberbox.fleet.data.missing import GapKind, kind_of
     ("reason", "kind"),
     [
         (TO_COME, "to_come"),
-        (WAITING, "to_come"),
+        (WAITING, "waiting"),
         (OLD, "deleted"),
         (f"{OLD}, the journal is kept", "deleted"),
         ("deleted on the robot before it was copied: lost patience", "deleted"),
@@ -22,7 +23,8 @@ from amberbox.fleet.data.missing import GapKind, kind_of
         ("dropped: the disk is too slow", "lost"),
         ("damaged: main-000001.mcap", "lost"),
         ("undecodable: the message ends early", "lost"),
-        ("refused: its signature is not right", "lost"),
+        ("refused: journal/1-1-1.mcap: its signature is not right", "refused"),
+        ("the publisher refused the connection", "lost"),
         ("no columns, only in main-000001.mcap: unknown type", "lost"),
         ("the box was not recording", "uncovered"),
         ("publisher not connected yet", "uncovered"),

@@ -118,6 +118,25 @@ def test_a_file_whose_times_are_not_known_counts_for_nothing(
     assert "1970" not in page
 
 
+def test_a_refused_file_is_a_gap_of_its_own_kind(
+    home: House, robot: Robot, viewer: TestClient
+) -> None:
+    last = max(path.name for path in robot.files() if path.parent.name == "journal")
+    run, boot, number = last.removesuffix(".mcap").split("-")
+    name = f"journal/{run}-{boot}-{int(number) + 1:04d}.mcap"
+    known = viewer.get(f"{PAGE}/coverage").json()
+    came_ns = int(known["end"] * NS) + 600 * NS
+    with quarantined(home, robot, name, came_ns=came_ns):
+        gaps = viewer.get("/api/v1/robots/ropod_001/gaps").json()["gaps"]
+        (gap,) = (one for one in gaps if one["kind"] == "refused")
+        found = viewer.get(f"{PAGE}/coverage").json()
+    assert gap["reason"] == f"refused: {name}: {WHY}"
+    assert gap["to"] == format_time(came_ns)
+    assert found["end"] == pytest.approx(came_ns / NS)
+    assert [one["kind"] for one in found["missing"]].count("refused") == 1
+    assert not [one for one in gaps if one["kind"] in ("to_come", "waiting")]
+
+
 def test_stretches_of_one_reason_that_are_near_are_one() -> None:
     lost = [Stretch(0, 1, "lost"), Stretch(1.5, 2, "lost"), Stretch(9, 10, "lost")]
     other = Stretch(1, 3, "deleted")

@@ -71,8 +71,9 @@ class Rows:
 class Gap(Shown):
     """A range without data, and why; ``count`` is None when nobody can know.
 
-    ``kind``: ``to_come`` (the robot has it), ``deleted``, ``filtered`` (the value did not change),
-    ``lost``, ``uncovered`` (nothing was recorded).
+    ``kind``: ``to_come`` (the robot has it), ``waiting`` (the server has it, and has not read it
+    in yet), ``refused`` (the server has the file, and set it aside as damaged), ``deleted``,
+    ``filtered`` (the value did not change), ``lost``, ``uncovered`` (nothing was recorded).
     """
 
     item: str

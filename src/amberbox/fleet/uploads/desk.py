@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from sqlalchemy import ColumnElement, Connection, and_, select
@@ -164,7 +164,8 @@ class Desk:
             return Answer(409, 0, text=result.reason)
         sealed = proof is not None and bool(proof.lines)
         if not result.reason and sealed and not result.signed:
-            result = Result("it is not signed, and this server takes signed journals only")
+            reason = "it is not signed, and this server takes signed journals only"
+            result = replace(result, reason=reason)
         return self._place(incoming, result)
 
     def _place(self, incoming: Incoming, result: Result) -> Answer:

@@ -71,6 +71,7 @@ def verify(claim: Claim) -> Result:
     """Check a file against what its robot has sealed and signed; any kind of damage is a reason."""
     if _sha256(claim.path) != claim.sha256:
         return Result("it did not arrive as it was sent", unread=True)
+    proven = None
     try:
         proven = _proven(claim)
         sealed = proven.sealed if proven is not None else None
@@ -79,7 +80,18 @@ def verify(claim: Claim) -> Result:
     except ProofError as error:
         return Result(f"its proof does not hold: {error}")
     except Exception as error:  # whatever bytes do to a reader: it is told, and not taken
-        return Result(f"it cannot be read: {type(error).__name__}: {error}")
+        return _unreadable(f"it cannot be read: {type(error).__name__}: {error}", proven)
+
+
+def _unreadable(reason: str, proven: Proven | None) -> Result:
+    """Say what a file was that cannot be read, as far as its seal tells."""
+    if proven is None:
+        return Result(reason)
+    seal = proven.sealed
+    return Result(
+        reason, False, proven.signed, seal.writer, seal.run, seal.number, seal.first_seq,
+        seal.end_seq, seal.start_ns, seal.end_ns,
+    )  # fmt: skip
 
 
 def _proven(claim: Claim) -> Proven | None:

@@ -54,9 +54,10 @@ def coverage(fleet: Services, who: Caller, robot: str) -> Coverage:
     if not every:
         return Coverage(None, None, (), ())
     held = _spans(o for o in journals if o.state in _HELD and o.integrity != "deleted")
+    missing = _missing(fleet, who, robot)
+    every += [one for one in missing if one.kind == "refused"]
     start, end = min(one.start for one in every), max(one.end for one in every)
     least = (end - start) / _STEPS
-    missing = _missing(fleet, who, robot)
     return Coverage(start, end, joined(held, least), joined(missing, least))
 
 

@@ -27,7 +27,9 @@ _HOUR_NS = 3600 * NS
 _ASIDE = ("watch", "keep")
 """Journals of what the box and its watcher say themselves: not what the robot's data cover."""
 _HELD = ("in_columns", "waiting")
-_DRAWN: Mapping[GapKind, Kind] = {"deleted": "deleted", "filtered": "filtered", "lost": "lost"}
+_DRAWN: Mapping[GapKind, Kind] = {
+    "deleted": "deleted", "filtered": "filtered", "lost": "lost", "refused": "lost"
+}  # fmt: skip
 """What of gaps has a look of its own; where nothing was recorded, nothing is drawn."""
 
 
