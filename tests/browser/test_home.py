@@ -75,7 +75,8 @@ def test_a_card_holds_what_it_says(page_as: PageAs) -> None:
 def test_a_wall_screen_is_used(page_as: PageAs) -> None:
     page = page_as("viewer", width=3840, height=2160)
     page.goto("/")
-    brand, card = page.locator(".brand").bounding_box(), page.locator(".robot-card").last.bounding_box()  # fmt: skip
+    brand = page.locator(".brand").bounding_box()
+    card = page.locator(".robot-card").last.bounding_box()
     title = page.get_by_role("heading", name="Robots", exact=True).bounding_box()
     assert brand and card and title and abs(brand["x"] - title["x"]) <= 4
     assert card["x"] + card["width"] > 2 / 3 * 3840
