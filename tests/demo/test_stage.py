@@ -15,11 +15,16 @@ from pathlib import Path
 
 import pytest
 
+import amberbox
 from amberbox.blackbox.folder.folder import load_folder
+from amberbox.blackbox.folder.missions import read_rules
+from amberbox.blackbox.missions import detect
 from amberbox.blackbox.sources.sim import Orders
+from amberbox.cli.main import main
+from amberbox.core.clock import NS
 from amberbox.core.errors import AmberboxError, UsageError
 from amberbox.demo.relay import Relay
-from amberbox.demo.robots import IDS
+from amberbox.demo.robots import IDS, place_of
 from amberbox.demo.show import free_port
 from amberbox.demo.stage import Stage
 
@@ -134,3 +139,26 @@ def _working_below(place: Path) -> list[str]:
             if str(place) in command:
                 found.append(command)
     return found
+
+
+def test_deliveries_of_the_robots_are_missions_and_fail_when_it_cannot_drive(
+    tmp_path: Path,
+) -> None:
+    Stage(tmp_path, 18999).prepare()
+    place = place_of(IDS[0], tmp_path)
+    box = (place.folder / "black_box.yaml").read_text()
+    assert "scenario: shuttle\n" in box
+    hurried = "    speed: max\n    duration_s: 120\n    topics: [{name: tasks}]\n"
+    fault = "    faults: [{id: bumper_switch_closed, at_s: 40}]\n"
+    (place.folder / "black_box.yaml").write_text(f"{box}{hurried}{fault}")
+    rules = read_rules(place.folder)
+    (place.folder / "robot.yaml").write_text("id: r\n")  # no keeper that is ended on its way
+    assert main(["record", str(place.folder), "--quiet"]) == 0
+    detect.detect(place.folder / "store", rules)
+    found = amberbox.open(place.folder).missions()
+    assert [(m.name, m.outcome, m.failed, m.parameters["to"]) for m in found[:2]] == [
+        ("delivery", "finished", False, "ward_a"),
+        ("delivery", "timeout", True, "charging_station"),
+    ]
+    seconds = [((m.to_ns or 0) - m.from_ns) / NS for m in found[:2]]
+    assert seconds == pytest.approx([24, 45], abs=1.5)

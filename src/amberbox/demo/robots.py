@@ -31,12 +31,22 @@ store:
   quota: 2 GB
   rotate_s: 10             # so that the server has what was recorded after seconds
 
+missions:                  # each delivery is one; it takes 24 s to 28 s
+  - name: delivery
+    start: >-
+      sim_tasks.kind == 'delivery' and sim_tasks.event != 'finished' and
+      sim_tasks.event != 'aborted'
+    end: sim_tasks.event == 'finished' or sim_tasks.event == 'aborted'
+    outcome: sim_tasks.event
+    parameters: {{to: sim_tasks.location, task: sim_tasks.task_id}}
+    max: 45 s              # whatever holds it up: then it has failed
+
 """
 _BLACK_BOX = """\
 - sim:
     robot: {id}
     seed: {seed}
-    scenario: shift
+    scenario: shuttle
     orders: {orders}
 """
 

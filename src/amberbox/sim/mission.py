@@ -13,9 +13,11 @@ SCENARIOS: dict[str, dict[str, Any]] = {
     "transport": {"place": "charging_station", "charge": (0.7, 0.95), "tasks": "transport"},
     "charging": {"place": "charging_station", "charge": (0.3, 0.4), "tasks": "charging"},
     "shift": {"place": "charging_station", "charge": (0.7, 0.95), "tasks": "shift"},
+    "shuttle": {"place": "charging_station", "charge": (0.7, 0.95), "tasks": "shuttle"},
     "standing": {"place": "ward_a", "charge": (0.7, 0.95), "tasks": "standing"},
 }
 _LOW_BATTERY_PERCENT = 30.0
+_SHUTTLE = ("ward_a", "charging_station")
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,17 +58,20 @@ class Planner:
         number = f"task_{self._count:04d}"
         kind = self._choose(battery_percent)
         stages = {
-            "transport": self._transport, "charging": _charge, "standing": _stand, "ready": _ready
+            "transport": self._transport, "charging": _charge, "standing": _stand, "ready": _ready,
+            "delivery": self._deliver,
         }[kind](floor)  # fmt: skip
         cart = f"cart_{self._noise.integer(1, 20):02d}" if kind == "transport" else ""
         return Task(number, f"cart_{kind}" if cart else kind, cart, stages, now_s)
 
     def _choose(self, battery_percent: float) -> str:
-        if self._kind == "shift" and self._count == 1:
+        if self._kind in ("shift", "shuttle") and self._count == 1:
             return "ready"
-        if self._kind not in ("transport", "shift"):
+        if self._kind not in ("transport", "shift", "shuttle"):
             return str(self._kind)
         low = battery_percent < _LOW_BATTERY_PERCENT
+        if self._kind == "shuttle":
+            return "charging" if low else "delivery"
         return "charging" if low or self._count % 4 == 0 else "transport"
 
     def _transport(self, floor: int) -> list[Stage]:
@@ -84,6 +89,14 @@ class Planner:
             Stage("drive", "drive_to_delivery", deliver),
             Stage("undock", "undock_cart", deliver, 5.0),
             Stage("wait", "wait_for_task", deliver, self._noise.uniform(2.0, 8.0)),
+        ]
+
+    def _deliver(self, floor: int) -> list[Stage]:
+        """Take something to the other of two places that are near each other."""
+        goal = _SHUTTLE[self._count % 2]
+        return [
+            Stage("drive", "drive_to_delivery", goal),
+            Stage("wait", "hand_over", goal, 2.0, floor),
         ]
 
 

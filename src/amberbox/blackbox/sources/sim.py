@@ -73,7 +73,8 @@ class Config:
     robot: str = option("ropod_001", "name of the simulated robot")
     seed: int = option(1, "the same seed gives the same messages, byte for byte")
     scenario: str = option(
-        "transport", "transport, charging, standing, or shift: it stands at first"
+        "transport",
+        "transport, charging, standing, shift or shuttle: these two stand at first",
     )
     speed: float | Literal["max"] = option(1.0, "times real time, or max for no waiting")
     start: str | None = option(None, "virtual start (RFC 3339); see times")
