@@ -170,6 +170,16 @@ class Fleet(AlarmCalls):
         path = f"{_of(robot)}/missions/{quote(mission, safe='')}/end"
         return self._send("POST", path, models.Mission, {"outcome": outcome, "at": said(at)})
 
+    def notes(self, robot: str, from_: Time = None, to: Time = None) -> list[models.MomentNote]:
+        """Return what people remarked on moments, on missions too, newest first."""
+        path = f"{_of(robot)}/notes"
+        return [*paged(self.wire, path, models.MomentNote, lambda n: n.id, _span(from_, to))]
+
+    def annotate(self, robot: str, text: str, at: Time = None) -> models.MomentNote:
+        """Remark something on a moment of a robot, whether a mission was under way or not."""
+        body = {"text": text, "at": said(at)}
+        return self._send("POST", f"{_of(robot)}/notes", models.MomentNote, body)
+
     def incidents(self, robot: str, from_: Time = None, to: Time = None) -> list[models.Incident]:
         """Return the windows that robots or people want kept, newest first."""
         path = f"{_of(robot)}/incidents"
