@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from amberbox.blackbox.sources import sim
-from amberbox.blackbox.sources.sim import Config, FaultOptions, Source
+from amberbox.blackbox.sources.sim import Config, FaultOptions, Pace, Source
 from amberbox.core.config import build, parse_yaml
 from amberbox.core.errors import Problem
 from amberbox.core.source import TopicOptions
@@ -61,6 +61,36 @@ def test_a_limited_speed_is_kept_and_stamps_by_the_box() -> None:
     took_ns = sink.messages[-1][2] - sink.messages[0][2]
     assert took_ns > 200_000_000
     assert abs(sink.messages[0][2] - sink.links[0][4]) < 2_000_000_000
+
+
+class _Clock(threading.Event):
+    """A clock that only goes on while somebody waits."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.now_ns = 5_000_000_000
+
+    def monotonic_ns(self) -> int:
+        return self.now_ns
+
+    def wait(self, timeout: float | None = None) -> bool:
+        self.now_ns += round((timeout or 0.0) * 1e9)
+        return False
+
+
+def test_a_robot_that_was_held_up_makes_up_for_it_gently(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = _Clock()
+    monkeypatch.setattr(sim, "time", clock)
+    pace = Pace(1.0, START_NS, clock)
+    went_s = []
+    for number in range(200):  # 100 messages a second
+        pace.wait(START_NS + number * 10_000_000)
+        went_s.append(clock.now_ns / 1e9 - 5.0)
+        clock.now_ns += 600_000_000 if number == 19 else 0
+    assert went_s[19] == pytest.approx(0.19)
+    assert went_s[20] == pytest.approx(0.79)
+    assert went_s[50] - went_s[20] == pytest.approx(0.2, abs=0.01), "half as fast again"
+    assert went_s[-1] == pytest.approx(1.99), "in time again"
 
 
 def test_stop_ends_an_endless_robot() -> None:

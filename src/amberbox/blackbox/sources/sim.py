@@ -39,6 +39,8 @@ FOLDER = Path(__file__).parents[2] / "sim" / "folder"
 """What ``amberbox new`` writes for it: a block that records everything, and its monitors."""
 PASSIVE = "simulated in this process: there is no robot that could be disturbed"
 _NOT_WORTH_WAITING_NS = 500_000
+_HURRY = 1.5
+"""So much faster a robot may be that was held up: all at once, it would seem to jump."""
 _log = logging.getLogger(__name__)
 
 
@@ -165,15 +167,12 @@ class Source:
     def _messages(self, robot: Robot, stop: threading.Event) -> Iterator[tuple[str, int, bytes]]:
         """Yield messages when their time has come."""
         speed, end_s = self.config.speed, self.config.duration_s
+        pace = None if speed == "max" else Pace(speed, robot.start_ns, stop)
         encode = msgspec.json.Encoder().encode
         orders = Orders(Path(self.config.orders)) if self.config.orders else None
-        began_ns = time.monotonic_ns()
         for topic, sent_ns, message in robot.step_until(float("inf") if end_s is None else end_s):
-            if speed != "max":
-                due_ns = began_ns + (sent_ns - robot.start_ns) / speed
-                wait_ns = due_ns - time.monotonic_ns()
-                if wait_ns > _NOT_WORTH_WAITING_NS:
-                    stop.wait(wait_ns / NS)
+            if pace is not None:
+                pace.wait(sent_ns)
             if stop.is_set():
                 return
             for line in orders.new() if orders else ():
@@ -181,6 +180,25 @@ class Source:
             if end_s is not None:
                 self.progress = robot.now_s / end_s
             yield topic, sent_ns, encode(message)
+
+
+class Pace:
+    """Lets messages out when their time has come; a delay of this machine is made up gently."""
+
+    def __init__(self, speed: float, start_ns: int, stop: threading.Event) -> None:
+        self._speed, self._start_ns, self._stop = speed, start_ns, stop
+        self._began_ns = self._last_ns = time.monotonic_ns()
+        self._last_sent_ns = start_ns
+
+    def wait(self, sent_ns: int) -> None:
+        """Wait until a message may go that the robot sends at this time of its own."""
+        due_ns = self._began_ns + (sent_ns - self._start_ns) / self._speed
+        since_ns = (sent_ns - self._last_sent_ns) / (self._speed * _HURRY)
+        due_ns = max(due_ns, self._last_ns + since_ns)
+        now_ns = time.monotonic_ns()
+        if due_ns - now_ns > _NOT_WORTH_WAITING_NS:
+            self._stop.wait((due_ns - now_ns) / NS)
+        self._last_ns, self._last_sent_ns = max(now_ns, round(due_ns)), sent_ns
 
 
 class Orders:
