@@ -163,7 +163,9 @@ def test_gaps_are_hatched_and_say_why(page_as: PageAs, site: Site) -> None:
     )
     settle(page)
     assert page.evaluate(INK_BETWEEN, [0.0, 1.0]) == 0  # no line over what is lost
-    expect(page.locator(".plot-key").first).to_contain_text("No values in this window")
+    expect(page.locator(".plot-key").first).to_contain_text(
+        "No values in this window: lost or damaged"
+    )
 
 
 def test_gaps_that_cannot_be_had_are_asked_for_again(page_as: PageAs, site: Site) -> None:
@@ -283,6 +285,26 @@ def test_two_missions_lie_over_each_other(page_as: PageAs, site: Site) -> None:
     began_s = record.BEGIN_NS / 1e9
     for value, origin in zip(values, (-50 * 60, -20 * 60), strict=True):
         assert value == pytest.approx(4 * math.cos((origin + 65.5 - began_s) / 30), abs=0.02)
+
+
+def test_what_is_compared_ends_with_its_mission(page_as: PageAs, site: Site) -> None:
+    page = page_as("viewer")
+    origin = at(site, -50 * 60 * 10**9)
+    voltage = VOLTS | {"panel": "one"}
+    missions = [
+        voltage | {"id": "done", "label": "Done", "origin": origin, "length": 30},
+        voltage | {"id": "late", "label": "Late", "origin": at(site, 60 * 10**9), "length": 16},
+        voltage | {"id": "long", "label": "Long", "origin": origin, "length": 120},
+    ]
+    open_plots(page, 0, 120, *missions, relative=True)
+    last = page.evaluate("() => stack.now().traces.map(({ series }) => series.x.at(-1) ?? null)")
+    assert last[0] <= 30 and last[1] is None and last[2] > 110
+    expect(page.locator(".plot-key").nth(1)).to_contain_text("not on the server yet")
+    page.evaluate("() => stack.cursorTo(60)")
+    expect(page.get_by_role("row", name="Late")).not_to_contain_text("not on the server")
+    page.evaluate("() => stack.cursorTo(8)")
+    expect(page.get_by_role("row", name="Late")).to_contain_text("not on the server yet")
+    expect(page.get_by_role("row", name="Done")).to_contain_text("15")  # rows of 30 s
 
 
 def test_a_variable_goes_and_its_colour_is_free_again(page_as: PageAs, site: Site) -> None:

@@ -2,7 +2,8 @@
  * What there is of a robot over all time: where it is recorded, and what is missing.
  *
  * @typedef {{start: ?number, end: ?number, recorded: {start: number, end: number}[],
- *   missing: {start: number, end: number, reason: string}[]}} Coverage seconds; null of nothing
+ *   missing: {start: number, end: number, kind: string, reason: string}[]}} Coverage seconds;
+ *   null of nothing
  */
 
 import { ask } from "../ask.js";

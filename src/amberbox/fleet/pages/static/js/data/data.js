@@ -263,7 +263,7 @@ function say(changes) {
   const { isEmpty, unknown = [], window } = page;
   page.parts.notes.show({
     isEmpty: isEmpty && page.look.mode === "time" && page.live !== "on", unknown,
-    canFetch: page.cover !== null && lacks(page.cover, window, now()) && !page.parts.works.isAsking(),
+    canFetch: page.cover !== null && !page.look.compare.length && lacks(page.cover, window, now()) && !page.parts.works.isAsking(),
   });
 }
 

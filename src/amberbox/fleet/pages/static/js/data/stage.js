@@ -171,7 +171,7 @@ function compared(element, { robot, missions }) {
   const stack = plots(element, { ...whole, whole, relative: true, fixed: true });
   const placed = placing(stack);
   const tracesOf = (one) => missions.map((mission, n) => ({
-    ...traceOf(robot, one), id: `${one.name} ${mission.id}`, origin: begins[n],
+    ...traceOf(robot, one), id: `${one.name} ${mission.id}`, origin: begins[n], length: lengths[n],
     label: t("data.compare.label", { name: one.name, mission: mission.name, at: moment(begins[n], 60), length: span(lengths[n]) }),
   }));
   return { stack, show: ({ chosen }) => placed.show(chosen.flatMap(tracesOf)), destroy: stack.destroy };

@@ -6,6 +6,7 @@
 import { ask } from "../ask.js";
 import { asked } from "./data.js";
 import { lanesOf, marksOf } from "./marks.js";
+import { partOf } from "./trace.js";
 
 const PAUSE_MS = 250;
 
@@ -77,8 +78,9 @@ function sums(traces, view, signal) {
   return [...groups.values()].map((group) => sumsOf(group, view, signal));
 }
 
-async function sumsOf(group, { from, to }, signal) {
+async function sumsOf(group, view, signal) {
   const [{ robot, item, origin }] = group;
+  const { from, to } = partOf(group[0], view);
   const query = new URLSearchParams({ item, from: asked(Math.max(from + origin, 0)), to: asked(to + origin) });
   for (const trace of group) query.append("variables", trace.variable);
   const answer = await ask(`/api/v1/robots/${encodeURIComponent(robot)}/statistics?${query}`, { signal }).catch(() => null);

@@ -1,5 +1,5 @@
 /**
- * What panels draw with: lines, steps, bands of envelopes, dots, and hatched stretches.
+ * What panels draw with: lines, steps, bands of envelopes, dots.
  *
  * A `Frame` says where values lie on the canvas; all lengths are pixels of the canvas.
  *
@@ -15,15 +15,6 @@ import { firstFrom } from "./data.js";
 
 const DOTS_EVERY_PX = 9;
 const DASH = [5, 4];
-const HATCH_PX = 8;
-/** How stretches of a kind are hatched: lines as x1, y1, x2, y2 of a tile. */
-const HATCHES = {
-  filtered: [[0, 4, 8, 4]],
-  lost: [[0, 8, 8, 0]],
-  deleted: [[0, 8, 8, 0], [0, 0, 8, 8]],
-  uncovered: [[0, 0, 8, 8]],
-  to_come: [[4, 0, 4, 8]],
-};
 
 /** @param {Frame} frame */
 export const xOf = (frame, time) =>
@@ -37,7 +28,8 @@ const yOf = (frame, value) =>
  * Draw a variable.
  * @param {Frame} frame
  * @param {import("./data.js").Series} series
- * @param {{colour: string, steps: boolean, breaks: {from: number, to: number}[], strong: boolean}} look
+ * @param {{colour: string, steps: boolean, breaks: {from: number, to: number}[], strong: boolean,
+ *   sure: ?{from: number, to: number}}} look `sure` is from when to when it is known what is missing
  */
 export function drawSeries(frame, series, look) {
   const { context, dpr } = frame;
@@ -52,18 +44,6 @@ export function drawSeries(frame, series, look) {
   if (series.envelope) drawBand(frame, series, first, end);
   if (!(series.envelope && look.steps)) drawLine(frame, series, look, first, end);
   if (!series.envelope) drawDots(frame, series, first, end);
-  context.restore();
-}
-
-/** Hatch a stretch over the whole height. @param {Frame} frame @param {string} kind */
-export function drawStretch(frame, from, to, kind, colour) {
-  const left = Math.max(xOf(frame, from), frame.left);
-  const right = Math.min(xOf(frame, to), frame.left + frame.width);
-  if (right <= frame.left || left >= frame.left + frame.width) return;
-  const { context } = frame;
-  context.save();
-  context.fillStyle = hatch(context, kind, colour, frame.dpr);
-  context.fillRect(left, frame.top, Math.max(right - left, 2 * frame.dpr), frame.height);
   context.restore();
 }
 
@@ -147,13 +127,14 @@ function join(frame, series, look, solid, held, last, n) {
   const half = series.step / 2;
   const x = xOf(frame, series.x[n] + half);
   const y = yOf(frame, series.mean[n]);
-  const begin = last < 0 || isBroken(look.breaks, series.x[last], series.x[n]);
-  if (begin) {
+  const isSilent = last >= 0 && series.x[n] - series.x[last] > series.silence;
+  if (last < 0 || isBroken(look.breaks, series.x[last], series.x[n])
+      || (isSilent && !isSure(frame, look.sure, series.x[last], series.x[n]))) {
     solid.moveTo(x, y);
     return;
   }
   const before = yOf(frame, series.mean[last]);
-  if (series.x[n] - series.x[last] > series.silence) {
+  if (isSilent) {
     held.moveTo(xOf(frame, series.x[last] + half), before);
     held.lineTo(x, before);
     solid.moveTo(x, before);
@@ -166,6 +147,11 @@ function join(frame, series, look, solid, held, last, n) {
 /** Tell whether there is nothing between two times, and it is known why. */
 function isBroken(breaks, from, to) {
   return breaks.some((gap) => gap.from < to && gap.to > from);
+}
+
+/** Tell whether it is known of what one sees between two times that nothing is missing there. */
+function isSure(frame, sure, from, to) {
+  return sure !== null && Math.max(from, frame.from) >= sure.from && Math.min(to, frame.to) <= sure.to;
 }
 
 /** Where rows are far apart each is seen. */
@@ -183,22 +169,4 @@ function drawDots(frame, series, first, end) {
     context.arc(x, y, radius, 0, 2 * Math.PI);
   }
   context.fill();
-}
-
-/** Make a pattern of hatching. */
-function hatch(context, kind, colour, dpr) {
-  const tile = document.createElement("canvas");
-  tile.width = tile.height = HATCH_PX * Math.max(1, Math.round(dpr));
-  const pen = tile.getContext("2d");
-  pen.scale(tile.width / HATCH_PX, tile.height / HATCH_PX);
-  pen.strokeStyle = colour;
-  pen.globalAlpha = 0.4;
-  pen.lineWidth = 1.2;
-  pen.beginPath();
-  for (const [x1, y1, x2, y2] of HATCHES[kind]) {
-    pen.moveTo(x1, y1);
-    pen.lineTo(x2, y2);
-  }
-  pen.stroke();
-  return context.createPattern(tile, "repeat");
 }

@@ -23,7 +23,7 @@ export function frameOf(stack, element) {
     "aria-describedby": help.id }, flags.flags, panels, lanes.root);
   const root = el("div", { class: "plots" }, tools(stack), help, plots, holes, values.root, flags.details, spoken);
   element.append(root);
-  return { root, plots, panels, flags, lanes, holes, readout: values, toCome: t("plot.to_come"),
+  return { root, plots, panels, flags, lanes, holes, readout: values,
     say: () => setText(spoken, sentence(stack)), showTime: () => showTime(stack, values.time) };
 }
 
@@ -37,7 +37,7 @@ export function showAround(stack) {
   const found = new Map();
   for (const trace of stack.traces.values()) {
     for (const hole of stack.gapsOf(trace)) {
-      if (hole.to > stack.view.from && hole.from < stack.view.to) found.set(hole.kind, hole.reason);
+      if (hole.to > stack.view.from && hole.from < stack.view.to) found.set(hole.kind, trace.robot);
     }
   }
   const isUnsure = stack.around.isUnsure();
@@ -45,9 +45,15 @@ export function showAround(stack) {
   const key = [...found.keys(), isUnsure].sort().join();
   if (holes.dataset.shown === key) return;
   holes.dataset.shown = key;
-  holes.replaceChildren(...KINDS.filter((kind) => found.has(kind)).map((kind) =>
-    el("li", {}, el("span", { class: `plot-hatch plot-hatch-${kind}`, "aria-hidden": "true" }), t(`plot.hole.${kind}`))),
+  holes.replaceChildren(...KINDS.filter((kind) => found.has(kind)).map((kind) => holeKey(kind, found.get(kind))),
   ...(isUnsure ? [el("li", {}, icon("info"), t("plot.unsure"))] : []));
+}
+
+/** What a hatching means; files that were refused one can look at. @param {string} kind */
+function holeKey(kind, robot) {
+  const file = el("a", { href: `/recordings/${encodeURIComponent(robot)}?show=trouble#journals` }, t("plot.refused_file"));
+  return el("li", {}, el("span", { class: `plot-hatch plot-hatch-${kind}`, "aria-hidden": "true" }), t(`plot.hole.${kind}`),
+    kind === "refused" ? file : null);
 }
 
 function tools(stack) {

@@ -1,7 +1,9 @@
 /** The legend of a panel: which line is what, its value at the cursor, how much was summed up. */
 
 import { el, icon, setText } from "../dom.js";
+import { kindOver } from "./gaps.js";
 import { ratioOf, shownText, valueAt } from "./table.js";
+import { partOf } from "./trace.js";
 import { t } from "../strings.js";
 
 /** Make the key of a variable. @param {any} shown its panel @param {any} trace */
@@ -33,12 +35,15 @@ export function writeKey(key, trace, stack) {
   setText(key.value, note ? `${text} (${note})` : text);
   key.badge.hidden = ratioOf(trace) === 1;
   setText(key.badge, shownText(trace));
-  setText(key.problem, problemOf(trace));
+  setText(key.problem, problemOf(trace, stack));
   key.problem.hidden = !key.problem.textContent;
   key.root.classList.toggle("plot-waiting", !trace.series && !trace.problem);
 }
 
-function problemOf({ problem, series, live }) {
+function problemOf(trace, stack) {
+  const { problem, series, live } = trace;
   if (problem) return problem.hint ? `${problem.message}. ${problem.hint}` : problem.message;
-  return series && !series.x.length && !live ? t("plot.none_here") : "";
+  if (!series || series.x.length || live) return "";
+  const kind = kindOver(stack.gapsOf(trace), partOf(trace, stack.view));
+  return kind ? t("plot.none_because", { why: t(`plot.hole.${kind}`) }) : t("plot.none_here");
 }

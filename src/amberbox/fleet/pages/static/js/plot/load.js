@@ -5,6 +5,7 @@
 
 import { ask, askPlot } from "../ask.js";
 import { asked, moved, placed, seriesOf, withNeighbours, wordsOf } from "./data.js";
+import { partOf } from "./trace.js";
 
 const AT_ONCE = 4;
 const PATIENCE_MS = 800;
@@ -64,7 +65,8 @@ export function loader({ points, loaded, failed }) {
 /** Load a variable's rows of a window, and a little around it. */
 async function take(trace, view, points, signal) {
   const around = AROUND * (view.to - view.from);
-  const found = await rowsOf(trace, view.from - around, view.to + around, points, signal);
+  const { from, to } = partOf(trace, { from: view.from - around, to: view.to + around });
+  const found = await rowsOf(trace, from, to, points, signal);
   const series = moved(found, -trace.origin);
   if (!trace.widest || series.of >= trace.widest.of) trace.widest = series;
   trace.series = withNeighbours(series, trace.widest, view.from, view.to);

@@ -1,12 +1,13 @@
 /** Colours of plots: those of the page's style, read again when light and dark change. */
 
 const PLOTS = 8;
-const NAMES = { ink: "--ink", ink2: "--ink-2", line: "--line", surface: "--surface", accent: "--accent" };
+const NAMES = { ink: "--ink", ink2: "--ink-2", line: "--line", surface: "--surface", accent: "--accent",
+  shade: "--shade", error: "--error", errorBg: "--error-bg", staleBg: "--stale-bg" };
 
 /**
  * Read the colours that canvases draw with.
  * @param {HTMLElement} root
- * @returns {{ink: string, ink2: string, line: string, surface: string, accent: string, plot: string[]}}
+ * @returns {Record<string, string> & {plot: string[]}}
  */
 export function colours(root) {
   const probe = document.createElement("span");

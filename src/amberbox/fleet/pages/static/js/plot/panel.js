@@ -15,7 +15,8 @@ import { TIME_HEIGHT, axisWidth, timeAxis, valueAxis } from "./axes.js";
 import { el } from "../dom.js";
 import { extremes } from "./data.js";
 import { t } from "../strings.js";
-import { drawMoment, drawSeries, drawStretch } from "./draw.js";
+import { drawMoment, drawSeries } from "./draw.js";
+import { drawStretch } from "./hatching.js";
 
 const HEIGHT = 190;
 const WORDS_HEIGHT = 26;
@@ -32,7 +33,7 @@ export function panel(stack, name) {
   const legend = el("ul", { class: "plot-keys" });
   const box = el("div", { class: "plot-canvas" });
   const root = el("section", { class: "plot-panel" }, legend, box);
-  return { stack, name, root, legend, box, traces: [], chart: null, drawn: "", strong: "" };
+  return { stack, name, root, legend, box, traces: [], chart: null, drawn: "", strong: "", patterns: new Map() };
 }
 
 /** Name the scale of a variable: variables of one unit share one. */
@@ -171,8 +172,9 @@ function drawBehind(shown) {
   const seen = new Set();
   for (const trace of shown.traces) {
     for (const gap of stack.gapsOf(trace)) {
-      const key = `${gap.from} ${gap.to} ${gap.kind}`;
-      if (!seen.has(key)) drawStretch(frame, gap.from, gap.to, gap.kind, stack.colours.now.ink2);
+      const own = stack.options.relative ? stack.colours.now.plot[trace.colour] : "";
+      const key = `${gap.from} ${gap.to} ${gap.kind} ${own}`;
+      if (!seen.has(key)) drawStretch(frame, gap, { colours: stack.colours.now, own, patterns: shown.patterns });
       seen.add(key);
     }
   }
@@ -186,7 +188,7 @@ function drawTraces(shown) {
     const breaks = stack.gapsOf(trace).filter((gap) => gap.kind !== "filtered");
     const look = {
       colour: stack.colours.now.plot[trace.colour], steps: trace.names.length > 0, breaks,
-      strong: shown.strong === trace.id,
+      strong: shown.strong === trace.id, sure: stack.gaps.reach(trace),
     };
     for (const series of [trace.series, trace.live]) {
       if (series?.x.length) drawSeries(frame, series, look);

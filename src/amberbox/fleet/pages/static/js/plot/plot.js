@@ -20,10 +20,11 @@
  * @property {"number"|"enum"|"bool"|"text"} [kind] see `kindOf`
  * @property {string} [panel] variables of one panel lie over each other; else each has its own
  * @property {number} [origin] seconds that are the zero of its time (0)
+ * @property {number} [length] seconds behind `origin` that are shown, of a mission; else all
  */
 
 import { axisWidth } from "./axes.js";
-import { gapKeeper } from "./gaps.js";
+import { gapKeeper, holesOf } from "./gaps.js";
 import { listenTo } from "./input.js";
 import { makeKey, writeKey } from "./keys.js";
 import { following } from "./follow.js";
@@ -145,13 +146,7 @@ function members(stack) {
     stack.frame.plots.focus();
   }
 
-  const gapsOf = (trace) => {
-    const until = trace.series?.completeTo;
-    const holes = stack.gaps.of(trace);
-    const to = trace.live ? trace.live.x[0] : stack.view.to;
-    if (until === null || until === undefined || until >= to) return holes;
-    return [...holes, { from: until, to, kind: "to_come", reason: stack.frame.toCome }];
-  };
+  const gapsOf = (trace) => holesOf(trace, stack.gaps.of(trace), trace.live ? trace.live.x[0] : stack.view.to);
   return { add, remove, drop, gapsOf };
 }
 

@@ -39,7 +39,7 @@ export function valueAt(trace, time, gaps) {
   const series = trace.live && time >= trace.live.x[0] ? trace.live : trace.series;
   const place = series ? placeAt(series, time) : -1;
   if (gap && gap.kind !== "filtered" && !(place >= 0 && series.x[place] >= gap.from)) {
-    return { text: "–", note: gap.reason };
+    return { text: "–", note: gap.kind === "refused" ? t("plot.hole.refused") : gap.reason };
   }
   if (place < 0) return { text: "–", note: "" };
   return valueOf(trace, series, place, time);

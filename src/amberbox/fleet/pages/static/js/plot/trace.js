@@ -3,6 +3,7 @@
 import { t } from "../strings.js";
 
 const COLOURS = 8;
+const LEAST_S = 1e-3;
 
 /**
  * Tell how a column is drawn.
@@ -21,13 +22,24 @@ export function kindOf(column) {
  * @returns {import("./panel.js").Trace}
  */
 export function traceOf(about, used) {
-  const { id, robot, item, variable, label = variable, unit = "", labels = {}, origin = 0 } = about;
+  const { id, robot, item, variable, label = variable, unit = "", labels = {}, origin = 0, length = null } = about;
   const kind = about.kind ?? kindOf({ type: "", labels });
   const { codes, names } = namesOf(kind, labels);
   return {
-    id, robot, item, variable, label, unit, kind, origin, codes, names, panel: about.panel ?? id,
+    id, robot, item, variable, label, unit, kind, origin, length, codes, names, panel: about.panel ?? id,
     colour: freeColour(used), series: null, live: null, widest: null, sums: null, problem: null, asked: null,
   };
+}
+
+/**
+ * The part of a window in which a variable is shown: of a mission only its own time.
+ * @param {{length: ?number}} trace @param {import("./view.js").Span} window
+ * @returns {import("./view.js").Span}
+ */
+export function partOf({ length }, { from, to }) {
+  if (length === null) return { from, to };
+  const end = Math.min(Math.max(to, LEAST_S), Math.max(length, LEAST_S));
+  return { from: Math.min(Math.max(from, 0), end - LEAST_S), to: end };
 }
 
 /** Values that have names, in order, and the names. */
