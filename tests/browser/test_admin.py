@@ -11,6 +11,7 @@ def test_somebody_is_invited_and_chooses_a_password(page_as: PageAs) -> None:
     page.goto("/admin/users")
     page.get_by_text("Invite somebody").first.click()
     page.get_by_label("Name", exact=False).first.fill("berta")
+    page.locator("#invite").get_by_label("All robots").check()
     page.locator("#invite button").click()
     password = page.get_by_role("dialog").locator("textarea").input_value()
     page.get_by_role("button", name="I have put it away").click()
@@ -39,7 +40,8 @@ def test_a_robot_is_added_and_its_line_shown_once(page_as: PageAs) -> None:
     page.get_by_role("button", name="I have put it away").click()
     row = page.get_by_role("row").filter(has_text="ropod_009")
     expect(row).to_contain_text("never connected")
-    row.get_by_role("button", name="Switch off").click()
+    row.get_by_role("button", name="Change").click()
+    page.get_by_role("button", name="Switch off").click()
     page.get_by_role("dialog").get_by_role("button", name="Yes").click()
     expect(row).to_contain_text("switched off")
 
@@ -64,13 +66,14 @@ def test_an_admin_revokes_a_token_of_somebody(page_as: PageAs, site: Site) -> No
     page = page_as("admin")
     page.goto("/admin/users")
     row = page.locator("tr", has=page.locator("b", has_text="operator"))
-    row.get_by_text("Change", exact=True).click()
-    expect(row.get_by_text(prefix)).to_be_visible()
+    row.get_by_role("button", name="Change").click()
+    dialog = page.get_by_role("dialog")
+    expect(dialog.get_by_text(prefix)).to_be_visible()
     axe(page)
     shot(page, "admin-tokens")
-    row.get_by_role("button", name="Revoke").click()
+    dialog.get_by_role("button", name="Revoke").click()
     page.get_by_role("dialog").get_by_role("button", name="Yes").click()
-    expect(row.get_by_text(prefix)).to_have_count(0)
+    expect(page.get_by_text(prefix)).to_have_count(0)
     assert all(one["revoked"] for one in site.ask("/users/operator/tokens"))
 
 
@@ -116,3 +119,31 @@ def test_rows_are_cards_where_there_is_no_room(page_as: PageAs) -> None:
     assert role.evaluate("one => getComputedStyle(one, '::before').content") == '"Role"'
     page.set_viewport_size({"width": 1440, "height": 900})
     assert role.evaluate("one => getComputedStyle(one, '::before').content") == "none"
+
+
+def test_all_robots_are_given_by_choosing_them_and_by_nothing_else(
+    page_as: PageAs, site: Site
+) -> None:
+    page = page_as("admin")
+    page.goto("/admin/users")
+    page.get_by_text("Invite somebody").first.click()
+    page.get_by_label("Name", exact=False).first.fill("carla")
+    page.locator("#invite button").click()
+    every = page.locator("#invite").get_by_label("All robots, also those to come")
+    assert every.evaluate("one => one.validationMessage").startswith("Choose all robots")
+    page.locator("#invite").get_by_label("kitchen").check()
+    page.locator("#invite button").click()
+    page.get_by_role("button", name="I have put it away").click()
+    row = page.locator("tr", has=page.locator("b", has_text="carla"))
+    expect(row).to_contain_text("kitchen")
+    assert site.ask("/users/carla")["groups"] == ["kitchen"]
+
+    row.get_by_role("button", name="Change").click()
+    every = page.get_by_role("dialog").get_by_label("All robots, also those to come")
+    every.check()
+    expect(page.get_by_role("dialog").get_by_label("kitchen")).to_be_disabled()
+    axe(page)
+    shot(page, "admin-change")
+    page.get_by_role("dialog").get_by_role("button", name="Save").click()
+    expect(row).to_contain_text("all robots")
+    assert site.ask("/users/carla")["groups"] is None

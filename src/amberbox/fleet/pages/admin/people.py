@@ -12,6 +12,7 @@ from amberbox.fleet.api.groups import list_groups
 from amberbox.fleet.api.robots import list_cards
 from amberbox.fleet.api.users import list_people
 from amberbox.fleet.pages.page import Pages, render
+from amberbox.fleet.services import Services
 
 routes = Pages()
 
@@ -25,7 +26,7 @@ def show_people(request: Request, fleet: Fleet, who: Who) -> Response:
     with fleet.database.reading() as connection:
         tokens = working_tokens(connection, fleet.clock.wall_ns())
     return render(request, "admin/users.html", people=people, roles=list(Role), tokens=tokens,
-                  rfc3339=shown, may=who.may("users.write"))  # fmt: skip
+                  teams=_teams(fleet), rfc3339=shown, may=who.may("users.write"))  # fmt: skip
 
 
 @routes.get("/admin/teams", "users.read")
@@ -38,4 +39,9 @@ def show_teams(request: Request, fleet: Fleet, who: Who) -> Response:
 @routes.get("/admin/robots", "robots.write")
 def show_robots(request: Request, fleet: Fleet, who: Who) -> Response:
     """Show which robots may connect, and whether they do."""
-    return render(request, "admin/robots.html", cards=list_cards(fleet, who, "", "", _MOST))
+    return render(request, "admin/robots.html", cards=list_cards(fleet, who, "", "", _MOST),
+                  teams=_teams(fleet))  # fmt: skip
+
+
+def _teams(fleet: Services) -> list[str]:
+    return [group.name for group in list_groups(fleet, "", _MOST)]

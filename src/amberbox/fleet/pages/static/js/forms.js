@@ -42,7 +42,9 @@ export function fields(form) {
 
 function put(found, input) {
   const as = input.dataset.type ?? "text";
-  if (input.type === "checkbox" && as === "list") {
+  if (as === "every") {
+    if (input.checked) found[input.name] = null;
+  } else if (input.type === "checkbox" && as === "list") {
     found[input.name] = [...(found[input.name] ?? []), ...(input.checked ? [input.value] : [])];
   } else if (input.type === "checkbox") {
     found[input.name] = input.checked;

@@ -3,6 +3,7 @@
 import { ask } from "./ask.js";
 import { label } from "./cards.js";
 import { all, el, one } from "./dom.js";
+import * as every from "./every.js";
 import * as forms from "./forms.js";
 import { refresh } from "./time.js";
 import * as view from "./view.js";
@@ -60,6 +61,13 @@ function onKey(event) {
   }
 }
 
+/** Open the dialog that a button names; close the one that a button is in. */
+function openDialog(event) {
+  const opener = event.target.closest("[data-dialog]");
+  if (opener) document.getElementById(opener.dataset.dialog).showModal();
+  event.target.closest("[data-closes]")?.closest("dialog").close();
+}
+
 /** Parts that open, and whose being open stands in the address. */
 function remember(details) {
   const name = details.dataset.view;
@@ -70,8 +78,10 @@ function remember(details) {
 one("[data-theme-switch]")?.addEventListener("click", switchTheme);
 document.addEventListener("click", closeMenus);
 document.addEventListener("click", explain);
+document.addEventListener("click", openDialog);
 document.addEventListener("keydown", onKey);
 all("details[data-view]").forEach(remember);
 forms.start();
+every.start();
 refresh();
 label();
