@@ -25,6 +25,7 @@ from amberbox.fleet.knowledge.announcing import announce
 from amberbox.fleet.knowledge.explained import Explained
 from amberbox.fleet.linkend.server import Hooks, LinkServer
 from amberbox.fleet.linkend.tables import STORE
+from amberbox.fleet.pages.warming import Warming
 from amberbox.fleet.part import Part
 from amberbox.fleet.services import Services
 from amberbox.fleet.serving.doorkeeper import Doorkeeper
@@ -79,6 +80,7 @@ def parts(services: Services) -> Sequence[Part]:
     return (
         services.folders, services.asking, services.explained, services.jobs, services.fetches,
         services.alarms, services.feed, services.system, services.keeping, services.doors,
+        Warming(),
     )  # fmt: skip
 
 
