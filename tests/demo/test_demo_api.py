@@ -126,6 +126,10 @@ def test_a_robot_is_broken_and_repaired(home: House, demo: Pretended) -> None:
     assert viewer.post(path, json={"fault": "unheard_of"}).status_code == 400
     assert viewer.delete(path).status_code == 200
     assert demo.acting == {}
+    rows = home.client("admin").get("/api/v1/audit", params={"object": "ropod_002"}).json()
+    assert [(row["action"], row["details"]) for row in rows[:2]] == [
+        ("demo.repair", {"fault": FAULT}), ("demo.break", {"fault": FAULT}),
+    ]  # fmt: skip
 
 
 def test_nobody_breaks_robots_that_are_not_theirs(home: House, demo: Pretended) -> None:

@@ -21,14 +21,14 @@ STATUS: Mapping[int, str] = {
     1: "stage off",
     3: "on",
     5: "stopped",
-    8: "supply low",
+    8: "brown-out",
     19: "warm",
     35: "limit 1",
     67: "limit 2",
     99: "limit 1+2",
-    129: "no setpoint",
+    129: "no orders",
 }
-"""Names of the values that usually come of them."""
+"""Names of the values that usually come of them, short enough for an axis of a plot."""
 
 LOG_LEVELS: Mapping[int, str] = {
     10: "debug",

@@ -62,21 +62,23 @@ def read(demo: InDemo, fleet: Fleet, who: Who) -> DemoView:
 def damage(demo: InDemo, fleet: Fleet, who: Who, robot: OfRobot, wanted: Damage) -> DemoView:
     """Break a robot."""
     demo.damage(robot.id, wanted.fault)
-    return _noted(fleet, who, demo, robot.id, {"fault": wanted.fault})
+    return _noted(fleet, who, demo, robot.id, ("demo.break", {"fault": wanted.fault}))
 
 
 @routes.delete("/demo/{robot}/fault", "demo.break")
 def repair(demo: InDemo, fleet: Fleet, who: Who, robot: OfRobot) -> DemoView:
     """Repair a robot."""
+    fault = demo.broken().get(robot.id, "")
     demo.repair(robot.id)
-    return _noted(fleet, who, demo, robot.id, {"fault": ""})
+    return _noted(fleet, who, demo, robot.id, ("demo.repair", {"fault": fault}))
 
 
 def _noted(
-    fleet: Services, who: Caller, demo: Demonstration, robot: str, told: dict[str, str]
+    fleet: Services, who: Caller, demo: Demonstration, robot: str, done: tuple[str, dict[str, str]]
 ) -> DemoView:
+    action, told = done
     with fleet.database.begin() as connection:
-        who.note(connection, fleet.clock.wall_ns(), "demo.break", robot, details=told)
+        who.note(connection, fleet.clock.wall_ns(), action, robot, details=told)
     return _view(fleet, who, demo)
 
 
