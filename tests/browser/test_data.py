@@ -165,6 +165,34 @@ def test_one_against_another_and_how_often(page_as: PageAs) -> None:
     expect(page.get_by_text("coloured by time")).to_be_visible()
 
 
+def test_what_is_drawn_against_what_is_chosen_from_all(page_as: PageAs) -> None:
+    page = page_as("viewer")
+    open_data(page, VOLTS, mode="xy")
+    expect(page.get_by_text("Choose two variables: one across, one up.")).to_be_visible()
+    across, up = (page.get_by_role("combobox", name=name) for name in ("Across", "Up"))
+    expect(across).to_have_value(VOLTS)
+    expect(up).to_have_value("")
+    up.select_option("battery.charge_percent")
+    expect(page.get_by_text("coloured by time")).to_be_visible()
+    expect(page).to_have_url(re.compile(rf"x={VOLTS}&y=battery\.charge_percent"))
+    page.get_by_role("button", name=f"Take {VOLTS} away").click()
+    expect(across).to_have_value(VOLTS)
+    expect(page.get_by_text("coloured by time")).to_be_visible()
+
+
+def test_headers_and_stamps_stand_last_and_names_break_between_words(page_as: PageAs) -> None:
+    page = page_as("viewer")
+    open_data(page, SPEED)
+    page.get_by_role("treeitem", name="ros_ropod_odom, ").click()
+    names = page.locator('.tree [data-node^="item:ros_ropod_odom "]').evaluate_all(
+        "(leaves) => leaves.map((leaf) => leaf.dataset.node.split('.').pop())"
+    )
+    stamps = [name for name in names if "stamp" in name or name.startswith("header")]
+    assert stamps and names[-len(stamps) :] == stamps
+    name = page.locator("#shown .shown-name")
+    assert name.inner_html().startswith("ros_<wbr>ropod_<wbr>odom.<wbr>twist_")
+
+
 def test_two_missions_over_each_other(page_as: PageAs) -> None:
     page = page_as("viewer")
     open_data(page, VOLTS)

@@ -2,6 +2,7 @@
 
 import { el, icon } from "./dom.js";
 import { t } from "./strings.js";
+import { breakable } from "./data/names.js";
 import { asDragged } from "./data/variables.js";
 
 const MOST_PLOTS = 12;
@@ -37,7 +38,7 @@ function rowOf({ name, plot }, most, unit) {
   const options = Array.from({ length: most }, (_, n) => n + 1).map((number) => el("option", {
     value: number, selected: number === plot }, t(number === most ? "data.shown.new_plot" : "data.shown.plot", { n: number })));
   return el("li", { "data-name": name, draggable: "true" },
-    el("span", { class: "clip shown-name", title: name }, name, unit ? el("span", { class: "muted" }, ` ${unit}`) : null),
+    el("span", { class: "shown-name", title: name }, ...breakable(name), unit ? el("span", { class: "muted" }, ` ${unit}`) : null),
     el("select", { "aria-label": t("data.shown.move", { name }) }, ...options),
     el("button", { class: "button quiet icon-only small", type: "button", "data-remove": true, "aria-label": t("data.shown.remove", { name }),
       title: t("data.shown.remove", { name }) }, icon("close")));

@@ -139,7 +139,7 @@ const times = () => ({ now: now(), last: page.reach.last });
 function show() {
   const { look, parts } = page;
   followed();
-  const scene = { robot, look, chosen: chosen(), window: page.window, whole: everything(), missions: page.missions };
+  const scene = { robot, look, chosen: chosen(), window: page.window, whole: everything(), missions: page.missions, items: page.items };
   one("#data").classList.toggle("data-comparing", look.compare.length > 0);
   one("#comparing").hidden = !look.compare.length;
   parts.stage.show(scene);
@@ -150,8 +150,9 @@ function show() {
   showWindow();
   say({ isEmpty: false, unknown: look.named.filter((one) => !find(page.items, one.name)?.kind).map((one) => one.name) });
   emptyStage(one("#data-empty"), look.named.length ? [] : suggestions(), toggle);
-  one("#data-empty").hidden = look.named.length > 0;
-  one("#plots").hidden = !look.named.length;
+  const isBare = !look.named.length && look.mode !== "xy"; // where two are chosen from all
+  one("#data-empty").hidden = !isBare;
+  one("#plots").hidden = isBare;
 }
 
 function suggestions() {

@@ -7,6 +7,7 @@
  * @property {string} robot @property {Chosen[]} chosen @property {import("./view.js").Look} look
  * @property {{from: number, to: number}} window seconds @property {{from: number, to: number}} whole
  * @property {any[]} missions the two that are compared
+ * @property {import("./variablelist.js").Item[]} items all that one can choose from
  */
 
 import { fail } from "../ask.js";
@@ -17,6 +18,7 @@ import { maybeSeconds, seconds } from "../plot/data.js";
 import { moment } from "../plot/time.js";
 import { t } from "../strings.js";
 import { nowMs, span } from "../time.js";
+import { find, isNumber } from "./variablelist.js";
 import { droppedAddress, isVariable } from "./variables.js";
 import { xyView } from "../plot/xy.js";
 
@@ -198,39 +200,54 @@ function said(error, element) {
   if (error.name !== "AbortError") fail(error, element);
 }
 
-function oneAgainstAnother(element, { robot }, to) {
+function oneAgainstAnother(element, { robot, items }, to) {
   const place = el("div");
   const [x, y] = ["x", "y"].map((name) => el("select", { name }));
   const field = (name, select) => el("label", { class: "field inline" }, el("span", {}, t(`data.xy.${name}`)), select);
-  const bar = el("div", { class: "toolbar no-print" }, field("x", x), field("y", y));
+  const bar = el("div", { class: "toolbar data-axes no-print" }, field("x", x), field("y", y));
   const few = el("p", { class: "notice" }, t("data.xy.two"));
   element.append(bar, few, place);
   bar.addEventListener("change", () => to.onAxes(x.value, y.value));
   let shown = null;
+  let offered = null;
   return {
     show({ chosen, look, window }) {
-      const numbers = chosen.filter((one) => one.variable.kind !== "text");
-      const pick = (name, n) => numbers.find((one) => one.name === look[name]) ?? numbers[n];
-      const pair = [pick("x", 0), pick("y", numbers.length > 1 ? 1 : 0)];
-      bar.hidden = place.hidden = numbers.length < 2;
-      few.hidden = numbers.length >= 2;
-      if (numbers.length < 2) return;
-      [x, y].forEach((select, n) => choices(select, numbers, pair[n].name));
-      shown ??= { view: null, pair: [] };
-      const key = pair.map((one) => one.name).join("\n");
-      if (shown.key !== key) {
-        shown.view?.destroy();
+      const used = chosen.map((one) => one.variable).filter(isNumber);
+      const pair = pairOf(items, used, look);
+      const offers = used.map((one) => one.address).join("\n");
+      if (offers !== offered) for (const select of [x, y]) offer(select, items, used);
+      offered = offers;
+      [x, y].forEach((select, n) => (select.value = pair[n]?.address ?? ""));
+      place.hidden = !pair.every(Boolean);
+      few.hidden = !place.hidden;
+      if (place.hidden) return;
+      const key = pair.map((one) => one.address).join("\n");
+      if (shown?.key !== key) {
+        shown?.view.destroy();
         place.replaceChildren();
-        shown = { key, view: following(place, (span) => xyView(place, { x: traceOf(robot, pair[0]), y: traceOf(robot, pair[1]), ...span })) };
+        const [across, up] = pair.map((variable) => traceOf(robot, { name: variable.address, plot: 1, variable }));
+        shown = { key, view: following(place, (span) => xyView(place, { x: across, y: up, ...span })) };
       }
       shown.view.show(key, window);
     },
-    destroy: () => shown?.view?.destroy(),
+    destroy: () => shown?.view.destroy(),
   };
 }
 
-function choices(select, numbers, name) {
-  select.replaceChildren(...numbers.map((one) => el("option", { value: one.name, selected: one.name === name }, one.name)));
+/** What is drawn across and up: what the address names, else the first of those that are shown. */
+function pairOf(items, used, look) {
+  const [x, y] = [look.x, look.y].map((name) => find(items, name)).map((one) => (one && isNumber(one) ? one : null));
+  const first = x ?? used.find((one) => one !== y) ?? null;
+  return [first, y ?? used.find((one) => one !== first) ?? null];
+}
+
+/** Offer all variables with numbers, first those that are shown. */
+function offer(select, items, used) {
+  const options = (variables) => variables.map(({ address }) => el("option", { value: address }, address));
+  const others = items.map((item) => ({ name: item.name, variables: item.variables.filter((one) => isNumber(one) && !used.includes(one)) }));
+  select.replaceChildren(el("option", { value: "" }, t("data.xy.choose")),
+    ...(used.length ? [el("optgroup", { label: t("data.xy.shown") }, ...options(used))] : []),
+    ...others.filter(({ variables }) => variables.length).map(({ name, variables }) => el("optgroup", { label: name }, ...options(variables))));
 }
 
 function howOften(element, { robot }) {
@@ -247,7 +264,7 @@ function howOften(element, { robot }) {
   }
   return {
     show({ chosen, window }) {
-      const numbers = chosen.filter((one) => one.variable.kind !== "text");
+      const numbers = chosen.filter((one) => isNumber(one.variable));
       few.hidden = numbers.length > 0 || !chosen.length;
       for (const name of [...shown.keys()]) if (!numbers.some((one) => one.name === name)) drop(name);
       for (const one of numbers) {

@@ -18,7 +18,7 @@ import { kindOf } from "../plot/trace.js";
 
 const UNDRAWN = /^(list<|binary|time$|duration$)/;
 const TELLING = [/charge|soc\b|percent/i, /volt|battery/i, /wheel|odom|velocity|twist_linear_x|speed/i, /temperature|current/i];
-const DULL = /^(timestamp|received|stamp|seq|index)$|stamp_|_stamp$/i;
+const DULL = /^(timestamp|received|stamp|seq|index)$|stamp_|_stamp$|(^|_)(header|frame_id)(_|$)/i;
 const OWN = "amberbox";
 
 /** Ask for all variables of a robot. @returns {Promise<Item[]>} */
@@ -29,7 +29,8 @@ export async function loadItems(robot) {
 
 function itemOf(about) {
   const { name, topic, type, rows, chosen } = about;
-  const variables = about.columns.map((column) => variableOf(about, column));
+  const every = about.columns.map((column) => variableOf(about, column));
+  const variables = [...every.filter((one) => !DULL.test(one.name)), ...every.filter((one) => DULL.test(one.name))];
   return { name, topic, type, rows, chosen, variables, rate: about.rate_hz, isOwn: about.source === OWN,
     first: maybeSeconds(about.first), last: maybeSeconds(about.last) };
 }
@@ -77,6 +78,9 @@ export function search(items, text) {
   return items.map((item) => ({ ...item, variables: item.variables.filter(fits) }))
     .filter((item) => item.variables.length);
 }
+
+/** Tell whether a variable has numbers, also under names. @param {Variable} variable */
+export const isNumber = ({ kind }) => Boolean(kind) && kind !== "text";
 
 /** Suggest variables to begin with. @param {Item[]} items @returns {Variable[]} */
 export function suggested(items, most = 6) {

@@ -4,6 +4,7 @@
  */
 
 import { all, el, icon, one } from "../dom.js";
+import { breakable } from "./names.js";
 import { spark, sparklines } from "./sparklines.js";
 import { t } from "../strings.js";
 import { find, search } from "./variablelist.js";
@@ -98,7 +99,7 @@ function branchOf(state, branch) {
   const isOpen = branch.isFound || state.opened.has(branch.id);
   const label = t("data.tree.branch", { name: branch.title, n: branch.variables.length });
   const count = el("span", { class: "muted small tree-note" }, branch.note);
-  const row = el("div", { class: "tree-row", title: branch.help }, icon("next"), el("span", { class: "tree-name" }, branch.title), count);
+  const row = el("div", { class: "tree-row", title: branch.help }, icon("next"), el("span", { class: "tree-name" }, ...breakable(branch.title)), count);
   const item = el("li", { role: "treeitem", "aria-expanded": String(isOpen), "aria-label": label, tabindex: "-1",
     "data-node": branch.id }, row);
   item.fillBranch = () => fillBranch(state, item, branch);
@@ -129,7 +130,7 @@ function leafOf(state, branch, variable) {
     "aria-disabled": kind ? null : "true", "aria-label": label, tabindex: "-1", draggable: kind ? "true" : null,
     "data-address": kind ? address : null, "data-node": `${branch.id} ${address}` },
   el("div", { class: "tree-row", title: about }, el("span", { class: "tree-check", "aria-hidden": "true" }, icon("check")),
-    el("span", { class: "tree-name" }, name, variable.unit ? el("span", { class: "muted" }, ` ${variable.unit}`) : null), spark(variable)));
+    el("span", { class: "tree-name" }, ...breakable(name), variable.unit ? el("span", { class: "muted" }, ` ${variable.unit}`) : null), spark(variable)));
   if (!branch.isMixed) state.lines.watch(item);
   return item;
 }
