@@ -4,6 +4,7 @@ from tests.browser.conftest import PageAs
 from tests.browser.expecting import expect
 from tests.browser.looks import axe, shot
 from tests.browser.site import Site
+from tests.fleet.notifying.receivers import hook_server
 
 
 def test_somebody_is_invited_and_chooses_a_password(page_as: PageAs) -> None:
@@ -147,3 +148,34 @@ def test_all_robots_are_given_by_choosing_them_and_by_nothing_else(
     page.get_by_role("dialog").get_by_role("button", name="Save").click()
     expect(row).to_contain_text("all robots")
     assert site.ask("/users/carla")["groups"] is None
+
+
+def test_a_destination_is_tried_and_its_answer_shown(page_as: PageAs, site: Site) -> None:
+    page = page_as("admin")
+    page.goto("/admin/settings/notifications")
+    expect(page.get_by_text("Nobody is told yet.")).to_be_visible()
+    with hook_server() as hook:
+        page.get_by_role("group", name="By webhook").get_by_role("button", name="Add").click()
+        entry = page.locator(".entry")
+        expect(entry.get_by_text("One is stored")).to_have_count(0)
+        entry.get_by_role("textbox", name="Name", exact=True).fill("pager")
+        entry.get_by_label("Address").fill(hook.url)
+        entry.get_by_label("Secret").fill("0123456789abcdef")
+        page.get_by_role("button", name="Save").click()
+        row = page.locator("[data-destinations] li")
+        expect(row).to_contain_text("pager by webhook to 127.0.0.1")
+        expect(entry.get_by_text("One is stored")).to_be_visible()
+
+        row.get_by_role("button", name="Send a test message").click()
+        expect(row).to_contain_text("Taken by the receiver at")
+        assert b'"type": "test"' in hook.bodies[0]
+        hook.status = 503
+        row.get_by_role("button", name="Send a test message").click()
+        expect(row.get_by_role("alert")).to_contain_text("the answer was 503")
+        axe(page)
+        shot(page, "admin-notifications")
+    tried = [one["object"] for one in site.ask("/audit?action=notifications.test")]
+    assert tried == ["pager", "pager"]
+    page.locator(".entry").get_by_role("button", name="Remove").click()
+    page.get_by_role("button", name="Save").click()
+    expect(page.get_by_text("Nobody is told yet.")).to_be_visible()

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from typing import Annotated, Literal
+from urllib.parse import urlsplit
 
 from fastapi import Path, Request, Response
 
 from amberbox.fleet.api.access import Fleet, Who
 from amberbox.fleet.api.notifications import list_notifications
 from amberbox.fleet.api.settings import read_setting
-from amberbox.fleet.notifying.settings import Notifications
+from amberbox.fleet.notifying.settings import Notifications, Webhook
 from amberbox.fleet.options.options import read
 from amberbox.fleet.pages.page import Pages, render
 from amberbox.fleet.services import Services
@@ -32,7 +33,20 @@ def show(request: Request, fleet: Fleet, who: Who, setting: Name) -> Response:
     )  # fmt: skip
 
 
-def _destinations(fleet: Services) -> list[str]:
+@dataclass(frozen=True, slots=True)
+class Told:
+    """Who is told: the name, how, and where in a few words."""
+
+    name: str
+    how: Literal["email", "webhook"]
+    where: str
+
+
+def _destinations(fleet: Services) -> list[Told]:
     with fleet.database.reading() as connection:
         found = read(connection, "notifications", Notifications)
-    return [one.name for one in found.destinations()]
+    return [
+        Told(one.name, "webhook", urlsplit(one.url).netloc) if isinstance(one, Webhook)
+        else Told(one.name, "email", ", ".join(one.to))
+        for one in found.destinations()
+    ]  # fmt: skip

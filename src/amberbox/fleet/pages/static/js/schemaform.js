@@ -40,7 +40,8 @@ const field = (name, ...inside) => el("label", { class: "field" }, el("span", {}
 
 function text(_, value, name) {
   const input = el("input", { type: SECRET.test(name) ? "password" : "text", value: value ?? "", maxlength: 1000, autocomplete: "off", spellcheck: "false" });
-  return { node: field(name, input), read: () => input.value };
+  const kept = SECRET.test(name) && value ? el("small", { class: "note" }, t("setting.kept")) : null;
+  return { node: field(name, input, kept), read: () => input.value };
 }
 
 function number(form, value, name) {

@@ -4,6 +4,7 @@ import { ask, clear, fail, toast } from "./ask.js";
 import { all, brought, el, one } from "./dom.js";
 import { editor } from "./schemaform.js";
 import { t } from "./strings.js";
+import { local, nowMs } from "./time.js";
 
 const setting = brought("setting");
 const form = one("#setting-form");
@@ -15,25 +16,29 @@ async function save(event) {
   try {
     await ask(`/api/v1/settings/${setting.name}`, { method: "PUT", body: made.read() });
     toast(t("setting.saved"));
-    if (one("[data-destinations]")) location.reload();
+    if (one("#destinations")) location.reload();
   } catch (error) {
     fail(error, form);
   }
 }
 
+/** Send a test to a destination, and say beside it what became of that. */
 async function tryOut(button) {
-  button.setAttribute("aria-busy", "true");
-  const body = { destination: button.dataset.test };
-  const near = button.closest("li");
-  clear(near);
+  const place = button.closest("li");
+  const said = one("[data-answer]", place);
+  clear(place);
+  said.textContent = t("setting.sending");
+  button.disabled = true;
   try {
+    const body = { destination: button.dataset.test };
     const { arrived, trouble } = await ask("/api/v1/settings/notifications/test", { method: "POST", body });
-    if (arrived) toast(t("setting.arrived"));
-    else fail({ message: t("setting.not_arrived"), hint: trouble }, near);
+    said.textContent = arrived ? t("setting.arrived", { at: local(nowMs(), "time") }) : "";
+    if (!arrived) fail({ message: t("setting.not_arrived"), hint: trouble }, place);
   } catch (error) {
-    fail(error, near);
+    said.textContent = "";
+    fail(error, place);
   } finally {
-    button.removeAttribute("aria-busy");
+    button.disabled = false;
   }
 }
 
