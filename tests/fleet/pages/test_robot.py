@@ -155,8 +155,8 @@ def test_hostile_names_and_reasons_are_text(home: House) -> None:
 
 
 def test_operators_act_and_viewers_look(home: House) -> None:
-    assert "data-dialog" not in page(home)
-    acts = set(re.findall(r'data-dialog="(\w+)"', page(home, PAGE, "operator")))
+    assert "data-act" not in page(home)
+    acts = set(re.findall(r'data-act="(\w+)"', page(home, PAGE, "operator")))
     assert acts == {"incident", "begin"}
 
 

@@ -9,7 +9,7 @@ import { all, one } from "../dom.js";
  */
 export function startActs(page, done) {
   page.addEventListener("click", (event) => {
-    const button = event.target.closest("button[data-dialog]");
+    const button = event.target.closest("button[data-act]");
     if (button) open(button.dataset);
   });
   for (const dialog of all("dialog")) {
@@ -22,7 +22,7 @@ export function startActs(page, done) {
 }
 
 /** Open a dialog, empty; `path` is where its form is sent. */
-function open({ dialog: name, path }) {
+function open({ act: name, path }) {
   const dialog = one(`#dialog-${name}`);
   const form = one("form", dialog);
   if (path) form.dataset.post = path;
