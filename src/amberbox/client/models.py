@@ -82,6 +82,7 @@ class Output(Answer, frozen=True):
     expected: str = ""
     severity: str = ""
     description: str = ""
+    unit: str = ""
 
 
 class Condition(Answer, frozen=True):

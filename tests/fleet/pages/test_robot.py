@@ -233,10 +233,35 @@ def test_numbers_have_digits_that_tell_something(value: float, text: str) -> Non
 @pytest.mark.parametrize(
     ("name", "unit"),
     [("rate_hz", "Hz"), ("volts", "V"), ("time_to_empty", ""), ("m", ""), ("left_m", "m"),
-     ("charge_percent", "%"), ("a", "")],
+     ("charge_percent", "%"), ("a", ""), ("kelvin_per_s", ""), ("per_s", ""), ("paper_s", "s")],
 )  # fmt: skip
 def test_units_are_read_from_names(name: str, unit: str) -> None:
-    assert robottree.unit(name) == unit
+    assert robottree.guessed_unit(name) == unit
+
+
+@pytest.mark.parametrize(
+    ("name", "type", "declared", "label", "unit"),
+    [("rate_hz", "float", "", "rate", "Hz"), ("charge", "float", "%", "charge", "%"),
+     ("mb_per_s", "float", "MB/s", "mb per s", "MB/s"),
+     ("over_voltage", "bool", "", "over voltage", ""),
+     ("supply_voltage", "float", "V", "supply voltage", "V"), ("age_s", "float", "", "age", ""),
+     ("left_m", "float", "mm", "left m", "mm")],
+)  # fmt: skip
+def test_a_unit_is_declared_else_guessed_and_not_said_twice(
+    name: str, type: str, declared: str, label: str, unit: str
+) -> None:
+    output = Output(name, type, 1.0, "", "", "", declared)
+    assert (robottree.label(output), robottree.unit(output)) == (label, unit)
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [(0.1, "0.100 s"), (119.0, "119.0 s"), (120.0, "2 min"), (3725.0, "1 h 2 min"),
+     (49887.0, "13 h 51 min"), (90061.0, "1 d 1 h"), (-200.0, "-3 min 20 s")],
+)  # fmt: skip
+def test_numbers_of_seconds_are_durations(seconds: float, text: str) -> None:
+    assert robottree.shown(Output("time_to_empty", "float", seconds, "", "", "", "s")) == text
+    assert robottree.shown(Output("left_s", "float", None, "", "", "")) != text
 
 
 @pytest.mark.parametrize(

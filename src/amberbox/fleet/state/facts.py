@@ -43,6 +43,7 @@ class OutputFacts(msgspec.Struct, frozen=True):
     severity: str = ""
     description: str = ""
     hint: str = ""
+    unit: str = ""
 
 
 class ComponentFacts(msgspec.Struct, frozen=True):

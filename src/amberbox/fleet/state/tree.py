@@ -79,5 +79,11 @@ def _mode(status: Standing, facts: ComponentFacts, when: Moment) -> Mode:
 
 def _output(said: SaidOutput, facts: OutputFacts) -> Output:
     return Output(
-        said.name, said.type, said.shown, facts.expected, facts.severity, facts.description
+        said.name,
+        said.type,
+        said.shown,
+        facts.expected,
+        facts.severity,
+        facts.description,
+        facts.unit,
     )

@@ -88,6 +88,7 @@ class Output:
     expected: str
     severity: str
     description: str
+    unit: str = ""
 
 
 @dataclass(frozen=True, slots=True)

@@ -49,5 +49,5 @@ def _outputs(component: ComponentPlan, mode: str) -> Iterator[OutputFacts]:
                 shown = "" if expected.value is None else str(expected)
                 yield OutputFacts(
                     output.name, shown, output.severity if shown else "", output.description,
-                    output.hint,
+                    output.hint, output.result.unit,
                 )  # fmt: skip

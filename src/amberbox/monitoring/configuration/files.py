@@ -49,6 +49,7 @@ class OutputOptions:
     type: OutputType = option(doc="what its values are")
     expected: Any = option(None, "what it should be: a value, '>= 50', '2 .. 8', {min: 2, max: 8}")
     result: str = option("", "result of the monitor that it shows; else by name, else by type")
+    unit: str = option("", "unit of its numbers, for people; else what the monitor says")
     severity: Severity = option("urgent", "what it means for the robot if it is not as expected")
     for_s: float = option(
         0.0, "how long it must be bad before it counts", unit="s", aliases=["for"]

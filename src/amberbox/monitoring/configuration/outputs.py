@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 from amberbox.core.config import did_you_mean
@@ -82,7 +82,7 @@ def _plan(output: OutputOptions, binding: Binding, inputs: int, tell: Tell) -> O
     return OutputPlan(
         output.name.strip(),
         kind,
-        binding.result,
+        replace(binding.result, unit=output.unit or binding.result.unit),
         binding.place,
         expected,
         output.severity,

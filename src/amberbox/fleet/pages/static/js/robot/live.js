@@ -6,6 +6,8 @@ import { t } from "../strings.js";
 import { nowMs, span, when } from "../time.js";
 
 const DIGITS = 4;
+const [LONG_S, FOREVER_S] = [120, 1e9];
+const SPANS = [["d", 86400], ["h", 3600], ["min", 60], ["s", 1]];
 
 /** Return the name by which something is found: as robottree.py makes it. */
 export const key = (component, mode = "", output = "") => [component, mode, output].map(encodeURIComponent).join("/");
@@ -18,10 +20,22 @@ export function number(value) {
   return value.toFixed(Math.max(0, DIGITS - 1 - whole));
 }
 
+/** Write a duration, as tree.py does: in two units from 2 min on. @param {number} value seconds */
+export function duration(value) {
+  const whole = Math.floor(Math.abs(value));
+  if (!(Math.abs(value) >= LONG_S && Math.abs(value) < FOREVER_S)) return `${number(value)} s`;
+  const place = SPANS.findIndex(([, size]) => whole >= size);
+  const [[most, size], next] = [SPANS[place], SPANS[place + 1]];
+  const parts = [[most, Math.floor(whole / size)], ...(next ? [[next[0], Math.floor((whole % size) / next[1])]] : [])];
+  const text = parts.filter(([, n]) => n).map(([name, n]) => t(`common.span.${name}`, { n })).join(" ");
+  return value < 0 ? `-${text}` : text;
+}
+
 /** Write a value of an output. @param {unknown} value @param {string} type */
 export function shown(value, type) {
   if (value === null || value === undefined) return t("robot.value.none");
   if (typeof value === "boolean") return t(value ? "robot.value.yes" : "robot.value.no");
+  if (typeof value === "number" && type === "duration") return duration(value);
   return typeof value === "number" && type === "float" ? number(value) : String(value);
 }
 
