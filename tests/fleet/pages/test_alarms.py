@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Iterator
 from dataclasses import asdict, replace
@@ -16,14 +15,14 @@ from amberbox.consult.telling import explained, json_of
 from amberbox.core.clock import NS
 from amberbox.core.timetext import format_time
 from amberbox.diagnosis.situation import Situation
+from amberbox.fleet.alarms import words as wordsof
 from amberbox.fleet.alarms.alarm import Alarm
 from amberbox.fleet.alarms.tables import ALARM, ALARM_ROBOT, CONSEQUENCE, HISTORY
+from amberbox.fleet.alarms.words import explanation_of, written
 from amberbox.fleet.api.alarmlines import AlarmLine, Happening, line_of
-from amberbox.fleet.knowledge.notebook import Given, keep_answer
 from amberbox.fleet.notifying.tables import OUTBOX
 from amberbox.fleet.pages.alarms.search import Look
-from amberbox.fleet.pages.alarms.view import Item
-from amberbox.fleet.pages.alarms.wording import Words, events, words_of
+from amberbox.fleet.pages.alarms.wording import Words, checks_fail, events
 from amberbox.fleet.pages.figures import span
 from tests.fleet.house import START_NS, House, house
 from tests.fleet.knowledge import robot as sim
@@ -177,8 +176,9 @@ def test_who_is_not_signed_in_sees_no_number(home: House) -> None:
 
 def test_an_alarm_in_words(home: House) -> None:
     found = page(home, "/pieces/alarms", robot="ropod_001", q="laser")
-    for text in ("Laser front: laser_front is broken", "it cannot go on with what it does",
-                 "Laser front: silent or Laser front: no power (very likely)", "7 times",
+    for text in ("Laser front: “laser front” fails", "laser_front is broken",
+                 "it cannot go on with what it does",
+                 "Laser front: silent or Laser front: no power (cannot tell them apart)", "7 times",
                  "happened while offline", "1 part suffers from it", "Task executor"):  # fmt: skip
         assert text in found, text
 
@@ -193,24 +193,59 @@ def explained_answer(revision: int, **answers: str) -> dict[str, Any]:
     return {**told, "revision": revision}
 
 
-def cause_of(home: House, line: AlarmLine) -> str:
-    with home.services.database.reading() as connection:
-        of = [("ropod_001", line.diagnosis)]
-        return words_of(connection, home.services, of).cause(line)
+def told(answer: dict[str, Any]) -> AlarmLine:
+    """Return an alarm that is explained by an answer."""
+    found = explanation_of("ropod_001", answer)
+    assert found is not None
+    return line_of(replace(ALARMS[1], diagnosis="d-1", words=written(found.words)), [])
 
 
 def test_the_cause_is_told_as_on_the_card_of_the_diagnosis(home: House) -> None:
-    services, line = home.services, line_of(replace(ALARMS[1], diagnosis="d-1"), [])
-    assert cause_of(home, line) == "Laser front: silent or Laser front: no power (very likely)"
-    first = explained_answer(1)
-    services.explained._keep(("ropod_001", "d-1", 1, "open", ()), first)
-    assert cause_of(home, line).startswith("one of these: The ")
-    given, more = Given("laser_front.lamp", "no", "anna", 1), explained_answer(1, **LAMP_OFF)
-    with services.database.begin() as connection:
-        keep_answer(connection, "ropod_001", "d-1", given, json.dumps(more).encode())
-    assert re.fullmatch(r"The front laser has no power \(\d\d %\)", cause_of(home, line))
-    services.explained._keep(("ropod_001", "d-1", 2, "open", ()), {**first, "revision": 2})
-    assert cause_of(home, line).startswith("one of these: The ")
+    words, line = Words(home.services), line_of(replace(ALARMS[1], diagnosis="d-1"), [])
+    assert words.cause(line) == (
+        "Laser front: silent or Laser front: no power (cannot tell them apart)"
+    )
+    both = told(explained_answer(1))
+    assert re.fullmatch(
+        r"The \w+ of the front laser .* or the front laser has no power "
+        r"\(cannot tell them apart, \d\d %\)", words.cause(both)
+    )  # fmt: skip
+    one = told(explained_answer(1, **LAMP_OFF))
+    assert re.fullmatch(r"The front laser has no power \(likely, \d\d %\)", words.cause(one))
+    assert words.title(one) == "The front laser has no power"
+
+
+def test_history_names_failures_as_the_card_does(home: House) -> None:
+    words, line = Words(home.services), told(explained_answer(1, **LAMP_OFF))
+    said = words.plain(line, "laser_front#silent (almost certain)")
+    assert said == "The front laser has no power (likely)"
+    assert words.plain(line, "laser_front#silent (possible)").endswith("(possible)")
+
+
+@pytest.mark.parametrize(
+    ("reason", "title"),
+    [
+        ("operational is false, expected true", "Laser: “operational” fails"),
+        ("operational is false, expected true; power_on is false, expected true: no power",
+         "Laser: “operational” and “power on” fail"),
+        ("a is 1, expected 2; b was not as expected less than 20 s ago; c flapping: 9 changes",
+         "Laser: “a” and 2 more fail"),
+        ("does_not_jump was not as expected less than 20 s ago", "Laser: “does not jump” fails"),
+        ("no message for 3 s", "Laser: no message for 3 s"),
+        ("", "Laser"),
+    ],
+)  # fmt: skip
+def test_without_a_cause_the_title_says_which_checks_fail(reason: str, title: str) -> None:
+    assert checks_fail("Laser", reason) == title
+
+
+def test_what_nobody_described_is_no_title(home: House) -> None:
+    other = wordsof.Words([wordsof.Cause("something", "other")], 0.7)
+    line = line_of(replace(ALARMS[1], words=written(other)), [])
+    assert Words(home.services).title(line) == "Laser front: “laser_front” fails".replace("_", " ")
+    assert Words(home.services).cause(line) == (
+        "Something that nobody has described yet (likely, 70 %)"
+    )
 
 
 @pytest.mark.parametrize(
@@ -220,7 +255,7 @@ def test_the_cause_is_told_as_on_the_card_of_the_diagnosis(home: House) -> None:
 def test_robots_that_are_away_in_words(home: House, origin: str, title: str) -> None:
     away = replace(ALARMS[-1], origin=origin, robot="ropod_001", reason="offline: ropod_001")
     line = line_of(away, [])
-    assert Item(line, Words(home.services).what(line), "", "", (), may=True).title == title
+    assert Words(home.services).title(line) == title
     assert "while it is away" in page(home, f"/alarms/{SEVERAL}")
 
 
@@ -264,11 +299,14 @@ def test_it_is_said_why_one_can_do_nothing(home: House) -> None:
     assert "robots of other teams" in page(home, f"/alarms/{SEVERAL}", "nurse")
 
 
-def test_only_who_may_read_the_accounts_gives_to_others(home: House) -> None:
-    assert '<select name="user">' not in page(home, "/alarms/1", "technician")
-    found = page(home, "/alarms/1", "admin")
-    assert set(re.findall(r"<option[^>]*>(\w+)</option>", found)) == {
-        "operator", "technician", "admin", "nurse"}  # fmt: skip
+@pytest.mark.parametrize(
+    ("number", "people"),
+    [(1, {"operator", "technician", "admin", "nurse"}), (3, {"operator", "technician", "admin"})],
+)
+def test_an_alarm_is_given_to_who_may_change_it(home: House, number: int, people: set[str]) -> None:
+    found = page(home, f"/alarms/{number}", "operator")
+    assert set(re.findall(r"<option[^>]*>(\w+)</option>", found)) == people
+    assert '<select name="user">' not in page(home, f"/alarms/{number}", "viewer")
 
 
 def test_forms_carry_the_revision_that_was_seen(home: House) -> None:
@@ -347,10 +385,10 @@ def test_history_in_words_the_newest_first(home: House) -> None:
         Happening(at, "", "new_word", "of a later version"),
     ) == [
         ("new_word", "of a later version", ""),
-        ("Closed", "over", ""),
-        ("Over by itself", "it came 3 times", ""),
-        ("Came back by itself", "its time is over", ""),
-        ("Put aside", "until 5: spare", "2027-01-15T08:00:00Z"),
+        ("Resolved", "over", ""),
+        ("Resolved by itself", "it came 3 times", ""),
+        ("Unshelved by itself", "its time is over", ""),
+        ("Shelved", "until 5: spare", "2027-01-15T08:00:00Z"),
         ("The diagnosis says", "Laser front: silent (likely)", ""),
         ("It got worse", "critical: it cannot go on with what it does", ""),
     ]

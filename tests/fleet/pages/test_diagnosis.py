@@ -4,11 +4,13 @@ import html
 import re
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import Any, Literal
 
 import pytest
 from starlette.testclient import TestClient
 
 from amberbox.core.clock import NS
+from amberbox.core.types import Diagnosis
 from amberbox.fleet.api import diagnoses
 from amberbox.fleet.knowledge import explained
 from amberbox.fleet.pages.diagnosis import look as diagnosislook
@@ -220,6 +222,85 @@ def test_what_is_over_is_said_to_be_over(tmp_path_factory: pytest.TempPathFactor
         assert "The front laser has no power" in before and "Do this next" not in before
         assert "Nothing is known to be broken" in part(viewer, "/others")
         assert "Speaks for it" in part(viewer, f"/others?diagnosis={sim.DIAGNOSIS}")
+
+
+IMU = "imu/registers/turn_rate_moves"
+
+
+def revised(
+    number: int, at_ns: int, *names: str, state: Literal["open", "healed"] = "open"
+) -> Diagnosis:
+    """Return a revision that the robot made of these symptoms."""
+    made = sim.diagnosis(at_ns, *(sim.symptom(name, at_ns) for name in names))
+    return replace(made, revision=number, state=state)
+
+
+def told(*found: tuple[int, str, Any], at_ns: int = sim.AT_NS) -> list[tuple[int, Any]]:
+    """Return what the watcher says of symptoms, seconds after the first instant."""
+    return [(at_ns + s * NS, sim.symptom(name, at_ns + s * NS, state)) for s, name, state in found]
+
+
+def test_what_is_not_seen_any_more_is_grey_and_in_the_past(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> None:
+    with house(tmp_path_factory.mktemp("gone"), shared=True) as home:
+        at_ns = sim.AT_NS
+        sim.hand_in(home)
+        sim.state(home)
+        sim.say(home, [
+            (at_ns, sim.status("laser_front", at_ns)), *told((0, sim.NO_SCANS, "present")),
+            (at_ns, revised(1, at_ns, sim.NO_SCANS)),
+        ])  # fmt: skip
+        operator = home.client("operator")
+        assert "What is broken" in part(operator, "/card")
+        sim.say(home, told((90, sim.NO_SCANS, "absent")), start=50)
+        for path in ("", "/card"):
+            shown = part(operator, path)
+            assert "What was broken" in shown and "Nothing of this is seen since" in shown
+            assert "Could the robot be used then?" in shown and "Do this next" not in shown
+            assert "failed" in shown.split("Why")[1] and "(1 min), fine again" in shown
+        assert 'class="card dx dx-gone"' in operator.get(BASE).text
+
+
+def test_an_answer_starts_from_what_the_robot_made_its_last_revision_of(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> None:
+    with house(tmp_path_factory.mktemp("dropped"), shared=True) as home:
+        at_ns = sim.AT_NS
+        sim.hand_in(home)
+        sim.state(home)
+        sim.say(home, [  # that the sensor was well again is not here, for whatever reason
+            (at_ns, sim.status("laser_front", at_ns)),
+            *told((0, IMU, "present"), (0, sim.NO_SCANS, "present")),
+            (at_ns, revised(1, at_ns, IMU, sim.NO_SCANS)),
+            (at_ns + 20 * NS, revised(2, at_ns + 20 * NS, sim.NO_SCANS)),
+        ])  # fmt: skip
+        body = {"test": "laser_front.lamp", "answer": "no"}
+        answer = home.client("operator").post(f"{API}/answers", json=body)
+        assert answer.status_code == 200, answer.text
+        (leading, *_) = answer.json()["hypotheses"]
+        assert (leading["faults"], leading["probability"] > 0.9) == (["laser_front#silent"], True)
+        (why,) = answer.json()["explanation"]["because"]
+        assert why["id"] == sim.NO_SCANS
+
+
+def test_a_revision_of_then_is_shown_as_it_was(tmp_path_factory: pytest.TempPathFactory) -> None:
+    with house(tmp_path_factory.mktemp("then"), shared=True) as home:
+        at_ns = sim.AT_NS
+        sim.hand_in(home)
+        sim.state(home)
+        sim.say(home, [
+            (at_ns, sim.status("laser_front", at_ns)), *told((0, sim.NO_SCANS, "present")),
+            (at_ns, revised(1, at_ns, sim.NO_SCANS)), *told((5, sim.NO_SCANS, "absent")),
+            *told((20, IMU, "present")), (at_ns + 20 * NS, revised(2, at_ns + 20 * NS, IMU)),
+        ])  # fmt: skip
+        viewer = home.client("viewer")
+        then = part(viewer, f"/card?diagnosis={sim.DIAGNOSIS}&revision=1")
+        assert "The front laser has no power" in then and "What was broken" in then
+        assert "This is what was known last while the alarm lasted" in then
+        assert "Do this next" not in then
+        now = part(viewer, f"/card?diagnosis={sim.DIAGNOSIS}")
+        assert "front laser" not in now and "What is broken" in now
 
 
 def test_somebody_answers_and_says_what_it_was(tmp_path_factory: pytest.TempPathFactory) -> None:

@@ -124,7 +124,7 @@ def test_without_any_explanation_the_revision_speaks_by_ids() -> None:
     ]  # fmt: skip
     assert not found.complete and found.next is not None
     assert [choice.value for choice in found.next.choices] == ["yes", "no"]
-    assert found.why[0].text == "Laser front heartbeat alive."
+    assert found.why[0].text == "Laser front: “heartbeat: alive” fails."
 
 
 def test_a_revision_without_any_hypothesis_has_a_card() -> None:

@@ -99,7 +99,8 @@ def worsened(
         return replace(alarm, severity=severity, revision=alarm.revision + 1), [entry]
     alarm, entries = _reopened(alarm, now_ns, settings)
     worse = replace(
-        alarm, severity=severity, worst=severity, state="shelved" if alarm.state == "shelved" else "open",
+        alarm, severity=severity, worst=severity,
+        state="shelved" if alarm.state == "shelved" else "open",
         acknowledged_by="", acknowledged_ns=None, revision=alarm.revision + 1,
         notify_ns=alarm.notify_ns or now_ns + settings.ns("settle_s"),
     )  # fmt: skip
@@ -139,7 +140,8 @@ def merged(keep: Alarm, gone: Alarm, origin: str, now_ns: int) -> tuple[Step, St
     effect = keep.effect or gone.effect
     severity = effect or worst([keep.severity, gone.severity])
     one = replace(
-        keep, origin=origin, severity=severity, effect=effect, told=told, owner=keep.owner or gone.owner,
+        keep, origin=origin, severity=severity, effect=effect, told=told,
+        owner=keep.owner or gone.owner,
         opened_ns=min(keep.opened_ns, gone.opened_ns), late=keep.late and gone.late,
         revision=keep.revision + 1,
     )  # fmt: skip

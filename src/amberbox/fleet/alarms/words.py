@@ -51,7 +51,7 @@ class Explanation:
 
 def explanation_of(robot: str, answer: Mapping[str, Any]) -> Explanation | None:
     """Read an answer of ``POST .../diagnose``; None for one that explains nothing."""
-    told = answer["explanation"]
+    told = answer.get("explanation")
     if told is None:
         return None
     broken, severity = told["broken"], told["use"]["severity"]

@@ -9,6 +9,7 @@ from sqlalchemy import RowMapping
 from amberbox.core.clock import NS
 from amberbox.core.timetext import format_time
 from amberbox.fleet.alarms.alarm import Alarm, Kind, State
+from amberbox.fleet.alarms.words import Words, read
 from amberbox.fleet.api.forms import shown
 from amberbox.fleet.api.windows import FROM, Shown
 from amberbox.monitoring.plan import Severity
@@ -45,7 +46,11 @@ class Window(Shown):
 
 @dataclass(frozen=True, slots=True)
 class AlarmLine:
-    """An alarm. ``active`` is whether it lasts, ``state`` what people made of it."""
+    """An alarm. ``active`` is whether it lasts, ``state`` what people made of it.
+
+    ``diagnosis_revision`` was the last while it lasted (0: not known), ``explained`` what that
+    says in words, null where nobody has worked that out.
+    """
 
     id: int
     kind: Kind
@@ -70,6 +75,8 @@ class AlarmLine:
     merged_into: int | None
     window: Window
     revision: int
+    diagnosis_revision: int = 0
+    explained: Words | None = None
 
 
 class Consequence(Shown):
@@ -120,6 +127,7 @@ def line_of(alarm: Alarm, robots: list[RowMapping]) -> AlarmLine:
         cleared=shown(alarm.cleared_ns), count=alarm.count, late=alarm.late, owner=alarm.owner,
         acknowledged=_acknowledged(alarm), shelved=_shelved(alarm), resolved=_resolved(alarm),
         merged_into=alarm.merged_into, window=window, revision=alarm.revision,
+        diagnosis_revision=alarm.revised, explained=read(alarm.words),
     )  # fmt: skip
 
 

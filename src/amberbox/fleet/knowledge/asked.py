@@ -24,12 +24,16 @@ class AboutRobot(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class AskDiagnosis(AboutRobot, frozen=True, kw_only=True):
-    """What is broken? With symptoms and answers that somebody gives, ``diagnosis`` one of old."""
+    """What is broken? With symptoms and answers that somebody gives.
+
+    ``diagnosis`` is one of old, as of its last revision or of ``revision``.
+    """
 
     symptoms: dict[str, SymptomWord] = {}
     answers: dict[str, str] = {}
     engine: Engine = "covering"
     diagnosis: str = ""
+    revision: int = 0
 
 
 class AskTrees(AboutRobot, frozen=True, kw_only=True):

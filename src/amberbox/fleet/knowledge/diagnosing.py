@@ -17,10 +17,12 @@ from amberbox.consult.span import DAY_NS
 from amberbox.consult.telling import explained, json_of
 from amberbox.core.errors import AmberboxError, UsageError
 from amberbox.core.timetext import format_time
+from amberbox.core.types import Symptom
 from amberbox.diagnosis.knowledge import Knowledge
 from amberbox.diagnosis.situation import Situation
 from amberbox.fleet.data.recorded import Stores
 from amberbox.fleet.knowledge.asked import AskDiagnosis
+from amberbox.fleet.knowledge.listing import find
 from amberbox.fleet.knowledge.moment import Moment, moment
 from amberbox.fleet.knowledge.past import past_of
 from amberbox.fleet.knowledge.statuses import symptoms_of
@@ -35,6 +37,8 @@ def answered(folder: Path, stores: Stores, asked: AskDiagnosis) -> dict[str, Any
     )
     knowledge = subject.knowledge(asked.exposure_h)
     case = _case(knowledge, subject, then)
+    if asked.diagnosis and not asked.at:
+        case = _as_revised(case)
     symptoms = given_symptoms(_texts(asked.symptoms), knowledge, case.at_ns)
     answers = given_answers(_texts(asked.answers), knowledge)
     case = case.told(symptoms, answers) if symptoms or answers else case
@@ -47,15 +51,14 @@ def answered(folder: Path, stores: Stores, asked: AskDiagnosis) -> dict[str, Any
 
 
 def _moment(stores: Stores, asked: AskDiagnosis) -> Moment:
-    """Return what was known then; of a diagnosis of old when it was revised last."""
+    """Return what was known then; of a diagnosis of old when it was revised, by default last."""
     if not asked.diagnosis:
         return moment(stores, asked.robot, asked.at, asked.now_ns)
-    latest = moment(stores, asked.robot, "", asked.now_ns)
-    times = [d.at_ns for d in latest.said.diagnoses if d.id == asked.diagnosis]
-    if not times:
+    known = find(stores, asked.robot, asked.diagnosis)
+    if known is None:
         raise UsageError(f"{asked.robot} has no diagnosis '{asked.diagnosis}'")
     if not asked.at:
-        last_ns = max(times)
+        last_ns = (known.until(asked.revision) if asked.revision else known).last.at_ns
         return moment(stores, asked.robot, format_time(last_ns), asked.now_ns, last_ns)
     return moment(stores, asked.robot, asked.at, asked.now_ns)
 
@@ -71,6 +74,27 @@ def _case(knowledge: Knowledge, subject: Declared, then: Moment) -> Case:
         return Case(then.at_ns)
     known = tuple(s for s in symptoms if s.id in knowledge.fmea.symptoms)
     return Case(then.at_ns, Situation(known, watched=True), origin="status", has_more=True)
+
+
+def _as_revised(case: Case) -> Case:
+    """Take as there what the robot's own revision was made of, and nothing else.
+
+    Of what it had dropped by then, the words that made it do so may have been lost on the way.
+    """
+    if case.open is None:
+        return case
+    names = frozenset(case.open.symptoms)
+    counting = case.situation.symptoms
+    present = {s.id: s for s in (*case.seen, *counting) if s.state == "present"}
+    there = tuple(
+        replace(present.get(name, Symptom(name, "present", name)), blocked_by=())
+        for name in case.open.symptoms
+    )
+    rest = (
+        replace(symptom, state="unknown") if symptom.state == "present" else symptom
+        for symptom in counting if symptom.id not in names
+    )  # fmt: skip
+    return replace(case, situation=replace(case.situation, symptoms=(*there, *rest)))
 
 
 def _known(knowledge: Knowledge, said: Said) -> Said:

@@ -47,6 +47,12 @@ def given_answers(database: Database, robot: str, diagnosis: str) -> dict[str, s
         return notebook.counting(notebook.given(connection, robot, diagnosis))
 
 
+def made_answers(database: Database, robot: str, diagnosis: str) -> list[notebook.Revision]:
+    """Return what the server made of a diagnosis with answers to tests."""
+    with database.reading() as connection:
+        return notebook.revisions(connection, robot, diagnosis)
+
+
 class Explained:
     """Explanations by revision; ``known`` never waits, threads may share it.
 
@@ -70,12 +76,6 @@ class Explained:
         """Return the explanation of a revision if it is there."""
         with self._lock:
             return self._known.get(key_of(robot, diagnosis, answers))
-
-    def newest(self, robot: str, diagnosis: str) -> Answer | None:
-        """Return the explanation of a diagnosis that was made last, of whichever revision."""
-        with self._lock:
-            fitting = (key for key in reversed(self._known) if key[:2] == (robot, diagnosis))
-            return next((self._known[key] for key in fitting), None)
 
     async def read(
         self, robot: str, diagnosis: Diagnosis, answers: Mapping[str, str], asker: str
@@ -137,6 +137,10 @@ class Explained:
             if known is not None and known.last.state == "open":
                 of = robot, known.id
                 answers = await asyncio.to_thread(given_answers, self.database, *of)
+                made = await asyncio.to_thread(made_answers, self.database, *of)
+                kept = kept_answer(known, made)
+                if kept is not None:
+                    self._keep(key_of(robot, known.last, answers), kept)
                 await self.read(robot, known.last, answers, robot)
         except AmberboxError as error:  # whoever looks at it is told, and asks again
             logging.getLogger(__name__).info("%s: %s", robot, error.what)
@@ -149,8 +153,9 @@ class Explained:
     async def _ask(self, key: Key, answers: Mapping[str, str], asker: str) -> Answer:
         robot, name = key[0], key[1]
         asked = AskDiagnosis(
-            robot=robot, now_ns=self._clock.wall_ns(), diagnosis=name, answers=dict(answers)
-        )
+            robot=robot, now_ns=self._clock.wall_ns(), diagnosis=name, revision=key[2],
+            answers=dict(answers),
+        )  # fmt: skip
         found = await self._asking.ask(OP, written(asked), LIMIT_S, MEMORY_BYTES, asker=asker)
         answer: Answer = json.loads(found)
         self._keep(key, answer)

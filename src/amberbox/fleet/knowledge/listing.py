@@ -28,10 +28,30 @@ class Known:
         """The revision that stands."""
         return self.revisions[-1]
 
+    def until(self, revision: int) -> Known:
+        """Return it as it was before later revisions; all of it where it has none so early."""
+        early = tuple(one for one in self.revisions if one.revision <= revision)
+        return Known(self.id, early) if early else self
+
+    def differs_since(self, before: Diagnosis) -> int | None:
+        """Return since when something else leads than by a revision; None if that leads still."""
+        later = [one for one in self.revisions if one.revision > before.revision]
+        other_ns = None
+        for one in later:
+            same = _leading(one) == _leading(before)
+            other_ns = None if same else other_ns or one.at_ns
+        return other_ns
+
     @property
     def peak(self) -> Diagnosis:
         """The last revision with hypotheses: a healed one may have none any more."""
         return next((d for d in reversed(self.revisions) if d.hypotheses), self.last)
+
+
+def _leading(one: Diagnosis) -> frozenset[frozenset[str]]:
+    """Return the sets of failure modes that lead, those that nothing tells apart together."""
+    names = one.groups[0].members if one.groups else [h.id for h in one.hypotheses[:1]]
+    return frozenset(h.faults for h in one.hypotheses if h.id in names)
 
 
 def diagnoses(

@@ -75,9 +75,9 @@ def show_parts(request: Request, fleet: Fleet, who: Who, id: Number) -> Response
 
 def _all_of(fleet: Services, who: Caller, number: int) -> Mapping[str, Any]:
     shown = whole(fleet, who, number)
-    card, may = diagnosis_of(fleet, who, shown.item.line)
-    links = links_of(shown.item.line, card, format_time(fleet.clock.wall_ns()))
-    return {"shown": shown, "card": card, "may_answer": may, "links": links}
+    explained = diagnosis_of(fleet, who, shown.item.line)
+    links = links_of(shown.item.line, explained.card, format_time(fleet.clock.wall_ns()))
+    return {"shown": shown, "explained": explained, "card": explained.card, "links": links}
 
 
 def _listed(fleet: Services, who: Caller, look: Look) -> Mapping[str, Any]:

@@ -11,7 +11,7 @@ from sqlalchemy import Connection, RowMapping, func, select
 
 from amberbox.core.timetext import format_time, ns_of
 from amberbox.fleet.accounts.actions import Role
-from amberbox.fleet.accounts.robots import KnownRobot
+from amberbox.fleet.accounts.robots import KnownRobot, list_robots
 from amberbox.fleet.accounts.users import list_users
 from amberbox.fleet.alarms import listing
 from amberbox.fleet.alarms.alarm import Alarm
@@ -26,7 +26,7 @@ from amberbox.fleet.notifying.tables import OUTBOX
 from amberbox.fleet.pages.alarms.wording import Event, Words, events, lasted_ns, words_of
 from amberbox.fleet.pages.datalinks import data_href
 from amberbox.fleet.pages.diagnosis.card import DiagnosisCard
-from amberbox.fleet.pages.diagnosis.look import card_now, look
+from amberbox.fleet.pages.diagnosis.look import card_now, look, look_then
 from amberbox.fleet.services import Services
 
 
@@ -51,17 +51,17 @@ class Item:
 
     line: AlarmLine
     what: str
+    title: str
     cause: str
     lasted: str
     suffering: Sequence[Suffering]
     may: bool
 
     @property
-    def title(self) -> str:
-        """Return what is wrong in one line."""
-        if not self.line.reason:
-            return self.what
-        return f"{self.what}: {self.line.reason}" if self.has_part else self.line.reason
+    def small(self) -> str:
+        """Return the robot's own words, where the title does not say them already."""
+        reason = self.line.reason
+        return "" if reason in self.title else reason
 
     @property
     def has_part(self) -> bool:
@@ -84,7 +84,7 @@ class Links:
 
 @dataclass(frozen=True, slots=True)
 class Whole:
-    """All of one alarm. ``people`` are those it can be given to, as far as the caller may know.
+    """All of one alarm. ``people`` are those it can be given to, by whoever may change it.
 
     ``told`` counts the messages. ``others``: the caller may not change it because it is about
     robots of others, too.
@@ -103,7 +103,7 @@ def items(
     connection: Connection, fleet: Services, who: Caller, alarms: Sequence[Alarm]
 ) -> list[Item]:
     """Return alarms as people read them, of their robots those that the caller may see."""
-    words = words_of(connection, fleet, ((alarm.robot, alarm.diagnosis) for alarm in alarms))
+    words = words_of(connection, fleet)
     numbers = [alarm.number for alarm in alarms]
     about = listing.robots_of(connection, numbers)
     suffering = _suffering(connection, numbers)
@@ -119,34 +119,63 @@ def items(
 def whole(fleet: Services, who: Caller, number: int) -> Whole:
     """Return all of one alarm; raises 404 for one that is not there, or not for the caller."""
     page = show_alarm(fleet, who, number)
-    of = page.alarm.window.robot, page.alarm.diagnosis
     with fleet.database.reading() as connection:
-        words = words_of(connection, fleet, [of])
+        words = words_of(connection, fleet)
         rows = _suffering(connection, [number]).get(number, ())
         about = listing.robots_of(connection, [number])[number]
         mine = _names(connection, who, "alarms.write")
-        people = _people(connection, who)
+        people = _people(connection, [row["robot"] for row in about])
         told = _told(connection, number)
     may = _may(who, about, mine)
     others = not may and any(row["robot"] in mine for row in about)
     item = _of_line(words, page.alarm, rows, may=may)
     history = [one for one in page.history if told or one.what != "notified"]
     said = list(events(history, words, page.alarm))
-    return Whole(item, others, said, _messages(fleet, who, number), told, people, _me(who))
+    given_to = people if may else []
+    return Whole(item, others, said, _messages(fleet, who, number), told, given_to, _me(who))
 
 
-def diagnosis_of(
-    fleet: Services, who: Caller, line: AlarmLine
-) -> tuple[DiagnosisCard | None, bool]:
-    """Return the card of the diagnosis that explains an alarm, and whether one may answer it."""
+@dataclass(frozen=True, slots=True)
+class Explained:
+    """The diagnosis that explains an alarm: as it stands, or as it was when the alarm ended.
+
+    ``revision`` is that of then, 0 while it lasts. ``later`` is what the robot says is broken by
+    now, since ``since``, if that is something else.
+    """
+
+    card: DiagnosisCard | None = None
+    may: bool = False
+    revision: int = 0
+    later: DiagnosisCard | None = None
+    since: str = ""
+
+
+def diagnosis_of(fleet: Services, who: Caller, line: AlarmLine) -> Explained:
+    """Return the diagnosis that explains an alarm, and whether one may answer its tests."""
     robot = _robot(fleet, who, line.window.robot) if line.diagnosis else None
     if robot is None or not who.may("diagnoses.read", robot):
-        return None, False
+        return Explained()
     try:
-        seen = look(fleet, robot.id, line.diagnosis)
+        if line.active:
+            card = card_now(fleet, look(fleet, robot.id, line.diagnosis), None)
+            return Explained(card, who.may("diagnoses.write", robot))
+        return _explained_then(fleet, robot.id, line)
     except HTTPException:  # what the robot found may come after its alarm
-        return None, False
-    return card_now(fleet, seen, None), who.may("diagnoses.write", robot)
+        return Explained()
+
+
+def _explained_then(fleet: Services, robot: str, line: AlarmLine) -> Explained:
+    end_ns = ns_of(line.cleared or line.changed)
+    then = look_then(fleet, robot, line.diagnosis, line.diagnosis_revision, end_ns)
+    assert then.known is not None
+    card, last = card_now(fleet, then, None), then.known.last
+    now = look(fleet, robot, line.diagnosis)
+    since_ns = now.known.differs_since(last) if now.known else None
+    if since_ns is None:
+        return Explained(card, revision=last.revision)
+    later = card_now(fleet, now, None)
+    return Explained(card, False, last.revision, later if later.state == "open" else None,
+                     format_time(since_ns))  # fmt: skip
 
 
 def links_of(line: AlarmLine, card: DiagnosisCard | None, now: str) -> Links:
@@ -177,7 +206,8 @@ def _of_line(words: Words, line: AlarmLine, suffering: Sequence[RowMapping], *, 
         )
         for row in suffering
     ]  # fmt: skip
-    return Item(line, words.what(line), words.cause(line), _lasted(line), parts, may)
+    return Item(line, words.what(line), words.title(line), words.cause(line), _lasted(line), parts,
+                may)  # fmt: skip
 
 
 def _lasted(line: AlarmLine) -> str:
@@ -220,13 +250,13 @@ def _may(who: Caller, about: Sequence[RowMapping], mine: frozenset[str] | _All) 
     return all(row["robot"] in mine for row in about)
 
 
-def _people(connection: Connection, who: Caller) -> list[str]:
-    """Return whom an alarm can be given to; of who may not read the accounts nobody."""
-    if not who.may("users.read"):
-        return []
+def _people(connection: Connection, about: Sequence[str]) -> list[str]:
+    """Return whom an alarm about some robots can be given to: who may change it."""
+    robots = [one for one in list_robots(connection) if one.id in about]
     return [
         user.name for user in list_users(connection)
         if user.disabled_ns is None and user.role.covers(Role.OPERATOR)
+        and all(user.groups is None or user.groups & frozenset(one.groups) for one in robots)
     ]  # fmt: skip
 
 

@@ -3,38 +3,45 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from sqlalchemy import Connection
 
 from amberbox.core.clock import NS
+from amberbox.core.sureness import SURE_WORDS, percent
+from amberbox.fleet.alarms.offline import CONNECTION
 from amberbox.fleet.api.alarmlines import AlarmLine, Happening
-from amberbox.fleet.knowledge import notebook
-from amberbox.fleet.knowledge.explained import Answer
 from amberbox.fleet.linkend.presence import presences
 from amberbox.fleet.pages import wording
-from amberbox.fleet.pages.diagnosis.card import card_of
+from amberbox.fleet.pages.diagnosis.card import LIKELY
 from amberbox.fleet.pages.figures import span
 from amberbox.fleet.pages.strings import catalogue
 from amberbox.fleet.pages.wording import capital
 from amberbox.fleet.services import Services
+from amberbox.monitoring.engine.outputs import SEVERITIES
 
 _SHELVED = re.compile(r"until (\d{4}-\d\d-\d\dT[\d:]+Z): (.*)", re.DOTALL)
 _WORSE = re.compile(r"(\w+) -> (\w+)")
 _OVER = "over"
 _UNDESCRIBED = "not in the FMEA"
+_NAMED = 2
+"""So many causes are named where nothing tells them apart."""
+_NO_FAULTS = ("false_alarm", "other")
+_LIKELY = tuple(word for least, word in SURE_WORDS if least >= LIKELY)
+_SURE = re.compile(rf" \(({'|'.join(word for _, word in SURE_WORDS)})\)$")
+_CHECK = re.compile(r"(?:^|; )(?:not confirmed yet: )?([A-Za-z]\w*) (?:is|was|flapping)\b")
+"""A check that a robot's reason names; what follows is its value."""
 _FAULT = re.compile(r"([^\s#()]+)#([^\s#()]+)")
 """A component and how it fails, as robots name a cause."""
 
 
 @dataclass(frozen=True, slots=True)
 class Words:
-    """What parts of robots are called, and the explanations that are known already."""
+    """What parts of robots are called."""
 
     fleet: Services
     folders: Mapping[str, str] = field(default_factory=dict)
-    told: Mapping[tuple[str, str], Answer] = field(default_factory=dict)
     _names: dict[str, Mapping[str, str]] = field(default_factory=dict)
 
     def part(self, robot: str, component: str) -> str:
@@ -55,38 +62,84 @@ class Words:
             return self.part(line.window.robot, line.origin)
         return readable(line.origin)
 
+    def title(self, line: AlarmLine) -> str:
+        """Return what is wrong in one line: the cause where one is known, else which checks fail.
+
+        The robot's own words are kept for what is small below.
+        """
+        causes = line.explained.causes if line.explained else ()
+        if causes and all(one.kind == "fault" for one in causes):
+            return _either([capital(one.text) for one in causes])
+        if line.kind == "robot":
+            return checks_fail(self.what(line), line.reason)
+        if not line.reason:
+            return self.what(line)
+        return line.reason if line.origin == CONNECTION else f"{self.what(line)}: {line.reason}"
+
     def cause(self, line: AlarmLine) -> str:
         """Return what the diagnosis says it comes from; empty where nobody knows."""
-        if not line.cause:
-            return ""
-        answer = self.told.get((line.window.robot, line.diagnosis))
-        return (_told(answer) if answer else "") or self.plain(line.window.robot, line.cause)
+        if line.explained is None or not line.explained.causes:
+            return self.plain(line, line.cause) if line.cause else ""
+        said = line.explained
+        kinds = {kind: catalogue().text(f"diagnosis.card.{kind}") for kind in _NO_FAULTS}
+        names = [kinds.get(one.kind) or capital(one.text) for one in said.causes]
+        word = sure_word(len(names), said.probability)
+        return catalogue().text("alarms.cause_sure", name=_either(names), word=word,
+                                share=percent(said.probability))  # fmt: skip
 
-    def plain(self, robot: str, cause: str) -> str:
-        """Return a robot's own words for a cause, with the names of its parts."""
-        named = _FAULT.sub(lambda one: f"{self.part(robot, one[1])}: {one[2].replace('_', ' ')}",
-                           cause)  # fmt: skip
-        return named.replace(_UNDESCRIBED, catalogue().text("alarms.cause_other"))
+    def plain(self, line: AlarmLine, cause: str) -> str:
+        """Return a robot's own words for a cause, with the names of its parts and failures."""
+        robot, known = line.window.robot, line.explained.names if line.explained else {}
+
+        def named(found: re.Match[str]) -> str:
+            text = known.get(found[0])
+            return text or f"{self.part(robot, found[1])}: {found[2].replace('_', ' ')}"
+
+        told = _FAULT.sub(named, cause).replace(
+            _UNDESCRIBED, catalogue().text("alarms.cause_other")
+        )
+        sure = _SURE.search(told)
+        if sure is None:
+            return capital(told)
+        count = cause.count(" or ") + 1
+        word = sure_word(count, 1.0 if sure[1] in _LIKELY else 0.0)
+        return capital(f"{told[: sure.start()]} ({word})")
 
 
-def words_of(
-    connection: Connection, fleet: Services, diagnoses: Iterable[tuple[str, str]]
-) -> Words:
-    """Return the words of all robots as their folders have them now, and of some diagnoses."""
-    folders = {one.robot: one.config_hash for one in presences(connection)}
-    told = {one: _explained(connection, fleet, *one) for one in set(diagnoses) if one[1]}
-    return Words(fleet, folders, {one: answer for one, answer in told.items() if answer})
+def sure_word(count: int, probability: float) -> str:
+    """Say how sure an answer is, in the words of the card: of one cause, or of several."""
+    if count > 1:
+        return catalogue().text("alarms.sure.cannot_tell_apart")
+    return catalogue().text(
+        "alarms.sure.likely" if probability >= LIKELY else "alarms.sure.possible"
+    )
 
 
-def _explained(
-    connection: Connection, fleet: Services, robot: str, diagnosis: str
-) -> Answer | None:
-    """Return what is known of a diagnosis: by the last answer to a test, if that is not older."""
-    found = fleet.explained.newest(robot, diagnosis)
-    made = notebook.revisions(connection, robot, diagnosis)
-    if made and (found is None or made[-1].body["revision"] >= found["revision"]):
-        return made[-1].body
-    return found
+def checks_fail(what: str, reason: str) -> str:
+    """Say which checks of a part fail, by the robot's own words; those words where none says."""
+    names = list(dict.fromkeys(readable(name).lower() for name in _CHECK.findall(reason)))
+    if not names:
+        return f"{what}: {reason}" if reason else what
+    text, quoted = catalogue().text, [catalogue().text("alarms.quoted", text=n) for n in names]
+    if len(names) == 1:
+        return text("alarms.check_fails", what=what, name=quoted[0])
+    if len(names) == 2:
+        return text("alarms.checks_fail", what=what, one=quoted[0], other=quoted[1])
+    return text("alarms.many_fail", what=what, one=quoted[0], n=len(names) - 1)
+
+
+def words_of(connection: Connection, fleet: Services) -> Words:
+    """Return the words of all robots as their folders have them now."""
+    return Words(fleet, {one.robot: one.config_hash for one in presences(connection)})
+
+
+def _either(names: Sequence[str]) -> str:
+    """Name the first of several, of which one is meant; the others begin in small letters."""
+    text = catalogue().text
+    first, *more = names
+    if len(names) > _NAMED:
+        return text("alarms.or_others", name=first, n=len(names) - 1)
+    return text("alarms.or").join([first, *(one[:1].lower() + one[1:] for one in more)])
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,17 +170,6 @@ def readable(name: str) -> str:
     return capital(wording.readable(name)) or name
 
 
-def _told(answer: Answer) -> str:
-    """Return the leading causes of an answer, with how sure it is."""
-    card = card_of(answer)
-    text = catalogue().text
-    names = [text(f"diagnosis.card.{one.kind}") if one.kind != "fault" else one.text
-             for one in card.causes]  # fmt: skip
-    if len(names) > 1:
-        return text("alarms.cause_one_of", names=text("alarms.or").join(names), share=card.number)
-    return text("alarms.cause_sure", name=names[0], share=card.number) if names else ""
-
-
 def _what(one: Happening) -> str:
     texts = catalogue().texts
     key = f"alarms.event.{one.what}"
@@ -141,10 +183,10 @@ def _said(one: Happening, words: Words, line: AlarmLine) -> tuple[str, str]:
     shelved, worse = _SHELVED.fullmatch(one.text), _WORSE.fullmatch(one.text)
     if one.what == "shelved" and shelved:
         return shelved[2], shelved[1]
-    if one.what == "worse" and worse and worse[2] in ("warning", "urgent", "critical", "fatal"):
+    if one.what in ("worse", "effect") and worse and worse[2] in SEVERITIES:
         return text(f"words.severity_{worse[2]}.name"), ""
     if one.what == "cause":
-        return words.plain(line.window.robot, one.text) if one.text else "", ""
+        return words.plain(line, one.text) if one.text else "", ""
     if one.what == "notified":
         return text("alarms.event.notified_as", severity=one.text), ""
     if one.what == "resolved" and not one.who:

@@ -6,13 +6,18 @@ used, what to do next. Texts about the robot come from its own list of what can 
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, TypeAlias
 
+from amberbox.core.clock import NS
 from amberbox.core.sureness import percent
 from amberbox.core.timetext import format_time
+from amberbox.fleet.knowledge.holding import Hold
 from amberbox.fleet.pages.datalinks import moment_href
+from amberbox.fleet.pages.figures import span
+from amberbox.fleet.pages.strings import catalogue
 from amberbox.fleet.pages.wording import capital, readable, sentence
 
 REASONS = 3
@@ -23,9 +28,13 @@ CANNOT = "cannot"
 
 Sure: TypeAlias = Literal["", "likely", "possible", "cannot_tell_apart"]
 Kind: TypeAlias = Literal["fault", "false_alarm", "other"]
+State: TypeAlias = Literal["open", "healed", "gone", "past", "none"]
 Answer: TypeAlias = Mapping[str, Any]
 
 _UNKNOWN = "unknown#other"
+_SHORT_S = 10.0
+"""What lasted less long is told in tenths of a second."""
+_FAILS = re.compile(r"\bfails(\.?)$")
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,11 +50,27 @@ class Cause:
 
 @dataclass(frozen=True, slots=True)
 class Reason:
-    """What was seen, since when, and where the data of that moment are."""
+    """What was seen, since when, and where the data of that moment are.
+
+    ``until`` is when it was gone, after ``lasted``; without it is there, as far as anybody knows.
+    ``small`` is the id that it has.
+    """
 
     text: str
     at: str | None
     href: str
+    small: str = ""
+    until: str | None = None
+    lasted: str = ""
+
+    def over(self, hold: Hold) -> Reason:
+        """Return it with both ends, in the past, once it is over."""
+        if hold.to_ns is None:
+            return self
+        lasted = _lasted((hold.to_ns - hold.from_ns) / NS)
+        text = _FAILS.sub(r"failed\1", self.text)
+        return replace(self, text=text, at=format_time(hold.from_ns),
+                       until=format_time(hold.to_ns), lasted=lasted)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,13 +101,14 @@ class DiagnosisCard:
     """A diagnosis for people.
 
     ``state`` is ``none`` where nothing is known to be broken; then ``at`` is up to when that is
-    known. ``complete`` is false while only the robot's own words are known, without explanation.
-    ``more`` counts what was seen beyond ``why``. ``number`` is empty where there is none. ``names``
-    are failure modes in words, by id.
+    known. It is ``gone`` where nothing of what was seen is there any more, since ``gone``, and
+    ``past`` for what was known when an alarm ended. ``complete`` is false while only the robot's
+    own words are known, without explanation. ``more`` counts what was seen beyond ``why``.
+    ``number`` is empty where there is none. ``names`` are failure modes in words, by id.
     """
 
     robot: str
-    state: Literal["open", "healed", "none"]
+    state: State
     at: str | None
     diagnosis: str = ""
     revision: int = 0
@@ -100,6 +126,12 @@ class DiagnosisCard:
     answers: Mapping[str, str] | None = None
     names: Mapping[str, str] = field(default_factory=dict)
     notes: Sequence[str] = ()
+    gone: str | None = None
+
+
+def _lasted(seconds: float) -> str:
+    short = seconds < _SHORT_S
+    return catalogue().text("common.js.span.s", n=f"{seconds:.1f}") if short else span(seconds)
 
 
 def nothing_broken(robot: str, at: str | None, notes: Sequence[str] = ()) -> DiagnosisCard:
@@ -144,8 +176,8 @@ def plain_card_of(revision: Answer) -> DiagnosisCard:
     return DiagnosisCard(
         robot, revision["state"], revision["at"], revision["id"], revision["revision"], causes,
         _sure(causes, probability), percent(probability) if causes else "",
-        tuple(Reason(sentence(readable(name.replace("/", " "))), revision["at"],
-                     moment_href(robot, (), revision["at_ns"])) for name in names[:REASONS]),
+        tuple(Reason(check_fails(name), revision["at"],
+                     moment_href(robot, (), revision["at_ns"]), name) for name in names[:REASONS]),
         max(0, len(names) - REASONS),
         next=_plain_next(revision["next_tests"]), complete=False,
     )  # fmt: skip
@@ -191,8 +223,17 @@ def reason_of(robot: str, seen: Answer, until_ns: int | None = None) -> Reason:
     onset_ns = seen["onset_ns"]
     return Reason(
         sentence(seen["text"]), None if onset_ns is None else format_time(onset_ns),
-        moment_href(robot, seen["measured_from"], onset_ns, until_ns),
+        moment_href(robot, seen["measured_from"], onset_ns, until_ns), str(seen.get("id", "")),
     )  # fmt: skip
+
+
+def check_fails(symptom: str) -> str:
+    """Say that a check fails, by the id of its symptom."""
+    parts = [capital(readable(part)) if k == 0 else readable(part)
+             for k, part in enumerate(symptom.split("/"))]  # fmt: skip
+    if len(parts) < 3:
+        return sentence(" ".join(parts))
+    return f"{parts[0]}: “{': '.join(parts[1:])}” fails."
 
 
 def choices_of(test: Answer, step: Answer | None = None) -> tuple[Choice, ...]:

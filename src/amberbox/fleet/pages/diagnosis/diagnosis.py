@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Awaitable
 from dataclasses import replace
+from functools import partial
 from typing import Annotated
 
 from fastapi import Query, Request, Response
@@ -20,7 +21,14 @@ from amberbox.fleet.knowledge.asked import SymptomWord
 from amberbox.fleet.pages.diagnosis import asking, parts
 from amberbox.fleet.pages.diagnosis import tree as trees
 from amberbox.fleet.pages.diagnosis.card import DiagnosisCard, card_of
-from amberbox.fleet.pages.diagnosis.look import Look, card_now, card_told, look, missing
+from amberbox.fleet.pages.diagnosis.look import (
+    Look,
+    card_now,
+    card_told,
+    look,
+    look_then,
+    missing,
+)
 from amberbox.fleet.pages.page import Pages, render
 from amberbox.fleet.services import Services
 from amberbox.fleet.state.views import Card
@@ -36,6 +44,7 @@ At = Annotated[str, Query(max_length=64)]
 Word = Annotated[str, Query(max_length=300)]
 Words = Annotated[list[Annotated[str, Query(max_length=300)]], Query(max_length=100)]
 NOTHING: list[str] = []
+Revision = Annotated[int, Query(ge=0, le=2**62)]
 Goal = Annotated[str, Query(max_length=4000)]
 
 
@@ -60,14 +69,16 @@ def show(
 @routes.get("/robots/{robot}/diagnosis/card", "diagnoses.read")
 async def show_card(
     request: Request, robot: OfRobot, fleet: Fleet, who: Who, diagnosis: Id = "", at: At = "",
-    link: bool = False,
+    link: bool = False, revision: Revision = 0,
 ) -> Response:  # fmt: skip
     """Return the card alone, with its explanation: what pages put in its place.
 
     ``link``: it leads to the page of the diagnosis, because it stands on another one.
+    ``revision``: as the diagnosis was then, whatever was found later.
     """
     may = who.may("diagnoses.write", robot)
-    seen = await asyncio.to_thread(look, fleet, robot.id, diagnosis)
+    then = partial(look_then, revision=revision) if diagnosis and revision else look
+    seen = await asyncio.to_thread(then, fleet, robot.id, diagnosis)
     try:
         if at:
             answer = await parts.Asked(fleet, who, robot.id, at=at).at_then()

@@ -6,17 +6,20 @@ known already, else in the robot's own words. ``card_told`` waits.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, TypeAlias
 
 from fastapi import HTTPException
 
+from amberbox.core.timetext import format_time
 from amberbox.diagnosis.fmea.load import FILE
 from amberbox.fleet.api.access import Caller
 from amberbox.fleet.api.diagnoses import revision_json
 from amberbox.fleet.knowledge import notebook
 from amberbox.fleet.knowledge.asked import AskDiagnosis
 from amberbox.fleet.knowledge.explained import Answer, kept_answer
+from amberbox.fleet.knowledge.holding import Hold, gone_since, holds_of
 from amberbox.fleet.knowledge.listing import Known, find, newest
 from amberbox.fleet.pages.diagnosis.card import (
     DiagnosisCard,
@@ -34,7 +37,8 @@ Missing: TypeAlias = Literal["", "never", "folder", "fmea"]
 class Look:
     """A diagnosis of a robot with what people said of it; ``known`` is None where there is none.
 
-    ``is_newest``: it is what the robot found last.
+    ``is_newest``: it is what the robot found last. ``is_past``: it is as it was at some revision,
+    whatever was found later. ``holds`` tells which of its symptoms are there still.
     """
 
     robot: str
@@ -44,6 +48,8 @@ class Look:
     made: tuple[notebook.Revision, ...] = ()
     causes: tuple[notebook.Cause, ...] = ()
     answers: dict[str, str] = field(default_factory=dict)
+    holds: Mapping[str, Hold] = field(default_factory=dict)
+    is_past: bool = False
 
     @property
     def stands(self) -> bool:
@@ -63,19 +69,40 @@ def look(fleet: Services, robot: str, diagnosis: str = "") -> Look:
     return _with_remarks(fleet, Look(robot, known, is_newest)) if known else Look(robot)
 
 
+def look_then(
+    fleet: Services, robot: str, diagnosis: str, revision: int, end_ns: int | None = None
+) -> Look:
+    """Look at a diagnosis as it was at a revision, of which later ones change nothing.
+
+    Without a number (0) it is the last one up to an instant. Raises 404 as ``look`` does.
+    """
+    whole = find(fleet, robot, diagnosis)
+    if whole is None:
+        raise HTTPException(404, "this robot has no such diagnosis")
+    if not revision and end_ns is not None:
+        early = [one.revision for one in whole.revisions if one.at_ns <= end_ns]
+        revision = max(early, default=whole.revisions[0].revision)
+    known = whole.until(revision) if revision else whole
+    later = next((one.at_ns for one in whole.revisions if one.revision > known.last.revision), None)
+    return _with_remarks(fleet, Look(robot, known, is_newest=False, is_past=True), later)
+
+
 def card_now(fleet: Services, seen: Look, as_of: str | None) -> DiagnosisCard:
     """Return the card of what is looked at without waiting; ``as_of`` is how far is known."""
     if seen.known is None or not seen.stands:
         return nothing_broken(seen.robot, as_of)
     answer = _at_hand(fleet, seen)
-    return _plain(seen, seen.known) if answer is None else _card(answer, seen, seen.known)
+    known = seen.known
+    card = _plain(seen, known) if answer is None else _card(answer, seen, known)
+    return _timed(card, seen, known, fleet.clock.wall_ns())
 
 
 async def card_told(fleet: Services, who: Caller, seen: Look, as_of: str | None) -> DiagnosisCard:
     """Return the card with its explanation; raises AmberboxError where there can be none."""
     if seen.known is None or not seen.stands:
         return nothing_broken(seen.robot, as_of)
-    return _card(await answer_told(fleet, who, seen), seen, seen.known)
+    card = _card(await answer_told(fleet, who, seen), seen, seen.known)
+    return _timed(card, seen, seen.known, fleet.clock.wall_ns())
 
 
 async def answer_told(fleet: Services, who: Caller, seen: Look) -> Answer:
@@ -118,16 +145,20 @@ def leading_faults(fleet: Services, seen: Look) -> list[str]:
     return [fault for entry in found for fault in entry["faults"]]
 
 
-def _with_remarks(fleet: Services, seen: Look) -> Look:
+def _with_remarks(fleet: Services, seen: Look, before_ns: int | None = None) -> Look:
+    """Add what people said, before a later revision where there is one, and what holds still."""
     assert seen.known is not None
     of = seen.robot, seen.known.id
     with fleet.database.reading() as connection:
         given = notebook.given(connection, *of)
         made = notebook.revisions(connection, *of)
         causes = notebook.causes(connection, *of)
+    if before_ns is not None:
+        given = [one for one in given if one.at_ns < before_ns]
+        made = [one for one in made if one.at_ns < before_ns]
     return replace(
         seen, given=tuple(given), made=tuple(made), causes=tuple(causes),
-        answers=notebook.counting(given),
+        answers=notebook.counting(given), holds=holds_of(fleet, seen.robot, seen.known.revisions),
     )  # fmt: skip
 
 
@@ -151,3 +182,13 @@ def _card(answer: Answer, seen: Look, known: Known) -> DiagnosisCard:
     if card.state == "none":
         return replace(_plain(seen, known), complete=True, notes=card.notes)
     return replace(card, state=known.last.state, answers=seen.answers)
+
+
+def _timed(card: DiagnosisCard, seen: Look, known: Known, now_ns: int) -> DiagnosisCard:
+    """Return a card that says of each reason until when it was there, and if all are gone."""
+    why = [one.over(seen.holds[one.small]) if one.small in seen.holds else one for one in card.why]
+    card = replace(card, why=why)
+    if seen.is_past:
+        return replace(card, state="past")
+    gone_ns = gone_since(known.last, seen.holds, now_ns) if card.state == "open" else None
+    return card if gone_ns is None else replace(card, state="gone", gone=format_time(gone_ns))

@@ -8,7 +8,7 @@ import { listen } from "../feed.js";
 import { piece, put } from "../pieces.js";
 import { t } from "../strings.js";
 
-const PARTS = ["alarm-head", "alarm-links", "alarm-rest"];
+const PARTS = ["alarm-head", "alarm-later", "alarm-links", "alarm-rest"];
 const page = one("#alarm");
 const { alarm, robot } = page.dataset;
 const feed = listen({ kinds: ["alarm", "diagnosis"] });
@@ -38,10 +38,10 @@ function tellNews() {
   news.hidden = false;
 }
 
-/** The diagnosis often comes after its alarm. */
+/** The diagnosis often comes after its alarm; when that is over it stays as it was last. */
 function showDiagnosis(fresh) {
   const place = one("#alarm-diagnosis");
-  if (fresh.dataset.diagnosis === place.dataset.diagnosis) return;
+  if (["diagnosis", "kept"].every((key) => fresh.dataset[key] === place.dataset[key])) return;
   place.replaceWith(fresh);
   startDiagnosis();
 }
@@ -53,9 +53,10 @@ function quietly() {
 
 function startDiagnosis() {
   const place = one("#alarm-diagnosis");
-  const { diagnosis } = place.dataset;
+  const { diagnosis, kept } = place.dataset;
   if (!diagnosis) return;
-  const path = () => `/robots/${encodeURIComponent(robot)}/diagnosis/card?diagnosis=${encodeURIComponent(diagnosis)}`;
+  const query = new URLSearchParams({ diagnosis, ...(kept ? { revision: kept } : {}) });
+  const path = () => `/robots/${encodeURIComponent(robot)}/diagnosis/card?${query}`;
   keepCard(place, { path, feed, robot, renewed: quietly });
 }
 
