@@ -53,3 +53,22 @@ def test_what_nothing_sees_is_listed(page_as: PageAs) -> None:
     expect(page.locator(".sheet .level-warn")).to_have_count(
         page.locator(".sheet tbody tr").count()
     )
+
+
+def test_what_sees_it_is_folded_and_the_head_stays(page_as: PageAs) -> None:
+    page = page_as("technician")
+    page.goto("/knowledge/ropod_001")
+    seen = page.locator(".sheet details").first
+    expect(seen.get_by_role("listitem").first).to_be_hidden()
+    number = int(seen.locator("summary").inner_text().split()[0])
+    seen.locator("summary").click()
+    assert seen.get_by_role("listitem").count() == number > 1
+    last = page.locator(".sheet tbody tr").last
+    last.scroll_into_view_if_needed()
+    head = page.locator(".sheet th").first.bounding_box()
+    bar = page.locator(".topbar").bounding_box()
+    assert head and bar and abs(head["y"] - bar["height"]) <= 2, "the head has gone with the rows"
+    action = last.get_by_role("cell").last.bounding_box()
+    assert action and action["x"] + action["width"] <= 1440
+    page.get_by_role("link", name="Rules").click()
+    expect(page.get_by_role("heading", name="Rules")).to_be_in_viewport()

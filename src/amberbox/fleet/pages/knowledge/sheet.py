@@ -43,6 +43,11 @@ class Mode:
     weak: float
 
     @property
+    def checks(self) -> Sequence[str]:
+        """Return what sees it: monitors' checks, and tests that people do."""
+        return [check for check in self.row["Detection"].split("; ") if check]
+
+    @property
     def is_seen(self) -> bool:
         """Tell whether any monitor or test can see it."""
         return not self.unseen
