@@ -39,8 +39,10 @@ FOLDER = Path(__file__).parents[2] / "sim" / "folder"
 """What ``amberbox new`` writes for it: a block that records everything, and its monitors."""
 PASSIVE = "simulated in this process: there is no robot that could be disturbed"
 _NOT_WORTH_WAITING_NS = 500_000
-_HURRY = 1.5
+_HURRY = 1.4
 """So much faster a robot may be that was held up: all at once, it would seem to jump."""
+_AT_ONCE_NS = 60_000_000
+"""So far ahead of that it may be: this machine does not always go on when it should."""
 _log = logging.getLogger(__name__)
 
 
@@ -187,18 +189,19 @@ class Pace:
 
     def __init__(self, speed: float, start_ns: int, stop: threading.Event) -> None:
         self._speed, self._start_ns, self._stop = speed, start_ns, stop
-        self._began_ns = self._last_ns = time.monotonic_ns()
+        self._began_ns = self._earliest_ns = time.monotonic_ns()
         self._last_sent_ns = start_ns
 
     def wait(self, sent_ns: int) -> None:
         """Wait until a message may go that the robot sends at this time of its own."""
         due_ns = self._began_ns + (sent_ns - self._start_ns) / self._speed
         since_ns = (sent_ns - self._last_sent_ns) / (self._speed * _HURRY)
-        due_ns = max(due_ns, self._last_ns + since_ns)
         now_ns = time.monotonic_ns()
-        if due_ns - now_ns > _NOT_WORTH_WAITING_NS:
-            self._stop.wait((due_ns - now_ns) / NS)
-        self._last_ns, self._last_sent_ns = max(now_ns, round(due_ns)), sent_ns
+        self._earliest_ns = max(self._earliest_ns, now_ns) + round(since_ns)
+        wait_ns = max(due_ns, self._earliest_ns - _AT_ONCE_NS) - now_ns
+        if wait_ns > _NOT_WORTH_WAITING_NS:
+            self._stop.wait(wait_ns / NS)
+        self._last_sent_ns = sent_ns
 
 
 class Orders:
