@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, HTTPServer
@@ -158,3 +159,25 @@ def test_the_server_is_restarted(site: Site) -> None:
     site.restart()
     until(lambda: site.is_online(*site.robots), "the robots came back by themselves")
     assert site.url == before
+
+
+def test_paper_says_when_by_whom_and_of_what(page_as: PageAs) -> None:
+    page = page_as("technician")
+    page.goto("/robots/ropod_001/data?from=2026-01-02T03:04:05Z&to=2026-01-02T04:04:05Z")
+    expect(page.locator("#window [name=from]")).to_have_value(re.compile("2026-01-02T04:04"))
+    printed = page.locator("[data-printed]")
+    expect(printed).to_be_hidden()
+    page.emulate_media(media="print")
+    page.evaluate("dispatchEvent(new Event('beforeprint'))")
+    expect(printed).to_contain_text("by technician, http://localhost")
+    expect(page.locator("[data-printed-window]")).to_have_text(
+        "2 Jan 2026, 04:04:05 to 2 Jan 2026, 05:04:05 (Europe/Berlin)"
+    )
+
+
+def test_what_is_closed_stays_closed_on_paper(page_as: PageAs) -> None:
+    page = page_as("viewer")
+    page.goto("/knowledge/ropod_001")
+    folded = page.locator(".sheet details:not([open]) li").first
+    page.emulate_media(media="print")
+    expect(folded).to_be_hidden()

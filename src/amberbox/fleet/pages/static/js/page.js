@@ -5,6 +5,7 @@ import { label } from "./cards.js";
 import { all, el, one } from "./dom.js";
 import * as every from "./every.js";
 import * as forms from "./forms.js";
+import * as printed from "./printed.js";
 import { refresh } from "./time.js";
 import * as view from "./view.js";
 
@@ -83,5 +84,6 @@ document.addEventListener("keydown", onKey);
 all("details[data-view]").forEach(remember);
 forms.start();
 every.start();
+printed.start();
 refresh();
 label();
