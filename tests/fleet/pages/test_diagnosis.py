@@ -140,15 +140,24 @@ def test_a_slip_in_a_goal_keeps_the_goal(operator: TestClient) -> None:
 
 
 def test_what_if_another_symptom_were_there(operator: TestClient) -> None:
-    found = part(operator, "/whatif")
+    found = part(operator, "/whatif/answer")
     assert "The answer as it is" in found and "rear laser" not in found.split("The answer")[1]
-    supposed = part(operator, "/whatif?present=laser_rear/heartbeat/alive")
+    supposed = part(operator, "/whatif/answer?present=laser_rear/heartbeat/alive")
     assert "rear laser" in supposed.split("The answer would be")[1]
-    assert part(operator, "/whatif") == found  # nothing of it is kept
+    assert part(operator, "/whatif/answer") == found  # nothing of it is kept
+
+
+def test_the_form_of_what_if_asks_no_worker(
+    home: House, operator: TestClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(home.services.asking, "ask", None)
+    page = operator.get(f"{BASE}/whatif", params={"absent": sim.NO_SCANS}).text
+    assert f'data-symptom="{sim.NO_SCANS}"' in page and '<option value="absent" selected>' in page
+    assert 'data-load="whatif/answer"' in page
 
 
 def test_what_if_all_were_well(operator: TestClient) -> None:
-    shown = part(operator, f"/whatif?absent={sim.NO_SCANS}")
+    shown = part(operator, f"/whatif/answer?absent={sim.NO_SCANS}")
     assert "Nothing is known to be broken" in shown.split("The answer would be")[1]
 
 
@@ -158,7 +167,7 @@ def test_what_if_by_fault_trees_alone(operator: TestClient) -> None:
 
 
 def test_a_symptom_that_there_is_not_keeps_the_form(operator: TestClient) -> None:
-    shown = part(operator, "/whatif?present=nonsense")
+    shown = part(operator, "/whatif/answer?present=nonsense")
     assert "there is no symptom 'nonsense'" in shown and "The answer as it is" in shown
 
 

@@ -21,9 +21,12 @@ class CancelledError(AmberboxError):
     """Whoever asked does not want to know any more."""
 
 
+TRY_AGAIN = "the server may be busy: try again; if that is no help, ask for less at a time"
+
+
 def too_long(limit_s: float) -> LimitError:
     """Say that an answer took too long."""
-    return LimitError(f"the answer took longer than {limit_s:g} s", "ask for less at a time")
+    return LimitError(f"the answer took longer than {limit_s:g} s", TRY_AGAIN)
 
 
 def too_big(memory_bytes: int) -> LimitError:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 
-from amberbox.diagnosis.explanation.lettering import SIZE, SMALL
+from amberbox.diagnosis.explanation.lettering import SMALL
 from amberbox.fleet.drawing.branches import Event, Gate, Tree, below, held, unfolded
 from amberbox.fleet.drawing.marks import box
 from amberbox.fleet.drawing.numbers import chance
@@ -180,13 +180,16 @@ def _leaf(
 
 def _beside_sign(text: str, said: str) -> Iterator[Element]:
     left, most = 34.0, ROW[0] - TRUNK - 8 - 34
-    yield lettering(text, (left, -1 if said else 4.5), most, SIZE)
+    lines = broken(text, most, 2)
+    first = 4.5 - 8 * (len(lines) - 1) - (5.5 if said else 0)
+    for place, line in enumerate(lines):
+        yield element("text", line, x=left, y=first + 16 * place)
     if said:
-        yield lettering(said, (left, 13), most, SMALL, class_="small")
+        yield lettering(said, (left, first + 16 * len(lines) - 2), most, SMALL, class_="small")
 
 
 def _below_sign(text: str, said: str) -> Iterator[Element]:
-    lines = broken(text, LEAF[0] - 6, 2)
+    lines = broken(text, LEAF[0] - 6, 3)
     for place, line in enumerate(lines):
         yield element("text", line, x=0, y=50 + 16 * place, class_="middle")
     if said:

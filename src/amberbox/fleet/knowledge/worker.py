@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import OrderedDict
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
@@ -10,14 +11,16 @@ from typing import Any
 import msgspec
 
 from amberbox.consult.closest import closest_json, outlooks
+from amberbox.consult.declared import Declared
 from amberbox.consult.facts import known_facts, lookups
 from amberbox.consult.faulttrees import effect_json, effects_json
 from amberbox.consult.sheets import coverage_json, criticality_json, table_json
 from amberbox.core.config import did_you_mean, refuse
 from amberbox.core.errors import UsageError
 from amberbox.core.timetext import format_time, parse_time
+from amberbox.diagnosis.explanation.names import Names
+from amberbox.diagnosis.faulttree import Analysis, analyse
 from amberbox.diagnosis.faulttree import Budget as TreeBudget
-from amberbox.diagnosis.faulttree import analyse
 from amberbox.diagnosis.findings.facts import Facts
 from amberbox.diagnosis.fmea.coverage import coverage
 from amberbox.diagnosis.fmea.trees import effects, fault_tree_of
@@ -36,6 +39,9 @@ from amberbox.fleet.knowledge.then import folder_of_then
 
 _CLOSEST = 5
 _NODES = 2_000_000
+_KEPT = 8
+"""Trees that are kept solved; each can have many nodes."""
+_SOLVED: OrderedDict[tuple[object, ...], Analysis] = OrderedDict()
 
 
 @spoken
@@ -59,6 +65,7 @@ def fmea(folder: Path, arguments: dict[str, Any]) -> Any:
         "name": found.name,
         "table": table_json(found),
         "criticality": criticality_json(found, asked.exposure_h),
+        "symptoms": {name: Names(found).symptom(name) for name in found.symptoms},
         "coverage": coverage_json(coverage(found, sorted(subject.known.watched))),
         "notes": list(notes),
     }  # fmt: skip
@@ -67,7 +74,10 @@ def fmea(folder: Path, arguments: dict[str, Any]) -> Any:
 @spoken
 def fault_trees(folder: Path, arguments: dict[str, Any]) -> Any:
     """Return the trees of all functions, or one with its cut sets and how close it is now."""
-    asked, stores = read(arguments, AskTrees), _stores(folder)
+    return _trees(folder, _stores(folder), read(arguments, AskTrees))
+
+
+def _trees(folder: Path, stores: Stores, asked: AskTrees) -> dict[str, Any]:
     then = moment(stores, asked.robot, asked.at, asked.now_ns)
     subject, notes = folder_of_then(
         folder,
@@ -80,10 +90,7 @@ def fault_trees(folder: Path, arguments: dict[str, Any]) -> Any:
     names = _effects(known, asked.effect)
     budget = TreeBudget(_NODES, _ends(asked.seconds))
     one = bool(asked.effect)
-    solved = [
-        analyse(fault_tree_of(known, name, asked.exposure_h), asked.order, one, budget)
-        for name in names
-    ]
+    solved = [_solved(subject, name, asked, budget, with_sets=one) for name in names]
     shown = (
         effect_json(known, solved[0], importance=True, cut_sets=asked.cut_sets)
         if one
@@ -98,15 +105,42 @@ def fault_trees(folder: Path, arguments: dict[str, Any]) -> Any:
     }  # fmt: skip
 
 
+def _solved(
+    subject: Declared, name: str, asked: AskTrees, budget: TreeBudget, *, with_sets: bool
+) -> Analysis:
+    """Solve a tree, once for each folder: one that stands on the shelf never changes."""
+    key = (asked.robot, subject.folder.config_hash, name, asked.exposure_h, asked.order, with_sets)
+    found = _SOLVED.get(key)
+    if found is None:
+        tree = fault_tree_of(subject.faults(), name, asked.exposure_h)
+        found = analyse(tree, asked.order, with_sets, budget)
+        if not found.incomplete:
+            _SOLVED[key] = found
+    while len(_SOLVED) > _KEPT:
+        _SOLVED.popitem(last=False)
+    return found
+
+
 @spoken
-def drawn_tree(folder: Path, arguments: dict[str, Any]) -> Any:
-    """Return the gates and events of one tree, as ``fleet.drawing`` draws them."""
+def one_tree(folder: Path, arguments: dict[str, Any]) -> Any:
+    """Return one tree, solved, with its gates and events as ``fleet.drawing`` draws them.
+
+    No other one is solved. Without a function it is the first that there is; ``functions`` names
+    all, by id and in words.
+    """
     asked, stores = read(arguments, AskTrees), _stores(folder)
     said = _said(stores, asked)
     subject, _ = folder_of_then(folder, stores.database, asked.robot, asked.config_hash, said)
     known = subject.faults()
-    (effect,) = _effects(known, asked.effect)
-    return msgspec.to_builtins(tree_of(fault_tree_of(known, effect, asked.exposure_h)))
+    every, names = _effects(known, ""), Names(known)
+    chosen = asked.effect or next(iter(every), "")
+    functions = [{"id": one, "text": names.function(one)} for one in every]
+    if not chosen:
+        return {"functions": functions, "tree": None, "shape": None}
+    _effects(known, chosen)
+    found = _trees(folder, stores, msgspec.structs.replace(asked, effect=chosen))
+    shape = tree_of(fault_tree_of(known, chosen, asked.exposure_h))
+    return {"functions": functions, "tree": found, "shape": msgspec.to_builtins(shape)}
 
 
 @spoken

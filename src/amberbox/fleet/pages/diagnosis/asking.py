@@ -34,6 +34,18 @@ class Line:
 
 
 async def what_if(asked: Asked, symptoms: Mapping[str, SymptomWord], engine: str) -> Values:
+    """Return what can be supposed, without asking a worker: the answer comes by itself."""
+    seen = await asked.look()
+    names = seen.known.last.symptoms if seen.known and seen.stands and not asked.at else ()
+    return {
+        "symptoms": [{"id": name, "given": symptoms.get(name, "")}
+                     for name in dict.fromkeys([*names, *symptoms])],
+        "engine": engine if engine in ENGINES else ENGINES[0], "engines": ENGINES,
+        "words": WORDS, "changed": bool(symptoms),
+    }  # fmt: skip
+
+
+async def supposed(asked: Asked, symptoms: Mapping[str, SymptomWord], engine: str) -> Values:
     """Return the answer if other things were seen; nothing of it is kept."""
     engine = engine if engine in ENGINES else ENGINES[0]
     found = await asked.fmea()
@@ -44,9 +56,8 @@ async def what_if(asked: Asked, symptoms: Mapping[str, SymptomWord], engine: str
         error, given = refused, {}
         answer = await _supposed(asked, given, engine)
     return {
-        "shown": card_of(answer), "symptoms": _listed(answer["symptoms"], given),
-        "known": _known_symptoms(found), "engine": engine, "engines": ENGINES, "words": WORDS,
-        "notes": answer["notes"], "changed": bool(symptoms), "error": error,
+        "shown": card_of(answer), "known": _known_symptoms(found), "changed": bool(symptoms),
+        "error": error,
     }  # fmt: skip
 
 
@@ -89,13 +100,6 @@ def _value(value: Any) -> Values:
     """Return a value of an answer; what can only be an instant is shown as one."""
     is_instant = isinstance(value, int) and value in INSTANTS_NS
     return {"text": str(value), "at": format_time(value) if is_instant else None}
-
-
-def _listed(found: Sequence[Answer], given: Mapping[str, str]) -> list[Values]:
-    """Return symptoms that are there or that somebody gave, with what somebody said of each."""
-    told = [one for one in found if one["state"] == "present" or one["id"] in given]
-    return [{"id": one["id"], "state": one["state"], "given": given.get(one["id"], "")}
-            for one in told]  # fmt: skip
 
 
 def _known_symptoms(found: Answer) -> list[str]:

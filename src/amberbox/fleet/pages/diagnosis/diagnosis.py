@@ -151,13 +151,28 @@ async def show_what_if(
     request: Request, robot: OfRobot, fleet: Fleet, who: Who, diagnosis: Id = "", at: At = "",
     present: Words = NOTHING, absent: Words = NOTHING, unknown: Words = NOTHING, engine: Word = "",
 ) -> Response:  # fmt: skip
+    """Return what can be supposed to be seen."""
+    asked = parts.Asked(fleet, who, robot.id, diagnosis, at)
+    given = _given(present, absent, unknown)
+    return await _part(request, "whatif", asked, robot, asking.what_if(asked, given, engine))
+
+
+@routes.get("/robots/{robot}/diagnosis/whatif/answer", "diagnoses.write")
+async def show_supposed(
+    request: Request, robot: OfRobot, fleet: Fleet, who: Who, diagnosis: Id = "", at: At = "",
+    present: Words = NOTHING, absent: Words = NOTHING, unknown: Words = NOTHING, engine: Word = "",
+) -> Response:  # fmt: skip
     """Return the answer if other things were seen."""
     asked = parts.Asked(fleet, who, robot.id, diagnosis, at)
-    given: dict[str, SymptomWord] = {
+    given = _given(present, absent, unknown)
+    return await _part(request, "supposed", asked, robot, asking.supposed(asked, given, engine))
+
+
+def _given(present: list[str], absent: list[str], unknown: list[str]) -> dict[str, SymptomWord]:
+    return {
         **dict.fromkeys(unknown, "unknown"), **dict.fromkeys(absent, "absent"),
         **dict.fromkeys(present, "present"),
     }  # fmt: skip
-    return await _part(request, "whatif", asked, robot, asking.what_if(asked, given, engine))
 
 
 async def _part(

@@ -146,7 +146,8 @@ async def history(asked: Asked) -> Values:
     """Return what was found before, and the revisions of the one that is looked at."""
     seen = await asked.look()
     found = await asyncio.to_thread(_history, asked, seen)
-    return {**found, "texts": await _texts(asked)}
+    texts, symptoms = await _texts(asked)
+    return {**found, "texts": texts, "symptom_texts": symptoms}
 
 
 async def cause(asked: Asked) -> Values:
@@ -225,12 +226,14 @@ def mode_texts(fmea: Answer) -> dict[str, str]:
     }
 
 
-async def _texts(asked: Asked) -> dict[str, str]:
-    """Return what failure modes are called; a history is there without the robot's folder, too."""
+async def _texts(asked: Asked) -> tuple[dict[str, str], dict[str, str]]:
+    """Return what failure modes and symptoms are called; without the robot's folder nothing."""
+    other = {"unknown#other": catalogue().text("diagnosis.card.other")}
     try:
-        return mode_texts(await asked.fmea())
+        found = await asked.fmea()
     except UsageError:
-        return {}
+        return other, {}
+    return {**mode_texts(found), **other}, dict(found["symptoms"])
 
 
 def remarks(seen: Look) -> Values:

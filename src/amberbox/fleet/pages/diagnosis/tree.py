@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import asyncio
 from collections.abc import Mapping, Sequence
+from itertools import islice
 from typing import Any
 
 import msgspec
 
+from amberbox.core.errors import UsageError
 from amberbox.core.sureness import percent
 from amberbox.fleet.drawing.branches import Tree
 from amberbox.fleet.drawing.faulttree import fault_tree
@@ -16,32 +17,33 @@ from amberbox.fleet.pages.diagnosis.parts import Asked, Values
 from amberbox.fleet.pages.drawingwords import drawing_words
 from amberbox.fleet.pages.strings import catalogue
 
-CUT_SETS = 20
-"""So many sets are listed, those of fewest failures first."""
+CUT_SETS = 300
+"""So many sets are looked at, those of fewest failures first."""
+PATTERNS = 20
+"""So many kinds of sets are listed."""
 IMPORTANT = 10
 DEPTH, PLACES = 3, 60
 """How much of a tree is drawn: gates above each other, and places in all."""
 
 
 async def tree(asked: Asked, effect: str) -> Values:
-    """Return the tree of a function: that which is closest to being lost without a name."""
-    every = await asked.ask(_question(asked, ""), "fault_trees")
-    effects = [{"id": one["effect"], "text": one["description"]} for one in every["effects"]]
-    chosen = effect or _closest(every) or (effects[0]["id"] if effects else "")
-    if not chosen:
+    """Return the tree of a function: of what the diagnosis says is lost, without a name.
+
+    It alone is solved; the others are listed.
+    """
+    chosen = effect or await _lost(asked)
+    every = await asked.ask(_question(asked, chosen), "one_tree")
+    if every["tree"] is None:
         return {"effects": [], "chosen": "", "tree": None}
-    question = _question(asked, chosen)
-    found, shape = await asyncio.gather(
-        asked.ask(question, "fault_trees"), asked.ask(question, "drawn_tree")
-    )
-    shown, near = msgspec.convert(shape, Tree), _near(found)
+    found, shown = every["tree"], msgspec.convert(every["shape"], Tree)
+    near = _near(found)
     texts = {name: event.label or name for name, event in shown.events.items()}
+    chosen = found["effect"]
     label = catalogue().text("diagnosis.details.tree.label", text=found["description"] or chosen)
     return {
-        "effects": effects, "chosen": chosen, "tree": found, "notes": found["notes"],
+        "effects": every["functions"], "chosen": chosen, "tree": found, "notes": found["notes"],
         "chance": _small(found["top_probability"]), "closest": _named(near, texts),
-        "important": _important(found, texts),
-        "sets": [[texts.get(name, name) for name in one] for one in found["cut_sets"][:CUT_SETS]],
+        "important": _important(found, texts), "patterns": _patterns(found["cut_sets"], texts),
         "drawing": fault_tree(
             shown, label=label, depth=DEPTH, most=PLACES, cut_set=_happened(near),
             words=drawing_words(),
@@ -49,14 +51,34 @@ async def tree(asked: Asked, effect: str) -> Values:
     }  # fmt: skip
 
 
+async def _lost(asked: Asked) -> str:
+    """Return the gravest of what the diagnosis says is lost; empty where it says nothing."""
+    try:
+        answer = await asked.answer()
+    except UsageError:
+        return ""
+    lost = answer["explanation"]["use"]["lost"] if answer else ()
+    return next((str(one["id"]) for one in lost), "")
+
+
+def _patterns(sets: Sequence[Sequence[str]], texts: Mapping[str, str]) -> list[Values]:
+    """Group sets that differ only in which of several like parts fails."""
+    found: dict[tuple[tuple[str, str], ...], list[list[str]]] = {}
+    for one in sets:
+        key = tuple(sorted(_pattern(name) for name in one))
+        found.setdefault(key, []).append([texts.get(name, name) for name in one])
+    return [{"first": alike[0], "others": alike[1:]} for alike in islice(found.values(), PATTERNS)]
+
+
+def _pattern(name: str) -> tuple[str, str]:
+    """Return what a failure has in common with that of like parts: the kind of part, and how."""
+    part, _, mode = name.partition("#")
+    return part.partition("_")[0], mode
+
+
 def _question(asked: Asked, effect: str) -> AskTrees:
     return AskTrees(robot=asked.robot, now_ns=asked.now_ns, at=asked.at, effect=effect,
                     cut_sets=CUT_SETS)  # fmt: skip
-
-
-def _closest(every: Mapping[str, Any]) -> str:
-    """Return the function that what is broken brings closest to being lost."""
-    return next((str(one["effect"]) for one in every["closest"] if one["closest"]), "")
 
 
 def _near(found: Mapping[str, Any]) -> Sequence[Mapping[str, Any]]:

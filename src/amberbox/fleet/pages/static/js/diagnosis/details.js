@@ -38,12 +38,18 @@ export function start({ part, renewed }) {
       shown = name;
       for (const drawing of all(".dx-drawing", place)) drawing.scrollLeft = middle(drawing, one("svg.faulttree", drawing));
       place.removeAttribute("aria-busy");
+      await loadInside(one("[data-load]", place), about);
     } catch (error) {
       if (error.name === "AbortError") return;
       place.removeAttribute("aria-busy");
       place.replaceChildren();
       fail(error, place);
     }
+  }
+
+  /** Fetch what of a tab takes a while: the rest of it is there already. */
+  async function loadInside(inner, about) {
+    if (inner) replace(inner, await pieces(part(inner.dataset.load, about), { signal: asking.signal }));
   }
 
   function mark(name) {
@@ -87,6 +93,7 @@ export function start({ part, renewed }) {
     event.preventDefault();
     const name = form.dataset.viewForm;
     view.set({ ...simple(form), ...(name === "whatif" ? symptoms(form) : {}) }, { push: true });
+    form.after(el("p", { class: "muted", role: "status" }, t("diagnosis.working")));
     load(name);
   }
 
