@@ -168,12 +168,31 @@ def test_gaps_are_hatched_and_say_why(page_as: PageAs, site: Site) -> None:
     )
 
 
+def test_what_was_refused_leads_to_the_file(page_as: PageAs, site: Site) -> None:
+    page = page_as("viewer")
+    since, until = (datetime.fromtimestamp(at(site, n * 10**9), UTC) for n in (-600, 60))
+    gap = {"item": ODOM, "from": since.isoformat(), "to": until.isoformat(), "kind": "refused",
+           "reason": "refused: journal/000002-b-0001.mcap: altered"}  # fmt: skip
+    items = {ODOM: {"gaps": [gap], "more": False}}
+    around = {"gaps": {"from": at(site, -(10**13)), "to": at(site, 10**13), "items": items}}
+    page.route("**/data/around?*", lambda route: route.fulfill(json=around))
+    open_plots(page, at(site, -3600 * 10**9), at(site, 60 * 10**9), SPEED)
+    legend = page.get_by_role("list", name="What is missing")
+    expect(legend).to_have_text(re.compile("^damaged: the server has the file, and set it aside"))
+    link = legend.get_by_role("link", name="Look at the file")
+    expect(link).to_have_attribute("href", f"/recordings/{ROBOT}?show=trouble#journals")
+
+
 def test_gaps_that_cannot_be_had_are_asked_for_again(page_as: PageAs, site: Site) -> None:
     page = page_as("viewer", expects=["503"])
     page.route("**/data/around?*", lambda route: route.fulfill(status=503, json={}))
     open_plots(page, *hour(site), SPEED)
     legend = page.get_by_role("list", name="What is missing")
     expect(legend).to_contain_text("cannot tell at the moment")
+    gap = [at(site, record.GAP_NS[0] - 10**10), at(site, record.GAP_NS[1] + 10**10)]
+    page.evaluate("([from, to]) => stack.window(from, to)", gap)
+    settle(page)
+    assert 0 < page.evaluate(INK_BETWEEN, [0.0, 1.0]) < 400  # no line over what may be missing
     page.unroute("**/data/around?*")
     from_s, to_s = hour(site)
     page.evaluate("([from, to]) => stack.window(from, to)", [from_s - 60, to_s])

@@ -2,7 +2,7 @@
 
 import { el, icon } from "./dom.js";
 import { t } from "./strings.js";
-import { breakable } from "./data/names.js";
+import { breakable } from "./names.js";
 import { asDragged } from "./data/variables.js";
 
 const MOST_PLOTS = 12;

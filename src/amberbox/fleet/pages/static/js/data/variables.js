@@ -4,7 +4,7 @@
  */
 
 import { all, el, icon, one } from "../dom.js";
-import { breakable } from "./names.js";
+import { breakable } from "../names.js";
 import { spark, sparklines } from "./sparklines.js";
 import { t } from "../strings.js";
 import { find, search } from "./variablelist.js";

@@ -39,11 +39,11 @@ export function valueAxis({ scale, unit, first, narrow, words, ink, line }) {
     label: unit || undefined, labelSize: LABEL_SIZE, labelFont: FONT, labelGap: 0,
   };
   if (!words.length) return { ...common, space: 34, values: (_, v, __, ___, s) => numbers(v, s) };
-  const room = narrow ? 6 : 9;
+  const shown = shortened(words, narrow ? 6 : 9);
   return {
     ...common,
     splits: () => words.map((_, n) => n).filter((n) => words[n] !== undefined),
-    values: (_, places) => places.map((n) => shortened(words[n] ?? "", room)),
+    values: (_, places) => places.map((n) => shown[n] ?? ""),
   };
 }
 
@@ -80,6 +80,11 @@ function minus(text) {
   return text.replace("-", "−").replace("e+", "e");
 }
 
-function shortened(text, room) {
-  return text.length > room ? `${text.slice(0, room - 1)}…` : text;
+/** Cut words that have no room: first the part with which all begin (`STATE_`), then the end. */
+function shortened(words, room) {
+  if (words.every((text) => text.length <= room)) return words;
+  const first = words.find(Boolean) ?? "";
+  const ends = [...first.matchAll(/_/g)].map((match) => match.index + 1).reverse();
+  const same = words.length > 1 ? ends.find((end) => words.every((text) => text.startsWith(first.slice(0, end)))) ?? 0 : 0;
+  return words.map((text) => text.slice(same)).map((text) => (text.length > room ? `${text.slice(0, room - 1)}…` : text));
 }

@@ -1,6 +1,7 @@
 /** The legend of a panel: which line is what, its value at the cursor, how much was summed up. */
 
 import { el, icon, setText } from "../dom.js";
+import { breakable } from "../names.js";
 import { kindOver } from "./gaps.js";
 import { ratioOf, shownText, valueAt } from "./table.js";
 import { partOf } from "./trace.js";
@@ -19,7 +20,7 @@ export function makeKey(shown, trace) {
     onclick: () => stack.drop(trace.id),
   }, icon("close"));
   const name = trace.unit ? `${trace.label} [${trace.unit}]` : trace.label;
-  const root = el("li", { class: "plot-key" }, swatch, el("span", { class: "plot-name" }, name), value, badge,
+  const root = el("li", { class: "plot-key" }, swatch, el("span", { class: "plot-name" }, ...breakable(name)), value, badge,
     problem, stack.options.fixed ? null : remove);
   for (const [event, id] of [["pointerenter", trace.id], ["pointerleave", ""]]) {
     root.addEventListener(event, () => stack.strengthen(shown, id));

@@ -2,6 +2,7 @@
 
 import { plain } from "./axes.js";
 import { el, setText } from "../dom.js";
+import { breakable } from "../names.js";
 import { placeAt } from "./data.js";
 import { t } from "../strings.js";
 
@@ -67,7 +68,7 @@ function addRow(shown, trace) {
   const swatch = el("span", { class: "plot-swatch", "aria-hidden": "true" });
   const cells = Object.fromEntries(COLUMNS.map((name) => [name, el("td", { class: "num nowrap" })]));
   const unit = trace.unit ? el("span", { class: "muted" }, ` ${trace.unit}`) : null;
-  const head = el("th", { scope: "row" }, swatch, el("span", {}, trace.label), unit);
+  const head = el("th", { scope: "row" }, swatch, el("span", {}, ...breakable(trace.label)), unit);
   const root = el("tr", {}, head, ...Object.values(cells));
   shown.body.append(root);
   const row = { root, swatch, cells };

@@ -1,6 +1,6 @@
 /** Names of variables: long ones break where their parts meet, and are never cut. */
 
-import { el } from "../dom.js";
+import { el } from "./dom.js";
 
 const PART = /[^_./]+[_./]*|[_./]+/g;
 
