@@ -97,7 +97,7 @@ def test_how_they_look(page_as: PageAs, theme: str, width: int) -> None:
     judge(page, f"alarms-{theme}")
     live(page, f"/alarms/{LASER}")
     expect(page.get_by_text("The front laser has no power").first).to_be_visible()
-    page.get_by_text("Put it aside").click()
+    page.locator("#do-shelve summary").click()
     judge(page, f"alarm-{theme}")
 
 
@@ -183,59 +183,60 @@ def test_what_can_be_done_about_one(page_as: PageAs, site: Site, two: None) -> N
     act, history = page.locator("#alarm-act"), page.locator(".alarm-history")
     expect(page.locator("h1")).to_contain_text(hostile.MARKUP)
     act.get_by_label("Note, if you like").fill(hostile.SCRIPT)
-    act.get_by_role("button", name="I see to it").click()
+    act.get_by_role("button", name="Acknowledge").click()
     expect(history).to_contain_text(hostile.SCRIPT)
-    act.get_by_role("button", name="Take it").click()
-    expect(act).to_contain_text("Whose is it? operator")
+    expect(act).to_contain_text("Owner operator")
     act.get_by_role("button", name="Give it back").click()
-    expect(act).to_contain_text("Whose is it? nobody")
-    act.get_by_text("Put it aside").click()
+    expect(act).to_contain_text("Owner nobody")
+    act.get_by_role("button", name="Take it").click()
+    expect(act).to_contain_text("Owner operator")
+    act.locator("#do-shelve summary").click()
     act.get_by_label("another time").check()
     act.get_by_label("That time").fill("2035-01-01T12:00")
     act.get_by_label("Why").first.fill("spare part")
-    act.get_by_role("button", name="Put aside").click()
+    act.locator("#shelve button").click()
     expect(act.locator("#shelve")).to_contain_text("shelved for a year at most")
     act.get_by_label("tomorrow morning, 7:00").check()
-    act.get_by_role("button", name="Put aside").click()
-    expect(act.get_by_role("button", name="Take it back now")).to_be_visible()
+    act.locator("#shelve button").click()
+    expect(act.get_by_role("button", name="Unshelve")).to_be_visible()
     until = site.ask(f"/alarms/{GRIPPER}")["alarm"]["shelved"]["until"]
     assert until[11:19] in ("05:00:00", "06:00:00"), "seven in Berlin"
-    act.get_by_role("button", name="Take it back now").click()
+    act.get_by_role("button", name="Unshelve").click()
     act.get_by_text("Add a note").click()
     act.get_by_label("Note", exact=True).fill("it was the fuse")
     act.get_by_role("button", name="Add", exact=True).click()
     expect(history).to_contain_text("it was the fuse")
-    act.get_by_text("Close it").click()
+    act.locator("#do-resolve summary").click()
     act.locator("#resolve").get_by_label("Why").fill("fuse replaced")
-    act.get_by_role("button", name="Close").click()
-    expect(page.locator("#alarm-head")).to_contain_text("closed by operator")
-    expect(act).to_contain_text("It is over")
+    act.locator("#resolve button").click()
+    expect(page.locator("#alarm-head")).to_contain_text("resolved by operator")
+    expect(act).to_contain_text("It is resolved")
 
 
-def test_an_admin_gives_it_to_somebody(page_as: PageAs, two: None) -> None:
-    page = live(page_as("admin"), f"/alarms/{ARM}")
+def test_an_operator_gives_it_to_somebody(page_as: PageAs, two: None) -> None:
+    page = live(page_as("operator"), f"/alarms/{ARM}")
     page.get_by_label("Give it to").select_option("technician")
     page.get_by_role("button", name="Give", exact=True).click()
-    expect(page.locator("#alarm-act")).to_contain_text("Whose is it? technician")
+    expect(page.locator("#alarm-act")).to_contain_text("Owner technician")
 
 
 def test_who_was_quicker_is_told_and_nothing_one_wrote_is_lost(
     page_as: PageAs, site: Site, two: None
 ) -> None:
     page = live(page_as("technician", expects=["409"]), f"/alarms/{GRIPPER}")
-    page.get_by_text("Close it").click()
+    page.locator("#do-resolve summary").click()
     why = page.locator("#resolve").get_by_label("Why")
     why.fill("cable")
     say(site, GRIPPER, "acknowledge", revision=1, note="I have it")
     expect(page.locator("#alarm-news")).to_contain_text("operator changed this alarm")
-    expect(page.locator("#alarm-head")).to_contain_text("operator sees to it")
+    expect(page.locator("#alarm-head")).to_contain_text("acknowledged by operator")
     expect(why).to_have_value("cable")
     expect(why).to_be_focused()
-    page.get_by_role("button", name="Close").click()
+    page.locator("#resolve button").click()
     expect(page.locator("#alarm-news")).to_contain_text("Somebody changed this alarm meanwhile")
     expect(why).to_have_value("cable")
-    page.get_by_role("button", name="Close").click()
-    expect(page.locator("#alarm-head")).to_contain_text("closed by technician")
+    page.locator("#resolve button").click()
+    expect(page.locator("#alarm-head")).to_contain_text("resolved by technician")
 
 
 def test_a_viewer_sees_what_happens_and_changes_nothing(
