@@ -6,7 +6,7 @@ import pytest
 
 from tests.browser.conftest import PageAs
 from tests.browser.expecting import expect
-from tests.browser.looks import axe, no_sideways_scroll, shot
+from tests.browser.looks import no_sideways_scroll, shot
 
 
 @pytest.mark.parametrize(("theme", "width"), [("light", 1440), ("dark", 390)])
@@ -15,9 +15,8 @@ def test_what_can_fail(page_as: PageAs, theme: str, width: int) -> None:
     page.goto("/knowledge")
     page.get_by_role("link", name="Failure modes").first.click()
     expect(page.locator(".sheet tbody tr")).not_to_have_count(0)
-    axe(page)
-    no_sideways_scroll(page)
-    shot(page, f"knowledge-{theme}-{width}")
+    no_sideways_scroll(page)  # whom it would stop is asked once, in test_every_page.py
+    shot(page, f"knowledge-{theme}-{width}", whole=False)
 
 
 def test_the_sheet_is_looked_through(page_as: PageAs) -> None:
@@ -70,5 +69,5 @@ def test_what_sees_it_is_folded_and_the_head_stays(page_as: PageAs) -> None:
     assert head and bar and abs(head["y"] - bar["height"]) <= 2, "the head has gone with the rows"
     action = last.get_by_role("cell").last.bounding_box()
     assert action and action["x"] + action["width"] <= 1440
-    page.get_by_role("link", name="Rules").click()
+    page.get_by_role("link", name="Rules", exact=True).click()
     expect(page.get_by_role("heading", name="Rules")).to_be_in_viewport()
