@@ -61,7 +61,19 @@ class Item:
     def small(self) -> str:
         """Return the robot's own words, where the title does not say them already."""
         reason = self.line.reason
+        if self.is_cause and self.has_part:
+            return f"{self.what}: {reason}" if reason else self.what
         return "" if reason in self.title else reason
+
+    @property
+    def is_cause(self) -> bool:
+        """Tell whether the title says the cause, as far as one is known."""
+        return bool(self.cause) and self.cause.startswith(self.title)
+
+    @property
+    def sure(self) -> str:
+        """Return how sure the cause is that the title says; empty for another title."""
+        return self.cause.removeprefix(self.title).strip(" ()") if self.is_cause else ""
 
     @property
     def has_part(self) -> bool:
