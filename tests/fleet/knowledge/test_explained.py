@@ -10,6 +10,7 @@ import pytest
 from amberbox.core.errors import UsageError
 from amberbox.fleet.bus import Change
 from amberbox.fleet.knowledge.explained import Explained
+from amberbox.fleet.knowledge.notebook import Given, keep_answer
 from tests.fleet.house import House, house
 from tests.fleet.knowledge import robot as sim
 
@@ -100,6 +101,26 @@ def test_what_comes_is_explained_before_anybody_asks(home: House, worker: Worker
         running.cancel()
 
     asyncio.run(come())
+
+
+def test_what_an_answer_gave_is_told_and_not_asked_again(home: House, worker: Worker) -> None:
+    sim.say(home, [(sim.AT_NS, SILENT), (sim.AT_NS, FOUND)])
+    given = Given("laser_front.lamp", "no", "anna", sim.AT_NS)
+    body = {"id": FOUND.id, "revision": FOUND.revision, "state": "open"}
+    with home.services.database.begin() as connection:
+        keep_answer(connection, "ropod_001", FOUND.id, given, json.dumps(body).encode())
+    told: list[Any] = []
+    home.services.bus.on("explained", lambda change: told.append(change.data["answer"]))
+
+    async def start() -> None:
+        running = asyncio.create_task(home.services.explained.run())
+        async with asyncio.timeout(5):
+            while not told:
+                await asyncio.sleep(0.01)
+        running.cancel()
+
+    asyncio.run(start())
+    assert (told, worker.asked) == ([body], [])
 
 
 def test_one_that_cannot_be_explained_keeps_no_other_one_waiting(

@@ -11,8 +11,6 @@ import { fieldStamp, fieldText } from "../time.js";
 import * as view from "../view.js";
 
 const TYPING_MS = 250;
-/** So long it takes at most times until a diagnosis that came is put into words. */
-const EXPLAINED_MS = 3000;
 const USUAL = { severity: "warning", sort: "worst" };
 const form = one("#look");
 const bulk = one("#bulk");
@@ -142,6 +140,5 @@ view.on(() => look({}, { push: false }));
 keys.start({ acknowledge: (row) => acknowledge([row]), choose: choice.turn });
 markPeriod();
 
-const feed = listen({ kinds: ["alarm", "diagnosis"] });
-feed.on("diagnosis", () => setTimeout(stale, EXPLAINED_MS));
+const feed = listen({ kinds: ["alarm"] });
 for (const kind of ["alarm", "snapshot"]) feed.on(kind, stale);
