@@ -182,7 +182,8 @@ def test_one_question_tells_what_is_around_values(viewer: TestClient) -> None:
     api = "/api/v1/robots/ropod_001"
     span = {"from": format_time(T0_NS), "to": format_time(T0_NS + 100 * NS)}
     found = viewer.get(f"{PAGE}/around", params={**span, "item": "odom"}).json()
-    assert sorted(found) == ["alarms", "gaps", "incidents", "missions", "refused", "timeline"]
+    parts = ["alarms", "gaps", "incidents", "missions", "notes", "refused", "timeline"]
+    assert sorted(found) == parts
     assert found["refused"] == {}
     for name in ("incidents", "missions"):
         assert found[name] == viewer.get(f"{api}/{name}", params=span).json()
@@ -229,7 +230,7 @@ def test_parts_that_somebody_may_not_see_are_left_out(home: House) -> None:
         )
         .json()
     )
-    assert sorted(found) == ["gaps", "incidents", "missions", "refused"]
+    assert sorted(found) == ["gaps", "incidents", "missions", "notes", "refused"]
 
 
 def _seconds(text: str) -> float:
