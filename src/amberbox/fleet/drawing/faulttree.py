@@ -180,7 +180,7 @@ def _leaf(
 
 def _beside_sign(text: str, said: str) -> Iterator[Element]:
     left, most = 34.0, ROW[0] - TRUNK - 8 - 34
-    lines = broken(text, most, 2)
+    lines = broken(text, most, 3)
     first = 4.5 - 8 * (len(lines) - 1) - (5.5 if said else 0)
     for place, line in enumerate(lines):
         yield element("text", line, x=left, y=first + 16 * place)
@@ -189,7 +189,7 @@ def _beside_sign(text: str, said: str) -> Iterator[Element]:
 
 
 def _below_sign(text: str, said: str) -> Iterator[Element]:
-    lines = broken(text, LEAF[0] - 6, 3)
+    lines = broken(text, LEAF[0] - 6, 4)
     for place, line in enumerate(lines):
         yield element("text", line, x=0, y=50 + 16 * place, class_="middle")
     if said:

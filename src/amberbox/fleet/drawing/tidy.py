@@ -10,8 +10,8 @@ from amberbox.fleet.drawing.branches import Branch
 
 GATE = (204.0, 94.0)
 """How much room a gate takes: its text and its symbol."""
-LEAF = (150.0, 110.0)
-ROW = (330.0, 54.0)
+LEAF = (150.0, 126.0)
+ROW = (330.0, 68.0)
 APART = 24.0
 DROP = 38.0
 """How far below a gate its inputs begin."""
