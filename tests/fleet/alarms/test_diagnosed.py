@@ -32,7 +32,7 @@ def answer(revision: int, severity: str, *texts: str) -> dict[str, Any]:
     """Return what of an answer counts for alarms."""
     members = [{"text": text, "faults": [{"id": f"laser#{n}", "text": text}]}
                for n, text in enumerate(texts)]  # fmt: skip
-    told = {"broken": {"members": members} if members else None, "others": [],
+    told: dict[str, Any] = {"broken": {"members": members} if members else None, "others": [],
             "sure": {"probability": 0.93}, "use": {"severity": severity}}  # fmt: skip
     return {"id": "d1", "revision": revision, "explanation": told}
 

@@ -23,7 +23,6 @@ from amberbox.fleet.api.alarmlines import AlarmLine, Happening, line_of
 from amberbox.fleet.notifying.tables import OUTBOX
 from amberbox.fleet.pages.alarms.search import Look
 from amberbox.fleet.pages.alarms.wording import Words, checks_fail, events
-from amberbox.fleet.pages.figures import span
 from tests.fleet.house import START_NS, House, house
 from tests.fleet.knowledge import robot as sim
 
@@ -392,10 +391,3 @@ def test_history_in_words_the_newest_first(home: House) -> None:
         ("The diagnosis says", "Laser front: silent (likely)", ""),
         ("It got worse", "critical: it cannot go on with what it does", ""),
     ]
-
-
-@pytest.mark.parametrize(
-    ("seconds", "text"), [(0, "0 s"), (59.9, "59 s"), (60, "1 min"), (7200, "2 h"), (200000, "2 d")]
-)
-def test_how_long_it_lasted(seconds: float, text: str) -> None:
-    assert span(seconds) == text

@@ -2,7 +2,7 @@
 
 import pytest
 
-from amberbox.fleet.pages.figures import count, percent, size
+from amberbox.fleet.pages.figures import count, percent, size, span
 
 
 @pytest.mark.parametrize(
@@ -21,3 +21,10 @@ def test_counts_have_their_thousands_apart() -> None:
 @pytest.mark.parametrize(("share", "shown"), [(0, 0), (0.001, 1), (0.5, 50), (0.999, 99), (1, 100)])
 def test_all_is_said_of_all_only(share: float, shown: int) -> None:
     assert percent(share) == shown
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"), [(0, "0 s"), (59.9, "59 s"), (60, "1 min"), (7200, "2 h"), (200000, "2 d")]
+)
+def test_how_long_it_lasted(seconds: float, text: str) -> None:
+    assert span(seconds) == text
