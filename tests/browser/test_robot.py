@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from amberbox.fleet.pages import assets
-from amberbox.fleet.pages.robot import tree as robottree
+from amberbox.fleet.pages.robot import values
 from amberbox.fleet.pages.robot.tree import key
 from tests.browser import hostile
 from tests.browser.conftest import PageAs
@@ -256,7 +256,7 @@ def test_browser_and_server_write_numbers_alike(page_as: PageAs) -> None:
         "async ([path, values]) => values.map((await import(path)).$need('robot/live.js').number)",
         [assets.address("all.js"), list(NUMBERS)],
     )
-    assert told == [robottree.number(value) for value in NUMBERS]
+    assert told == [values.number(value) for value in NUMBERS]
 
 
 def test_files_of_the_folder_come_when_they_are_opened(page_as: PageAs) -> None:

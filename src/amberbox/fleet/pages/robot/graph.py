@@ -9,7 +9,7 @@ from amberbox.fleet.drawing.graph import Component as Box
 from amberbox.fleet.drawing.graph import Edge, dependency_graph
 from amberbox.fleet.drawing.svg import Element
 from amberbox.fleet.pages.drawingwords import drawing_words
-from amberbox.fleet.pages.robot.tree import branch_id, is_root, level_of
+from amberbox.fleet.pages.robot.tree import branch_id, called, is_root, level_of, names
 from amberbox.fleet.pages.wording import readable
 from amberbox.fleet.state.views import Component
 
@@ -19,6 +19,7 @@ class Line:
     """A component in the list: what it needs, and what needs it."""
 
     component: Component
+    name: str
     id: str
     level: str
     root: bool
@@ -51,11 +52,12 @@ def graph(components: Sequence[Component], label: str) -> Element | None:
 def as_list(components: Sequence[Component]) -> list[Line]:
     """Return the same line by line, what is not well first."""
     needs = [edge for edge in edges(components) if edge.kind == "needs"]
+    name = names(components)
     found = [
         Line(
-            one, branch_id(one.component), level_of(one), is_root(one),
-            [edge.end for edge in needs if edge.start == one.component],
-            [edge.start for edge in needs if edge.end == one.component],
+            one, name[one.component], branch_id(one.component), level_of(one), is_root(one),
+            [name[edge.end] for edge in needs if edge.start == one.component],
+            [name[edge.start] for edge in needs if edge.end == one.component],
         )
         for one in components
     ]  # fmt: skip
@@ -66,6 +68,6 @@ def _box(one: Component) -> Box:
     said = one.condition
     state = readable(said.state) if said and said.level != "ok" else ""
     return Box(
-        one.component, readable(one.component), level_of(one), state,
+        one.component, called(one.component, one.name), level_of(one), state,
         said.reason if said else "", f"#{branch_id(one.component)}", is_root(one),
     )  # fmt: skip

@@ -27,16 +27,17 @@ from amberbox.fleet.data import remarks
 from amberbox.fleet.pages.datalinks import moment_href
 from amberbox.fleet.pages.diagnosis.look import current_card
 from amberbox.fleet.pages.page import Pages, render
+from amberbox.fleet.pages.robot import expected, values
 from amberbox.fleet.pages.robot import graph as robotgraph
 from amberbox.fleet.pages.robot import tree as robottree
-from amberbox.fleet.pages.robot.battery import trend
+from amberbox.fleet.pages.robot.battery import Said, hour, said
 from amberbox.fleet.pages.robot.groups import groups
 from amberbox.fleet.pages.robot.times import Lanes, Times, Window, times
 from amberbox.fleet.pages.robot.tree import Show
 from amberbox.fleet.pages.strings import catalogue
 from amberbox.fleet.services import Services
 from amberbox.fleet.state.said import moment
-from amberbox.fleet.state.views import Card, Component, StatusTree
+from amberbox.fleet.state.views import Card, StatusTree
 
 routes = Pages()
 
@@ -79,10 +80,10 @@ def show(
     may = {name: who.may(name, robot) for name in _ACTIONS}
     return _show(
         request, "robot/robot.html", card=card, look=look, may=may, **_tree(tree, look),
-        **_graph(tree), **_panels(tree), **_now(fleet, who, robot),
+        **_graph(tree), **_panels(tree, card), **_now(fleet, who, robot),
         fill=_fills(request, robot) if known is None else {},
         has_files=_has_files(fleet, who, robot, card), robot=robot,
-        seen=_times(fleet, robot, window, lanes), **_events(fleet, robot, kind, may["items.read"]),
+        seen=_times(fleet, robot, look, tree), **_events(fleet, robot, kind, may["items.read"]),
         diagnosis=current_card(fleet, robot.id, card.last_seen) if may["diagnoses.read"] else None,
         strings=("diagnosis",),
     )  # fmt: skip
@@ -117,7 +118,8 @@ def show_timeline(
 ) -> Response:
     """Show what was when alone."""
     look = Look(window=window, lanes=lanes)
-    seen = _times(fleet, robot, window, lanes)
+    tree = status_now(fleet, robot) or status_without_folder(fleet, robot)
+    seen = _times(fleet, robot, look, tree)
     return _show(request, "robot/timeline.html", robot=robot, look=look, seen=seen)
 
 
@@ -138,7 +140,7 @@ def show_now(request: Request, fleet: Fleet, who: Who, robot: OfRobot) -> Respon
 def show_panels(request: Request, fleet: Fleet, robot: OfRobot) -> Response:
     """Show battery and components that are alike, alone."""
     tree, card = read_status(fleet, robot), read_card(fleet, robot)
-    return _show(request, "robot/panels.html", card=card, **_panels(tree))
+    return _show(request, "robot/panels.html", card=card, **_panels(tree, card))
 
 
 @routes.get("/pieces/robots/{robot}/files", "folder.read")
@@ -146,28 +148,32 @@ def show_files(request: Request, fleet: Fleet, robot: OfRobot) -> Response:
     """Show the files of the folder that the robot has now, alone."""
     config_hash = fleet.folders.current(robot.id)
     files = fleet.folders.files(robot.id, config_hash) or ()
-    values = {"robot": robot.id, "config_hash": config_hash, "files": files}
-    return _show(request, "robot/files.html", **values)
+    found = {"robot": robot.id, "config_hash": config_hash, "files": files}
+    return _show(request, "robot/files.html", **found)
 
 
 @routes.get("/pieces/robots/{robot}/battery", "items.read")
 async def show_battery(request: Request, fleet: Fleet, who: Who, robot: OfRobot) -> Response:
     """Show how the battery went in the last hour."""
     try:
-        found = await trend(fleet, who, robot.id)
+        found = await hour(fleet, who, robot.id)
     except AmberboxError:  # too much is asked at the moment: the value itself is on the page
         found = None
-    return _show(request, "robot/trend.html", trend=found)
+    return _show(request, "robot/trend.html", hour=found)
 
 
-def _show(request: Request, template: str, **values: Any) -> Response:
-    return render(request, template, rt=robottree, **{"fill": NO_FILLS, **values})
+def _show(request: Request, template: str, **shown: Any) -> Response:
+    return render(
+        request, template, rt=robottree, vals=values, expect=expected,
+        **{"fill": NO_FILLS, **shown},
+    )  # fmt: skip
 
 
 def _tree(tree: StatusTree, look: Look) -> Mapping[str, Any]:
     return {
         "tree": tree,
         "branches": robottree.branches(tree, look.q, look.show, look.chosen),
+        "names": robottree.names(tree.components),
     }  # fmt: skip
 
 
@@ -179,9 +185,9 @@ def _graph(tree: StatusTree) -> Mapping[str, Any]:
     }
 
 
-def _times(fleet: Services, robot: KnownRobot, window: Window, lanes: Lanes) -> Times:
-    found = read_timeline(fleet, robot, f"now-{window}", "now", points=_POINTS)
-    return times(robot.id, found, lanes, window)
+def _times(fleet: Services, robot: KnownRobot, look: Look, tree: StatusTree) -> Times:
+    found = read_timeline(fleet, robot, f"now-{look.window}", "now", points=_POINTS)
+    return times(robot.id, found, look.lanes, robottree.names(tree.components))
 
 
 def _events(fleet: Services, robot: KnownRobot, kind: str, may: bool) -> Mapping[str, Any]:
@@ -210,13 +216,14 @@ def _now(fleet: Services, who: Who, robot: KnownRobot) -> Mapping[str, Any]:
     }  # fmt: skip
 
 
-def _panels(tree: StatusTree) -> Mapping[str, Any]:
-    return {"groups": groups(tree.components), "battery": _battery(tree)}
+def _panels(tree: StatusTree, card: Card) -> Mapping[str, Any]:
+    shown = card.battery.output if card.battery else ""
+    return {"groups": groups(tree.components), "battery": _battery(tree, shown)}
 
 
-def _battery(tree: StatusTree) -> Component | None:
+def _battery(tree: StatusTree, shown: str) -> Said | None:
     found = (one for one in tree.components if "battery" in one.component.casefold())
-    return next(found, None)
+    return said(next(found, None), shown)
 
 
 def _fills(request: Request, robot: KnownRobot) -> Mapping[str, str]:

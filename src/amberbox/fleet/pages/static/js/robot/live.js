@@ -2,6 +2,7 @@
 // it stands, found by its key; nothing is fetched, and nothing moves.
 
 import { all, el, level as levelOf, one, setText } from "../dom.js";
+import { isMet } from "./expected.js";
 import { t } from "../strings.js";
 import { nowMs, span, when } from "../time.js";
 
@@ -9,10 +10,10 @@ const DIGITS = 4;
 const [LONG_S, FOREVER_S] = [120, 1e9];
 const SPANS = [["d", 86400], ["h", 3600], ["min", 60], ["s", 1]];
 
-/** Return the name by which something is found: as robottree.py makes it. */
+/** Return the name by which something is found: as tree.py makes it. */
 export const key = (component, mode = "", output = "") => [component, mode, output].map(encodeURIComponent).join("/");
 
-/** Write a number with four digits that count, as robottree.py does. @param {number} value */
+/** Write a number with four digits that count, as values.py does. @param {number} value */
 export function number(value) {
   const size = Math.abs(value);
   if (!Number.isFinite(value) || size >= 1e6 || (size > 0 && size < 1e-3)) return value.toExponential(2).replace(/e([+-])(\d)$/, "e$10$2");
@@ -20,7 +21,7 @@ export function number(value) {
   return value.toFixed(Math.max(0, DIGITS - 1 - whole));
 }
 
-/** Write a duration, as tree.py does: in two units from 2 min on. @param {number} value seconds */
+/** Write a duration, as values.py does: in two units from 2 min on. @param {number} value seconds */
 export function duration(value) {
   const whole = Math.floor(Math.abs(value));
   if (!(Math.abs(value) >= LONG_S && Math.abs(value) < FOREVER_S)) return `${number(value)} s`;
@@ -85,6 +86,7 @@ export function robotLive(page) {
     setText(known.why, why);
     if (known.why.title !== said.reason) known.why.title = said.reason;
     if (!said.mode) writeComponent(known.row.parentElement, said, k);
+    else if (said.level !== "ok") unfold(known.row);
     return Object.entries(said.outputs).every(([name, value]) => writeValue(said, name, value));
   }
 
@@ -106,7 +108,7 @@ export function robotLive(page) {
     for (const element of found ?? []) {
       const cell = one(".val", element);
       setText(cell, shown(value, cell.dataset.type));
-      element.classList.toggle("wrong", said.level !== "ok" && said.state === name);
+      judge(element, said.level !== "ok", said.state === name, value);
     }
     return found !== undefined;
   }
@@ -148,8 +150,27 @@ function setLevel(element, name) {
   element.replaceChildren(...fresh.childNodes);
 }
 
-function link(name) {
-  return el("a", { href: `#c-${encodeURIComponent(name)}`, "data-go": name }, name);
+/** Mark a value that its mode is not well for, also while it is as expected again. */
+function judge(element, isIll, isNamed, value) {
+  const { expected = "" } = element.dataset;
+  const met = isMet(expected, value);
+  const isWrong = isIll && (isNamed || !met);
+  const isAgain = isWrong && met && expected !== "";
+  element.classList.toggle("wrong", isWrong);
+  element.classList.toggle("again", isAgain);
+  const healing = one(".healing", element);
+  if (healing && healing.hidden === isAgain) healing.hidden = !isAgain;
+  if (isWrong) unfold(element);
+}
+
+/** Show a row that was folded because it held. */
+function unfold(row) {
+  if (row.hidden) row.hidden = false;
+}
+
+function link(id) {
+  const called = one(`.branch[data-component="${CSS.escape(id)}"] .node .name b`)?.textContent;
+  return el("a", { href: `#c-${encodeURIComponent(id)}`, "data-go": id }, called ?? id.replaceAll("_", " "));
 }
 
 function joined(links) {

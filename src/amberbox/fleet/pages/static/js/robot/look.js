@@ -81,7 +81,17 @@ export function treeLook(section, form) {
     remember();
   }
 
+  /** Show what holds beside the checks of a component that fail. */
+  function unfold(row) {
+    for (const folded of all(".tr[hidden]", row.parentElement)) folded.hidden = false;
+    rows.go(one(".about", row.parentElement));
+    row.hidden = true;
+  }
+
   function start() {
+    section.addEventListener("click", ({ target }) => {
+      if (target.closest("[data-unfold]")) unfold(target.closest(".rest"));
+    });
     form.addEventListener("submit", (event) => event.preventDefault());
     form.elements.q.addEventListener("input", (event) => show({ q: event.target.value.trim() }));
     one("#trouble").addEventListener("click", (event) => {

@@ -13,7 +13,7 @@ import { silence } from "./silence.js";
 
 const TREE_MS = 2000;
 const NOW_MS = 20000;
-const TREND_MS = 300000;
+const TREND_MS = 60000;
 
 const page = one("#robot");
 const { robot } = page.dataset;
