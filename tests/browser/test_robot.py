@@ -5,13 +5,15 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import pytest
 
 from amberbox.fleet.pages import assets
-from amberbox.fleet.pages.robot import values
+from amberbox.fleet.pages.robot import expected, values
 from amberbox.fleet.pages.robot.tree import key
+from amberbox.fleet.state.views import Output
 from tests.browser import hostile
 from tests.browser.conftest import PageAs
 from tests.browser.expecting import expect
@@ -20,7 +22,7 @@ from tests.browser.site import Site, until
 from tests.browser.watching import RESTART
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Locator, Page, WebSocketRoute
+    from playwright.sync_api import Locator, Page, Route, WebSocketRoute
 
 PAGE = "/robots/ropod_001"
 SHIFTS = """() => {
@@ -32,6 +34,13 @@ SHIFTS = """() => {
     }).observe({type: "layout-shift"})
 }"""  # noqa: E501 - it is JavaScript
 NUMBERS = (0.0, 0.01, 0.5, 1.0, 9.9996, 24.2, -64.5, 999.96, 5400.0, 123456.7, 2.5e6, 1.5e-5)
+
+EXPECTED: tuple[tuple[str, str, bool | float | str | None], ...] = (
+    ("true", "bool", True), ("true", "bool", False), ("!= true", "bool", False),
+    (">= 5.0", "float", 5.0), ("< 5.0", "float", 5.0), ("!= 3", "int", 3), ("1 to 3", "int", 4),
+    ("1 to 3", "int", 3), ("0.5", "float", 0.5), ("up", "string", "up"), ("up", "float", 1.0),
+    ("!= down", "string", "down"), ("1 to 3", "string", "1 to 3"), ("true", "bool", None),
+)  # fmt: skip
 
 
 @pytest.fixture
@@ -257,6 +266,65 @@ def test_browser_and_server_write_numbers_alike(page_as: PageAs) -> None:
         [assets.address("all.js"), list(NUMBERS)],
     )
     assert told == [values.number(value) for value in NUMBERS]
+
+
+def test_browser_and_server_judge_values_alike(page_as: PageAs) -> None:
+    page = page_as("viewer")
+    page.goto(PAGE)
+    told = page.evaluate(
+        "async ([path, all]) => {"
+        " const { isMet } = (await import(path)).$need('robot/expected.js');"
+        " return all.map(([expected, value]) => isMet(expected, value)) }",
+        [assets.address("all.js"), [[expected, value] for expected, _, value in EXPECTED]],
+    )
+    outputs = [Output("x", type, value, said, "", "") for said, type, value in EXPECTED]
+    assert told == [expected.is_met(one) for one in outputs]
+    assert any(told) and not all(told)
+
+
+def test_what_holds_is_folded_and_what_heals_is_said(page_as: PageAs, robot: Site) -> None:
+    page = page_as("viewer", width=390)
+    page.goto(PAGE)
+    is_live(page)
+    alive, rate = (row(page, "laser_front", "heartbeat", name) for name in ("alive", "rate_hz"))
+    expect(alive).to_contain_text("expected yes")
+    expect(rate).to_be_hidden()
+    one = robot.robots["ropod_001"]
+    before = one.statuses["laser_front", "heartbeat"]
+    one.say(replace(before, outputs={"alive": True, "rate_hz": 9.5}))
+    expect(alive.get_by_text("so again, counted as failed")).to_be_visible()
+    one.say(before)
+    expect(alive.get_by_text("so again, counted as failed")).to_be_hidden()
+    page.get_by_role("button", name="that hold").click()
+    expect(rate).to_be_visible()
+    expect(page.locator('[data-component="laser_front"] .about')).to_be_focused()
+    box, cause = page.locator("#graph .scroll.live"), page.locator("#graph .node.root")
+    place, at = box.bounding_box(), cause.bounding_box()
+    assert place and at and place["x"] <= at["x"] <= place["x"] + place["width"]
+
+
+def test_what_a_battery_measures_comes_without_a_jump(page_as: PageAs, robot: Site) -> None:
+    page = page_as("viewer")
+    height = "() => document.querySelector('#trend').getBoundingClientRect().height"
+    summary = page.locator("#battery-rest summary")
+    held: list[Route] = []
+    page.route("**/pieces/**/battery", lambda route: held.append(route))
+    page.goto(PAGE)
+    before = page.evaluate(height)
+    while not held:
+        page.wait_for_timeout(50)
+    held[0].continue_()
+    expect(page.locator("#trend")).to_contain_text("Voltage")
+    assert page.evaluate(height) == before
+    expect(summary.locator(":visible")).to_have_text("The one check holds")
+    one = robot.robots["ropod_001"]
+    was = one.statuses["battery", "charge"]
+    one.say(
+        replace(was, level="error", state="not_empty", outputs={**was.outputs, "not_empty": False})
+    )
+    expect(summary.locator(":visible")).to_have_text("The one check does not hold")
+    one.say(was)
+    expect(summary.locator(":visible")).to_have_text("The one check holds")
 
 
 def test_files_of_the_folder_come_when_they_are_opened(page_as: PageAs) -> None:

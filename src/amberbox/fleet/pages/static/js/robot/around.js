@@ -52,6 +52,8 @@ export function around(base) {
     if (fresh) one("#trend")?.replaceWith(fresh);
   }
 
+  showCause();
+  new MutationObserver(showCause).observe(one("#graph").parentElement, { childList: true });
   one("#windows")?.addEventListener("click", chooseWindow);
   one("#lanes")?.addEventListener("click", chooseLanes);
   one("#event-kind")?.addEventListener("change", (event) => {
@@ -59,4 +61,11 @@ export function around(base) {
     stale.events();
   });
   return { ...stale, trend };
+}
+
+/** Where the graph is wider than its place, begin with what trouble comes from. */
+function showCause() {
+  const cause = one("#graph .node.root");
+  const place = cause?.closest(".scroll");
+  if (place) place.scrollLeft += cause.getBoundingClientRect().left - place.getBoundingClientRect().left - place.clientWidth / 4;
 }
