@@ -13,7 +13,7 @@ from amberbox.fleet.api.query import Gap
 from amberbox.fleet.data.journals import Integrity, Recording, State
 from amberbox.fleet.data.missing import GapKind
 from amberbox.fleet.drawing.axis import Axis
-from amberbox.fleet.pages.recordings.cover import axis_of, share, spans, stretches
+from amberbox.fleet.pages.recordings.cover import axis_of, share, shortest, spans, stretches
 
 HOUR_NS = 3600 * NS
 AXIS = Axis(0, 24 * HOUR_NS)
@@ -96,3 +96,14 @@ def test_the_share_of_a_mission_counts_nothing_twice() -> None:
     assert share(known, 3 * HOUR_NS, 7 * HOUR_NS) == 0.5
     assert share(known, 8 * HOUR_NS, 9 * HOUR_NS) == 0
     assert share(known, HOUR_NS, HOUR_NS) == 0
+
+
+@pytest.mark.parametrize(
+    ("hours", "window"),
+    [(None, "7d"), (0.1, "1h"), (1.0, "1h"), (1.1, "6h"), (20, "24h"), (25, "7d"), (2000, "7d")],
+)
+def test_where_nobody_chose_the_window_is_the_shortest_that_holds_all(
+    hours: float | None, window: str
+) -> None:
+    now_ns = 10_000 * HOUR_NS
+    assert shortest(None if hours is None else int(now_ns - hours * HOUR_NS), now_ns) == window

@@ -3,6 +3,7 @@
 import re
 from collections.abc import Iterator
 from html import unescape
+from pathlib import Path
 
 import pytest
 from starlette.testclient import TestClient
@@ -13,6 +14,7 @@ from amberbox.fleet.archive.files import Layout
 from amberbox.fleet.data import journals
 from tests.browser import hostile
 from tests.fleet.archive.recordings import Robot
+from tests.fleet.data.damaged import quarantined
 from tests.fleet.house import START_NS, House, house
 
 HTML = {"accept": "text/html"}
@@ -122,6 +124,30 @@ def test_files_of_another_time_are_not_looked_at(
         assert looked_at(home, f"{path}?window=all", monkeypatch) == 3
     finally:
         home.clock.advance(-48 * 3600)
+
+
+@pytest.mark.parametrize("path", ["/recordings", f"/recordings/{ROBOT}"])
+def test_the_window_is_what_holds_all_unless_somebody_chose(home: House, path: str) -> None:
+    viewer = home.client("viewer")
+    assert 'data-window="6h"' in viewer.get(path, headers=HTML).text
+    assert 'data-window="30d"' in viewer.get(f"{path}?window=30d", headers=HTML).text
+    assert 'data-window="7d"' in viewer.get("/recordings/ropod_003", headers=HTML).text
+
+
+def test_what_is_damaged_comes_first(home: House, tmp_path: Path) -> None:
+    damaged, ours = Robot("ropod_002", tmp_path), Robot(ROBOT, tmp_path / "ours")
+    for robot in (damaged, ours):
+        robot.record(0, files=1, at_ns=START_NS)
+    home.clock.advance(-48 * 3600)  # it came before all others
+    came_ns = home.clock.wall_ns()
+    home.clock.advance(48 * 3600)
+    with quarantined(home, damaged, "journal/odd.mcap", came_ns=came_ns):
+        answer = home.client("viewer").get("/recordings", headers=HTML).text
+        assert re.findall(r'<article[^>]*data-robot="([^"]+)"', answer)[0] == "ropod_002"
+    with quarantined(home, ours, "journal/odd.mcap", came_ns=came_ns):
+        answer = home.client("viewer").get(f"/recordings/{ROBOT}", headers=HTML).text
+        first, *rest = re.findall(r'<tr data-file="([^"]+)"', answer)
+        assert first.endswith("journal/odd.mcap") and len(rest) == 3
 
 
 def test_only_robots_that_are_named_are_told_of(home: House) -> None:

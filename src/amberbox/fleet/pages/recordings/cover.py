@@ -15,16 +15,19 @@ from amberbox.fleet.data.missing import GapKind
 from amberbox.fleet.drawing.axis import Axis
 from amberbox.fleet.drawing.coverage import Kind, Stretch
 
-Window = Literal["24h", "7d", "30d", "all"]
+Window = Literal["1h", "6h", "24h", "7d", "30d", "all"]
 WINDOWS: Mapping[Window, int | None] = {
-    "24h": 24 * 3600 * NS, "7d": 7 * 24 * 3600 * NS, "30d": 30 * 24 * 3600 * NS, "all": None,
+    "1h": 3600 * NS, "6h": 6 * 3600 * NS, "24h": 24 * 3600 * NS, "7d": 7 * 24 * 3600 * NS,
+    "30d": 30 * 24 * 3600 * NS, "all": None,
 }  # fmt: skip
 """How far a bar goes back from now, in ns; None is to the first recording."""
 
+_MOST: Window = "7d"
+"""The longest window that is shown where nobody chose one."""
 _STEPS = 800
 """Stretches nearer to each other than this part of the bar are drawn as one."""
 _HOUR_NS = 3600 * NS
-_ASIDE = ("watch", "keep")
+ASIDE = ("watch", "keep")
 """Journals of what the box and its watcher say themselves: not what the robot's data cover."""
 _HELD = ("in_columns", "waiting")
 _DRAWN: Mapping[GapKind, Kind] = {
@@ -41,6 +44,16 @@ class Part:
     start: str
     to: str
     text: str
+
+
+def shortest(first_ns: int | None, now_ns: int) -> Window:
+    """Return the shortest window that holds all since the first recording, at most 7 days."""
+    if first_ns is None:
+        return _MOST
+    for name, back_ns in WINDOWS.items():
+        if name == _MOST or (back_ns is not None and first_ns >= now_ns - back_ns):
+            return name
+    return _MOST
 
 
 def axis_of(window: Window, journals: Sequence[Recording], now_ns: int) -> Axis:
@@ -89,7 +102,7 @@ def share(recorded: Sequence[tuple[int, int]], from_ns: int, to_ns: int) -> floa
 
 
 def _data(journals: Iterable[Recording]) -> Iterator[Recording]:
-    return (one for one in journals if one.keeping not in _ASIDE)
+    return (one for one in journals if one.keeping not in ASIDE)
 
 
 def _recorded(journals: Iterable[Recording]) -> Iterator[Stretch]:

@@ -7,6 +7,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
+from sqlalchemy import func, select
+
 from amberbox.core.clock import NS
 from amberbox.core.errors import AmberboxError
 from amberbox.core.timetext import format_time, ns_of
@@ -18,15 +20,18 @@ from amberbox.fleet.api.missions import Mission, list_missions
 from amberbox.fleet.api.query import Gaps, list_gaps
 from amberbox.fleet.archive.retaining import rule_of
 from amberbox.fleet.archive.store import Retention
+from amberbox.fleet.archive.tables import JOURNALS
 from amberbox.fleet.data.journals import Integrity, Recording, Span, recordings
 from amberbox.fleet.drawing.axis import Axis
 from amberbox.fleet.drawing.coverage import Stretch
 from amberbox.fleet.options.options import read
 from amberbox.fleet.pages.recordings.cover import (
+    ASIDE,
     WINDOWS,
     Window,
     axis_of,
     share,
+    shortest,
     spans,
     stretches,
 )
@@ -94,6 +99,16 @@ class Cover:
     def to(self) -> str:
         """Where the bar ends."""
         return format_time(int(self.axis.to))
+
+
+def fitting(fleet: Services, robots: Sequence[str]) -> Window:
+    """Return the shortest window that holds what there is of some robots, at most 7 days."""
+    j = JOURNALS.c
+    chosen = select(func.min(j.start_ns)).where(
+        j.robot.in_(robots), j.end_ns > 0, j.keeping.not_in(ASIDE)
+    )
+    with fleet.database.reading() as connection:
+        return shortest(connection.execute(chosen).scalar(), fleet.clock.wall_ns())
 
 
 def record(

@@ -25,6 +25,7 @@ from amberbox.fleet.pages.recordings.look import (
     Record,
     Retaining,
     cover,
+    fitting,
     journals,
     record,
     with_journals,
@@ -47,6 +48,7 @@ _COMING = ("copying", "waiting", "aside")
 
 After = Annotated[str, Query(max_length=400)]
 Names = Annotated[list[Annotated[str, Query(max_length=64)]], Query(max_length=200)]
+Chosen = Annotated[Window | None, Query(description="empty: what holds all, at most 7 days")]
 NOTHING: list[str] = []
 
 
@@ -69,9 +71,10 @@ class Look:
 
 
 @routes.get("/recordings", "items.read", each=True)
-def show(request: Request, fleet: Fleet, who: Who, window: Window = "7d") -> Response:
+def show(request: Request, fleet: Fleet, who: Who, window: Chosen = None) -> Response:
     """Show what there is of all robots: cheap figures at once, the rest as it is asked for."""
     lines = _lines(fleet, who)
+    window = window or fitting(fleet, [line.card.robot for line in lines])
     return render(
         request, "recordings/recordings.html", lines=lines, window=window, windows=tuple(WINDOWS),
         swatches=_swatches(), total=_total(lines), may_download=who.may_some("data.download"),
@@ -103,11 +106,11 @@ def show_card(
 
 @routes.get("/recordings/{robot}", "items.read")
 def show_robot(
-    request: Request, fleet: Fleet, who: Who, robot: OfRobot, window: Window = "7d",
+    request: Request, fleet: Fleet, who: Who, robot: OfRobot, window: Chosen = None,
     show: Show = "all", after: After = "", mission: After = "",
 ) -> Response:  # fmt: skip
     """Show the recordings of a robot: what costs little at once, the rest when workers answer."""
-    look = Look(window, show, after, mission)
+    look = Look(window or fitting(fleet, [robot.id]), show, after, mission)
     return render(
         request, "recordings/robot.html", card=read_card(fleet, robot),
         robot=robot.id, held=_held(fleet, [robot.id])[robot.id], look=look, windows=tuple(WINDOWS),
@@ -164,6 +167,7 @@ def _lines(fleet: Services, who: Caller, only: Sequence[str] = ()) -> list[Line]
     mine = {robot.id for robot in seen if not only or robot.id in only}
     cards = [card for card in list_cards(fleet, who, "", "", _MOST) if card.robot in mine]
     known = _held(fleet, [card.robot for card in cards])
+    cards.sort(key=lambda card: card.damaged_files == 0)
     return [Line(card, known[card.robot]) for card in cards]
 
 
@@ -222,14 +226,15 @@ def _fetches(fleet: Services, robot: KnownRobot) -> Mapping[str, Any]:
 def _journals(
     fleet: Services, robot: KnownRobot, found: Sequence[Recording], look: Look
 ) -> Mapping[str, Any]:
-    fitting = [one for one in found if _fits(one, look.show)]
-    names = [_name(one) for one in fitting]
+    chosen = [one for one in found if _fits(one, look.show)]
+    chosen.sort(key=lambda one: not _fits(one, "trouble"))
+    names = [_name(one) for one in chosen]
     start = names.index(look.after) + 1 if look.after in names else 0
-    page = fitting[start : start + _PAGE]
+    page = chosen[start : start + _PAGE]
     retaining = Retaining(fleet, robot.id)
     return {
         "journals": [(_name(one), one, retaining.until(one)) for one in page],
-        "journals_first": start, "journals_all": len(fitting), "files_all": len(found),
+        "journals_first": start, "journals_all": len(chosen), "files_all": len(found),
         "journals_more": names[start + _PAGE - 1] if len(names) > start + _PAGE else "",
         "counts": {name: sum(_fits(one, name) for one in found) for name in SHOWS},
         "shows": SHOWS, "days_kept": retaining.days,

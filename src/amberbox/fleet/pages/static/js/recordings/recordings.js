@@ -3,7 +3,6 @@
 import { all, el, icon, one } from "../dom.js";
 import { piece, put } from "../pieces.js";
 import { followStates } from "./state.js";
-import * as view from "../view.js";
 
 /** Robots in one question: as many as the server takes. */
 const MOST = 200;
@@ -27,7 +26,7 @@ const next = () => [...shown].find((robot) => wanted.has(robot));
 
 async function more(robot) {
   const place = () => one(`[data-more="${CSS.escape(robot)}"]`);
-  const query = new URLSearchParams({ window: view.get("window", "7d") });
+  const query = new URLSearchParams({ window: one("#recordings").dataset.window });
   try {
     const fresh = await piece(`/pieces/recordings/${encodeURIComponent(robot)}?${query}`);
     if (place()) put(place(), fresh);

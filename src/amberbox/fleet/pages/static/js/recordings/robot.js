@@ -8,7 +8,6 @@ import { check } from "./check.js";
 import { followStates } from "./state.js";
 import { t } from "../strings.js";
 import { fieldText, nowMs } from "../time.js";
-import * as view from "../view.js";
 
 const PARTS = ["missions", "incidents", "fetches", "journals"];
 const WINDOW_MS = 600_000;
@@ -50,7 +49,7 @@ function isBusy(part) {
 }
 
 async function reloadCard() {
-  const query = new URLSearchParams({ window: view.get("window", "7d"), link: "false" });
+  const query = new URLSearchParams({ window: page.dataset.window, link: "false" });
   const fresh = await piece(`${base}?${query}`).catch(() => null); // as above
   const old = one("[data-more]");
   if (!fresh || !old) return;
