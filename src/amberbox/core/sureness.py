@@ -10,6 +10,8 @@ SURE_WORDS: tuple[tuple[float, str], ...] = (
     (0.0, "only a guess"),
 )
 """From which probability on each word is used."""
+LIKELY = 0.5
+"""From which probability on a cause is called likely: it is so rather than not."""
 
 
 def sure_word(probability: float) -> str:

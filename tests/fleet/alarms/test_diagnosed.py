@@ -37,8 +37,11 @@ def answer(revision: int, severity: str, *texts: str) -> dict[str, Any]:
     return {"id": "d1", "revision": revision, "explanation": told}
 
 
-def explain(home: Stand, revision: int, severity: str, *texts: str) -> None:
-    told = {"answer": answer(revision, severity, *texts)}
+def explain(
+    home: Stand, revision: int, severity: str, *texts: str, probability: float = 0.93
+) -> None:
+    told: dict[str, Any] = {"answer": answer(revision, severity, *texts)}
+    told["answer"]["explanation"]["sure"]["probability"] = probability
     home.bus.publish(Change("explained", "r1", told))
     home.alarms.step()
 
@@ -97,6 +100,16 @@ def test_the_severity_is_that_of_the_effect(home: Stand) -> None:
     assert home.only().severity == "warning"  # nobody knows: as it was
     home.wait(12)
     assert home.only().told == "warning"
+
+
+def test_a_guess_makes_an_alarm_worse_but_not_less_bad(home: Stand) -> None:
+    home.say("r1", diagnosis(home, "laser#x"), explained(home))
+    explain(home, 1, "warning", "one", probability=0.4)
+    assert home.only().severity == "urgent"
+    explain(home, 1, "warning")  # probably a false alarm
+    assert home.only().severity == "urgent"
+    explain(home, 1, "critical", "one", probability=0.4)
+    assert home.only().severity == "critical"
 
 
 def test_what_was_as_bad_before_is_not_open_again(home: Stand) -> None:

@@ -239,7 +239,7 @@ def test_without_a_cause_the_title_says_which_checks_fail(reason: str, title: st
 
 
 def test_what_nobody_described_is_no_title(home: House) -> None:
-    other = wordsof.Words([wordsof.Cause("something", "other")], 0.7)
+    other = wordsof.Words([wordsof.LeadingCause("something", "other")], 0.7)
     line = line_of(replace(ALARMS[1], words=written(other)), [])
     assert Words(home.services).title(line) == "Laser front: “laser_front” fails".replace("_", " ")
     assert Words(home.services).cause(line) == (

@@ -150,6 +150,28 @@ def test_what_is_damaged_comes_first(home: House, tmp_path: Path) -> None:
         assert first.endswith("journal/odd.mcap") and len(rest) == 3
 
 
+def test_a_damaged_file_can_be_taken_along(home: House, tmp_path: Path) -> None:
+    ours = Robot(ROBOT, tmp_path)
+    ours.record(0, files=1, at_ns=START_NS)
+    kept = home.services.folder / "quarantine" / "odd.mcap"
+    kept.parent.mkdir(exist_ok=True)
+    kept.write_bytes(b"odd")
+    link = f"/recordings/{ROBOT}/damaged/{'d' * 64}"
+    with quarantined(home, ours, "journal/odd.mcap", came_ns=START_NS, path="quarantine/odd.mcap"):
+        technician = home.client("technician")
+        assert f'href="{link}"' in technician.get(f"/recordings/{ROBOT}", headers=HTML).text
+        answer = technician.get(link)
+        assert answer.content == b"odd"
+        assert answer.headers["content-disposition"].startswith("attachment; filename=")
+        assert link not in home.client("viewer").get(f"/recordings/{ROBOT}", headers=HTML).text
+        assert home.client("viewer").get(link).status_code == 403
+        assert technician.get(link.replace(ROBOT, "ropod_002")).status_code == 404
+        kept.unlink()
+        assert technician.get(link).status_code == 404
+    noted = home.client("admin").get("/api/v1/audit?action=downloads.fetch").json()
+    assert noted[0]["object"] == "journal/odd.mcap"
+
+
 def test_only_robots_that_are_named_are_told_of(home: House) -> None:
     answer = home.client("viewer").get("/pieces/recordings?robot=ropod_001&robot=ropod_003")
     assert re.findall('data-state="([^"]+)"', answer.text) == ["ropod_001", "ropod_003"]

@@ -14,6 +14,7 @@ from amberbox.core.errors import UsageError
 from amberbox.core.timetext import format_time
 from amberbox.fleet.alarms.alarm import Alarm, Entry, Part, State, Step, is_worse, worst
 from amberbox.fleet.alarms.settings import AlarmSettings
+from amberbox.fleet.alarms.words import read
 from amberbox.monitoring.engine.outputs import RANK
 from amberbox.monitoring.plan import Severity
 
@@ -60,7 +61,10 @@ def revised(alarm: Alarm, revision: int) -> Alarm:
 def explained(
     alarm: Alarm, effect: Severity | Literal[""], words: str, now_ns: int, settings: AlarmSettings
 ) -> Step:
-    """Take what its diagnosis means: its severity is that of the effect, be it less or more."""
+    """Take what its diagnosis means: the severity of the effect, a lesser one if it is likely."""
+    told = read(words)
+    if effect and not (told and told.is_likely):
+        effect = worst([alarm.severity, effect])
     changed = replace(alarm, effect=effect, words=words)
     if not effect or effect == alarm.severity:
         return changed, []

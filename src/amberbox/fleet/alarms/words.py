@@ -8,6 +8,7 @@ from typing import Any, Final, Literal, TypeAlias
 
 import msgspec
 
+from amberbox.core.sureness import LIKELY
 from amberbox.monitoring.engine.outputs import SEVERITIES
 from amberbox.monitoring.plan import Severity
 
@@ -19,7 +20,7 @@ _UNDESCRIBED: Final = "unknown#other"
 
 
 @dataclass(frozen=True, slots=True)
-class Cause:
+class LeadingCause:
     """What may be broken; ``kind`` tells a failure from none, and from one nobody described."""
 
     text: str
@@ -33,9 +34,15 @@ class Words:
     ``names`` are failure modes in words, by id.
     """
 
-    causes: Sequence[Cause] = ()
+    causes: Sequence[LeadingCause] = ()
     probability: float = 0.0
     names: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def is_likely(self) -> bool:
+        """Whether it is a described failure, rather than not."""
+        described = [cause.kind == "fault" for cause in self.causes]
+        return bool(described) and all(described) and self.probability >= LIKELY
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +64,7 @@ def explanation_of(robot: str, answer: Mapping[str, Any]) -> Explanation | None:
     broken, severity = told["broken"], told["use"]["severity"]
     members = broken["members"] if broken else ()
     causes = [
-        Cause(_cut(one["text"]), _kind([fault["id"] for fault in one["faults"]]))
+        LeadingCause(_cut(one["text"]), _kind([fault["id"] for fault in one["faults"]]))
         for one in members[:_MOST]
     ]
     groups = [*([broken] if broken else ()), *told["others"]]

@@ -9,12 +9,11 @@ from dataclasses import dataclass, field
 from sqlalchemy import Connection
 
 from amberbox.core.clock import NS
-from amberbox.core.sureness import SURE_WORDS, percent
+from amberbox.core.sureness import LIKELY, SURE_WORDS, percent
 from amberbox.fleet.alarms.offline import CONNECTION
 from amberbox.fleet.api.alarmlines import AlarmLine, Happening
 from amberbox.fleet.linkend.presence import presences
 from amberbox.fleet.pages import wording
-from amberbox.fleet.pages.diagnosis.card import LIKELY
 from amberbox.fleet.pages.figures import span
 from amberbox.fleet.pages.strings import catalogue
 from amberbox.fleet.pages.wording import capital

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Literal, TypeAlias
 
 from amberbox.core.clock import NS
-from amberbox.core.sureness import percent
+from amberbox.core.sureness import LIKELY, percent
 from amberbox.core.timetext import format_time
 from amberbox.fleet.knowledge.holding import Hold
 from amberbox.fleet.pages.datalinks import moment_href
@@ -22,8 +22,6 @@ from amberbox.fleet.pages.wording import capital, readable, sentence
 
 REASONS = 3
 """How many sentences say why."""
-LIKELY = 0.5
-"""From which probability on one cause is called likely."""
 CANNOT = "cannot"
 
 Sure: TypeAlias = Literal["", "likely", "possible", "cannot_tell_apart"]
