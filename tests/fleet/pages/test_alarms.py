@@ -22,7 +22,7 @@ from amberbox.fleet.alarms.words import explanation_of, written
 from amberbox.fleet.api.alarmlines import AlarmLine, Happening, line_of
 from amberbox.fleet.notifying.tables import OUTBOX
 from amberbox.fleet.pages.alarms.search import Look
-from amberbox.fleet.pages.alarms.wording import Words, checks_fail, events
+from amberbox.fleet.pages.alarms.wording import Words, checks_fail, events, plain_cause
 from tests.fleet.house import START_NS, House, house
 from tests.fleet.knowledge import robot as sim
 
@@ -236,6 +236,18 @@ def test_history_names_failures_as_the_card_does(home: House) -> None:
 )  # fmt: skip
 def test_without_a_cause_the_title_says_which_checks_fail(reason: str, title: str) -> None:
     assert checks_fail("Laser", reason) == title
+
+
+@pytest.mark.parametrize(
+    ("cause", "said"),
+    [
+        ("laser_front: working is false, expected true", "Laser front: “working” fails"),
+        ("the watcher has said nothing for 5 s", "the watcher has said nothing for 5 s"),
+        ("", ""),
+    ],
+)
+def test_the_cause_of_a_card_says_which_checks_fail(cause: str, said: str) -> None:
+    assert plain_cause(cause) == said
 
 
 def test_what_nobody_described_is_no_title(home: House) -> None:

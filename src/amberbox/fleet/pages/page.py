@@ -19,6 +19,7 @@ from amberbox.fleet.accounts.sessions import csrf_token
 from amberbox.fleet.api.access import Caller, Decorator, Open, Routes, caller_of, services_of
 from amberbox.fleet.pages import assets, figures, wording
 from amberbox.fleet.pages.alarms.count import OpenCount, open_count
+from amberbox.fleet.pages.alarms.wording import plain_cause
 from amberbox.fleet.pages.datalinks import data_href, mission_href
 from amberbox.fleet.pages.strings import catalogue, for_browser
 from amberbox.monitoring.engine.outputs import SEVERITIES
@@ -75,7 +76,7 @@ def environment() -> Environment:
     made.filters.update(
         json=as_json, size=figures.size, count=figures.count, percent=figures.percent,
         span=figures.span, capital=wording.capital, sentence=wording.sentence,
-        readable=wording.readable,
+        readable=wording.readable, plain_cause=plain_cause,
     )  # fmt: skip
     made.globals["m"] = made.get_template("macros.html").module
     return made

@@ -127,6 +127,12 @@ def checks_fail(what: str, reason: str) -> str:
     return text("alarms.many_fail", what=what, one=quoted[0], n=len(names) - 1)
 
 
+def plain_cause(cause: str) -> str:
+    """Say what is wrong with a robot, of which a card says "component: reason"."""
+    component, colon, reason = cause.partition(": ")
+    return checks_fail(capital(wording.readable(component)), reason) if colon else cause
+
+
 def words_of(connection: Connection, fleet: Services) -> Words:
     """Return the words of all robots as their folders have them now."""
     return Words(fleet, {one.robot: one.config_hash for one in presences(connection)})
