@@ -315,6 +315,7 @@ def test_what_a_battery_measures_comes_without_a_jump(page_as: PageAs, robot: Si
         page.wait_for_timeout(50)
     held[0].continue_()
     expect(page.locator("#trend")).to_contain_text("Voltage")
+    expect(page.locator(".trends li", has_text="Voltage")).to_contain_text(re.compile(r"\d V"))
     assert page.evaluate(height) == before
     expect(summary.locator(":visible")).to_have_text("The one check holds")
     one = robot.robots["ropod_001"]

@@ -146,10 +146,16 @@ def _trend(quantity: str, variable: Found, numbers: Sequence[float | None]) -> T
     known = [value for value in numbers if value is not None]
     if not known:
         return None
-    unit = variable["unit"] or ("%" if quantity == CHARGE and "percent" in variable["name"] else "")
+    unit = _unit(variable)
     label = catalogue().text(f"robot.battery.trends.{quantity}")
     first, last = (f"{values.number(value)} {unit}".strip() for value in (known[0], known[-1]))
     return Trend(quantity, first, last, spark(numbers, label=label, size=_SMALL))
+
+
+def _unit(variable: Found) -> str:
+    """Return the unit of a variable: as declared, else as its name says."""
+    name: str = variable["name"]
+    return variable["unit"] or values.guessed_unit(name) or ("%" if "percent" in name else "")
 
 
 def _last_flag(numbers: Sequence[float | None]) -> bool | None:
