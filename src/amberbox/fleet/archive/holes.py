@@ -6,7 +6,7 @@ where not even that holds, its name tells between which other files it stands.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -83,12 +83,17 @@ def holes(
 ) -> Iterator[Gap]:
     """Find rows between those of which something is known, run by run."""
     runs = _runs(rows, missing, files)
-    begins = {name: min(s.from_ns for s in run.stretches) for name, run in runs.items()}
     for (writer, number), run in runs.items():
-        later = [begins[name] for name in runs if name[0] == writer and name[1] > number]
         run.stretches.sort(key=lambda s: (s.from_seq, s.to_seq))
-        for gap in (*_between(run), *_behind(run, min(later, default=None))):
+        next_ns = _next_ns(runs, writer, number) if run.lost else None
+        for gap in (*_between(run), *_behind(run, next_ns)):
             yield replace(gap, writer=writer, run=number)
+
+
+def _next_ns(runs: Mapping[tuple[str, int], _Run], writer: str, number: int) -> int | None:
+    """Return when the next run of a writer begins."""
+    later = [runs[name] for name in runs if name[0] == writer and name[1] > number]
+    return min((s.from_ns for run in later for s in run.stretches), default=None)
 
 
 def _runs(
