@@ -27,7 +27,7 @@ def test_a_card_follows_its_robot(page_as: PageAs, site: Site) -> None:
     card = page.locator('[data-robot="ropod_002"]')
     expect(page.locator("html")).to_have_attribute("data-feed", "live")
     site.say("ropod_002", "wifi", "error", reason="no network")
-    expect(card).to_contain_text("wifi: no network")
+    expect(card).to_contain_text("Wifi: no network")
     expect(card).to_have_attribute("data-level", "error")
     site.say("ropod_002", "wifi", "ok")
     expect(card).not_to_contain_text("no network")
