@@ -69,6 +69,7 @@ def _run(options: argparse.Namespace) -> int:
     threading.Thread(target=listen, args=(sys.stdin, orders), daemon=True).start()
     if options.wait:
         wait_for_subscriber(publisher, stop)
+    catalogue()  # before the robot's time begins: at the first order it would stand still for it
     start_ns = parse_time(options.start or "now", time.time_ns, lambda: None)
     robot = Robot(options.seed, options.robot, options.scenario, start_ns)
     for fault in faults:

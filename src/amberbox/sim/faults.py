@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from amberbox.core.errors import UsageError
-from amberbox.sim.catalogue import Fault, Onset, catalogue, find_fault
+from amberbox.sim.catalogue import Fault, Onset, find_fault
 from amberbox.sim.noise import Noise
 
 
@@ -68,7 +68,6 @@ class Injector:
         self._parts = parts
         self._courses: list[_Course] = []
         self._nominal: dict[tuple[str, str], float] = {}
-        catalogue()  # read now: a robot that lives would stand still for it, and look faulty
 
     def add(
         self, fault: str | Fault, at_s: float, magnitude: float | None, until_s: float | None

@@ -232,6 +232,7 @@ def _chosen(config: Config) -> Sequence[TopicSpec]:
 
 def make_robot(config: Config) -> Robot:
     """Return the robot of a configuration with its faults scheduled."""
+    catalogue()  # before the robot's time begins: at the first order it would stand still for it
     robot = Robot(config.seed, config.robot, config.scenario, config.start_ns())
     for fault in config.faults:
         robot.inject(fault.id, fault.at_s, fault.magnitude, fault.until_s)
