@@ -1,7 +1,8 @@
 """Run the benchmarks, each in a process of its own, and write what they measured.
 
-``python -m benchmarks.run`` runs all and keeps the results; with names it runs those and only
-prints. A benchmark is a module of this folder with a function ``measure() -> list[Row]``.
+``python -m benchmarks.run`` runs all and keeps the results; with names it runs those, and keeps
+what they measured with ``--keep``. A benchmark is a module of this folder with a function
+``measure() -> list[Row]``.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from pathlib import Path
 from benchmarks.common import Row
 
 FOLDER = Path(__file__).parent
+RESULTS = FOLDER / "results"
 PAGE = FOLDER.parent / "docs" / "benchmarks.md"
 PACKAGES = ("amberbox", "numpy", "zstandard", "msgspec", "rosbags", "mcap", "foxglove-sdk",
             "pyarrow", "duckdb")  # fmt: skip
@@ -35,11 +37,13 @@ Written by `make bench`; do not edit. Every number of the documentation comes fr
 
 @dataclass(frozen=True)
 class Result:
-    """What one benchmark measured."""
+    """What one benchmark measured, when and on which machine."""
 
     name: str
     about: str
     rows: list[Row]
+    when: str
+    where: dict[str, str | int]
 
 
 def benchmarks() -> list[str]:
@@ -51,6 +55,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the benchmarks that are asked for; 1 if one of them failed."""
     parser = argparse.ArgumentParser(description="Measure.")
     parser.add_argument("names", nargs="*", help=f"all when absent; of {', '.join(benchmarks())}")
+    parser.add_argument("--keep", action="store_true", help="keep the results of those, too")
     parser.add_argument("--json", action="store_true", help=argparse.SUPPRESS)
     options = parser.parse_args(arguments)
     unknown = sorted(set(options.names) - set(benchmarks()))
@@ -61,10 +66,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 0
     wanted = options.names or benchmarks()
     results = [result for name in wanted if (result := _in_a_process(name)) is not None]
-    complete = len(results) == len(wanted)
-    if complete and not options.names:
+    if options.keep or not options.names:
         _keep(results)
-    return 0 if complete else 1
+    return 0 if len(results) == len(wanted) else 1
 
 
 def table(rows: Sequence[Row]) -> str:
@@ -97,11 +101,15 @@ def machine() -> dict[str, str | int]:
     return facts | {name: version(name) for name in PACKAGES}
 
 
-def page(results: Sequence[Result], when: str, where: dict[str, str | int]) -> str:
+def page(results: Sequence[Result]) -> str:
     """Write the page of the documentation."""
-    facts = ", ".join(f"{key} {value}" for key, value in where.items())
-    parts = [f"## {result.name}\n\n{result.about}\n\n{table(result.rows)}" for result in results]
-    return "\n".join([INTRODUCTION, f"Measured on {when}: {facts}.\n", *parts])
+    return "\n".join([INTRODUCTION, *map(_section, results)])
+
+
+def _section(result: Result) -> str:
+    facts = ", ".join(f"{key} {value}" for key, value in result.where.items())
+    when = f"Measured on {result.when}: {facts}."
+    return f"## {result.name}\n\n{result.about}\n\n{table(result.rows)}\n{when}\n"
 
 
 def _measures(path: Path) -> bool:
@@ -123,7 +131,7 @@ def _in_a_process(name: str) -> Result | None:
         return None
     rows = [Row(**row) for row in json.loads(done.stdout.splitlines()[-1])]
     print(table(rows), flush=True)
-    return Result(name, _about(name), rows)
+    return Result(name, _about(name), rows, f"{datetime.now(UTC):%Y-%m-%d}", machine())
 
 
 def _about(name: str) -> str:
@@ -139,15 +147,17 @@ def _processor() -> str:
 
 
 def _keep(results: Sequence[Result]) -> None:
-    now = datetime.now(UTC)
-    where = machine()
-    kept = {"at": now.isoformat(timespec="seconds"), "machine": where}
-    kept |= {"results": {result.name: [asdict(row) for row in result.rows] for result in results}}
-    folder = FOLDER / "results"
-    folder.mkdir(exist_ok=True)
-    (folder / f"{now:%Y-%m-%d}.json").write_text(json.dumps(kept, indent=1) + "\n")
-    PAGE.write_text(page(results, f"{now:%Y-%m-%d}", where))
+    """Keep results, each in place of what its benchmark measured before, and write the page."""
+    RESULTS.mkdir(exist_ok=True)
+    for result in results:
+        (RESULTS / f"{result.name}.json").write_text(json.dumps(asdict(result), indent=1) + "\n")
+    PAGE.write_text(page([_kept(path) for path in sorted(RESULTS.glob("*.json"))]))
     print(f"written: {PAGE.relative_to(FOLDER.parent)}")
+
+
+def _kept(path: Path) -> Result:
+    found = json.loads(path.read_text())
+    return Result(**{**found, "rows": [Row(**row) for row in found["rows"]]})
 
 
 if __name__ == "__main__":

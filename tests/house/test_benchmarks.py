@@ -29,7 +29,8 @@ def test_numbers_have_three_digits(value: float, text: str) -> None:
 
 def test_the_page_holds_every_row_and_no_name_of_the_machine() -> None:
     rows = [Row("journal", 950_000, "messages/s", "rosbags", 3.2, "write_s 0.1"), Row("x", 1, "s")]
-    text = page([Result("record", "What it costs.", rows)], "2026-01-01", machine())
+    text = page([Result("record", "What it costs.", rows, "2026-01-01", machine())])
+    assert "Measured on 2026-01-01: processor" in text
     assert "| journal | 950,000 | messages/s | rosbags | 3.2 | write_s 0.1 |" in text
     assert "| x | 1.00 | s |  |  |  |" in text
     assert "hostname" not in machine() and "numpy" in machine()
