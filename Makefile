@@ -40,7 +40,7 @@ rules: $(TEST)
 	$(BIN)/python -m tools.check_files
 	$(BIN)/python -m tools.check_docs
 
-bench: $(TEST)  ## measure the numbers that the documentation quotes (BENCH_ARGS="unroll query")
+bench: $(TEST)  ## measure the numbers that the documentation quotes (BENCH_ARGS="--keep unroll")
 	$(BIN)/python -m benchmarks.run $(BENCH_ARGS)
 
 soak: $(TEST)  ## what takes long: random lives of stores, of robots and their server, load (about two hours)
