@@ -146,9 +146,12 @@ def test_a_mission_is_begun_and_ended(page_as: PageAs) -> None:
 def test_the_robot_is_asked_for_data_and_that_is_cancelled(page_as: PageAs) -> None:
     page = page_as("technician")
     page.goto("/recordings/ropod_003")
+    rows = page.locator("#fetches tbody tr")
+    before = rows.count()
     page.get_by_text("Ask the robot for data").click()
     page.get_by_role("button", name="Ask", exact=True).click()
-    row = page.locator("#fetches tbody tr").first
+    expect(rows).to_have_count(before + 1)  # what others asked for stands there, too
+    row = rows.first
     expect(row).to_contain_text("waits for the robot")
     row.get_by_role("button", name="Cancel").click()
     page.get_by_role("button", name="Yes").click()
