@@ -13,7 +13,7 @@ A test of a page::
         page.goto("/")                                   # paths are those of the site
         page.get_by_role("link", name="ropod_001").wait_for()
         site.say("ropod_002", "wifi", "error", reason="no network")   # comes over the link
-        page.get_by_text("wifi: no network").wait_for()  # and over the feed
+        page.get_by_text("Wifi: no network").wait_for()  # and over the feed
         axe(page), no_sideways_scroll(page), shot(page, "fleet")
 
 At the end of a test each of its pages is closed, and the test fails when one had an error on its
