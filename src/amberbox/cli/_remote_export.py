@@ -15,7 +15,7 @@ import msgspec
 from amberbox.cli._output import print_json, tell
 from amberbox.cli._progress import progress_bar
 from amberbox.cli._server import refuse_options, remote_record
-from amberbox.client.models import Download
+from amberbox.client.data_models import Download
 from amberbox.client.remote import NOT_YET, RemoteRecord
 from amberbox.client.times import Time
 from amberbox.core.errors import AmberboxError, UsageError

@@ -12,7 +12,7 @@ from amberbox.blackbox.journal.reserved import PREFIX
 from amberbox.cli._output import print_grid, print_json
 from amberbox.cli._server import remote_record
 from amberbox.cli._text import in_columns
-from amberbox.client.models import Incident
+from amberbox.client.data_models import Incident
 from amberbox.client.remote import RemoteRecord
 from amberbox.client.times import time_ns
 from amberbox.core.clock import NS

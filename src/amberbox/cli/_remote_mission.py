@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from amberbox.cli._server import robot_at
-from amberbox.client.models import Mission
+from amberbox.client.data_models import Mission
 from amberbox.core.errors import UsageError
 
 

@@ -10,8 +10,8 @@ import msgspec
 from amberbox.cli._output import accept_relative_times, print_grid, print_json, tell
 from amberbox.cli._server import PAGE, add_robot, robot_at
 from amberbox.client.address import is_url
+from amberbox.client.data_models import Fetch
 from amberbox.client.fleet import Fleet
-from amberbox.client.models import Fetch
 from amberbox.core.errors import UsageError
 
 ALL = "all"

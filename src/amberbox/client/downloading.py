@@ -13,8 +13,8 @@ from amberbox.core.errors import AmberboxError
 if TYPE_CHECKING:
     from http.client import HTTPResponse
 
+    from amberbox.client.data_models import Download
     from amberbox.client.fleet import Fleet
-    from amberbox.client.models import Download
 
 Progress = Callable[[float], None]
 _PIECE = 1 << 18

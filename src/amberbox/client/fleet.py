@@ -9,7 +9,7 @@ from urllib.parse import quote
 
 import msgspec
 
-from amberbox.client import downloading, models, tables
+from amberbox.client import data_models, downloading, models, tables
 from amberbox.client.address import read_address
 from amberbox.client.fleet_alarms import AlarmCalls
 from amberbox.client.paging import PAGE, paged
@@ -89,13 +89,13 @@ class Fleet(AlarmCalls):
 
     # What was recorded.
 
-    def items(self, robot: str) -> list[models.Item]:
+    def items(self, robot: str) -> list[data_models.Item]:
         """Return the data items that the server has rows of."""
-        return self._get(f"{_of(robot)}/items", list[models.Item])
+        return self._get(f"{_of(robot)}/items", list[data_models.Item])
 
-    def item(self, robot: str, item: str) -> models.ItemDetail:
+    def item(self, robot: str, item: str) -> data_models.ItemDetail:
         """Return an item with its columns."""
-        return self._get(f"{_of(robot)}/items/{quote(item, safe='')}", models.ItemDetail)
+        return self._get(f"{_of(robot)}/items/{quote(item, safe='')}", data_models.ItemDetail)
 
     def query(
         self, robot: str, item: str, variables: Sequence[str] | None = None, from_: Time = None,
@@ -128,20 +128,20 @@ class Fleet(AlarmCalls):
     def statistics(
         self, robot: str, item: str, variables: Sequence[str] | None = None, from_: Time = None,
         to: Time = None,
-    ) -> models.Summaries:  # fmt: skip
+    ) -> data_models.Summaries:  # fmt: skip
         """Return number of values, least, greatest and mean of a range."""
         asked = {"item": item, "variables": variables, **_span(from_, to)}
-        return self._get(f"{_of(robot)}/statistics", models.Summaries, asked)
+        return self._get(f"{_of(robot)}/statistics", data_models.Summaries, asked)
 
     def gaps(
         self, robot: str, item: str = "", from_: Time = None, to: Time = None
-    ) -> list[models.Gap]:
+    ) -> list[data_models.Gap]:
         """Return what is missing in a range, and why, in order of time."""
-        found: dict[models.Gap, None] = {}
+        found: dict[data_models.Gap, None] = {}
         start = said(from_)
         while True:
             asked = {"item": item, **_span(start, to), "limit": PAGE}
-            answer = self._get(f"{_of(robot)}/gaps", models.Gaps, asked)
+            answer = self._get(f"{_of(robot)}/gaps", data_models.Gaps, asked)
             fresh = [gap for gap in answer.gaps if gap not in found]
             found.update(dict.fromkeys(fresh))
             if not (answer.more and fresh):
@@ -150,71 +150,77 @@ class Fleet(AlarmCalls):
 
     def missions(
         self, robot: str, name: str = "", failed: bool = False, from_: Time = None, to: Time = None
-    ) -> list[models.Mission]:
+    ) -> list[data_models.Mission]:
         """Return missions, newest first."""
         asked = {"name": name, "failed": failed, **_span(from_, to)}
         path = f"{_of(robot)}/missions"
-        return [*paged(self.wire, path, models.Mission, lambda m: m.id, asked)]
+        return [*paged(self.wire, path, data_models.Mission, lambda m: m.id, asked)]
 
     def begin_mission(
         self, robot: str, name: str, parameters: Mapping[str, Any] | None = None, at: Time = None
-    ) -> models.Mission:
+    ) -> data_models.Mission:
         """Begin a mission on the server."""
         body = {"name": name, "parameters": dict(parameters or {}), "at": said(at)}
-        return self._send("POST", f"{_of(robot)}/missions", models.Mission, body)
+        return self._send("POST", f"{_of(robot)}/missions", data_models.Mission, body)
 
     def end_mission(
         self, robot: str, mission: str, outcome: str = "done", at: Time = None
-    ) -> models.Mission:
+    ) -> data_models.Mission:
         """End a mission that was begun on the server."""
         path = f"{_of(robot)}/missions/{quote(mission, safe='')}/end"
-        return self._send("POST", path, models.Mission, {"outcome": outcome, "at": said(at)})
+        return self._send("POST", path, data_models.Mission, {"outcome": outcome, "at": said(at)})
 
-    def notes(self, robot: str, from_: Time = None, to: Time = None) -> list[models.MomentNote]:
+    def notes(
+        self, robot: str, from_: Time = None, to: Time = None
+    ) -> list[data_models.MomentNote]:
         """Return what people remarked on moments, on missions too, newest first."""
         path = f"{_of(robot)}/notes"
-        return [*paged(self.wire, path, models.MomentNote, lambda n: n.id, _span(from_, to))]
+        return [*paged(self.wire, path, data_models.MomentNote, lambda n: n.id, _span(from_, to))]
 
-    def annotate(self, robot: str, text: str, at: Time = None) -> models.MomentNote:
+    def annotate(self, robot: str, text: str, at: Time = None) -> data_models.MomentNote:
         """Remark something on a moment of a robot, whether a mission was under way or not."""
         body = {"text": text, "at": said(at)}
-        return self._send("POST", f"{_of(robot)}/notes", models.MomentNote, body)
+        return self._send("POST", f"{_of(robot)}/notes", data_models.MomentNote, body)
 
-    def incidents(self, robot: str, from_: Time = None, to: Time = None) -> list[models.Incident]:
+    def incidents(
+        self, robot: str, from_: Time = None, to: Time = None
+    ) -> list[data_models.Incident]:
         """Return the windows that robots or people want kept, newest first."""
         path = f"{_of(robot)}/incidents"
-        return [*paged(self.wire, path, models.Incident, lambda i: i.id, _span(from_, to))]
+        return [*paged(self.wire, path, data_models.Incident, lambda i: i.id, _span(from_, to))]
 
-    def mark_incident(self, robot: str, from_: Time, to: Time, reason: str) -> models.Incident:
+    def mark_incident(self, robot: str, from_: Time, to: Time, reason: str) -> data_models.Incident:
         """Mark a window: what the server has of it, or gets, is kept until it is released."""
         body = {**_span(from_, to), "reason": reason}
-        return self._send("POST", f"{_of(robot)}/incidents", models.Incident, body)
+        return self._send("POST", f"{_of(robot)}/incidents", data_models.Incident, body)
 
-    def release_incident(self, robot: str, incident: str) -> models.Incident:
+    def release_incident(self, robot: str, incident: str) -> data_models.Incident:
         """Let a window go that was marked on the server."""
         path = f"{_of(robot)}/incidents/{quote(incident, safe='')}/release"
-        return self._send("POST", path, models.Incident)
+        return self._send("POST", path, data_models.Incident)
 
-    def recordings(self, robot: str) -> list[models.Recording]:
+    def recordings(self, robot: str) -> list[data_models.Recording]:
         """Return the journals of a robot by name, with what is known of their integrity."""
         path = f"{_of(robot)}/recordings"
-        return [*paged(self.wire, path, models.Recording, lambda r: f"{r.store_id}/{r.journal}")]
+        return [
+            *paged(self.wire, path, data_models.Recording, lambda r: f"{r.store_id}/{r.journal}")
+        ]
 
     # What is still on the robot.
 
-    def fetch(self, robot: str, item: str, from_: Time, to: Time) -> models.Fetch:
+    def fetch(self, robot: str, item: str, from_: Time, to: Time) -> data_models.Fetch:
         """Ask a robot for a window of an item, of all items without a name."""
         body = {"item": item, **_span(from_, to)}
-        return self._send("POST", f"{_of(robot)}/fetches", models.Fetch, body)
+        return self._send("POST", f"{_of(robot)}/fetches", data_models.Fetch, body)
 
-    def fetches(self, robot: str) -> list[models.Fetch]:
+    def fetches(self, robot: str) -> list[data_models.Fetch]:
         """Return what was asked of a robot, newest first."""
         path = f"{_of(robot)}/fetches"
-        return [*paged(self.wire, path, models.Fetch, lambda f: f.id)]
+        return [*paged(self.wire, path, data_models.Fetch, lambda f: f.id)]
 
-    def fetched(self, robot: str, fetch: str) -> models.Fetch:
+    def fetched(self, robot: str, fetch: str) -> data_models.Fetch:
         """Return how far a window is that was asked of a robot."""
-        return self._get(f"{_of(robot)}/fetches/{fetch}", models.Fetch)
+        return self._get(f"{_of(robot)}/fetches/{fetch}", data_models.Fetch)
 
     # Files.
 
@@ -222,30 +228,30 @@ class Fleet(AlarmCalls):
         self, robots: Sequence[str], items: Sequence[str] = (), *, format: str = "csv",
         from_: Time = None, to: Time = None, missions: Sequence[str] = (),
         variables: Mapping[str, Sequence[str]] | None = None,
-    ) -> models.Download:  # fmt: skip
+    ) -> data_models.Download:  # fmt: skip
         """Let the server make a file: ``csv``, ``parquet``, ``mcap`` or ``journals``."""
         body = {
             "robots": list(robots), "items": list(items), "missions": list(missions),
             "variables": {k: list(v) for k, v in (variables or {}).items()}, "format": format,
             **_span(from_, to),
         }  # fmt: skip
-        return self._send("POST", "/downloads", models.Download, body)
+        return self._send("POST", "/downloads", data_models.Download, body)
 
-    def downloads(self) -> list[models.Download]:
+    def downloads(self) -> list[data_models.Download]:
         """Return one's own downloads, newest first."""
-        return [*paged(self.wire, "/downloads", models.Download, lambda d: d.id)]
+        return [*paged(self.wire, "/downloads", data_models.Download, lambda d: d.id)]
 
-    def download(self, download: str) -> models.Download:
+    def download(self, download: str) -> data_models.Download:
         """Return how far a download is."""
-        return self._get(f"/downloads/{download}", models.Download)
+        return self._get(f"/downloads/{download}", data_models.Download)
 
-    def cancel_download(self, download: str) -> models.Download:
+    def cancel_download(self, download: str) -> data_models.Download:
         """Stop a download, or throw it away when it is done."""
-        return self._send("DELETE", f"/downloads/{download}", models.Download)
+        return self._send("DELETE", f"/downloads/{download}", data_models.Download)
 
     def wait_download(
         self, download: str, progress: Progress | None = None, limit_s: float | None = None
-    ) -> models.Download:
+    ) -> data_models.Download:
         """Wait until a download is made; raises AmberboxError when it will not be."""
         return downloading.waited(self, download, progress, limit_s)
 

@@ -22,8 +22,8 @@ from amberbox.core.types import Column, Gap, ItemSchema
 
 if TYPE_CHECKING:
     from amberbox.blackbox.missions import Mission
+    from amberbox.client.data_models import Item
     from amberbox.client.fleet import Fleet
-    from amberbox.client.models import Item
 
 _SQL_HINT = (
     "amberbox export URL -o robot.mcap, then amberbox sql robot.mcap; on the server itself: "

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal, NamedTuple, TypeAlias
+from typing import Any, Final, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -268,6 +268,10 @@ class Symptom:
     source: str = "monitor"
     evidence: tuple[tuple[str, int, int], ...] = ()
     blocked_by: tuple[str, ...] = ()
+
+
+UNKNOWN_FAULT: Final = "unknown#other"
+"""The failure mode that stands for everything that is not in the FMEA."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,9 +9,10 @@ from functools import cached_property
 from amberbox.core.config import did_you_mean
 from amberbox.core.errors import UsageError
 from amberbox.core.needs import Needs, cycles
+from amberbox.core.types import UNKNOWN_FAULT
 from amberbox.diagnosis.covering.tables import Tables
 
-UNKNOWN = "unknown#other"
+UNKNOWN = UNKNOWN_FAULT
 """The mode that stands for everything that is not in the FMEA."""
 
 

@@ -9,14 +9,14 @@ from typing import Any, Final, Literal, TypeAlias
 import msgspec
 
 from amberbox.core.sureness import LIKELY
+from amberbox.core.types import UNKNOWN_FAULT
 from amberbox.monitoring.engine.outputs import SEVERITIES
 from amberbox.monitoring.plan import Severity
 
-Kind: TypeAlias = Literal["fault", "false_alarm", "other"]
+CauseKind: TypeAlias = Literal["fault", "false_alarm", "other"]
 _MOST: Final = 20
 """Causes, and names of failure modes, that are kept."""
 _LONG: Final = 500
-_UNDESCRIBED: Final = "unknown#other"
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,7 +24,7 @@ class LeadingCause:
     """What may be broken; ``kind`` tells a failure from none, and from one nobody described."""
 
     text: str
-    kind: Kind = "fault"
+    kind: CauseKind = "fault"
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +64,7 @@ def explanation_of(robot: str, answer: Mapping[str, Any]) -> Explanation | None:
     broken, severity = told["broken"], told["use"]["severity"]
     members = broken["members"] if broken else ()
     causes = [
-        LeadingCause(_cut(one["text"]), _kind([fault["id"] for fault in one["faults"]]))
+        LeadingCause(_cut(one["text"]), kind_of([fault["id"] for fault in one["faults"]]))
         for one in members[:_MOST]
     ]
     groups = [*([broken] if broken else ()), *told["others"]]
@@ -85,10 +85,11 @@ def read(text: str) -> Words | None:
     return msgspec.json.decode(text, type=Words) if text else None
 
 
-def _kind(ids: Sequence[str]) -> Kind:
+def kind_of(ids: Sequence[str]) -> CauseKind:
+    """Tell what failure modes that are broken together stand for; none is a false alarm."""
     if not ids:
         return "false_alarm"
-    return "other" if list(ids) == [_UNDESCRIBED] else "fault"
+    return "other" if list(ids) == [UNKNOWN_FAULT] else "fault"
 
 
 def _cut(text: str) -> str:

@@ -6,10 +6,8 @@ from collections.abc import Sequence
 from typing import Final
 
 from amberbox.core.sureness import percent, sure_word
-from amberbox.core.types import AmbiguityGroup, Diagnosis, Hypothesis
+from amberbox.core.types import UNKNOWN_FAULT, AmbiguityGroup, Diagnosis, Hypothesis
 
-OTHER: Final = "unknown#other"
-"""The failure mode that stands for everything that is not in the FMEA."""
 _NAMED: Final = 3
 """So many of those that nothing tells apart are named; of the others it is said how many."""
 _ALSO: Final = 0.05
@@ -61,5 +59,8 @@ def _probability(diagnosis: Diagnosis, first: Sequence[Hypothesis]) -> float:
 
 
 def _name(hypothesis: Hypothesis) -> str:
-    faults = ("not in the FMEA" if fault == OTHER else fault for fault in sorted(hypothesis.faults))
+    faults = (
+        "not in the FMEA" if fault == UNKNOWN_FAULT else fault
+        for fault in sorted(hypothesis.faults)
+    )
     return " + ".join(faults) or "a false alarm"

@@ -14,6 +14,7 @@ from typing import Any, Literal, TypeAlias
 from amberbox.core.clock import NS
 from amberbox.core.sureness import LIKELY, percent
 from amberbox.core.timetext import format_time
+from amberbox.fleet.alarms.words import CauseKind, kind_of
 from amberbox.fleet.knowledge.holding import Hold
 from amberbox.fleet.pages.datalinks import moment_href
 from amberbox.fleet.pages.figures import span
@@ -25,11 +26,9 @@ REASONS = 3
 CANNOT = "cannot"
 
 Sure: TypeAlias = Literal["", "likely", "possible", "cannot_tell_apart"]
-Kind: TypeAlias = Literal["fault", "false_alarm", "other"]
 State: TypeAlias = Literal["open", "healed", "gone", "past", "none"]
 Answer: TypeAlias = Mapping[str, Any]
 
-_UNKNOWN = "unknown#other"
 _SHORT_S = 10.0
 """What lasted less long is told in tenths of a second."""
 _FAILS = re.compile(r"\bfails(\.?)$")
@@ -42,7 +41,7 @@ class Cause:
     id: str
     text: str
     share: str
-    kind: Kind = "fault"
+    kind: CauseKind = "fault"
     comes_from: str = ""
 
 
@@ -193,19 +192,13 @@ def _told_causes(broken: Answer | None) -> Iterator[Cause]:
         ids = [fault["id"] for fault in member["faults"]]
         comes_from = "; ".join(fault["cause"] for fault in member["faults"] if fault["cause"])
         yield Cause(member["id"], capital(member["text"]), percent(member["probability"]),
-                    _kind(ids), comes_from)  # fmt: skip
+                    kind_of(ids), comes_from)  # fmt: skip
 
 
 def _plain_cause(ids: Sequence[str], probability: float | None) -> Cause:
     text = " + ".join(capital(readable(name.replace("#", ": ").replace("/", " "))) for name in ids)
     share = "" if probability is None else percent(probability)
-    return Cause(" ".join(ids), text, share, _kind(ids))
-
-
-def _kind(ids: Sequence[str]) -> Kind:
-    if not ids:
-        return "false_alarm"
-    return "other" if list(ids) == [_UNKNOWN] else "fault"
+    return Cause(" ".join(ids), text, share, kind_of(ids))
 
 
 def _sure(causes: Sequence[Cause], probability: float) -> Sure:

@@ -11,6 +11,7 @@ from typing import Any
 from amberbox.core.errors import UsageError
 from amberbox.core.sureness import percent
 from amberbox.core.timetext import format_time
+from amberbox.core.types import UNKNOWN_FAULT
 from amberbox.fleet.api.access import Caller
 from amberbox.fleet.api.diagnoses import LIMIT_S, MEMORY_BYTES, WORKER, line_of, revision_json
 from amberbox.fleet.drawing.effects import effect_graph, effects_of
@@ -228,7 +229,7 @@ def mode_texts(fmea: Answer) -> dict[str, str]:
 
 async def _texts(asked: Asked) -> tuple[dict[str, str], dict[str, str]]:
     """Return what failure modes and symptoms are called; without the robot's folder nothing."""
-    other = {"unknown#other": catalogue().text("diagnosis.card.other")}
+    other = {UNKNOWN_FAULT: catalogue().text("diagnosis.card.other")}
     try:
         found = await asked.fmea()
     except UsageError:
