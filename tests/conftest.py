@@ -20,8 +20,11 @@ NO_DATA = "needs_data: the folder ../shared/data beside the repository is absent
 SKIPS: pytest.StashKey[Skips] = pytest.StashKey()
 
 settings.register_profile("soak", max_examples=400)  # about twenty minutes of random histories
+settings.register_profile("ci", derandomize=True)  # the same examples every time: luck fails nobody
 if os.environ.get("HYPOTHESIS_PROFILE"):
     settings.load_profile(os.environ["HYPOTHESIS_PROFILE"])
+elif os.environ.get("AMBERBOX_CI", "") not in ("", "0"):
+    settings.load_profile("ci")
 
 
 def in_ci() -> bool:
