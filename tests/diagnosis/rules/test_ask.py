@@ -140,6 +140,8 @@ def test_why_not_of_what_nobody_knows_and_of_loops() -> None:
         ("X = f(X), Y = X, copy_term(X, Z)", "contains itself"),
         ("length(X, 99999999999)", "too long"),
         ("3", "no goal"),
+        ("maplist([X]>>(X > 1), [2])", "write a rule of its own"),
+        ("1 + 2", "X is 1 + 2"),
     ],
 )
 def test_goals_that_cannot_be_asked(goal: str, what: str) -> None:
@@ -210,6 +212,50 @@ def test_recursion_is_as_deep_as_the_budget() -> None:
     assert values(ask(program, "numlist(1, 5000, L), len(L, N), N > 5, X = deep")) == ["deep"]
     assert values(ask(program, "down(10000), X = low")) == ["low"]
     assert values(ask(program, "chain(1000), X = end")) == ["end"]
+
+
+def test_thousands_of_alternatives_are_not_deep() -> None:
+    alternatives = "; ".join(f"X = {number}" for number in range(11_000))
+    cases = "; ".join(f"X == {number} -> Y = even" for number in range(0, 11_000, 2))
+    program = read_text(f"p(X) :- ({alternatives}).\nq(X, Y) :- ({cases} ; Y = odd).\n")
+    assert len(ask(program, "p(X)").answers) == 11_000
+    assert [ask(program, f"q({n}, Y)").answers[0]["Y"] for n in (10_998, 7)] == ["even", "odd"]
+    (failure,) = ask(program, "p(x)", want="why_not").failed
+    assert max(map(len, failure.lines())) < 1_000
+    with pytest.raises(ConfigurationError, match="nested too deeply"):
+        read_text("r :- " + " -> ".join(["true"] * 11_000) + ".")
+
+
+DOUBLE = "double(X, X, 0).\ndouble(A, X, N) :- N > 0, M is N - 1, {goal}, double(B, X, M).\n"
+
+
+@pytest.mark.parametrize(
+    "goal", ["atom_concat(A, A, B)", "string_concat(A, A, B)", "atomic_list_concat([A, A], B)"]
+)
+def test_texts_count_against_the_budget(goal: str) -> None:
+    program = read_text(DOUBLE.format(goal=goal))
+    (answer,) = ask(program, "double(a, X, 16), atom_length(X, N)").answers
+    assert answer["N"] == 2**16
+    with pytest.raises(StoppedError, match="ever larger terms"):
+        ask(program, "double(a, X, 40)")
+
+
+def test_what_is_large_asks_for_the_time_within_one_goal() -> None:
+    budget = Budget(is_over=lambda: True)
+    with pytest.raises(StoppedError, match="the time is over"):
+        ask(read_text("p."), "length(L, 100000), msort(L, M)", budget)
+
+
+def test_deep_answers_and_proofs_are_written() -> None:
+    program = read_text("nest(0, z).\nnest(N, f(T)) :- N > 0, M is N - 1, nest(M, T).\n")
+    found = ask(program, "nest(1500, X)", want="why")
+    assert show(found.answers[0]) == f"X = {'f(' * 1500}z{')' * 1500}"
+    (node,) = found.proof[0]
+    text = node.text().splitlines()
+    assert len(text) == 3 * 1500 + 1
+    assert max(map(len, text)) < 1_000
+    goals = json.dumps(node.to_json())
+    assert goals.count('"goal"') == len(text)
 
 
 def test_each_answer_once_and_how_it_is_written() -> None:

@@ -34,8 +34,14 @@ class Answers:
         }
 
 
-def plain(term: Term) -> Any:
-    """Turn a term into plain Python: atoms and texts are strings, structures are written."""
+_DEEPEST = 100
+
+
+def plain(term: Term, depth: int = 0) -> Any:
+    """Turn a term into plain Python: atoms and texts are strings, structures are written.
+
+    So are lists nested more than 100 deep.
+    """
     term = deref(term)
     if isinstance(term, str | int):
         return [] if term == "[]" else term
@@ -44,8 +50,8 @@ def plain(term: Term) -> Any:
     if isinstance(term, Text):
         return term.value
     items, tail = split_list(term)
-    if items and tail == "[]":
-        return [plain(item) for item in items]
+    if items and tail == "[]" and depth < _DEEPEST:
+        return [plain(item, depth + 1) for item in items]
     return None if isinstance(term, Var) else write(term)
 
 

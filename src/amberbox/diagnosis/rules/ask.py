@@ -15,7 +15,7 @@ from amberbox.diagnosis.rules.clauses import flatten
 from amberbox.diagnosis.rules.compile import FIXED, compile_goal
 from amberbox.diagnosis.rules.datalog import question as datalog
 from amberbox.diagnosis.rules.datalog.forms import Rule
-from amberbox.diagnosis.rules.faults import RuleError, RuleFault, StopFault, StoppedError
+from amberbox.diagnosis.rules.faults import TOO_DEEP, RuleError, RuleFault, StopFault, StoppedError
 from amberbox.diagnosis.rules.machine import Machine
 from amberbox.diagnosis.rules.program import Program
 from amberbox.diagnosis.rules.proof import Node, nodes_of
@@ -49,7 +49,7 @@ def ask(
     except StopFault as fault:
         raise StoppedError(str(fault), _STOPPED, tuple(question.found)) from fault
     except RecursionError as error:
-        raise RuleError("an answer is nested too deeply", "use lists, not f(f(f(...)))") from error
+        raise RuleError(*TOO_DEEP) from error
     except RuleFault as fault:
         raise RuleError(fault.what, fault.hint) from fault
 
@@ -137,6 +137,8 @@ def _read(goal_text: str) -> Sentence:
         at = place.place(max(fault.at, 0))
         what = f"goal, column {at.column}: {fault.what}{place.picture(at)}"
         raise RuleError(what, fault.hint) from fault
+    except RecursionError as error:
+        raise RuleError(*TOO_DEEP) from error
     return sentence
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 from amberbox.diagnosis.rules.builtin_terms import Args, proper_list
@@ -47,22 +47,37 @@ def _length(m: Machine, args: Args) -> bool:
     return m.unify(args[1], len(text_of(args[0], "the length of an atom")))
 
 
-def _concat(m: Machine, args: Args) -> Iterator[None]:
+def _concatenation(make: Callable[[str], Term], what: str) -> Callable[[Any, Args], Iterator[None]]:
+    """Make ``atom_concat/3`` or ``string_concat/3``: both parts to a whole, or a whole cut up."""
+    return lambda m, args: _concat(m, args, make, what)
+
+
+def _concat(m: Machine, args: Args, make: Callable[[str], Term], what: str) -> Iterator[None]:
     left, right = _text(args[0]), _text(args[1])
     if left is not None and right is not None:
-        if m.unify(args[2], left + right) or _text(args[2]) == left + right:
+        both = m.charge_text(left + right)
+        if m.unify(args[2], make(both)) or _text(args[2]) == both:
             yield
         return
-    whole = text_of(args[2], "atom_concat/3")
-    for place in range(len(whole) + 1):
+    whole = text_of(args[2], what)
+    for place in _cuts(whole, left, right):
+        m.charge_text(whole)
         mark = len(m.trail)
-        fits = left in (None, whole[:place]) and right in (None, whole[place:])
-        if fits and _bind(m, args[:2], (whole[:place], whole[place:])):
+        if _bind(m, args[:2], (make(whole[:place]), make(whole[place:]))):
             yield
         undo(m.trail, mark)
 
 
-def _bind(m: Machine, args: Args, texts: tuple[str, str]) -> bool:
+def _cuts(whole: str, left: str | None, right: str | None) -> Iterable[int]:
+    """Return the places at which a text can be cut so that the known part fits."""
+    if left is not None:
+        return [len(left)] if whole.startswith(left) else []
+    if right is not None:
+        return [len(whole) - len(right)] if whole.endswith(right) else []
+    return range(len(whole) + 1)
+
+
+def _bind(m: Machine, args: Args, texts: tuple[Term, Term]) -> bool:
     """Bind those of the arguments that are variables."""
     pairs = zip(args, texts, strict=True)
     return all(not isinstance(deref(arg), Var) or m.unify(arg, text) for arg, text in pairs)
@@ -74,10 +89,12 @@ def _join(m: Machine, args: Args) -> bool:
     items, tail = split_list(args[0])
     parts = [_text(item) for item in items]
     if tail == "[]" and all(part is not None for part in parts):
-        return m.unify(args[-1], separator.join(part for part in parts if part is not None))
+        whole = separator.join(part for part in parts if part is not None)
+        return m.unify(args[-1], m.charge_text(whole))
     if not separator:
         raise RuleFault("atomic_list_concat needs a list of values", "or a separator to cut at")
-    pieces = text_of(args[-1], "atomic_list_concat/3").split(separator)
+    pieces = m.charge_text(text_of(args[-1], "atomic_list_concat/3")).split(separator)
+    m.charge(len(pieces))
     return m.unify(args[0], make_list([*pieces]))
 
 
@@ -87,6 +104,7 @@ def _parts(make: Callable[[str], Term], what: str) -> Callable[[Any, Args], bool
     def convert(m: Machine, args: Args) -> bool:
         known = _text(args[0])
         if known is not None:
+            m.charge(len(known))
             return m.unify(args[1], make_list([make(sign) for sign in known]))
         return m.unify(args[0], _joined(args[1], what))
 
@@ -138,7 +156,24 @@ def _atom_number(m: Machine, args: Args) -> bool:
 
 def _convert(from_: Callable[[str], Term]) -> Callable[[Any, Args], bool]:
     """Make a predicate such as ``upcase_atom/2``."""
-    return lambda m, args: m.unify(args[1], from_(text_of(args[0], "a change of letters")))
+
+    def convert(m: Machine, args: Args) -> bool:
+        text = m.charge_text(text_of(args[0], "a change of letters"))
+        return m.unify(args[1], from_(text))
+
+    return convert
+
+
+def _upper(text: str) -> str:
+    """Return capital letters; as in SWI-Prolog a letter that has no single one stays (ß)."""
+    return "".join(
+        next(new for new in (sign.upper(), sign.title(), sign) if len(new) == 1) for sign in text
+    )
+
+
+def _lower(text: str) -> str:
+    """Return small letters, one for each letter, as SWI-Prolog does."""
+    return "".join(sign.lower()[0] for sign in text)
 
 
 def _atom_string(m: Machine, args: Args) -> bool:
@@ -149,17 +184,12 @@ def _atom_string(m: Machine, args: Args) -> bool:
     return m.unify(args[0], text_of(args[1], "atom_string/2"))
 
 
-def _string_concat(m: Machine, args: Args) -> bool:
-    both = text_of(args[0], "string_concat/3") + text_of(args[1], "string_concat/3")
-    wanted = _text(args[2])
-    return wanted == both if wanted is not None else m.unify(args[2], Text(both))
-
-
 def _sub_atom(m: Machine, args: Args) -> Iterator[None]:
     """Find parts: ``sub_atom(Atom, Before, Length, After, Part)``."""
     whole = text_of(args[0], "sub_atom/5")
     part = _text(args[4])
     for start, end in _spans(whole, part, deref(args[1]), deref(args[2]), deref(args[3])):
+        m.charge((end - start) // 8)
         mark = len(m.trail)
         numbers = (start, end - start, len(whole) - end)
         found = all(m.unify(arg, value) for arg, value in zip(args[1:4], numbers, strict=True))
@@ -200,13 +230,13 @@ TESTS: Mapping[Key, Callable[[Any, Args], bool]] = {
     ("number_codes", 2): _number_codes,
     ("atom_number", 2): _atom_number,
     ("atom_string", 2): _atom_string,
-    ("string_concat", 3): _string_concat,
-    ("upcase_atom", 2): _convert(str.upper),
-    ("downcase_atom", 2): _convert(str.lower),
-    ("string_upper", 2): _convert(lambda text: Text(text.upper())),
-    ("string_lower", 2): _convert(lambda text: Text(text.lower())),
+    ("upcase_atom", 2): _convert(_upper),
+    ("downcase_atom", 2): _convert(_lower),
+    ("string_upper", 2): _convert(lambda text: Text(_upper(text))),
+    ("string_lower", 2): _convert(lambda text: Text(_lower(text))),
 }
 SEVERAL: Mapping[Key, Callable[[Any, Args], Iterator[None]]] = {
-    ("atom_concat", 3): _concat,
+    ("atom_concat", 3): _concatenation(str, "atom_concat/3"),
+    ("string_concat", 3): _concatenation(Text, "string_concat/3"),
     ("sub_atom", 5): _sub_atom,
 }

@@ -49,9 +49,12 @@ def _length(m: Machine, args: Args) -> Iterator[None]:
 
 def _longer(m: Machine, count: int, tail: Var, wanted: Term) -> Iterator[None]:
     """Make a list without an end as long as wanted, or longer and longer."""
+    if wanted is tail:
+        return  # no list is its own length
     if isinstance(wanted, int):
         if wanted - count > _MOST:
             raise RuleFault(f"a list of {wanted} elements is too long")
+        m.charge(max(wanted - count, 0))
         if wanted >= count and m.unify(tail, _fresh(wanted - count)):
             yield
         return
@@ -70,11 +73,18 @@ def _fresh(count: int) -> Term:
 
 
 def _msort(m: Machine, args: Args) -> bool:
-    return m.unify(args[1], make_list(in_order(proper_list(args[0], "msort/2"))))
+    return m.unify(args[1], make_list(in_order(_to_sort(m, args[0], "msort/2"))))
 
 
 def _sort(m: Machine, args: Args) -> bool:
-    return m.unify(args[1], make_list(once_each(proper_list(args[0], "sort/2"))))
+    return m.unify(args[1], make_list(once_each(_to_sort(m, args[0], "sort/2"))))
+
+
+def _to_sort(m: Machine, term: Term, what: str) -> list[Term]:
+    """Return the elements of a list, their comparisons counted as work."""
+    items = proper_list(term, what)
+    m.charge(len(items) * len(items).bit_length() // 4)
+    return items
 
 
 def _sort_by(m: Machine, args: Args) -> bool:
@@ -82,7 +92,7 @@ def _sort_by(m: Machine, args: Args) -> bool:
     number, order = whole(args[0], "sort/4"), deref(args[1])
     if order not in ("@<", "@=<", "@>", "@>="):
         raise RuleFault("sort/4 needs an order", "one of @<, @=<, @>, @>=")
-    items = proper_list(args[2], "sort/4")
+    items = _to_sort(m, args[2], "sort/4")
     keys = {id(item): _key(item, number) for item in items}
     sign = -1 if order in ("@>", "@>=") else 1
 

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 from amberbox.diagnosis.rules import control
 from amberbox.diagnosis.rules.builtins import SEVERAL, TESTS
-from amberbox.diagnosis.rules.clauses import Clause, Goal, chain, flatten
+from amberbox.diagnosis.rules.clauses import Clause, Goal, Op, chain, flatten
 from amberbox.diagnosis.rules.faults import Place, RuleFault
 from amberbox.diagnosis.rules.terms import Key, Pattern, Slot, Struct, Term, Var, deref, key_of
 
@@ -99,17 +99,20 @@ class _Compiler:
         return Goal(control.call, key, args, None, place)
 
     def _control(self, term: Term, key: Key) -> Iterator[Goal]:
-        args, place = self._args(term), self.where(term)
+        name, place = key[0], self.where(term)
         inner = [deref(arg) for arg in term.args] if isinstance(term, Struct) else []
-        name = key[0]
-        if name == "!":
+        args = () if name in (";", "|", "->") else self._args(term)
+        if name in (";", "|"):
+            yield self._choice(term)
+        elif name == "!":
             goal = Goal(control.cut_clause, key, place=place)
             goal.cuts = True
             yield goal
         elif name in ("fail", "false"):
             yield Goal(control.fail, key, place=place)
-        elif name in (";", "|", "->"):
-            yield self._branches(inner, key, place)
+        elif name == "->":
+            parts = [*map(self.goals, inner), self.goals("fail")]
+            yield _branching(control.if_then_else, key, parts, place)
         elif name in ("\\+", "not"):
             yield Goal(control.negation, key, args, self.goals(inner[0]), place)
         elif name == "findall":
@@ -129,17 +132,25 @@ class _Compiler:
             return Goal(control.apart, ("call", 1), args, self.goals(inner[0]), place)
         return Goal(control.call_term, ("call", len(args)), args, None, place)
 
-    def _branches(self, inner: list[Term], key: Key, place: Place | None) -> Goal:
-        """Compile ``a ; b``, ``c -> a ; b`` and ``c -> a``."""
-        first = inner[0]
-        if key[0] == "->":
-            parts = [*map(self.goals, inner), self.goals("fail")]
-        elif isinstance(first, Struct) and first.name == "->" and len(first.args) == 2:
-            parts = [self.goals(part) for part in (*first.args, inner[1])]
-        else:
-            parts = [self.goals(part) for part in inner]
-        op = control.either if len(parts) == 2 else control.if_then_else
-        goal = Goal(op, key, (), tuple(parts), place)
-        own = parts if len(parts) == 2 else parts[1:]  # a cut in the condition stays there
-        goal.cuts = any(part is not None and part.cuts for part in own)
-        return goal
+    def _choice(self, term: Term) -> Goal:
+        """Compile ``a ; b ; c``, where any may be ``c -> a``, without descending once per ``;``."""
+        spine: list[Struct] = []
+        while isinstance(term, Struct) and key_of(term) in ((";", 2), ("|", 2)):
+            spine.append(term)
+            term = deref(term.args[1])
+        rest = self.goals(term)
+        for choice in reversed(spine):
+            first, place = deref(choice.args[0]), self.where(choice)
+            if isinstance(first, Struct) and key_of(first) == ("->", 2):
+                parts = [*map(self.goals, first.args), rest]
+                rest = _branching(control.if_then_else, (";", 2), parts, place)
+            else:
+                rest = _branching(control.either, (";", 2), [self.goals(first), rest], place)
+        assert rest is not None  # there was a choice
+        return rest
+
+
+def _branching(op: Op, key: Key, parts: Sequence[Goal | None], place: Place | None) -> Goal:
+    goal = Goal(op, key, (), tuple(parts), place)
+    goal.cuts = any(part is not None and part.cuts for part in parts[-2:])  # not the condition's
+    return goal

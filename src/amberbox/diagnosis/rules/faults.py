@@ -7,6 +7,9 @@ from dataclasses import dataclass
 
 from amberbox.core.errors import AmberboxError, UsageError
 
+TOO_DEEP = "a term is nested too deeply", "use lists, not f(f(f(...)))"
+"""What is wrong with a term whose parts are nested too deeply to go through, and the hint."""
+
 
 class RuleFault(Exception):  # noqa: N818  # not an error yet: it becomes one with its place
     """Something is wrong; ``at`` is the place in the text being read, -1 where there is none."""

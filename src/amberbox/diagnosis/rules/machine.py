@@ -11,7 +11,7 @@ from typing import Any, TypeAlias
 
 from amberbox.diagnosis.rules.budget import Budget
 from amberbox.diagnosis.rules.clauses import Clause, Frame, Goal, Predicate
-from amberbox.diagnosis.rules.faults import RuleError, RuleFault, StopFault
+from amberbox.diagnosis.rules.faults import TOO_DEEP, RuleError, RuleFault, StopFault
 from amberbox.diagnosis.rules.proof import ENTER, EXIT, LEAF, Looked, Trace
 from amberbox.diagnosis.rules.terms import Env, Key, Struct, Term, Trail, Var
 from amberbox.diagnosis.rules.unify import match, undo, unify
@@ -20,6 +20,7 @@ Choice: TypeAlias = tuple[Any, ...]
 """Length of the trail, trace, a function that goes on, and its arguments."""
 
 _EVERY = 256
+_LARGE = 65_536
 _MOST_BOUND = 3_000_000
 
 
@@ -61,7 +62,7 @@ class Machine:
         except RuleFault as fault:
             raise self._explained(fault) from fault
         except RecursionError as error:
-            raise self._explained(RuleFault("a term is nested too deeply")) from error
+            raise self._explained(RuleFault(*TOO_DEEP)) from error
 
     def _run(self, frame: Frame | None) -> bool:
         steps = self.steps
@@ -106,9 +107,17 @@ class Machine:
 
     def charge(self, size: int) -> None:
         """Count work on something large as steps, so that few steps cannot take for ever."""
+        before = self.charged
         self.charged += size
         if self.charged > self.budget.steps:
-            raise StopFault(f"stopped after {self.steps:,} steps on ever larger terms")
+            raise StopFault(f"stopped after {self.charged:,} steps on ever larger terms")
+        if self.charged // _LARGE > before // _LARGE and self.budget.is_over():
+            raise StopFault(f"stopped after {self.steps:,} steps, the time is over")
+
+    def charge_text(self, text: str) -> str:
+        """Count a text that was made as steps, one for eight characters, and return it."""
+        self.charge(len(text) // 8)
+        return text
 
     def choose(self, go_on: Callable[..., Frame | None], *rest: Any) -> None:
         """Remember that something else may be tried from here."""

@@ -7,7 +7,7 @@ from functools import cmp_to_key
 from typing import Any
 
 from amberbox.diagnosis.rules.faults import RuleFault
-from amberbox.diagnosis.rules.terms import LONGEST, Real, Struct, Term, Text, Var, deref
+from amberbox.diagnosis.rules.terms import ENDLESS, LONGEST, Real, Struct, Term, Text, Var, deref
 
 
 def compare(left: Term, right: Term) -> int:
@@ -25,7 +25,7 @@ def compare(left: Term, right: Term) -> int:
                 pairs.extend(zip(reversed(a.args), reversed(b.args), strict=True))
             steps += 1
             if steps > LONGEST:
-                raise RuleFault("a term contains itself")
+                raise RuleFault(ENDLESS)
         else:
             found = _simple(a, b)
         if found:

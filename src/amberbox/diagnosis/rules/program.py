@@ -14,7 +14,7 @@ from amberbox.diagnosis.rules.clauses import Clause, Predicate
 from amberbox.diagnosis.rules.compile import FIXED, compile_clause
 from amberbox.diagnosis.rules.datalog.evaluate import Database
 from amberbox.diagnosis.rules.directives import declarations
-from amberbox.diagnosis.rules.faults import Place, RuleFault
+from amberbox.diagnosis.rules.faults import TOO_DEEP, Place, RuleFault
 from amberbox.diagnosis.rules.library import library
 from amberbox.diagnosis.rules.reader import Sentence, sentences
 from amberbox.diagnosis.rules.sourcetext import SourceText, read_source
@@ -168,6 +168,9 @@ def _add(
         clause = _compiled(sentence, source)
     except RuleFault as fault:
         yield source.problem(fault, sentence.at)
+        return
+    except RecursionError:
+        yield source.problem(RuleFault(*TOO_DEEP), sentence.at)
         return
     predicates.setdefault(clause.key, Predicate(clause.key)).add(clause)
     for suspicion in suspicions(sentence) if sentence.names else ():

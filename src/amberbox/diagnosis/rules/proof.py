@@ -9,7 +9,7 @@ from typing import Any, Literal, NamedTuple, TypeAlias
 from amberbox.diagnosis.rules.clauses import Clause
 from amberbox.diagnosis.rules.faults import Place
 from amberbox.diagnosis.rules.terms import Term, make
-from amberbox.diagnosis.rules.unify import Memo, copy
+from amberbox.diagnosis.rules.unify import Copies, Memo, copy, freeze
 from amberbox.diagnosis.rules.writer import Names, anonymous, write
 
 Trace: TypeAlias = "tuple[Any, ...] | None"
@@ -17,6 +17,12 @@ Trace: TypeAlias = "tuple[Any, ...] | None"
 ``(older, LEAF, term or Node)``."""
 
 ENTER, EXIT, LEAF = "enter", "exit", "leaf"
+
+LONGEST_GOAL = 500
+"""Most characters of one goal that is shown as a reason; a longer one ends with ``...``."""
+
+_DEEPEST = 40
+"""Deepest goal of a proof that is shown by indentation, and that is nested in JSON."""
 
 Kind: TypeAlias = Literal["rule", "fact", "builtin", "lookup"]
 
@@ -66,28 +72,38 @@ class Node:
                 open_nodes.extend((child, depth + 1) for child in reversed(node.children))
 
     def text(self, names: Names = anonymous) -> str:
-        """Write the tree, one goal per line, indented by depth."""
+        """Write the tree, one goal per line, indented by depth; very deep ones by a number."""
         lines = []
         for node, depth, is_again in self.walk():
             note = "   (shown above)" if is_again else _source(node)
-            lines.append(f"{'  ' * depth}{write(node.goal, names)}{note}")
+            goal = write(node.goal, names, longest=LONGEST_GOAL)
+            lines.append(f"{_indent(depth)}{goal}{note}")
         return "\n".join(lines)
 
     def to_json(self) -> dict[str, Any]:
-        """Return the tree as plain Python; what is below a repeated goal is given once."""
-        made: list[tuple[dict[str, Any], int]] = []
+        """Return the tree as plain Python; what is below a repeated goal is given once.
+
+        Goals deeper than 40 are beside each other there, in order, each with its ``depth``.
+        """
+        root: dict[str, Any] | None = None
         path: list[dict[str, Any]] = []
         for node, depth, is_again in self.walk():
-            entry: dict[str, Any] = {"goal": write(node.goal), "by": node.kind}
+            goal = write(node.goal, longest=LONGEST_GOAL)
+            entry: dict[str, Any] = {"goal": goal, "by": node.kind}
+            entry |= {"depth": depth} if depth > _DEEPEST else {}
             entry |= {"at": str(node.place)} if node.place is not None else {}
             entry |= {"at": node.source.text} if node.source is not None else {}
             entry |= {"shown_above": True} if is_again else {}
-            del path[depth:]
+            del path[min(depth, _DEEPEST) :]
             if path:
                 path[-1].setdefault("because", []).append(entry)
             path.append(entry)
-            made.append((entry, depth))
-        return made[0][0]
+            root = root or entry
+        return root or {}
+
+
+def _indent(depth: int) -> str:
+    return "  " * depth if depth <= _DEEPEST else f"{'  ' * _DEEPEST}({depth}) "
 
 
 def _source(node: Node) -> str:
@@ -102,6 +118,7 @@ def nodes_of(trace: Trace) -> list[Node]:
     """Return the goals that a trace proves, in the order in which they were run."""
     root = Node("true", "builtin")
     path = [root]
+    copied: Copies = {}
     hidden: list[int] = []
     for event in _events(trace):
         if event[1] == EXIT:
@@ -109,7 +126,7 @@ def nodes_of(trace: Trace) -> list[Node]:
                 hidden.pop()
             path.pop()
             continue
-        node = event[2] if isinstance(event[2], Node) else _node(event)
+        node = event[2] if isinstance(event[2], Node) else _node(event, copied)
         if not hidden:
             path[-1].children.append(node)
         if event[1] == ENTER:
@@ -137,20 +154,20 @@ def _events(trace: Trace) -> list[tuple[Any, ...]]:
     return events[::-1]
 
 
-def _node(event: tuple[Any, ...]) -> Node:
+def _node(event: tuple[Any, ...], copied: Copies) -> Node:
     if event[1] == LEAF:
-        return _leaf(event[2])
+        return _leaf(event[2], copied)
     clause: Clause = event[2]
-    goal = copy(make(clause.key[0], event[3]), None)
+    goal = make(clause.key[0], [freeze(arg, copied) for arg in event[3]])
     if clause.place.file == LIBRARY:
         return Node(goal, "builtin")
     return Node(goal, "fact" if clause.body is None else "rule", clause.place)
 
 
-def _leaf(leaf: Term | Looked) -> Node:
+def _leaf(leaf: Term | Looked, copied: Copies) -> Node:
     if isinstance(leaf, Looked):
-        return Node(copy(leaf.goal, None), "lookup", source=leaf.source)
-    return Node(copy(leaf, None), "builtin")
+        return Node(freeze(leaf.goal, copied), "lookup", source=leaf.source)
+    return Node(freeze(leaf, copied), "builtin")
 
 
 def copy_trace(trace: Trace, memo: Memo) -> Trace:

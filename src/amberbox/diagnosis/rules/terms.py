@@ -19,6 +19,9 @@ PAIR = "[|]"
 LONGEST = 1_000_000
 """Most elements of a list, and most steps of a walk through a term that may contain itself."""
 
+ENDLESS = f"a term contains itself or has more than {LONGEST:,} parts"
+"""What is wrong with a term whose end was not reached after so many steps."""
+
 Key: TypeAlias = tuple[str, int]
 """Name and number of arguments of a predicate or structure."""
 
@@ -120,7 +123,7 @@ def split_list(term: Term) -> tuple[list[Term], Term]:
     while isinstance(term, Struct) and term.name == PAIR and len(term.args) == 2:
         items.append(term.args[0])
         if len(items) > LONGEST:
-            raise RuleFault("a list contains itself")
+            raise RuleFault(f"a list contains itself or has more than {LONGEST:,} elements")
         term = deref(term.args[1])
     return items, term
 

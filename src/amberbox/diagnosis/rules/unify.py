@@ -6,6 +6,7 @@ from collections.abc import Hashable, Iterable
 
 from amberbox.diagnosis.rules.faults import RuleFault
 from amberbox.diagnosis.rules.terms import (
+    ENDLESS,
     LONGEST,
     Env,
     Pattern,
@@ -42,7 +43,7 @@ def unify(left: Term, right: Term, trail: Trail) -> bool:
             open_pairs.extend(zip(reversed(a.args), reversed(b.args), strict=True))
             steps += 1
             if steps > LONGEST:
-                raise RuleFault("a term contains itself")
+                raise RuleFault(ENDLESS)
         elif a != b:
             return False
     return True
@@ -123,10 +124,33 @@ def copy(term: Term, memo: Memo | None) -> Term:
         spine.append((term.name, [copy(part, memo) for part in term.args[:-1]]))
         term = deref(term.args[-1])
         if len(spine) > LONGEST:
-            raise RuleFault("a term contains itself")
+            raise RuleFault(ENDLESS)
     if memo is not None and type(term) is Var:
         term = memo.setdefault(term, Var())
     return _fold(spine, term)
+
+
+Copies = dict[int, tuple[Struct, Term]]
+"""Structures with their copies, by ``id``."""
+
+
+def freeze(term: Term, copies: Copies) -> Term:
+    """Copy a term with its bindings; what the copies have in common is copied once."""
+    spine: list[tuple[Struct, list[Term]]] = []
+    term = deref(term)
+    while isinstance(term, Struct):
+        known = copies.get(id(term))
+        if known is not None:
+            term = known[1]
+            break
+        spine.append((term, [freeze(part, copies) for part in term.args[:-1]]))
+        term = deref(term.args[-1])
+        if len(spine) > LONGEST:
+            raise RuleFault(ENDLESS)
+    for struct, parts in reversed(spine):
+        term = Struct(struct.name, (*parts, term))
+        copies[id(struct)] = struct, term
+    return term
 
 
 def free_variables(terms: Iterable[Term]) -> list[Var]:
@@ -142,7 +166,7 @@ def free_variables(terms: Iterable[Term]) -> list[Var]:
             open_terms.extend(reversed(term.args))
             steps += 1
             if steps > LONGEST:
-                raise RuleFault("a term contains itself")
+                raise RuleFault(ENDLESS)
     return list(found)
 
 
@@ -159,7 +183,7 @@ def variant(terms: Iterable[Term]) -> tuple[Hashable, ...]:
             key.append((term.name, len(term.args)))
             open_terms.extend(reversed(term.args))
             if len(key) > LONGEST:
-                raise RuleFault("a term contains itself")
+                raise RuleFault(ENDLESS)
         else:
             key.append(term)
     return tuple(key)

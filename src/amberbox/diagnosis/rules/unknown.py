@@ -22,6 +22,11 @@ _REFUSED: dict[str, str] = {
     **dict.fromkeys(("shell", "halt", "getenv", "setenv"), "rules cannot reach the system"),
     **dict.fromkeys(("use_module", "module", "ensure_loaded"), _FILES),
     **dict.fromkeys(("nb_setval", "b_setval", "nb_getval", "b_getval"), _CHANGES),
+    **dict.fromkeys(
+        ("+", "-", "*", "/", "//", "mod", "rem", "div", "**", "<<", "/\\", "\\/", "xor"),
+        "it makes a number of numbers: X is 1 + 2, or compare with =:= and <"),
+    ">>": "as a goal it is a lambda of SWI-Prolog's yall: write a rule of its own and call that; "
+          "as a shift it stands behind is",
     "*->": "use (once(A) -> B ; C) or (A, B)",
     ":": "there are no modules: write the goal without its module",
 }  # fmt: skip

@@ -11,6 +11,7 @@ from amberbox.diagnosis.rules.clauses import Clause, Predicate, flatten
 from amberbox.diagnosis.rules.compile import compile_goal
 from amberbox.diagnosis.rules.faults import Place
 from amberbox.diagnosis.rules.machine import Machine
+from amberbox.diagnosis.rules.proof import LONGEST_GOAL
 from amberbox.diagnosis.rules.terms import (
     Key,
     Struct,
@@ -40,9 +41,9 @@ class Tried:
 
     def lines(self, indent: str) -> Iterator[str]:
         """Write it with what is below."""
-        yield f"{indent}{write(self.head)}   {self.place}"
+        yield f"{indent}{write(self.head, longest=LONGEST_GOAL)}   {self.place}"
         for goal in self.held:
-            yield f"{indent}  holds: {write(goal)}"
+            yield f"{indent}  holds: {write(goal, longest=LONGEST_GOAL)}"
         yield from self.failed.lines(f"{indent}  ")
 
 
@@ -56,7 +57,7 @@ class Failure:
 
     def lines(self, indent: str = "") -> Iterator[str]:
         """Write it with what is below, a line each."""
-        yield f"{indent}fails: {write(self.goal)}   {self.what}".rstrip()
+        yield f"{indent}fails: {write(self.goal, longest=LONGEST_GOAL)}   {self.what}".rstrip()
         for tried in self.tried:
             yield from tried.lines(f"{indent}  ")
 
@@ -64,14 +65,14 @@ class Failure:
         """Return it as plain Python."""
         tried = [
             {
-                "head": write(entry.head),
+                "head": write(entry.head, longest=LONGEST_GOAL),
                 "at": str(entry.place),
-                "held": [write(goal) for goal in entry.held],
+                "held": [write(goal, longest=LONGEST_GOAL) for goal in entry.held],
                 "failed": entry.failed.to_json(),
             }
             for entry in self.tried
         ]
-        return {"goal": write(self.goal), "what": self.what, "tried": tried}
+        return {"goal": write(self.goal, longest=LONGEST_GOAL), "what": self.what, "tried": tried}
 
 
 class Inquiry:
