@@ -30,6 +30,7 @@ from amberbox.core.expression_tree import (
     history_ns,
     kind_of,
     needs_history,
+    shortest_ns,
     walk,
     with_addresses,
 )
@@ -90,6 +91,11 @@ class Expression:
     def history_ns(self) -> int:
         """How far it looks back: series must reach back this far, and one sample further."""
         return history_ns(self.tree)
+
+    @property
+    def shortest_ns(self) -> int | None:
+        """The shortest time that it looks back by ``over`` or ``for``; None without."""
+        return shortest_ns(self.tree)
 
     @property
     def reads_age(self) -> bool:

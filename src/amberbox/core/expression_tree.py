@@ -193,6 +193,12 @@ def history_ns(tree: Tree) -> int:
     return own + max((history_ns(child) for child in children(tree)), default=0)
 
 
+def shortest_ns(tree: Tree) -> int | None:
+    """Return the shortest time that a tree looks back by ``over`` or ``for``; None without."""
+    spans = [part.over_ns for part in walk(tree) if isinstance(part, Window)]
+    return min(spans + [part.for_ns for part in walk(tree) if isinstance(part, Held)], default=None)
+
+
 def delays_ns(tree: Tree) -> frozenset[int]:
     """Return how long after a sample the value of a tree may change."""
     own = {tree.over_ns} if isinstance(tree, Window) else set()

@@ -18,10 +18,12 @@ machine. It may also define
 - ``PER_INPUT = True``: it is called for each input of a mapping alone. One output then says
   whether all are well, or there is one output for each;
 - ``TIMED = True``, or ``timed(config)``: the results change as time passes, also without a new
-  sample; it is then called every quarter of a second, not with every sample;
+  sample; it is then called every quarter of a second, not with every sample, but with both where
+  it looks back less than half a second: no sample passes through such a window unseen;
 - ``SEES_SILENCE = True``: it wants to be called also where its inputs are stale;
 - ``PARTS = True``: an ``item`` input brings all columns of its rows in ``parts``;
-- ``history_s(config)``: how far back it looks, in seconds;
+- ``history_s(config)``: how far back it looks, in seconds; ``shortest_s(config)``: its shortest
+  window, where that is another one;
 - ``results_of(config, inputs, bools)``: the results of a mapping, where they depend on the
   arguments or on how many inputs and bool outputs it has (ints); outputs are bound to these, and
   ``RESULTS`` are those that it always has;
@@ -115,6 +117,12 @@ class Input:
     def rate_hz(self, now: Now, seconds: float) -> Any:
         """Return messages of its item per second over the last ``seconds``, before any filter."""
         return self.flow.rate_hz(now, seconds)
+
+
+def shortest_window_s(module: Any, config: Any) -> float:
+    """Return the shortest window that a mode looks back over, in seconds; 0 if it has none."""
+    shortest = getattr(module, "shortest_s", None) or getattr(module, "history_s", None)
+    return 0.0 if shortest is None else float(shortest(config))
 
 
 class Evaluate(Protocol):

@@ -14,11 +14,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from amberbox.core.clock import NS
+from amberbox.core.expression import parse
 from amberbox.core.types import Batch, Level, Status
 from amberbox.monitoring.engine.engine import Engine
 from amberbox.monitoring.engine.findings import TICK_NS, Finding
 from amberbox.monitoring.messages.records import encoded
-from amberbox.monitoring.plan import InputPlan, ModePlan
+from amberbox.monitoring.modes import expression
+from amberbox.monitoring.plan import InputPlan, MappingPlan, ModePlan
 from tests.monitoring.engine.plans import (
     ALIVE,
     CRASHING,
@@ -74,6 +76,28 @@ def test_what_depends_on_time_changes_without_a_row() -> None:
     batch = rows(seconds(1.0), v=[5.0])
     found = levels(watch([mode(STEADY, variable())], [batch], 3.0))
     assert found == [(0.0, "unknown"), (1.0, "error"), (2.0, "ok")]
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    period_ms=st.integers(20, 600), phase_ms=st.integers(0, 1000), place=st.integers(1, 8),
+    spare_ms=st.integers(0, 200), word=st.sampled_from(["rate", "max"]),
+)  # fmt: skip
+def test_no_jump_falls_between_two_windows(
+    period_ms: int, phase_ms: int, place: int, spare_ms: int, word: str
+) -> None:
+    """A window of two periods sees every sample with the one before it, whenever it is asked."""
+    window_ms = max(2 * period_ms, 100) + spare_ms
+    times = np.arange(10, dtype=np.int64) * period_ms * 10**6 + (1000 + phase_ms) * 10**6
+    if word == "rate":
+        values, condition = (np.arange(10) >= place) * 1000.0, f"rate(a.v over {window_ms}ms) < 1"
+    else:
+        values, condition = (np.arange(10) == place) * 1.0, f"max(a.v over {window_ms}ms) < 1"
+    config = expression.Config(condition=parse(condition))
+    mapping = MappingPlan([], [output(expression.RESULTS[0])], [variable()])
+    plan = ModePlan("m", "m", expression, config, [mapping], stale_s=None)
+    found = levels(watch([plan], [rows(times, v=values)], 10.0))
+    assert "error" in {level for _, level in found}
 
 
 def test_a_value_gets_stale() -> None:

@@ -7,11 +7,18 @@ from dataclasses import fields
 from typing import Any
 
 from amberbox.core.errors import Problem
+from amberbox.core.mode import shortest_window_s
 from amberbox.core.nodes import Node
 from amberbox.monitoring.configuration.recorded import Item, Recorded
 from amberbox.monitoring.plan import InputPlan, ModePlan
 
 _NEVER_KEPT = "none"
+_LONG_S = 10.0
+"""Windows of this length or more are not compared with what was recorded."""
+_PERIODS = 1.9
+"""Two, less what a measured rate may be off."""
+_SHORTEST_S = 0.1
+"""Two instants at which monitors are evaluated."""
 
 
 def filter_problems(plan: ModePlan, node: Node, recorded: Recorded) -> Iterator[Problem]:
@@ -24,12 +31,14 @@ def filter_problems(plan: ModePlan, node: Node, recorded: Recorded) -> Iterator[
     told: set[str] = set()
     for mapping in plan.mappings:
         for entry in (*mapping.inputs, *mapping.reads):
-            item = recorded.by_name.get(entry.item.partition("__")[0])
-            if item is not None:
-                for what, is_error in _complaints(plan, entry, item):
-                    if what not in told:
-                        told.add(what)
-                        yield place.problem("mappings", what, is_error=is_error)
+            name = entry.item.partition("__")[0]
+            item = recorded.by_name.get(name)
+            found = [] if item is None else [*_complaints(plan, entry, item)]
+            found = found or [(what, False) for what in _too_short(plan, entry, name, recorded)]
+            for what, is_error in found:
+                if what not in told:
+                    told.add(what)
+                    yield place.problem("mappings", what, is_error=is_error)
 
 
 def _complaints(plan: ModePlan, entry: InputPlan, item: Item) -> Iterator[tuple[str, bool]]:
@@ -57,6 +66,24 @@ def _complaints(plan: ModePlan, entry: InputPlan, item: Item) -> Iterator[tuple[
             f"looks back over {window_s:g} s, but while nothing changes {item.name} keeps one row "
             f"in {options.change.heartbeat_s:g} s (change)",
             True,
+        )
+
+
+def _too_short(plan: ModePlan, entry: InputPlan, name: str, recorded: Recorded) -> Iterator[str]:
+    """Yield that samples may pass between two looks, as far as the item's rate is known."""
+    window_s = shortest_window_s(plan.module, plan.config)
+    if entry.kind == "item" or not 0 < window_s < _LONG_S:
+        return
+    if window_s < _SHORTEST_S:
+        yield (
+            f"looks back over {window_s:g} s, but at most 20 times a second: samples between pass "
+            f"unseen; make it {_SHORTEST_S:g} s or more"
+        )
+    rate_hz = recorded.rate_hz(name)
+    if rate_hz is not None and window_s * rate_hz < _PERIODS:
+        yield (
+            f"looks back over {window_s:g} s, but {name} comes {rate_hz:.2g} times a second: what "
+            f"changes between two samples may pass unseen; make it {2 / rate_hz:.2g} s or more"
         )
 
 

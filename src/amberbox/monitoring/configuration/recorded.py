@@ -62,6 +62,20 @@ class Recorded:
         """Return the variables of an item that was recorded before."""
         return self._stored.get(name)
 
+    def rate_hz(self, name: str) -> float | None:
+        """Return how often an item comes: as recorded before, at most as its filter lets it."""
+        item = self.by_name.get(name)
+        limit_hz = None if item is None else item.options.max_frequency
+        known = [rate for rate in (limit_hz, self._rates.get(name)) if rate is not None]
+        return min(known, default=None)
+
+    @cached_property
+    def _rates(self) -> Mapping[str, float]:
+        """Rows per second of the items that were recorded before."""
+        with suppress(AmberboxError, OSError):
+            return _stored_rates(self._folder)
+        return {}
+
     @cached_property
     def _stored(self) -> Mapping[str, ItemSchema]:
         """What has been recorded already; empty if there is no store, or none that can be read."""
@@ -85,6 +99,15 @@ def _stored_schemas(folder: RobotFolder) -> Mapping[str, ItemSchema]:
         return {name: _with_children(name, found, plain) for name in found}
 
     return ask(folder.store_path, tables)
+
+
+def _stored_rates(folder: RobotFolder) -> Mapping[str, float]:
+    from amberbox.blackbox.query.record import Record  # needs the store's readers
+
+    if not folder.store_path.is_dir():
+        return {}
+    infos = Record(folder.store_path).items()
+    return {info.name: info.rate_hz for info in infos if info.rate_hz is not None}
 
 
 def _with_children(

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from amberbox.core.clock import NS
-from amberbox.core.mode import FALSE, HOLD, TRUE, UNKNOWN, Input
+from amberbox.core.mode import FALSE, HOLD, TRUE, UNKNOWN, Input, shortest_window_s
 from amberbox.core.types import IntArray, Output
 from amberbox.monitoring.engine import freshness
 from amberbox.monitoring.engine.findings import Found, What
@@ -24,6 +24,12 @@ from amberbox.monitoring.plan import MappingPlan, ModePlan, OutputPlan
 
 QUARTER_NS = NS // 4
 """Modes whose results change with time are evaluated at multiples of this."""
+SHORT_S = 0.5
+"""Those that look back over less are evaluated wherever rows came as well.
+
+What two samples in a row have between them (a jump) is then in some window, if a window is as
+long as two of the item's periods, which ``check`` looks after.
+"""
 _CODES = 8
 """There are fewer codes of freshness than this; the place of an input is counted above them."""
 _FEW = 4
@@ -111,6 +117,7 @@ class MappingRun:
         self._columns = getattr(module, "COLUMNS", False)
         timed = getattr(module, "timed", None)
         self._timed = timed(mode.config) if timed else getattr(module, "TIMED", False)
+        self._is_short = 0 < shortest_window_s(module, mode.config) < SHORT_S
         self._sees_silence = getattr(module, "SEES_SILENCE", False)
         self._config, self._stale_s = mode.config, mode.stale_s
         results = [*getattr(module, "RESULTS", ()), *(output.plan.result for output in outputs)]
@@ -181,7 +188,7 @@ class MappingRun:
         listed = [freshness.FRESH] * len(block.times) if codes is None else codes.tolist()
         if any(listed):
             listed = self._with_culprits(block).tolist()
-        is_due = block.is_quarter if self._timed else block.has_rows
+        is_due = self._is_due(block)
         for now, code, due in zip(block.times, listed, is_due.tolist(), strict=True):
             if code == freshness.FRESH:
                 if due or self.code != code:
@@ -193,6 +200,12 @@ class MappingRun:
             elif code != self.code:
                 self._not_fresh(now, code, found)
             self.code = code
+
+    def _is_due(self, block: Block) -> Any:
+        """Return at which instants of a block the results may be others than before."""
+        if not self._timed:
+            return block.has_rows
+        return block.is_quarter | block.has_rows if self._is_short else block.is_quarter
 
     def _crash(self, now: int, error: BaseException, found: list[Found]) -> None:
         self.crashed = readable(f"crashed: {type(error).__name__}: {error}".rstrip(": "))
@@ -272,7 +285,7 @@ class MappingRun:
             codes = self._with_culprits(block)
         before = np.concatenate([[self.code], codes[:-1]])
         is_fresh = codes == freshness.FRESH
-        is_due = block.is_quarter if self._timed else block.has_rows
+        is_due = self._is_due(block)
         wanted = is_fresh & (is_due | (codes != before))
         turns = np.flatnonzero(~is_fresh & (codes != before)).tolist()
         starts = [0, *turns, count]

@@ -64,6 +64,13 @@ def history_s(config: Config) -> float:
     return max(one.history_ns / 1e9 for one in asked if one is not None)
 
 
+def shortest_s(config: Config) -> float:
+    """Return the shortest time that it looks back, 0 if it does not."""
+    asked = (config.condition, config.number)
+    spans = [one.shortest_ns for one in asked if one is not None]
+    return min((span for span in spans if span is not None), default=0) / 1e9
+
+
 def timed(config: Config) -> bool:
     """Tell whether what it asks changes as time passes."""
     asked = (config.condition, config.number)
