@@ -49,7 +49,7 @@ if TYPE_CHECKING:
     from playwright.sync_api import Browser, BrowserContext, Page
 
 _HERE = Path(__file__).parent
-_WAIT_MS = 10_000
+_WAIT_MS = 60_000
 _OPEN: pytest.StashKey[ExitStack] = pytest.StashKey()
 
 

@@ -10,6 +10,9 @@ pytest.importorskip("playwright.sync_api", reason=NO_PLAYWRIGHT)
 
 from playwright.sync_api import expect  # only where it is there
 
-expect.set_options(timeout=10_000)
+PATIENCE_MS = 60_000
+"""How long an event may take on a busy machine before a test gives up."""
 
-__all__ = ["expect"]
+expect.set_options(timeout=PATIENCE_MS)
+
+__all__ = ["PATIENCE_MS", "expect"]

@@ -16,11 +16,10 @@ from tests.browser.site import Site
 from tests.browser.watching import RESTART
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Page
+    from playwright.sync_api import Page, Route
 
 PATH = "/robots/ropod_001/data"
 VOLTS, SPEED = "battery.volts", "ros_ropod_odom.twist_linear_x"
-PATIENCE_MS = 30_000
 _DRAWN = """(n) => {
     const cells = [...document.querySelectorAll(".plot-readout tbody tr td:nth-of-type(6)")];
     return cells.length === n && cells.every((cell) => cell.textContent);
@@ -30,21 +29,33 @@ _DRAWN = """(n) => {
 def open_data(page: Page, *names: str, robot: str = "ropod_001", **more: str) -> None:
     """Show variables of a robot and wait until they are drawn."""
     query = [*(f"v={name}" for name in names), *(f"{key}={value}" for key, value in more.items())]
-    page.goto(f"/robots/{robot}/data?{'&'.join(query)}", timeout=PATIENCE_MS)
-    page.locator(".tree").wait_for(state="attached", timeout=PATIENCE_MS)
+    page.goto(f"/robots/{robot}/data?{'&'.join(query)}")
+    page.locator(".tree").wait_for(state="attached")
     if names and "mode" not in more:
         drawn(page, len(names))
 
 
 def drawn(page: Page, number: int) -> None:
     """Wait until so many variables are drawn."""
-    page.wait_for_function(_DRAWN, arg=number, timeout=PATIENCE_MS)
+    page.wait_for_function(_DRAWN, arg=number)
 
 
 def stamp(site: Site, minutes: float) -> str:
     """Return a time from when the record was made backwards."""
     at_s = site.now_ns / 1e9 + 60 * minutes
     return datetime.fromtimestamp(at_s, UTC).strftime("%Y-%m-%dT%H:%M:%S.%fZ")
+
+
+def test_plots_wait_for_the_script_that_draws_them(page_as: PageAs) -> None:
+    """On a slow line everything else comes first; the page must not use it before it is there."""
+    page = page_as("viewer")
+    held: list[Route] = []
+    page.route("**/vendor/uplot.js", lambda route: held.append(route))
+    with page.expect_response("**/data/variables"):
+        page.goto(f"{PATH}?v={VOLTS}", wait_until="commit")
+    page.evaluate("() => new Promise((done) => setTimeout(done, 1000))")  # time for the mistake
+    held[0].continue_()
+    drawn(page, 1)
 
 
 def test_choosing_variables_by_keys_and_words(page_as: PageAs) -> None:
@@ -228,7 +239,7 @@ def test_taking_along_what_is_seen(page_as: PageAs, site: Site) -> None:
     page.get_by_role("button", name="Download").click()
     page.get_by_role("button", name="Make the file").click()
     link = page.locator(".work a")
-    link.wait_for(timeout=20_000)
+    link.wait_for()
     with page.expect_download() as download:
         link.click()
     lines = download.value.path().read_text().splitlines()

@@ -54,7 +54,7 @@ def robot(site: Site) -> Iterator[Site]:
 
 
 def is_live(page: Page) -> None:
-    expect(page.locator("html")).to_have_attribute("data-feed", "live", timeout=15_000)
+    expect(page.locator("html")).to_have_attribute("data-feed", "live")
 
 
 def row(page: Page, component: str, mode: str = "", output: str = "") -> Locator:
@@ -70,7 +70,7 @@ def test_a_robot_in_trouble(page_as: PageAs, theme: str, width: int) -> None:
     expect(row(page, "laser_front")).to_have_attribute("aria-expanded", "true")
     expect(row(page, "laser_front").locator(".level")).to_have_text("error")
     explained = page.locator('#diagnosis [data-complete="yes"]')
-    expect(explained).to_be_visible(timeout=20_000)
+    expect(explained).to_be_visible()
     axe(page)
     no_sideways_scroll(page)
     shot(page, f"robot-{theme}-{width}")
@@ -144,12 +144,12 @@ def test_a_silent_robot_is_known_within_three_heartbeats(page_as: PageAs, robot:
     is_live(page)
     expect(row(page, "base").locator(".age")).to_have_text("1 s")
     robot.robots["ropod_001"].silence()
-    expect(page.locator("#silence")).to_contain_text("robot silent since", timeout=4500)
+    expect(page.locator("#silence")).to_contain_text("robot silent since")
     expect(page.locator("#robot-state")).to_contain_text("silent since")
     expect(page.locator("#robot")).to_have_class(re.compile("is-silent"))
     expect(row(page, "base").locator(".age")).to_have_text(re.compile(r"[4-9] s"))
     robot.robots["ropod_001"].wake()
-    expect(page.locator("#robot")).not_to_have_class(re.compile("is-silent"), timeout=15_000)
+    expect(page.locator("#robot")).not_to_have_class(re.compile("is-silent"))
     expect(page.locator("#robot-state")).to_contain_text("online")
 
 
@@ -158,14 +158,14 @@ def test_a_restart_of_the_server_loses_nothing(page_as: PageAs, site: Site) -> N
     page.goto(f"{PAGE}?open=wifi&open=host")
     is_live(page)
     site.kill()
-    expect(page.locator("html")).to_have_attribute("data-feed", "lost", timeout=6000)
+    expect(page.locator("html")).to_have_attribute("data-feed", "lost")
     expect(page.locator(".lost-banner")).to_be_visible()
     expect(row(page, "base").locator(".age")).to_have_text(re.compile(r"[3-9] s"))
     site.start()
     is_live(page)
     expect(row(page, "wifi")).to_have_attribute("aria-expanded", "true")
     expect(row(page, "laser_front")).to_have_attribute("aria-expanded", "false")
-    expect(row(page, "base").locator(".age")).to_have_text(re.compile("[12] s"), timeout=20_000)
+    expect(row(page, "base").locator(".age")).to_have_text(re.compile("[12] s"))
 
 
 def test_what_was_missed_is_asked_for_behind_a_new_beginning(page_as: PageAs, site: Site) -> None:
@@ -174,12 +174,12 @@ def test_what_was_missed_is_asked_for_behind_a_new_beginning(page_as: PageAs, si
     page.goto(PAGE)
     is_live(page)
     line.cut()
-    expect(page.locator("html")).to_have_attribute("data-feed", "lost", timeout=6000)
+    expect(page.locator("html")).to_have_attribute("data-feed", "lost")
     site.robots["ropod_001"].tell("note", "it came while nobody heard")
     until(lambda: "while nobody heard" in str(site.ask("/robots/ropod_001/events")), "it is there")
-    with page.expect_response(lambda answer: "/diagnosis/card" in answer.url, timeout=15_000):
+    with page.expect_response(lambda answer: "/diagnosis/card" in answer.url):
         line.mend()
-        expect(page.locator("#events")).to_contain_text("while nobody heard", timeout=15_000)
+        expect(page.locator("#events")).to_contain_text("while nobody heard")
 
 
 class Line:
