@@ -22,7 +22,7 @@ from amberbox.blackbox.segments.manifest import (
     part_clock,
     part_from_json,
 )
-from amberbox.core.files import sync_folder
+from amberbox.core.files import below, sync_folder
 from amberbox.core.types import IntArray
 
 if TYPE_CHECKING:
@@ -56,7 +56,7 @@ class TableFile:
         self.path = path
         self.schema = schema
         self._store = store
-        self._final = store / path
+        self._final = below(store, path)
         self._temporary = self._final.with_name(f".{self._final.name}.tmp")
         self._writer: pq.ParquetWriter | None = None
         self.rows = 0

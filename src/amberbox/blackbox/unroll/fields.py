@@ -204,8 +204,7 @@ class _Walk:
         if base not in self._depths:
             self._depths[base] = max(
                 (
-                    self.depth(kind.base)
-                    + (kind.count is not None and not self.is_unrolled(kind))
+                    self.depth(kind.base) + (kind.count is not None and not self.is_unrolled(kind))
                     for _, kind in self.definition.structures[base].fields
                 ),
                 default=0,

@@ -39,7 +39,7 @@ def _view(connection: duckdb.DuckDBPyConnection, reader: Reader, table: str) -> 
     union, paths, selects = reader.schema(table), list[str](), list[str]()
     for source in reader.sources:
         for version in reader.schemas[table]:
-            folder = reader.layout.tables / table_of(version)
+            folder = reader.layout.table(table_of(version))
             files = [
                 str((folder / file.path).resolve()) for file in reader.files(source, version, None)
             ]
