@@ -27,5 +27,5 @@ def deadly(journal: Any, *arguments: Any) -> Any:
 
 
 if __name__ == "__main__":
-    committing.flats_of = deadly
+    setattr(committing, "flats_of", deadly)  # noqa: B010  # it is what the test is about
     worker.main()

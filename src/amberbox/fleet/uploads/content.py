@@ -99,6 +99,7 @@ def _check_chunks(chunks: Iterator[Chunk]) -> None:
         if int(chunk.log_ns.min()) < 0:
             raise ContentError("a message is of a time that no clock shows")
         days.update(np.unique(chunk.log_ns // _DAY_NS).tolist())
-        if messages > MOST_MESSAGES or len(days) > MOST_DAYS:
-            most = f"{MOST_MESSAGES} messages, or messages of {MOST_DAYS} days"
-            raise ContentError(f"it has more than {most}")
+        if messages > MOST_MESSAGES:
+            raise ContentError(f"it has more than {MOST_MESSAGES} messages")
+        if len(days) > MOST_DAYS:
+            raise ContentError(f"it has messages of more than {MOST_DAYS} days")
