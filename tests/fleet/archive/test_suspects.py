@@ -103,7 +103,7 @@ def test_a_worker_has_limits_of_time_and_memory(archive: FolderArchive, tmp_path
             worker.commit(0.0)
     assert caught.value.journal.startswith("b/")
     (size,) = re.findall(r"Max data size +(\d+)", limits)
-    assert 512 << 20 <= int(size) <= MEMORY_BYTES
+    assert 2 << 30 <= int(size) <= MEMORY_BYTES
 
 
 def test_the_culprit_is_refused_and_all_others_are_committed(
@@ -123,8 +123,22 @@ def test_the_culprit_is_refused_and_all_others_are_committed(
     with archive.catalogue.database.reading() as connection:
         (event,) = connection.execute(select(EVENT)).all()
     assert (event.robot, event.kind) == ("b", suspects.KIND)
-    assert "download it" in event.text and why in event.text
+    assert "amberbox verify" in event.text and why in event.text
     assert suspects.known(archive.catalogue) == suspects.Suspects()
+
+
+def test_what_one_version_refused_is_tried_by_the_next(
+    archive: FolderArchive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bring(archive, tmp_path, "a")
+    archive.catalogue.plan(archive.catalogue.waiting(), 0)
+    for _ in range(suspects.TRIES):
+        archive.note_failure("", "a mistake of this version")
+    assert archive.commit(0.0).refused == 1
+    assert archive.try_again() == 0 and states(archive) == {"a": "refused"}
+    monkeypatch.setattr(suspects, "__version__", "the next one")
+    assert archive.try_again() == 1
+    assert archive.commit(0.0).journals == 1 and archive.robot().gaps() == []
 
 
 def test_an_innocent_journal_is_committed_alone(archive: FolderArchive, tmp_path: Path) -> None:

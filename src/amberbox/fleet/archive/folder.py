@@ -86,6 +86,10 @@ class FolderArchive:
         """Count that a commit failed over a journal (``robot/store_id/file``, empty: unknown)."""
         suspects.note_failure(self.catalogue, self.clock.wall_ns(), journal, why)
 
+    def try_again(self) -> int:
+        """Have journals committed that an older server could not; return how many there are."""
+        return suspects.try_again(self.catalogue, self.clock.wall_ns())
+
     def compact(self) -> int:
         """Join small files of the tables; return how many files went."""
         return compacting.compact(self.layout, self.catalogue)

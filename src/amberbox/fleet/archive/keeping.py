@@ -126,6 +126,7 @@ class Keeping:
     async def _commit_always(self) -> None:
         backoff = Backoff(least_s=1.0, most_s=60.0)
         await self._apart(partial(settling.take_over, self._archive, self._database, self._folder))
+        await self._apart(self._archive.try_again)
         while True:
             self._woken.clear()
             try:

@@ -7,10 +7,12 @@ is known of failures stands in the database: it outlives the worker, and the ser
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
-from sqlalchemy import Connection
+from sqlalchemy import Connection, Row
 
-from amberbox.fleet.archive.catalogue import REFUSED, Batch, Catalogue, name_of
+from amberbox import __version__
+from amberbox.fleet.archive.catalogue import PUT, REFUSED, Batch, Catalogue, name_of
 from amberbox.fleet.archive.journal import decode, encode
 from amberbox.fleet.linkend.events import note
 from amberbox.fleet.options import options
@@ -83,9 +85,9 @@ def give_up(catalogue: Catalogue, batch: Batch, now_ns: int) -> int:
         refused = next(iter(names.values())) if len(names) == 1 else None
         if refused is not None:
             facts = decode(refused.facts)
-            facts.refused = f"it cannot be made rows of: {suspects.why}"
+            facts.refused, facts.by = f"it cannot be made rows of: {suspects.why}", __version__
             catalogue.change_in(connection, [refused], state=REFUSED, facts=encode(facts))
-            note(connection, refused.robot, now_ns, KIND, _told(refused.file, facts.refused))
+            note(connection, refused.robot, now_ns, KIND, _told(refused, facts.refused))
             blamed = set()
         catalogue.cancel(connection, batch)
         after = Suspects(alone=(*left, *sorted(blamed)))
@@ -104,8 +106,24 @@ def clear(catalogue: Catalogue, batch: Batch, now_ns: int) -> None:
         options.write(connection, now_ns, _NAME, Suspects(alone=left))
 
 
-def _told(file: str, reason: str) -> str:
+def try_again(catalogue: Catalogue, now_ns: int) -> int:
+    """Have journals committed, alone, that another version of the server refused; count them."""
+    rows = [row for row in catalogue.journals() if row.state == REFUSED and not row.raw_gone]
+    found = [row for row in rows if decode(row.facts).by not in ("", __version__)]
+    with catalogue.database.begin() as connection:
+        for row in found:
+            facts = decode(row.facts)
+            facts.refused = facts.by = ""
+            catalogue.change_in(connection, [row], state=PUT, facts=encode(facts))
+        before = read(connection)
+        alone = (*before.alone, *map(name_of, found))
+        options.write(connection, now_ns, _NAME, replace(before, alone=alone))
+    return len(found)
+
+
+def _told(row: Row[Any], reason: str) -> str:
     return (
-        f"{file} is kept and in no table: {reason}. It is damaged or forged, or this server has a "
-        "mistake: download it, look at it, and send it with the server's log to who made it"
+        f"{row.file} is kept and in no table: {reason}. It is damaged or forged, or this server "
+        "has a mistake: run amberbox verify on the robot, and report the error of the server's "
+        f"log with the file journals/{name_of(row)}. After an update it is tried again"
     )
