@@ -1,8 +1,8 @@
 """The process that works on an archive's tables: requests as JSON lines in, answers out.
 
-``python -m amberbox.fleet.archive.worker DIR``. Delta commits are made here and nowhere else: what
-deltalake does to memory, threads or at exit does not touch the server, and a worker that is killed
-is started again and finishes what it had begun.
+``python -m amberbox.fleet.archive.worker DIR [BYTES]``, with BYTES of memory at most. Delta commits
+are made here and nowhere else: what deltalake does to memory, threads or at exit does not touch the
+server, and a worker that is killed is started again and finishes what it had begun.
 """
 
 from __future__ import annotations
@@ -298,7 +298,7 @@ class _Lines:
 def main() -> None:
     """Serve until stdin closes; leave without what libraries do at exit (deltalake may abort)."""
     code = 0
-    limit_memory(int(sys.argv[2]))
+    limit_memory(int(sys.argv[2]) if len(sys.argv) > 2 else MEMORY_BYTES)
     try:
         serve(Path(sys.argv[1]), sys.stdin, sys.stdout)
     except AmberboxError as error:
