@@ -131,9 +131,13 @@ def test_what_one_version_refused_is_tried_by_the_next(
     archive: FolderArchive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     bring(archive, tmp_path, "a")
-    archive.catalogue.plan(archive.catalogue.waiting(), 0)
-    for _ in range(suspects.TRIES):
+    monkeypatch.setattr(committing, "flats_of", Mock(side_effect=KeyError("a mistake")))
+    for _ in range(2 * suspects.TRIES):  # also who came alone is tried so twice
+        assert states(archive) == {"a": "put"}
+        with pytest.raises(KeyError):
+            archive.commit(0.0)
         archive.note_failure("", "a mistake of this version")
+    monkeypatch.undo()
     assert archive.commit(0.0).refused == 1
     assert archive.try_again() == 0 and states(archive) == {"a": "refused"}
     monkeypatch.setattr(suspects, "__version__", "the next one")

@@ -37,13 +37,13 @@ Progress = Callable[[str, int], None]
 """Hears of each step: which journal is at hand (empty: none), and how many bytes it has."""
 
 
-def _unheard(_name: str, _size: int) -> None:
-    return None
+def unheard(_name: str, _size: int) -> None:
+    """Hear of steps and do nothing."""
 
 
 def commit(
     layout: Layout, catalogue: Catalogue, now_ns: int, every_s: float,
-    progress: Progress = _unheard,
+    progress: Progress = unheard,
 ) -> Committed:  # fmt: skip
     """Finish what was begun, else commit what waits if the last commit is long enough ago.
 

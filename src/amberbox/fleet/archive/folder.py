@@ -72,9 +72,7 @@ class FolderArchive:
         """Remember what will not come; saying it twice changes nothing."""
         self.catalogue.note_missing(Source(robot, store_id), ranges)
 
-    def commit(
-        self, every_s: float = 60.0, progress: Progress = lambda name, size: None
-    ) -> Committed:
+    def commit(self, every_s: float = 60.0, progress: Progress = committing.unheard) -> Committed:
         """Turn the journals that wait into columns; finish first what was cut short.
 
         ``progress`` hears of each step (see ``committing``).

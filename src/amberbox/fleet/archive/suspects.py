@@ -74,15 +74,15 @@ def note_failure(catalogue: Catalogue, now_ns: int, at: str, why: str) -> None:
 def give_up(catalogue: Catalogue, batch: Batch, now_ns: int) -> int:
     """End a batch that failed, of which no row is in any table; return how many were refused.
 
-    A journal that failed alone is refused. Of several, the one over which it happened is
-    committed alone from now on, or each of them when it is not known which one.
+    The journal over which it happened is committed alone from now on, or each of them when it is
+    not known which one. One that failed so is refused.
     """
     with catalogue.database.begin() as connection:
         suspects = read(connection)
         names = {name_of(row): row for row in batch.journals}
         blamed = {suspects.at} & names.keys() or names.keys()
         left = [name for name in suspects.alone if name not in names]
-        refused = next(iter(names.values())) if len(names) == 1 else None
+        refused = next((row for name, row in names.items() if name in suspects.alone), None)
         if refused is not None:
             facts = decode(refused.facts)
             facts.refused, facts.by = f"it cannot be made rows of: {suspects.why}", __version__

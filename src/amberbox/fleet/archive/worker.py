@@ -24,7 +24,7 @@ from typing import IO, Any
 import msgspec
 
 from amberbox.core.errors import AmberboxError, UsageError
-from amberbox.fleet.archive.committing import Progress
+from amberbox.fleet.archive.committing import Progress, unheard
 from amberbox.fleet.archive.folder import FolderArchive
 from amberbox.fleet.archive.store import Committed, Retention
 from amberbox.fleet.archive.where import TABLES
@@ -47,13 +47,7 @@ _LOCK_TRIES = 40
 _LOCK_PAUSE_S = 0.05
 
 
-def _unheard(_name: str, _size: int) -> None:
-    return None
-
-
-def handle(
-    archive: FolderArchive, request: Mapping[str, Any], progress: Progress = _unheard
-) -> Any:
+def handle(archive: FolderArchive, request: Mapping[str, Any], progress: Progress = unheard) -> Any:
     """Do what a request asks; raises UsageError for one that nobody knows."""
     match request["op"]:
         case "commit":
@@ -225,7 +219,8 @@ class Worker:
         """Say that the worker ended: of itself, or because the server stops."""
         code = process.wait()
         what = f"the archive's worker ended with {code} over {op!r}"
-        if self._is_stopped or code == UsageError.exit_code or op != "commit":
+        began = bool(at) or code < 0  # else it did not even start: no journal's fault
+        if self._is_stopped or op != "commit" or not began:
             return AmberboxError(what, "ask again")
         return WorkFailedError(what, "ask again", at)
 
