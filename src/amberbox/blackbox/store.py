@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import IO
 
 from amberbox.core.errors import AmberboxError, UsageError
-from amberbox.core.files import replace_file
+from amberbox.core.files import below, replace_file
 
 FOLDERS = {
     "main": "journal",
@@ -55,8 +55,11 @@ class Store:
         return sorted(found.values(), key=run_and_number)
 
     def journal_path(self, name: str) -> Path:
-        """Return where a journal called ``folder/file`` lies; an incident may hold it."""
-        path = self.path / name
+        """Return where a journal called ``folder/file`` lies; an incident may hold it.
+
+        Raises AmberboxError for a name that leads out of the store.
+        """
+        path = below(self.path, name)
         if not path.exists():
             held = sorted((self.path / INCIDENTS).glob(f"*/{name}"))
             return held[0] if held else path

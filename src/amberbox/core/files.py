@@ -5,6 +5,30 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+from amberbox.core.errors import AmberboxError
+
+_LONGEST_NAME = 255
+
+
+def below(folder: Path, *names: str) -> Path:
+    """Join names to a path that lies below a folder, whoever made the names.
+
+    Each may have several parts (``a/b``). Raises AmberboxError for a name that would lead
+    elsewhere (``..``, an absolute path) or that no file can have.
+    """
+    for name in names:
+        if not all(map(_is_file_name, name.split("/"))):
+            raise AmberboxError(
+                f"{name[:100]!r} is no name of a file below {folder}",
+                "it comes from a damaged or forged file: do not use that file",
+            )
+    return folder.joinpath(*names)
+
+
+def _is_file_name(part: str) -> bool:
+    size = len(part.encode("utf-8", "surrogateescape"))
+    return part not in ("", ".", "..") and "\0" not in part and size <= _LONGEST_NAME
+
 
 def replace_file(path: Path, text: str) -> None:
     """Write a small file so that a power cut leaves the old or the new one."""

@@ -8,6 +8,10 @@ from collections.abc import Callable, Iterable, Mapping
 
 _NOT_IN_A_NAME = re.compile(r"[^A-Za-z0-9_]")
 _RESERVED = frozenset({"timestamp", "received", "seq", "index"})
+_TABLE = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
+_LONGEST = 200
+"""Bytes of an item's name that this box gives: with an ending it is still a file name."""
+_LONGEST_FILE = 255
 
 
 def identifier(text: str) -> str:
@@ -19,9 +23,38 @@ def identifier(text: str) -> str:
 def item_name(source: str, topic: str) -> str:
     """Name the data item of a topic: ``/ropod/odom`` on ``ros`` is ``ros_ropod_odom``.
 
-    Without a source the topic alone is the name.
+    Without a source the topic alone is the name. A long one is cut (see ``fitted``).
     """
-    return identifier("_".join(part for part in (source, topic.strip("/")) if part))
+    return fitted(identifier("_".join(part for part in (source, topic.strip("/")) if part)))
+
+
+def child_name(table: str, path: str) -> str:
+    """Name the child table of a table: ``table__path``, cut if it is long."""
+    return fitted(f"{table}__{identifier(path)}")
+
+
+def fitted(name: str) -> str:
+    """Cut a long name of an item, so that it can be the name of a file or of a database column.
+
+    What was cut is told apart by 8 hex digits of the SHA-256 of the whole name.
+    """
+    if len(name) <= _LONGEST:
+        return name
+    digest = hashlib.sha256(name.encode("utf-8", "surrogatepass")).hexdigest()
+    return f"{name[: _LONGEST - 9]}_{digest[:8]}"
+
+
+def is_item(name: str) -> bool:
+    """Tell whether this is how an item or child table is called: ``[A-Za-z_][A-Za-z0-9_]*``.
+
+    255 characters at most: names are those of folders, too.
+    """
+    return len(name) <= _LONGEST_FILE and has_item_form(name)
+
+
+def has_item_form(name: str) -> bool:
+    """Tell whether a name has the characters of an item's, however long it is."""
+    return _TABLE.fullmatch(name) is not None
 
 
 def is_reserved(name: str) -> bool:
@@ -57,7 +90,7 @@ def extend_names(
 
 
 def _free_name(path: str, taken: set[str], reserved: Callable[[str], bool]) -> str:
-    plain = identifier(path)
+    plain = fitted(identifier(path))
     if not reserved(plain) and plain.casefold() not in taken:
         return plain
     digest = hashlib.sha256(path.encode("utf-8", "surrogatepass")).hexdigest()

@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from amberbox.fleet.archive.suspects import KIND
+from amberbox.fleet.linkend.events import note
 from amberbox.fleet.state.damaged import NEW_NS
 from tests.fleet.archive.recordings import Robot
 from tests.fleet.data.damaged import quarantined
@@ -58,3 +60,13 @@ def test_old_ones_are_still_told_and_alarm_nobody(home: House, robot: Robot) -> 
         assert "1 file damaged" in card and "severity-warning" not in card
         metrics = home.client("admin").get("/api/v1/metrics").text
         assert "amberbox_files_damaged 1" in metrics
+
+
+def test_a_journal_that_cannot_be_made_rows_of_is_told_with_file_and_cure(home: House) -> None:
+    about = "journal/000001-a-0001.mcap is kept and in no table: run amberbox verify on the robot"
+    with home.services.database.begin() as connection:
+        note(connection, "ropod_001", START_NS - NEW_NS + 1, KIND, about)
+        note(connection, "ropod_003", START_NS - NEW_NS - 1, KIND, "an old one")
+    assert home.client().get("/api/v1/health").json() == {"status": "poor"}
+    shown = read(home, "/admin/health")
+    assert f"ropod_001: {about}" in shown and "an old one" not in shown

@@ -16,6 +16,7 @@ from amberbox.blackbox.segments import manifest as mf
 from amberbox.blackbox.segments.entries import Tombstone, What, to_record
 from amberbox.blackbox.segments.manifest import Manifest
 from amberbox.blackbox.store import Store
+from amberbox.core.files import below
 
 Pins = Callable[[], Sequence[Pin]]
 
@@ -81,11 +82,11 @@ class Remover:
     def _unlink_raw(self, tombstone: Tombstone) -> None:
         if tombstone.what != "columns":
             for name in tombstone.journals:
-                (self.store.path / name).unlink(missing_ok=True)
+                below(self.store.path, name).unlink(missing_ok=True)
 
     def _unlink_segments(self, before: Manifest) -> None:
         for path in mf.read(self.store.path).gone_segments - before.gone_segments:
-            (self.store.path / path).unlink(missing_ok=True)
+            below(self.store.path, path).unlink(missing_ok=True)
 
     def finish(self) -> int:
         """Delete what has its tombstone but was not deleted before the keeper died."""

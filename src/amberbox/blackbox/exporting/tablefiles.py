@@ -10,6 +10,7 @@ from typing import Protocol
 from amberbox.blackbox.exporting.job import Job, new_file, new_folder, size_of
 from amberbox.blackbox.exporting.tables import Block, TableStream, table_streams
 from amberbox.core.errors import UsageError
+from amberbox.core.files import below
 
 
 class TableWriter(Protocol):
@@ -32,7 +33,8 @@ def write_tables(job: Job, ending: str, open_table: OpenTable) -> None:
     else:
         with new_folder(job.path) as folder:
             for number, stream in enumerate(streams):
-                with open_table(stream, folder / f"{stream.schema.item}{ending}") as writer:
+                path = below(folder, f"{stream.schema.item}{ending}")
+                with open_table(stream, path) as writer:
                     write_rows(job, stream, writer, number, len(streams))
     job.report.bytes = size_of(job.path)
     job.progress(1.0)

@@ -14,7 +14,7 @@ from amberbox.blackbox.journal.clocktable import ClockTable
 from amberbox.blackbox.journal.mcap import Channel
 from amberbox.blackbox.unroll import Unroller, UnrollError, unroller
 from amberbox.core.errors import AmberboxError
-from amberbox.core.names import identifier, item_name
+from amberbox.core.names import child_name, fitted, identifier, item_name
 from amberbox.core.types import Batch, Gap, IntArray, Rows, Schema, Topic
 
 
@@ -41,7 +41,11 @@ def _unroller(topic: Topic, stamp: str | None) -> Unroller:
 
 
 def stream_of(channel: Channel, schemas: Mapping[int, Schema]) -> Stream:
-    """Say what a channel is: by its metadata in journals of ours, else by its topic."""
+    """Say what a channel is: by its metadata in journals of ours, else by its topic.
+
+    Whatever a file of somebody else states as the item, it has the form of one afterwards: items
+    are names of folders, files and views.
+    """
     marks = channel.metadata
     topic = Topic(
         channel.topic,
@@ -50,7 +54,8 @@ def stream_of(channel: Channel, schemas: Mapping[int, Schema]) -> Stream:
         latched=marks.get("latched") == "1",
     )
     source = marks.get("source", "mcap")
-    item = marks.get("item") or item_name(source, channel.topic)
+    stated = marks.get("item")
+    item = fitted(identifier(stated)) if stated else item_name(source, channel.topic)
     return Stream(item, topic, source, marks.get("repeated") == "1", marks.get("stamp"))
 
 
@@ -81,6 +86,11 @@ def make_batch(origin: Origin, seq: IntArray, log_ns: IntArray, messages: Sequen
         return _without_bad(origin, seq, log_ns, messages, error)
     except AmberboxError as error:  # no definition, or one that nobody can read: raw is kept
         return Made(None, [_undecodable(origin, seq, log_ns, error.what)])
+    except MemoryError:
+        raise
+    except Exception as error:  # messages come from anybody, and fail in any way that bytes can
+        why = f"{type(error).__name__}: {error}"[:300]
+        return Made(None, [_undecodable(origin, seq, log_ns, why)])
     received = origin.clock.received(log_ns)
     stamp = received if rows.stamp_ns is None else np.where(rows.stamp_ns, rows.stamp_ns, received)
     batch = Batch(
@@ -163,7 +173,7 @@ def _child(
         keys["parent_index"] = parent_number[rows.parent_row]
     child = replace(
         whole,
-        item=f"{parent.item}__{identifier(path)}",
+        item=child_name(parent.item, path),
         schema=parent.schema.children[path],
         seq=whole.seq[message],
         log_time_ns=whole.log_time_ns[message],

@@ -17,7 +17,7 @@ from amberbox.blackbox.store import INCIDENTS, Store
 from amberbox.core.clock import NS
 from amberbox.core.config import did_you_mean
 from amberbox.core.errors import UsageError
-from amberbox.core.files import replace_file
+from amberbox.core.files import below, replace_file
 from amberbox.core.timetext import format_time
 
 FILE = "incident.json"
@@ -156,8 +156,8 @@ class Incident:
 
 
 def folder_of(store: Store, incident_id: str) -> Path:
-    """Return the folder of an incident."""
-    return store.path / INCIDENTS / incident_id
+    """Return the folder of an incident; raises AmberboxError for an id that leads elsewhere."""
+    return below(store.path / INCIDENTS, incident_id)
 
 
 def load_all(store: Store) -> list[Incident]:

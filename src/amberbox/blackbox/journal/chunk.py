@@ -17,7 +17,8 @@ from amberbox.blackbox.journal import mcap
 from amberbox.blackbox.journal.mcap import MESSAGE_HEAD, Channel, ChunkHead
 from amberbox.core.types import IntArray, Schema
 
-MAX_CHUNK_BYTES = 1 << 32
+MAX_CHUNK_BYTES = 1 << 30
+"""Most that a compressed chunk may hold; no size that a file announces is allocated beyond it."""
 _KEPT_BYTES = 1 << 14
 
 
@@ -53,7 +54,9 @@ class Chunk:
 
 def decompress(head: ChunkHead, data: bytes | memoryview) -> bytes | None:
     """Return a chunk's records if decompression, size and CRC agree, else None."""
-    if head.size > MAX_CHUNK_BYTES or head.data_offset + head.data_length > len(data):
+    if head.data_offset + head.data_length > len(data):
+        return None
+    if head.compression and head.size > MAX_CHUNK_BYTES:
         return None
     packed = data[head.data_offset : head.data_offset + head.data_length]
     body = _unpack(head.compression, packed, head.size)
@@ -68,22 +71,32 @@ def _unpack(compression: str, packed: bytes | memoryview, size: int) -> bytes | 
     if compression == "":
         return bytes(packed)
     if compression == "zstd":
-        try:
-            return zstandard.ZstdDecompressor().decompress(packed, max_output_size=size)
-        except zstandard.ZstdError:
-            return None
+        return _unpack_zstd(packed, size)
     if compression == "lz4":
-        return _unpack_lz4(bytes(packed))
+        return _unpack_lz4(bytes(packed), size)
     return None
 
 
-def _unpack_lz4(packed: bytes) -> bytes | None:
+def _unpack_zstd(packed: bytes | memoryview, size: int) -> bytes | None:
+    """Unpack at most ``size`` bytes: what a frame says of its own size is allocated unchecked."""
+    try:
+        if zstandard.frame_content_size(packed) not in (size, -1):
+            return None
+        return zstandard.ZstdDecompressor().decompress(packed, max_output_size=size)
+    except zstandard.ZstdError:
+        return None
+
+
+def _unpack_lz4(packed: bytes, size: int) -> bytes | None:
+    """Unpack until there are more than ``size`` bytes, however many come then."""
     import lz4.frame  # type: ignore[import-untyped]  # it ships no types; only others use it
 
+    unpacker, body = lz4.frame.LZ4FrameDecompressor(), b""
     try:
-        return bytes(lz4.frame.decompress(packed))
+        body = bytes(unpacker.decompress(packed, max_length=size + 1))
     except (RuntimeError, ValueError, EOFError):
         return None
+    return body if unpacker.eof else None
 
 
 def open_chunk(body: bytes, offset: int, end: int, offsets: IntArray | None = None) -> Chunk | None:

@@ -15,6 +15,7 @@ from amberbox.blackbox.segments.flat import TableSchema
 from amberbox.blackbox.segments.manifest import Segment, part_clock
 from amberbox.blackbox.segments.parquet import seq_name, stored_name
 from amberbox.core.errors import AmberboxError, UsageError
+from amberbox.core.files import below
 from amberbox.core.types import Column, ColumnData
 
 if TYPE_CHECKING:
@@ -139,7 +140,7 @@ def _groups(catalogue: Catalogue, table: str) -> dict[tuple[TableSchema, Pieces]
     groups: dict[tuple[TableSchema, Pieces], list[str]] = {}
     for segment in catalogue.segments(table):
         version = catalogue.manifest.schemas[segment.schema]
-        path = str((catalogue.store / segment.path).resolve())
+        path = str(below(catalogue.store, segment.path).resolve())
         groups.setdefault((version, _pieces(segment)), []).append(path)
     return groups
 

@@ -22,6 +22,7 @@ from amberbox.blackbox.segments.lines import CHECKPOINT
 from amberbox.blackbox.segments.manifest import Part, Segment
 from amberbox.blackbox.segments.parquet import TableFile, describe, read_segment
 from amberbox.core.errors import AmberboxError
+from amberbox.core.files import below
 from amberbox.core.types import ColumnData, Gap, IntArray, Ragged
 
 FOLDER = "segments"
@@ -284,11 +285,11 @@ def put_in_place_of(store: Path, segment: Segment, before: Sequence[Segment]) ->
         named = {part.journal for part in segment.parts}
         is_late = not known.gone_segments.isdisjoint(paths)
         if is_late or not (known.columns_gone.isdisjoint(named) or is_kept_segment(segment, known)):
-            (store / segment.path).unlink(missing_ok=True)
+            below(store, segment.path).unlink(missing_ok=True)
             return False
         mf.append(store, [mf.segment_record(segment, paths)])
         for path in paths:
-            (store / path).unlink(missing_ok=True)
+            below(store, path).unlink(missing_ok=True)
     return True
 
 

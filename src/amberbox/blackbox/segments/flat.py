@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from amberbox.blackbox.segments import columns as col
-from amberbox.core.names import identifier
+from amberbox.core.names import child_name
 from amberbox.core.types import Batch, Column, ColumnData, IntArray, ItemSchema
 
 
@@ -168,7 +168,7 @@ def tables_of(item: str, schema: ItemSchema, topic: str, source: str) -> list[Ta
     """Return the schemas of the tables that an item's batches flatten to."""
     tables = [_table(item, schema, (), "", schema.stamp, topic, source)]
     for path, child in schema.children.items():
-        name = f"{item}__{identifier(path)}"
+        name = child_name(item, path)
         tables += _child_tables(name, child, tables[0], ("index",))
     return tables
 
@@ -178,6 +178,6 @@ def _child_tables(
 ) -> list[TableSchema]:
     tables = [_table(name, schema, keys, top.item, top.stamp, top.topic, top.source)]
     for path, child in schema.children.items():
-        below = f"{name}__{identifier(path)}"
+        below = child_name(name, path)
         tables += _child_tables(below, child, top, ("index", "parent_index"))
     return tables

@@ -22,7 +22,7 @@ from amberbox.blackbox.segments.manifest import (
     part_clock,
     part_from_json,
 )
-from amberbox.core.files import sync_folder
+from amberbox.core.files import below, sync_folder
 from amberbox.core.types import IntArray
 
 if TYPE_CHECKING:
@@ -56,7 +56,7 @@ class TableFile:
         self.path = path
         self.schema = schema
         self._store = store
-        self._final = store / path
+        self._final = below(store, path)
         self._temporary = self._final.with_name(f".{self._final.name}.tmp")
         self._writer: pq.ParquetWriter | None = None
         self.rows = 0
@@ -167,7 +167,7 @@ def read_segment(
     Row groups are chosen by their statistics: rows outside of the range may come along. Gives
     one ``Flat`` per part of the segment. ``stored`` says how a variable is called in the file.
     """
-    with _opened(store / segment.path) as file:
+    with _opened(below(store, segment.path)) as file:
         found = _row_groups(file.metadata, schema, segment, by)
         chosen = [group for group in found if overlaps(group.low_ns, group.high_ns, span)]
         return _read(file, segment, schema, names, [group.number for group in chosen], stored)
@@ -184,7 +184,7 @@ class RowGroup:
 
 def row_groups(store: Path, segment: Segment, schema: TableSchema, by: str) -> list[RowGroup]:
     """List the row groups of a segment with the bounds of ``received`` or of the stamps."""
-    with _opened(store / segment.path) as file:
+    with _opened(below(store, segment.path)) as file:
         return _row_groups(file.metadata, schema, segment, by)
 
 
@@ -192,7 +192,7 @@ def read_row_group(
     store: Path, segment: Segment, schema: TableSchema, names: Collection[str], number: int
 ) -> list[Flat]:
     """Read the named columns of one row group; one ``Flat`` per part of the segment."""
-    with _opened(store / segment.path) as file:
+    with _opened(below(store, segment.path)) as file:
         return _read(file, segment, schema, names, [number])
 
 

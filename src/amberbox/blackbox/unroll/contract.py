@@ -8,6 +8,18 @@ from typing import Protocol
 from amberbox.core.errors import AmberboxError
 from amberbox.core.types import ItemSchema, Rows
 
+MOST_PLACES = 16_384
+"""Columns that the tables of one type may have together; a type of more has none."""
+
+
+def check_places(type_name: str, count: int) -> None:
+    """Raise AmberboxError for a type with so many columns that nobody could keep them."""
+    if count > MOST_PLACES:
+        raise AmberboxError(
+            f"{type_name} has more than {MOST_PLACES} columns",
+            "the messages are still recorded, but have no columns",
+        )
+
 
 class UnrollError(AmberboxError):
     """Messages that do not fit their definition; ``bad`` are their places in the batch."""

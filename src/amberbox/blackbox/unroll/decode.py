@@ -24,8 +24,26 @@ _PLAIN_TYPES: dict[str, Any] = {
 }
 
 
+_FEW_BYTES = 1 << 20
+_MOST_LISTS = 1 << 20
+_MOST_VALUES = 1 << 24
+"""A map of 4,000 x 4,000 cells is believed; a JSON text of more values is not decoded."""
+
+
 class MalformedError(Exception):
-    """A message that is no JSON or MessagePack."""
+    """A message that is no JSON or MessagePack, or one that takes too much to decode."""
+
+
+def check_size(message: bytes, encoding: str) -> None:
+    """Raise MalformedError for a JSON text of so many values that they would fill the memory.
+
+    Each takes 50 to 100 times its bytes. What is in strings is counted, too.
+    """
+    if encoding != "json" or len(message) <= _FEW_BYTES:
+        return
+    lists = message.count(b"{") + message.count(b"[")
+    if lists > _MOST_LISTS or message.count(b",") > _MOST_VALUES:
+        raise MalformedError("it has more values than can be decoded")
 
 
 def decode_plain(message: bytes, encoding: str) -> Any:
@@ -33,6 +51,7 @@ def decode_plain(message: bytes, encoding: str) -> Any:
 
     Python's ``NaN`` and ``Infinity`` are read although they are not JSON. Keys become strings.
     """
+    check_size(message, encoding)
     try:
         if encoding == "json":
             return _decode_json(message)
@@ -141,6 +160,7 @@ def decoder_into(target: Any, encoding: str) -> Callable[[bytes], Any]:
     quick = module.Decoder(target).decode
 
     def decode(message: bytes) -> Any:
+        check_size(message, encoding)
         try:
             return quick(message)
         except (msgspec.MsgspecError, ValueError, TypeError, RecursionError):

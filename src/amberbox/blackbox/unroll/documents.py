@@ -9,7 +9,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from amberbox.blackbox.unroll.contract import UnrollError
+from amberbox.blackbox.unroll.contract import UnrollError, check_places
 from amberbox.blackbox.unroll.decode import (
     MalformedError,
     decoder_into,
@@ -38,6 +38,7 @@ class DocumentUnroller:
 
     def __init__(self, schema: Schema, encoding: str, stamp: str | None = None) -> None:
         self._shape = from_schema(schema)
+        check_places(schema.name, _count(self._shape))
         self._decode = make_decoder(self._shape, encoding, exact=False)
         self._stamp_path = _own_stamp(self._shape, stamp)
         self._decode_stamp = _stamp_decoder(self._stamp_path, encoding)
@@ -106,6 +107,14 @@ class DocumentUnroller:
         parent_row = np.repeat(np.arange(len(values), dtype=np.int64), counts)
         index = np.arange(rows.count, dtype=np.int64) - offsets[parent_row]
         return Rows(rows.count, rows.columns, rows.children, None, parent_row, index)
+
+
+def _count(table: Shape) -> int:
+    """Count the columns of a table and of those below it."""
+    return sum(
+        1 + (_count(shape.items) if kind == "children" and shape.items else 0)
+        for _, shape, kind in places(table)
+    )
 
 
 def _described(name: str, path: str, kind: str, note: Note) -> Column:

@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TypeAlias
 
+from amberbox.blackbox.unroll.contract import check_places
 from amberbox.blackbox.unroll.definition import FILLER, HEADER, Definition, FieldType, Structure
 from amberbox.blackbox.unroll.labels import field_labels
 from amberbox.blackbox.unroll.units import known_unit
+from amberbox.core.errors import AmberboxError
 from amberbox.core.names import unique_names
 from amberbox.core.types import Column, ItemSchema
 
 LONGEST_UNROLLED = 64
 MOST_COLUMNS = 4096
 """A fixed array of structures that would unroll into more columns becomes a child table."""
+DEEPEST = 12
+"""Child tables within child tables; Python itself compiles no reader for 20."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,6 +76,13 @@ class Table:
 
 def flatten(definition: Definition, type_name: str, ros1: bool) -> Table:
     """Lay a message type out as a table; ``schema.stamp`` is the message's own stamp, if any."""
+    walk = _Walk(definition, ros1)
+    check_places(type_name, walk.places(definition.root))
+    if walk.depth(definition.root) > DEEPEST:
+        raise AmberboxError(
+            f"{type_name} has lists in lists, more than {DEEPEST} deep",
+            "the messages are still recorded, but have no columns",
+        )
     table = _table(definition, definition.root, type_name, ros1)
     stamp = _own_stamp(definition.structures[definition.root])
     return replace(table, schema=replace(table.schema, stamp=stamp))
@@ -107,28 +118,31 @@ class _Walk:
 
     definition: Definition
     ros1: bool
+    _widths: dict[str, int] = field(default_factory=dict)
+    _places: dict[str, int] = field(default_factory=dict)
+    _depths: dict[str, int] = field(default_factory=dict)
 
     def structure(self, name: str, path: str, unit: str) -> Iterator[Entry]:
         structure = self.definition.structures[name]
         if not structure.fields and not self.ros1:
             yield Scalar(None)  # DDS sends one byte for a structure without members
         labels = field_labels(structure)
-        for field, field_type in structure.fields:
-            place = f"{path}/{field}" if path else field
-            field_unit = known_unit(name, field) or unit
-            column = Column("", place, field_type.base, field_unit, labels.get(field, {}))
+        for member, field_type in structure.fields:
+            place = f"{path}/{member}" if path else member
+            field_unit = known_unit(name, member) or unit
+            column = Column("", place, field_type.base, field_unit, labels.get(member, {}))
             yield from self.field(column, field_type)
 
-    def field(self, column: Column, field: FieldType) -> Iterator[Entry]:
+    def field(self, column: Column, kind: FieldType) -> Iterator[Entry]:
         if column.path.endswith(FILLER):
             yield Scalar(None)
-        elif field.count is None:
+        elif kind.count is None:
             yield from self.single(column)
-        elif 0 <= field.count <= LONGEST_UNROLLED and self.fits(field):
-            for index in range(field.count):
+        elif self.is_unrolled(kind):
+            for index in range(kind.count):
                 yield from self.single(replace(column, path=f"{column.path}/{index}"))
         else:
-            yield self.many(column, None if field.count < 0 else field.count)
+            yield self.many(column, None if kind.count < 0 else kind.count)
 
     def single(self, column: Column) -> Iterator[Entry]:
         base = column.type
@@ -153,18 +167,49 @@ class _Walk:
         kind = "binary" if base in ("uint8", "byte") else f"list<{base}>"
         return Numbers(_plain(column, kind), self.number(base), count)
 
-    def fits(self, field: FieldType) -> bool:
-        return (field.count or 0) * self.width(field.base) <= MOST_COLUMNS
+    def is_unrolled(self, kind: FieldType) -> bool:
+        """Tell whether a fixed array becomes columns, not a list or a child table."""
+        count = kind.count or 0
+        return 0 <= count <= LONGEST_UNROLLED and count * self.width(kind.base) <= MOST_COLUMNS
 
     def width(self, base: str) -> int:
-        """Count the columns of one value, up to ``MOST_COLUMNS``."""
+        """Count the columns of one value, up to ``MOST_COLUMNS`` and one."""
         if base not in self.definition.structures:
             return 1
-        total = 0
-        for _, field in self.definition.structures[base].fields:
-            unrolled = field.count is not None and 0 <= field.count <= LONGEST_UNROLLED
-            total += self.width(field.base) * ((field.count or 0) if unrolled else 1)
-        return total
+        if base not in self._widths:
+            total = 0
+            for _, kind in self.definition.structures[base].fields:
+                unrolled = kind.count is not None and 0 <= kind.count <= LONGEST_UNROLLED
+                total += self.width(kind.base) * ((kind.count or 0) if unrolled else 1)
+            self._widths[base] = min(total, MOST_COLUMNS + 1)
+        return self._widths[base]
+
+    def places(self, base: str) -> int:
+        """Count what a walk over one value visits, child tables and empty structures included."""
+        if base not in self.definition.structures:
+            return 1
+        if base not in self._places:
+            fields = self.definition.structures[base].fields
+            self._places[base] = 1 + sum(
+                self.places(kind.base)
+                * (kind.count if kind.count is not None and self.is_unrolled(kind) else 1)
+                for _, kind in fields
+            )
+        return self._places[base]
+
+    def depth(self, base: str) -> int:
+        """Count how deep child tables lie within each other."""
+        if base not in self.definition.structures:
+            return 0
+        if base not in self._depths:
+            self._depths[base] = max(
+                (
+                    self.depth(kind.base) + (kind.count is not None and not self.is_unrolled(kind))
+                    for _, kind in self.definition.structures[base].fields
+                ),
+                default=0,
+            )
+        return self._depths[base]
 
 
 def _plain(column: Column, kind: str) -> Column:

@@ -29,8 +29,10 @@ Walker: TypeAlias = Callable[..., Walk]
 MISFITS = (ValueError, IndexError, error)
 """What a walk raises on a message that does not fit."""
 
-_MOST_EMPTY_ROWS = 1 << 16
+_MOST_EMPTY_ROWS = 1 << 8
 """Structures without a single byte can come in any claimed number; this many are believed."""
+MOST_ROWS = 1 << 21
+"""Rows of child tables that one message may have together; one with more has no columns."""
 
 
 def compile_walker(plan: Plan, watch: bool = False) -> Walker:
@@ -66,6 +68,7 @@ class _Source:
         if self.plan.cdr:
             yield "  p += 4"
         yield "  o = p"
+        yield "  r = 0"
         yield from _indented(self.table(self.plan.table), 2)
         trailing = 3 if self.plan.cdr else 0  # CDR writers pad messages to 4 bytes
         yield f"  if not 0 <= e - p <= {trailing}: raise ValueError"
@@ -136,10 +139,11 @@ class _Source:
         if op.count is None:
             yield from _lead(op.lead)
             yield from self.prefix()
-            limit = f"{smallest} * n > e - p" if smallest else f"n > {_MOST_EMPTY_ROWS}"
-            yield f"if {limit}: raise ValueError"
         else:
             yield f"n = {op.count}"
+        limit = f"{smallest} * n > e - p" if smallest else f"n > {_MOST_EMPTY_ROWS}"
+        yield "r += n"
+        yield f"if {limit} or r > {MOST_ROWS}: raise ValueError"
         yield f"s{op.slot}(n)"
 
     def texts(self, op: TextsOp) -> Iterator[str]:

@@ -10,6 +10,7 @@ from typing import Any
 from sqlalchemy import Connection, Row, and_, func, select, update
 
 from amberbox.blackbox.segments.flat import TableSchema
+from amberbox.core.names import is_item
 from amberbox.fleet.archive.store import JournalKey, Missing
 from amberbox.fleet.archive.tables import BATCHES, JOURNALS, MISSING, SCHEMAS, SOURCES
 from amberbox.fleet.database.database import Database
@@ -117,8 +118,19 @@ class Catalogue:
     def change(self, rows: Iterable[Row[Any]], **values: object) -> None:
         """Change columns of journals."""
         with self.database.begin() as connection:
-            for row in rows:
-                connection.execute(update(JOURNALS).where(_is(row)).values(**values))
+            self.change_in(connection, rows, **values)
+
+    def change_in(self, connection: Connection, rows: Iterable[Row[Any]], **values: object) -> None:
+        """Change columns of journals within a transaction."""
+        for row in rows:
+            connection.execute(update(JOURNALS).where(_is(row)).values(**values))
+
+    def cancel(self, connection: Connection, batch: Batch) -> None:
+        """End a batch of which no row is in any table: its journals wait again."""
+        of_batch = update(JOURNALS).where(JOURNALS.c.batch == batch.number)
+        connection.execute(of_batch.values(batch=None))
+        ended = update(BATCHES).where(BATCHES.c.number == batch.number)
+        connection.execute(ended.values(done=True))
 
     def note_missing(self, source: Source, ranges: Sequence[Missing]) -> None:
         """Remember what will not come; what is known already stays as it is."""
@@ -170,10 +182,17 @@ class Catalogue:
             return connection.scalar(done) or 0
 
     def schemas(self) -> list[TableSchema]:
-        """Return what the columns of all tables are, oldest version of an item first."""
+        """Return what the columns of all tables are, oldest version of an item first.
+
+        Tables that an older server made of names that lead elsewhere are none.
+        """
         with self.database.reading() as connection:
             rows = connection.execute(select(SCHEMAS).order_by(SCHEMAS.c.item, SCHEMAS.c.number))
-            return [TableSchema.from_json(json.loads(row.definition)) for row in rows]
+            return [
+                TableSchema.from_json(json.loads(row.definition))
+                for row in rows
+                if is_item(row.item)
+            ]
 
     def held(self, source: Source) -> set[str]:
         """Return the ids of the schemas that a store has rows of."""

@@ -1,12 +1,13 @@
 """From journals to tables: a batch is planned, written, committed table by table, and ended.
 
 Whatever dies on the way, the batch is the same when it is done again, its files have the same
-names, and a table that has its number already is left alone: no row is lost or doubled.
+names, and a table that has its number already is left alone: no row is lost or doubled. A batch
+over which the worker fails again is taken apart, so that one journal never holds up the others.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -18,11 +19,13 @@ from amberbox.blackbox.segments.flat import Flat, TableSchema, flatten
 from amberbox.core.clock import NS
 from amberbox.core.errors import AmberboxError
 from amberbox.core.types import Gap
+from amberbox.fleet.archive import suspects
 from amberbox.fleet.archive.catalogue import REFUSED, Batch, Catalogue, Source, name_of
 from amberbox.fleet.archive.files import Layout, table_of, tables_of
 from amberbox.fleet.archive.journal import decode, encode, gap_facts, sha256_of
 from amberbox.fleet.archive.log import LiveFile
 from amberbox.fleet.archive.pyramid import Climb
+from amberbox.fleet.archive.retaining import remove_rows
 from amberbox.fleet.archive.store import Committed
 from amberbox.fleet.archive.writing import FileBuilder, Origin, Place, by_day
 
@@ -30,24 +33,70 @@ BATCH_BYTES = 512 << 20
 """Journals of one batch: so much memory and time at most; the rest follows a minute later."""
 
 
-def commit(layout: Layout, catalogue: Catalogue, now_ns: int, every_s: float) -> Committed:
-    """Finish what was begun, else commit what waits if the last commit is long enough ago."""
-    begun = catalogue.open_batch()
+Progress = Callable[[str, int], None]
+"""Hears of each step: which journal is at hand (empty: none), and how many bytes it has."""
+
+
+def unheard(_name: str, _size: int) -> None:
+    """Hear of steps and do nothing."""
+
+
+def commit(
+    layout: Layout, catalogue: Catalogue, now_ns: int, every_s: float,
+    progress: Progress = unheard,
+) -> Committed:  # fmt: skip
+    """Finish what was begun, else commit what waits if the last commit is long enough ago.
+
+    A batch that failed too often is taken apart: see ``suspects``.
+    """
+    begun, refused = catalogue.open_batch(), 0
     if begun is not None:
-        return _commit(layout, catalogue, begun)
-    waiting = catalogue.waiting()
-    last_ns = catalogue.last_batch_ns()
+        if not suspects.known(catalogue).is_given_up(begun):
+            done = _commit(layout, catalogue, begun, now_ns, progress)
+            return replace(done, waiting=len(catalogue.waiting()))
+        _withdraw(layout, catalogue, begun, progress)
+        refused = suspects.give_up(catalogue, begun, now_ns)
+    waiting, last_ns = catalogue.waiting(), catalogue.last_batch_ns()
+    alone, others = _apart(waiting, suspects.known(catalogue).alone)
     passed_s = every_s if last_ns is None else (now_ns - last_ns) / NS
-    if not waiting or 0 <= passed_s < every_s:
+    is_due = bool(others) and not 0 <= passed_s < every_s
+    chosen = list(_first(others)) if is_due else alone[:1]
+    if not chosen:
         due = max(every_s - passed_s, 0.0) if waiting else every_s
-        return Committed(waiting=len(waiting), next_in_s=due)
-    chosen = list(_first(waiting))
+        return Committed(refused=refused, waiting=len(waiting), next_in_s=due)
     sound = _refuse_changed(layout, catalogue, chosen)
-    if sound:
-        catalogue.plan(sound, now_ns)
+    if sound:  # others are due when they would be without those that are committed alone
+        catalogue.plan(sound, now_ns if is_due or last_ns is None else last_ns)
     batch = catalogue.open_batch()
-    done = Committed() if batch is None else _commit(layout, catalogue, batch)
-    return replace(done, refused=len(chosen) - len(sound), waiting=len(waiting) - len(chosen))
+    done = Committed() if batch is None else _commit(layout, catalogue, batch, now_ns, progress)
+    left = len(waiting) - len(chosen)
+    soon = 0.0 if len(alone) > (0 if is_due else 1) else every_s
+    refused += len(chosen) - len(sound)
+    return replace(done, refused=refused, waiting=left, next_in_s=soon)
+
+
+def _apart(
+    waiting: Sequence[Row[Any]], alone: Sequence[str]
+) -> tuple[list[Row[Any]], list[Row[Any]]]:
+    """Part journals that are committed alone from the others."""
+    names = set(alone)
+    found: tuple[list[Row[Any]], list[Row[Any]]] = ([], [])
+    for row in waiting:
+        found[name_of(row) not in names].append(row)
+    return found
+
+
+def _withdraw(layout: Layout, catalogue: Catalogue, batch: Batch, progress: Progress) -> None:
+    """Take out of the tables what a batch that failed brought there; done again it is the same."""
+    by_source: dict[Source, list[Row[Any]]] = {}
+    for row in batch.journals:
+        by_source.setdefault(Source(row.robot, row.store_id), []).append(row)
+    for table, schema in (pair for known in catalogue.schemas() for pair in tables_of(known)):
+        if layout.snapshot(table).batch >= batch.number:
+            progress("", 0)
+            about = f"batch {batch.number} failed"
+            for source, rows in by_source.items():
+                remove_rows(layout, table, schema, source, rows, about)
 
 
 def _first(waiting: Sequence[Row[Any]]) -> Iterator[Row[Any]]:
@@ -78,19 +127,23 @@ def _refuse_changed(
     return sound
 
 
-def _commit(layout: Layout, catalogue: Catalogue, batch: Batch) -> Committed:
+def _commit(
+    layout: Layout, catalogue: Catalogue, batch: Batch, now_ns: int, progress: Progress
+) -> Committed:
     from amberbox.fleet.archive import delta
 
-    writing = _Writing(layout, catalogue, batch.number)
+    writing = _Writing(layout, catalogue, batch.number, progress)
     try:
         writing.write(batch.journals)
         found = writing.finish()
     finally:
         writing.discard()
     for table, (schema, files) in found.items():
+        progress("", 0)
         about = f"batch {batch.number}: {len(batch.journals)} journals"
-        delta.change(layout.tables / table, schema, files, batch=batch.number, about=about)
+        delta.change(layout.table(table), schema, files, batch=batch.number, about=about)
     catalogue.finish(batch, writing.facts)
+    suspects.clear(catalogue, batch, now_ns)
     return Committed(len(batch.journals), writing.rows, len(found))
 
 
@@ -101,6 +154,7 @@ class _Writing:
     layout: Layout
     catalogue: Catalogue
     batch: int
+    progress: Progress
     rows: int = 0
     facts: dict[str, str] = field(default_factory=dict)
     _done: dict[str, tuple[TableSchema, list[LiveFile]]] = field(default_factory=dict)
@@ -116,6 +170,7 @@ class _Writing:
             if group not in (None, mine):
                 self._close()
             group = mine
+            self.progress(name_of(row), row.bytes)
             self._journal(row, mine[0])
         self._close()
 
@@ -203,7 +258,7 @@ def flats_of(journal: JournalFile, gaps: list[Gap], sizes: dict[str, int]) -> It
 def leftovers(layout: Layout, schemas: Sequence[TableSchema]) -> Iterator[Path]:
     """Find files that no table names: of a commit that was cut short, or joined since."""
     for table, _ in (pair for schema in schemas for pair in tables_of(schema)):
-        folder = layout.tables / table
+        folder = layout.table(table)
         live = {str(folder / path) for path in layout.snapshot(table).files}
         for path in folder.glob("robot=*/day=*/*"):
             if str(path) not in live and not path.name.startswith("_"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator, Sequence
 
 from amberbox.fleet.archive.catalogue import Catalogue
@@ -14,6 +15,8 @@ FULL_BYTES = 128 << 20
 COUNT = 8
 """So many small files of a day that still grows are joined; of a day that is over, any two."""
 
+_LOG = logging.getLogger(__name__)
+
 
 def compact(layout: Layout, catalogue: Catalogue) -> int:
     """Join small files of all tables; each join is one commit. Return how many files went."""
@@ -23,10 +26,14 @@ def compact(layout: Layout, catalogue: Catalogue) -> int:
     for table, schema in (pair for known in catalogue.schemas() for pair in tables_of(known)):
         files = list(layout.snapshot(table).files.values())
         for group in groups(files):
-            made = joined(layout.tables, table, schema, group)
+            try:
+                made = joined(layout.tables, table, schema, group)
+            except MemoryError:  # they stay small files, and all other tables are joined
+                _LOG.warning("%s: %d files are too large to be joined", table, len(group))
+                continue
             assert made is not None  # nothing was left out
             about = f"joined {len(group)} files"
-            folder = layout.tables / table
+            folder = layout.table(table)
             delta.change(folder, schema, [made], group, same_rows=True, about=about)
             gone += len(group)
     return gone

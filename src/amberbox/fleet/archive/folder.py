@@ -11,8 +11,9 @@ from pathlib import Path
 from amberbox.core.clock import Clock, SystemClock
 from amberbox.core.errors import AmberboxError
 from amberbox.core.files import sync_folder
-from amberbox.fleet.archive import committing, compacting, retaining
+from amberbox.fleet.archive import committing, compacting, retaining, suspects
 from amberbox.fleet.archive.catalogue import PUT, REFUSED, Catalogue, Source
+from amberbox.fleet.archive.committing import Progress
 from amberbox.fleet.archive.files import Layout
 from amberbox.fleet.archive.journal import checked_key, inspect
 from amberbox.fleet.archive.record import ArchiveRecord
@@ -71,9 +72,21 @@ class FolderArchive:
         """Remember what will not come; saying it twice changes nothing."""
         self.catalogue.note_missing(Source(robot, store_id), ranges)
 
-    def commit(self, every_s: float = 60.0) -> Committed:
-        """Turn the journals that wait into columns; finish first what was cut short."""
-        return committing.commit(self.layout, self.catalogue, self.clock.wall_ns(), every_s)
+    def commit(self, every_s: float = 60.0, progress: Progress = committing.unheard) -> Committed:
+        """Turn the journals that wait into columns; finish first what was cut short.
+
+        ``progress`` hears of each step (see ``committing``).
+        """
+        now_ns = self.clock.wall_ns()
+        return committing.commit(self.layout, self.catalogue, now_ns, every_s, progress)
+
+    def note_failure(self, journal: str, why: str) -> None:
+        """Count that a commit failed over a journal (``robot/store_id/file``, empty: unknown)."""
+        suspects.note_failure(self.catalogue, self.clock.wall_ns(), journal, why)
+
+    def try_again(self) -> int:
+        """Have journals committed that an older server could not; return how many there are."""
+        return suspects.try_again(self.catalogue, self.clock.wall_ns())
 
     def compact(self) -> int:
         """Join small files of the tables; return how many files went."""

@@ -41,12 +41,17 @@ class GapFact(msgspec.Struct):
 
 
 class Facts(msgspec.Struct):
-    """What the catalogue keeps of a journal beside its place: clock, variables, holes."""
+    """What the catalogue keeps of a journal beside its place: clock, variables, holes.
+
+    ``refused`` is why it is in no table; ``by`` is the version of the server that could not make
+    rows of it, empty for a file that had changed.
+    """
 
     clock: list[tuple[int, int, bool | None, int | None]] = []
     selection: dict[str, list[str]] = {}
     gaps: list[GapFact] = []
     refused: str = ""
+    by: str = ""
 
     @property
     def readings(self) -> tuple[ClockReading, ...]:

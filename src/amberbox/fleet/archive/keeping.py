@@ -23,7 +23,7 @@ from amberbox.fleet.archive.folder import FolderArchive
 from amberbox.fleet.archive.forgetting import forget
 from amberbox.fleet.archive.room import Room, Usage, room_of
 from amberbox.fleet.archive.store import Retention
-from amberbox.fleet.archive.worker import Worker
+from amberbox.fleet.archive.worker import Worker, WorkFailedError
 from amberbox.fleet.bus import Bus, Change
 from amberbox.fleet.database.database import Database
 from amberbox.fleet.linkend.events import note
@@ -126,10 +126,15 @@ class Keeping:
     async def _commit_always(self) -> None:
         backoff = Backoff(least_s=1.0, most_s=60.0)
         await self._apart(partial(settling.take_over, self._archive, self._database, self._folder))
+        await self._apart(self._archive.try_again)
         while True:
             self._woken.clear()
             try:
                 wait_s = await self._commit_once()
+            except WorkFailedError as error:
+                await self._apart(partial(self._archive.note_failure, error.journal, error.what))
+                self._failed(error)
+                wait_s = backoff.failed()
             except AmberboxError as error:
                 self._failed(error)
                 wait_s = backoff.failed()
@@ -146,8 +151,6 @@ class Keeping:
             return None
         done = await self._apart(partial(self._worker.commit, self._every_s))
         self._tell(await self._apart(partial(settling.settle, self._database, self._clock)))
-        if done.journals:
-            return self._every_s if done.waiting else None
         return done.next_in_s if done.waiting else None
 
     def _has_work(self) -> bool:
@@ -201,7 +204,9 @@ class Keeping:
         self._worker.sweep()
 
     def _failed(self, error: AmberboxError) -> None:
-        self._trouble = f"the archive: {error.what}"
+        journal = getattr(error, "journal", "")
+        what = error.what.removeprefix("the archive: ")
+        self._trouble = f"the archive: {what}" + (f" (journal {journal})" if journal else "")
         logging.getLogger(__name__).warning("%s (%s)", self._trouble, error.hint)
 
     async def _watch_disk(self) -> None:

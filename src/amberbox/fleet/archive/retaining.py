@@ -115,12 +115,14 @@ def remove_columns(layout: Layout, catalogue: Catalogue) -> None:
             gone = [row for row in rows if getattr(row, flag)]
             if gone:
                 for table, kind in tables_of(schema):
-                    _remove(layout, table, kind, source, gone)
+                    remove_rows(layout, table, kind, source, gone)
 
 
-def _remove(
-    layout: Layout, table: str, schema: TableSchema, source: Source, gone: Sequence[Row[Any]]
-) -> None:
+def remove_rows(
+    layout: Layout, table: str, schema: TableSchema, source: Source, gone: Sequence[Row[Any]],
+    about: str = "rows older than their lifetime went",
+) -> None:  # fmt: skip
+    """Take the rows of some journals of a store out of a table."""
     from amberbox.fleet.archive import delta
 
     names = {row.file for row in gone}
@@ -132,8 +134,7 @@ def _remove(
         if any(part.journal in names for part in parts):
             rest = joined(layout.tables, table, schema, [file], names)
             added = [] if rest is None else [rest]
-            about = "rows older than their lifetime went"
-            delta.change(layout.tables / table, schema, added, [file], about=about)
+            delta.change(layout.table(table), schema, added, [file], about=about)
 
 
 def _may_hold(file: LiveFile, source: Source, runs: Iterable[int]) -> bool:

@@ -87,7 +87,9 @@ def _taken(archive: FolderArchive, key: JournalKey, path: Path) -> bool:
         return archive.put(key, path).is_new
     except AmberboxError as error:
         logging.getLogger(__name__).warning("%s (%s)", error.what, error.hint)
-        return False
+    except Exception:  # an older server let in what this one refuses: it must start nevertheless
+        logging.getLogger(__name__).exception("%s of %s cannot be read", key.file, key.robot)
+    return False
 
 
 def _unknown() -> Any:

@@ -9,6 +9,7 @@ from amberbox.blackbox.query.table import Table
 from amberbox.blackbox.segments.columns import element_type
 from amberbox.blackbox.segments.flat import TableSchema
 from amberbox.blackbox.segments.parquet import seq_name
+from amberbox.core.names import unique_names
 from amberbox.core.types import Column
 from amberbox.fleet.archive.files import table_of
 from amberbox.fleet.archive.layout import stored_name
@@ -22,24 +23,29 @@ def run_sql(reader: Reader, statement: str) -> Table:
     """Answer a SELECT over the views of an archive; times are UTC, as known at the commit.
 
     Each data item and child table is a view: ``timestamp``, its variables, ``received``, ``seq``
-    (``parent_seq`` in child tables), ``robot``.
+    (``parent_seq`` in child tables), ``robot``. Of names that differ in case only (robots choose
+    them), the first one keeps its own and others get 4 hex digits.
 
     Raises AmberboxError when DuckDB refuses the statement, UsageError without DuckDB.
     """
 
+    names = unique_names(sorted(reader.schemas), lambda name: False)
+
     def create(connection: duckdb.DuckDBPyConnection) -> list[str]:
         return [
-            path for table in sorted(reader.schemas) for path in _view(connection, reader, table)
+            path for table, view in names.items() for path in _view(connection, reader, table, view)
         ]
 
-    return sql.run_views(create, sorted(reader.schemas), statement)
+    return sql.run_views(create, list(names.values()), statement)
 
 
-def _view(connection: duckdb.DuckDBPyConnection, reader: Reader, table: str) -> list[str]:
+def _view(
+    connection: duckdb.DuckDBPyConnection, reader: Reader, table: str, view: str
+) -> list[str]:
     union, paths, selects = reader.schema(table), list[str](), list[str]()
     for source in reader.sources:
         for version in reader.schemas[table]:
-            folder = reader.layout.tables / table_of(version)
+            folder = reader.layout.table(table_of(version))
             files = [
                 str((folder / file.path).resolve()) for file in reader.files(source, version, None)
             ]
@@ -47,7 +53,7 @@ def _view(connection: duckdb.DuckDBPyConnection, reader: Reader, table: str) -> 
                 paths += files
                 selects.append(_select(union, version, source.robot, files))
     text = " UNION ALL ".join(selects) or _empty(union)
-    connection.execute(f"CREATE VIEW {sql.quoted_name(table)} AS {text}")
+    connection.execute(f"CREATE VIEW {sql.quoted_name(view)} AS {text}")
     return paths
 
 

@@ -14,7 +14,7 @@ from amberbox.blackbox.query.catalogue import Catalogue
 from amberbox.blackbox.query.gather import Request, gather
 from amberbox.blackbox.query.tabletext import plain
 from amberbox.blackbox.segments.flat import Flat
-from amberbox.core.names import identifier
+from amberbox.core.names import child_name, identifier
 from amberbox.fleet.archive.catalogue import Source
 from amberbox.fleet.archive.reading import Reader
 from amberbox.fleet.conclusions.entry import Entry
@@ -108,7 +108,7 @@ class _Parts:
         self, table: str, shape: Shape, parents: Mapping[tuple[Any, ...], Values], key: str
     ) -> None:
         for name, inner in _lists(shape):
-            below, children = f"{table}__{identifier(name)}", {}
+            below, children = child_name(table, name), {}
             for number, index, parent, values in self._listed(below, inner, key):
                 if (*number, parent) in parents:
                     parents[*number, parent][name].append(values)

@@ -134,7 +134,8 @@ def _integrity(row: Row[Any], path: str) -> Integrity:
         size = os.stat(path).st_size  # noqa: PTH116  # thousands at a time
     except FileNotFoundError:
         return "missing"
-    if row.state == REFUSED or size != row.bytes:
+    was_changed = row.state == REFUSED and not decode(row.why).by
+    if was_changed or size != row.bytes:
         return "altered"
     return "intact" if row.signed else "unsigned"
 

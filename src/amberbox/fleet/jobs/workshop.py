@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from amberbox.core.files import below
 from amberbox.fleet.asking.errors import LimitError
 from amberbox.fleet.jobs.wanted import Wanted
 
@@ -37,7 +38,7 @@ class Workshop:
         """Return the path of a new file."""
         where = self.path / "files" / folder
         where.mkdir(parents=True, exist_ok=True)
-        return where / name
+        return below(where, name)
 
     def add(self, path: Path) -> None:
         """Count a file that is finished among those of the download."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import multiprocessing
 import os
-import resource
 import signal
 import threading
 from collections.abc import Callable
@@ -14,7 +13,7 @@ from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from pathlib import Path
 
-from amberbox.blackbox.follow.read import journal_file
+from amberbox.blackbox.follow.read import JournalFile, journal_file
 from amberbox.blackbox.journal.clocktable import ClockTable
 from amberbox.blackbox.segments.entries import Sealed
 from amberbox.blackbox.store import FOLDERS, run_and_number
@@ -22,12 +21,17 @@ from amberbox.blackbox.verify.block import Identity
 from amberbox.blackbox.verify.findings import BAD
 from amberbox.blackbox.verify.journal import Checked, Target, check_journal
 from amberbox.core.errors import AmberboxError
+from amberbox.fleet.archive.journal import inspect
+from amberbox.fleet.archive.store import JournalKey
+from amberbox.fleet.asking.memory import limit_memory
+from amberbox.fleet.uploads.content import ContentError, check_content
 from amberbox.link.proof import ProofError, Proven, prove
 from amberbox.link.uploads import Proof
 
 _FIRST_CHAIN = "0" * 64
 _WRITER_OF = {folder: writer for writer, folder in FOLDERS.items()}
-_MEMORY_BYTES = 8 << 30
+_MEMORY_BYTES = 2 << 30
+_FACTS_BYTES = 8 << 20
 _READ_BYTES = 1 << 20
 _NICE = 5
 _TRIES = 2
@@ -79,6 +83,10 @@ def verify(claim: Claim) -> Result:
         return _judged(claim, checked, proven)
     except ProofError as error:
         return Result(f"its proof does not hold: {error}")
+    except ContentError as error:
+        return _unreadable(f"it is not taken in: {error}", proven)
+    except MemoryError:
+        return _unreadable("to read it takes more memory than it may", proven)
     except Exception as error:  # whatever bytes do to a reader: it is told, and not taken
         return _unreadable(f"it cannot be read: {type(error).__name__}: {error}", proven)
 
@@ -117,12 +125,13 @@ def _target(claim: Claim, sealed: Sealed | None) -> Target:
 def _judged(claim: Claim, checked: Checked, proven: Proven | None) -> Result:
     bad = [finding for finding in checked.findings if finding.state in BAD]
     identity = checked.target.identity
+    journal = None if bad else _content(claim, identity)
     if proven is not None:
         known = proven.sealed
         edges = known.start_ns, known.end_ns
         first, end = known.first_seq, known.end_seq
     else:
-        journal = journal_file(claim.path, claim.journal)
+        journal = journal or journal_file(claim.path, claim.journal)
         edges = ClockTable(journal.clock).bounds()
         edges = journal.start_ns + edges[0], journal.end_ns + edges[1]
         first, end = journal.first_seq, journal.end_seq
@@ -131,6 +140,16 @@ def _judged(claim: Claim, checked: Checked, proven: Proven | None) -> Result:
         False, proven is not None and proven.signed, identity.writer, identity.run,
         identity.number, first, end, *edges,
     )  # fmt: skip
+
+
+def _content(claim: Claim, identity: Identity) -> JournalFile:
+    """Look at what a sound file holds, and at what the archive will keep of it."""
+    journal = check_content(claim.path, claim.journal, identity)
+    key = JournalKey(claim.robot, claim.store_id, claim.journal, claim.sha256)
+    facts = inspect(key, claim.path, 0, is_checked=True).row["facts"]
+    if len(facts) > _FACTS_BYTES:
+        raise ContentError("it says more of its clock and its gaps than can be kept")
+    return journal
 
 
 def _sha256(path: Path) -> str:
@@ -215,7 +234,7 @@ def _begin() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the server, which ends it
     threading.Thread(target=_leave_with_parent, daemon=True).start()
     os.nice(_NICE)
-    resource.setrlimit(resource.RLIMIT_AS, (_MEMORY_BYTES, _MEMORY_BYTES))
+    limit_memory(_MEMORY_BYTES)
 
 
 def _leave_with_parent() -> None:

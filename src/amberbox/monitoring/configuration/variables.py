@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from fnmatch import fnmatchcase
 from typing import Literal, NamedTuple
 
-from amberbox.core.names import identifier
+from amberbox.core.names import child_name, identifier
 from amberbox.core.types import Column, ItemSchema
 
 _SPLIT = re.compile(r"[/.\[\]]+")
@@ -65,7 +65,7 @@ def guessed(item: str, text: str) -> Place:
     parts = tokens(text)
     row = next((place for place, part in enumerate(parts) if part.isdigit()), 0)
     if 0 < row < len(parts) - 1:
-        table = f"{item}__{identifier('_'.join(parts[:row]))}"
+        table = child_name(item, "_".join(parts[:row]))
         return Place(table, identifier("_".join(parts[row + 1 :])), int(parts[row]))
     path, bracket, number = text.strip("./").partition("[")
     index = int(number[:-1]) if bracket and number[:-1].isdigit() else None
@@ -86,7 +86,7 @@ def _places(schema: ItemSchema, item: str) -> Iterator[_Candidate]:
     for path, child in schema.children.items():
         above = tokens(path)
         for column in child.columns:
-            place = _place(f"{item}__{identifier(path)}", column)
+            place = _place(child_name(item, path), column)
             yield _Candidate((*above, "", *tokens(column.path)), place, len(above))
 
 
