@@ -64,6 +64,8 @@ def _email(to: Email, message: Message, smtp: Smtp, now_ns: int) -> EmailMessage
     mail["To"] = ", ".join(to.to)
     mail["Date"] = format_datetime(datetime.fromtimestamp(now_ns // NS, UTC))
     mail["Message-ID"] = f"<{message.key}@amberbox.invalid>"
+    if message.thread and message.thread != message.key:
+        mail["In-Reply-To"] = mail["References"] = f"<{message.thread}@amberbox.invalid>"
     mail["Auto-Submitted"] = "auto-generated"
     mail.set_content(message.body + "\n")
     return mail
