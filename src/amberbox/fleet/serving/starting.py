@@ -13,6 +13,7 @@ from amberbox.core.clock import Clock, SystemClock
 from amberbox.core.errors import AmberboxError
 from amberbox.fleet.accounts.passwords import Passwords
 from amberbox.fleet.accounts.setupcode import SetupCode, needs_setup, new_setup_code
+from amberbox.fleet.database.database import FILE, refuse_damaged
 from amberbox.fleet.database.lock import ServerLock
 from amberbox.fleet.demonstration import Demonstration
 from amberbox.fleet.services import Services
@@ -52,6 +53,7 @@ def run(
     clock = clock or SystemClock()
     make_folder(folder)
     with _locked(folder, clock):
+        refuse_damaged(folder / FILE)
         renewed = Files(folder).are_there and certificates.renew(folder, clock.wall_ns())
         settings = settings_of(folder, wanted)
         port = process.listen(settings)
