@@ -22,6 +22,8 @@ from amberbox.fleet.database.migrations import MIGRATIONS
 from amberbox.fleet.database.schema import Migration, check_version, prepare
 
 FILE = "server.db"
+FOLDER = "amberbox_folder"
+"""The option of a connection that says in which folder its database lies."""
 BUSY_S = 10.0
 _READERS = 48
 _BEGIN = "amberbox_begin"
@@ -141,6 +143,21 @@ class Database:
             self.damage = DatabaseDamagedError(self.path, cause)
             raise self.damage from error
 
+    def forget_deleted(self) -> None:
+        """Leave nothing of what was overwritten: in free places of the file, or in its log.
+
+        Raises DatabaseBusyError, for instance where the disk has no room for a second copy.
+        """
+        connection = sqlite3.connect(self.path, isolation_level=None)
+        try:
+            connection.execute(f"PRAGMA busy_timeout={BUSY_S * 1000:.0f}")
+            connection.execute("VACUUM")
+            connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+        except sqlite3.OperationalError as error:
+            raise DatabaseBusyError(f"{self.path}: {error}", _LOOK) from error
+        finally:
+            connection.close()
+
     def close(self) -> None:
         """Close all connections."""
         self.engine.dispose()
@@ -159,7 +176,10 @@ def _make_private(path: Path) -> None:
 def _engine(path: Path, read_only: bool) -> Engine:
     address = f"file:{quote(str(path.absolute()))}?mode={'ro' if read_only else 'rw'}"
     connect = partial(sqlite3.connect, address, uri=True, check_same_thread=False)
-    engine = create_engine("sqlite://", creator=connect, poolclass=QueuePool, pool_size=_READERS)
+    engine = create_engine(
+        "sqlite://", creator=connect, poolclass=QueuePool, pool_size=_READERS,
+        execution_options={FOLDER: path.absolute().parent},
+    )  # fmt: skip
     event.listen(engine, "connect", _configure_reader if read_only else _configure)
     event.listen(engine, "begin", _begin)
     return engine

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from amberbox.fleet.notifying.settings import LOST_HINT, NAME, Notifications
+from amberbox.fleet.options.options import read
 from amberbox.fleet.services import Services
 from amberbox.fleet.state.damaged import damaged_files
 
@@ -10,9 +12,12 @@ def troubles(services: Services) -> list[str]:
     """Say what somebody has to see to soon, in sentences; nothing when all is well."""
     with services.database.reading() as connection:
         damaged = damaged_files(connection, services.clock.wall_ns())
+        notified = read(connection, NAME, Notifications)
     lately = {robot: one.new for robot, one in damaged.items() if one.new}
     files = sum(lately.values())
     what = "1 file was" if files == 1 else f"{files} files were"
     whose = ", ".join(sorted(lately))
     said = [f"{what} damaged and set aside in the last 24 hours, of {whose}"] if files else []
+    if notified.has_lost_secrets:
+        said.append(f"secrets of notifications cannot be read: {LOST_HINT}")
     return [*services.keeping.troubles(), *said]

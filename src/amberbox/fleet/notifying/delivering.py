@@ -17,7 +17,15 @@ from urllib.parse import urlsplit
 
 from amberbox.core.clock import NS
 from amberbox.fleet.notifying.message import Message, plain
-from amberbox.fleet.notifying.settings import Destination, Email, Notifications, Smtp, Webhook
+from amberbox.fleet.notifying.settings import (
+    LOST_HINT,
+    Destination,
+    Email,
+    Notifications,
+    Smtp,
+    Webhook,
+)
+from amberbox.fleet.options.vault import LOST
 
 TIMEOUT_S: Final = 10.0
 SIGNATURE: Final = "Amberbox-Signature"
@@ -30,6 +38,8 @@ Deliver: TypeAlias = Callable[[Destination, Message, Notifications, int], str]
 def deliver(to: Destination, message: Message, setting: Notifications, now_ns: int) -> str:
     """Deliver a message; return what went wrong in a line, empty if it arrived."""
     try:
+        if LOST in (to.secret if isinstance(to, Webhook) else "", _password(to, setting)):
+            return f"its secret cannot be read: {LOST_HINT}"
         if isinstance(to, Webhook):
             return _post(to, message, now_ns)
         if setting.smtp is None:
@@ -38,6 +48,10 @@ def deliver(to: Destination, message: Message, setting: Notifications, now_ns: i
     except (OSError, ValueError, smtplib.SMTPException, http.client.HTTPException) as error:
         # a host may be no name at all, which is a ValueError
         return plain(f"{type(error).__name__}: {error}")[:500]
+
+
+def _password(to: Destination, setting: Notifications) -> str:
+    return "" if setting.smtp is None or isinstance(to, Webhook) else setting.smtp.password
 
 
 def _mail(to: Email, message: Message, smtp: Smtp, now_ns: int) -> str:

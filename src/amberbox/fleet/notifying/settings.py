@@ -14,10 +14,16 @@ import msgspec
 
 from amberbox.core.clock import NS
 from amberbox.core.redaction import MASK
+from amberbox.fleet.options.vault import LOST
 from amberbox.monitoring.plan import Severity
 
 NAME: Final = "notifications"
 """Under this name it is kept among the settings."""
+
+LOST_HINT: Final = (
+    "the file secrets.key of the server's folder is missing, or another one; put it back, or enter "
+    "them again in the settings"
+)
 
 Also: TypeAlias = Literal["acknowledged", "resolved"]
 """What else a destination may be told of alarms that it was told of."""
@@ -152,6 +158,12 @@ class Notifications:
     def destinations(self) -> tuple[Destination, ...]:
         """Return all who are told."""
         return (*self.emails, *self.webhooks)
+
+    @property
+    def has_lost_secrets(self) -> bool:
+        """Whether a secret in it could not be read."""
+        password = "" if self.smtp is None else self.smtp.password
+        return LOST in (password, *(one.secret for one in self.webhooks))
 
     def destination(self, name: str) -> Destination | None:
         """Return who has this name."""
