@@ -95,8 +95,11 @@ def check_installed() -> None:
     """Raise UsageError where a package is missing that a server needs."""
     from importlib.util import find_spec
 
-    missing = [name for name in ("fastapi", "uvicorn", "sqlalchemy", "deltalake", "argon2")
-               if find_spec(name) is None]  # fmt: skip
+    needed = (
+        *("fastapi", "uvicorn", "sqlalchemy", "deltalake", "argon2"),
+        *("cryptography", "zxcvbn"),
+    )
+    missing = [name for name in needed if find_spec(name) is None]
     if missing:
         raise UsageError(
             f"a server needs {', '.join(missing)}", "pip install 'amberbox[server,keep,query]'"
