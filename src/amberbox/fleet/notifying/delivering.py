@@ -16,7 +16,8 @@ from typing import Final, TypeAlias
 from urllib.parse import urlsplit
 
 from amberbox.core.clock import NS
-from amberbox.fleet.notifying.message import Message, plain
+from amberbox.core.showing import one_line
+from amberbox.fleet.notifying.message import Message
 from amberbox.fleet.notifying.settings import (
     LOST_HINT,
     Destination,
@@ -47,7 +48,7 @@ def deliver(to: Destination, message: Message, setting: Notifications, now_ns: i
         return _mail(to, message, setting.smtp, now_ns)
     except (OSError, ValueError, smtplib.SMTPException, http.client.HTTPException) as error:
         # a host may be no name at all, which is a ValueError
-        return plain(f"{type(error).__name__}: {error}")[:500]
+        return one_line(f"{type(error).__name__}: {error}")[:500]
 
 
 def _password(to: Destination, setting: Notifications) -> str:
@@ -73,7 +74,7 @@ def _mail(to: Email, message: Message, smtp: Smtp, now_ns: int) -> str:
 
 def _email(to: Email, message: Message, smtp: Smtp, now_ns: int) -> EmailMessage:
     mail = EmailMessage()
-    mail["Subject"] = plain(f"[amberbox] {message.subject}")
+    mail["Subject"] = one_line(f"[amberbox] {message.subject}")
     mail["From"] = smtp.sender
     mail["To"] = ", ".join(to.to)
     mail["Date"] = format_datetime(datetime.fromtimestamp(now_ns // NS, UTC))

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final, Literal, TypeAlias
 
+from amberbox.core.showing import one_line
 from amberbox.core.timetext import format_time
 from amberbox.fleet.alarms.alarm import Alarm
 
@@ -34,7 +35,7 @@ def subject_of(alarm: Alarm, event: Event = "opened") -> str:
     """Return an alarm in a few words: ``critical: ropod_001 laser``, with what became of it."""
     whose = alarm.robot or "several robots:"
     what = "" if event == "opened" else f"{event}: "
-    return plain(f"{what}{alarm.severity}: {whose} {alarm.origin}")[:200]
+    return one_line(f"{what}{alarm.severity}: {whose} {alarm.origin}")[:200]
 
 
 def body_of(alarm: Alarm, url: str, now_ns: int, event: Event = "opened") -> str:
@@ -43,8 +44,8 @@ def body_of(alarm: Alarm, url: str, now_ns: int, event: Event = "opened") -> str
     lines = [
         subject_of(alarm, event),
         *_became(alarm, event),
-        plain(alarm.reason),
-        *([f"cause: {plain(alarm.cause)}"] if alarm.cause else []),
+        one_line(alarm.reason),
+        *([f"cause: {one_line(alarm.cause)}"] if alarm.cause else []),
         f"since {format_time(alarm.opened_ns)[:19]}Z, {lasts}",
         *([f"it came {alarm.count} times"] if alarm.count > 1 else []),
         *(["the robot was offline when it happened"] if alarm.late else []),
@@ -60,7 +61,7 @@ def _became(alarm: Alarm, event: Event) -> list[str]:
     by, at_ns = _who_and_when(alarm, event)
     who = f" by {by}" if by else ""
     why = f": {alarm.resolution}" if event == "resolved" and by and alarm.resolution else ""
-    return [plain(f"{event}{who} {format_time(at_ns or 0)[:19]}Z{why}")]
+    return [one_line(f"{event}{who} {format_time(at_ns or 0)[:19]}Z{why}")]
 
 
 def _who_and_when(alarm: Alarm, event: Event) -> tuple[str, int | None]:
@@ -96,8 +97,3 @@ def data_of(
         "count": alarm.count,
         "url": f"{url}/alarms/{alarm.number}" if url else "",
     }
-
-
-def plain(text: str) -> str:
-    """Take out of a text what is not for reading: line ends and controls, which robots may send."""
-    return "".join(char if char.isprintable() else " " for char in text)
