@@ -12,6 +12,7 @@ from pathlib import Path
 
 from amberbox.core.clock import Clock, SystemClock
 from amberbox.core.errors import AmberboxError
+from amberbox.core.files import keep_to_group
 from amberbox.fleet.accounts.passwords import Passwords
 from amberbox.fleet.accounts.setupcode import SetupCode, needs_setup, new_setup_code
 from amberbox.fleet.database.database import FILE, DatabaseBusyError, refuse_damaged
@@ -53,6 +54,7 @@ def run(
     Raises UsageError when another server has the folder, or what is wanted is not safe.
     """
     clock = clock or SystemClock()
+    keep_to_group()
     make_folder(folder)
     with _locked(folder, clock):
         refuse_damaged(folder / FILE)
