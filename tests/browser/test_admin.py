@@ -161,10 +161,15 @@ def test_a_destination_is_tried_and_its_answer_shown(page_as: PageAs, site: Site
         entry.get_by_role("textbox", name="Name", exact=True).fill("pager")
         entry.get_by_label("Address").fill(hook.url)
         entry.get_by_label("Secret").fill("0123456789abcdef")
+        entry.get_by_label("when it is resolved").check()
         page.get_by_role("button", name="Save").click()
         row = page.locator("[data-destinations] li")
         expect(row).to_contain_text("pager by webhook to 127.0.0.1")
         expect(entry.get_by_text("One is stored:")).to_be_visible()
+
+        expect(entry.get_by_label("when it is resolved")).to_be_checked()
+        (saved,) = site.ask("/settings/notifications")["value"]["webhooks"]
+        assert saved["also"] == ["resolved"]
 
         row.get_by_role("button", name="Send a test message").click()
         expect(row).to_contain_text("Taken by the receiver at")

@@ -9,6 +9,7 @@ import resource
 import signal
 import socket
 import ssl
+import stat
 import subprocess
 import sys
 import time
@@ -247,6 +248,22 @@ def test_a_key_that_is_revoked_ends_the_open_connection(server: Server, tmp_path
             await dial(options_of(mine), context)
 
     asyncio.run(scene())
+
+
+def test_a_line_goes_to_a_file_that_nobody_else_reads(server: Server, tmp_path: Path) -> None:
+    file, add = tmp_path / "line", command("add-robot", "r8", "--data", server.data)
+    done = subprocess.run([*add, "--line-file", file], capture_output=True, text=True)
+    assert done.returncode == 0 and "abr_" not in done.stdout
+    assert stat.S_IMODE(file.stat().st_mode) == 0o600
+    assert read_join_line(file.read_text()).robot == "r8"
+    again = command("add-robot", "r9", "--data", server.data)
+    done = subprocess.run([*again, "--line-file", file], capture_output=True, text=True)
+    assert done.returncode == 2 and "is there already" in done.stderr
+    with (tmp_path / "open").open("w") as out:
+        (tmp_path / "open").chmod(0o644)
+        done = subprocess.run(again, stdout=out, stderr=subprocess.PIPE, text=True)
+    assert done.returncode == 0, "the refused one did not add the robot"
+    assert "others can read this file" in done.stderr
 
 
 def test_the_audit_log_holds_while_the_server_runs(

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import os
+import stat
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -65,3 +68,22 @@ def _umask() -> int:
     mask = os.umask(0)
     os.umask(mask)
     return mask
+
+
+def test_what_a_process_creates_is_for_its_group_at_most(tmp_path: Path) -> None:
+    for before, after in ((0o022, 0o027), (0o002, 0o027), (0o077, 0o077)):
+        code = f"""
+import os, sys
+from pathlib import Path
+from amberbox.core.files import keep_to_group
+os.umask({before})
+keep_to_group()
+folder = Path(sys.argv[1])
+(folder / "d").mkdir()
+(folder / "f").write_text("")
+"""
+        folder = tmp_path / f"{before:o}"
+        folder.mkdir()
+        subprocess.run([sys.executable, "-c", code, folder], check=True)
+        assert stat.S_IMODE((folder / "d").stat().st_mode) == 0o777 & ~after
+        assert stat.S_IMODE((folder / "f").stat().st_mode) == 0o666 & ~after

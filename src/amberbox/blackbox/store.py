@@ -114,14 +114,14 @@ def open_store(path: Path) -> Store:
 
 
 def create_store(path: Path) -> Store:
-    """Open a store, or make a new one with an identity of its own.
+    """Open a store, or make a new one with an identity of its own, for its user and group.
 
     Raises AmberboxError when the folder cannot be written.
     """
     if is_store(path):
         return open_store(path)
     try:
-        path.mkdir(parents=True, exist_ok=True)
+        path.mkdir(mode=0o750, parents=True, exist_ok=True)
         replace_file(path / _IDENTITY, json.dumps({"store_id": str(uuid.uuid4()), "format": 1}))
     except OSError as error:
         raise AmberboxError(

@@ -6,6 +6,7 @@ import os
 from collections.abc import Callable, Mapping
 from typing import IO
 
+from amberbox.core.terminal import OWN
 from amberbox.core.types import Level
 
 Paint = Callable[[str, Level], str]
@@ -27,4 +28,4 @@ def plain(text: str, level: Level) -> str:
 
 
 def _paint(text: str, level: Level) -> str:
-    return f"\x1b[{_CODES[level]}m{text}\x1b[0m"
+    return f"{OWN}[{_CODES[level]}m{text}{OWN}[0m"

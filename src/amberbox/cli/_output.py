@@ -18,6 +18,7 @@ from amberbox.blackbox.query.tabletext import grid
 from amberbox.cli._server import remote_record
 from amberbox.client.address import is_url
 from amberbox.core.errors import UsageError
+from amberbox.core.terminal import for_data
 from amberbox.fleet.archive.where import archive_in
 
 if TYPE_CHECKING:
@@ -79,7 +80,7 @@ def _opened_archive(folder: Path, robots: Sequence[str]) -> Record:
 def text_output(path: str | None) -> Iterator[IO[str]]:
     """Open the file to write to, or stdout."""
     if path is None:
-        yield sys.stdout
+        yield for_data(sys.stdout)
         return
     with writable(path).open("w", encoding="utf-8", newline="") as file:
         yield file

@@ -5,6 +5,8 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 
+from amberbox.core.terminal import BACK
+
 _BAR = 30
 
 
@@ -22,7 +24,7 @@ def progress_bar(*, wanted: bool = True) -> Callable[[float], None]:
         shown = percent
         full = round(percent * _BAR / 100)
         end = "\n" if percent == 100 else ""
-        print(f"\r[{'#' * full}{'.' * (_BAR - full)}] {percent:3d}%", end=end, file=sys.stderr,
+        print(f"{BACK}[{'#' * full}{'.' * (_BAR - full)}] {percent:3d}%", end=end, file=sys.stderr,
               flush=True)  # fmt: skip
 
     return draw

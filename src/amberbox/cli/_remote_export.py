@@ -19,6 +19,7 @@ from amberbox.client.data_models import Download
 from amberbox.client.remote import NOT_YET, RemoteRecord
 from amberbox.client.times import Time
 from amberbox.core.errors import AmberboxError, UsageError
+from amberbox.core.terminal import for_data
 from amberbox.core.timetext import format_time
 from amberbox.core.units import in_bytes
 
@@ -80,7 +81,7 @@ def _stream(
     for start, end in spans:
         pages = record.fleet.pages(record.robot, item, [*named, *keys] or None, start, end, args.by)
         for page in pages:
-            page.table.to_csv(sys.stdout, header=is_first, raw_text=args.raw_text)
+            page.table.to_csv(for_data(sys.stdout), header=is_first, raw_text=args.raw_text)
             notes.update(dict.fromkeys(page.table.notes))
             is_first = False
     tell(notes)

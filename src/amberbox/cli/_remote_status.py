@@ -21,6 +21,7 @@ from amberbox.client.models import Component, Condition, StatusTree
 from amberbox.client.times import maybe_ns, time_ns
 from amberbox.core.config import did_you_mean
 from amberbox.core.errors import AmberboxError, UsageError
+from amberbox.core.terminal import OWN
 from amberbox.core.types import Status
 from amberbox.monitoring.engine.findings import AlarmChange
 from amberbox.monitoring.messages.board import Board
@@ -93,7 +94,7 @@ def watch_remote(args: argparse.Namespace) -> Board:
         while True:
             board, tree = board_of(fleet, robot, args.component)
             if sys.stdout.isatty():
-                print("\x1b[H\x1b[J", end="")
+                print(f"{OWN}[H{OWN}[J", end="")
             show_remote(board, tree, args)
             sys.stdout.flush()
             try:

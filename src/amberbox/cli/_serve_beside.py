@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import getpass
 import os
+import stat
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 
 from amberbox.core.clock import SystemClock
 from amberbox.core.errors import UsageError
+from amberbox.core.files import write_private
 
 
 def make_certificate(folder: Path, names: Sequence[str]) -> int:
@@ -30,8 +33,13 @@ def make_certificate(folder: Path, names: Sequence[str]) -> int:
     return 0
 
 
-def add_robot(folder: Path, robot: str, groups: Sequence[str]) -> int:
-    """Make a robot known, and groups that are new; print the one line that is pasted on it."""
+def add_robot(folder: Path, robot: str, groups: Sequence[str], line_file: Path | None) -> int:
+    """Make a robot known, and groups that are new; print the one line that is pasted on it.
+
+    With ``line_file`` the line is written there instead, readable for this user only.
+    """
+    if line_file is not None and line_file.exists():
+        raise UsageError(f"{line_file} is there already", "name a new file")
     from amberbox.fleet.accounts import robotkeys
     from amberbox.fleet.accounts.groups import add_group, list_groups
     from amberbox.fleet.audit.entry import Entry
@@ -51,10 +59,28 @@ def add_robot(folder: Path, robot: str, groups: Sequence[str]) -> int:
             details = {"groups": sorted(groups), "new_groups": new, "key_id": secret.id}
             entry = Entry(_who(), "", "robots.add", robot, details=details)
             append(connection, now_ns, entry)
+            if line_file is not None:  # before the robot is added for good
+                write_private(line_file, f"{line}\n")
     finally:
         database.close()
-    print(str(line))
+    if line_file is None:
+        print(str(line))
+        _warn_readable()
+    else:
+        print(f"the line for {robot} is in {line_file}: it holds the robot's key; delete the file "
+              "once the robot has joined")  # fmt: skip
     return 0
+
+
+def _warn_readable() -> None:
+    """Warn where what is printed lands in a file that others can read."""
+    try:
+        out = os.fstat(sys.stdout.fileno())
+    except (OSError, ValueError):  # it is no file at all
+        return
+    if stat.S_ISREG(out.st_mode) and out.st_mode & 0o077:
+        print("warning: the line holds the robot's key, and others can read this file\n"
+              "hint: chmod 600 it now; next time: --line-file FILE", file=sys.stderr)  # fmt: skip
 
 
 def verify_audit(folder: Path, heads: Sequence[str]) -> int:

@@ -9,6 +9,7 @@ from typing import Any
 from amberbox.cli._output import add_range_only, opened
 from amberbox.cli._server import add_where
 from amberbox.cli._window import add_window, window_of
+from amberbox.core.terminal import for_data
 from amberbox.core.timetext import format_time
 
 
@@ -25,7 +26,7 @@ def run(args: argparse.Namespace) -> int:
     with opened(args.where) as record:
         table = record.events(*window_of(args, record))
     if args.json:
-        table.to_json(sys.stdout)
+        table.to_json(for_data(sys.stdout))
         print()
         return 0
     for row in table.rows():

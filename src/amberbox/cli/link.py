@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from amberbox.cli._output import tell
 from amberbox.core.errors import UsageError
+from amberbox.core.files import keep_to_group
 
 if TYPE_CHECKING:
     from amberbox.robot.link.agent import Agent
@@ -27,6 +28,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Link until SIGTERM or Ctrl-C; what is durable by then is sent first."""
+    keep_to_group()
     from amberbox.blackbox.doctor.linked import LOCK
     from amberbox.blackbox.folder.folder import load_folder
     from amberbox.blackbox.store import WriterLock, create_store

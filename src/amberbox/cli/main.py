@@ -8,12 +8,14 @@ import os
 import sys
 import traceback
 from collections.abc import Mapping, Sequence
+from contextlib import redirect_stderr, redirect_stdout
 from typing import NoReturn
 
 from amberbox import __version__
 from amberbox.core.config import did_you_mean
 from amberbox.core.errors import AmberboxError, ConfigurationError, UsageError
 from amberbox.core.plugins import Plugin, find
+from amberbox.core.terminal import harmless
 
 EVERYDAY = (
     *("new", "check", "record", "watch", "run", "status"),
@@ -25,6 +27,11 @@ _BROKEN_PIPE = 141
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command line and return its exit status."""
+    with redirect_stdout(harmless(sys.stdout)), redirect_stderr(harmless(sys.stderr)):
+        return _main(arguments)
+
+
+def _main(arguments: Sequence[str] | None) -> int:
     try:
         return _run(list(sys.argv[1:] if arguments is None else arguments))
     except SystemExit as request:  # argparse, after it has printed a help page

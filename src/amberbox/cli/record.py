@@ -14,6 +14,8 @@ from dataclasses import asdict
 from amberbox.blackbox.folder.folder import load_folder
 from amberbox.blackbox.recorder.recorder import Recorder, RecorderState
 from amberbox.blackbox.service import is_service
+from amberbox.core.files import keep_to_group
+from amberbox.core.terminal import OWN
 from amberbox.core.units import in_bytes, in_unit
 
 _TABLE_S = 1.0
@@ -41,6 +43,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Record until stopped by a signal, by ``--for``, or by the end of all inputs."""
+    keep_to_group()
     recorder = Recorder(load_folder(args.folder))
     recorder.pipeline.on_event = _tell
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -100,8 +103,8 @@ def _show(recorder: Recorder, args: argparse.Namespace) -> None:
 
 
 def _redraw(rows: list[str], before: int) -> int:
-    up = f"\x1b[{before}A" if before else ""
-    print(up + "".join(f"\x1b[K{row}\n" for row in rows), end="", flush=True)
+    up = f"{OWN}[{before}A" if before else ""
+    print(up + "".join(f"{OWN}[K{row}\n" for row in rows), end="", flush=True)
     return len(rows)
 
 

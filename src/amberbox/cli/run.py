@@ -10,6 +10,7 @@ from pathlib import Path
 from amberbox.blackbox.folder.folder import load_folder
 from amberbox.blackbox.store import create_store
 from amberbox.core.errors import UsageError
+from amberbox.core.files import keep_to_group
 from amberbox.robot.supervisor.child import children_of
 from amberbox.robot.supervisor.supervisor import Box, Supervisor
 
@@ -26,6 +27,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run everything until SIGTERM or Ctrl-C; a second one hurries."""
+    keep_to_group()
     if not Path(args.folder).is_dir():
         raise UsageError(f"'{args.folder}' is no folder", "run takes a robot folder")
     supervisor = Supervisor(box_of(args.folder, quiet=args.quiet))

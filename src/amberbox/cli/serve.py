@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 _PORT = 8443
 _USAGE = """amberbox serve --data DIR [options]
        amberbox serve cert --data DIR --host NAME...
-       amberbox serve add-robot ID --data DIR [--group GROUP]...
+       amberbox serve add-robot ID --data DIR [--group GROUP]... [--line-file FILE]
        amberbox serve verify-audit --data DIR [--head "NUMBER HASH"]..."""
 _EXIT = "exit status: 0 after an orderly end, 1 it cannot go on, 2 wrong usage"
 
@@ -41,6 +41,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
                         help="make a code that lets somebody become an admin")  # fmt: skip
     parser.add_argument("--group", action="append", default=[], metavar="GROUP",
                         help="add-robot: a group that the robot is in")  # fmt: skip
+    parser.add_argument("--line-file", metavar="FILE",
+                        help="add-robot: write the line into a new file with mode 0600, "
+                        "instead of printing it")  # fmt: skip
     parser.add_argument("--head", action="append", default=[], metavar="HEAD",
                         help="verify-audit: a head that was noted elsewhere")  # fmt: skip
     parser.add_argument("--quiet", action="store_true", help="print troubles only")
@@ -59,8 +62,9 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _serve(args: argparse.Namespace) -> int:
-    if args.group or args.head:
-        raise UsageError("--group is for add-robot, --head for verify-audit", _USAGE)
+    if args.group or args.line_file or args.head:
+        what = "--group and --line-file are for add-robot, --head for verify-audit"
+        raise UsageError(what, _USAGE)
     if args.host is not None and len(args.host) > 1:
         raise UsageError("a server listens at one address", "--host 0.0.0.0 for all of them")
     check_installed()
@@ -95,8 +99,11 @@ def check_installed() -> None:
     """Raise UsageError where a package is missing that a server needs."""
     from importlib.util import find_spec
 
-    missing = [name for name in ("fastapi", "uvicorn", "sqlalchemy", "deltalake", "argon2")
-               if find_spec(name) is None]  # fmt: skip
+    needed = (
+        *("fastapi", "uvicorn", "sqlalchemy", "deltalake", "argon2"),
+        *("cryptography", "zxcvbn"),
+    )
+    missing = [name for name in needed if find_spec(name) is None]
     if missing:
         raise UsageError(
             f"a server needs {', '.join(missing)}", "pip install 'amberbox[server,keep,query]'"
@@ -114,7 +121,8 @@ def _add_robot(args: argparse.Namespace) -> int:
 
     if len(args.words) != 2:
         raise UsageError("add-robot takes one ID", "amberbox serve add-robot ID --data DIR")
-    return add_robot(Path(args.data), args.words[1], args.group)
+    file = None if args.line_file is None else Path(args.line_file)
+    return add_robot(Path(args.data), args.words[1], args.group, file)
 
 
 def _verify_audit(args: argparse.Namespace) -> int:

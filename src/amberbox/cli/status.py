@@ -26,6 +26,7 @@ from amberbox.client.address import is_url
 from amberbox.core.clock import NS
 from amberbox.core.config import did_you_mean
 from amberbox.core.errors import AmberboxError, UsageError
+from amberbox.core.terminal import OWN
 from amberbox.core.timetext import format_time
 from amberbox.core.types import Output, Status
 from amberbox.core.units import parse_duration_s
@@ -91,7 +92,7 @@ def _watch(reader: BoardReader, args: argparse.Namespace, plan: Plan | None) -> 
     while True:
         board = _read(reader, args, plan)
         if sys.stdout.isatty():
-            print("\x1b[H\x1b[J", end="")
+            print(f"{OWN}[H{OWN}[J", end="")
         _show(board, args, plan)
         sys.stdout.flush()
         try:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from amberbox.cli._output import accept_relative_times, tell
 from amberbox.core.errors import UsageError
+from amberbox.core.files import keep_to_group
 
 if TYPE_CHECKING:
     from amberbox.blackbox.folder.folder import RobotFolder
@@ -47,6 +48,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Watch as asked."""
+    keep_to_group()
     if not args.replay and (args.from_ or args.to or args.speed != "max"):
         raise UsageError("--from, --to and --speed are about a replay", "add --replay")
     folder = _folder(args)

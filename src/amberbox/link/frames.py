@@ -13,9 +13,8 @@ import msgspec
 from msgspec import Meta, Struct
 
 from amberbox.link import limits
-from amberbox.link.positions import Place, Reach
+from amberbox.link.positions import Count, Place, Reach, TimeNs
 
-Count = Annotated[int, Meta(ge=0)]
 Name = Annotated[str, Meta(max_length=128)]
 Text = Annotated[str, Meta(max_length=limits.TEXT_BYTES)]
 Writers = Annotated[dict[Name, Reach], Meta(max_length=8)]
@@ -34,7 +33,7 @@ class Row(Struct, frozen=True, array_like=True):
     run: Count
     seq: Count
     channel: Name
-    log_ns: int
+    log_ns: TimeNs
     data: bytes
 
     @property
@@ -51,8 +50,8 @@ class Hello(Struct, frozen=True, tag="hello"):
     boot_id: Name
     writers: Writers
     config_hash: Name
-    wall_ns: int
-    mono_ns: int
+    wall_ns: TimeNs
+    mono_ns: TimeNs
     version: Name
     protocol: int = limits.PROTOCOL
     public_key: Name = ""
@@ -78,7 +77,9 @@ class Live(Struct, frozen=True, tag="live"):
     """The latest value of each variable that somebody looks at; never stored."""
 
     epoch: Count
-    values: Annotated[dict[Text, tuple[int, float | str | None]], Meta(max_length=limits.VARIABLES)]
+    values: Annotated[
+        dict[Text, tuple[TimeNs, float | str | None]], Meta(max_length=limits.VARIABLES)
+    ]
 
 
 class Beat(Struct, frozen=True, tag="beat"):
@@ -89,11 +90,11 @@ class Beat(Struct, frozen=True, tag="beat"):
     """
 
     epoch: Count
-    wall_ns: int
-    mono_ns: int
+    wall_ns: TimeNs
+    mono_ns: TimeNs
     backlog: Count = 0
-    offset_ns: int | None = None
-    round_ns: int | None = None
+    offset_ns: TimeNs | None = None
+    round_ns: TimeNs | None = None
     backlog_bytes: Count = 0
 
 

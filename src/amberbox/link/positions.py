@@ -2,20 +2,33 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Annotated, NamedTuple, TypeAlias
 
 import msgspec
+from msgspec import Meta
+
+LARGEST = 2**62
+"""Largest number that a robot may send: sums and ends of ranges still fit into 64 bits."""
+
+Count: TypeAlias = Annotated[int, Meta(ge=0, le=LARGEST)]
+"""A number, size or position that a robot sends."""
+TimeNs: TypeAlias = Annotated[int, Meta(ge=-LARGEST, le=LARGEST)]
+"""A time, duration or clock offset in nanoseconds that a robot sends; until the year 2116."""
+
+
+def is_in_range(*numbers: int) -> bool:
+    """Tell whether numbers that a robot sent fit into databases, columns and times."""
+    return all(-LARGEST <= number <= LARGEST for number in numbers)
 
 
 class Place(NamedTuple):
     """A place in a writer's journal: everything before ``(run, seq)``."""
 
-    run: int = 0
-    seq: int = 0
+    run: Count = 0
+    seq: Count = 0
 
 
 START = Place()
-LARGEST = 2**63 - 1
 
 
 class RunEnd(msgspec.Struct, frozen=True, array_like=True):
@@ -24,9 +37,9 @@ class RunEnd(msgspec.Struct, frozen=True, array_like=True):
     ``closed`` says that nobody writes it any more, and that its end survives a power cut.
     """
 
-    run: int
+    run: Count
     boot: str
-    end_seq: int
+    end_seq: Count
     closed: bool = True
 
 
@@ -42,12 +55,12 @@ class Reach(msgspec.Struct, frozen=True, array_like=True):
         """Say what cannot be true in it; empty where all can."""
         if min(*self.oldest, *self.end, *self.durable) < 0:
             return "a position below 0"
-        ends = (run.end_seq for run in self.runs)
-        if max(*self.oldest, *self.end, *self.durable, *ends) > LARGEST:
-            return "a position that is no number of 64 bits"
+        numbers = [run.run for run in self.runs]
+        ends = [run.end_seq for run in self.runs]
+        if not is_in_range(*self.oldest, *self.end, *self.durable, *ends, *numbers):
+            return "a position that is out of range"
         if self.durable > self.end:
             return "more is durable than was written"
-        numbers = [run.run for run in self.runs]
-        if numbers != sorted(set(numbers)) or any(abs(n) > LARGEST for n in numbers):
+        if numbers != sorted(set(numbers)):
             return "runs out of order"
         return "a run that ends below 0" if any(run.end_seq < 0 for run in self.runs) else ""

@@ -27,7 +27,7 @@ from amberbox.link.frames import (
     Welcome,
 )
 from amberbox.link.ledger import Admission, Stored
-from amberbox.link.positions import LARGEST, Place, Reach
+from amberbox.link.positions import Place, Reach, is_in_range
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,12 +135,12 @@ class ServerEnd:
             return self._end(f"frame {self.next_number} is missing")
         for row in frame.rows:
             known = row.writer in self.reaches and row.channel in limits.CHANNELS
-            if max(row.run, row.seq, abs(row.log_ns)) > LARGEST:
-                return self._end("a row has numbers of more than 64 bits")
+            if not is_in_range(row.run, row.seq, row.log_ns):
+                return self._end("a row has numbers that are out of range")
             if not known:
                 return self._end(f"no rows of {row.writer}/{row.channel} are taken")
         if not set(frame.upto) <= set(self.reaches) or any(
-            min(at) < 0 or max(at) > LARGEST for at in frame.upto.values()
+            min(at) < 0 or not is_in_range(*at) for at in frame.upto.values()
         ):
             return self._end("it reaches where nothing is")
         self.next_number += 1

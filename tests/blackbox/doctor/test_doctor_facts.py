@@ -21,7 +21,7 @@ from amberbox.blackbox.doctor.traffic import traffic
 from amberbox.blackbox.doctor.wear import read_disk
 from amberbox.blackbox.folder.folder import load_folder
 from amberbox.blackbox.journal.head import read_head
-from amberbox.blackbox.store import open_store
+from amberbox.blackbox.store import create_store, open_store
 from amberbox.blackbox.unitfile import service_of, unit_text
 from amberbox.core.plugins import find
 from amberbox.testing.box import COUNT, ManualBox, number
@@ -253,6 +253,21 @@ def test_a_head_that_cannot_be_read_at_once_is_read_again(
     assert "hangs: no last write" in one(folder, "recorder", host).found
     box.close()
     assert "not running" in one(folder, "recorder", host).found
+
+
+def test_a_store_that_everybody_can_read_is_warned_of(folder: Path, host: Host) -> None:
+    store = create_store(folder / "store")
+    assert store.path.stat().st_mode & 0o777 == 0o750 & ~_umask()
+    assert "store" not in {finding.check for finding in checkup(folder, host)}
+    store.path.chmod(0o755)
+    found = one(folder, "store", host)
+    assert found.level == "warn" and "chmod -R o-rwx" in found.hint
+
+
+def _umask() -> int:
+    mask = os.umask(0o077)
+    os.umask(mask)
+    return mask
 
 
 def test_keys(folder: Path, host: Host) -> None:

@@ -156,6 +156,11 @@ def _until(true: Callable[[], bool]) -> None:
         "admin-admin-admin",
         "anna.mueller2026",
         "Mueller-Anna-12",
+        "iloveliverpool",
+        "manchesterunited",
+        "ilovemanchester",
+        "chelseaforever1",
+        "P@55w0rd!1234567",
         "\U0001d4c5\U0001d4b6\U0001d4c8\U0001d4c8word1234",  # in script letters
     ],
 )
@@ -172,6 +177,7 @@ def test_passwords_that_are_tried_first_are_refused(password: str) -> None:
         "hkT3!xWq92mz",
         "tischlampe77gruen",
         "die Äpfel sind im Keller",
+        "4@8({[<3691!|0$5+72%hx4@8kq{[<36",  # of which zxcvbn alone would make seconds
     ],
 )
 def test_good_passwords_are_taken(password: str) -> None:

@@ -22,8 +22,10 @@ def said(**more: Any) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"at_ns": "now"}, {"hypotheses": 5}, {"hypotheses": ["x"]}, {"revision": None}]
-)
+    "wrong",
+    [{"at_ns": "now"}, {"hypotheses": 5}, {"hypotheses": ["x"]}, {"revision": None},
+     {"at_ns": 2**63 - 1}, {"at_ns": 10**30}, {"revision": -(2**64)}],
+)  # fmt: skip
 def test_what_is_not_of_its_form_is_nothing(wrong: dict[str, Any]) -> None:
     entries = [
         Entry(reserved.DIAGNOSIS, 7, 5, "s", "watch", 1, number, values)

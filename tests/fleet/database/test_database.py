@@ -29,7 +29,12 @@ from sqlalchemy.schema import CreateIndex, CreateTable
 
 import amberbox.fleet
 from amberbox.core.errors import AmberboxError, UsageError
-from amberbox.fleet.database.database import Database, DatabaseBusyError
+from amberbox.fleet.database.database import (
+    Database,
+    DatabaseBusyError,
+    DatabaseDamagedError,
+    refuse_damaged,
+)
 from amberbox.fleet.database.metadata import METADATA, complete
 from amberbox.fleet.database.migrations import MIGRATIONS
 from amberbox.fleet.database.schema import SCHEMA_VERSION, Migration, version
@@ -317,3 +322,36 @@ def test_all_tables_of_the_server_are_made(tmp_path: Path) -> None:
 def test_an_integrity_error_is_the_callers(database: Database, things: Table) -> None:
     with pytest.raises(IntegrityError), database.begin() as connection:
         connection.execute(insert(things), [{"name": "a", "number": None}])
+
+
+def test_damage_is_found_before_anything_is_read_that_lies_there(tmp_path: Path) -> None:
+    path = tmp_path / "server.db"
+    refuse_damaged(path)  # there is none yet
+    database = Database(path)
+    with database.begin() as connection:
+        connection.execute(text("PRAGMA user_version = 1"))
+        page = connection.execute(text("SELECT rootpage FROM sqlite_master WHERE name = 'option'"))
+        start = (page.scalar_one() - 1) * 4096
+    database.close()
+    refuse_damaged(path)
+    with path.open("r+b") as file:
+        file.seek(start)
+        file.write(b"\xaa" * 4096)
+    Database(path).close()  # nothing shows
+    with pytest.raises(DatabaseDamagedError, match=r"server\.db is damaged: .*\nhint: stop the"):
+        refuse_damaged(path)
+
+
+def test_damage_that_shows_itself_later_is_remembered(tmp_path: Path) -> None:
+    database = Database(tmp_path / "server.db")
+    with database.reading() as connection:
+        page = connection.execute(text("SELECT rootpage FROM sqlite_master WHERE name = 'option'"))
+        start = (page.scalar_one() - 1) * 4096
+    database.close()
+    with (tmp_path / "server.db").open("r+b") as file:
+        file.seek(start)
+        file.write(b"\xaa" * 4096)
+    with pytest.raises(DatabaseDamagedError), database.reading() as connection:
+        connection.execute(text("SELECT * FROM option")).all()
+    assert database.damage is not None
+    database.close()

@@ -8,7 +8,10 @@ import signal
 import time
 from pathlib import Path
 
+import pytest
+
 from amberbox.fleet.asking.pool import Pool
+from amberbox.fleet.database.database import DatabaseDamagedError
 from amberbox.fleet.serving import process
 from amberbox.fleet.serving.settings import Settings
 from tests.fleet.asking.program import MODULE
@@ -39,3 +42,21 @@ def test_a_question_that_takes_long_holds_up_no_end(tmp_path: Path) -> None:
         asyncio.run(scene())
         assert time.monotonic() - began_s < LASTS_S / 2
         assert len(told) == 1, "it was told that nobody answers any more"
+
+
+def test_damage_of_the_database_ends_the_server_in_order(tmp_path: Path) -> None:
+    with house(tmp_path / "server") as home:
+        answers = list[int]()
+
+        async def scene() -> None:
+            port = process.listen(Settings("http://localhost", port=0))
+
+            def ready(_: int) -> None:
+                home.services.database.damage = DatabaseDamagedError(tmp_path, "malformed")
+                answers.append(1)
+
+            await process.serve(home.services, port, process.Told(ready=ready))
+
+        with pytest.raises(DatabaseDamagedError, match="is damaged: malformed"):
+            asyncio.run(scene())
+        assert answers == [1]

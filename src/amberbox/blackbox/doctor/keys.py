@@ -1,4 +1,4 @@
-"""The robot's signing key: is it there, is it private, is its other half kept elsewhere."""
+"""Who can read the store and its signing key: are both private, is the other half elsewhere."""
 
 from __future__ import annotations
 
@@ -18,6 +18,10 @@ def keys(subject: Subject, host: Host) -> Iterator[Finding]:
         yield ok("keys", "none yet: they are made at the first start of the recorder")
         return
     yield _judged(subject)
+    mode = stat.S_IMODE(subject.store_path.stat().st_mode)
+    if mode & 0o007:
+        what = f"everybody on this computer can read the store (mode {mode:04o})"
+        yield warn("store", what, f"chmod -R o-rwx {subject.store_path}")
 
 
 def _judged(subject: Subject) -> Finding:

@@ -7,6 +7,8 @@ import unicodedata
 from collections.abc import Iterator
 from html import escape
 
+from amberbox.core.showing import visible
+
 SIZE = 13
 SMALL = 11
 
@@ -28,8 +30,11 @@ _BREAKS = re.compile(r"(?<=[/_#.+\-])")
 
 
 def escaped(text: str) -> str:
-    """Write text so that it is only text; what XML does not allow becomes a question mark."""
-    return escape(_FORBIDDEN.sub("\ufffd", text))
+    """Write text so that it is only text; what XML does not allow becomes a question mark.
+
+    What a text hides is written out.
+    """
+    return escape(visible(_FORBIDDEN.sub("\ufffd", text)))
 
 
 def width(text: str, size: float = SIZE, *, bold: bool = False) -> float:

@@ -10,6 +10,11 @@ SHORTEST = 12
 LONGEST = 256
 _FEWEST_DIFFERENT = 6
 _FEWEST_LEFT = 4
+_FEWEST_GUESSES = 1e8
+"""So many attempts a password has to stand: zxcvbn calls that safely unguessable."""
+_LOOKED_AT = 32
+_MOST_SIGNS = 12
+"""Beyond so many characters, and so many different digits and signs, zxcvbn takes seconds."""
 _COMMON = (
     "|password|passwort|kennwort|contrasena|motdepasse|qwertyuiop|qwertzuiop|asdfghjkl|yxcvbnm"
     "|zxcvbnm|azertyuiop|qwerty|qwertz|azerty|letmein|welcome|willkommen|iloveyou|administrator|admin"
@@ -39,7 +44,8 @@ def weakness(password: str, name: str = "") -> str | None:
 
     A good one has 12 to 256 characters, 6 different ones, and at least 4 characters are left when
     common words, the name of the account, sequences (``1234``, ``qwer``) and repetitions are taken
-    out.
+    out; and it stands 100 million guesses of somebody who tries leaked passwords, names, words
+    and dates first, as zxcvbn estimates it.
     """
     text = normal(password)
     if len(text) < SHORTEST:
@@ -51,7 +57,22 @@ def weakness(password: str, name: str = "") -> str | None:
     for plain in (text.casefold(), _plain(text.casefold())):
         if len(_left(plain, name.casefold())) < _FEWEST_LEFT:
             return "it is made of words and sequences that are tried first"
+    if _is_guessed(text, name):
+        return "it is like passwords that are tried first"
     return None
+
+
+def _is_guessed(text: str, name: str) -> bool:
+    """Tell whether both the beginning and the end are found with few guesses."""
+    from zxcvbn import zxcvbn  # it reads lists of words when it is imported
+
+    known = [*_COMMON.split("|")[1:], *_parts(name.casefold())]
+    for piece in {text[:_LOOKED_AT], text[-_LOOKED_AT:]}:
+        if len({char for char in piece if not char.isalpha()}) > _MOST_SIGNS:
+            return False
+        if zxcvbn(piece, known)["guesses"] >= _FEWEST_GUESSES:
+            return False
+    return True
 
 
 def _left(text: str, name: str) -> str:

@@ -84,6 +84,8 @@ class Alarms:
         while True:
             try:
                 await asyncio.to_thread(self.sender.step)
+            except AmberboxError as error:
+                logging.getLogger(__name__).error("the outbox waits: %s", error.what)
             except Exception:  # the messages are still there, whatever it was
                 logging.getLogger(__name__).exception("the outbox could not be emptied")
             await asyncio.sleep(_TICK_S)

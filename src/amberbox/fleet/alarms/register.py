@@ -12,6 +12,7 @@ from sqlalchemy import ColumnElement, Connection, RowMapping, Table, select, upd
 from amberbox.fleet.alarms.alarm import Alarm, Entry, Part, Step
 from amberbox.fleet.alarms.tables import ALARM, ALARM_ROBOT, BLOCKED, HISTORY, PART, ROOTS
 from amberbox.fleet.database.upsert import upsert
+from amberbox.fleet.notifying.followups import note_change
 
 _TEXT = 2_000
 _LISTS = frozenset({"blocked_by", "components", "words"})
@@ -73,6 +74,7 @@ class Register:
             statement = update(ALARM).where(ALARM.c.number == alarm.number)
             self.connection.execute(statement.values(**_cut(values, ALARM)))
             self.touched.add(alarm.number)
+            note_change(self.connection, before, alarm)
         self.note(alarm.number, entries)
         return alarm
 

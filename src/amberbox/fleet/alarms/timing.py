@@ -16,6 +16,7 @@ from amberbox.fleet.alarms.register import Register
 from amberbox.fleet.alarms.reports import Report
 from amberbox.fleet.alarms.settings import AlarmSettings
 from amberbox.fleet.alarms.tables import ALARM, ALARM_ROBOT
+from amberbox.fleet.notifying import followups
 from amberbox.fleet.notifying.outbox import Told, put
 from amberbox.fleet.notifying.settings import NAME, Notifications
 from amberbox.fleet.options.options import read
@@ -42,7 +43,7 @@ def is_due(connection: Connection, now_ns: int, settings: AlarmSettings) -> bool
     """Tell whether something happens to an alarm by itself now."""
     over = and_(ALARM.c.state != "resolved", _is_over(now_ns, settings))
     chosen = select(ALARM.c.number).where(or_(over, _is_to_be_told(now_ns, settings))).limit(1)
-    return connection.execute(chosen).first() is not None
+    return connection.execute(chosen).first() is not None or followups.is_due(connection, now_ns)
 
 
 def _is_over(now_ns: int, settings: AlarmSettings) -> ColumnElement[bool]:
@@ -65,6 +66,10 @@ def pass_time(
         register.keep(alarm, machine.settled(alarm, now_ns, settings))
     for alarm in register.alarms(_is_to_be_told(now_ns, settings))[:_AT_ONCE]:
         _tell(register, late, alarm, now_ns, settings, url)
+    if followups.is_due(register.connection, now_ns):
+        setting = read(register.connection, NAME, Notifications)
+        stays_ns = settings.ns("reopen_s")
+        followups.follow_up(register.connection, register.alarm, now_ns, stays_ns, setting, url)
 
 
 def _tell(

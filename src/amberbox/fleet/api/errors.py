@@ -15,7 +15,7 @@ from amberbox.core.errors import AmberboxError, UsageError
 from amberbox.fleet.accounts.passwords import TooManyError
 from amberbox.fleet.accounts.signin import MustWaitError, WrongLoginError
 from amberbox.fleet.asking.errors import BrokenError, BusyError
-from amberbox.fleet.database.database import DatabaseBusyError
+from amberbox.fleet.database.database import DatabaseBusyError, DatabaseDamagedError
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,6 +69,7 @@ _STATUS: Mapping[type[AmberboxError], int] = {
     TooManyError: 503,
     WrongLoginError: 401,
     DatabaseBusyError: 503,
+    DatabaseDamagedError: 503,
     BusyError: 503,
     BrokenError: 500,
     UsageError: 400,

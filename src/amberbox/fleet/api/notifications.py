@@ -31,7 +31,7 @@ class Notification:
 
     number: int
     destination: str
-    kind: Literal["alarm", "digest"]
+    kind: Literal["alarm", "acknowledged", "resolved", "digest"]
     alarm: int | None
     severity: str
     state: Fate

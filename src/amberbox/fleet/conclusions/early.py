@@ -12,6 +12,7 @@ from amberbox.fleet.archive.catalogue import COMMITTED
 from amberbox.fleet.archive.tables import JOURNALS
 from amberbox.fleet.conclusions.columns import Span
 from amberbox.fleet.conclusions.entry import Entry
+from amberbox.fleet.conclusions.findings import fits
 from amberbox.fleet.linkend.presence import short
 from amberbox.fleet.linkend.tables import ASIDE, BOOT, ROW, RUN
 
@@ -66,6 +67,8 @@ def _entries(rows: Iterable[Row[Any]]) -> list[Entry]:
             values = msgspec.json.decode(row.data, type=dict[str, Any])
         except msgspec.MsgspecError:
             continue  # kept as it came, but nothing that could be shown
+        if not fits(values):
+            continue
         why = getattr(row, "why", "")
         found.append(
             Entry(row.channel, row.log_ns, row.log_ns, row.store_id, row.writer, row.run, row.seq,

@@ -22,13 +22,50 @@ from amberbox.fleet.database.migrations import MIGRATIONS
 from amberbox.fleet.database.schema import Migration, check_version, prepare
 
 FILE = "server.db"
+FOLDER = "amberbox_folder"
+"""The option of a connection that says in which folder its database lies."""
 BUSY_S = 10.0
 _READERS = 48
 _BEGIN = "amberbox_begin"
+_DAMAGE = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
+_LOOK = "look at the disk: is it full, or read-only? then try again"
 
 
 class DatabaseBusyError(AmberboxError):
     """The database cannot do this now: somebody else writes, or the disk is full or failing."""
+
+
+class DatabaseDamagedError(AmberboxError):
+    """The file is damaged: nothing that is read from it or written to it can be relied on."""
+
+    def __init__(self, path: Path, what: object) -> None:
+        super().__init__(
+            f"{path} is damaged: {what}",
+            "stop the server, move this file and those beside it (-wal, -shm) away, and put a copy "
+            "from a backup in its place (docs/serve.md, 'Restore')",
+        )
+
+
+def refuse_damaged(path: Path) -> None:
+    """Read a database once as a whole, if there is one; raises DatabaseDamagedError.
+
+    It takes as long as to read the file from the disk.
+    """
+    if not path.is_file() or not path.stat().st_size:
+        return
+    try:
+        connection = sqlite3.connect(f"file:{quote(str(path.absolute()))}?mode=rw", uri=True)
+        try:
+            connection.execute(f"PRAGMA busy_timeout={BUSY_S * 1000:.0f}")
+            found = [str(row[0]) for row in connection.execute("PRAGMA quick_check(3)")]
+        finally:
+            connection.close()
+    except sqlite3.OperationalError as error:
+        raise DatabaseBusyError(f"{path}: {error}", _LOOK) from error
+    except sqlite3.DatabaseError as error:
+        raise DatabaseDamagedError(path, error) from error
+    if found != ["ok"]:
+        raise DatabaseDamagedError(path, "; ".join(" ".join(found).splitlines()[:3]))
 
 
 class Database:
@@ -50,6 +87,8 @@ class Database:
         migrations: Sequence[Migration] = MIGRATIONS,
     ) -> None:
         self.path = path
+        self.damage: DatabaseDamagedError | None = None
+        """Set once a transaction has met damage in the file."""
         self._writing = threading.Lock()
         if not read_only:
             _make_private(path)
@@ -95,13 +134,29 @@ class Database:
             ):
                 yield connection
         except OperationalError as error:
-            hint = "look at the disk: is it full, or read-only? then try again"
-            raise DatabaseBusyError(f"{self.path}: {error.orig}", hint) from error
-        except DatabaseError as error:
-            if type(error) is not DatabaseError:
+            raise DatabaseBusyError(f"{self.path}: {error.orig}", _LOOK) from error
+        except (DatabaseError, sqlite3.DatabaseError) as error:
+            # what fails while a connection is made comes as the driver says it
+            cause = error.orig if isinstance(error, DatabaseError) else error
+            if getattr(cause, "sqlite_errorcode", 0) & 0xFF not in _DAMAGE:
                 raise
-            hint = "restore the file from a copy"
-            raise AmberboxError(f"{self.path} is damaged: {error.orig}", hint) from error
+            self.damage = DatabaseDamagedError(self.path, cause)
+            raise self.damage from error
+
+    def forget_deleted(self) -> None:
+        """Leave nothing of what was overwritten: in free places of the file, or in its log.
+
+        Raises DatabaseBusyError, for instance where the disk has no room for a second copy.
+        """
+        connection = sqlite3.connect(self.path, isolation_level=None)
+        try:
+            connection.execute(f"PRAGMA busy_timeout={BUSY_S * 1000:.0f}")
+            connection.execute("VACUUM")
+            connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+        except sqlite3.OperationalError as error:
+            raise DatabaseBusyError(f"{self.path}: {error}", _LOOK) from error
+        finally:
+            connection.close()
 
     def close(self) -> None:
         """Close all connections."""
@@ -121,7 +176,10 @@ def _make_private(path: Path) -> None:
 def _engine(path: Path, read_only: bool) -> Engine:
     address = f"file:{quote(str(path.absolute()))}?mode={'ro' if read_only else 'rw'}"
     connect = partial(sqlite3.connect, address, uri=True, check_same_thread=False)
-    engine = create_engine("sqlite://", creator=connect, poolclass=QueuePool, pool_size=_READERS)
+    engine = create_engine(
+        "sqlite://", creator=connect, poolclass=QueuePool, pool_size=_READERS,
+        execution_options={FOLDER: path.absolute().parent},
+    )  # fmt: skip
     event.listen(engine, "connect", _configure_reader if read_only else _configure)
     event.listen(engine, "begin", _begin)
     return engine

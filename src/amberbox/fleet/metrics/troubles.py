@@ -6,6 +6,8 @@ from sqlalchemy import Connection, select
 
 from amberbox.fleet.archive.suspects import KIND
 from amberbox.fleet.linkend.tables import EVENT
+from amberbox.fleet.notifying.settings import LOST_HINT, NAME, Notifications
+from amberbox.fleet.options.options import read
 from amberbox.fleet.services import Services
 from amberbox.fleet.state.damaged import NEW_NS, damaged_files
 
@@ -18,11 +20,14 @@ def troubles(services: Services) -> list[str]:
         now_ns = services.clock.wall_ns()
         damaged = damaged_files(connection, now_ns)
         refused = _refused(connection, now_ns - NEW_NS)
+        notified = read(connection, NAME, Notifications)
     lately = {robot: one.new for robot, one in damaged.items() if one.new}
     files = sum(lately.values())
     what = "1 file was" if files == 1 else f"{files} files were"
     whose = ", ".join(sorted(lately))
     said = [f"{what} damaged and set aside in the last 24 hours, of {whose}"] if files else []
+    if notified.has_lost_secrets:
+        said.append(f"secrets of notifications cannot be read: {LOST_HINT}")
     return [*services.keeping.troubles(), *said, *refused]
 
 

@@ -16,8 +16,17 @@ from typing import Final, TypeAlias
 from urllib.parse import urlsplit
 
 from amberbox.core.clock import NS
-from amberbox.fleet.notifying.message import Message, plain
-from amberbox.fleet.notifying.settings import Destination, Email, Notifications, Smtp, Webhook
+from amberbox.core.showing import one_line
+from amberbox.fleet.notifying.message import Message
+from amberbox.fleet.notifying.settings import (
+    LOST_HINT,
+    Destination,
+    Email,
+    Notifications,
+    Smtp,
+    Webhook,
+)
+from amberbox.fleet.options.vault import LOST
 
 TIMEOUT_S: Final = 10.0
 SIGNATURE: Final = "Amberbox-Signature"
@@ -30,6 +39,8 @@ Deliver: TypeAlias = Callable[[Destination, Message, Notifications, int], str]
 def deliver(to: Destination, message: Message, setting: Notifications, now_ns: int) -> str:
     """Deliver a message; return what went wrong in a line, empty if it arrived."""
     try:
+        if LOST in (to.secret if isinstance(to, Webhook) else "", _password(to, setting)):
+            return f"its secret cannot be read: {LOST_HINT}"
         if isinstance(to, Webhook):
             return _post(to, message, now_ns)
         if setting.smtp is None:
@@ -37,7 +48,11 @@ def deliver(to: Destination, message: Message, setting: Notifications, now_ns: i
         return _mail(to, message, setting.smtp, now_ns)
     except (OSError, ValueError, smtplib.SMTPException, http.client.HTTPException) as error:
         # a host may be no name at all, which is a ValueError
-        return plain(f"{type(error).__name__}: {error}")[:500]
+        return one_line(f"{type(error).__name__}: {error}")[:500]
+
+
+def _password(to: Destination, setting: Notifications) -> str:
+    return "" if setting.smtp is None or isinstance(to, Webhook) else setting.smtp.password
 
 
 def _mail(to: Email, message: Message, smtp: Smtp, now_ns: int) -> str:
@@ -59,11 +74,13 @@ def _mail(to: Email, message: Message, smtp: Smtp, now_ns: int) -> str:
 
 def _email(to: Email, message: Message, smtp: Smtp, now_ns: int) -> EmailMessage:
     mail = EmailMessage()
-    mail["Subject"] = plain(f"[amberbox] {message.subject}")
+    mail["Subject"] = one_line(f"[amberbox] {message.subject}")
     mail["From"] = smtp.sender
     mail["To"] = ", ".join(to.to)
     mail["Date"] = format_datetime(datetime.fromtimestamp(now_ns // NS, UTC))
     mail["Message-ID"] = f"<{message.key}@amberbox.invalid>"
+    if message.thread and message.thread != message.key:
+        mail["In-Reply-To"] = mail["References"] = f"<{message.thread}@amberbox.invalid>"
     mail["Auto-Submitted"] = "auto-generated"
     mail.set_content(message.body + "\n")
     return mail

@@ -12,11 +12,21 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
-from sqlalchemy import ColumnElement, Connection, RowMapping, func, or_, select, update
+from sqlalchemy import (
+    ColumnElement,
+    Connection,
+    RowMapping,
+    and_,
+    exists,
+    func,
+    or_,
+    select,
+    update,
+)
 
 from amberbox.core.clock import NS
 from amberbox.fleet.alarms.alarm import Alarm, is_worse, rank_of
-from amberbox.fleet.notifying.message import Message, body_of, data_of, subject_of
+from amberbox.fleet.notifying.message import Event, Message, body_of, data_of, subject_of
 from amberbox.fleet.notifying.settings import Destination, Notifications
 from amberbox.fleet.notifying.tables import OUTBOX
 
@@ -36,16 +46,21 @@ class Told:
     robots: dict[str, frozenset[str]]
 
 
+@dataclass(frozen=True, slots=True)
+class Telling:
+    """What one destination is told of an alarm, and of which of its robots."""
+
+    alarm: Alarm
+    robots: Sequence[str]
+    event: Event = "opened"
+
+
 def put(connection: Connection, told: Told, now_ns: int, setting: Notifications, url: str) -> int:
     """Put a message about an alarm into the outbox for each who wants it; return how many."""
-    rows = [
-        _row(connection, one, told, names, now_ns, setting, url)
-        for one in setting.destinations()
-        if (names := _seen(one, told))
-    ]
-    if rows:
-        connection.execute(OUTBOX.insert(), rows)
-    return len(rows)
+    wanted = [(one, names) for one in setting.destinations() if (names := _seen(one, told))]
+    for one, names in wanted:
+        enter(connection, one, Telling(told.alarm, names), now_ns, setting, url)
+    return len(wanted)
 
 
 def _seen(one: Destination, told: Told) -> list[str]:
@@ -56,29 +71,56 @@ def _seen(one: Destination, told: Told) -> list[str]:
     return [name for name, of in sorted(told.robots.items()) if not groups or groups & of]
 
 
-def _row(
+def enter(
     connection: Connection,
     one: Destination,
-    told: Told,
-    names: Sequence[str],
+    told: Telling,
     now_ns: int,
     setting: Notifications,
     url: str,
-) -> dict[str, Any]:
+) -> None:
+    """Put one message into the outbox; it is held in quiet hours, and when there are many."""
     alarm = told.alarm
     quiet_ns = None if one.quiet is None else one.quiet.until_ns(now_ns)
     if quiet_ns is not None and one.quiet and not is_worse(one.quiet.but, alarm.severity):
         quiet_ns = None
     many = _recent(connection, one.name, now_ns, setting) >= setting.digest_above
-    held = quiet_ns is not None or many
-    return {
-        "key": secrets.token_hex(16), "destination": one.name, "kind": "alarm",
+    behind = told.event != "opened" and _is_held(connection, one.name, alarm.number)
+    held = quiet_ns is not None or many or behind
+    key = secrets.token_hex(16)
+    data = data_of(alarm, told.robots, url, told.event)
+    data["dedup_key"] = _first_key(connection, one.name, alarm.number) or key
+    connection.execute(OUTBOX.insert(), [{
+        "key": key, "destination": one.name,
+        "kind": "alarm" if told.event == "opened" else told.event,
         "alarm": alarm.number, "severity": alarm.severity, "state": "held" if held else "waiting",
-        "subject": subject_of(alarm), "body": body_of(alarm, url, now_ns),
-        "data": json.dumps(data_of(alarm, names, url)), "created_ns": now_ns,
+        "subject": subject_of(alarm, told.event), "body": body_of(alarm, url, now_ns, told.event),
+        "data": json.dumps(data), "created_ns": now_ns,
         "due_ns": quiet_ns or now_ns + (_GATHER_NS if many else 0), "tries": 0, "trouble": "",
         "sent_ns": None,
-    }  # fmt: skip
+    }])  # fmt: skip
+
+
+def _first_key(connection: Connection, destination: str, number: int) -> str:
+    """Return the key of the first message about an alarm to a destination, empty for none.
+
+    It stays when later messages follow, so receivers know by it what belongs together.
+    """
+    chosen = (
+        select(OUTBOX.c.key)
+        .where(OUTBOX.c.alarm == number, OUTBOX.c.destination == destination)
+        .order_by(OUTBOX.c.number)
+        .limit(1)
+    )
+    return str(connection.execute(chosen).scalar() or "")
+
+
+def _is_held(connection: Connection, destination: str, number: int) -> bool:
+    """Tell whether something about an alarm waits for a digest: what follows comes with it."""
+    chosen = select(OUTBOX.c.number).where(
+        OUTBOX.c.alarm == number, OUTBOX.c.destination == destination, OUTBOX.c.state == "held"
+    )
+    return connection.execute(chosen.limit(1)).first() is not None
 
 
 def _recent(connection: Connection, destination: str, now_ns: int, setting: Notifications) -> int:
@@ -86,7 +128,7 @@ def _recent(connection: Connection, destination: str, now_ns: int, setting: Noti
     since_ns = now_ns - round(setting.digest_s * NS)
     chosen = select(func.count()).where(
         OUTBOX.c.destination == destination, OUTBOX.c.created_ns > since_ns,
-        OUTBOX.c.kind == "alarm",
+        OUTBOX.c.kind != "digest",
     )  # fmt: skip
     return int(connection.execute(chosen).scalar_one())
 
@@ -129,6 +171,8 @@ def _last_digest_ns(connection: Connection, destination: str) -> int:
 
 
 def _digest(destination: str, rows: Sequence[RowMapping], now_ns: int) -> dict[str, Any]:
+    ends = {row["alarm"]: row["number"] for row in rows if row["kind"] != "alarm"}
+    rows = [row for row in rows if row["number"] >= ends.get(row["alarm"], 0)]  # the last word
     shown = "\n\n".join(row["body"] for row in rows[:_LISTED])
     more = f"\n\nand {len(rows) - _LISTED} more" if len(rows) > _LISTED else ""
     alarms = [json.loads(row["data"]) for row in rows[:_LISTED]]
@@ -147,11 +191,38 @@ def due(connection: Connection, now_ns: int, most: int = 20) -> list[RowMapping]
     """Return messages that are to be delivered now, oldest first."""
     chosen = (
         select(OUTBOX)
-        .where(OUTBOX.c.state == "waiting", _is_due(now_ns))
+        .where(OUTBOX.c.state == "waiting", _is_due(now_ns), ~_is_behind())
         .order_by(OUTBOX.c.due_ns, OUTBOX.c.number)
         .limit(most)
     )
     return list(connection.execute(chosen).mappings())
+
+
+def _is_behind() -> ColumnElement[bool]:
+    """Judge whether an earlier message about the same alarm has to arrive first."""
+    earlier, other = OUTBOX.alias(), OUTBOX.alias()
+    in_digest = exists().where(
+        other.c.alarm == OUTBOX.c.alarm, other.c.destination == OUTBOX.c.destination,
+        other.c.state == "digested", other.c.number < earlier.c.number,
+    )  # fmt: skip
+    same = earlier.c.alarm == OUTBOX.c.alarm
+    return exists().where(
+        OUTBOX.c.kind != "digest", earlier.c.state == "waiting",
+        earlier.c.destination == OUTBOX.c.destination, earlier.c.number < OUTBOX.c.number,
+        or_(same, and_(earlier.c.kind == "digest", in_digest)),
+    )  # fmt: skip
+
+
+def drop_untold(connection: Connection) -> None:
+    """Give up what became of alarms that their destination was never told of: that has failed."""
+    first = OUTBOX.alias()
+    told = exists().where(
+        first.c.alarm == OUTBOX.c.alarm, first.c.destination == OUTBOX.c.destination,
+        first.c.kind == "alarm", first.c.state != "failed",
+    )  # fmt: skip
+    follows = OUTBOX.c.kind.in_(("acknowledged", "resolved"))
+    gone = update(OUTBOX).where(OUTBOX.c.state.in_(("waiting", "held")), follows, ~told)
+    connection.execute(gone.values(state="failed", trouble="the alarm itself did not arrive"))
 
 
 def _is_due(now_ns: int) -> ColumnElement[bool]:
@@ -161,7 +232,8 @@ def _is_due(now_ns: int) -> ColumnElement[bool]:
 
 def message_of(row: RowMapping) -> Message:
     """Return a message as it is delivered."""
-    return Message(row["key"], row["subject"], row["body"], json.loads(row["data"]))
+    data = json.loads(row["data"])
+    return Message(row["key"], row["subject"], row["body"], data, data.get("dedup_key", ""))
 
 
 def delivered(connection: Connection, numbers: Iterable[int], now_ns: int) -> None:
@@ -180,3 +252,10 @@ def troubled(
     values = {"tries": tries, "trouble": trouble[:500], "due_ns": now_ns + wait_ns,
               "state": "failed" if failed else "waiting"}  # fmt: skip
     connection.execute(update(OUTBOX).where(OUTBOX.c.number == row["number"]).values(**values))
+    if failed and row["kind"] == "digest":
+        numbers = [one["id"] for one in json.loads(row["data"])["alarms"]]
+        lost = update(OUTBOX).where(
+            OUTBOX.c.destination == row["destination"], OUTBOX.c.alarm.in_(numbers),
+            OUTBOX.c.state == "digested", OUTBOX.c.number < row["number"],
+        )  # fmt: skip
+        connection.execute(lost.values(state="failed", trouble="its digest did not arrive"))

@@ -45,6 +45,7 @@ class Sender:
             if not waiting and not outbox.held(connection, now_ns):
                 return 0
         with self.database.begin() as connection:
+            outbox.drop_untold(connection)
             outbox.gather(connection, now_ns, setting)
             waiting = outbox.due(connection, now_ns)
         of: dict[str, list[RowMapping]] = {}

@@ -14,10 +14,19 @@ import msgspec
 
 from amberbox.core.clock import NS
 from amberbox.core.redaction import MASK
+from amberbox.fleet.options.vault import LOST
 from amberbox.monitoring.plan import Severity
 
 NAME: Final = "notifications"
 """Under this name it is kept among the settings."""
+
+LOST_HINT: Final = (
+    "the file secrets.key of the server's folder is missing, or another one; put it back, or enter "
+    "them again in the settings"
+)
+
+Also: TypeAlias = Literal["acknowledged", "resolved"]
+"""What else a destination may be told of alarms that it was told of."""
 
 _ADDRESS = re.compile(r"[^\s@<>,;:\"]{1,64}@[A-Za-z0-9.-]{1,190}")
 _HOST = re.compile(r"[A-Za-z0-9.:_-]{1,253}")
@@ -78,17 +87,22 @@ class Quiet(msgspec.Struct, frozen=True, rename={"from_": "from"}):
 
 @dataclass(frozen=True, slots=True)
 class Email:
-    """Somebody who gets mails about alarms of ``groups`` (none: all) from ``least`` on."""
+    """Somebody who gets mails about alarms of ``groups`` (none: all) from ``least`` on.
+
+    ``also`` asks for messages when such an alarm is acknowledged or resolved.
+    """
 
     name: str
     to: tuple[str, ...]
     least: Severity = "urgent"
     groups: tuple[str, ...] = ()
     quiet: Quiet | None = None
+    also: tuple[Also, ...] = ()
 
     def __post_init__(self) -> None:
         """Refuse addresses that are none; raises ValueError."""
         _check_name(self.name)
+        _check_also(self.also)
         for address in self.to:
             if not _ADDRESS.fullmatch(address):
                 raise ValueError(f"to: {address!r} is no address")
@@ -106,10 +120,12 @@ class Webhook:
     least: Severity = "warning"
     groups: tuple[str, ...] = ()
     quiet: Quiet | None = None
+    also: tuple[Also, ...] = ()
 
     def __post_init__(self) -> None:
         """Refuse addresses that are none of a program; raises ValueError."""
         _check_name(self.name)
+        _check_also(self.also)
         check_url(self.url)
         if len(self.secret) < 16:
             raise ValueError("secret: 16 characters at least; enter it again for another address")
@@ -142,6 +158,12 @@ class Notifications:
     def destinations(self) -> tuple[Destination, ...]:
         """Return all who are told."""
         return (*self.emails, *self.webhooks)
+
+    @property
+    def has_lost_secrets(self) -> bool:
+        """Whether a secret in it could not be read."""
+        password = "" if self.smtp is None else self.smtp.password
+        return LOST in (password, *(one.secret for one in self.webhooks))
 
     def destination(self, name: str) -> Destination | None:
         """Return who has this name."""
@@ -187,6 +209,11 @@ def _is_odd(address: ipaddress.IPv4Address | ipaddress.IPv6Address) -> bool:
     """Tell whether an address is nobody's: unspecified, multicast, or link-local (metadata)."""
     plain = getattr(address, "ipv4_mapped", None) or address
     return bool(plain.is_unspecified or plain.is_multicast or plain.is_link_local)
+
+
+def _check_also(also: tuple[Also, ...]) -> None:
+    if len(set(also)) != len(also):
+        raise ValueError("also: each of acknowledged and resolved once at most")
 
 
 def _check_name(name: str) -> None:

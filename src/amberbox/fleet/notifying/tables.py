@@ -29,5 +29,14 @@ OUTBOX = Table(
     Index(None, "state", "due_ns"),
     Index(None, "destination", "created_ns"),
 )
-"""Messages. ``kind``: alarm or digest. ``state``: waiting, held (for a digest), sent, failed,
-digested. ``key`` names a message to who gets it, the same at every attempt."""
+"""Messages. ``kind``: alarm, acknowledged, resolved or digest. ``state``: waiting, held (for a
+digest), sent, failed, digested. ``key`` names a message to who gets it, the same at every
+attempt."""
+
+CHANGED = Table(
+    "notification_changed",
+    METADATA,
+    Column("alarm", BigInteger, primary_key=True, autoincrement=False),
+    Column("due_ns", Time, nullable=False, index=True),
+)
+"""Alarms that somebody was told of and whose state has changed since: when to look at them."""

@@ -7,10 +7,11 @@ from typing import Any
 
 from amberbox.core.errors import UsageError
 from amberbox.core.redaction import MASK, sounds_secret
+from amberbox.fleet.options.vault import LOST
 
 
 def masked(value: Any) -> Any:
-    """Return what JSON can hold, with secrets masked that are not empty."""
+    """Return what JSON can hold, with secrets masked that are not empty; lost ones are empty."""
     if isinstance(value, Mapping):
         return {key: _cover(key, inner) for key, inner in value.items()}
     return [masked(inner) for inner in value] if isinstance(value, list | tuple) else value
@@ -34,12 +35,14 @@ def unmasked(value: Any, before: Any) -> Any:
 
 
 def _cover(key: str, value: Any) -> Any:
-    return MASK if sounds_secret(key) and isinstance(value, str) and value else masked(value)
+    if not (sounds_secret(key) and isinstance(value, str) and value):
+        return masked(value)
+    return "" if value == LOST else MASK
 
 
 def _uncover(key: str, value: Any, before: Any) -> Any:
     if sounds_secret(key) and value == MASK:
-        if isinstance(before, str) and before:
+        if isinstance(before, str) and before and before != LOST:
             return before
         raise UsageError(
             f"the {key} is masked, and there is none to keep",

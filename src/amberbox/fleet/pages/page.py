@@ -14,6 +14,7 @@ from markupsafe import Markup
 from starlette.responses import HTMLResponse, Response
 
 from amberbox import __version__
+from amberbox.core.showing import visible
 from amberbox.core.timetext import format_time
 from amberbox.fleet.accounts.sessions import csrf_token
 from amberbox.fleet.api.access import Caller, Decorator, Open, Routes, caller_of, services_of
@@ -67,7 +68,7 @@ def environment() -> Environment:
     """Return what makes pages of templates: everything is escaped, nothing may be missing."""
     made = Environment(
         loader=FileSystemLoader(TEMPLATES), autoescape=True, undefined=StrictUndefined,
-        trim_blocks=True, lstrip_blocks=True,
+        trim_blocks=True, lstrip_blocks=True, finalize=_shown,
     )  # fmt: skip
     made.globals.update(
         t=catalogue().text, asset=assets.address, version=__version__, severities=SEVERITIES,
@@ -80,6 +81,11 @@ def environment() -> Environment:
     )  # fmt: skip
     made.globals["m"] = made.get_template("macros.html").module
     return made
+
+
+def _shown(value: Any) -> Any:
+    """Write out what a text hides; what was escaped before was shown before."""
+    return visible(value) if type(value) is str else value
 
 
 def as_json(value: Any) -> Markup:

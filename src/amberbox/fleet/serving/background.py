@@ -6,6 +6,7 @@ import asyncio
 import logging
 from collections.abc import Sequence
 
+from amberbox.core.errors import AmberboxError
 from amberbox.fleet.part import Part
 from amberbox.link.backoff import Backoff
 
@@ -22,6 +23,9 @@ async def keep_running(part: Part, backoff: Backoff | None = None) -> None:
         try:
             await part.run()
             return
+        except AmberboxError as error:  # the database is busy or damaged, the disk is full
+            name = type(part).__name__
+            logging.getLogger(__name__).error("%s failed and starts again: %s", name, error.what)
         except Exception:  # a defect of one part must not take the server down
             name = type(part).__name__
             logging.getLogger(__name__).exception("%s failed and starts again", name)

@@ -15,6 +15,7 @@ import uvicorn
 
 from amberbox.blackbox.service import Notifier
 from amberbox.core.errors import AmberboxError
+from amberbox.fleet.database.database import Database
 from amberbox.fleet.linkend.server import LinkServer
 from amberbox.fleet.services import Services
 from amberbox.fleet.serving import assembly, background
@@ -30,6 +31,7 @@ GRACE_S = 3.0
 """So long requests that have begun may take when the server is to end."""
 _BYE_S = 1.0
 _BACKLOG = 2048
+_LOOK_S = 1.0
 _FILES = 65_536
 _PONG_S = 90.0
 """A pong stands behind what its sender said before; under load that is not read at once, and to end
@@ -69,7 +71,10 @@ def listen(settings: Settings) -> socket.socket:
 
 
 async def serve(services: Services, port: socket.socket, told: Told | None = None) -> None:
-    """Answer until SIGTERM or Ctrl-C; then say goodbye to robots, and end within seconds."""
+    """Answer until SIGTERM or Ctrl-C; then say goodbye to robots, and end within seconds.
+
+    Raises DatabaseDamagedError, after the same orderly end, when the database turns out damaged.
+    """
     told, stop, notifier = told or Told(), asyncio.Event(), Notifier()
     served = wrapped(services)
     server = _Server(_config(served.app, services.settings))
@@ -79,13 +84,15 @@ async def serve(services: Services, port: socket.socket, told: Told | None = Non
     answering = asyncio.create_task(server.serve([port]))
     alive = asyncio.create_task(_stay_alive(server, notifier, services.links))
     stopping = asyncio.create_task(stop.wait())
+    damaged = asyncio.create_task(_until_damaged(services.database))
     try:
         await _until_started(server, answering)
         gc.freeze()  # what is there now stays: the collector need not look at it each time
         gc.enable()
         told.ready(int(port.getsockname()[1]))
         notifier.ready()
-        await asyncio.wait([answering, stopping], return_when=asyncio.FIRST_COMPLETED)
+        ends = [answering, stopping, damaged]
+        await asyncio.wait(ends, return_when=asyncio.FIRST_COMPLETED)
     finally:
         told.stopping()
         notifier.stopping("ending connections")
@@ -93,12 +100,20 @@ async def serve(services: Services, port: socket.socket, told: Told | None = Non
         server.should_exit = True
         await asyncio.wait([answering])
         services.asking.close()  # threads that wait for an answer would hold up the loop's end
-        for task in (alive, stopping):
+        for task in (alive, stopping, damaged):
             task.cancel()
         await background.end(parts)
         served.log.close()
+    if services.database.damage is not None:
+        raise services.database.damage
     if not stop.is_set():
         answering.result()
+
+
+async def _until_damaged(database: Database) -> None:
+    """Wait until damage of the database has shown itself: what is taken then may be lost."""
+    while database.damage is None:
+        await asyncio.sleep(_LOOK_S)
 
 
 async def say_goodbye(links: LinkServer) -> None:

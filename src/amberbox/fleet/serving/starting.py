@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import logging
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -11,10 +12,13 @@ from pathlib import Path
 
 from amberbox.core.clock import Clock, SystemClock
 from amberbox.core.errors import AmberboxError
+from amberbox.core.files import keep_to_group
 from amberbox.fleet.accounts.passwords import Passwords
 from amberbox.fleet.accounts.setupcode import SetupCode, needs_setup, new_setup_code
+from amberbox.fleet.database.database import FILE, DatabaseBusyError, refuse_damaged
 from amberbox.fleet.database.lock import ServerLock
 from amberbox.fleet.demonstration import Demonstration
+from amberbox.fleet.options.options import seal_plain
 from amberbox.fleet.services import Services
 from amberbox.fleet.serving import app, assembly, certificates, process
 from amberbox.fleet.serving.binding import Wanted, settings_of
@@ -50,8 +54,10 @@ def run(
     Raises UsageError when another server has the folder, or what is wanted is not safe.
     """
     clock = clock or SystemClock()
+    keep_to_group()
     make_folder(folder)
     with _locked(folder, clock):
+        refuse_damaged(folder / FILE)
         renewed = Files(folder).are_there and certificates.renew(folder, clock.wall_ns())
         settings = settings_of(folder, wanted)
         port = process.listen(settings)
@@ -90,10 +96,20 @@ def make_folder(folder: Path) -> None:
 
 
 def _prepared(services: Services, *, new_code: bool) -> SetupCode | None:
-    """Write down how the server is reached; make a code where one is needed or wanted."""
+    """Write down how the server is reached; make a code where one is needed or wanted.
+
+    Secrets of settings that an earlier version kept in plain text are encrypted.
+    """
     with services.database.begin() as connection:
         note_reached(connection, services.clock.wall_ns(), services.settings)
         is_first = needs_setup(connection)
+        were_plain = seal_plain(connection)
+    if were_plain:
+        try:
+            services.database.forget_deleted()
+        except DatabaseBusyError as error:
+            what = "secrets that were kept in plain text are encrypted, but remains of them may be"
+            logging.getLogger(__name__).warning("%s in free places of %s", what, error.what)
     if not is_first and not new_code:
         return None
     return new_setup_code(services.database, services.clock, services.folder)

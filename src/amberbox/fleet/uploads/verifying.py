@@ -25,6 +25,7 @@ from amberbox.fleet.archive.journal import inspect
 from amberbox.fleet.archive.store import JournalKey
 from amberbox.fleet.asking.memory import limit_memory
 from amberbox.fleet.uploads.content import ContentError, check_content
+from amberbox.link.positions import is_in_range
 from amberbox.link.proof import ProofError, Proven, prove
 from amberbox.link.uploads import Proof
 
@@ -80,7 +81,7 @@ def verify(claim: Claim) -> Result:
         proven = _proven(claim)
         sealed = proven.sealed if proven is not None else None
         checked = check_journal(_target(claim, sealed))
-        return _judged(claim, checked, proven)
+        return _in_range(_judged(claim, checked, proven))
     except ProofError as error:
         return Result(f"its proof does not hold: {error}")
     except ContentError as error:
@@ -91,15 +92,23 @@ def verify(claim: Claim) -> Result:
         return _unreadable(f"it cannot be read: {type(error).__name__}: {error}", proven)
 
 
+def _in_range(result: Result) -> Result:
+    """Refuse a journal whose positions or times no database, column or date can hold."""
+    numbers = (result.run, result.number, result.first_seq, result.end_seq)
+    if is_in_range(*numbers, result.start_ns, result.end_ns):
+        return result
+    return Result("its positions or times are out of range", writer=result.writer)
+
+
 def _unreadable(reason: str, proven: Proven | None) -> Result:
     """Say what a file was that cannot be read, as far as its seal tells."""
     if proven is None:
         return Result(reason)
     seal = proven.sealed
-    return Result(
+    return _in_range(Result(
         reason, False, proven.signed, seal.writer, seal.run, seal.number, seal.first_seq,
         seal.end_seq, seal.start_ns, seal.end_ns,
-    )  # fmt: skip
+    ))  # fmt: skip
 
 
 def _proven(claim: Claim) -> Proven | None:

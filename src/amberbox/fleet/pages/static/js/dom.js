@@ -38,11 +38,20 @@ export const all = (selector, root = document) => [...root.querySelectorAll(sele
  * Set a text only if it is another one: what has not changed is not drawn again. Where there is a
  * text and nothing else it is changed in its place, which costs the browser least.
  */
-export function setText(element, text) {
+export function setText(element, said) {
+  const text = visible(String(said ?? ""));
   const first = element?.firstChild;
   if (first && first === element.lastChild && first.nodeType === Node.TEXT_NODE) {
     if (first.data !== text) first.data = text;
   } else if (element && element.textContent !== text) element.textContent = text;
+}
+
+const HIDDEN = /[\u0000-\u0008\u000b-\u001f\u007f-\u009f\u00ad\u061c\u180e\u200b-\u200f\u2028-\u202e\u2060-\u206f\ufeff\ufff9-\ufffb]/g;
+
+/** Write out what a text hides: controls, marks that reorder it, what has no width. */
+export function visible(text) {
+  const joins = (one, at) => (one === "\u200c" || one === "\u200d") && at > 0 && text.charCodeAt(at - 1) > 127;
+  return text.replace(HIDDEN, (one, at) => (joins(one, at) ? one : `\\u${one.charCodeAt(0).toString(16).padStart(4, "0")}`));
 }
 
 /** Return what a page brought along for its modules. @param {string} id */
@@ -57,7 +66,8 @@ function filled(element, about, inside) {
     if (name.startsWith("on")) element.addEventListener(name.slice(2), value);
     else element.setAttribute(name, value === true ? "" : String(value));
   }
-  element.append(...inside.filter((one) => one !== null && one !== undefined));
+  const there = inside.filter((one) => one !== null && one !== undefined);
+  element.append(...there.map((one) => (typeof one === "string" ? visible(one) : one)));
   return element;
 }
 

@@ -22,6 +22,7 @@ function kind(form, name) {
   if (form.enum) return choice;
   if (form.anyOf) return form.anyOf.some((one) => one.type === "null") ? optional : anything;
   if (form.type === "object") return form.properties ? fieldset : pairs;
+  if (form.type === "array" && form.items.enum) return several;
   if (form.type === "array") return form.items.type === "string" ? words : list;
   if (form.type === "boolean") return check;
   if (form.type === "number" || form.type === "integer") return name.endsWith("_s") ? duration : number;
@@ -64,11 +65,20 @@ function check(_, value, name) {
   return { node: el("label", { class: "field check" }, input, el("span", {}, label(name))), read: () => input.checked };
 }
 
+const word = (one) => (has(`setting.choice.${one}`) ? t(`setting.choice.${one}`) : one);
+
 function choice(form, value, name) {
-  const word = (one) => (has(`setting.choice.${one}`) ? t(`setting.choice.${one}`) : one);
   const order = form.enum.includes("urgent") ? ["warning", "urgent", "critical", "fatal"] : form.enum;
   const select = el("select", {}, ...order.map((one) => el("option", { value: one, selected: one === value }, word(one))));
   return { node: field(name, select), read: () => select.value };
+}
+
+/** Any of a few words, each with a box to tick. */
+function several(form, value, name) {
+  const boxes = form.items.enum.map((one) => [one, el("input", { type: "checkbox", checked: (value ?? []).includes(one) })]);
+  const lines = boxes.map(([one, box]) => el("label", { class: "field check" }, box, el("span", {}, word(one))));
+  const node = el("fieldset", { class: "fields" }, el("legend", {}, label(name)), ...lines, note(name));
+  return { node, read: () => boxes.filter(([, box]) => box.checked).map(([one]) => one) };
 }
 
 function words(_, value, name) {
