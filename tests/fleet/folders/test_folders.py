@@ -129,7 +129,7 @@ def test_what_robots_send_is_read_by_workers_of_its_own(home: House) -> None:
     assert home.services.feed.state.facts.read("ropod_001", A).model == ""
     assert for_people == [] and home.services.preparing.pids
     with pytest.raises(UsageError, match="no packed folder"):
-        kept.keep("ropod_001", B, bX)
+        kept.keep("ropod_001", B, b"nonsense")
 
 
 HOSTILE = st.dictionaries(
