@@ -26,6 +26,17 @@ SOUNDS_SECRET = "(?:" + "|".join(word.replace("_", "[ _-]?") for word in SECRET_
 _SOUNDS_SECRET = re.compile(SOUNDS_SECRET, re.IGNORECASE)
 
 
+def word_with(sounds: str) -> str:
+    """Return a pattern for a word with one of some words in it, ``SOUNDS_SECRET`` or more.
+
+    Found in linear time: a plain ``\\w*secret\\w*`` would try each ``secret`` of a long word, and
+    read on to its end from each. The first one tells as much as the others, but for one with a
+    space or hyphen (``API key``), with which the word goes on beyond what ``\\w*`` takes.
+    """
+    beyond = "|".join(word.replace("_", "[ -]") for word in SECRET_WORDS if "_" in word)
+    return rf"(?:(?>\w*?{sounds})|(?>\w*?(?:{beyond})))\w*+"
+
+
 def sounds_secret(key: str) -> bool:
     """Tell whether what has this name is a secret: ``mqtt_password``, ``apiKey``, ``API key``."""
     return _SOUNDS_SECRET.search(key) is not None
@@ -57,11 +68,16 @@ def likely_secrets(node: Node, key: str = "") -> Iterator[Node]:
 
 
 def redact(text: str, nodes: Iterable[Node]) -> str:
-    """Replace values in the text of their file; comments, layout and anchors stay."""
-    for start, end in sorted({node.span for node in nodes}, reverse=True):
-        if text[start:end].strip():
-            text = text[:start] + _mask(text[start:end]) + text[end:]
-    return text
+    """Replace values in the text of their file; comments, layout and anchors stay.
+
+    Of values within each other the outer one is replaced.
+    """
+    parts, at = [], 0
+    for start, end in sorted({node.span for node in nodes}, key=lambda span: (span[0], -span[1])):
+        if start >= at and text[start:end].strip():
+            parts += [text[at:start], _mask(text[start:end])]
+            at = end
+    return "".join([*parts, text[at:]])
 
 
 def as_plain(value: Any) -> Any:

@@ -42,6 +42,9 @@ class Services:
     desk: Desk
     folders: Folders
     asking: Asking
+    """Answers people."""
+    preparing: Asking
+    """Unpacks and reads what robots send, and explains it before anybody asks."""
     explained: Explained
     jobs: Jobs
     fetches: Fetches

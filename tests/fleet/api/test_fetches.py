@@ -107,7 +107,7 @@ def test_it_is_sent_copied_and_ready(home: House, frames: list[ServerFrame]) -> 
     told(home, [first], lambda: state(home, one)["copied"] == 1)
     assert state(home, one)["state"] == "copying"
     # asked again the robot names only what it still has
-    told(home, [has(one)], lambda: state(home, one)["copied"] == 1)
+    told(home, [has(one, files[1])], lambda: state(home, one)["copied"] == 1)
     second = arrived(home, files[1][0], "quarantined")
     told(home, [second], lambda: state(home, one)["state"] == "ready")
     assert [file["state"] for file in state(home, one)["journals"]] == ["verified", "quarantined"]
@@ -118,6 +118,22 @@ def test_what_the_robot_has_no_more_is_gone(home: House, frames: list[ServerFram
     told(home, [has(one)], lambda: state(home, one)["state"] == "gone")
     told(home, [Change("connected", "ropod_001")], lambda: bool(state(home, one)["ended"]))
     assert one["id"] not in {f.id for f in frames[1:] if isinstance(f, Fetch)}
+
+
+def test_what_the_robot_deletes_before_it_is_copied_is_not_waited_for(
+    home: House, frames: list[ServerFrame]
+) -> None:
+    one = ask(home, item="laser")
+    files = [("journal/000002-a-0000.mcap", 10), ("journal/000002-a-0001.mcap", 20)]
+    told(home, [has(one, *files)], lambda: state(home, one)["state"] == "copying")
+    told(home, [has(one, files[1])], lambda: state(home, one)["copied"] == 1)
+    last = arrived(home, files[1][0])
+    told(home, [last], lambda: state(home, one)["state"] == "ready")
+    assert [file["state"] for file in state(home, one)["journals"]] == ["gone", "verified"]
+    other = ask(home, item="imu")
+    lost = ("journal/000002-a-0002.mcap", 10)
+    told(home, [has(other, lost)], lambda: state(home, other)["state"] == "copying")
+    told(home, [has(other)], lambda: state(home, other)["state"] == "gone")
 
 
 def test_another_robot_cannot_answer(home: House) -> None:
@@ -164,7 +180,7 @@ def test_who_may_ask(home: House) -> None:
 
 def test_a_robot_that_names_ever_more_journals_is_not_believed_for_ever(home: House) -> None:
     def named(start: int) -> list[ledger.File]:
-        return [ledger.File("s", f"journal/{n}", 1) for n in range(start, start + FILES // 2)]
+        return [ledger.File("s", f"journal/{n}", 1) for n in range(start + FILES // 2)]
 
     with home.services.database.begin() as connection:
         one = ledger.add(connection, 1, "ropod_002", "user:x", "", (1, 2))

@@ -18,7 +18,7 @@ import pytest
 from amberbox.core.errors import AmberboxError, UsageError
 from amberbox.fleet.asking import asking as module
 from amberbox.fleet.asking.asking import ANSWER_BYTES, Asking
-from amberbox.fleet.asking.errors import BrokenError, BusyError, LimitError
+from amberbox.fleet.asking.errors import BrokenError, BusyError, CancelledError, LimitError
 from amberbox.fleet.asking.frames import Unpacker, packed
 from amberbox.fleet.asking.pool import Pool
 from amberbox.fleet.asking.question import Question
@@ -97,6 +97,24 @@ def test_a_worker_that_was_killed_is_started_again(asking: Asking) -> None:
     time.sleep(0.1)  # the kernel closes the pipe
     assert asking.ask_now(op("echo"), {"text": "here"}) == b"here"
     assert asking.ask_now(op("echo"), {"text": "here"}) == b"here"
+
+
+def test_one_of_many_keeps_one_worker_at_most(tmp_path: Path) -> None:
+    """What a robot sends may take the longest time there is: others do not wait for it."""
+    pool = Pool(tmp_path, 2, program=PROGRAM, at_once=1)
+    asking = Asking(tmp_path, pool)
+    mine = [Question(op("spin"), {}, lambda part: None, 60, 1 << 30, "bad") for _ in range(3)]
+    for question in mine:
+        pool.put(question)
+    for number in range(3):
+        assert asking.ask_now(op("echo"), {"text": str(number)}, asker="good") == b"%d" % number
+    assert [question.done.running() for question in mine] == [True, False, False]
+    mine[0].cancel()  # the next one of them has its turn then
+    with pytest.raises(CancelledError):
+        mine[0].done.result()
+    assert asking.ask_now(op("echo"), {"text": "still"}, asker="good") == b"still"
+    asking.close()
+    assert all(question.done.done() for question in mine)
 
 
 def test_only_workers_operations_can_be_asked(asking: Asking) -> None:

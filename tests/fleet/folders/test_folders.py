@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
+import msgspec
 import pytest
+import zstandard
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from amberbox.core.clock import NS
 from amberbox.core.errors import UsageError
@@ -13,9 +18,11 @@ from amberbox.fleet.folders import folders
 from amberbox.fleet.folders.folders import Folders
 from amberbox.fleet.folders.masking import masked
 from amberbox.fleet.folders.shelf import Shelf
-from amberbox.link.folders import pack
+from amberbox.fleet.folders.worker import keep
+from amberbox.link.folders import FolderError, pack
 from amberbox.link.frames import Hello
 from tests.fleet.house import House, house
+from tests.fuzzing import examples, fuzz
 
 A, B, C = "a" * 64, "b" * 64, "c" * 64
 SECRET = "hunter2-tr0ub4dor"
@@ -111,6 +118,59 @@ def test_secrets_that_a_robot_let_through_are_masked(home: House) -> None:
     assert [path for path in everywhere if SECRET.encode() in path.read_bytes()] == []
     assert [folder.masked for folder in kept.kept("ropod_001")] == [6]
     assert kept.read("ropod_001", A, "plain.yaml") == planted["plain.yaml"].encode()
+
+
+def test_what_robots_send_is_read_by_workers_of_its_own(home: House) -> None:
+    """People's questions never wait behind it: nothing of it is put where these are answered."""
+    for_people: list[str] = []
+    home.services.asking._pool.put = lambda question: for_people.append(question.op)  # type: ignore[method-assign]
+    kept = home.services.folders
+    assert kept.keep("ropod_001", A, pack({"robot.yaml": b"id: ropod_001\n"}))
+    assert home.services.feed.state.facts.read("ropod_001", A).model == ""
+    assert for_people == [] and home.services.preparing.pids
+    with pytest.raises(UsageError, match="no packed folder"):
+        kept.keep("ropod_001", B, b"nonsense")
+
+
+HOSTILE = st.dictionaries(
+    st.sampled_from(
+        ("a.yaml", "../b.yaml", "/etc/passwd.txt", "a.yaml/b.yaml", "x/../../y.md", "c\x00.txt",
+         ".hidden/d.yaml", "e.py", "CON.txt", "f" * 300 + ".txt", "g/" * 20 + "h.txt", "i.yaml ",
+         "ok/j.yaml", "k.xml", "l\n.md", "robot.yaml", "m.txt")
+    ),
+    st.sampled_from(
+        (b"", b"\xff\xfe", b"[" * 20_000, b"{a: " * 5_000, b"- " * 20_000, b"\n" * 200_000,
+         b"a: &a [x, x]\nb: &b [*a, *a]\nc: &c [*b, *b]\nd: [*c, *c, *c]\n", b"a: &a {b: *a}\n",
+         b"!!python/object/apply:os.system ['touch /tmp/x']\n", b"token: " + b"x" * 100_000,
+         b"<password " * 20_000, b"secret" * 30_000, b"password: hunter2-tr0ub4dor\n" * 500,
+         b"-----BEGIN PRIVATE KEY-----\n" * 2_000, b"%YAML 9.9\n---\n? [a]\n: b\n")
+    ),
+    max_size=6,
+)  # fmt: skip
+
+
+@fuzz
+@given(HOSTILE, st.booleans(), st.binary(max_size=40))
+@settings(max_examples=examples(25), deadline=None)
+def test_a_hostile_folder_is_taken_whole_and_masked_or_refused(
+    files: dict[str, bytes], cut: bool, rubbish: bytes
+) -> None:
+    """Nothing lands elsewhere, and no other error is raised."""
+    packed = zstandard.compress(msgspec.msgpack.encode(files))
+    packed = packed[: len(packed) // 2] + rubbish if cut else packed
+    with tempfile.TemporaryDirectory() as folder:
+        root = Path(folder) / "server"
+        root.mkdir()
+        try:
+            keep(root, {"robot": "r1", "config_hash": A, "data": packed})
+        except FolderError:
+            assert not list(root.rglob("*.*"))
+        else:
+            place = root / "folders" / "r1" / A
+            written = [path for path in Path(folder).rglob("*") if path.is_file()]
+            assert all(path.is_relative_to(place) for path in written)
+            assert {str(path.relative_to(place)) for path in written} == set(files)
+            assert not any(b"hunter2" in path.read_bytes() for path in written)
 
 
 def test_masking_leaves_the_simulated_robot_alone() -> None:

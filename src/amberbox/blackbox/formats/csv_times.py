@@ -17,7 +17,7 @@ UNITS_NS = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
 RECEIVED, STAMP = "received", "timestamp"
 _NAMES = (RECEIVED, STAMP, "time", "t", "stamp", "log_time", "datetime", "date_time", "date")
 _UNIT = re.compile(
-    r"[ _\[(]+(?:(ns|nsec|nanosec\w*)|(us|µs|usec|microsec\w*)|(ms|msec|millisec\w*)"
+    r"(?<![ _\[(])[ _\[(]+(?:(ns|nsec|nanosec\w*)|(us|µs|usec|microsec\w*)|(ms|msec|millisec\w*)"
     r"|(s|secs?|seconds?))[\])]?",
     re.IGNORECASE,
 )

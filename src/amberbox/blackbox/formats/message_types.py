@@ -14,7 +14,7 @@ from amberbox.core.errors import AmberboxError, UsageError
 from amberbox.core.types import Schema
 
 _SEPARATOR = "=" * 80 + "\n"
-_FIELD = re.compile(r"^[ \t]*([A-Za-z][\w/]*)[ \t]*(?:\[\d*\])?[ \t]+\w+[ \t]*(?:#.*)?$", re.M)
+_FIELD = re.compile(r"^[ \t]*([A-Za-z][\w/]*)(?:[ \t]*+\[\d*\])?[ \t]++\w+[ \t]*(?:#.*)?$", re.M)
 _PRIMITIVES = {*SIZES, "byte", "char", "string"}
 
 

@@ -78,8 +78,8 @@ class Keeper:
         self._recover()
         self._incidents.step()  # what is pinned now is not deleted below
         self._missions.step()
+        confirm.take_requests(self._store)  # what a server lacks is not the first to go below
         self._make_room()
-        confirm.take_requests(self._store)
         remarks.take_requests(self._store, self.journal)
         if self._situations.changed(self._deleter.is_full):
             self.build(stop)

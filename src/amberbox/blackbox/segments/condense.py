@@ -9,7 +9,12 @@ from typing import Any
 
 from amberbox.blackbox.journal.clocktable import simplified
 from amberbox.blackbox.segments import manifest as mf
-from amberbox.blackbox.segments.entries import Tombstone, confirmed_record, to_record
+from amberbox.blackbox.segments.entries import (
+    Tombstone,
+    confirmed_record,
+    to_record,
+    unconfirmed_record,
+)
 from amberbox.blackbox.segments.lines import CHECKPOINT, encode
 from amberbox.blackbox.segments.manifest import Manifest, Part, Segment
 
@@ -91,6 +96,9 @@ def kept_records(known: Manifest, exists: Callable[[str], bool]) -> Iterator[Rec
     confirmed = tuple(sorted(n for n in known.confirmed if exists(n) or n in known.journals))
     if confirmed:
         yield confirmed_record(confirmed, "", 0)
+    unconfirmed = tuple(sorted(filter(exists, known.unconfirmed)))
+    if unconfirmed:
+        yield unconfirmed_record(unconfirmed, "", 0)
     for signature in known.signatures[-1:]:
         yield to_record(signature)
 

@@ -118,6 +118,11 @@ def confirmed_record(journals: tuple[str, ...], by: str, at_ns: int) -> dict[str
     return {"kind": "confirmed", "journals": list(journals), "by": by, "at_ns": at_ns}
 
 
+def unconfirmed_record(journals: tuple[str, ...], by: str, at_ns: int) -> dict[str, Any]:
+    """Say that a server does not hold these journals any more, though it had confirmed them."""
+    return {"kind": "unconfirmed", "journals": list(journals), "by": by, "at_ns": at_ns}
+
+
 def from_record(record: Mapping[str, Any]) -> Sealed | Tombstone | Signature | None:
     """Read what ``to_record`` returned; None for a line of another kind."""
     cls = _KINDS.get(record["kind"])

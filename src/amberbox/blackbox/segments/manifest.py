@@ -137,7 +137,8 @@ class Manifest:
     ``columns_gone`` and ``raw_gone`` name the journals of which one or the other was deleted, as
     far as the manifest has not been condensed since; ``gone_segments`` are files that went thus.
     ``incidents`` is what was said last of each; ``lines`` is how many there are. ``unsigned`` are
-    the journals that were sealed after the last signature.
+    the journals that were sealed after the last signature; ``unconfirmed`` those that a server had
+    confirmed and lacks now.
     """
 
     schemas: Mapping[str, TableSchema] = field(default_factory=dict)
@@ -155,6 +156,7 @@ class Manifest:
     lines: int = 0
     incidents: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     unsigned: frozenset[str] = frozenset()
+    unconfirmed: frozenset[str] = frozenset()
 
     def complete(self, item: str, existing: Container[str] | None = None) -> frozenset[str]:
         """Return the journals whose rows of this item are all in segments.
@@ -195,6 +197,7 @@ class _State:
     gone_segments: set[str] = field(default_factory=set)
     incidents: dict[str, Mapping[str, Any]] = field(default_factory=dict)
     unsigned: set[str] = field(default_factory=set)
+    unconfirmed: set[str] = field(default_factory=set)
 
     def take(self, record: Mapping[str, Any]) -> None:
         """Add one record."""
@@ -207,6 +210,10 @@ class _State:
                 self.journals[record["journal"]] = _journal_from_json(record)
             case "confirmed":
                 self.confirmed.update(record["journals"])
+                self.unconfirmed.difference_update(record["journals"])
+            case "unconfirmed":
+                self.confirmed.difference_update(record["journals"])
+                self.unconfirmed.update(record["journals"])
             case "incident":
                 said = {k: v for k, v in record.items() if k not in ("hash", "prev")}
                 self.incidents[record["incident"]["id"]] = said
@@ -262,6 +269,7 @@ class _State:
             frozenset(self.confirmed), tuple(self.signatures), tuple(read.damage), read.last_hash,
             frozenset(self.columns_gone), frozenset(self.raw_gone), frozenset(self.gone_segments),
             read.number, dict(self.incidents), frozenset(self.unsigned),
+            frozenset(self.unconfirmed),
         )  # fmt: skip
 
 

@@ -27,7 +27,7 @@ _POLL_MS = 100
 _AT_ONCE = 500  # messages of one publisher before the others have their turn
 _KEY_LENGTH = 40  # characters of a CURVE key in Z85
 _BYTE_ORDER_MARK = b"\xef\xbb\xbf"
-_NAME_AND_JSON = re.compile(rb"([^\s{\[\"]+)[ \t\0]+([{\[].*)", re.DOTALL)
+_NAME_AND_JSON = re.compile(rb"([^\s{\[\"]+)(?:\0|[ \t][ \t\0]*+)([{\[].*)", re.DOTALL)
 
 
 @dataclass(frozen=True)

@@ -79,6 +79,8 @@ def _after_stop(text: str, at: int) -> int | None:
                     return token.at + 1
             return None
         except RuleFault as fault:
+            if text.startswith("/*", fault.at):
+                return None  # all the rest is in a comment that is not closed
             line_end = text.find("\n", max(fault.at, at))
             if line_end < 0:
                 return None

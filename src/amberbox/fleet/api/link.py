@@ -13,8 +13,10 @@ from amberbox.fleet.api.access import Fleet, Open, Routes, Who
 from amberbox.fleet.linkend.sockets import StarletteSocket
 from amberbox.fleet.serving.doorkeeper import KeyedSocket
 from amberbox.fleet.uploads.desk import Answer, verdict
+from amberbox.fleet.uploads.holdings import answer as answer_held
 from amberbox.fleet.uploads.pieces import Incoming
-from amberbox.link import limits, uploads
+from amberbox.link import holdings, limits, uploads
+from amberbox.link.holdings import Question
 from amberbox.link.uploads import Proof
 
 routes = Routes("link", prefix=limits.PATH)
@@ -80,6 +82,17 @@ async def finish(
     return _answered(answer)
 
 
+@routes.post("/held/{store_id}", "journals.upload")
+async def held(store_id: Store, request: Request, fleet: Fleet, who: Who) -> Response:
+    """List the journals of the robot's store that are here, where the robot counts on others."""
+    robot = who.principal.id
+    with fleet.threads.turn(robot):
+        question = _question(await body_of(request, holdings.QUESTION_BYTES))
+        work = partial(answer_held, fleet.database, fleet.folder, robot, store_id, question)
+        answer = await fleet.threads.piece(work)
+    return Response(msgspec.msgpack.encode(answer), media_type="application/x-msgpack")
+
+
 def _incoming(robot: str, store_id: str, journal: str, request: Request) -> Incoming:
     digest = request.headers.get(uploads.SHA256, "")
     return Incoming(robot, store_id, journal, digest, _number(request, uploads.BYTES))
@@ -107,6 +120,13 @@ def _proof(body: bytes) -> Proof:
         return msgspec.json.decode(body, type=Proof)
     except (msgspec.MsgspecError, UnicodeDecodeError) as error:
         raise HTTPException(400, f"the proof cannot be read: {error}") from error
+
+
+def _question(body: bytes) -> Question:
+    try:
+        return msgspec.msgpack.decode(body, type=Question)
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+        raise HTTPException(400, f"the question cannot be read: {error}") from error
 
 
 def _answered(answer: Answer, *, with_body: bool = True) -> Response:

@@ -19,6 +19,7 @@ ANSWER_BYTES = 64 << 20
 
 _SPOOL_BYTES = 4 << 20
 _WORKERS = 2
+_NICE = 5
 _WARM_S = 1.0
 _READY = "amberbox.fleet.data.worker:ready"
 
@@ -31,6 +32,14 @@ class Asking:
     UsageError and AmberboxError as the function does, LimitError for what takes too much,
     BusyError when too many wait. ``asker`` is whose question it is: askers take turns.
     """
+
+    @classmethod
+    def for_robots(cls, folder: Path) -> Asking:
+        """Make one for what robots send, besides the one that answers people.
+
+        Whatever one of them sends keeps one worker at most, and none of those for people.
+        """
+        return cls(folder, Pool(folder, _WORKERS, nice=_NICE, at_once=1))
 
     def __init__(self, folder: Path, pool: Pool | None = None) -> None:
         self._folder = folder

@@ -15,14 +15,15 @@ class Pool:
     """Answers questions with ``count`` workers; they start with the first question.
 
     ``most`` wait: fewer than the server has threads that answer people, or those could all wait.
+    ``each`` of them are of one asker, and ``at_once`` of one asker are worked on.
     """
 
     def __init__(
         self, folder: Path, count: int = 2, *, most: int = 32, each: int = 8, nice: int = 0,
-        program: str = PROGRAM,
+        program: str = PROGRAM, at_once: int | None = None,
     ) -> None:  # fmt: skip
         self._children = [Child(folder, nice, program) for _ in range(count)]
-        self._waiting = Waiting(most, each)
+        self._waiting = Waiting(most, each, at_once)
         self._threads: list[threading.Thread] = []
         self._lock = threading.Lock()
         self._now: set[Question] = set()
@@ -62,6 +63,7 @@ class Pool:
                 self._now.add(question)
                 self._answer(child, question)
                 self._now.discard(question)
+            self._waiting.done(question)
         child.stop()
 
     def _answer(self, child: Child, question: Question) -> None:

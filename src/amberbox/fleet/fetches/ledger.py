@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import secrets
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -20,12 +20,16 @@ OPEN: Sequence[State] = ("waiting", "asked", "copying")
 MOST_OPEN = 100
 """Windows that wait for one robot."""
 
+_GONE = "gone"
 _ENDED = ("verified", "aside", "quarantined")
 """States of an upload that nothing more comes of."""
 
 
 class File(msgspec.Struct, frozen=True):
-    """A journal of a window: ``state`` is empty while it is to come, then that of its upload."""
+    """A journal of a window: ``state`` is empty while it is to come, then that of its upload.
+
+    ``gone`` is one that the robot had named and has deleted before it was copied.
+    """
 
     store_id: str
     journal: str
@@ -110,7 +114,8 @@ def answered(
 ) -> Fetched | None:
     """Note which journals a robot named; None where that changes nothing.
 
-    A robot that is asked again may have deleted meanwhile what it has handed in.
+    A robot names all that hold the window: what it named before and has not sent, and does not
+    name any more, will not come (``gone``).
     """
     known = {(file.store_id, file.journal) for file in one.files}
     more = [file for file in named if (file.store_id, file.journal) not in known]
@@ -119,16 +124,25 @@ def answered(
         return None
     if not (one.files or more):
         return _change(connection, one, state="gone", ended_ns=now_ns)
-    return looked(connection, now_ns, one, [*one.files, *more])
+    here = {(file.store_id, file.journal) for file in named}
+    is_all = len(named) < FILES  # else there are more than fit in a frame
+    return looked(connection, now_ns, one, [*one.files, *more], here if is_all else None)
 
 
 def looked(
-    connection: Connection, now_ns: int, one: Fetched, files: Sequence[File]
-) -> Fetched | None:
-    """See which journals have come; None where that changes nothing."""
+    connection: Connection, now_ns: int, one: Fetched, files: Sequence[File],
+    here: Collection[tuple[str, str]] | None = None,
+) -> Fetched | None:  # fmt: skip
+    """See which journals have come; None where that changes nothing.
+
+    ``here`` is what the robot still has (store and journal), None where that is not known.
+    """
     found = [_with_state(connection, one.robot, file) for file in files]
+    if here is not None:
+        found = [file if _is_expected(file, here) else _gone(file) for file in found]
     done = all(file.state for file in found)
-    state: State = "ready" if done else "copying"
+    nothing = all(file.state == _GONE for file in found)
+    state: State = "copying" if not done else "gone" if nothing else "ready"
     if (list(one.files), one.state) == (found, state):
         return None
     text = msgspec.json.encode(found).decode()
@@ -151,6 +165,14 @@ def _with_state(connection: Connection, robot: str, file: File) -> File:
     states = set(connection.scalars(chosen))
     best = next((state for state in _ENDED if state in states), "")
     return msgspec.structs.replace(file, state=best)
+
+
+def _is_expected(file: File, here: Collection[tuple[str, str]]) -> bool:
+    return bool(file.state) or (file.store_id, file.journal) in here
+
+
+def _gone(file: File) -> File:
+    return msgspec.structs.replace(file, state=_GONE)
 
 
 def _change(connection: Connection, one: Fetched, **values: Any) -> Fetched | None:

@@ -11,16 +11,18 @@ from collections.abc import Mapping
 
 from amberbox.core.errors import Problem
 from amberbox.core.nodes import parse_yaml
-from amberbox.core.redaction import MASK, SOUNDS_SECRET, likely_secrets, redact
+from amberbox.core.redaction import MASK, SECRET_WORDS, SOUNDS_SECRET, likely_secrets, redact
 
 _YAML = (".yaml", ".yml")
 _MASKS = (MASK, "(masked)")
 _KEY_BLOCK = re.compile(r"-----BEGIN ([A-Z ]*PRIVATE KEY)-----.*?(-----END \1-----|\Z)", re.DOTALL)
 _LOGIN = re.compile(r"(?<=://)([^\s:/?#@\"']*):([^\s/?#\"']+)@")
-_SAID = re.compile(
-    rf"(?im)^(?P<key>[\s\-#\"'<]*[\w.\-]*{SOUNDS_SECRET}[\w.\-]*[\"']?\s*[:=>]\s*)"
-    r"(?P<value>[^\s{\[|>&*].*)$"
-)
+_LEAD = re.compile(r"[\s\-#\"'<]*")
+_WORD = re.compile(r"[\w.\-]*")
+_SECRET = re.compile(SOUNDS_SECRET, re.IGNORECASE)
+_BEYOND = tuple(len(word.partition("_")[0]) for word in SECRET_WORDS if "_" in word)
+"""Lengths of what stands before the space in a secret's name such as ``API key``."""
+_VALUE = re.compile(r"[\"']?\s*[:=>]\s*(?P<value>[^\s{\[|>&*].*)")
 
 
 def masked(files: Mapping[str, bytes]) -> tuple[dict[str, bytes], list[str]]:
@@ -46,11 +48,42 @@ def _read(name: str, text: str) -> str | None:
 
 
 def _by_lines(text: str) -> str:
-    return _SAID.sub(_hidden, text)
+    """Mask what stands behind a telling key at the start of a line, or on the lines after it.
+
+    Linear in the length of the text, blank lines and words of any length included.
+    """
+    parts, at, line = [], 0, 0
+    while line < len(text):
+        lead = _LEAD.match(text, line)
+        assert lead is not None
+        value = _value_of(text, line, lead.end())
+        if value is None:
+            end = lead.end()
+        else:
+            end = value.end()
+            if not value["value"].strip("\"' ,;<").startswith(_MASKS):  # the robot has done so
+                parts += [text[at : value.start("value")], f"'{MASK}'"]
+                at = end
+        line = text.find("\n", end) + 1 or len(text)
+    return "".join([*parts, text[at:]])
 
 
-def _hidden(found: re.Match[str]) -> str:
-    """Mask a value, unless the robot has done so; what its mask is followed by is no value."""
-    written: str = found[0]
-    is_masked = found["value"].strip("\"' ,;<").startswith(_MASKS)
-    return written if is_masked else f"{found['key']}'{MASK}'"
+def _value_of(text: str, line: int, lead_end: int) -> re.Match[str] | None:
+    """Find the value behind the key that follows the lead of a line; None for no telling key."""
+    start = line + len(text[line:lead_end].rstrip("-"))  # hyphens may belong to the key
+    end = _end_of_word(text, start)
+    if _SECRET.search(text, start, end):
+        found = _VALUE.match(text, end)
+        if found is not None:
+            return found
+    for length in _BEYOND:
+        spaced = _SECRET.match(text, end - length) if end - length >= start else None
+        if spaced is not None and spaced.end() > end:
+            return _VALUE.match(text, _end_of_word(text, spaced.end()))
+    return None
+
+
+def _end_of_word(text: str, start: int) -> int:
+    word = _WORD.match(text, start)
+    assert word is not None
+    return word.end()

@@ -56,17 +56,20 @@ def made_answers(database: Database, robot: str, diagnosis: str) -> list[noteboo
 class Explained:
     """Explanations by revision; ``known`` never waits, threads may share it.
 
-    While it runs, each diagnosis that comes from a robot is explained before anybody asks.
+    While it runs, each diagnosis that comes from a robot is explained before anybody asks, by the
+    workers ``preparing``; ``asking`` are those for people.
     """
 
     def __init__(
-        self, database: Database, archive: FolderArchive, bus: Bus, clock: Clock, asking: Asking
-    ) -> None:
+        self, database: Database, archive: FolderArchive, bus: Bus, clock: Clock, asking: Asking,
+        preparing: Asking,
+    ) -> None:  # fmt: skip
         self.database = database
         self.archive = archive
         self._bus = bus
         self._clock = clock
         self._asking = asking
+        self._preparing = preparing
         self._lock = threading.Lock()
         self._known: OrderedDict[Key, Answer] = OrderedDict()
         self._asked: dict[Key, asyncio.Task[Answer]] = {}
@@ -156,7 +159,8 @@ class Explained:
             robot=robot, now_ns=self._clock.wall_ns(), diagnosis=name, revision=key[2],
             answers=dict(answers),
         )  # fmt: skip
-        found = await self._asking.ask(OP, written(asked), LIMIT_S, MEMORY_BYTES, asker=asker)
+        workers = self._preparing if asker == robot else self._asking
+        found = await workers.ask(OP, written(asked), LIMIT_S, MEMORY_BYTES, asker=asker)
         answer: Answer = json.loads(found)
         self._keep(key, answer)
         return answer

@@ -51,9 +51,10 @@ def assemble(
     announce(bus)
     archive = FolderArchive(folder, database, clock)
     asking = Asking(folder)
-    folders = Folders(folder, database, bus, clock, asking)
+    preparing = Asking.for_robots(folder)
+    folders = Folders(folder, database, bus, clock, preparing)
     links = LinkServer(database, _hooks(bus, folders), clock)
-    state = State(database, archive, bus, links, folders, asking)
+    state = State(database, archive, bus, links, folders, preparing)
     desk = Desk(
         folder,
         database,
@@ -64,8 +65,8 @@ def assemble(
     return Services(
         folder=folder, settings=settings, clock=clock, database=database,
         passwords=passwords or Passwords(), bus=bus, archive=archive, links=links, desk=desk,
-        folders=folders, asking=asking,
-        explained=Explained(database, archive, bus, clock, asking),
+        folders=folders, asking=asking, preparing=preparing,
+        explained=Explained(database, archive, bus, clock, asking, preparing),
         jobs=Jobs(folder, database, bus, clock), fetches=Fetches(database, bus, clock, links),
         alarms=Alarms(database, bus, clock, settings.public_url),
         feed=Feed(database, bus, clock, links, state),
@@ -88,6 +89,7 @@ def close(services: Services) -> None:
     """Let go of everything, in the order of who needs whom."""
     for part in reversed(parts(services)):
         part.close()
+    services.preparing.close()
     services.links.close()
     services.threads.close()
     services.desk.close()

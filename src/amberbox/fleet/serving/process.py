@@ -99,7 +99,8 @@ async def serve(services: Services, port: socket.socket, told: Told | None = Non
         await say_goodbye(services.links)
         server.should_exit = True
         await asyncio.wait([answering])
-        services.asking.close()  # threads that wait for an answer would hold up the loop's end
+        for asking in (services.asking, services.preparing):
+            asking.close()  # threads that wait for an answer would hold up the loop's end
         for task in (alive, stopping, damaged):
             task.cancel()
         await background.end(parts)

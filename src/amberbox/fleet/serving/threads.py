@@ -20,14 +20,14 @@ EACH = 8
 class Threads:
     """Sets of threads: for pieces of journals, for their ends, for folders.
 
-    Ends wait for the one worker that verifies, folders for one that unpacks; pieces of others go
+    Ends wait for the one worker that verifies, folders for those that unpack; pieces of others go
     on meanwhile, and so does all that is done in the loop's own threads.
     """
 
     def __init__(self) -> None:
         self._pieces = ThreadPoolExecutor(8, "pieces")
         self._ends = ThreadPoolExecutor(16, "ends")
-        self._folders = ThreadPoolExecutor(2, "folders")
+        self._folders = ThreadPoolExecutor(2 * EACH, "folders")
         self._under_way: Counter[str] = Counter()
 
     async def piece(self, work: Callable[[], T]) -> T:

@@ -19,6 +19,7 @@ from amberbox.fleet.database.database import Database
 from amberbox.fleet.database.upsert import upsert
 from amberbox.fleet.linkend.events import note
 from amberbox.fleet.uploads import pieces
+from amberbox.fleet.uploads.holdings import is_held, known_uploads
 from amberbox.fleet.uploads.pieces import Incoming, PieceError
 from amberbox.fleet.uploads.tables import UPLOAD
 from amberbox.fleet.uploads.verifying import Claim, Result, Verifier
@@ -110,10 +111,10 @@ class Desk:
         return None
 
     def _known(self, incoming: Incoming) -> Answer | None:
-        """Answer for a file whose fate is known."""
+        """Answer for a file whose fate is known; one that the disk has lost may come again."""
         with self.database.reading() as connection:
-            row = connection.execute(select(UPLOAD).where(_is(incoming))).first()
-        if row is None:
+            row = connection.execute(known_uploads().where(_is(incoming))).first()
+        if row is None or not is_held(self.root, row):
             return None
         return Answer(200, incoming.size, row.state, row.reason)
 
@@ -208,17 +209,17 @@ def _state(connection: Connection, incoming: Incoming, result: Result) -> State:
     if result.reason:
         return "quarantined"
     table = UPLOAD.c
-    other = and_(
+    other_content = and_(
         table.robot == incoming.robot, table.store_id == incoming.store_id,
-        table.state == "verified", table.writer == result.writer, table.run == result.run,
+        table.state == "verified", table.sha256 != incoming.sha256,
+    )  # fmt: skip
+    overlapping = and_(
+        table.writer == result.writer, table.run == result.run,
         table.first_seq < max(result.end_seq, result.first_seq + 1),
         table.end_seq > result.first_seq,
     )  # fmt: skip
-    same = and_(
-        table.robot == incoming.robot, table.store_id == incoming.store_id,
-        table.state == "verified", table.journal == incoming.journal,
-    )  # fmt: skip
-    wanted = select(table.journal).where(other | same).limit(1)
+    same_name = table.journal == incoming.journal
+    wanted = select(table.journal).where(other_content, overlapping | same_name).limit(1)
     return "verified" if connection.execute(wanted).first() is None else "aside"
 
 

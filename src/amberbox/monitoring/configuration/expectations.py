@@ -12,7 +12,7 @@ from amberbox.monitoring.plan import Expectation
 
 Type = Literal["bool", "int", "float", "string"]
 _COMPARISON = re.compile(r"(>=|<=|==|!=|>|<)\s*(.+)")
-_RANGE = re.compile(r"(.+?)\s*\.\.\s*(.+)")
+_RANGE = re.compile(r"(.+?)\.\.(.+)")
 _WORDS = {"true": True, "yes": True, "on": True, "false": False, "no": False, "off": False}
 
 

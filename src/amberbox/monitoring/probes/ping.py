@@ -30,8 +30,8 @@ _LOST = frozenset(
 """What says that nobody answers; TimeoutError has no number. Other errors: it cannot be known."""
 
 _SUBJECT = re.compile(r"(\[(?P<v6>[0-9A-Fa-f:.]+(%\w+)?)\]|(?P<host>[\w.-]+))(:(?P<port>\d+))?")
-_BARE_V6 = re.compile(r"[0-9A-Fa-f]*:[0-9A-Fa-f:.]*:[0-9A-Fa-f:.]*(?:%\w+)?")
-_SUMMARY = re.compile(r"([\d.]+)% packet loss")
+_BARE_V6 = re.compile(r"[0-9A-Fa-f]*:[0-9A-Fa-f.]*:[0-9A-Fa-f:.]*(?:%\w+)?")
+_SUMMARY = re.compile(r"(?<![\d.])([\d.]+)% packet loss")
 _MEAN = re.compile(r"= [\d.]+/([\d.]+)/")
 
 

@@ -26,6 +26,7 @@ from amberbox.core.redaction import (
     redact,
     secrets,
     sounds_secret,
+    word_with,
 )
 from amberbox.link.keys import LOOKS_LIKE_ONE
 
@@ -36,14 +37,16 @@ _YAML = frozenset({".yaml", ".yml"})
 _LEAST = 6
 """Shorter secrets are not looked for in other places: they would be found in every number."""
 _LEAST_IN_COMMENTS = 3
-_USER = re.compile(r"([a-zA-Z][a-zA-Z0-9+.-]*://)[^/\s@'\"<>]+@")
-_QUERY = re.compile(rf"([?&]\w*(?:{SOUNDS_SECRET}|key|sig)\w*=)[^&\s#'\"<>]+", re.IGNORECASE)
+_USER = re.compile(r"((?<![a-zA-Z0-9+.-])[0-9+.-]*+[a-zA-Z][a-zA-Z0-9+.-]*+://)[^/\s@'\"<>]+@")
+_QUERY = re.compile(
+    rf"([?&]{word_with(f'(?:{SOUNDS_SECRET}|key|sig)')}=)[^&\s#'\"<>]+", re.IGNORECASE
+)
 _PEM = re.compile(r"-----BEGIN [A-Z ]*PRIVATE KEY-----.*?(?:-----END [A-Z ]*-----|\Z)", re.DOTALL)
 _SAID = re.compile(
-    rf"(\b\w*{SOUNDS_SECRET}\w*[\"']?\s*(?:[:=]|\bis\b)\s*)(\"[^\"]*\"|'[^']*'|[^\s\"'<>,;]+)",
+    rf"(\b{word_with(SOUNDS_SECRET)}[\"']?\s*(?:[:=]|\bis\b)\s*)(\"[^\"]*\"|'[^']*'|[^\s\"'<>,;]+)",
     re.IGNORECASE,
 )
-_ELEMENT = re.compile(rf"(<\w*{SOUNDS_SECRET}\w*\b[^>]*>)[^<]+(</)", re.IGNORECASE)
+_OPENING = re.compile(rf"<{word_with(SOUNDS_SECRET)}", re.IGNORECASE)
 
 
 @dataclass
@@ -160,8 +163,23 @@ def _in_gap(text: str, start: int, end: int) -> Iterator[tuple[int, int]]:
 
 def _plain(text: str) -> str:
     """Mask what a text says to be a secret: ``password: ...``, ``<token>...``."""
-    text = _ELEMENT.sub(rf"\1{WORD}\2", text)
-    return _SAID.sub(lambda match: match[1] + _quoted_as(match[2]), text)
+    return _SAID.sub(lambda match: match[1] + _quoted_as(match[2]), _elements(text))
+
+
+def _elements(text: str) -> str:
+    """Mask the text of XML elements whose name sounds secret; each sign is looked at once."""
+    parts, at, closing = [], 0, -1
+    for opening in _OPENING.finditer(text):
+        if opening.start() < at or opening.end() <= closing:
+            continue  # of several before one ">" the first one counts
+        closing = text.find(">", opening.end())
+        if closing < 0:
+            break
+        end = text.find("<", closing)
+        if end > closing + 1 and text.startswith("</", end):
+            parts += [text[at : closing + 1], WORD]
+            at = end
+    return "".join([*parts, text[at:]])
 
 
 def _quoted_as(written: str) -> str:

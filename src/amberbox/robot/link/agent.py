@@ -21,6 +21,7 @@ from amberbox.robot.link.copyloop import CopyLoop
 from amberbox.robot.link.copyrule import Situation
 from amberbox.robot.link.docking import Dock
 from amberbox.robot.link.fetching import Requests
+from amberbox.robot.link.holdings import Holdings
 from amberbox.robot.link.network import Network, allowed, current_network
 from amberbox.robot.link.options import LinkOptions, options_of
 from amberbox.robot.link.remarks import Remarks
@@ -75,10 +76,14 @@ class Agent:
             store, self.options, self._sending, self._situation, self.client.bucket,
             remarks=self._remarks,
         )  # fmt: skip
+        self._holdings = Holdings(copier, self._contact)
         self._requests = Requests(
-            store, self.client.answers.append, self.client.clock.wall_ns, copier.is_settled
+            store, self.client.answers.append, self.client.clock.wall_ns, copier.is_settled,
+            self._holdings.may_lack,
+        )  # fmt: skip
+        self.loop = CopyLoop(
+            copier, self._requests, self._send_folder, self._may_copy, self._holdings
         )
-        self.loop = CopyLoop(copier, self._requests, self._send_folder, self._may_copy)
         self._wanted = threading.Event()
         self._said = ""
 
@@ -130,6 +135,7 @@ class Agent:
     # -- what the server asks
 
     def _fetch(self, frame: Fetch) -> None:
+        self._holdings.look_again()
         self._requests.add(frame)
         self.loop.wake.set()
 
@@ -142,6 +148,11 @@ class Agent:
 
     def _context(self) -> ssl.SSLContext | None:
         return context_for(self.options.url, self.options.ca, self._store.path)
+
+    def _contact(self) -> int | None:
+        """Number this connection; None while there is none."""
+        progress = self.client.progress
+        return progress.contacts if progress.connected else None
 
     def _may_copy(self) -> bool:
         return self.client.progress.connected and self._allowed(self.options)

@@ -72,6 +72,7 @@ class Progress:
     connected: bool = False
     trouble: str = ""
     attempts: int = 0
+    contacts: int = 0
     backlog: int = 0
     backlog_bytes: int = 0
     rows_sent: int = 0
@@ -145,6 +146,7 @@ class LinkClient:
             self._backoff.succeeded()
             self._remarks.over("link_refused")
             self.progress.connected, self.progress.trouble = True, ""
+            self.progress.contacts += 1
             await session.run(stop)
         finally:
             self.progress.connected = False

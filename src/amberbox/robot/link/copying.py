@@ -13,14 +13,14 @@ import threading
 import time
 import zlib
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Protocol
 from urllib.parse import urlsplit
 
 import msgspec
 
-from amberbox.blackbox.deletion.confirm import confirm
+from amberbox.blackbox.deletion.confirm import confirm, unconfirm
 from amberbox.blackbox.follow.read import journal_file
 from amberbox.blackbox.incidents.incident import Incident, load_all
 from amberbox.blackbox.segments import manifest
@@ -39,10 +39,12 @@ from amberbox.robot.link.remarks import Remarks
 _TIMEOUT_S = 30.0
 _VERIFY_S = 300.0
 _READ_BYTES = 1 << 20
+_ANSWER_BYTES = 4 << 20
 _TRIES = 5
 """How often one piece is begun anew before the file waits for another time."""
 SIGNATURE_S = 900.0
 """A seal is signed within moments, those of a whole disk after minutes; then it is not to come."""
+_NAMED = 5
 LEAST_BYTES = 16 << 10
 """Pieces get no smaller than this, however bad the network is."""
 
@@ -90,7 +92,7 @@ class HttpSending:
             everything = authorization(self.options) | headers | length
             connection.request(method, base + path, body or None, everything)
             answer = connection.getresponse()
-            content = answer.read(1 << 20)
+            content = answer.read(_ANSWER_BYTES)
             offset = int(answer.headers.get(uploads.OFFSET) or 0)
         except (OSError, http.client.HTTPException, ValueError) as error:
             self.close()
@@ -126,6 +128,10 @@ class Copier:
     remarks: Remarks | None = None
     backlog_bytes: int = 0
     """How much is to be copied, as of the last step."""
+    lacking: set[str] = field(default_factory=set)
+    """Journals that were confirmed and that the server lacks, as it said since."""
+    quarantined: set[str] = field(default_factory=set)
+    """Journals that the server was sent and does not take."""
     _refused: set[str] = field(default_factory=set)
     _unsigned_since: float | None = None
     _piece_bytes: int = PIECE_BYTES
@@ -136,12 +142,16 @@ class Copier:
         pins = [incident for incident in load_all(self.store) if incident.is_pinned]
         sealed = [s for s in found.sealed.values() if s.journal not in found.raw_gone]
         rule = self.options.copy
-        ordered = due(sealed, found.confirmed, pins, rule, self.situation())
-        held = _held_by(self.store, pins) if may_copy(rule, self.situation()) else []
+        confirmed = found.confirmed - self.lacking
+        now = self.situation()
+        asked_for = now.requested | self.lacking | (found.unconfirmed - confirmed)
+        now = replace(now, requested=asked_for)  # what a server had it gets under any rule
+        ordered = due(sealed, confirmed, pins, rule, now)
+        held = _held_by(self.store, pins) if may_copy(rule, now) else []
         names = [s.journal for s in ordered]
-        known = {*names, *found.confirmed}
+        known = {*names, *confirmed}
         names = [*(name for name in held if name not in known), *names]
-        asked = _of_ring(self.store, self.situation().requested - known)
+        asked = _of_ring(self.store, now.requested - known)
         names = [*asked, *(name for name in names if name not in asked)]
         awaited = self._awaited(found.unsigned)
         return [name for name in names if name not in self._refused and name not in awaited]
@@ -159,6 +169,21 @@ class Copier:
         """Tell whether nothing more will be done about a journal by this copier."""
         return name in self._refused
 
+    def copy_again(self, journals: Collection[str]) -> None:
+        """Note that the server lacks journals that it had confirmed, or had refused."""
+        again = frozenset(journals)
+        self._refused -= again
+        lost = again - self.quarantined
+        self.quarantined -= again
+        if not lost:
+            return
+        self.lacking |= lost
+        host = urlsplit(self.options.url).netloc
+        if self.remarks is not None:
+            self.remarks.over("server_lacks")  # the same ones may be lost twice
+            self.remarks.say("server_lacks", _lost_text(host, sorted(lost)))
+        unconfirm(self.store, sorted(lost), host)
+
     def step(self) -> bool:
         """Copy the next journal; tell whether there was one. Raises CopyError for another time."""
         names = self.waiting()
@@ -171,6 +196,7 @@ class Copier:
             self._refused.add(name)  # it is gone meanwhile
         elif verdict.state == "quarantined":
             self._refused.add(name)
+            self.quarantined.add(name)
             if self.remarks is not None:
                 self.remarks.say("copy_refused", f"the server refuses {name}: {verdict.reason}")
         else:
@@ -244,7 +270,15 @@ class Copier:
         """Note that the server holds a journal: it is the first to go when room is needed."""
         host = urlsplit(self.options.url).netloc
         confirm(self.store, [name], host)
+        self.lacking.discard(name)
         self._refused.add(name)  # the keeper may take a while to write it down
+
+
+def _lost_text(host: str, names: Sequence[str]) -> str:
+    """Say in a line which journals a server lacks."""
+    which = ", ".join(names[:_NAMED]) + (", ..." if len(names) > _NAMED else "")
+    count = "1 journal" if len(names) == 1 else f"{len(names)} journals"
+    return f"{host} lacks {count} that it had confirmed: copied again ({which})"
 
 
 def _verdict(reply: Reply) -> Verdict:

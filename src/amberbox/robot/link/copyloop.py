@@ -10,6 +10,7 @@ from amberbox.core.errors import AmberboxError
 from amberbox.link.backoff import Backoff
 from amberbox.robot.link.copying import Copier, CopyError
 from amberbox.robot.link.fetching import Requests
+from amberbox.robot.link.holdings import Holdings
 
 POLL_S = 2.0
 
@@ -25,6 +26,7 @@ class CopyLoop:
     requests: Requests
     before: Callable[[], None]
     may_copy: Callable[[], bool]
+    holdings: Holdings | None = None
     backoff: Backoff = field(default_factory=Backoff)
     trouble: str = ""
     copied: int = 0
@@ -47,12 +49,24 @@ class CopyLoop:
     def step(self) -> bool:
         """Do the next thing; tell whether there was one. Raises what may pass by itself."""
         self.requests.step()
-        if not self.may_copy():
-            return False
-        self.before()
-        worked = self.copier.step()
-        self.copied += worked
+        trouble = self._look_at_holdings()
+        worked = False
+        if self.may_copy():
+            self.before()
+            worked = self.copier.step()
+            self.copied += worked
+        if trouble is not None:
+            raise trouble  # after a copy: a question that is never answered does not stop them
         return worked
+
+    def _look_at_holdings(self) -> CopyError | None:
+        """See whether the server lacks what it had; return why that is not known."""
+        try:
+            if self.holdings is not None:
+                self.holdings.step()
+        except CopyError as error:
+            return error
+        return None
 
     def _rest(self, *, worked: bool) -> None:
         if not worked:

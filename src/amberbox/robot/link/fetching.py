@@ -48,9 +48,10 @@ class Requests:
         answer: Callable[[Found], None],
         wall_ns: Callable[[], int],
         is_settled: Callable[[str], bool] = lambda name: False,
+        lacks: Callable[[str], bool] = lambda name: False,
     ) -> None:
         self._store, self._answer = store, answer
-        self._wall_ns, self._is_settled = wall_ns, is_settled
+        self._wall_ns, self._is_settled, self._lacks = wall_ns, is_settled, lacks
         self._lock = threading.Lock()
         self._open: dict[str, Request] = {r.id: r for r in _read(store.path / FILE)}
         self._told: dict[str, tuple[tuple[str, int], ...]] = {}
@@ -90,7 +91,7 @@ class Requests:
     ) -> tuple[tuple[str, int], ...]:
         files = tuple(journals_of(self._store, request, said))
         told = {name for name, _ in self._told.get(request.id, ())}
-        if is_news or {name for name, _ in files} - told:
+        if is_news or {name for name, _ in files} != told:
             self._told[request.id] = files
             self._answer(Found(request.id, files))
         return files
@@ -101,7 +102,10 @@ class Requests:
         """Tell whether the window has passed, and each of its journals has had its turn."""
         if request.to_ns + _MARGIN_NS > self._wall_ns() and is_locked(self._store, "main"):
             return False
-        return all(n in said.confirmed or self._is_settled(n) for n, _ in files)
+        return all(
+            (name in said.confirmed and not self._lacks(name)) or self._is_settled(name)
+            for name, _ in files
+        )
 
     def _let_go(self, request: Request) -> None:
         with self._lock:
