@@ -14,6 +14,8 @@ from amberbox.core.types import Schema
 
 FOOTER_SIZE = 9 + 20 + len(mcap.MAGIC)
 _DATA_END_SIZE = 13
+_INDEX_HEAD = struct.Struct("<QQQQI")
+_INDEX_OFFSET = struct.Struct("<HQ")
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,9 +169,12 @@ def _take(summary: Summary, opcode: int, content: bytes) -> None:
 
 
 def _chunk_index(content: bytes) -> IndexedChunk:
-    fields = mcap.Fields(content)
-    start_ns, end_ns, offset, length = (fields.number("Q") for _ in range(4))
-    offsets = [(c, o) for c, o in struct.iter_unpack("<HQ", fields.bytes())]
+    start_ns, end_ns, offset, length, size = _INDEX_HEAD.unpack_from(content)
+    at = _INDEX_HEAD.size + size
+    if at > len(content):
+        raise ValueError("a length points past the end of its record")
+    offsets = list(_INDEX_OFFSET.iter_unpack(content[_INDEX_HEAD.size : at]))
+    fields = mcap.Fields(content, at)
     return IndexedChunk(
         start_ns, end_ns, offset, length, offsets, fields.number("Q"), fields.text(),
         fields.number("Q"), fields.number("Q"),
