@@ -160,9 +160,8 @@ class GrowingIndex:
         for place in places:
             self._define(data, place)
         if places:
-            known = self._times_ns if self._places else ()
-            first_ns, last_ns = min(records.starts_ns), max(records.ends_ns)
-            self._times_ns = min(first_ns, *known), max(last_ns, *known)
+            known = self._times_ns if self._places else (places[0].start_ns, places[0].end_ns)
+            self._times_ns = min(known[0], *records.starts_ns), max(known[1], *records.ends_ns)
         self._places += places
         self._tallies = together([self._tallies, tallies])
         self._at = at

@@ -143,9 +143,9 @@ def parse_chunk_head(buffer: bytes | memoryview, offset: int) -> ChunkHead | Non
 class Fields:
     """Reads the fields of one record's content in order."""
 
-    def __init__(self, data: bytes, at: int = 0) -> None:
+    def __init__(self, data: bytes) -> None:
         self.data = data
-        self.at = at
+        self.at = 0
 
     def number(self, kind: str) -> int:
         """Read one little-endian number of a struct format character."""

@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Container, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
 
+from amberbox.blackbox.follow.batching import Stream
 from amberbox.blackbox.follow.read import JournalFile, journal_file
 from amberbox.blackbox.journal.clocktable import ClockReading, ClockTable
 from amberbox.blackbox.query.clockbook import UNKNOWN_BOOT, ClockBook, JournalClock, book_of
@@ -45,6 +46,8 @@ class Catalogue:
     existing: tuple[str, ...] = ()
     book: ClockBook = field(default_factory=ClockBook)
     stored: Callable[[str], str] = stored_name
+    opened: dict[str, JournalFile] = field(default_factory=dict, compare=False, repr=False)
+    """Journals as they were found at first: one that grows is looked into once."""
 
     def journals(self, skip: Container[str]) -> Iterator[JournalFile]:
         """Open the journal files that are not named in ``skip``, in the order of writing.
@@ -53,9 +56,13 @@ class Catalogue:
         """
         for name in self.existing:
             if name not in skip:
-                journal = journal_file(open_store(self.store).journal_path(name), name)
-                points = self.book.points(name)
-                yield journal if points is None else replace(journal, clock=points)
+                if name not in self.opened:
+                    journal = journal_file(open_store(self.store).journal_path(name), name)
+                    points = self.book.points(name)
+                    self.opened[name] = (
+                        journal if points is None else replace(journal, clock=points)
+                    )
+                yield self.opened[name]
 
     @property
     def done(self) -> Collection[str]:
@@ -139,8 +146,13 @@ def look(store: Path, *, with_segments: bool = True) -> Catalogue:
         for path in opened.journal_files(writer)
     )
     manifest = mf.read(store)
-    book = book_of(_clocks(opened, manifest, existing))
-    return Catalogue(store, corrected(manifest, book), with_segments, existing, book)
+    found: dict[str, JournalFile] = {}
+    book = book_of(_clocks(opened, manifest, existing, found))
+    for name, journal in found.items():
+        points = book.points(name)
+        found[name] = journal if points is None else replace(journal, clock=points)
+    known = corrected(manifest, book)
+    return Catalogue(store, known, with_segments, existing, book, opened=found)
 
 
 def ask(
@@ -161,14 +173,19 @@ def ask(
     )
 
 
-def _clocks(store: Store, manifest: Manifest, existing: Sequence[str]) -> Iterator[JournalClock]:
-    """Give what journals say about clocks: by the manifest if they are sealed, else by the file."""
+def _clocks(
+    store: Store, manifest: Manifest, existing: Sequence[str], opened: dict[str, JournalFile]
+) -> Iterator[JournalClock]:
+    """Give what journals say about clocks: by the manifest if they are sealed, else by the file.
+
+    The files that are looked into are put into ``opened``.
+    """
     for sealed in manifest.sealed.values():
         yield _sealed_clock(sealed)
     for name in existing:
         if name not in manifest.sealed:
             with suppress(FileNotFoundError):  # deleted meanwhile
-                journal = journal_file(store.journal_path(name), name)
+                journal = opened[name] = journal_file(store.journal_path(name), name)
                 yield JournalClock(name, boot_in(name), journal.run, journal.readings)
 
 
@@ -240,9 +257,17 @@ def journal_tables(journal: JournalFile) -> Iterator[TableSchema]:
     """Give the tables of a journal's items that have rows and columns."""
     for stream in journal.streams.values():
         if not stream.repeated and journal.items.get(stream.item):
-            with suppress(AmberboxError):  # a message type without columns: kept, not shown
-                schema = stream.unroller().schema
-                yield from tables_of(stream.item, schema, stream.topic.name, stream.source)
+            yield from stream_tables(stream)
+
+
+@lru_cache(maxsize=4096)
+def stream_tables(stream: Stream) -> Sequence[TableSchema]:
+    """Return the tables that a stream's messages make: its own first, then its children's."""
+    try:
+        schema = stream.unroller().schema
+    except AmberboxError:  # a message type without columns: kept, not shown
+        return ()
+    return tables_of(stream.item, schema, stream.topic.name, stream.source)
 
 
 def item_of(journal: JournalFile, table: str) -> str | None:
