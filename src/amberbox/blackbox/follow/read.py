@@ -18,6 +18,7 @@ from amberbox.blackbox.journal import reserved
 from amberbox.blackbox.journal.buffer import open_buffer
 from amberbox.blackbox.journal.chunk import Chunk, sequences
 from amberbox.blackbox.journal.clocktable import ClockReading, ClockTable, simplified
+from amberbox.blackbox.journal.groups import read_in_groups
 from amberbox.blackbox.journal.growing import GrowingIndex, UnindexedError
 from amberbox.blackbox.journal.scan import ChunkPlace, FileScan, Tally, read_chunk, scan
 from amberbox.blackbox.journal.walk import Damage
@@ -283,7 +284,11 @@ def batches_of(
     clock = ClockTable(journal.clock)
     piles: dict[int, _Pile] = {}
     overlaps = _overlapping(clock, from_ns, to_ns)
-    for chunk in sound_chunks(journal, lambda p: p.may_hold(wanted) and overlaps(p)):
+
+    def may_hold(place: ChunkPlace) -> bool:
+        return place.may_hold(wanted) and overlaps(place)
+
+    for chunk in sound_chunks(journal, may_hold, in_groups=True):
         seq, received = sequences(chunk, journal.first_seq), clock.received(chunk.log_ns)
         inside = _inside(received, from_ns, to_ns)
         for number in np.unique(chunk.channel[inside]).tolist():
@@ -326,19 +331,24 @@ def _inside(received: IntArray, from_ns: int | None, to_ns: int | None) -> Any:
 
 
 def sound_chunks(
-    journal: JournalFile, choose: Callable[[ChunkPlace], bool] = lambda place: True
+    journal: JournalFile,
+    choose: Callable[[ChunkPlace], bool] = lambda place: True,
+    *,
+    in_groups: bool = False,
 ) -> Iterator[Chunk]:
-    """Decode the chosen chunks of a file in ``seq`` order.
+    """Decode the chosen chunks of a file in ``seq`` order; ``in_groups`` several as one.
 
     When a checksum refuses one, the file is walked: what lies elsewhere than its index says (a
     disk that swapped pages) is found, and only what is really damaged is missing.
     """
     next_seq = journal.first_seq
     with open_buffer(journal.path) as data:
-        for place in journal.places:
-            if not choose(place):
-                continue
-            chunk = read_chunk(data, place)
+        places = (place for place in journal.places if choose(place))
+        if in_groups:
+            chunks = read_in_groups(data, places)
+        else:
+            chunks = (read_chunk(data, place) for place in places)
+        for chunk in chunks:
             if chunk is None:
                 break
             if len(chunk):
