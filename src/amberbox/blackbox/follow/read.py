@@ -286,7 +286,7 @@ def batches_of(
     overlaps = _overlapping(clock, from_ns, to_ns)
 
     def may_hold(place: ChunkPlace) -> bool:
-        return place.may_hold(wanted) and overlaps(place)
+        return place.may_hold(wanted.keys()) and overlaps(place)
 
     for chunk in sound_chunks(journal, may_hold, in_groups=True):
         seq, received = sequences(chunk, journal.first_seq), clock.received(chunk.log_ns)

@@ -6,7 +6,7 @@ A sound summary is believed; without one, or when asked to, the whole file is wa
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Container, Iterable, Mapping
+from collections.abc import Iterable, Mapping, Set
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
@@ -33,9 +33,9 @@ class ChunkPlace(NamedTuple):
     channels: tuple[int, ...] | None = None
     """Channels that have messages in it, as far as that is known."""
 
-    def may_hold(self, channels: Container[int]) -> bool:
+    def may_hold(self, channels: Set[int]) -> bool:
         """Tell whether a message of one of these channels may be in it."""
-        return self.channels is None or any(number in channels for number in self.channels)
+        return self.channels is None or not channels.isdisjoint(self.channels)
 
 
 class Tally(NamedTuple):

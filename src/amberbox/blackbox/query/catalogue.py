@@ -81,12 +81,27 @@ class Catalogue:
                 _add(found, schema)
         return found
 
+    def _versions(self, table: str) -> list[TableSchema]:
+        """Return the versions of one table's schema; the definitions of others are not read."""
+        if "schemas" in self.__dict__:
+            return self.schemas.get(table, [])
+        found: dict[str, list[TableSchema]] = {}
+        for segment in self.manifest.segments.get(table, ()) if self.with_segments else ():
+            _add(found, self.manifest.schemas[segment.schema])
+        for journal in self.journals(skip=self.done):
+            for schema in journal_tables(journal, table):
+                _add(found, schema)
+        return found.get(table, [])
+
     def schema(self, table: str) -> TableSchema:
         """Return the union of a table's versions: every column, in its widest type.
 
         Raises UsageError for a table that is not there.
         """
-        name = table if table in self.schemas else _by_case(table, self.schemas)
+        versions = self._versions(table)
+        if versions:
+            return union(versions)
+        name = _by_case(table, self.schemas)
         if name is None:
             raise UsageError(
                 f"there is no data item {table!r}", closest(table, sorted(self.schemas))
@@ -253,11 +268,15 @@ def _corrected_part(part: Part, book: ClockBook, *, stamped: bool) -> Part:
     return replace(part, clock=points, stamp_from_ns=edges[0], stamp_to_ns=edges[1])
 
 
-def journal_tables(journal: JournalFile) -> Iterator[TableSchema]:
-    """Give the tables of a journal's items that have rows and columns."""
+def journal_tables(journal: JournalFile, table: str | None = None) -> Iterator[TableSchema]:
+    """Give the tables of a journal's items that have rows and columns, or only one of a name."""
     for stream in journal.streams.values():
-        if not stream.repeated and journal.items.get(stream.item):
+        if stream.repeated or not journal.items.get(stream.item):
+            continue
+        if table is None:
             yield from stream_tables(stream)
+        elif table == stream.item or table.startswith(f"{stream.item}__"):
+            yield from (schema for schema in stream_tables(stream) if schema.item == table)
 
 
 @lru_cache(maxsize=4096)
@@ -272,7 +291,7 @@ def stream_tables(stream: Stream) -> Sequence[TableSchema]:
 
 def item_of(journal: JournalFile, table: str) -> str | None:
     """Return the item of a journal whose messages hold a table's rows."""
-    tables = (schema for schema in journal_tables(journal) if schema.item == table)
+    tables = journal_tables(journal, table)
     return next((schema.parent or schema.item for schema in tables), None)
 
 
