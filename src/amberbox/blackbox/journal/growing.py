@@ -85,26 +85,36 @@ class _Records:
             raise UnindexedError("chunk without a message index")
         log_ns, offsets = np.frombuffer(self.entries, "<i8").reshape(-1, 2).T
         counts = np.array(self.lengths, np.int64) // 16
-        numbers = np.repeat(np.array(self.channels, np.uint16), counts)
-        records = np.diff([*self.firsts, len(self.channels)])
-        chunks = np.repeat(np.repeat(np.arange(len(self.offsets)), records), counts)
-        starts, ends = np.array(self.starts_ns)[chunks], np.array(self.ends_ns)[chunks]
-        if bool(((log_ns < starts) | (log_ns > ends)).any()):
+        begins = np.cumsum(counts) - counts
+        of_chunk = np.repeat(
+            np.arange(len(self.offsets)), np.diff([*self.firsts, len(self.channels)])
+        )
+        first_ns, last_ns = (f.reduceat(log_ns, begins) for f in (np.minimum, np.maximum))
+        starts, ends = np.array(self.starts_ns)[of_chunk], np.array(self.ends_ns)[of_chunk]
+        if bool(((first_ns < starts) | (last_ns > ends)).any()):
             raise UnindexedError("message index")
-        sizes = _message_sizes(chunks, offsets, np.array(self.sizes, np.int64))
-        return tally(numbers, log_ns.astype(np.int64), sizes)
+        bounds = np.cumsum([0, *self.sizes])
+        inside = offsets + np.repeat(bounds[of_chunk], counts)
+        if bool((offsets < 0).any() or (inside >= np.repeat(bounds[of_chunk + 1], counts)).any()):
+            raise UnindexedError("message index")
+        sizes = np.add.reduceat(_message_sizes(inside, bounds), begins)
+        numbers = np.array(self.channels, np.uint16)
+        return tally(numbers, first_ns, last_ns, sizes, counts)
 
 
-def _message_sizes(chunks: IntArray, offsets: IntArray, ends: IntArray) -> IntArray:
-    """Tell the bytes of messages from where they begin; within a chunk nothing lies between."""
-    order = np.lexsort((offsets, chunks))
-    chunk, begin = chunks[order], offsets[order]
-    end = np.append(begin[1:], 0)
-    last = np.append(chunk[1:] != chunk[:-1], True)
-    end[last] = ends[chunk[last]]
+def _message_sizes(begins: IntArray, bounds: IntArray) -> IntArray:
+    """Tell the bytes of messages from where they begin; between them lies nothing else.
+
+    Both count from the first chunk's first byte, ``bounds`` are where the chunks begin and end.
+    """
+    order = np.argsort(begins, kind="stable")  # they come in long runs that are in order
+    begin = begins[order]
+    following = np.append(begin[1:], bounds[-1])
+    lasts = np.searchsorted(begin, bounds[1:]) - 1
+    following[lasts] = bounds[1:]
     sizes = np.empty(len(order), np.int64)
-    sizes[order] = end - begin - MESSAGE_HEAD
-    if int(begin.min()) < 0 or int(sizes.min()) < 0:
+    sizes[order] = following - begin - MESSAGE_HEAD
+    if int(sizes.min()) < 0:
         raise UnindexedError("message index")
     return sizes
 

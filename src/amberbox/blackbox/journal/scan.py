@@ -172,7 +172,7 @@ def _take_chunk(result: FileScan, chunk: Chunk) -> Mapping[ChunkPlace, Mapping[i
     summary.channels.update(chunk.channels)
     if not len(chunk):
         return {}
-    tallies = tally(chunk.channel, chunk.log_ns, chunk.ends - chunk.starts)
+    tallies = tally_of(chunk)
     first, last = int(chunk.log_ns.min()), int(chunk.log_ns.max())
     summary.start_ns = min(summary.start_ns, first) if result.places else first
     summary.end_ns = max(summary.end_ns, last)
@@ -182,20 +182,32 @@ def _take_chunk(result: FileScan, chunk: Chunk) -> Mapping[ChunkPlace, Mapping[i
     return {place: tallies}
 
 
-def tally(channels: NDArray[np.uint16], log_ns: IntArray, sizes: IntArray) -> dict[int, Tally]:
-    """Count messages by channel; the three columns are parallel."""
+def tally(
+    channels: NDArray[np.uint16],
+    first_ns: IntArray,
+    last_ns: IntArray,
+    sizes: IntArray,
+    counts: IntArray,
+) -> dict[int, Tally]:
+    """Count messages by channel; the columns are parallel, each row stands for some messages."""
     if not len(channels):
         return {}
     order = np.argsort(channels, kind="stable")
     grouped = channels[order]
     starts = np.flatnonzero(np.concatenate(([True], grouped[1:] != grouped[:-1])))
-    counts = np.diff(np.append(starts, len(order)))
     columns = (
-        grouped[starts], counts, np.minimum.reduceat(log_ns[order], starts),
-        np.maximum.reduceat(log_ns[order], starts), np.add.reduceat(sizes[order], starts),
+        grouped[starts], np.add.reduceat(counts[order], starts),
+        np.minimum.reduceat(first_ns[order], starts), np.maximum.reduceat(last_ns[order], starts),
+        np.add.reduceat(sizes[order], starts),
     )  # fmt: skip
     rows = zip(*(column.tolist() for column in columns), strict=True)
     return {number: Tally(*figures) for number, *figures in rows}
+
+
+def tally_of(chunk: Chunk) -> dict[int, Tally]:
+    """Count the messages of a chunk by channel."""
+    ones = np.ones(len(chunk), np.int64)
+    return tally(chunk.channel, chunk.log_ns, chunk.log_ns, chunk.ends - chunk.starts, ones)
 
 
 def together(parts: Iterable[Mapping[int, Tally]]) -> dict[int, Tally]:

@@ -18,7 +18,7 @@ from amberbox.blackbox.follow.read import JournalFile, batches_of, sound_chunks
 from amberbox.blackbox.journal import reserved
 from amberbox.blackbox.journal.clocktable import ClockPoints, ClockTable
 from amberbox.blackbox.journal.growing import UnindexedError, counted
-from amberbox.blackbox.journal.scan import ChunkPlace, Tally, tally, together
+from amberbox.blackbox.journal.scan import ChunkPlace, Tally, tally_of, together
 from amberbox.blackbox.query.catalogue import Catalogue, item_of, stream_tables, union
 from amberbox.blackbox.query.rates import Place, Share, deleted_places, rate_hz
 from amberbox.blackbox.segments.build import median
@@ -199,8 +199,7 @@ def _tallies(journal: JournalFile) -> Mapping[int, Tally]:
     try:
         return counted(journal.path)
     except UnindexedError:
-        chunks = sound_chunks(journal)
-        return together(tally(c.channel, c.log_ns, c.ends - c.starts) for c in chunks)
+        return together(tally_of(chunk) for chunk in sound_chunks(journal))
 
 
 def _chosen(
