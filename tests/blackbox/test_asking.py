@@ -114,6 +114,27 @@ def test_what_was_read_of_a_growing_journal_is_kept(
     assert journal_file(path) is after
 
 
+@pytest.mark.parametrize("ends", ["rotated", "closed", "killed"])
+def test_a_journal_that_is_given_up_is_looked_into_anew(tmp_path: Path, ends: str) -> None:
+    """Also where its head still names it, and where not a byte is added."""
+    box = ManualBox(tmp_path / "store")
+    box.hear(COUNT, number(1))
+    box.write()
+    box.pipeline._journals.publish_heads(box.sink.now_ns())
+    (path,) = box.pipeline.journal_paths
+    before = journal_file(path)
+    assert (before.finished, before.walked) == (False, False)
+    if ends == "rotated":
+        box.pipeline._journals.rotate()
+    else:
+        (box.close if ends == "closed" else box.crash)()
+    after = journal_file(path)
+    assert (after.finished, after.walked) == (ends != "killed", ends == "killed")
+    assert after.items["ros_count"] == before.items["ros_count"]
+    if ends == "rotated":
+        box.close()
+
+
 def test_a_query_reads_only_chunks_of_its_item(live: ManualBox, unpacked: Counter[str]) -> None:
     record = amberbox.open(live.store)
     held = sum(

@@ -115,7 +115,8 @@ class _Looked:
         with self._lock:
             status = self._path.stat()
             seen = status.st_ino, status.st_mtime_ns, status.st_size
-            if self._found is None or seen != self._seen:
+            given_up = self._index is not None and not being_written(self._path)
+            if self._found is None or seen != self._seen or given_up:
                 if self._seen is not None and self._seen[0] != status.st_ino:
                     self._index = self._found = None
                 self._found = self._look()

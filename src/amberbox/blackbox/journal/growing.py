@@ -145,8 +145,9 @@ class GrowingIndex:
             if len(data) < self._at:
                 raise UnindexedError("shorter than before")
             self._take(data)
-            if self._at < len(data) and (written is None or self._at < written):
-                raise UnindexedError("not whole")
+            rest = bytes(data[self._at : self._at + 1])
+            if rest and (written is None or self._at < written or rest[0] == mcap.DATA_END):
+                raise UnindexedError("not whole, or just being finished")
             return self._found(len(data))
 
     def _found(self, size: int) -> FileScan:
