@@ -5,6 +5,7 @@ from __future__ import annotations
 import random
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -300,3 +301,25 @@ def test_items_whose_type_changes_are_counted_together(tmp_path: Path) -> None:
     assert (info.rows, info.bytes) == (40, 320)
     assert told([info])[info.name] == counted_by_rows(record, "ros_count")
     box.close()
+
+
+@fuzz
+@settings(max_examples=examples(5), deadline=None)
+@given(seed=st.integers(0, 2**32))
+def test_an_index_is_believed_or_refused(
+    tmp_path_factory: pytest.TempPathFactory, seed: int
+) -> None:
+    """Changed heads of chunks and of their indices end in nothing but a refusal."""
+    chance = random.Random(seed)
+    box = ManualBox(tmp_path_factory.mktemp("index") / "store", OPTIONS)
+    record_some(box, 10, chance)
+    path = box.pipeline.journal_paths[0]
+    places, whole = growing.GrowingIndex(path).read().places, path.read_bytes()
+    for _ in range(50):
+        data = bytearray(whole)
+        data[chance.choice(places).offset + chance.randrange(60)] = chance.randrange(256)
+        path.write_bytes(data[: chance.choice([len(data), chance.randrange(9, len(data))])])
+        with suppress(growing.UnindexedError):
+            found = growing.GrowingIndex(path).read()
+            assert len(found.places) <= len(places)
+    box.crash()

@@ -18,6 +18,7 @@ import numpy as np
 
 from amberbox.blackbox.journal import mcap
 from amberbox.blackbox.journal.buffer import Buffer, open_buffer
+from amberbox.blackbox.journal.chunk import MAX_CHUNK_BYTES
 from amberbox.blackbox.journal.head import read_head
 from amberbox.blackbox.journal.mcap import CHAIN_METADATA, MESSAGE_HEAD, START_METADATA, Channel
 from amberbox.blackbox.journal.scan import ChunkPlace, FileScan, Tally, tally, together
@@ -28,6 +29,7 @@ from amberbox.core.types import IntArray, Schema
 _RECORD = struct.Struct("<BQ").unpack_from
 _CHUNK = struct.Struct("<QQQ").unpack_from
 _INDEX = struct.Struct("<HI").unpack_from
+_CHUNK_HEAD, _INDEX_HEAD = 24, 6
 
 
 class UnindexedError(Exception):
@@ -83,6 +85,8 @@ class _Records:
             return {}
         if len(self.firsts) != len(set(self.firsts)) or self.firsts[-1] == len(self.channels):
             raise UnindexedError("chunk without a message index")
+        if max(self.sizes) > MAX_CHUNK_BYTES or max(*self.starts_ns, *self.ends_ns) >= 1 << 63:
+            raise UnindexedError("chunk head")
         log_ns, offsets = np.frombuffer(self.entries, "<i8").reshape(-1, 2).T
         counts = np.array(self.lengths, np.int64) // 16
         begins = np.cumsum(counts) - counts
@@ -215,14 +219,14 @@ def _records(
         end = at + 9 + length
         if end > size or opcode == mcap.DATA_END:
             break
-        if opcode == mcap.MESSAGE_INDEX:
+        if opcode == mcap.MESSAGE_INDEX and length >= _INDEX_HEAD:
             number, count = _INDEX(data, at + 9)
             if count != length - 6 or count % 16 or not count or not found.offsets:
                 raise UnindexedError("message index")
             found.channels.append(number)
             found.lengths.append(count)
             entries.append(data[at + 15 : end])
-        elif opcode == mcap.CHUNK:
+        elif opcode == mcap.CHUNK and length >= _CHUNK_HEAD:
             start_ns, end_ns, unpacked = _CHUNK(data, at + 9)
             found.offsets.append(at)
             found.starts_ns.append(start_ns)
