@@ -28,6 +28,8 @@ INCIDENTS = "incidents"
 SEGMENTS = "segments"
 _IDENTITY = "store.json"
 _RUN = "run"
+_LOCKS = {"keep": "keeper", "kept": "keeper"}
+"""Locks of the writers that are not called like these."""
 _LOCK_TRIES = 10
 _LOCK_PAUSE_S = 0.02
 """A reader that asks whether a lock is held holds it itself for some microseconds."""
@@ -182,6 +184,14 @@ def is_locked(store: Store, writer: str) -> bool:
     except OSError:
         return True
     return False
+
+
+def being_written(path: Path) -> bool:
+    """Tell whether a journal file is the one that its writer adds to right now."""
+    folder, store = path.parent, Store(path.parent.parent, "")
+    writer = next((writer for writer, name in FOLDERS.items() if name == folder.name), "")
+    newest = max(folder.glob("*.mcap"), key=run_and_number, default=None)
+    return newest == path and is_locked(store, _LOCKS.get(writer, writer))
 
 
 def run_and_number(path: Path) -> tuple[int, int]:

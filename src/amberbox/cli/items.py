@@ -46,7 +46,7 @@ def _row(item: ItemInfo) -> tuple[object, ...]:
     return (
         item.name,
         item.type,
-        item.rows,
+        f"~{item.rows}" if item.estimated else item.rows,
         item.rate_hz,
         _short(item.first_ns),
         _short(item.last_ns),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Collection, Container, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -17,9 +18,11 @@ from amberbox.blackbox.journal import reserved
 from amberbox.blackbox.journal.buffer import open_buffer
 from amberbox.blackbox.journal.chunk import Chunk, sequences
 from amberbox.blackbox.journal.clocktable import ClockReading, ClockTable, simplified
-from amberbox.blackbox.journal.scan import ChunkPlace, FileScan, read_chunk, scan
+from amberbox.blackbox.journal.groups import read_in_groups
+from amberbox.blackbox.journal.growing import GrowingIndex, UnindexedError
+from amberbox.blackbox.journal.scan import ChunkPlace, FileScan, Tally, read_chunk, scan
 from amberbox.blackbox.journal.walk import Damage
-from amberbox.blackbox.store import Store, open_store
+from amberbox.blackbox.store import Store, being_written, open_store
 from amberbox.core.types import Batch, Gap, IntArray
 
 BATCH_ROWS = 4096
@@ -52,6 +55,8 @@ class JournalFile:
     store_id: str = ""
     walked: bool = False
     readings: tuple[ClockReading, ...] = ()
+    tallies: Mapping[int, Tally] | None = field(default=None, repr=False)
+    """What there is of each channel, where that is known without reading messages."""
 
     @property
     def rows(self) -> int:
@@ -86,17 +91,55 @@ def newest_first(store: Store, writer: str) -> Iterator[JournalFile]:
 
 def journal_file(path: Path, name: str = "") -> JournalFile:
     """Look into a journal file; what was found is remembered until the file changes."""
-    status = path.stat()
-    return _journal_file(path, name or path.name, status.st_mtime_ns, status.st_size)
+    return _journal_file(path, name or path.name).now()
 
 
 @lru_cache(maxsize=1024)
-def _journal_file(path: Path, name: str, _mtime_ns: int, _size: int) -> JournalFile:
-    return describe(scan(path), name)
+def _journal_file(path: Path, name: str) -> _Looked:
+    return _Looked(path, name)
 
 
-def describe(found: FileScan, name: str) -> JournalFile:
-    """Turn a scan into a journal file with items and clock."""
+class _Looked:
+    """What is known of one file by now; of one that is being written only the rest is read."""
+
+    def __init__(self, path: Path, name: str) -> None:
+        self._path = path
+        self._name = name
+        self._lock = threading.Lock()
+        self._seen: tuple[int, int, int] | None = None
+        self._index: GrowingIndex | None = None
+        self._found: JournalFile | None = None
+
+    def now(self) -> JournalFile:
+        """Look into the file, if it has changed."""
+        with self._lock:
+            status = self._path.stat()
+            seen = status.st_ino, status.st_mtime_ns, status.st_size
+            given_up = self._index is not None and not being_written(self._path)
+            if self._found is None or seen != self._seen or given_up:
+                if self._seen is not None and self._seen[0] != status.st_ino:
+                    self._index = self._found = None
+                self._found = self._look()
+                self._seen = seen
+            return self._found
+
+    def _look(self) -> JournalFile:
+        known = self._found
+        if being_written(self._path):
+            self._index = self._index or GrowingIndex(self._path)
+            try:
+                return describe(self._index.read(), self._name, known)
+            except UnindexedError:  # damaged, or not ours
+                pass
+        self._index = None
+        return describe(scan(self._path), self._name)
+
+
+def describe(found: FileScan, name: str, known: JournalFile | None = None) -> JournalFile:
+    """Turn a scan into a journal file with items and clock.
+
+    ``known`` is the same file as it was before it grew.
+    """
     start, summary = found.start, found.summary
     streams = {n: stream_of(c, summary.schemas) for n, c in summary.channels.items()}
     items: dict[str, int] = {}
@@ -125,8 +168,12 @@ def describe(found: FileScan, name: str) -> JournalFile:
         damage=tuple(found.damage),
         store_id=start.get("store_id", ""),
         walked=found.walked,
+        tallies=found.tallies,
     )
-    readings = tuple(_clock_readings(journal, _places_of_clock(found)))
+    numbers = {n for n, c in found.summary.channels.items() if c.topic == reserved.CLOCK}
+    read, readings = (len(known.places), known.readings) if known else (0, ())
+    places = [p for p in journal.places[read:] if p.may_hold(numbers)] if numbers else []
+    readings += tuple(_clock_readings(journal, places))
     points = [(reading.log_ns, reading.offset_ns) for reading in readings]
     return replace(journal, clock=simplified(points), readings=readings)
 
@@ -140,17 +187,6 @@ def _end_seq(found: FileScan, first_seq: int) -> int:
     if last.first_sequence is None:
         return first_seq + sum(place.count for place in found.places)
     return first_seq + ((last.first_sequence - first_seq) & 0xFFFFFFFF) + last.count
-
-
-def _places_of_clock(found: FileScan) -> list[ChunkPlace]:
-    """Chunks with clock records: by the index of a finished file, else all."""
-    numbers = {n for n, c in found.summary.channels.items() if c.topic == reserved.CLOCK}
-    if not numbers:
-        return []
-    if found.walked:
-        return found.places
-    indexed = zip(found.places, found.summary.chunks, strict=True)
-    return [p for p, c in indexed if any(n in numbers for n, _ in c.index_offsets)]
 
 
 def _clock_readings(journal: JournalFile, places: Sequence[ChunkPlace]) -> Iterator[ClockReading]:
@@ -248,7 +284,12 @@ def batches_of(
         return
     clock = ClockTable(journal.clock)
     piles: dict[int, _Pile] = {}
-    for chunk in sound_chunks(journal, _overlapping(clock, from_ns, to_ns)):
+    overlaps = _overlapping(clock, from_ns, to_ns)
+
+    def may_hold(place: ChunkPlace) -> bool:
+        return place.may_hold(wanted.keys()) and overlaps(place)
+
+    for chunk in sound_chunks(journal, may_hold, in_groups=True):
         seq, received = sequences(chunk, journal.first_seq), clock.received(chunk.log_ns)
         inside = _inside(received, from_ns, to_ns)
         for number in np.unique(chunk.channel[inside]).tolist():
@@ -291,19 +332,24 @@ def _inside(received: IntArray, from_ns: int | None, to_ns: int | None) -> Any:
 
 
 def sound_chunks(
-    journal: JournalFile, choose: Callable[[ChunkPlace], bool] = lambda place: True
+    journal: JournalFile,
+    choose: Callable[[ChunkPlace], bool] = lambda place: True,
+    *,
+    in_groups: bool = False,
 ) -> Iterator[Chunk]:
-    """Decode the chosen chunks of a file in ``seq`` order.
+    """Decode the chosen chunks of a file in ``seq`` order; ``in_groups`` several as one.
 
     When a checksum refuses one, the file is walked: what lies elsewhere than its index says (a
     disk that swapped pages) is found, and only what is really damaged is missing.
     """
     next_seq = journal.first_seq
     with open_buffer(journal.path) as data:
-        for place in journal.places:
-            if not choose(place):
-                continue
-            chunk = read_chunk(data, place)
+        places = (place for place in journal.places if choose(place))
+        if in_groups:
+            chunks = read_in_groups(data, places)
+        else:
+            chunks = (read_chunk(data, place) for place in places)
+        for chunk in chunks:
             if chunk is None:
                 break
             if len(chunk):

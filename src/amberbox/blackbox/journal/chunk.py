@@ -52,14 +52,16 @@ class Chunk:
         return [body[a:b] for a, b in spans]
 
 
-def decompress(head: ChunkHead, data: bytes | memoryview) -> bytes | None:
+def decompress(
+    head: ChunkHead, data: bytes | memoryview, zstd: zstandard.ZstdDecompressor | None = None
+) -> bytes | None:
     """Return a chunk's records if decompression, size and CRC agree, else None."""
     if head.data_offset + head.data_length > len(data):
         return None
     if head.compression and head.size > MAX_CHUNK_BYTES:
         return None
     packed = data[head.data_offset : head.data_offset + head.data_length]
-    body = _unpack(head.compression, packed, head.size)
+    body = _unpack(head.compression, packed, head.size, zstd)
     if body is None or len(body) != head.size:
         return None
     if head.crc and zlib.crc32(body) != head.crc:
@@ -67,22 +69,29 @@ def decompress(head: ChunkHead, data: bytes | memoryview) -> bytes | None:
     return body
 
 
-def _unpack(compression: str, packed: bytes | memoryview, size: int) -> bytes | None:
+def _unpack(
+    compression: str,
+    packed: bytes | memoryview,
+    size: int,
+    zstd: zstandard.ZstdDecompressor | None,
+) -> bytes | None:
     if compression == "":
         return bytes(packed)
     if compression == "zstd":
-        return _unpack_zstd(packed, size)
+        return _unpack_zstd(packed, size, zstd or zstandard.ZstdDecompressor())
     if compression == "lz4":
         return _unpack_lz4(bytes(packed), size)
     return None
 
 
-def _unpack_zstd(packed: bytes | memoryview, size: int) -> bytes | None:
+def _unpack_zstd(
+    packed: bytes | memoryview, size: int, zstd: zstandard.ZstdDecompressor
+) -> bytes | None:
     """Unpack at most ``size`` bytes: what a frame says of its own size is allocated unchecked."""
     try:
         if zstandard.frame_content_size(packed) not in (size, -1):
             return None
-        return zstandard.ZstdDecompressor().decompress(packed, max_output_size=size)
+        return zstd.decompress(packed, max_output_size=size)
     except zstandard.ZstdError:
         return None
 
@@ -132,6 +141,33 @@ def _stated(
 @lru_cache(maxsize=256)
 def _kept(head: bytes) -> tuple[dict[int, Schema], dict[int, Channel], int]:
     return _definitions(head)
+
+
+def states_only(head: bytes) -> bool:
+    """Tell whether bytes are definitions and nothing else."""
+    try:
+        return (_kept if len(head) <= _KEPT_BYTES else _definitions)(head)[2] == len(head)
+    except (ValueError, struct.error, IndexError):
+        return False
+
+
+def lay_open(
+    bodies: bytes, starts: IntArray, bounds: IntArray, firsts: IntArray, offset: int
+) -> Chunk | None:
+    """Lay the messages of joined chunks open; None if their records do not fit together.
+
+    ``starts`` are the message offsets in order, ``bounds`` where the chunks end, ``firsts`` the
+    row that each chunk begins with.
+    """
+    if int(starts[-1]) + MESSAGE_HEAD > len(bodies):
+        return None
+    ends = starts + 9 + _take(bodies, "<u8", 7, starts + 1).astype(np.int64)
+    expected = np.append(starts[1:], 0)
+    expected[np.append(firsts[1:], len(starts)) - 1] = bounds
+    sound = np.frombuffer(bodies, np.uint8)[starts] == mcap.MESSAGE
+    if not (np.array_equal(ends, expected) and bool(sound.all())):
+        return None
+    return _columns(bodies, starts, offset, offset, {}, {})
 
 
 def _definitions(body: bytes) -> tuple[dict[int, Schema], dict[int, Channel], int]:

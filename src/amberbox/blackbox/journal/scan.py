@@ -5,28 +5,53 @@ A sound summary is believed; without one, or when asked to, the whole file is wa
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Iterable, Mapping, Set
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from amberbox.blackbox.journal.buffer import Buffer, open_buffer
 from amberbox.blackbox.journal.chunk import Chunk
 from amberbox.blackbox.journal.mcap import CHAIN_METADATA, START_METADATA
 from amberbox.blackbox.journal.summary import Summary, read_summary
 from amberbox.blackbox.journal.walk import Damage, Metadata, Walk, chunk_at, metadata_at
+from amberbox.core.types import IntArray
 
 
-@dataclass(frozen=True, slots=True)
-class ChunkPlace:
+class ChunkPlace(NamedTuple):
     """Where a chunk lies and what it holds, without holding it."""
 
     offset: int
     start_ns: int
     end_ns: int
-    count: int
+    count: int  # type: ignore[assignment]  # hides tuple.count, which is not asked of places
     first_sequence: int | None = None
+    channels: tuple[int, ...] | None = None
+    """Channels that have messages in it, as far as that is known."""
+
+    def may_hold(self, channels: Set[int]) -> bool:
+        """Tell whether a message of one of these channels may be in it."""
+        return self.channels is None or not channels.isdisjoint(self.channels)
+
+
+class Tally(NamedTuple):
+    """Messages of one channel in a file: how many, first and last log time, their bytes."""
+
+    rows: int
+    first_ns: int
+    last_ns: int
+    bytes: int
+
+    def plus(self, other: Tally | None) -> Tally:
+        """Return both together."""
+        if other is None:
+            return self
+        first_ns, last_ns = min(self.first_ns, other.first_ns), max(self.last_ns, other.last_ns)
+        return Tally(self.rows + other.rows, first_ns, last_ns, self.bytes + other.bytes)
 
 
 @dataclass(slots=True)
@@ -44,6 +69,8 @@ class FileScan:
     indexed: int | None = None
     """How many messages the file was finished with, also where some are damaged now."""
     damage: list[Damage] = field(default_factory=list)
+    tallies: Mapping[int, Tally] | None = None
+    """What there is of each channel; None where nobody has counted yet."""
 
 
 def scan(path: Path, *, walk: bool = False) -> FileScan:
@@ -78,10 +105,11 @@ def _start_record(data: Buffer) -> Mapping[str, str]:
 def _from_summary(path: Path, data: Buffer, start: Mapping[str, str], summary: Summary) -> FileScan:
     places = [
         ChunkPlace(
-            c.offset, c.start_ns, c.end_ns, (c.index_length - 15 * len(c.index_offsets)) // 16
+            c.offset, c.start_ns, c.end_ns, (c.index_length - 15 * len(c.index_offsets)) // 16,
+            channels=tuple([number for number, _ in c.index_offsets]) if c.index_offsets else None,
         )
         for c in summary.chunks
-    ]
+    ]  # fmt: skip
     result = FileScan(path, len(data), start, finished=True, summary=summary, places=places)
     for offset, _, name in summary.metadata[-1:]:
         last = metadata_at(data, offset)
@@ -93,13 +121,14 @@ def _from_summary(path: Path, data: Buffer, start: Mapping[str, str], summary: S
 def _from_walk(path: Path, data: Buffer, summary: Summary | None) -> FileScan:
     result = FileScan(path, len(data), walked=True)
     walk = Walk(data)
+    tallies: dict[ChunkPlace, Mapping[int, Tally]] = {}
     for found in walk:
         if isinstance(found, Damage):
             result.damage.append(found)
         elif isinstance(found, Metadata):
             _take_metadata(result, found)
         else:
-            _take_chunk(result, found)
+            tallies.update(_take_chunk(result, found))
     result.finished = walk.finished
     if summary is not None:  # it has a checksum of its own: definitions whose chunks are damaged
         result.summary.schemas = {**summary.schemas, **result.summary.schemas}
@@ -109,6 +138,8 @@ def _from_walk(path: Path, data: Buffer, summary: Summary | None) -> FileScan:
         result.start = _start_by_mark(result)
     if result.start:
         result.places = _in_order(result)
+    result.tallies = together(tallies[place] for place in result.places)
+    result.summary.counts = Counter({n: tally.rows for n, tally in result.tallies.items()})
     return result
 
 
@@ -134,19 +165,58 @@ def _take_metadata(result: FileScan, found: Metadata) -> None:
         result.chain = found.values.get("chain", "")
 
 
-def _take_chunk(result: FileScan, chunk: Chunk) -> None:
+def _take_chunk(result: FileScan, chunk: Chunk) -> Mapping[ChunkPlace, Mapping[int, Tally]]:
+    """Note a chunk; return its place and what it holds of each channel, if it holds anything."""
     summary = result.summary
     summary.schemas.update(chunk.schemas)
     summary.channels.update(chunk.channels)
     if not len(chunk):
-        return
-    numbers, counts = np.unique(chunk.channel, return_counts=True)
-    for number, count in zip(numbers.tolist(), counts.tolist(), strict=True):
-        summary.counts[number] += count
+        return {}
+    tallies = tally_of(chunk)
     first, last = int(chunk.log_ns.min()), int(chunk.log_ns.max())
     summary.start_ns = min(summary.start_ns, first) if result.places else first
     summary.end_ns = max(summary.end_ns, last)
-    result.places.append(ChunkPlace(chunk.offset, first, last, len(chunk), int(chunk.sequence[0])))
+    first_sequence, channels = int(chunk.sequence[0]), tuple(tallies)
+    place = ChunkPlace(chunk.offset, first, last, len(chunk), first_sequence, channels)
+    result.places.append(place)
+    return {place: tallies}
+
+
+def tally(
+    channels: NDArray[np.uint16],
+    first_ns: IntArray,
+    last_ns: IntArray,
+    sizes: IntArray,
+    counts: IntArray,
+) -> dict[int, Tally]:
+    """Count messages by channel; the columns are parallel, each row stands for some messages."""
+    if not len(channels):
+        return {}
+    order = np.argsort(channels, kind="stable")
+    grouped = channels[order]
+    starts = np.flatnonzero(np.concatenate(([True], grouped[1:] != grouped[:-1])))
+    columns = (
+        grouped[starts], np.add.reduceat(counts[order], starts),
+        np.minimum.reduceat(first_ns[order], starts), np.maximum.reduceat(last_ns[order], starts),
+        np.add.reduceat(sizes[order], starts),
+    )  # fmt: skip
+    rows = zip(*(column.tolist() for column in columns), strict=True)
+    return {number: Tally(*figures) for number, *figures in rows}
+
+
+def tally_of(chunk: Chunk) -> dict[int, Tally]:
+    """Count the messages of a chunk by channel."""
+    ones = np.ones(len(chunk), np.int64)
+    return tally(chunk.channel, chunk.log_ns, chunk.log_ns, chunk.ends - chunk.starts, ones)
+
+
+def together(parts: Iterable[Mapping[int, Tally]]) -> dict[int, Tally]:
+    """Add up what parts of a file hold of each channel."""
+    found: dict[int, Tally] = {}
+    for part in parts:
+        for number, one in part.items():
+            found[number] = one.plus(found.get(number))
+    return found
 
 
 def _in_order(result: FileScan) -> list[ChunkPlace]:

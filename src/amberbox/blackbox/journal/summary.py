@@ -7,6 +7,7 @@ import zlib
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 from amberbox.blackbox.journal import mcap
 from amberbox.blackbox.journal.mcap import Channel
@@ -14,10 +15,13 @@ from amberbox.core.types import Schema
 
 FOOTER_SIZE = 9 + 20 + len(mcap.MAGIC)
 _DATA_END_SIZE = 13
+_INDEX_HEAD = struct.Struct("<QQQQI")
+_INDEX_MIDDLE = struct.Struct("<QI")
+_INDEX_OFFSET = struct.Struct("<HQ")
+_INDEX_SIZES = struct.Struct("<QQ")
 
 
-@dataclass(frozen=True, slots=True)
-class IndexedChunk:
+class IndexedChunk(NamedTuple):
     """One chunk's entry in the chunk index."""
 
     start_ns: int
@@ -167,13 +171,16 @@ def _take(summary: Summary, opcode: int, content: bytes) -> None:
 
 
 def _chunk_index(content: bytes) -> IndexedChunk:
-    fields = mcap.Fields(content)
-    start_ns, end_ns, offset, length = (fields.number("Q") for _ in range(4))
-    offsets = [(c, o) for c, o in struct.iter_unpack("<HQ", fields.bytes())]
+    start_ns, end_ns, offset, length, map_size = _INDEX_HEAD.unpack_from(content)
+    at = _INDEX_HEAD.size + map_size
+    index_length, name_size = _INDEX_MIDDLE.unpack_from(content, at)
+    offsets = list(_INDEX_OFFSET.iter_unpack(content[_INDEX_HEAD.size : at]))
+    at += _INDEX_MIDDLE.size
+    compression = content[at : at + name_size].decode()
+    compressed_size, size = _INDEX_SIZES.unpack_from(content, at + name_size)
     return IndexedChunk(
-        start_ns, end_ns, offset, length, offsets, fields.number("Q"), fields.text(),
-        fields.number("Q"), fields.number("Q"),
-    )  # fmt: skip
+        start_ns, end_ns, offset, length, offsets, index_length, compression, compressed_size, size
+    )
 
 
 def _statistics(summary: Summary, content: bytes) -> None:

@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Container, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
 
+from amberbox.blackbox.follow.batching import Stream
 from amberbox.blackbox.follow.read import JournalFile, journal_file
 from amberbox.blackbox.journal.clocktable import ClockReading, ClockTable
 from amberbox.blackbox.query.clockbook import UNKNOWN_BOOT, ClockBook, JournalClock, book_of
@@ -45,6 +46,8 @@ class Catalogue:
     existing: tuple[str, ...] = ()
     book: ClockBook = field(default_factory=ClockBook)
     stored: Callable[[str], str] = stored_name
+    opened: dict[str, JournalFile] = field(default_factory=dict, compare=False, repr=False)
+    """Journals as they were found at first: one that grows is looked into once."""
 
     def journals(self, skip: Container[str]) -> Iterator[JournalFile]:
         """Open the journal files that are not named in ``skip``, in the order of writing.
@@ -53,9 +56,13 @@ class Catalogue:
         """
         for name in self.existing:
             if name not in skip:
-                journal = journal_file(open_store(self.store).journal_path(name), name)
-                points = self.book.points(name)
-                yield journal if points is None else replace(journal, clock=points)
+                if name not in self.opened:
+                    journal = journal_file(open_store(self.store).journal_path(name), name)
+                    points = self.book.points(name)
+                    self.opened[name] = (
+                        journal if points is None else replace(journal, clock=points)
+                    )
+                yield self.opened[name]
 
     @property
     def done(self) -> Collection[str]:
@@ -74,12 +81,27 @@ class Catalogue:
                 _add(found, schema)
         return found
 
+    def _versions(self, table: str) -> list[TableSchema]:
+        """Return the versions of one table's schema; the definitions of others are not read."""
+        if "schemas" in self.__dict__:
+            return self.schemas.get(table, [])
+        found: dict[str, list[TableSchema]] = {}
+        for segment in self.manifest.segments.get(table, ()) if self.with_segments else ():
+            _add(found, self.manifest.schemas[segment.schema])
+        for journal in self.journals(skip=self.done):
+            for schema in journal_tables(journal, table):
+                _add(found, schema)
+        return found.get(table, [])
+
     def schema(self, table: str) -> TableSchema:
         """Return the union of a table's versions: every column, in its widest type.
 
         Raises UsageError for a table that is not there.
         """
-        name = table if table in self.schemas else _by_case(table, self.schemas)
+        versions = self._versions(table)
+        if versions:
+            return union(versions)
+        name = _by_case(table, self.schemas)
         if name is None:
             raise UsageError(
                 f"there is no data item {table!r}", closest(table, sorted(self.schemas))
@@ -139,8 +161,13 @@ def look(store: Path, *, with_segments: bool = True) -> Catalogue:
         for path in opened.journal_files(writer)
     )
     manifest = mf.read(store)
-    book = book_of(_clocks(opened, manifest, existing))
-    return Catalogue(store, corrected(manifest, book), with_segments, existing, book)
+    found: dict[str, JournalFile] = {}
+    book = book_of(_clocks(opened, manifest, existing, found))
+    for name, journal in found.items():
+        points = book.points(name)
+        found[name] = journal if points is None else replace(journal, clock=points)
+    known = corrected(manifest, book)
+    return Catalogue(store, known, with_segments, existing, book, opened=found)
 
 
 def ask(
@@ -161,14 +188,19 @@ def ask(
     )
 
 
-def _clocks(store: Store, manifest: Manifest, existing: Sequence[str]) -> Iterator[JournalClock]:
-    """Give what journals say about clocks: by the manifest if they are sealed, else by the file."""
+def _clocks(
+    store: Store, manifest: Manifest, existing: Sequence[str], opened: dict[str, JournalFile]
+) -> Iterator[JournalClock]:
+    """Give what journals say about clocks: by the manifest if they are sealed, else by the file.
+
+    The files that are looked into are put into ``opened``.
+    """
     for sealed in manifest.sealed.values():
         yield _sealed_clock(sealed)
     for name in existing:
         if name not in manifest.sealed:
             with suppress(FileNotFoundError):  # deleted meanwhile
-                journal = journal_file(store.journal_path(name), name)
+                journal = opened[name] = journal_file(store.journal_path(name), name)
                 yield JournalClock(name, boot_in(name), journal.run, journal.readings)
 
 
@@ -236,18 +268,30 @@ def _corrected_part(part: Part, book: ClockBook, *, stamped: bool) -> Part:
     return replace(part, clock=points, stamp_from_ns=edges[0], stamp_to_ns=edges[1])
 
 
-def journal_tables(journal: JournalFile) -> Iterator[TableSchema]:
-    """Give the tables of a journal's items that have rows and columns."""
+def journal_tables(journal: JournalFile, table: str | None = None) -> Iterator[TableSchema]:
+    """Give the tables of a journal's items that have rows and columns, or only one of a name."""
     for stream in journal.streams.values():
-        if not stream.repeated and journal.items.get(stream.item):
-            with suppress(AmberboxError):  # a message type without columns: kept, not shown
-                schema = stream.unroller().schema
-                yield from tables_of(stream.item, schema, stream.topic.name, stream.source)
+        if stream.repeated or not journal.items.get(stream.item):
+            continue
+        if table is None:
+            yield from stream_tables(stream)
+        elif table == stream.item or table.startswith(f"{stream.item}__"):
+            yield from (schema for schema in stream_tables(stream) if schema.item == table)
+
+
+@lru_cache(maxsize=4096)
+def stream_tables(stream: Stream) -> Sequence[TableSchema]:
+    """Return the tables that a stream's messages make: its own first, then its children's."""
+    try:
+        schema = stream.unroller().schema
+    except AmberboxError:  # a message type without columns: kept, not shown
+        return ()
+    return tables_of(stream.item, schema, stream.topic.name, stream.source)
 
 
 def item_of(journal: JournalFile, table: str) -> str | None:
     """Return the item of a journal whose messages hold a table's rows."""
-    tables = (schema for schema in journal_tables(journal) if schema.item == table)
+    tables = journal_tables(journal, table)
     return next((schema.parent or schema.item for schema in tables), None)
 
 

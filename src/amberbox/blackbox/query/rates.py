@@ -24,6 +24,7 @@ class Share:
     last_ns: int
     bytes: int = 0
     stamp_offset_ns: int | None = None
+    estimated: bool = False
 
 
 def rate_hz(shares: Iterable[Share], holes: Iterable[Place]) -> float | None:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from amberbox.blackbox.journal.clocktable import ClockTable, Piece
@@ -26,6 +29,11 @@ Pieces: TypeAlias = tuple[tuple[int, Piece], ...]
 
 _JOURNALS = "journals"
 """Schema of the rows that no segment serves."""
+
+_UNREAD = "amberbox: not read yet"
+_FAILS = f"error('{_UNREAD}')"
+_EVERY = frozenset({"columns", "explain"})
+"""Words of statements that may get at columns without naming them."""
 
 _TYPES = {
     "bool": "BOOLEAN",
@@ -52,17 +60,61 @@ def run_sql(catalogue: Catalogue, statement: str) -> Table:
     (``parent_seq`` in child tables). DuckDB sees the store's segments and nothing else: no other
     file, no network, no extension, and it changes nothing.
 
+    Rows of journals are read only of the tables, and only in the columns, that the statement
+    names. What it gets at in other ways (``*``, ``query_table``) is read when it turns out.
+
     Raises AmberboxError when DuckDB refuses the statement, UsageError without DuckDB or when the
     statement is not a single SELECT, DESCRIBE, SHOW or EXPLAIN.
     """
+    named, names = _Named(statement), sorted(catalogue.schemas)
+    for reading in (named, replace(named, all_columns=True), replace(named, all_tables=True)):
+        try:
+            return run_views(partial(_create_views, catalogue, reading), names, statement)
+        except AmberboxError as error:
+            if reading.all_tables or _UNREAD not in error.what:
+                raise
+    raise AssertionError("the last of these reads everything")
 
-    def create(connection: duckdb.DuckDBPyConnection) -> list[str]:
-        files: list[str] = []
-        for table in sorted(catalogue.schemas):
-            _create_view(connection, catalogue, table, files)
-        return files
 
-    return run_views(create, sorted(catalogue.schemas), statement)
+@dataclass(frozen=True)
+class _Named:
+    """What a statement names, and so what has to be read of journals to answer it."""
+
+    statement: str
+    all_columns: bool = False
+    all_tables: bool = False
+
+    @cached_property
+    def _words(self) -> frozenset[str]:
+        return frozenset(re.findall(r"\w+", self.statement.casefold()))
+
+    def _names(self, name: str) -> bool:
+        known = name.casefold()
+        return known in self._words or (
+            re.fullmatch(r"\w+", known) is None and known in self.statement.casefold()
+        )
+
+    def table(self, name: str) -> bool:
+        """Tell whether rows of a table are wanted."""
+        return self.all_tables or self._names(name)
+
+    def columns(self, schema: TableSchema) -> list[str]:
+        """Return the columns of a table that are wanted."""
+        star = "*" in re.sub(r"count\s*\(\s*\*\s*\)", "", self.statement, flags=re.IGNORECASE)
+        every = self.all_columns or self.all_tables or star or self._words & _EVERY
+        return [c.name for c in schema.columns if every or self._names(c.name)]
+
+
+def _create_views(
+    catalogue: Catalogue, named: _Named, connection: duckdb.DuckDBPyConnection
+) -> list[str]:
+    files: list[str] = []
+    for table in sorted(catalogue.schemas):
+        if named.table(table):
+            _create_view(connection, catalogue, table, named, files)
+        else:
+            _create_unread_view(connection, catalogue.schema(table))
+    return files
 
 
 def run_views(
@@ -112,8 +164,35 @@ def _shut_off(connection: duckdb.DuckDBPyConnection, files: Sequence[str]) -> No
     connection.execute("SET lock_configuration = true")
 
 
+def _create_unread_view(connection: duckdb.DuckDBPyConnection, schema: TableSchema) -> None:
+    """Make a view that has a table's columns, and fails when rows of it are asked for."""
+    columns = ", ".join(_unread(column) for column in _fields(schema))
+    connection.execute(
+        f"CREATE VIEW {quoted_name(schema.item)} AS SELECT {columns} WHERE {_FAILS}::BOOLEAN"
+    )
+
+
+def _unread(column: Column) -> str:
+    return f"{_FAILS}::{sql_type(column.type)} AS {quoted_name(column.name)}"
+
+
+def _fields(schema: TableSchema) -> tuple[Column, ...]:
+    """Return the columns of a table's view."""
+    seq = seq_name(schema)
+    return (
+        Column("timestamp", "timestamp", "time"),
+        *schema.columns,
+        Column("received", "received", "time"),
+        Column(seq, seq, "int64"),
+    )
+
+
 def _create_view(
-    connection: duckdb.DuckDBPyConnection, catalogue: Catalogue, table: str, files: list[str]
+    connection: duckdb.DuckDBPyConnection,
+    catalogue: Catalogue,
+    table: str,
+    named: _Named,
+    files: list[str],
 ) -> None:
     schema = catalogue.schema(table)
     groups = {} if _needs_text(catalogue, schema) else _groups(catalogue, table)
@@ -121,9 +200,12 @@ def _create_view(
         _select(schema, version, pieces, paths) for (version, pieces), paths in groups.items()
     ]
     files += (path for paths in groups.values() for path in paths)
-    rest = _journal_rows(catalogue, schema, also_segments=not groups)
+    names = named.columns(schema)
+    rest = _journal_rows(catalogue, schema, names, also_segments=not groups)
     if rest is not None:
-        selects.append(f"SELECT * FROM {_beside(connection, table, rest)}")
+        read = set(rest.column_names)
+        columns = [quoted_name(c.name) if c.name in read else _unread(c) for c in _fields(schema)]
+        selects.append(f"SELECT {', '.join(columns)} FROM {_beside(connection, table, rest)}")
     connection.execute(f"CREATE VIEW {quoted_name(table)} AS {' UNION ALL '.join(selects)}")
 
 
@@ -228,24 +310,17 @@ def quoted(text: str) -> str:
 
 
 def _journal_rows(
-    catalogue: Catalogue, schema: TableSchema, *, also_segments: bool
+    catalogue: Catalogue, schema: TableSchema, names: Sequence[str], *, also_segments: bool
 ) -> pa.Table | None:
-    """Return the rows that no segment serves, as an Arrow table with the view's columns."""
-    names = [column.name for column in schema.columns]
+    """Return the rows that no segment serves, as an Arrow table with some of the columns."""
     request = Request(schema.item, names)
     found = gather(catalogue, request) if also_segments else from_journals(catalogue, request)
     if not found.pieces and not also_segments:
         return None
     rows = merge(found.pieces, schema, names, "received")
-    seq = seq_name(schema)
-    fields = (
-        Column("timestamp", "timestamp", "time"),
-        *schema.columns,
-        Column("received", "received", "time"),
-        Column(seq, seq, "int64"),
-    )
-    keys: dict[str, ColumnData] = {"received": rows.received_ns, seq: rows.seq}
+    keys: dict[str, ColumnData] = {"received": rows.received_ns, seq_name(schema): rows.seq}
     columns = {"timestamp": rows.timestamp_ns, **rows.columns, **keys}
+    fields = tuple(field for field in _fields(schema) if field.name in columns)
     return _without_zone(Table(schema.item, fields, columns).to_arrow())
 
 

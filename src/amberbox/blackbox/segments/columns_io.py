@@ -96,7 +96,18 @@ def _from_chunk(array: pa.Array, column_type: str) -> ColumnData:
 
 
 def _numbers(array: pa.Array) -> NDArray[Any]:
-    return np.asarray(array.to_numpy(zero_copy_only=False))
+    """View numbers as they lie: pyarrow's own way to numpy imports pandas where there is one."""
+    import pyarrow as pa
+
+    kind, data = array.type, array.buffers()[1]
+    rows = slice(array.offset, array.offset + len(array))
+    if data is None:
+        return np.asarray(array.to_numpy(zero_copy_only=False))
+    if pa.types.is_boolean(kind):
+        bits = np.unpackbits(np.frombuffer(data, np.uint8), count=rows.stop, bitorder="little")
+        return bits[rows].astype(bool)
+    letter = "f" if pa.types.is_floating(kind) else "iu"[pa.types.is_unsigned_integer(kind)]
+    return np.frombuffer(data, f"<{letter}{kind.bit_width // 8}", rows.stop)[rows]
 
 
 def _from_list(array: pa.Array, inner: str) -> ColumnData:

@@ -225,4 +225,5 @@ def _summed(infos: Sequence[ItemInfo]) -> ItemInfo:
         first_ns=min(info.first_ns for info in infos),
         last_ns=max(info.last_ns for info in infos),
         bytes=sum(info.bytes for info in infos),
+        estimated=any(info.estimated for info in infos),
     )
