@@ -24,6 +24,7 @@ class MemorySink:
     latched: dict[str, bytes] = field(default_factory=dict)
     saved: dict[str, Any] = field(default_factory=dict)
     powers: list[tuple[Power, str]] = field(default_factory=list)
+    longest_bytes: int = 64_000_000
 
     def __post_init__(self) -> None:
         self._lock = threading.Condition(threading.RLock())
@@ -43,6 +44,9 @@ class MemorySink:
             if self.topics[stream].latched:
                 self.latched[self.topics[stream].name] = data
             self._lock.notify_all()
+
+    def longest_message(self) -> int:
+        return self.longest_bytes
 
     def link_up(self, topic: str, peer: str, since_ns: int | None = None) -> None:
         self._note_link("up", topic, peer, "", since_ns or self.now_ns())

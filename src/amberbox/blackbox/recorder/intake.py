@@ -83,6 +83,11 @@ class Intake:
                     item.drops[reason] = (first_ns + step_ns, last_ns + step_ns, count)
 
     @property
+    def longest_bytes(self) -> int:
+        """Bytes of the longest message that the empty queue takes."""
+        return max(0, self.limit_bytes - _OVERHEAD)
+
+    @property
     def size_bytes(self) -> int:
         """Bytes that wait, the ones being written included."""
         return self._bytes + self._waiting_bytes

@@ -54,6 +54,9 @@ class BlockSink:
     def message(self, stream: int, data: bytes, received_ns: int) -> None:
         self._put(self._streams[stream], data, received_ns)
 
+    def longest_message(self) -> int:
+        return self._pipeline.intake.longest_bytes
+
     def has_heard(self) -> bool:
         """Tell whether any message has come so far."""
         return any(stream.counters.received for stream in self._streams)

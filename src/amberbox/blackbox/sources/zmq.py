@@ -52,7 +52,9 @@ class Config:
     )
     port: int | None = option(None, "publisher's port")
     topics: Sequence[ZmqTopic] = option((), "topics to record; all when absent")
-    max_message_mb: float = option(256.0, "longer messages end the connection", unit="MB")
+    max_message_mb: float | None = option(
+        None, "longer messages end the connection; store.queue when absent", unit="MB"
+    )
     curve_server_key: str = option("", "publisher's public CURVE key, 40 characters")
     curve_public_key: str = option("", "own public CURVE key; made anew when absent")
     curve_secret_key: str = option("", "own secret CURVE key", secret=True)
@@ -66,7 +68,7 @@ class Config:
         for topic in self.topics:
             yield from (("topics", f"'{topic.name}': {what}") for what in self._wrong_topic(topic))
         yield from self._check_keys()
-        if self.max_message_mb <= 0:
+        if self.max_message_mb is not None and self.max_message_mb <= 0:
             yield "max_message_mb", "must be above 0"
 
     def _check_keys(self) -> Iterator[tuple[str, str]]:
@@ -184,7 +186,9 @@ class _Link:
         self.socket = context.socket(zmq.SUB)
         # the queue must never be the place where messages are dropped: that would not be counted
         self.socket.rcvhwm = 0
-        self.socket.maxmsgsize = int(config.max_message_mb * 1e6)
+        limit_mb = config.max_message_mb
+        self.limit = self.sink.longest_message() if limit_mb is None else int(limit_mb * 1e6)
+        self.socket.maxmsgsize = self.limit
         self.socket.reconnect_ivl_max = 1000
         self.socket.ipv6 = True
         self.socket.setsockopt(zmq.TCP_KEEPALIVE, 1)
