@@ -15,7 +15,6 @@ from amberbox.blackbox.ros1.names import host_and_port, mapped, mapped_host
 from amberbox.blackbox.ros1.settings import NoAnswerError, RefusedError, Settings
 from amberbox.blackbox.ros1.xmlvalues import AnswerParser, AnswerReader
 
-
 _PIECE = 1 << 16
 _SLOWEST = 5
 """Waits an answer may take in all, each up to the time limit."""
