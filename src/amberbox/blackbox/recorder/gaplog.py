@@ -63,7 +63,7 @@ class GapLog:
         """Open a gap for a peer that was lost."""
         with self._lock:
             self._known.add((item, peer))
-            self._begin(item, peer, now_ns, reason)
+            self._begin(item, peer, max(now_ns, self.start_ns), reason)
 
     def dropping(self, item: str, from_ns: int, reason: str) -> None:
         """Write that the box itself drops an item from now on; ``dropped`` tells the end."""

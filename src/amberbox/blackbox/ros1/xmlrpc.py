@@ -160,6 +160,17 @@ def request_topic(node_uri: str, topic: str, settings: Settings) -> tuple[str, i
         api.close()
 
 
+def publications(node_uri: str, settings: Settings) -> list[str]:
+    """Ask a node for the topics it publishes."""
+    api = Api(node_uri, settings)
+    try:
+        return [str(topic) for topic, _ in api.call("getPublications")]
+    except (TypeError, ValueError) as error:
+        raise NoAnswerError(f"{node_uri} gave no publications: {error}") from error
+    finally:
+        api.close()
+
+
 def host_of(uri: str) -> str:
     """Return the host of a URI for messages, or the URI itself."""
     try:
