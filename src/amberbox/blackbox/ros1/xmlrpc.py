@@ -63,6 +63,7 @@ class _TimedTransport(xmlrpc.client.Transport):
             parser.feed(piece)
             if time.monotonic() > end_s:
                 raise TimeoutError("the answer does not end")
+        response.close()  # the connection stays: it is ready for the next call
         parser.close()
         return reader.close()
 
