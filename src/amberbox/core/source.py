@@ -99,6 +99,11 @@ class Sink(Protocol):
         ``since_ns`` is given when the loss is noticed late: the gap begins there.
         """
 
+    def lost(
+        self, topic: str, peer: str, from_ns: int, to_ns: int, count: int, reason: str
+    ) -> None:
+        """Say that messages of ``peer`` were lost before the box, between two that arrived."""
+
     def event(self, kind: str, text: str, **details: Any) -> None:
         """Record an event; ``kind`` is a short identifier, ``text`` one line for a person."""
 

@@ -11,7 +11,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from socketserver import ThreadingMixIn
 from typing import Any
-from xmlrpc.server import SimpleXMLRPCRequestHandler, SimpleXMLRPCServer
+from xmlrpc.server import SimpleXMLRPCServer
 
 from amberbox.blackbox.ros1.tcpros import encode_header
 
@@ -26,12 +26,8 @@ class _Server(ThreadingMixIn, SimpleXMLRPCServer):
         """Stay silent when a caller breaks off."""
 
 
-class _Handler(SimpleXMLRPCRequestHandler):
-    protocol_version = "HTTP/1.1"  # as rosmaster and nodes: connections are kept
-
-
 def _serve(functions: Mapping[str, Callable[..., Any]], port: int = 0) -> _Server:
-    server = _Server(("127.0.0.1", port), _Handler, logRequests=False, allow_none=True)
+    server = _Server(("127.0.0.1", port), logRequests=False, allow_none=True)
     for name, function in functions.items():
         server.register_function(function, name)
     threading.Thread(target=server.serve_forever, args=(0.02,), daemon=True).start()

@@ -74,6 +74,10 @@ class GapLog:
         first_ns, last_ns, count = drops
         self._write(item, "", first_ns, last_ns + 1, f"dropped: {reason}", count)
 
+    def lost(self, item: str, peer: str, from_ns: int, to_ns: int, reason: str, count: int) -> None:
+        """Write that messages were lost between two that arrived."""
+        self._write(item, peer, from_ns, to_ns, reason, count)
+
     def shift(self, step_ns: int) -> None:
         """Move the beginnings of what is open: log time has begun anew."""
         with self._lock:

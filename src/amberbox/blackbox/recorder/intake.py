@@ -69,6 +69,11 @@ class Intake:
             for item, received_ns in messages:
                 item.drop(received_ns, reason)
 
+    def count_lost(self, item: Item, count: int) -> None:
+        """Count messages that a source found missing among those that came."""
+        with self._room:
+            item.counters.lost += count
+
     def take_drops(self, item: Item) -> dict[str, Drops]:
         """Return what was dropped of an item since the last call, by reason."""
         with self._room:

@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import msgspec
-from msgspec import structs
 
 from amberbox import __version__
 from amberbox.blackbox.follow.chain import previous_chain
@@ -268,7 +267,7 @@ class Pipeline:
         for item in list(self.items.values()):
             if item.counters != item.reported:
                 item.reported = copy(item.counters)
-                changed.append({"item": item.name, **structs.asdict(item.counters)})
+                changed.append({"item": item.name, **item.counters.record()})
         silent = self.options.counts_silence and now_ns - self._counted_ns >= HEARTBEAT_NS
         if changed or silent:
             self._counted_ns = now_ns

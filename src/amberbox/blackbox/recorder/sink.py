@@ -75,6 +75,13 @@ class BlockSink:
         at_ns = self.now_ns() if since_ns is None else since_ns
         self._pipeline.gaps.down(self._item(topic), peer, at_ns, reason)
 
+    def lost(
+        self, topic: str, peer: str, from_ns: int, to_ns: int, count: int, reason: str
+    ) -> None:
+        item = self._pipeline.items[self._item(topic)]
+        self._pipeline.intake.count_lost(item, count)
+        self._pipeline.gaps.lost(item.name, peer, from_ns, to_ns, reason, count)
+
     def event(self, kind: str, text: str, **details: Any) -> None:
         self._pipeline.event(kind, text, self._name, **details)
 

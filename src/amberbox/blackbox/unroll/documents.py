@@ -21,8 +21,8 @@ from amberbox.blackbox.unroll.jsonschema import from_schema
 from amberbox.blackbox.unroll.notes import Note, notes_of
 from amberbox.blackbox.unroll.places import objects
 from amberbox.blackbox.unroll.shapes import Shape, column_kind, escape, places
-from amberbox.blackbox.unroll.stamps import stamp_of
 from amberbox.core.names import unique_names
+from amberbox.core.stamps import stamp_of
 from amberbox.core.types import Column, ColumnData, IntArray, ItemSchema, Ragged, Rows, Schema
 
 _STAMPS = ("header/stamp", "header/timestamp", "stamp", "timestamp")
@@ -66,6 +66,15 @@ class DocumentUnroller:
             return stamp_of(self._decode_stamp(message)) or None
         except (*_MISFITS, AttributeError):
             return None
+
+    def no_stamp(self, message: bytes) -> Any:
+        """Return what stands where the stamp belongs and is no time; None if nothing does."""
+        try:
+            found = self._decode_stamp(message) if self._stamp_path else None
+        except (*_MISFITS, AttributeError):
+            return None
+        is_unset = not found or (isinstance(found, dict) and not any(found.values()))
+        return None if is_unset or stamp_of(found) else found
 
     def _stamps(self, messages: Sequence[bytes]) -> IntArray | None:
         if not self._stamp_path:

@@ -54,6 +54,8 @@ def _to_json(shape: Shape, table: bool = False) -> dict[str, Any]:
         return document | {"additionalProperties": True}
     if "object" in shape.kinds:
         document["properties"] = {k: _to_json(v) for k, v in shape.properties.items()}
+    if shape.closed:  # readers that do not know such shapes keep the whole object as text
+        document["additionalProperties"] = True
     if shape.items is not None:
         empty = not shape.items.kinds  # no item was ever seen
         document["items"] = False if empty else _to_json(shape.items, table=True)
@@ -93,9 +95,9 @@ def _from_json(document: Mapping[str, Any], table: bool = False) -> Shape:
         if not document.get(ALSO_TEXT):
             shape.kinds.discard("string")
     properties = document.get("properties", {})
-    shape.open = document.get("additionalProperties") is True or not all(
-        map(is_nameable, properties)
-    )
+    takes_more = document.get("additionalProperties") is True
+    shape.closed = takes_more and bool(properties)
+    shape.open = (takes_more and not properties) or not all(map(is_nameable, properties))
     if not shape.open:
         shape.properties = {k: _nullable(v) for k, v in properties.items()}
     if "items" in document:
