@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from operator import itemgetter
 from typing import TypeAlias
 
@@ -85,19 +85,24 @@ def _infer(stream: Stream, messages: Sequence[bytes], now_ns: int, tell: Tell) -
     tell_unused(stream, tell)
 
 
-def _tell_widened(stream: Stream, before: set[str], now_ns: int, tell: Tell) -> None:
+def _tell_widened(stream: Stream, before: Mapping[str, str], now_ns: int, tell: Tell) -> None:
     """Say what became of a schema, once for changes that follow each other."""
-    item, new = stream.item, sorted(stream.columns() - before)
-    change = "new" if new else "wider"
+    item, after = stream.item, stream.columns()
+    new = [path for path in after if path not in before]
+    is_wider = any(after.get(path, kind) != kind for path, kind in before.items())
+    change = "wider" if is_wider and not new else "new"
     last_ns = item.widened_ns.get(change)
     item.widened_ns[change] = now_ns
     if last_ns is not None and now_ns - last_ns < QUIET_NS:
         return
-    text = f"{item.name} has {change} variables"
+    text = f"{item.name} has wider variables"
     if new:
         more = f" and {len(new) - 3} more" if len(new) > 3 else ""
         names = ", ".join(name[:60] for name in new[:3])
-        text += f": {names}{more} (new keys get columns until it has had {OPEN_VERSIONS} schemas)"
+        limit = f"new keys get columns until it has had {OPEN_VERSIONS} schemas"
+        text = f"{item.name} has new variables: {names}{more} ({limit})"
+    elif not is_wider:
+        text = f"{item.name} has had {OPEN_VERSIONS} schemas: new keys get no columns any more"
     tell("schema_widened", text, item.source, item=item.name)
 
 

@@ -131,9 +131,9 @@ class Stream:
         """Counters of the item."""
         return self.item.counters
 
-    def columns(self) -> set[str]:
-        """Return the paths of the variables, those of child tables included."""
-        return set() if self.stamps is None else set(_paths(self.stamps.schema))
+    def columns(self) -> dict[str, str]:
+        """Return paths and types of the variables, those of child tables included."""
+        return {} if self.stamps is None else dict(_columns(self.stamps.schema))
 
     def drop(self, received_ns: int, reason: str = QUEUE_FULL) -> None:
         """Count a message that found no room."""
@@ -155,10 +155,10 @@ class Stream:
         return ""
 
 
-def _paths(schema: ItemSchema, above: str = "") -> Iterator[str]:
-    yield from (above + column.path for column in schema.columns)
+def _columns(schema: ItemSchema, above: str = "") -> Iterator[tuple[str, str]]:
+    yield from ((above + column.path, column.type) for column in schema.columns)
     for path, child in schema.children.items():
-        yield from _paths(child, f"{above}{path}/")
+        yield from _columns(child, f"{above}{path}/")
 
 
 def tell_no_stamp(stream: Stream, data: bytes, tell: Tell) -> None:
