@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -19,6 +20,8 @@ class TableWriter(Protocol):
         """Append rows."""
 
 
+_LONGEST_STEM = 200
+
 OpenTable = Callable[[TableStream, Path], AbstractContextManager[TableWriter]]
 
 
@@ -32,10 +35,19 @@ def write_tables(job: Job, ending: str, open_table: OpenTable) -> None:
     else:
         with new_folder(job.path) as folder:
             for number, stream in enumerate(streams):
-                with open_table(stream, folder / f"{stream.schema.item}{ending}") as writer:
+                path = folder / f"{file_stem(stream.schema.item)}{ending}"
+                with open_table(stream, path) as writer:
                     write_rows(job, stream, writer, number, len(streams))
     job.report.bytes = size_of(job.path)
     job.progress(1.0)
+
+
+def file_stem(item: str) -> str:
+    """Return the name of a table's file: the item's, shortened to what every disk takes."""
+    if len(item) <= _LONGEST_STEM:
+        return item
+    digest = hashlib.sha256(item.encode()).hexdigest()[:8]
+    return f"{item[: _LONGEST_STEM - 9]}_{digest}"
 
 
 def streams_of(job: Job) -> list[TableStream]:

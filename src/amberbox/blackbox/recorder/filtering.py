@@ -66,7 +66,13 @@ def _infer(stream: Stream, messages: Sequence[bytes], now_ns: int, tell: Tell) -
         return
     closes = item.versions >= OPEN_VERSIONS
     schema, bad = widen(
-        topic.schema, messages, topic.message_encoding, item.name, stream.told, closes=closes
+        topic.schema,
+        messages,
+        topic.message_encoding,
+        item.name,
+        stream.told,
+        closes=closes,
+        letters=stream.letters,
     )
     if bad:
         _note_malformed(stream, len(bad), tell)

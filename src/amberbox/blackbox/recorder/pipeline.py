@@ -96,7 +96,7 @@ class Pipeline:
         self._locks = [WriterLock(self.store, writer) for writer in RECORDED]
         self.run = self.store.next_run()
         self.intake = Intake(self.options.queue_bytes)
-        self.names = ItemNames(self.store.path)
+        self.names = ItemNames(self.store.path, is_new=self.run == 1)
         self._own: list[tuple[str, bytes, int]] = []
         self._own_lock = threading.Lock()
         self._items_lock = threading.Lock()

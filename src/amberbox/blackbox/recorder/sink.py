@@ -126,7 +126,7 @@ class BlockSink:
         told = notes_of(topic.schema) if infers else {}
         if infers:  # what is really sent counts, not what was declared
             topic = replace(topic, schema=None)
-        stream = Stream(item, topic, infers=infers, told=told)
+        stream = Stream(item, topic, infers=infers, told=told, letters=self._pipeline.names.letters)
         known = [s for s in self._streams if s.item is item]
         if known and not stream.infers:
             self._tell_of_change(known[-1].topic, topic, item.name)

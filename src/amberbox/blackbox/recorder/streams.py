@@ -124,6 +124,8 @@ class Stream:
     infers: bool = False
     told: Notes = field(default_factory=dict)
     """What its sender says of units and codes, where the schema is inferred."""
+    letters: bool = False
+    """Whether inferred variables keep what words of other scripts say in their names."""
     change: ChangeFilter | None = None
 
     @property

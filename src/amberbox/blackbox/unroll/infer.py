@@ -22,11 +22,13 @@ def widen(
     told: Notes | None = None,
     *,
     closes: bool = False,
+    letters: bool = False,
 ) -> tuple[Schema, tuple[int, ...]]:
     """Widen a schema so that all messages unroll under it.
 
     ``encoding`` is ``json`` or ``msgpack``; ``told`` is what the sender says of units and codes,
-    which a schema keeps once it has it. With ``closes`` no object gets further keys. Returns the
+    which a schema keeps once it has it. With ``closes`` no object gets further keys; with
+    ``letters`` columns keep what words of other scripts say in their names. Returns the
     same object when nothing has changed, and the numbers of the messages that are malformed. The
     kinds of value in the schema depend only on which messages were seen, not on their order;
     column names on which came first.
@@ -36,6 +38,7 @@ def widen(
     if not unknown and schema is not None:
         return schema, ()
     shape = from_schema(schema) if schema is not None else nullable()
+    shape.letters = shape.letters or letters
     if closes:
         close(shape)
     bad = [n for n in unknown if not _observed(shape, messages[n], encoding)]

@@ -10,6 +10,7 @@ import msgspec
 from amberbox.blackbox.unroll.notes import Notes, notes_json
 from amberbox.blackbox.unroll.shapes import Shape, is_nameable, nullable, places
 from amberbox.blackbox.unroll.viewerform import ALSO_TEXT, viewer_form
+from amberbox.core.names import identifier, readable
 from amberbox.core.types import Schema
 
 NAMES = "x-columns"
@@ -21,6 +22,10 @@ SHAPE = "x-shape"
 take has no way to say "number or text"; whether a value may be missing or null goes unsaid,
 because the root and every property may."""
 
+LETTERS = "x-letters"
+"""Keyword of a document whose columns are named in Latin letters where paths are of other scripts;
+without it everything but ASCII is ``_`` in a name."""
+
 _DRAFT = "https://json-schema.org/draft/2020-12/schema"
 OURS = "every message fits: amberbox"
 """Comment of documents that promise the columns of their messages, as those of others may not."""
@@ -31,7 +36,20 @@ def to_schema(shape: Shape, name: str, notes: Notes | None = None) -> Schema:
     """Write a shape as a JSON Schema document that viewers take, with notes on its places."""
     document = {"$schema": _DRAFT, "$comment": OURS, "title": name}
     document |= _for_viewers(shape) | notes_json(notes or {})
+    if shape.letters and _has_other_letters(shape):
+        document[LETTERS] = "latin"
     return Schema(name, "jsonschema", msgspec.json.encode(document))
+
+
+def _has_other_letters(table: Shape) -> bool:
+    """Tell whether any column has another name in Latin letters."""
+    for path, shape, kind in places(table):
+        if kind == "children" and shape.items is not None:
+            if _has_other_letters(shape.items):
+                return True
+        elif readable(path) != identifier(path):
+            return True
+    return False
 
 
 def _for_viewers(shape: Shape) -> dict[str, Any]:
@@ -79,7 +97,9 @@ def from_schema(schema: Schema) -> Shape:
         return nullable()
     if not is_ours(document):
         return nullable()
-    return _nullable(document.get(SHAPE, document), table=True)
+    shape = _nullable(document.get(SHAPE, document), table=True)
+    shape.letters = document.get(LETTERS) == "latin"
+    return shape
 
 
 def is_ours(document: Any) -> bool:

@@ -37,6 +37,8 @@ class Shape:
     open: bool = False
     closed: bool = False
     names: list[str] = field(default_factory=list)
+    letters: bool = False
+    """At the top: whether columns are named in Latin letters."""
 
     def values(self) -> set[str]:
         """Give the kinds without null."""
