@@ -129,8 +129,7 @@ class RosPublisher:
         self._master = master
         self._changed = threading.Condition()
         self._listener = socket.create_server(("127.0.0.1", 0))
-        calls = {"requestTopic": self._request, "getPublications": self._publications}
-        self._api = _serve(calls)
+        self._api = _serve({"requestTopic": self._request, "getPublications": self._publications})
         self.uri = f"http://127.0.0.1:{self._api.server_address[1]}/"
         threading.Thread(target=self._accept, daemon=True).start()
         for topic in self.topics if master else ():
