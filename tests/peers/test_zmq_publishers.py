@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import json
 import socket
+import threading
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import msgpack  # type: ignore[import-untyped]  # the package has no type hints
 import pytest
 import zmq
 
+import amberbox
 from amberbox.blackbox.sources.zmq import Config, Source, ZmqTopic
+from amberbox.testing.box import ManualBox, events, last_counters
 from amberbox.testing.contract import ObservedSink, observe
 
 
@@ -30,6 +34,15 @@ def bind_publisher(context: zmq.Context[Any], port: int = 0) -> tuple[zmq.Socket
         publisher.bind(f"tcp://127.0.0.1:{port}")
         return publisher, port
     return publisher, publisher.bind_to_random_port("tcp://127.0.0.1")
+
+
+def is_bound(publisher: zmq.Socket[Any], port: int) -> bool:
+    """Bind a port that a socket closed before may still hold for a moment."""
+    try:
+        publisher.bind(f"tcp://127.0.0.1:{port}")
+    except zmq.ZMQError:
+        return False
+    return True
 
 
 def await_subscription(publisher: zmq.Socket[Any]) -> bytes:
@@ -212,3 +225,89 @@ def test_stop_is_heard_within_a_fifth_of_a_second(context: zmq.Context[Any]) -> 
         await_subscription(publisher)
         before = time.monotonic()
     assert time.monotonic() - before < 0.2
+
+
+def test_what_a_high_water_mark_hides_is_a_gap_with_a_count(tmp_path: Path) -> None:
+    box = ManualBox(tmp_path / "store", source="zmq")
+    topic = ZmqTopic(name="odom", sequence="n")
+    with zmq.Context() as context:
+        publisher, port = bind_publisher(context)
+        config = Config(endpoint=f"tcp://127.0.0.1:{port}", topics=[topic])
+        stop = threading.Event()
+        thread = threading.Thread(target=Source(config, "zmq").run, args=(box.sink, stop))
+        thread.start()
+        await_subscription(publisher)
+        for n in [*range(5), *range(8, 10), *range(20, 25)]:
+            publisher.send_multipart([b"odom", b'{"n": %d}' % n])
+        wait_until(lambda: "zmq_odom" in box.pipeline.items)
+        counters = box.pipeline.items["zmq_odom"].counters
+        wait_until(lambda: counters.received == 12)
+        stop.set()
+        thread.join(5)
+        publisher.close(linger=0)
+    box.write()
+    box.close()
+    lost = [gap for gap in amberbox.open(box.store).gaps("zmq_odom") if gap.count]
+    assert sum(gap.count or 0 for gap in lost) == 13
+    assert {gap.reason for gap in lost} == {"lost before the box: holes in n"}
+    assert last_counters(box.store)["zmq_odom"]["lost"] == 13
+    assert events(box.store, "no_continuity") == []
+
+
+def test_without_the_number_that_is_declared_there_is_one_event(
+    context: zmq.Context[Any],
+) -> None:
+    publisher, port = bind_publisher(context)
+    topic = ZmqTopic(name="odom", sequence="n")
+    with observe(Source(Config(endpoint=f"tcp://127.0.0.1:{port}", topics=[topic]), "z")) as sink:
+        await_subscription(publisher)
+        for _ in range(3):
+            publisher.send_multipart([b"odom", b'{"m": 1}'])
+        sink.wait_for("odom", 3)
+    assert [kind for kind, _, _ in sink.events] == ["no_continuity"]
+
+
+def test_a_message_that_is_too_long_is_an_event_and_does_not_end_the_source(
+    context: zmq.Context[Any],
+) -> None:
+    publisher, port = bind_publisher(context)
+    config = Config(endpoint=f"tcp://127.0.0.1:{port}", max_message_mb=0.001)
+    with observe(Source(config, "z")) as sink:
+        await_subscription(publisher)
+        publisher.send_multipart([b"a", b'{"x": 1}'])
+        sink.wait_for("a", 1)
+        publisher.send_multipart([b"a", b"x" * 2000])
+        wait_until(lambda: "malformed_connection" in [kind for kind, _, _ in sink.events])
+        wait_until(lambda: [way for way, *_ in sink.links] == ["up", "down", "up"])
+
+        def is_heard() -> bool:  # the subscription follows the connection
+            publisher.send_multipart([b"a", b'{"x": 2}'])
+            return len(sink.of("a")) > 1
+
+        wait_until(is_heard)
+    (text,) = [text for kind, text, _ in sink.events if kind == "malformed_connection"]
+    assert "max_message_mb" in text
+
+
+def test_all_topics_of_the_last_run_are_gaps_until_they_are_heard(
+    context: zmq.Context[Any],
+) -> None:
+    publisher, port = bind_publisher(context)
+    config = Config(endpoint=f"tcp://127.0.0.1:{port}")
+    with observe(Source(config, "z")) as sink:
+        await_subscription(publisher)
+        publisher.send_multipart([b"a", b'{"x": 1}'])
+        sink.wait_for("a", 1)
+    publisher.close(linger=0)
+    again, stop = ObservedSink(saved=sink.saved), threading.Event()
+    thread = threading.Thread(target=Source(config, "z").run, args=(again, stop))
+    thread.start()
+    try:
+        wait_until(lambda: len(again.links) == 1)
+        publisher = context.socket(zmq.XPUB)
+        wait_until(lambda: is_bound(publisher, port))
+        wait_until(lambda: len(again.links) == 2)
+    finally:
+        stop.set()
+        thread.join(5)
+    assert links(again)[:2] == [("down", "a", "publisher not connected yet"), ("up", "a", "")]

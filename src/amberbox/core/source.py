@@ -83,6 +83,9 @@ class Sink(Protocol):
     def message(self, stream: int, data: bytes, received_ns: int) -> None:
         """Take one message as it came. Never blocks a live source: a full queue drops, counted."""
 
+    def longest_message(self) -> int:
+        """Return how many bytes a message may have to find room; a longer one is always lost."""
+
     def link_up(self, topic: str, peer: str, since_ns: int | None = None) -> None:
         """Say that messages of ``peer`` on ``topic`` arrive from now on.
 
@@ -95,6 +98,11 @@ class Sink(Protocol):
 
         ``since_ns`` is given when the loss is noticed late: the gap begins there.
         """
+
+    def lost(
+        self, topic: str, peer: str, from_ns: int, to_ns: int, count: int, reason: str
+    ) -> None:
+        """Say that messages of ``peer`` were lost before the box, between two that arrived."""
 
     def event(self, kind: str, text: str, **details: Any) -> None:
         """Record an event; ``kind`` is a short identifier, ``text`` one line for a person."""

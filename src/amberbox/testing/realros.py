@@ -194,14 +194,17 @@ class GapSink(MemorySink):
     def link_up(self, topic: str, peer: str, since_ns: int | None = None) -> None:
         super().link_up(topic, peer, since_ns)
         first = topic not in self.gaps
-        start_ns = self.open_gaps.pop((topic, peer), since_ns or self.now_ns())
+        start_ns = self.open_gaps.pop((topic, peer), self._from_ns(since_ns))
         self.gaps.setdefault(topic, []).append((start_ns, self.now_ns()))
         if first:
             self.gaps[topic].append((self.run_from_ns, self.now_ns()))
 
     def link_down(self, topic: str, peer: str, reason: str, since_ns: int | None = None) -> None:
         super().link_down(topic, peer, reason, since_ns)
-        self.open_gaps[topic, peer] = since_ns or self.now_ns()
+        self.open_gaps[topic, peer] = self._from_ns(since_ns)
+
+    def _from_ns(self, since_ns: int | None) -> int:
+        return self.now_ns() if since_ns is None else max(since_ns, self.run_from_ns)
 
     def all_gaps(self, topic: str, until_ns: int) -> list[Interval]:
         """Return the gaps of a topic, those still open until the end that is given."""

@@ -129,7 +129,7 @@ class RosPublisher:
         self._master = master
         self._changed = threading.Condition()
         self._listener = socket.create_server(("127.0.0.1", 0))
-        self._api = _serve({"requestTopic": self._request})
+        self._api = _serve({"requestTopic": self._request, "getPublications": self._publications})
         self.uri = f"http://127.0.0.1:{self._api.server_address[1]}/"
         threading.Thread(target=self._accept, daemon=True).start()
         for topic in self.topics if master else ():
@@ -182,6 +182,9 @@ class RosPublisher:
         if topic not in self.topics:
             return -1, f"Not a publisher of [{topic}]", []
         return 1, "", ["TCPROS", *self._listener.getsockname()]
+
+    def _publications(self, caller: str) -> Any:
+        return 1, "", [[topic, offered.type] for topic, offered in self.topics.items()]
 
     def _accept(self) -> None:
         with suppress(OSError):

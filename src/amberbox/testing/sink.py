@@ -24,6 +24,9 @@ class MemorySink:
     latched: dict[str, bytes] = field(default_factory=dict)
     saved: dict[str, Any] = field(default_factory=dict)
     powers: list[tuple[Power, str]] = field(default_factory=list)
+    longest_bytes: int = 64_000_000
+    losses: list[tuple[str, str, int, int, int, str]] = field(default_factory=list)
+    """(topic, peer, from and to in ns, how many, reason)"""
 
     def __post_init__(self) -> None:
         self._lock = threading.Condition(threading.RLock())
@@ -44,11 +47,21 @@ class MemorySink:
                 self.latched[self.topics[stream].name] = data
             self._lock.notify_all()
 
+    def longest_message(self) -> int:
+        return self.longest_bytes
+
     def link_up(self, topic: str, peer: str, since_ns: int | None = None) -> None:
         self._note_link("up", topic, peer, "", since_ns or self.now_ns())
 
     def link_down(self, topic: str, peer: str, reason: str, since_ns: int | None = None) -> None:
         self._note_link("down", topic, peer, reason, since_ns or self.now_ns())
+
+    def lost(
+        self, topic: str, peer: str, from_ns: int, to_ns: int, count: int, reason: str
+    ) -> None:
+        with self._lock:
+            self.losses.append((topic, peer, from_ns, to_ns, count, reason))
+            self._lock.notify_all()
 
     def event(self, kind: str, text: str, **details: Any) -> None:
         with self._lock:

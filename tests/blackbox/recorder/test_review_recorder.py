@@ -243,6 +243,51 @@ def test_accounts_of_a_long_trouble_do_not_pile_up(
     assert len(gaps) <= 2
 
 
+def test_one_key_more_per_message_is_one_event_and_a_bounded_schema(tmp_path: Path) -> None:
+    box = ManualBox(tmp_path / "store")
+    for n in range(300):
+        box.hear(Topic("/tasks", "json"), b'{"n": %d, "task_%d": 1}' % (n, n))
+        box.write()
+    box.close()
+    (told,) = own_records(box.store, "amberbox/event")
+    assert told["kind"] == "schema_widened"
+    assert told["text"].startswith("ros_tasks has new variables: task_1 (")
+    record = amberbox.open(box.store)
+    assert len(record.variables("ros_tasks").columns) == filtering.OPEN_VERSIONS + 1
+    assert record.query("ros_tasks").values("n") == list(range(300))
+    assert record.query("ros_tasks").values("task_5")[5] == 1
+    assert record.gaps("ros_tasks") == []
+
+
+def test_a_later_change_of_a_schema_is_an_event_of_its_own(tmp_path: Path) -> None:
+    box = ManualBox(tmp_path / "store")
+    for message in (b'{"a": 1}', b'{"a": 1, "b": 1}', b'{"c": 1}'):
+        box.hear(Topic("/tasks", "json"), message)
+        box.write()
+    box.clock.advance(filtering.QUIET_NS / 1e9 + 1)
+    box.hear(Topic("/tasks", "json"), b'{"d": 1}')
+    box.close()
+    texts = [event["text"] for event in events(box.store, "schema_widened")]
+    assert [text.partition(" (")[0] for text in texts] == [
+        "ros_tasks has new variables: b",
+        "ros_tasks has new variables: d",
+    ]
+
+
+@pytest.mark.parametrize("stamp", ["5", "0.25", '"12"', '"12:30"'])
+def test_what_is_no_time_is_no_stamp_which_is_said_once(tmp_path: Path, stamp: str) -> None:
+    box = ManualBox(tmp_path / "store")
+    for n in range(3):
+        box.hear(Topic("/odom", "json"), b'{"timestamp": %s, "x": %d}' % (stamp.encode(), n))
+        box.write()
+    box.close()
+    (told,) = events(box.store, "no_stamp")
+    value = stamp.strip('"')
+    assert told["text"].startswith(f"ros_odom: timestamp is {value}, which is no time")
+    table = amberbox.open(box.store).query("ros_odom", ["received", "x"])
+    assert table.values("timestamp") == table.values("received")
+
+
 def test_keys_that_are_data_do_not_widen_a_schema_for_ever(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -430,6 +430,68 @@ def test_all_topics_are_followed_on_request(network: Network) -> None:
     assert "/rosout" not in network.master.subscribers
 
 
+def test_all_topics_are_heard_again_when_box_and_master_have_restarted(network: Network) -> None:
+    sink = MemorySink()
+    with listening(network.settings(all_topics=True), sink, {}):
+        talker = say(network, sink, b"before")
+    network.master.publishers.clear()
+    talker.topics["/new"] = RosTopic()
+    again = MemorySink(saved=sink.saved)
+    with listening(network.settings(all_topics=True), again, {}):
+        talker.wait_for_subscribers("/new")
+        talker.publish("/new", b"told by the node itself")
+        talker.publish(TOPIC, b"after")
+        assert again.wait_for(TOPIC, 1) == [b"after"]
+        again.wait_for("/new", 1)
+    assert {(way, peer) for way, peer, _ in ways(again)} == {("up", NODE), ("down", NODE)}
+
+
+@pytest.mark.parametrize("all_topics", [True, False])
+def test_a_remembered_publisher_that_is_dead_is_a_gap_and_an_event(
+    network: Network, all_topics: bool
+) -> None:
+    sink, topics = MemorySink(), {} if all_topics else {TOPIC: ""}
+    with listening(network.settings(all_topics=all_topics), sink, topics):
+        say(network, sink, b"before").kill()
+        wait_for_link(sink, "down")
+    network.master.publishers.clear()
+    again = MemorySink(saved={"publishers": {TOPIC: {NODE: network.publishers[0].uri}}})
+    with listening(network.settings(all_topics=all_topics), again, topics):
+        wait_for_event(again, "ros_publisher_silent")
+        wait_until(lambda: again.saved["publishers"][TOPIC] == {}, 5, "not for the next run")
+        assert len(again.links) == 1
+        say(network, again, b"back at another address")
+    assert ways(again)[0][:2] == ("down", NODE)
+    assert ways(again)[0][2].startswith("publisher not connected: http://127.0.0.1")
+    assert "refused" in ways(again)[0][2]
+    assert [way for way, *_ in ways(again)] == ["down", "up", "down"]
+
+
+def test_a_node_that_publishes_a_topic_no_more_is_not_missed(network: Network) -> None:
+    sink = MemorySink()
+    talker = network.talker()
+    remembered = {"/old": {NODE: talker.uri}, TOPIC: {NODE: talker.uri}}
+    sink.saved = {"publishers": remembered}
+    with listening(network.settings(all_topics=True), sink, {}):
+        wait_until(lambda: sink.saved["publishers"].get("/old") == {}, 5, "forgotten")
+        wait_for_link(sink, "up")
+    assert [topic for _, topic, *_ in sink.links] == [TOPIC, TOPIC]
+
+
+def test_a_publisher_that_cannot_be_reached_is_a_gap_though_another_is_heard(
+    network: Network,
+) -> None:
+    sink = MemorySink()
+    with listening(network.settings(all_topics=True), sink, {}):
+        say(network, sink, b"heard")
+        network.master.register(TOPIC, "/far", f"http://127.0.0.1:{free_port()}/")
+        wait_for_link(sink, "down")
+        text = wait_for_event(sink, "ros_publisher_silent")
+    missing = next(link for link in sink.links if link[2] == "/far")
+    assert missing[0] == "down" and missing[3].startswith("publisher not connected")
+    assert TOPIC in text
+
+
 def test_a_sink_that_is_stuck_holds_nobody_else(network: Network) -> None:
     release = threading.Event()
 

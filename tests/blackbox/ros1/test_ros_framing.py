@@ -5,13 +5,21 @@ from __future__ import annotations
 import socket
 import struct
 import threading
+import tracemalloc
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from amberbox.blackbox.ros1.framing import BUFFER_BYTES, LARGE_BYTES, Framer, Reader
+from amberbox.blackbox.ros1.framing import (
+    BUFFER_BYTES,
+    FIRST_BYTES,
+    LARGE_BYTES,
+    Framer,
+    Reader,
+)
 from amberbox.blackbox.ros1.settings import MalformedError
+from tests.fuzzing import examples, fuzz
 
 LIMIT = 1 << 30
 
@@ -67,6 +75,38 @@ def test_a_store_for_huge_messages_is_given_back() -> None:
 def test_an_absurd_length_is_malformed(size: int) -> None:
     with pytest.raises(MalformedError, match=f"message of {size} bytes"):
         feed(Framer(1000), framed(b"fine") + struct.pack("<I", size), [])
+
+
+@fuzz
+@settings(max_examples=examples(30), deadline=None)
+@given(
+    st.integers(LARGE_BYTES + 1, LIMIT),
+    st.integers(0, 3 * FIRST_BYTES),
+    st.integers(1, BUFFER_BYTES),
+)
+def test_memory_grows_with_what_arrives_whatever_is_announced(
+    announced: int, arrived: int, piece: int
+) -> None:
+    data = struct.pack("<I", announced) + bytes(min(arrived, announced - 1))
+    framer = Framer(LIMIT)
+    tracemalloc.start()
+    try:
+        assert feed(framer, data, [piece] * 3) == []
+        assert tracemalloc.get_traced_memory()[1] < 4 * len(data) + 2 * FIRST_BYTES
+    finally:
+        tracemalloc.stop()
+
+
+@fuzz
+@settings(max_examples=examples(50), deadline=None)
+@given(st.binary(max_size=2000))
+def test_random_bytes_are_messages_or_malformed(data: bytes) -> None:
+    framer = Framer(100_000)
+    try:
+        messages = feed(framer, data, [7, 300])
+    except MalformedError:
+        return
+    assert sum(4 + len(message) for message in messages) <= len(data)
 
 
 def test_a_reader_stamps_after_each_receive_and_ends_with_the_connection() -> None:

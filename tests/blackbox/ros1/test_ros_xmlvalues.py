@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import xmlrpc.client
+from contextlib import suppress
 from typing import Any
 from xml.etree.ElementTree import ParseError
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from amberbox.blackbox.ros1.xmlvalues import AnswerParser, AnswerReader
+from amberbox.blackbox.ros1.xmlvalues import DEEPEST, MOST_BYTES, AnswerParser, AnswerReader
+from tests.fuzzing import examples, fuzz
 
 texts = st.text(st.characters(codec="utf-8", exclude_categories=["Cc", "Cs"]), max_size=20)
 scalars = texts | st.integers(-(2**31), 2**31 - 1) | st.booleans() | st.none()
@@ -35,6 +37,35 @@ def test_values_are_read_as_the_standard_library_does(value: Any, pieces: int) -
     text = xmlrpc.client.dumps((value,), methodresponse=True, allow_none=True)
     expected = xmlrpc.client.loads(text)[0]
     assert read(text.encode(), pieces) == expected
+
+
+@pytest.mark.parametrize("piece", [b"<i4>1</i4>", b"<array>" * 5000])
+def test_an_answer_without_end_is_refused(piece: bytes) -> None:
+    parser = AnswerParser()
+    parser.feed(b"<methodResponse>")
+    with pytest.raises(ValueError, match="more than"):
+        for _ in range(MOST_BYTES // len(piece) + 1):
+            parser.feed(piece)
+
+
+def test_values_nested_too_deep_are_refused() -> None:
+    value: Any = 1
+    for _ in range(DEEPEST + 2):
+        value = [value]
+    with pytest.raises(ValueError, match="nested deeper"):
+        read(xmlrpc.client.dumps((value,), methodresponse=True).encode())
+
+
+@fuzz
+@settings(max_examples=examples(50), deadline=None)
+@given(st.data())
+def test_damaged_answers_are_values_or_errors_that_a_call_expects(data: st.DataObject) -> None:
+    whole = xmlrpc.client.dumps((data.draw(values),), methodresponse=True, allow_none=True)
+    damaged = bytearray(whole.encode())
+    for at in data.draw(st.lists(st.integers(0, len(damaged) - 1), min_size=1, max_size=4)):
+        damaged[at] = data.draw(st.integers(0, 255))
+    with suppress(ParseError, LookupError, TypeError, ValueError, xmlrpc.client.Error):
+        read(bytes(damaged))
 
 
 def test_untyped_and_empty_values_are_text() -> None:

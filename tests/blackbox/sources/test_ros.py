@@ -63,11 +63,12 @@ def test_no_topic_is_fine_when_all_are_wanted() -> None:
 
 def test_the_environment_completes_the_configuration(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ROS_MASTER_URI", "http://robot:11311")
-    assert settings(Config()).master_uri == "http://robot:11311/"
-    assert settings(Config("localhost")).master_uri == "http://localhost:11311/"
+    assert settings(Config(), 900).master_uri == "http://robot:11311/"
+    assert settings(Config("localhost"), 900).master_uri == "http://localhost:11311/"
     monkeypatch.delenv("ROS_MASTER_URI")
-    assert settings(Config(caller_id="box")).caller_id == "/box"
-    assert settings(Config(max_message_mb=2)).message_limit == 2_000_000
+    assert settings(Config(caller_id="box"), 900).caller_id == "/box"
+    assert settings(Config(max_message_mb=2), 900).message_limit == 2_000_000
+    assert settings(Config(), 900).message_limit == 900
     monkeypatch.setenv("ROS_MASTER_URI", "ftp://robot")
     with pytest.raises(UsageError, match="'ftp' is not a protocol"):
-        settings(Config())
+        settings(Config(), 900)

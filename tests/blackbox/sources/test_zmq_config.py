@@ -118,3 +118,16 @@ def test_json_is_told_from_msgpack(value: Any) -> None:
     assert detect_encoding(b"\xef\xbb\xbf" + json.dumps(value).encode()) == "json"
     if isinstance(value, dict | list):
         assert detect_encoding(msgpack.packb(value)) == "msgpack"
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"rate_hz": 0.0, "stamp": "t"}, "above 0"),
+        ({"rate_hz": 10.0}, "goes together with 'stamp'"),
+        ({"rate_hz": 10.0, "stamp": "t", "sequence": "n"}, "remove one of them"),
+    ],
+)
+def test_what_cannot_tell_losses_is_said(options: dict[str, Any], words: str) -> None:
+    (found,) = ZmqTopic("a", **options).check()
+    assert found[0] == "rate_hz" and words in found[1]

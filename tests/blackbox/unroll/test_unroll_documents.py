@@ -6,6 +6,7 @@ import json
 import math
 import random
 import struct
+from contextlib import suppress
 from typing import Any
 
 import msgspec
@@ -16,9 +17,11 @@ from hypothesis import strategies as st
 
 from amberbox.blackbox.unroll import Unroller, UnrollError, unroller
 from amberbox.blackbox.unroll.infer import widen
-from amberbox.blackbox.unroll.shapes import DEEPEST, MOST_PROPERTIES
+from amberbox.blackbox.unroll.jsonschema import from_schema, to_schema
+from amberbox.blackbox.unroll.shapes import DEEPEST, MOST_COLUMNS, MOST_PROPERTIES
 from amberbox.core.errors import AmberboxError
 from amberbox.core.types import ItemSchema, Ragged, Rows, Schema, Topic
+from tests.fuzzing import examples, fuzz
 
 NS = 1_000_000_000
 KEYS = st.sampled_from(["a", "b", "A", "a/b", "a_b", "seq", "~", ""])
@@ -302,8 +305,6 @@ def test_any_bytes_are_a_value_or_named_malformed(message: bytes, encoding: str)
         b"{}x",
         b'"\xff"',
         b"[" * 200_000 + b"]" * 200_000,
-        b"1e400",
-        b'{"x": NaN, "y": "\\ud800"}',
     ],
 )
 def test_malformed_json_is_named_and_changes_nothing(message: bytes) -> None:
@@ -313,9 +314,81 @@ def test_malformed_json_is_named_and_changes_nothing(message: bytes) -> None:
     assert bad == (0,) and first == widen(None, [], "json", "t")[0]
 
 
-def test_a_number_beyond_all_floats_is_malformed() -> None:
+@pytest.mark.parametrize(
+    ("message", "expected"),
+    [
+        (b'{"x": 1e309}', math.inf),
+        (b'{"x": -1e400}', -math.inf),
+        (b'{"x": 1%s}' % (b"0" * 400), math.inf),
+        (b'{"x": -1%s}' % (b"0" * 6000), -math.inf),
+        (b'{"x": 1%s}' % (b"0" * 305), 1e305),
+    ],
+)
+def test_numbers_beyond_all_floats_are_infinite(message: bytes, expected: float) -> None:
     schema, _, _ = learn([{"x": 1}])
-    assert widen(schema, [b'{"y": 2, "x": 1%s}' % (b"0" * 400)], "json", "t") == (schema, (0,))
+    widened, bad = widen(schema, [message], "json", "t")
+    assert bad == ()
+    rows = unroller(Topic("/t", "json", widened)).rows([message, b'{"x": 2}'])
+    assert cells(rows, "x") == [expected, 2.0]
+
+
+def test_half_surrogates_become_the_character_for_what_is_none() -> None:
+    messages = [b'{"a": "x\\ud800y", "\\udc00k": [1e999]}', b'{"a": "\\ud83d\\ude00"}']
+    schema, bad = widen(None, messages, "json", "t")
+    assert bad == ()
+    table = unroller(Topic("/t", "json", schema))
+    rows = table.rows(messages)
+    assert cells(rows, "a") == ["x\ufffdy", "\U0001f600"]
+    assert [column.path for column in table.schema.columns] == ["a", "\ufffdk"]
+
+
+def test_what_is_nested_too_deep_is_text_or_malformed_never_an_error() -> None:
+    schema, bad = widen(None, [b'{"a": {"b": 1}}'], "json", "t")
+    for depth in (20, 300, 900, 5000, 100_000):
+        for open_, close in ((b"[", b"]"), (b'{"k":', b"}")):
+            message = b'{"a": {"b": %s1%s}}' % (open_ * depth, close * depth)
+            schema, bad = widen(schema, [message], "json", "t")
+            with suppress(UnrollError):
+                rows = unroller(Topic("/t", "json", schema)).rows([message])
+                assert not bad and rows.count == 1
+
+
+def test_no_object_gets_further_keys_once_it_is_closed() -> None:
+    schema, _ = widen(None, [b'{"a": {"x": 1}, "n": 0}'], "json", "t")
+    more = [b'{"a": {"x": 1.5, "y": 2}, "z": 3}', b'{"n": {"u": 1}}', b'{"n": {"w": 2}}']
+    for message in more:
+        schema, bad = widen(schema, [message], "json", "t", closes=True)
+        assert bad == ()
+    assert widen(schema, [b'{"q": 1, "a": {"v": []}}'], "json", "t") == (schema, ())
+    assert from_schema(to_schema(from_schema(schema), "t")) == from_schema(schema)
+    rows = unroller(Topic("/t", "json", schema)).rows([b'{"a": {"x": 1, "y": 7}, "z": 3, "n": 4}'])
+    assert cells(rows, "a_x") == [1.0]
+    assert "a_y" not in rows.columns and "z" not in rows.columns
+
+
+def test_a_message_with_very_many_places_has_a_bounded_schema() -> None:
+    value = {f"o{n}": {f"k{m}": {"v": m} for m in range(80)} for n in range(80)}
+    message = json.dumps(value).encode()
+    schema, bad = widen(None, [message], "json", "t")
+    table = unroller(Topic("/t", "json", schema))
+    assert bad == () and 80 <= len(table.schema.columns) <= MOST_COLUMNS
+    assert json.loads(cells(table.rows([message]), "o7")[0]) == value["o7"]
+    assert widen(schema, [message], "json", "t")[0] is schema
+
+
+@fuzz
+@settings(max_examples=examples(60), deadline=None)
+@given(st.binary(max_size=300), st.sampled_from(["json", "msgpack"]))
+def test_random_bytes_are_rows_or_malformed(message: bytes, encoding: str) -> None:
+    good = b'{"x": 1}' if encoding == "json" else msgspec.msgpack.encode({"x": 1})
+    schema, bad = widen(None, [good, message], encoding, "t")
+    table = unroller(Topic("/t", encoding, schema))
+    assert table.stamp_ns(message) is None or table.no_stamp(message) is None
+    if bad:
+        with suppress(UnrollError):  # a decoder with less to look for may be content
+            table.rows([message])
+    else:
+        assert table.rows([good, message]).count == 2
 
 
 def test_python_s_nan_is_read() -> None:
@@ -363,7 +436,12 @@ def test_times_of_msgpack_are_text() -> None:
         (1_500_000_000_123, 1_500_000_000_123_000_000),
         (1_500_000_000_123_456, 1_500_000_000_123_456_000),
         (1_500_000_000_123_456_789, 1_500_000_000_123_456_789),
-        (12.5, 12_500_000_000),
+        (12.5, None),
+        (5, None),
+        ("5", None),
+        (99_999_999, None),
+        (100_000_000, 100_000_000 * NS),
+        ({"secs": 5, "nsecs": 0}, 5 * NS),
         ("2017-07-14T02:40:00.123456789Z", 1_500_000_000_123_456_789),
         ("2017-07-14T04:40:00+02:00", 1_500_000_000 * NS),
         ({"secs": 1_500_000_000, "nsecs": 7}, 1_500_000_000 * NS + 7),
@@ -379,21 +457,21 @@ def test_times_of_msgpack_are_text() -> None:
     ],
 )
 def test_stamps_as_senders_write_them(stamp: Any, expected: int | None) -> None:
-    usual = {"stamp": 1, "header": {"stamp": 1}}
+    usual = {"stamp": 1, "header": {"stamp": 1_600_000_000}}
     values = [usual, {"stamp": 5, "header": {"stamp": stamp}}]
     _, task, messages = learn(values)
     assert task.schema.stamp == "header/stamp"
     assert task.stamp_ns(messages[1]) == expected
     stamps = task.rows(messages).stamp_ns
-    assert stamps is not None and stamps.tolist() == [NS, expected or 0]
+    assert stamps is not None and stamps.tolist() == [1_600_000_000 * NS, expected or 0]
 
 
 def test_which_stamp_counts() -> None:
-    value = {"t": {"at": 3}, "stamp": 1, "timestamp": 2}
+    value = {"t": {"at": 10**9 + 3}, "stamp": 10**9 + 1, "timestamp": 10**9 + 2}
     schema, task, messages = learn([value])
     topic = Topic("/t", "json", schema)
-    assert task.schema.stamp == "stamp" and task.stamp_ns(messages[0]) == NS
-    assert unroller(topic, "t.at").stamp_ns(messages[0]) == 3 * NS
+    assert task.schema.stamp == "stamp" and task.stamp_ns(messages[0]) == (10**9 + 1) * NS
+    assert unroller(topic, "t.at").stamp_ns(messages[0]) == (10**9 + 3) * NS
     assert unroller(topic, "").stamp_ns(messages[0]) is None
     assert unroller(topic, "").rows(messages).stamp_ns is None
     assert unroller(topic, "not/seen/yet").schema.stamp == ""

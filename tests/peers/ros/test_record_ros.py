@@ -35,13 +35,14 @@ POLL_S = 0.25
 class Box:
     """The recorder as a user runs it: a robot folder and a process."""
 
-    def __init__(self, ros: Ros, invisible: bool) -> None:
+    def __init__(self, ros: Ros, invisible: bool, all_topics: bool = False) -> None:
         self.folder = ros.folder / "folder"
         self.store = self.folder / "store"
         self.folder.mkdir()
         topics = "".join(f"        - topic: {{name: /robot/{name}}}\n" for name in NAMES)
         extra = f"    invisible: true\n    poll_s: {POLL_S}\n" if invisible else ""
-        text = f"- ros:\n    ros_master_uri: {ros.uri}\n{extra}    topics:\n{topics}"
+        wanted = "    all_topics: true\n" if all_topics else f"    topics:\n{topics}"
+        text = f"- ros:\n    ros_master_uri: {ros.uri}\n{extra}{wanted}"
         (self.folder / "black_box.yaml").write_text(text)
         (self.folder / "robot.yaml").write_text("id: test_robot\n")
         self.log = ros.folder / "box.log"
@@ -105,8 +106,8 @@ def assert_all_accounted_for(ros: Ros, box: Box, *, invisible: bool = False) -> 
 
 
 @contextmanager
-def running(ros: Ros, *, invisible: bool = False) -> Iterator[Box]:
-    box = Box(ros, invisible)
+def running(ros: Ros, *, invisible: bool = False, all_topics: bool = False) -> Iterator[Box]:
+    box = Box(ros, invisible, all_topics)
     box.start()
     try:
         wait_until(lambda: box.rows("amberbox_run"), 20, "the box records")
@@ -182,3 +183,16 @@ def test_every_message_is_recorded_or_lies_in_a_gap(ros: Ros, order: str, invisi
         end(robots(ros)[-1])
         time.sleep(0.3)
     assert_all_accounted_for(ros, box, invisible=invisible)
+
+
+def test_all_topics_are_recorded_after_master_and_box_have_restarted(ros: Ros) -> None:
+    ros.master()
+    with running(ros, all_topics=True) as box:
+        ros.robot()
+        box.wait_for_more()
+        kill_master(ros, box)
+        kill_box(ros, box)
+        box.wait_for_more()
+        end(robots(ros)[-1])
+        time.sleep(0.3)
+    assert_all_accounted_for(ros, box)

@@ -11,6 +11,7 @@ from amberbox.blackbox.exporting.job import Job, new_file, new_folder, size_of
 from amberbox.blackbox.exporting.tables import Block, TableStream, table_streams
 from amberbox.core.errors import UsageError
 from amberbox.core.files import below
+from amberbox.core.names import fitted
 
 
 class TableWriter(Protocol):
@@ -33,7 +34,7 @@ def write_tables(job: Job, ending: str, open_table: OpenTable) -> None:
     else:
         with new_folder(job.path) as folder:
             for number, stream in enumerate(streams):
-                path = below(folder, f"{stream.schema.item}{ending}")
+                path = below(folder, f"{fitted(stream.schema.item)}{ending}")
                 with open_table(stream, path) as writer:
                     write_rows(job, stream, writer, number, len(streams))
     job.report.bytes = size_of(job.path)

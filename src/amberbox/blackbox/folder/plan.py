@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from amberbox.blackbox.folder.blocks import SourceBlock
 from amberbox.blackbox.folder.folder import SOURCES, RobotFolder
 from amberbox.core.errors import AmberboxError, Problem
-from amberbox.core.names import extend_names, item_name
+from amberbox.core.names import extend_names, item_name, readable
 from amberbox.core.plugins import get
 from amberbox.core.source import TopicOptions
 
@@ -42,7 +42,7 @@ def _named(item: PlannedItem, names: dict[str, str]) -> PlannedItem:
     """Name an item as a new store would: a name that is taken gets a suffix."""
     key = f"{item.source} {item.topic.strip('/')}"
     if item.item.casefold() in {name.casefold() for name in names.values()}:
-        names.update(extend_names(names, [key], lambda name: False))
+        names.update(extend_names(names, [key], lambda name: False, readable))
         return replace(item, item=names[key])
     names[key] = item.item
     return item

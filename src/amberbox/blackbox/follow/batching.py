@@ -14,7 +14,7 @@ from amberbox.blackbox.journal.clocktable import ClockTable
 from amberbox.blackbox.journal.mcap import Channel
 from amberbox.blackbox.unroll import Unroller, UnrollError, unroller
 from amberbox.core.errors import AmberboxError
-from amberbox.core.names import child_name, fitted, identifier, item_name
+from amberbox.core.names import child_name, fitted, identifier, is_item, item_name
 from amberbox.core.types import Batch, Gap, IntArray, Rows, Schema, Topic
 
 
@@ -55,7 +55,9 @@ def stream_of(channel: Channel, schemas: Mapping[int, Schema]) -> Stream:
     )
     source = marks.get("source", "mcap")
     stated = marks.get("item")
-    item = fitted(identifier(stated)) if stated else item_name(source, channel.topic)
+    if stated and not is_item(stated):
+        stated = fitted(identifier(stated))
+    item = stated or item_name(source, channel.topic)
     return Stream(item, topic, source, marks.get("repeated") == "1", marks.get("stamp"))
 
 

@@ -13,9 +13,10 @@ from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import ModuleType
-from typing import Any
+from typing import IO, Any
 
 from amberbox.blackbox.formats.bytesource import ByteSource, FileBytes
+from amberbox.blackbox.formats.compression import write_unpacked
 from amberbox.blackbox.formats.recording import Damage, Report
 from amberbox.core.errors import UsageError
 
@@ -49,19 +50,25 @@ def open_bson(path: Path, report: Report, stack: ExitStack) -> FileBytes:
 def _unpacked(path: Path, report: Report, folder: Path) -> Path:
     """Unpack a file as far as it goes."""
     target = folder / path.stem
-    unpacking, problem = zlib.decompressobj(wbits=_GZIP), ""
-    with path.open("rb") as packed, target.open("wb") as unpacked:
-        while not unpacking.eof and not problem:
-            piece = packed.read(_PIECE)
-            try:
-                unpacked.write(unpacking.decompress(piece))
-            except zlib.error as error:
-                problem = str(error)
-            problem = problem or ("" if piece else "it is cut short")
+    try:
+        with path.open("rb") as packed:
+            problem = write_unpacked(_pieces(packed), target)
+    except (zlib.error, EOFError) as error:
+        problem = str(error)
     if problem:
         damage = Damage(path.name, 0, path.stat().st_size, f"unpacked in part only ({problem})")
         report.add_damage(damage)
     return target
+
+
+def _pieces(packed: IO[bytes]) -> Iterator[bytes]:
+    """Unpack gzip, never more than a piece at once; raise zlib.error, or EOFError at its end."""
+    unpacking = zlib.decompressobj(wbits=_GZIP)
+    while not unpacking.eof:
+        data = unpacking.unconsumed_tail or packed.read(_PIECE)
+        if not data:
+            raise EOFError("it is cut short")
+        yield unpacking.decompress(data, _PIECE)
 
 
 def stretches(source: ByteSource, on_damage: Callable[[int, int, str], None]) -> Iterator[Stretch]:

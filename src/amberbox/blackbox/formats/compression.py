@@ -3,11 +3,21 @@
 from __future__ import annotations
 
 import bz2
+import shutil
+from collections.abc import Iterable
+from pathlib import Path
 from typing import Any
 
 import zstandard
 
+MOST_BYTES = 512 << 20
+"""A piece of a recording that unpacks to more is refused: a few bytes may say so."""
+DISK_LEFT_BYTES = 1 << 30
+"""A whole file is unpacked beside the recording until the disk has no more than this left."""
+_LOOK_BYTES = 32 << 20
 _PIECE = 1 << 16
+_ZSTD_PIECE = 1 << 11
+"""zstd has no limit of its own; each 4 bytes can become a block of 128 KiB."""
 
 
 def unpack(compression: str, data: bytes, size: int) -> tuple[bytes, str]:
@@ -17,6 +27,8 @@ def unpack(compression: str, data: bytes, size: int) -> tuple[bytes, str]:
     """
     if compression in ("", "none"):
         return data, ""
+    if size > MOST_BYTES:
+        return b"", f"says that it unpacks to {size} bytes, {MOST_BYTES} are allowed"
     decompressor = _decompressor(compression)
     if decompressor is None:
         return b"", f"compression {compression!r} is not known"
@@ -25,6 +37,30 @@ def unpack(compression: str, data: bytes, size: int) -> tuple[bytes, str]:
     if not problem and len(unpacked) != size:
         problem = f"unpacks to {len(unpacked)} bytes instead of {size}"
     return unpacked[:size], problem
+
+
+def unpack_message(data: bytes) -> bytes | None:
+    """Unpack a message in zstd; None if it cannot be, or is larger than allowed."""
+    unpacked, problem = _unpack_pieces(_Zstd(), data, MOST_BYTES)
+    return None if problem or len(unpacked) > MOST_BYTES else unpacked
+
+
+def write_unpacked(pieces: Iterable[bytes], target: Path) -> str:
+    """Write a file as it is unpacked, while its disk has room; say why it ends early, if so."""
+    free, written = _free_bytes(target), 0
+    with target.open("wb") as unpacked:
+        for piece in pieces:
+            written += len(piece)
+            if written > _LOOK_BYTES:
+                free, written = _free_bytes(target), 0
+            if free - written < DISK_LEFT_BYTES:
+                return f"less than {DISK_LEFT_BYTES >> 20} MiB are left in {target.parent}"
+            unpacked.write(piece)
+    return ""
+
+
+def _free_bytes(target: Path) -> int:
+    return shutil.disk_usage(target.parent).free
 
 
 def _decompressor(compression: str) -> Any:
@@ -54,9 +90,10 @@ class _Zstd:
 def _unpack_pieces(decompressor: Any, data: bytes, room: int) -> tuple[bytes, str]:
     # in pieces, so that what lies before a broken byte is not lost
     unpacked: list[bytes] = []
-    for start in range(0, len(data), _PIECE):
+    step = _ZSTD_PIECE if isinstance(decompressor, _Zstd) else _PIECE
+    for start in range(0, len(data), step):
         try:
-            unpacked.append(decompressor.decompress(data[start : start + _PIECE], room))
+            unpacked.append(decompressor.decompress(data[start : start + step], room))
         except (OSError, EOFError, RuntimeError, ValueError, zstandard.ZstdError) as error:
             return b"".join(unpacked), f"cannot be unpacked from byte {start} on ({error})"
         room -= len(unpacked[-1])

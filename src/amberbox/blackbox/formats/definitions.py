@@ -6,8 +6,7 @@ from collections.abc import Callable
 from functools import cache
 from typing import Any
 
-import zstandard
-
+from amberbox.blackbox.formats.compression import unpack_message
 from amberbox.blackbox.formats.recording import Report
 from amberbox.core.types import Schema
 
@@ -49,7 +48,7 @@ class Definitions:
     def _fitting(self, candidates: list[str], type_name: str, data: bytes | None) -> str:
         if data is None or candidates[0] == self.distribution:
             return candidates[0]
-        plain = _unpack(data)
+        plain = unpack_message(data) or data
         fitting = [d for d in candidates if _reads(d, type_name, plain)]
         if not fitting:
             self.report.add_note(f"{type_name}: its messages fit no known definition")
@@ -70,14 +69,6 @@ def _knows(distribution: str, type_name: str) -> bool:
 def _definition(distribution: str, type_name: str) -> bytes:
     text, _ = _typestore(distribution).generate_msgdef(type_name, ros_version=2)
     return str(text).encode()
-
-
-def _unpack(data: bytes) -> bytes:
-    """Unpack a message that its bag has compressed; other bytes stay."""
-    try:
-        return zstandard.ZstdDecompressor().decompressobj().decompress(data)
-    except zstandard.ZstdError:
-        return data
 
 
 def _reads(distribution: str, type_name: str, data: bytes) -> bool:

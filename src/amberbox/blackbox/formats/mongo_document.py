@@ -8,7 +8,7 @@ from typing import Any
 
 import msgspec
 
-from amberbox.blackbox.unroll.stamps import stamp_of
+from amberbox.core.stamps import stamp_of
 
 _TIME = "timestamp"
 _ID = "_id"

@@ -9,7 +9,7 @@ from struct import Struct, error, pack
 from typing import Any, TypeAlias
 
 from amberbox.blackbox.unroll.definition import Definition, FieldType
-from amberbox.blackbox.unroll.stamps import stamp_of
+from amberbox.core.stamps import time_of
 
 _CODES = {
     "int8": "b", "byte": "b", "uint8": "B", "char": "B", "int16": "h", "uint16": "H",
@@ -196,7 +196,7 @@ def _write_time(value: Any, pieces: list[bytes]) -> None:
 def _epoch_ns(value: Any) -> int:
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise TypeError
-    stamp_ns = stamp_of(value)
+    stamp_ns = time_of(value)
     if value and not stamp_ns:
         raise ValueError
     return stamp_ns

@@ -15,6 +15,7 @@ import yaml
 import zstandard
 
 from amberbox.blackbox.formats import mcap_storage, sqlite_storage
+from amberbox.blackbox.formats.compression import unpack_message, write_unpacked
 from amberbox.blackbox.formats.definitions import DISTRIBUTIONS, Definitions
 from amberbox.blackbox.formats.recording import (
     Damage,
@@ -129,15 +130,14 @@ def _unpacking(parts: list[Part], path: Path, bag: _Bag) -> list[Part]:
 def _load_unpacked(
     load: Callable[[], list[RecordedMessage]], path: Path, bag: _Bag
 ) -> list[RecordedMessage]:
-    decompressor = zstandard.ZstdDecompressor()
     messages, broken = load(), 0
     for place, message in enumerate(messages):
         if message.data[:4] == ZSTD_MAGIC and _is_cdr(bag, message):
-            try:
-                data = decompressor.decompressobj().decompress(message.data)
-                messages[place] = message._replace(data=data)
-            except zstandard.ZstdError:
+            data = unpack_message(message.data)
+            if data is None:
                 broken += 1
+            else:
+                messages[place] = message._replace(data=data)
     if broken:
         reason = f"{broken} messages cannot be unpacked and are kept as they are"
         bag.report.add_damage(Damage(path.name, 0, 0, reason))
@@ -152,12 +152,14 @@ def _decompress_file(path: Path, bag: _Bag) -> Path:
     """Unpack a whole file into a scratch folder, as far as it goes."""
     folder = bag.stack.enter_context(tempfile.TemporaryDirectory(prefix="amberbox-"))
     target = Path(folder) / path.name.removesuffix(".zstd")
-    with path.open("rb") as packed, target.open("wb") as unpacked:
+    with path.open("rb") as packed:
         try:
-            zstandard.ZstdDecompressor().copy_stream(packed, unpacked)
+            problem = write_unpacked(zstandard.ZstdDecompressor().read_to_iter(packed), target)
         except zstandard.ZstdError as error:
-            size = path.stat().st_size
-            bag.report.add_damage(Damage(path.name, 0, size, f"unpacked in part only ({error})"))
+            problem = str(error)
+    if problem:
+        size = path.stat().st_size
+        bag.report.add_damage(Damage(path.name, 0, size, f"unpacked in part only ({problem})"))
     return target
 
 

@@ -66,6 +66,7 @@ _FIELDS: dict[str, dict[str, object]] = {
                     "dropped": _COUNT,
                     "bytes": _COUNT,
                     "last_received_ns": _COUNT,
+                    "lost": _COUNT,
                 },
             },
         }

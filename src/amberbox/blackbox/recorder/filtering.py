@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from operator import itemgetter
 from typing import TypeAlias
 
@@ -13,8 +13,12 @@ from amberbox.blackbox.unroll import UnrollError
 from amberbox.blackbox.unroll.infer import widen
 from amberbox.core.types import Topic
 
+OPEN_VERSIONS = 32
+"""Schemas of an item until new keys of its messages get columns no more: they are data, ids say."""
 MOST_VERSIONS = 256
-"""A message whose keys are data (an id, a time) would widen its schema for ever."""
+"""Schemas of an item in all; what does not fit the last one stays raw."""
+QUIET_NS = 60_000_000_000
+"""Changes of a schema that follow each other within this time are one event."""
 
 Message: TypeAlias = tuple[Stream, bytes, int]
 
@@ -47,7 +51,7 @@ def change_filtered(kept: list[Message], tell: Tell) -> list[Message]:
     for found in places.values():
         stream = kept[found[0]][0]
         if stream.infers:
-            _infer(stream, [kept[place][1] for place in found], tell)
+            _infer(stream, [kept[place][1] for place in found], kept[found[-1]][2], tell)
         if stream.item.options.change is not None:
             unchanged.update(_unchanged(stream, kept, found))
     if not unchanged:
@@ -55,19 +59,26 @@ def change_filtered(kept: list[Message], tell: Tell) -> list[Message]:
     return [message for place, message in enumerate(kept) if place not in unchanged]
 
 
-def _infer(stream: Stream, messages: Sequence[bytes], tell: Tell) -> None:
+def _infer(stream: Stream, messages: Sequence[bytes], now_ns: int, tell: Tell) -> None:
     """Widen a stream's schema so that it holds all these messages; a wider one is an event."""
     topic, item = stream.topic, stream.item
     if item.versions >= MOST_VERSIONS:
         return
-    schema, bad = widen(topic.schema, messages, topic.message_encoding, item.name, stream.told)
+    closes = item.versions >= OPEN_VERSIONS
+    schema, bad = widen(
+        topic.schema,
+        messages,
+        topic.message_encoding,
+        item.name,
+        stream.told,
+        closes=closes,
+        letters=stream.letters,
+    )
     if bad:
         _note_malformed(stream, len(bad), tell)
     if schema is topic.schema:
         return
-    if topic.schema is not None:
-        text = f"{item.name} has new or wider variables"
-        tell("schema_widened", text, item.source, item=item.name)
+    before = None if topic.schema is None else stream.columns()
     item.versions += 1
     if item.versions == MOST_VERSIONS:
         text = f"{item.name} had {MOST_VERSIONS} schemas; what does not fit the last one stays raw"
@@ -75,14 +86,37 @@ def _infer(stream: Stream, messages: Sequence[bytes], tell: Tell) -> None:
     stream.topic = Topic(topic.name, topic.message_encoding, schema, topic.latched)
     stream.channel = -1
     stream.compile()
+    if before is not None:
+        _tell_widened(stream, before, now_ns, tell)
     tell_unused(stream, tell)
+
+
+def _tell_widened(stream: Stream, before: Mapping[str, str], now_ns: int, tell: Tell) -> None:
+    """Say what became of a schema, once for changes that follow each other."""
+    item, after = stream.item, stream.columns()
+    new = [path for path in after if path not in before]
+    is_wider = any(after.get(path, kind) != kind for path, kind in before.items())
+    change = "wider" if is_wider and not new else "new"
+    last_ns = item.widened_ns.get(change)
+    item.widened_ns[change] = now_ns
+    if last_ns is not None and now_ns - last_ns < QUIET_NS:
+        return
+    text = f"{item.name} has wider variables"
+    if new:
+        more = f" and {len(new) - 3} more" if len(new) > 3 else ""
+        names = ", ".join(name[:60] for name in new[:3])
+        limit = f"new keys get columns until it has had {OPEN_VERSIONS} schemas"
+        text = f"{item.name} has new variables: {names}{more} ({limit})"
+    elif not is_wider:
+        text = f"{item.name} has had {OPEN_VERSIONS} schemas: new keys get no columns any more"
+    tell("schema_widened", text, item.source, item=item.name)
 
 
 def _note_malformed(stream: Stream, count: int, tell: Tell) -> None:
     item = stream.item
     if not item.malformed:
         encoding = stream.topic.message_encoding
-        text = f"{item.name}: a message is no valid {encoding}; it is kept as it came"
+        text = f"{item.name}: a message is no valid {encoding}, or nested too deep; kept as it came"
         tell("malformed", text, item.source, item=item.name)
     item.malformed += count
 

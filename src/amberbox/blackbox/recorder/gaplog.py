@@ -63,7 +63,7 @@ class GapLog:
         """Open a gap for a peer that was lost."""
         with self._lock:
             self._known.add((item, peer))
-            self._begin(item, peer, now_ns, reason)
+            self._begin(item, peer, max(now_ns, self.start_ns), reason)
 
     def dropping(self, item: str, from_ns: int, reason: str) -> None:
         """Write that the box itself drops an item from now on; ``dropped`` tells the end."""
@@ -73,6 +73,10 @@ class GapLog:
         """Write what the box itself had to drop."""
         first_ns, last_ns, count = drops
         self._write(item, "", first_ns, last_ns + 1, f"dropped: {reason}", count)
+
+    def lost(self, item: str, peer: str, from_ns: int, to_ns: int, reason: str, count: int) -> None:
+        """Write that messages were lost between two that arrived."""
+        self._write(item, peer, from_ns, to_ns, reason, count)
 
     def shift(self, step_ns: int) -> None:
         """Move the beginnings of what is open: log time has begun anew."""

@@ -69,6 +69,11 @@ class Intake:
             for item, received_ns in messages:
                 item.drop(received_ns, reason)
 
+    def count_lost(self, item: Item, count: int) -> None:
+        """Count messages that a source found missing among those that came."""
+        with self._room:
+            item.counters.lost += count
+
     def take_drops(self, item: Item) -> dict[str, Drops]:
         """Return what was dropped of an item since the last call, by reason."""
         with self._room:
@@ -81,6 +86,11 @@ class Intake:
             for item in items:
                 for reason, (first_ns, last_ns, count) in item.drops.items():
                     item.drops[reason] = (first_ns + step_ns, last_ns + step_ns, count)
+
+    @property
+    def longest_bytes(self) -> int:
+        """Bytes of the longest message that the empty queue takes."""
+        return max(0, self.limit_bytes - _OVERHEAD)
 
     @property
     def size_bytes(self) -> int:

@@ -12,7 +12,7 @@ from typing import TypeAlias
 from amberbox.blackbox.journal import reserved
 from amberbox.blackbox.journal.syncmark import SyncMark
 from amberbox.blackbox.journal.writer import JournalWriter
-from amberbox.blackbox.recorder.streams import Item, Stream, Tell
+from amberbox.blackbox.recorder.streams import Item, Stream, Tell, tell_no_stamp
 from amberbox.core.types import Topic
 
 Row: TypeAlias = tuple[int, int, int, bytes]
@@ -69,7 +69,10 @@ class Journals:
         """Take a message to be written."""
         if stream.channel < 0:
             stream.channel = self._channel(stream)
-        row = (stream.channel, received_ns, stream.stamp_ns(data, received_ns), data)
+        stamp_ns = stream.stamp_ns(data)
+        if stamp_ns is None:
+            tell_no_stamp(stream, data, self._tell)
+        row = (stream.channel, received_ns, stamp_ns or received_ns, data)
         self._pending.setdefault(stream.item.writer, []).append(row)
 
     def add_own(self, writer: str, name: str, at_ns: int, data: bytes) -> None:

@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import msgspec
-from msgspec import structs
 
 from amberbox import __version__
 from amberbox.blackbox.follow.chain import previous_chain
@@ -97,7 +96,7 @@ class Pipeline:
         self._locks = [WriterLock(self.store, writer) for writer in RECORDED]
         self.run = self.store.next_run()
         self.intake = Intake(self.options.queue_bytes)
-        self.names = ItemNames(self.store.path)
+        self.names = ItemNames(self.store.path, is_new=self.run == 1)
         self._own: list[tuple[str, bytes, int]] = []
         self._own_lock = threading.Lock()
         self._items_lock = threading.Lock()
@@ -268,7 +267,7 @@ class Pipeline:
         for item in list(self.items.values()):
             if item.counters != item.reported:
                 item.reported = copy(item.counters)
-                changed.append({"item": item.name, **structs.asdict(item.counters)})
+                changed.append({"item": item.name, **item.counters.record()})
         silent = self.options.counts_silence and now_ns - self._counted_ns >= HEARTBEAT_NS
         if changed or silent:
             self._counted_ns = now_ns

@@ -54,6 +54,9 @@ class BlockSink:
     def message(self, stream: int, data: bytes, received_ns: int) -> None:
         self._put(self._streams[stream], data, received_ns)
 
+    def longest_message(self) -> int:
+        return self._pipeline.intake.longest_bytes
+
     def has_heard(self) -> bool:
         """Tell whether any message has come so far."""
         return any(stream.counters.received for stream in self._streams)
@@ -71,6 +74,13 @@ class BlockSink:
         self._links.discard((topic, peer))
         at_ns = self.now_ns() if since_ns is None else since_ns
         self._pipeline.gaps.down(self._item(topic), peer, at_ns, reason)
+
+    def lost(
+        self, topic: str, peer: str, from_ns: int, to_ns: int, count: int, reason: str
+    ) -> None:
+        item = self._pipeline.items[self._item(topic)]
+        self._pipeline.intake.count_lost(item, count)
+        self._pipeline.gaps.lost(item.name, peer, from_ns, to_ns, reason, count)
 
     def event(self, kind: str, text: str, **details: Any) -> None:
         self._pipeline.event(kind, text, self._name, **details)
@@ -116,7 +126,7 @@ class BlockSink:
         told = notes_of(topic.schema) if infers else {}
         if infers:  # what is really sent counts, not what was declared
             topic = replace(topic, schema=None)
-        stream = Stream(item, topic, infers=infers, told=told)
+        stream = Stream(item, topic, infers=infers, told=told, letters=self._pipeline.names.letters)
         known = [s for s in self._streams if s.item is item]
         if known and not stream.infers:
             self._tell_of_change(known[-1].topic, topic, item.name)

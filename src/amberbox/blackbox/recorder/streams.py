@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from typing import Any, Protocol, TypeAlias
 
 import msgspec
+from msgspec import structs
 
 from amberbox.blackbox.filters.change import ChangeFilter
 from amberbox.blackbox.filters.rate import RateLimit
@@ -14,13 +16,16 @@ from amberbox.blackbox.unroll.notes import Notes
 from amberbox.blackbox.unroll.select import select
 from amberbox.core.errors import AmberboxError
 from amberbox.core.source import TopicOptions
-from amberbox.core.types import Topic
+from amberbox.core.types import ItemSchema, Topic
 
 _WRITERS = {"all": "main", "bulk": "bulk"}
 
 
 class Counters(msgspec.Struct):
-    """What happened to an item's messages since the start of the run."""
+    """What happened to an item's messages since the start of the run.
+
+    ``lost`` never reached the box, so it is no part of ``received``.
+    """
 
     received: int = 0
     kept: int = 0
@@ -29,6 +34,15 @@ class Counters(msgspec.Struct):
     dropped: int = 0
     bytes: int = 0
     last_received_ns: int = 0
+    lost: int = 0
+
+    def record(self) -> dict[str, int]:
+        """Return the counters as they are written; only what was lost may be left out.
+
+        Servers of earlier versions know no such counter.
+        """
+        values = structs.asdict(self)
+        return values if self.lost else {k: v for k, v in values.items() if k != "lost"}
 
 
 Drops: TypeAlias = tuple[int, int, int]
@@ -61,8 +75,12 @@ class Item:
     waits: bool = False
     """Whether its source waits for room, as a file does, instead of being lost."""
     malformed: int = 0
+    widened_ns: dict[str, int] = field(default_factory=dict)
+    """When its schema got ``new`` or ``wider`` variables last."""
     versions: int = 0
     """How many schemas have been inferred for its messages."""
+    stamp_told: bool = False
+    """Whether it has been told that the messages' own stamp is no time."""
     unused: tuple[str, ...] = ()
     """Names in the options that fit no variable, as told last."""
 
@@ -106,6 +124,8 @@ class Stream:
     infers: bool = False
     told: Notes = field(default_factory=dict)
     """What its sender says of units and codes, where the schema is inferred."""
+    letters: bool = False
+    """Whether inferred variables keep what words of other scripts say in their names."""
     change: ChangeFilter | None = None
 
     @property
@@ -113,15 +133,17 @@ class Stream:
         """Counters of the item."""
         return self.item.counters
 
+    def columns(self) -> dict[str, str]:
+        """Return paths and types of the variables, those of child tables included."""
+        return {} if self.stamps is None else dict(_columns(self.stamps.schema))
+
     def drop(self, received_ns: int, reason: str = QUEUE_FULL) -> None:
         """Count a message that found no room."""
         self.item.drop(received_ns, reason)
 
-    def stamp_ns(self, data: bytes, received_ns: int) -> int:
-        """Return the message's own time stamp, else the time of receipt."""
-        if self.stamps is None:
-            return received_ns
-        return self.stamps.stamp_ns(data) or received_ns
+    def stamp_ns(self, data: bytes) -> int | None:
+        """Return the message's own time stamp, if it has one."""
+        return None if self.stamps is None else self.stamps.stamp_ns(data)
 
     def compile(self) -> str:
         """Build unroller and change filter before the first row; return what is wrong with them."""
@@ -133,6 +155,25 @@ class Stream:
         except AmberboxError as error:
             return error.what
         return ""
+
+
+def _columns(schema: ItemSchema, above: str = "") -> Iterator[tuple[str, str]]:
+    yield from ((above + column.path, column.type) for column in schema.columns)
+    for path, child in schema.children.items():
+        yield from _columns(child, f"{above}{path}/")
+
+
+def tell_no_stamp(stream: Stream, data: bytes, tell: Tell) -> None:
+    """Say once of an item that what it has for a stamp is no time."""
+    item, stamps = stream.item, stream.stamps
+    if item.stamp_told or stamps is None or not stamps.schema.stamp:
+        return
+    found = stamps.no_stamp(data)
+    if found is not None:
+        item.stamp_told = True
+        path, value = stamps.schema.stamp, str(found)[:40]
+        text = f"{item.name}: {path} is {value}, which is no time; the time of receipt counts"
+        tell("no_stamp", text, item.source, item=item.name, path=path)
 
 
 def tell_unused(stream: Stream, tell: Tell) -> None:

@@ -21,12 +21,14 @@ from amberbox.blackbox.ros1.node import Node
 from amberbox.blackbox.ros1.reports import Reports
 from amberbox.blackbox.ros1.settings import RosError, Settings
 from amberbox.blackbox.ros1.subscription import Subscription
-from amberbox.blackbox.ros1.xmlrpc import Graph, Master
+from amberbox.blackbox.ros1.xmlrpc import Graph, Master, publications
 from amberbox.core.source import Sink
 
 LONGEST_WAIT_S = 2.0
 FAILURE_CHECK_S = 0.2
 STOP_S = 0.3
+NEVER_NS = 1
+"""When the master was asked last, before it ever was: gaps begin with the run."""
 STOPPED = "the recorder stopped listening"
 NOT_FOLLOWED = frozenset({"/rosout", "/rosout_agg"})
 
@@ -52,7 +54,10 @@ class Client:
         self._ending = threading.Event()
         self._changing = threading.Lock()
         self._building = threading.Lock()
-        for topic in topics:
+        self._asked_ns = NEVER_NS
+        self._asked_nodes: set[str] = set()
+        remembered = set(self._memory.topics()) if settings.all_topics else set()
+        for topic in topics.keys() | (remembered - NOT_FOLLOWED):
             self._subscribe(topic)
 
     def run(self, stop: threading.Event) -> None:
@@ -128,6 +133,9 @@ class Client:
             self._follow_new_topics(graph)
             self._register(graph)
             self._poll(asked_ns, graph)
+            self._asked_ns = asked_ns
+            if self._settings.all_topics:
+                self._ask_forgotten_nodes(graph)
         except RosError as error:
             self._failures += 1
             if not self._ending.is_set():
@@ -140,10 +148,26 @@ class Client:
                     if not self._ending.is_set():
                         self._subscribe(topic)
 
+    def _ask_forgotten_nodes(self, graph: Graph) -> None:
+        """Ask connected nodes that the master has forgotten what else they publish, once each."""
+        found: dict[str, set[str]] = {}
+        for topic, subscription in list(self._subscriptions.items()):
+            for uri in subscription.unlisted(graph.publishers.get(topic, ())) - self._asked_nodes:
+                self._asked_nodes.add(uri)
+                with suppress(RosError):  # what it has been heard of goes on
+                    for other in publications(uri, self._settings):
+                        found.setdefault(other, set()).add(uri)
+        for topic in found.keys() - NOT_FOLLOWED - graph.publishers.keys():
+            with self._changing:
+                if topic not in self._subscriptions and not self._ending.is_set():
+                    self._subscribe(topic)
+                    self._subscriptions[topic].listed(sorted(found[topic]))
+
     def _subscribe(self, topic: str) -> None:
         self._subscriptions[topic] = Subscription(
-            topic, self._sink, self._memory, self._settings, self._reports, self._building
-        )
+            topic, self._sink, self._memory, self._settings, self._reports, self._building,
+            self._asked_ns,
+        )  # fmt: skip
 
     def _register(self, graph: Graph) -> None:
         """Register where the master does not name the box: at first, and when it forgot."""

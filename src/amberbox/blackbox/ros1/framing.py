@@ -11,6 +11,8 @@ from amberbox.blackbox.ros1.settings import MalformedError
 BUFFER_BYTES = 256 << 10
 LARGE_BYTES = 64 << 10
 KEPT_BYTES = 16 << 20
+FIRST_BYTES = 1 << 20
+"""Memory for a large message at first; it doubles as its bytes arrive, whatever was announced."""
 
 _length_at = struct.Struct("<I").unpack_from
 
@@ -20,7 +22,7 @@ class Framer:
 
     Small messages are sliced out of one buffer that is read into again and again; what is left
     of the last one is carried over. A message above ``LARGE_BYTES`` that is not complete yet is
-    received in its own place, so that no byte of it is moved twice.
+    received in its own place, which grows with it and is used again for the next one.
     """
 
     def __init__(self, limit: int) -> None:
@@ -29,6 +31,7 @@ class Framer:
         self._rest = b""
         self._store = bytearray()
         self._large = memoryview(b"")
+        self._size = 0
         self._filled = 0
 
     def room(self) -> memoryview:
@@ -47,7 +50,8 @@ class Framer:
         while end - at >= 4:
             size = _length_at(data, at)[0]
             if size > limit:
-                raise MalformedError(f"message of {size} bytes announced, {limit} allowed")
+                text = f"message of {size} bytes announced, {limit} allowed"
+                raise MalformedError(text, "store.queue and max_message_mb set how much")
             stop = at + 4 + size
             if stop > end:
                 if size > LARGE_BYTES:
@@ -60,8 +64,9 @@ class Framer:
         return messages
 
     def _begin_large(self, size: int, first: bytes) -> None:
-        if len(self._store) < size:
-            self._store = bytearray(size)
+        if len(self._store) < min(size, FIRST_BYTES):
+            self._store = bytearray(min(size, FIRST_BYTES))
+        self._size = size
         self._large = memoryview(self._store)[:size]
         self._large[: len(first)] = first
         self._filled = len(first)
@@ -70,11 +75,21 @@ class Framer:
         self._filled += count
         if self._filled < len(self._large):
             return []
+        if self._filled < self._size:
+            self._grow()
+            return []
         message = bytes(self._large)
         self._large = memoryview(b"")
         if len(self._store) > KEPT_BYTES:
             self._store = bytearray()
         return [message]
+
+    def _grow(self) -> None:
+        """Make as much room again as has been filled."""
+        store = bytearray(min(self._size, 2 * self._filled))
+        store[: self._filled] = self._large
+        self._store = store
+        self._large = memoryview(store)
 
 
 class Reader:

@@ -55,6 +55,8 @@ class Link:
         self.peer = ""
         self.endpoint: object = None
         self.failures = 0
+        self.error = ""
+        """Why the last attempt failed; empty once a connection is open."""
         self.is_parked = False
         self.was_unregistered = threading.Event()
         self._owner = owner
@@ -111,6 +113,7 @@ class Link:
                     self._serve(sock, tcpros.read_answer(sock, self.uri))
         except RosError as error:
             self.failures += 1
+            self.error = error.what
             self._owner.failed(self, error)
         finally:
             self._hold(None)
@@ -123,6 +126,7 @@ class Link:
 
     def _serve(self, sock: socket.socket, publisher: Publisher) -> None:
         tcpros.listen_only(sock, self._settings.dead_after_s)
+        self.error = ""
         self.peer = publisher.node
         self.endpoint = sock.getpeername()
         deliver = self._owner.opened(self, publisher)

@@ -12,6 +12,7 @@ from typing import Any
 from amberbox.core.source import Sink
 
 MOST_PER_TOPIC = 8
+MOST_TOPICS = 4096
 SAVE_EVERY_S = 0.2
 
 Table = dict[str, dict[str, str]]
@@ -31,6 +32,17 @@ class Memory:
         self.port = int(state.get("port", 0))
         self._uris: Table = _table(state.get("publishers"))
         self._latched: Table = _table(state.get("latched"))
+        self._dead: set[str] = set()
+
+    def topics(self) -> list[str]:
+        """Return the topics that had a publisher when they were last heard."""
+        with self._lock:
+            return [topic for topic, nodes in self._uris.items() if nodes]
+
+    def nodes(self, topic: str) -> dict[str, str]:
+        """Return the nodes that published a topic, and where each one was."""
+        with self._lock:
+            return dict(self._uris.get(topic, {}))
 
     def uris(self, topic: str) -> list[str]:
         """Return the addresses at which a topic was published when it was last heard."""
@@ -46,12 +58,22 @@ class Memory:
         """Keep where a node is."""
         with self._lock:
             nodes = self._uris.setdefault(topic, {})
-            if nodes.pop(node, None) != uri:
+            if nodes.pop(node, None) != uri or uri in self._dead:
                 self._touch()
+            self._dead.discard(uri)
             nodes[node] = uri
             for oldest in list(nodes)[:-MOST_PER_TOPIC]:
                 del nodes[oldest]
                 self._latched.get(topic, {}).pop(oldest, None)
+            for long_ago in list(self._uris)[:-MOST_TOPICS]:
+                del self._uris[long_ago]
+
+    def bury(self, uri: str) -> None:
+        """Leave an address at which no process listens out of what the next run is told."""
+        with self._lock:
+            if uri not in self._dead:
+                self._dead.add(uri)
+                self._touch()
 
     def forget(self, topic: str, uri: str) -> None:
         """Drop an address that is known to publish the topic no more."""
@@ -111,11 +133,12 @@ class Memory:
             if not self._changed:
                 return None
             self._changed = False
-            tables = {"publishers": self._uris, "latched": self._latched}
-            copies = {
-                name: {t: dict(n) for t, n in table.items()} for name, table in tables.items()
+            publishers = {
+                topic: {node: uri for node, uri in nodes.items() if uri not in self._dead}
+                for topic, nodes in self._uris.items()
             }
-            return {"port": self.port, **copies}
+            latched = {topic: dict(nodes) for topic, nodes in self._latched.items()}
+            return {"port": self.port, "publishers": publishers, "latched": latched}
 
 
 def _table(saved: Any) -> Table:

@@ -99,7 +99,8 @@ class Reports:
 
     def malformed(self, topic: str, uri: str, error: RosError) -> None:
         """A publisher sent what is not TCPROS."""
-        text = f"{topic}: {uri} sent malformed data: {error.what}; connecting again"
+        hint = f" ({error.hint})" if error.hint else ""
+        text = f"{topic}: {uri} sent malformed data: {error.what}{hint}; connecting again"
         self.once(("malformed", topic, uri), "ros_malformed", text, topic=topic, uri=uri)
 
     def repeated(self, topic: str, node: str) -> None:

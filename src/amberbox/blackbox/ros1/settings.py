@@ -20,7 +20,7 @@ class Settings:
     all_topics: bool = False
     poll_s: float = 1.0
     tcp_nodelay: bool = True
-    message_limit: int = 1 << 30
+    message_limit: int = 64_000_000
     dead_after_s: float = 40.0
     timeout_s: float = 3.0
     unknown_after_s: float = 10.0

@@ -34,9 +34,15 @@ class Subscription:
         settings: Settings,
         reports: Reports,
         building: threading.Lock,
+        since_ns: int,
     ) -> None:
+        """``since_ns`` is when the topic may have been published first, unheard."""
         self.topic = topic
-        self.sightings = Sightings(sink.now_ns())
+        self.sightings = Sightings(since_ns)
+        self._since_ns = since_ns
+        self._nodes = {uri: node for node, uri in memory.nodes(topic).items()}
+        self._unheard = set(self._nodes.values())
+        self._missing: set[str] = set()
         self._sink = sink
         self._memory = memory
         self._settings = settings
@@ -85,21 +91,30 @@ class Subscription:
         a few attempts have failed.
         """
         self.sightings.polled(asked_ns, nodes)
-        uris = set()
+        found = {}
         for node in sorted(set(nodes) - self.peers()):
             try:
-                uris.add(node_uri(node))
+                found[node_uri(node)] = node
             except RefusedError:
                 continue  # it left between the two questions
         with self._lock:
+            self._nodes.update(found)
             fresh = {uri for uri in self._listed if self._is_fresh(uri)}
-            self._listed = frozenset(uris | fresh)
+            self._listed = frozenset(found.keys() | fresh)
+            failed = [link for uri, link in self._links.items() if uri in found and link.error]
+        for link in failed:
+            self._miss(link)
         self._reconcile()
 
     def peers(self) -> set[str]:
         """Return the nodes that are connected now."""
         with self._lock:
             return set(self._open)
+
+    def unlisted(self, nodes: Collection[str]) -> set[str]:
+        """Return the addresses of connected nodes that the master does not name."""
+        with self._lock:
+            return {link.uri for peer, link in self._open.items() if peer not in nodes}
 
     def close(self, reason: str) -> None:
         """Begin to end all links; what has arrived is still delivered."""
@@ -175,7 +190,10 @@ class Subscription:
             if link.is_closing:
                 return None
             self._open[link.peer] = link
-            since_ns = self.sightings.absent_until_ns(link.peer)
+            self._nodes[link.uri] = link.peer
+            since_ns = self._absent_until_ns(link.peer)
+            self._missing.discard(link.peer)
+            self._unheard.discard(link.peer)
             self._sink.link_up(self.topic, link.peer, since_ns)
         is_known = self._memory.knows(self.topic, link.peer, link.uri)
         self._memory.remember(self.topic, link.peer, link.uri)
@@ -239,7 +257,29 @@ class Subscription:
         with self._lock:
             if self._open.get(link.peer) is link:
                 del self._open[link.peer]
+                self._missing.add(link.peer)
                 self._sink.link_down(self.topic, link.peer, reason, since_ns)
+
+    def _absent_until_ns(self, node: str) -> int:
+        """Return since when a node may have published; one of the run before, ever since then."""
+        if node in self._unheard:
+            return self._since_ns
+        return self.sightings.absent_until_ns(node)
+
+    def _is_wanted(self, link: Link) -> bool:
+        """Tell whether the master names a publisher, or it was one and has not denied it since."""
+        with self._lock:
+            return link.uri in self._listed or link.uri in self._memory.uris(self.topic)
+
+    def _miss(self, link: Link) -> None:
+        """Open the gap of a publisher that is wanted and cannot be connected."""
+        with self._lock:
+            node = self._nodes.get(link.uri)
+            if node is None or node in self._missing or node in self._open or self._is_closed:
+                return
+            self._missing.add(node)
+            reason = f"publisher not connected: {link.error}"
+            self._sink.link_down(self.topic, node, reason, self._absent_until_ns(node))
 
     def failed(self, link: Link, error: RosError) -> None:
         """Account for a failed attempt; an address that nobody names any more is given up."""
@@ -248,6 +288,10 @@ class Subscription:
         self._reports.failed(self.topic, link.uri, link.failures, error)
         if isinstance(error, RefusedError):
             self._memory.forget(self.topic, link.uri)
+        if self._is_wanted(link):
+            self._miss(link)
+        if isinstance(error.__cause__, ConnectionRefusedError):
+            self._memory.bury(link.uri)
         self._reconcile()
 
     def malformed(self, link: Link, error: RosError) -> None:

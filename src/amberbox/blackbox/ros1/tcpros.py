@@ -73,8 +73,9 @@ def connect(host: str, port: int, topic: str, settings: Settings) -> socket.sock
     """Open a connection to a publisher and ask for a topic; raise NoAnswerError."""
     try:
         sock = socket.create_connection((host, port), settings.timeout_s)
-    except OSError as error:
-        raise NoAnswerError(f"{host}:{port}: {error.strerror or error}") from error
+    except (OSError, OverflowError, ValueError) as error:  # what a peer calls host and port
+        text = getattr(error, "strerror", None) or str(error)
+        raise NoAnswerError(f"{host}:{port}: {text}") from error
     try:
         sock.sendall(encode_header(_request(topic, settings)))
     except OSError as error:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import http.client
+import time
 import xmlrpc.client
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from http import HTTPStatus
 from typing import Any
 from xml.etree.ElementTree import ParseError
 
@@ -13,9 +15,15 @@ from amberbox.blackbox.ros1.names import host_and_port, mapped, mapped_host
 from amberbox.blackbox.ros1.settings import NoAnswerError, RefusedError, Settings
 from amberbox.blackbox.ros1.xmlvalues import AnswerParser, AnswerReader
 
+_PIECE = 1 << 16
+_SLOWEST = 5
+"""Waits an answer may take in all, each up to the time limit."""
+
 
 class _TimedTransport(xmlrpc.client.Transport):
     """Gives up after a while; keeps its connection between calls."""
+
+    accept_gzip_encoding = False  # what is packed could unpack to anything
 
     def __init__(self, timeout_s: float) -> None:
         super().__init__()
@@ -27,6 +35,37 @@ class _TimedTransport(xmlrpc.client.Transport):
         connection = http.client.HTTPConnection(str(host), timeout=self._timeout_s)
         self._connection = host, connection
         return connection
+
+    def single_request(
+        self, host: Any, handler: str, request_body: Any, verbose: bool = False
+    ) -> Any:
+        """Send a request and read the answer as it comes, up to a size and for a time.
+
+        The base class reads and unpacks whatever a peer sends.
+        """
+        try:
+            response = self.send_request(host, handler, request_body, verbose).getresponse()
+            if response.status != HTTPStatus.OK:
+                raise xmlrpc.client.ProtocolError(
+                    str(host), response.status, response.reason, dict(response.getheaders())
+                )
+            return self._answer(response)
+        except xmlrpc.client.Fault:
+            raise
+        except Exception:
+            self.close()
+            raise
+
+    def _answer(self, response: http.client.HTTPResponse) -> Any:
+        parser, reader = self.getparser()
+        end_s = time.monotonic() + _SLOWEST * self._timeout_s
+        while piece := response.read1(_PIECE):
+            parser.feed(piece)
+            if time.monotonic() > end_s:
+                raise TimeoutError("the answer does not end")
+        response.close()  # the connection stays: it is ready for the next call
+        parser.close()
+        return reader.close()
 
     def getparser(self) -> Any:
         parser = AnswerParser()
@@ -81,7 +120,7 @@ class Master:
         """Ask who publishes and subscribes what."""
         try:
             publishers, subscribers, _ = self._api.call("getSystemState")
-            return Graph(dict(publishers), dict(subscribers))
+            return Graph(_nodes_by_topic(publishers), _nodes_by_topic(subscribers))
         except (TypeError, ValueError) as error:
             raise NoAnswerError(f"{self._api.uri} gave no system state: {error}") from error
 
@@ -102,6 +141,10 @@ class Master:
         self._api.close()
 
 
+def _nodes_by_topic(pairs: Any) -> dict[str, list[str]]:
+    return {str(topic): [str(node) for node in nodes] for topic, nodes in pairs}
+
+
 def request_topic(node_uri: str, topic: str, settings: Settings) -> tuple[str, int]:
     """Ask a publisher where to connect for a topic; return host and TCP port."""
     try:
@@ -114,6 +157,17 @@ def request_topic(node_uri: str, topic: str, settings: Settings) -> tuple[str, i
         return mapped_host(str(host), settings.hosts), int(port)
     except (TypeError, ValueError) as error:
         raise RefusedError(f"{node_uri} offers no TCPROS connection for {topic}") from error
+    finally:
+        api.close()
+
+
+def publications(node_uri: str, settings: Settings) -> list[str]:
+    """Ask a node for the topics it publishes."""
+    api = Api(node_uri, settings)
+    try:
+        return [str(topic) for topic, _ in api.call("getPublications")]
+    except (TypeError, ValueError) as error:
+        raise NoAnswerError(f"{node_uri} gave no publications: {error}") from error
     finally:
         api.close()
 

@@ -13,16 +13,25 @@ from xml.etree import ElementTree
 
 Element = ElementTree.Element
 
+MOST_BYTES = 2 << 20
+"""Of an answer; the state of a large robot's master has 100 kB."""
+DEEPEST = 32
+"""Values in values; those of ROS are four deep."""
+
 
 class AnswerParser:
     """What ``xmlrpc.client.Transport`` feeds an answer to."""
 
     def __init__(self) -> None:
         self._parser = ElementTree.XMLParser()
+        self._size = 0
         self.root: Element | None = None
 
     def feed(self, data: bytes) -> None:
-        """Take a piece of the answer."""
+        """Take a piece of the answer; raise ValueError when there is too much of it."""
+        self._size += len(data)
+        if self._size > MOST_BYTES:
+            raise ValueError(f"an answer of more than {MOST_BYTES} bytes")
         self._parser.feed(data)
 
     def close(self) -> None:
@@ -53,10 +62,16 @@ def _only(element: Element) -> Element:
     return element[0]
 
 
-def _value(element: Element) -> Any:
+def _value(element: Element, depth: int = 0) -> Any:
     if not len(element):
         return element.text or ""
     typed = _only(element)
+    if depth > DEEPEST:
+        raise ValueError(f"values nested deeper than {DEEPEST}")
+    if typed.tag == "array":
+        return [_value(value, depth + 1) for value in _only(typed)]
+    if typed.tag == "struct":
+        return {_text(m.find("name")): _value(m[-1], depth + 1) for m in typed}
     if typed.tag not in _READERS:
         raise ValueError(f"<{typed.tag}> is no value of ROS")
     return _READERS[typed.tag](typed)
@@ -64,14 +79,6 @@ def _value(element: Element) -> Any:
 
 def _number(element: Element) -> int:
     return int(element.text or "")
-
-
-def _array(element: Element) -> list[Any]:
-    return [_value(value) for value in _only(element)]
-
-
-def _struct(element: Element) -> dict[str, Any]:
-    return {_text(member.find("name")): _value(member[-1]) for member in element}
 
 
 def _text(element: Element | None) -> str:
@@ -86,6 +93,4 @@ _READERS: dict[str, Callable[[Element], Any]] = {
     "boolean": lambda element: bool(_number(element)),
     "double": lambda element: float(element.text or ""),
     "nil": lambda element: None,
-    "array": _array,
-    "struct": _struct,
 }

@@ -40,7 +40,9 @@ class Config:
     caller_id: str = option("/amberbox", "name of the box as a ROS node; one per box and master")
     advertise: str = option("", "own address for the master; ROS_HOSTNAME, ROS_IP when absent")
     tcp_nodelay: bool = option(True, "ask publishers to send small messages without delay")
-    max_message_mb: float = option(1024.0, "longer messages are taken for garbage", unit="MB")
+    max_message_mb: float | None = option(
+        None, "longer messages are taken for garbage; store.queue when absent", unit="MB"
+    )
     dead_after_s: float = option(40.0, "a silent peer is probed and given up after", unit="s")
 
     @property
@@ -56,7 +58,7 @@ class Config:
         yield from self._check_topics()
         if not 0.05 <= self.poll_s <= 3600:
             yield "poll_s", "must be between 0.05 and 3600 seconds"
-        if not 0 < self.max_message_mb <= 4095:
+        if self.max_message_mb is not None and not 0 < self.max_message_mb <= 4095:
             yield "max_message_mb", "must be above 0, and TCPROS allows 4095 at most"
         if not 4 <= self.dead_after_s <= 86400:
             yield "dead_after_s", "must be between 4 seconds and a day"
@@ -98,16 +100,20 @@ class Source:
     def run(self, sink: Sink, stop: threading.Event) -> None:
         """Listen until ``stop``; master and publishers may come, go and return."""
         types = {topic.name: topic.type for topic in self.topics()}
-        Client(settings(self._config), types, sink).run(stop)
+        Client(settings(self._config, sink.longest_message()), types, sink).run(stop)
 
 
-def settings(config: Config) -> Settings:
-    """Complete a configuration from the environment; raise UsageError for a bad master URI."""
+def settings(config: Config, longest_message: int) -> Settings:
+    """Complete a configuration from the environment; raise UsageError for a bad master URI.
+
+    ``longest_message`` is how many bytes the recorder takes where the configuration sets no limit.
+    """
     text = config.ros_master_uri or os.environ.get("ROS_MASTER_URI") or DEFAULT_MASTER
     try:
         uri = master_uri(text)
     except ValueError as error:
         raise UsageError(f"ros_master_uri: {error}", "write http://HOST:11311") from error
+    limit_mb = config.max_message_mb
     return Settings(
         master_uri=uri,
         caller_id=global_name(config.caller_id),
@@ -117,6 +123,6 @@ def settings(config: Config) -> Settings:
         all_topics=config.all_topics,
         poll_s=config.poll_s,
         tcp_nodelay=config.tcp_nodelay,
-        message_limit=round(config.max_message_mb * 1_000_000),
+        message_limit=longest_message if limit_mb is None else round(limit_mb * 1_000_000),
         dead_after_s=config.dead_after_s,
     )

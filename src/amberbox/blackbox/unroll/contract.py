@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Protocol
+from typing import Any, Protocol
 
 from amberbox.core.errors import AmberboxError
 from amberbox.core.types import ItemSchema, Rows
@@ -47,3 +47,6 @@ class Unroller(Protocol):
 
     def stamp_ns(self, message: bytes) -> int | None:
         """Read only the message's own stamp, nanoseconds; None without one or if it is 0."""
+
+    def no_stamp(self, message: bytes) -> Any:
+        """Return what stands where the stamp belongs and is no time; None if nothing does."""

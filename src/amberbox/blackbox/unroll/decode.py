@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import datetime
 import json
+import re
 from base64 import b64encode
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Annotated, Any, Union
 
 import msgspec
@@ -28,6 +30,11 @@ _FEW_BYTES = 1 << 20
 _MOST_LISTS = 1 << 20
 _MOST_VALUES = 1 << 24
 """A map of 4,000 x 4,000 cells is believed; a JSON text of more values is not decoded."""
+_HALF = re.compile("[\ud800-\udfff]")
+_MOST_DIGITS = 300
+_LONG_NUMBER = re.compile(rb"[0-9]{%d}" % _MOST_DIGITS)
+TOO_DEEP = "(nested too deep to be shown)"
+"""Text of a value that is nested deeper than Python can follow; the message has it."""
 
 
 class MalformedError(Exception):
@@ -50,6 +57,7 @@ def decode_plain(message: bytes, encoding: str) -> Any:
     """Decode one message of any shape; raises ``MalformedError``.
 
     Python's ``NaN`` and ``Infinity`` are read although they are not JSON. Keys become strings.
+    Numbers beyond all floats are infinite, half surrogates in texts become U+FFFD.
     """
     check_size(message, encoding)
     try:
@@ -61,13 +69,26 @@ def decode_plain(message: bytes, encoding: str) -> Any:
 
 
 def _decode_json(message: bytes) -> Any:
-    try:
-        return msgspec.json.decode(message)
-    except msgspec.DecodeError:
-        if b"NaN" not in message and b"Infinity" not in message:
-            raise
-    value = json.loads(message.decode())
-    json.dumps(value, ensure_ascii=False).encode()  # raises on half surrogates
+    if not _LONG_NUMBER.search(message):
+        with suppress(msgspec.DecodeError):
+            return msgspec.json.decode(message)
+    return _mended(json.loads(message.decode(), parse_int=_number))
+
+
+def _number(text: str) -> float:
+    """Read a whole number; one that is so long that no float may hold it as a float."""
+    return int(text) if len(text) < _MOST_DIGITS else float(text)
+
+
+def _mended(value: Any) -> Any:
+    """Replace half surrogates, which no text in UTF-8 can hold."""
+    match value:
+        case str():
+            return _HALF.sub("\ufffd", value)
+        case dict():
+            return {_mended(key): _mended(item) for key, item in value.items()}
+        case list():
+            return [_mended(item) for item in value]
     return value
 
 
@@ -91,12 +112,19 @@ def _key(key: Any) -> str:
 
 def text_of(value: Any) -> str | None:
     """Write a value of a text column: strings as they are, bytes as Base64, the rest as JSON."""
+    try:
+        return _text_of(value)
+    except RecursionError:
+        return TOO_DEEP
+
+
+def _text_of(value: Any) -> str | None:
     simple = plain(value)
     if simple is None or isinstance(simple, str):
         return simple
     if isinstance(simple, bytes):
         return b64encode(simple).decode()
-    return json.dumps(simple, ensure_ascii=False, separators=(",", ":"), default=text_of)
+    return json.dumps(simple, ensure_ascii=False, separators=(",", ":"), default=_text_of)
 
 
 def message_type(shape: Shape, exact: bool) -> Any:
@@ -124,7 +152,9 @@ def _structure(shape: Shape, exact: bool) -> Any:
         for number, key in enumerate(keys)
     ]
     names = {f"f{number}": key for number, key in enumerate(keys)}
-    return msgspec.defstruct("Message", fields, rename=names, forbid_unknown_fields=True)
+    return msgspec.defstruct(
+        "Message", fields, rename=names, forbid_unknown_fields=not shape.closed
+    )
 
 
 def _list(shape: Shape, exact: bool) -> Any:

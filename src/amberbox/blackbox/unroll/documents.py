@@ -21,8 +21,8 @@ from amberbox.blackbox.unroll.jsonschema import from_schema
 from amberbox.blackbox.unroll.notes import Note, notes_of
 from amberbox.blackbox.unroll.places import objects
 from amberbox.blackbox.unroll.shapes import Shape, column_kind, escape, places
-from amberbox.blackbox.unroll.stamps import stamp_of
-from amberbox.core.names import unique_names
+from amberbox.core.names import identifier, readable, unique_names
+from amberbox.core.stamps import stamp_of
 from amberbox.core.types import Column, ColumnData, IntArray, ItemSchema, Ragged, Rows, Schema
 
 _STAMPS = ("header/stamp", "header/timestamp", "stamp", "timestamp")
@@ -42,6 +42,7 @@ class DocumentUnroller:
         self._decode = make_decoder(self._shape, encoding, exact=False)
         self._stamp_path = _own_stamp(self._shape, stamp)
         self._decode_stamp = _stamp_decoder(self._stamp_path, encoding)
+        self._plain = readable if self._shape.letters else identifier
         self._names: dict[int, dict[str, str]] = {}
         self._notes = notes_of(schema)
         self.schema = self._item_schema(self._shape, schema.name, stamp=self._stamp_path)
@@ -68,6 +69,15 @@ class DocumentUnroller:
         except (*_MISFITS, AttributeError):
             return None
 
+    def no_stamp(self, message: bytes) -> Any:
+        """Return what stands where the stamp belongs and is no time; None if nothing does."""
+        try:
+            found = self._decode_stamp(message) if self._stamp_path else None
+        except (*_MISFITS, AttributeError):
+            return None
+        is_unset = not found or (isinstance(found, dict) and not any(found.values()))
+        return None if is_unset or stamp_of(found) else found
+
     def _stamps(self, messages: Sequence[bytes]) -> IntArray | None:
         if not self._stamp_path:
             return None
@@ -76,7 +86,7 @@ class DocumentUnroller:
     def _item_schema(
         self, table: Shape, type_name: str, above: str = "", stamp: str = ""
     ) -> ItemSchema:
-        names = self._names[id(table)] = unique_names(table.names)
+        names = self._names[id(table)] = unique_names(table.names, plain=self._plain)
         columns = []
         children = {}
         for path, shape, kind in places(table):

@@ -10,6 +10,7 @@ import msgspec
 from amberbox.blackbox.unroll.notes import Notes, notes_json
 from amberbox.blackbox.unroll.shapes import Shape, is_nameable, nullable, places
 from amberbox.blackbox.unroll.viewerform import ALSO_TEXT, viewer_form
+from amberbox.core.names import identifier, readable
 from amberbox.core.types import Schema
 
 NAMES = "x-columns"
@@ -21,6 +22,10 @@ SHAPE = "x-shape"
 take has no way to say "number or text"; whether a value may be missing or null goes unsaid,
 because the root and every property may."""
 
+LETTERS = "x-letters"
+"""Keyword of a document whose columns are named in Latin letters where paths are of other scripts;
+without it everything but ASCII is ``_`` in a name."""
+
 _DRAFT = "https://json-schema.org/draft/2020-12/schema"
 OURS = "every message fits: amberbox"
 """Comment of documents that promise the columns of their messages, as those of others may not."""
@@ -31,7 +36,20 @@ def to_schema(shape: Shape, name: str, notes: Notes | None = None) -> Schema:
     """Write a shape as a JSON Schema document that viewers take, with notes on its places."""
     document = {"$schema": _DRAFT, "$comment": OURS, "title": name}
     document |= _for_viewers(shape) | notes_json(notes or {})
+    if shape.letters and _has_other_letters(shape):
+        document[LETTERS] = "latin"
     return Schema(name, "jsonschema", msgspec.json.encode(document))
+
+
+def _has_other_letters(table: Shape) -> bool:
+    """Tell whether any column has another name in Latin letters."""
+    for path, shape, kind in places(table):
+        if kind == "children" and shape.items is not None:
+            if _has_other_letters(shape.items):
+                return True
+        elif readable(path) != identifier(path):
+            return True
+    return False
 
 
 def _for_viewers(shape: Shape) -> dict[str, Any]:
@@ -54,6 +72,8 @@ def _to_json(shape: Shape, table: bool = False) -> dict[str, Any]:
         return document | {"additionalProperties": True}
     if "object" in shape.kinds:
         document["properties"] = {k: _to_json(v) for k, v in shape.properties.items()}
+    if shape.closed:  # readers that do not know such shapes keep the whole object as text
+        document["additionalProperties"] = True
     if shape.items is not None:
         empty = not shape.items.kinds  # no item was ever seen
         document["items"] = False if empty else _to_json(shape.items, table=True)
@@ -77,7 +97,9 @@ def from_schema(schema: Schema) -> Shape:
         return nullable()
     if not is_ours(document):
         return nullable()
-    return _nullable(document.get(SHAPE, document), table=True)
+    shape = _nullable(document.get(SHAPE, document), table=True)
+    shape.letters = document.get(LETTERS) == "latin"
+    return shape
 
 
 def is_ours(document: Any) -> bool:
@@ -93,9 +115,9 @@ def _from_json(document: Mapping[str, Any], table: bool = False) -> Shape:
         if not document.get(ALSO_TEXT):
             shape.kinds.discard("string")
     properties = document.get("properties", {})
-    shape.open = document.get("additionalProperties") is True or not all(
-        map(is_nameable, properties)
-    )
+    takes_more = document.get("additionalProperties") is True
+    shape.closed = takes_more and bool(properties)
+    shape.open = (takes_more and not properties) or not all(map(is_nameable, properties))
     if not shape.open:
         shape.properties = {k: _nullable(v) for k, v in properties.items()}
     if "items" in document:

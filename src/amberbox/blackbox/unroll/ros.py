@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from struct import Struct
+from typing import Any
 
 import numpy as np
 
@@ -66,6 +67,19 @@ class RosUnroller:
         except UnrollError:
             return None
         return (int(stamps[0]) or None) if stamps is not None else None
+
+    def no_stamp(self, message: bytes) -> Any:
+        """Return what stands where the stamp belongs and is no time; None if nothing does.
+
+        The zero of a ROS time says that there is none.
+        """
+        if self._stamp is None or self._stamp.type == "time" or self.stamp_ns(message):
+            return None
+        try:
+            found = self.rows([message]).columns[self._stamp.name]
+        except UnrollError:
+            return None
+        return found[0].item() if isinstance(found[0], np.generic) else found[0]
 
     def _with_stamps(self, rows: Rows) -> Rows:
         if self._stamp is None:

@@ -14,6 +14,9 @@ MOST_PROPERTIES = 256
 DEEPEST = 16
 """Objects with more keys, and values nested deeper, are kept as JSON text in one column."""
 
+MOST_COLUMNS = 4096
+"""A message with more places has the objects in it kept as text, the deepest ones first."""
+
 _INT64 = range(-(2**63), 2**63)
 _UNNAMEABLE = re.compile(r'["\\\x00-\x1f\ud800-\udfff]')
 
@@ -23,7 +26,8 @@ class Shape:
     """Kinds seen at one place, with the shapes below it.
 
     ``kinds`` holds JSON's types and ``binary``. ``number`` covers ``integer``. An ``open`` shape
-    does not look further down, nor does a list without ``items``. ``names`` is used where a table
+    does not look further down, nor does a list without ``items``. A ``closed`` one takes no
+    further properties: their values stay in the message alone. ``names`` is used where a table
     begins.
     """
 
@@ -31,7 +35,10 @@ class Shape:
     properties: dict[str, Shape] = field(default_factory=dict)
     items: Shape | None = None
     open: bool = False
+    closed: bool = False
     names: list[str] = field(default_factory=list)
+    letters: bool = False
+    """At the top: whether columns are named in Latin letters."""
 
     def values(self) -> set[str]:
         """Give the kinds without null."""
@@ -43,8 +50,37 @@ def nullable() -> Shape:
     return Shape({"null"})
 
 
+def close(shape: Shape) -> None:
+    """Let no object that has properties get more: its keys are data, such as ids."""
+    shape.closed = shape.closed or bool(shape.properties)
+    for inner in (*shape.properties.values(), *([shape.items] if shape.items else ())):
+        close(inner)
+
+
+def limit(shape: Shape) -> None:
+    """Keep objects as text, the deepest first, until there are ``MOST_COLUMNS`` places at most."""
+    depth = DEEPEST
+    while depth and _count(shape) > MOST_COLUMNS:
+        _open_below(shape, depth)
+        depth -= 1
+
+
+def _count(shape: Shape) -> int:
+    inner = (*shape.properties.values(), *([shape.items] if shape.items else ()))
+    return 1 + sum(map(_count, inner))
+
+
+def _open_below(shape: Shape, depth: int) -> None:
+    if not depth:
+        shape.open = shape.open or bool(shape.properties) or shape.items is not None
+        shape.properties, shape.items, shape.closed = {}, None, False
+        return
+    for inner in (*shape.properties.values(), *([shape.items] if shape.items else ())):
+        _open_below(inner, depth - 1)
+
+
 def observe(shape: Shape, value: Any, depth: int = 0) -> None:
-    """Add a decoded value to a shape; raises ValueError for numbers beyond all floats."""
+    """Add a decoded value to a shape."""
     kind = _kind(value)
     shape.kinds.add(kind)
     if kind == "number" or "number" in shape.kinds:
@@ -62,7 +98,7 @@ def _kind(value: Any) -> str:
         case bool():
             return "boolean"
         case int():
-            return "integer" if value in _INT64 else _checked_number(value)
+            return "integer" if value in _INT64 else "number"
         case float():
             return "number"
         case str():
@@ -75,20 +111,14 @@ def _kind(value: Any) -> str:
             return "object"
 
 
-def _checked_number(value: int) -> str:
-    try:
-        float(value)
-    except OverflowError:
-        raise ValueError("a number beyond all floats") from None
-    return "number"
-
-
 def _observe_object(shape: Shape, value: Mapping[str, Any], depth: int) -> None:
     for key, item in value.items():
         if key not in shape.properties:
+            if shape.closed:
+                continue
             shape.properties[key] = nullable()
         if depth >= DEEPEST or len(shape.properties) > MOST_PROPERTIES or not is_nameable(key):
-            shape.open = True
+            shape.open, shape.closed = True, False
             shape.properties, shape.items = {}, None
             return
         observe(shape.properties[key], item, depth + 1)

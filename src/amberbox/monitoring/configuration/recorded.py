@@ -14,7 +14,7 @@ from amberbox.blackbox.folder.folder import SOURCES, RobotFolder
 from amberbox.blackbox.unroll import unroller
 from amberbox.blackbox.unroll.jsonschema import OURS
 from amberbox.core.errors import AmberboxError
-from amberbox.core.names import extend_names, item_name
+from amberbox.core.names import extend_names, item_name, readable
 from amberbox.core.plugins import get
 from amberbox.core.source import TopicOptions
 from amberbox.core.types import ItemSchema, Schema, Topic
@@ -160,7 +160,7 @@ def _named(items: Iterable[Item]) -> Iterator[Item]:
         names[key] = item.name
         if item.name.casefold() in taken:
             del names[key]
-            names = extend_names(names, [key], lambda name: False)
+            names = extend_names(names, [key], lambda name: False, readable)
         yield replace(item, name=names[key])
 
 

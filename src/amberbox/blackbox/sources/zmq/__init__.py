@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import re
 import threading
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
 
+from amberbox.blackbox.sources.zmq.continuity import Continuity
 from amberbox.core.options import option
 from amberbox.core.source import Sink, TopicOptions
 from amberbox.core.types import Topic
@@ -23,6 +26,13 @@ PASSIVE = "SUB sockets only: nothing is sent, no other subscriber misses a messa
 UNNAMED = "message"
 """Topic of messages in one frame that name none."""
 
+MOST_REMEMBERED = 1000
+"""Topics of a publisher that the next run knows from its start."""
+
+_NEVER_HEARD = "publisher not connected yet"
+_RUN_START_NS = 1
+_GIVEN_UP_S = (0.5, 30.0)
+"""Wait before ZeroMQ, which ends a connection for good at what it cannot read, connects again."""
 _POLL_MS = 100
 _AT_ONCE = 500  # messages of one publisher before the others have their turn
 _KEY_LENGTH = 40  # characters of a CURVE key in Z85
@@ -38,6 +48,26 @@ class ZmqTopic(TopicOptions):
     endpoint: str = option("", "its publisher, tcp://HOST:PORT; the block's when absent")
     url: str = option("", "its publisher's host, tcp://HOST, used with 'port'")
     port: int | None = option(None, "its publisher's port")
+    sequence: str = option("", "path of a number that counts messages; its holes are gaps")
+    rate_hz: float | None = option(
+        None, "rate of the stamps named by 'stamp'; their holes are gaps", unit="Hz"
+    )
+
+    def check(self) -> Iterator[tuple[str, str]]:
+        """Say which values cannot work."""
+        yield from super().check()
+        if self.rate_hz is not None and not 0 < self.rate_hz < float("inf"):
+            yield "rate_hz", "must be above 0"
+        elif self.rate_hz is not None and not self.stamp:
+            yield "rate_hz", "goes together with 'stamp', the path of the time stamp"
+        if self.rate_hz is not None and self.sequence:
+            yield "rate_hz", "is not needed beside 'sequence'; remove one of them"
+
+    def continuity(self) -> Continuity | None:
+        """Return what finds holes in the topic's messages; None if nothing is said of that."""
+        if not self.sequence and self.rate_hz is None:
+            return None
+        return Continuity(self.sequence, self.stamp or "", self.rate_hz or 0.0)
 
 
 @dataclass(frozen=True)
@@ -52,7 +82,9 @@ class Config:
     )
     port: int | None = option(None, "publisher's port")
     topics: Sequence[ZmqTopic] = option((), "topics to record; all when absent")
-    max_message_mb: float = option(256.0, "longer messages end the connection", unit="MB")
+    max_message_mb: float | None = option(
+        None, "longer messages end the connection; store.queue when absent", unit="MB"
+    )
     curve_server_key: str = option("", "publisher's public CURVE key, 40 characters")
     curve_public_key: str = option("", "own public CURVE key; made anew when absent")
     curve_secret_key: str = option("", "own secret CURVE key", secret=True)
@@ -66,7 +98,7 @@ class Config:
         for topic in self.topics:
             yield from (("topics", f"'{topic.name}': {what}") for what in self._wrong_topic(topic))
         yield from self._check_keys()
-        if self.max_message_mb <= 0:
+        if self.max_message_mb is not None and self.max_message_mb <= 0:
             yield "max_message_mb", "must be above 0"
 
     def _check_keys(self) -> Iterator[tuple[str, str]]:
@@ -143,10 +175,13 @@ class Source:
         import zmq
 
         context = zmq.Context()
-        links = [_Link(e, topics, sink) for e, topics in self.config.publishers().items()]
+        heard = _Heard(sink)
+        publishers = self.config.publishers().items()
+        links = [_Link(endpoint, topics, sink, heard) for endpoint, topics in publishers]
         poller = zmq.Poller()
         try:
             for link in links:
+                link.expect()
                 link.connect(context, self.config)
                 poller.register(link.socket, zmq.POLLIN)
                 poller.register(link.monitor, zmq.POLLIN)
@@ -160,6 +195,27 @@ class Source:
             context.destroy(linger=0)
 
 
+class _Heard:
+    """Which topics each publisher had when all were recorded, across restarts of the box."""
+
+    def __init__(self, sink: Sink) -> None:
+        self._sink = sink
+        saved = sink.state().get("topics")
+        table = saved if isinstance(saved, dict) else {}
+        self._topics = {str(e): [str(name) for name in names] for e, names in table.items()}
+
+    def topics(self, endpoint: str) -> Sequence[str]:
+        """Return the topics of a publisher."""
+        return self._topics.get(endpoint, ())
+
+    def add(self, endpoint: str, topic: str) -> None:
+        """Keep a topic that is new."""
+        known = self._topics.setdefault(endpoint, [])
+        if topic not in known and len(known) < MOST_REMEMBERED:
+            known.append(topic)
+            self._sink.save_state({"topics": self._topics})
+
+
 @dataclass
 class _Link:
     """The connection to one publisher; ZeroMQ itself connects and connects again."""
@@ -167,7 +223,12 @@ class _Link:
     endpoint: str
     options: Sequence[ZmqTopic]
     sink: Sink
+    heard: _Heard
     is_up: bool = False
+    limit: int = 0
+    given_up_s: float | None = None
+    pause_s: float = _GIVEN_UP_S[0]
+    continuities: dict[bytes, Continuity] = field(default_factory=dict)
     streams: dict[tuple[bytes, str], int] = field(default_factory=dict)
     seen: dict[str, None] = field(default_factory=dict)
     told: set[str] = field(default_factory=set)
@@ -175,16 +236,31 @@ class _Link:
     socket: Any = None
     monitor: Any = None
 
+    def expect(self) -> None:
+        """Take the topics that are known before anything is heard; open the gaps of the others.
+
+        Those of configured topics are opened by the recorder.
+        """
+        self.seen = dict.fromkeys(topic.name for topic in self.options)
+        for topic in self.options:
+            found = topic.continuity()
+            if found is not None:
+                self.continuities[topic.name.encode()] = found
+        for name in () if self.options else self.heard.topics(self.endpoint):
+            self.seen[name] = None
+            self.sink.link_down(name, self.endpoint, _NEVER_HEARD, _RUN_START_NS)
+
     def connect(self, context: Any, config: Config) -> None:
         """Subscribe; returns at once, whether the publisher is there or not."""
         import zmq
 
         self.types = {topic.name.encode(): topic.type for topic in self.options}
-        self.seen = dict.fromkeys(topic.name for topic in self.options)
         self.socket = context.socket(zmq.SUB)
         # the queue must never be the place where messages are dropped: that would not be counted
         self.socket.rcvhwm = 0
-        self.socket.maxmsgsize = int(config.max_message_mb * 1e6)
+        limit_mb = config.max_message_mb
+        self.limit = self.sink.longest_message() if limit_mb is None else int(limit_mb * 1e6)
+        self.socket.maxmsgsize = self.limit
         self.socket.reconnect_ivl_max = 1000
         self.socket.ipv6 = True
         self.socket.setsockopt(zmq.TCP_KEEPALIVE, 1)
@@ -203,6 +279,8 @@ class _Link:
             self._take_monitor_events()
         if self.socket in ready:
             self._take_messages(_AT_ONCE)
+        if self.given_up_s is not None and time.monotonic() >= self.given_up_s:
+            self._connect_again()
 
     def close(self) -> None:
         """Say that nothing more is heard."""
@@ -223,6 +301,7 @@ class _Link:
             self._take_monitor_event(str(zmq.Event(event["event"]).name), event["value"])
 
     def _take_monitor_event(self, kind: str, value: int) -> None:
+        self.given_up_s = time.monotonic() + self.pause_s if kind == "DISCONNECTED" else None
         if kind == "HANDSHAKE_SUCCEEDED" and not self.is_up:
             self._up()
         elif kind == "DISCONNECTED" and self.is_up:
@@ -235,6 +314,21 @@ class _Link:
             text = f"{self.endpoint} refuses the connection; are the CURVE keys right?"
             self._tell_once("handshake_failed", text, code=value)
 
+    def _connect_again(self) -> None:
+        """Connect where ZeroMQ has given up: it does at bytes it cannot read, without a word."""
+        import zmq
+
+        self.given_up_s = None
+        self.pause_s = min(2 * self.pause_s, _GIVEN_UP_S[1])
+        text = (
+            f"{self.endpoint} sent what is no ZeroMQ, or a message of more than {self.limit} bytes "
+            "(store.queue, max_message_mb); it is connected again"
+        )
+        self._tell_once("malformed_connection", text)
+        with suppress(zmq.ZMQError):  # the endpoint may be gone with the connection
+            self.socket.disconnect(self.endpoint)
+        self.socket.connect(self.endpoint)
+
     def _up(self) -> None:
         self.is_up = True
         self.told -= {"unreachable", "handshake_failed"}
@@ -246,10 +340,10 @@ class _Link:
         for topic in self.seen:
             self.sink.link_down(topic, self.endpoint, reason)
 
-    def _tell_once(self, kind: str, text: str, **details: Any) -> None:
-        if kind not in self.told:
-            self.told.add(kind)
-            self.sink.event(kind, text, endpoint=self.endpoint, **details)
+    def _tell_once(self, key: str, text: str, kind: str = "", **details: Any) -> None:
+        if key not in self.told:
+            self.told.add(key)
+            self.sink.event(kind or key, text, endpoint=self.endpoint, **details)
 
     def _take_messages(self, limit: int | None) -> None:
         import zmq
@@ -274,12 +368,32 @@ class _Link:
         if stream is None:
             stream = self._new_stream(topic, encoding)
         self.sink.message(stream, payload, received_ns)
+        self.pause_s = _GIVEN_UP_S[0]
+        watched = self.continuities.get(topic)
+        if watched is not None:
+            self._watch(watched, topic.decode(), payload, encoding, received_ns)
+
+    def _watch(
+        self, watched: Continuity, topic: str, payload: bytes, encoding: str, received_ns: int
+    ) -> None:
+        """Say how many messages are missing before this one."""
+        missing = watched.missing(payload, encoding)
+        since_ns, watched.last_received_ns = watched.last_received_ns, received_ns
+        if missing is None:
+            what = "no number" if watched.sequence else "no time"
+            text = f"{topic}: {watched.path} is {what}, so it does not tell what was lost"
+            self._tell_once(f"no_continuity {topic}", text, "no_continuity", topic=topic)
+        elif missing:
+            reason = f"lost before the box: holes in {watched.path}"
+            self.sink.lost(topic, self.endpoint, since_ns, received_ns, missing, reason)
 
     def _new_stream(self, topic: bytes, encoding: str) -> int:
         name = topic.decode(errors="backslashreplace") or UNNAMED
         stream = self.streams[topic, encoding] = self.sink.topic(Topic(name, encoding))
         if name not in self.seen:
             self.seen[name] = None
+            if not self.options:
+                self.heard.add(self.endpoint, name)
             if self.is_up:
                 self.sink.link_up(name, self.endpoint)
         return stream
