@@ -47,6 +47,14 @@ class CountingSink:
     def message(self, stream: int, data: bytes, received_ns: int) -> None:
         self.counts[stream] += 1
 
+    def longest_message(self) -> int:
+        return 64_000_000
+
+    def lost(
+        self, topic: str, peer: str, from_ns: int, to_ns: int, count: int, reason: str
+    ) -> None:
+        pass
+
     def link_up(self, topic: str, peer: str, since_ns: int | None = None) -> None:
         pass
 
