@@ -25,9 +25,12 @@ class Looking:
     def __init__(self, store: Path, report: ExportReport) -> None:
         self.store = store
         self.report = report
-        self.catalogue = look(store, with_segments=can_build())
+        self.catalogue = self._look()
         self._damaged: set[str] = set()
         self._failed = 0
+
+    def _look(self) -> Catalogue:
+        return replace(look(self.store, with_segments=can_build()), lasting=True)
 
     def moved_on(self) -> None:
         """Note that something was read since the last look."""
@@ -53,7 +56,7 @@ class Looking:
                 "export again, a shorter range if it is a long one",
             )
         before = self.catalogue
-        self.catalogue = self._sound(look(self.store, with_segments=can_build()))
+        self.catalogue = self._sound(self._look())
         for name in _lost(before, self.catalogue):
             self.report.miss(f"{name} was deleted while it was being exported")
 

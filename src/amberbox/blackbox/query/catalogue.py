@@ -48,6 +48,8 @@ class Catalogue:
     stored: Callable[[str], str] = stored_name
     opened: dict[str, JournalFile] = field(default_factory=dict, compare=False, repr=False)
     """Journals as they were found at first: one that grows is looked into once."""
+    lasting: bool = False
+    """Whether it is asked for long: then what has been added since counts, too."""
 
     def journals(self, skip: Container[str]) -> Iterator[JournalFile]:
         """Open the journal files that are not named in ``skip``, in the order of writing.
@@ -56,7 +58,7 @@ class Catalogue:
         """
         for name in self.existing:
             if name not in skip:
-                if name not in self.opened:
+                if name not in self.opened or (self.lasting and not self.opened[name].finished):
                     journal = journal_file(open_store(self.store).journal_path(name), name)
                     points = self.book.points(name)
                     self.opened[name] = (
