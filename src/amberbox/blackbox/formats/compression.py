@@ -8,10 +8,13 @@ from typing import Any
 import zstandard
 
 _PIECE = 1 << 16
+_MAGIC = {"bz2": b"BZh", "lz4": b"\x04\x22\x4d\x18", "zstd": b"\x28\xb5\x2f\xfd"}
+_BELIEVED = 16 << 20
+"""What may be unpacked though less was promised: the promise may be what is damaged."""
 
 
 def unpack(compression: str, data: bytes, size: int) -> tuple[bytes, str]:
-    """Unpack at most ``size`` bytes; the second value says what went wrong, if anything.
+    """Unpack ``size`` bytes or what there is; the second value says what went wrong, if anything.
 
     ``compression`` is ``none`` (or empty), ``bz2``, ``lz4`` or ``zstd``.
     """
@@ -21,10 +24,16 @@ def unpack(compression: str, data: bytes, size: int) -> tuple[bytes, str]:
     if decompressor is None:
         return b"", f"compression {compression!r} is not known"
     # one byte more than promised, to notice data that would unpack to more
-    unpacked, problem = _unpack_pieces(decompressor, data, size + 1)
+    room = max(size, _BELIEVED) + 1
+    unpacked, problem = _unpack_pieces(decompressor, data, room)
     if not problem and len(unpacked) != size:
         problem = f"unpacks to {len(unpacked)} bytes instead of {size}"
-    return unpacked[:size], problem
+    return unpacked[: room - 1], problem
+
+
+def compression_of(data: bytes) -> str:
+    """Tell by its first bytes how a piece is compressed; ``none`` if it is not."""
+    return next((name for name, magic in _MAGIC.items() if data.startswith(magic)), "none")
 
 
 def _decompressor(compression: str) -> Any:

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from amberbox.blackbox.formats.bytesource import FileBytes
-from amberbox.blackbox.formats.compression import unpack
+from amberbox.blackbox.formats.compression import compression_of, unpack
 from amberbox.blackbox.formats.recording import (
     Damage,
     Part,
@@ -189,6 +189,8 @@ class _Bag:
     def _read(self, chunk: _Chunk, topic_of: Mapping[int, int]) -> ChunkContent:
         data = self.file.read(chunk.data_offset, chunk.data_length)
         raw, problem = unpack(chunk.compression, data, chunk.unpacked_size)
+        if not raw and (seen := compression_of(data)) != chunk.compression:
+            raw, _ = unpack(seen, data, chunk.unpacked_size)
         if problem:
             self.damaged(chunk.offset, self._length(chunk), f"chunk {problem}")
         content = read_chunk(raw, topic_of)
