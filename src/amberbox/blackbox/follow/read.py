@@ -180,15 +180,6 @@ def run_messages(journal: JournalFile) -> dict[str, Any]:
     return {}
 
 
-def selection(store: Path) -> dict[str, list[str]]:
-    """Return the variables configured for each item, the newest run's word counting."""
-    chosen: dict[str, list[str]] = {}
-    for journal in journals(store):
-        items = msgspec.json.decode(run_messages(journal).get("items") or "{}")
-        chosen.update({item: o["variables"] for item, o in items.items() if o.get("variables")})
-    return chosen
-
-
 @dataclass(slots=True)
 class _Pile:
     """Messages of one stream waiting to be unrolled together."""
