@@ -20,6 +20,7 @@ from amberbox.blackbox.journal.clocktable import ClockReading, ClockTable, simpl
 from amberbox.blackbox.journal.scan import ChunkPlace, FileScan, read_chunk, scan
 from amberbox.blackbox.journal.walk import Damage
 from amberbox.blackbox.store import Store, open_store
+from amberbox.core.errors import AmberboxError
 from amberbox.core.types import Batch, Gap, IntArray
 
 BATCH_ROWS = 4096
@@ -216,6 +217,29 @@ def batches(
     for journal in journals(store):
         if journal.name not in skip:
             yield from batches_of(journal, items, from_ns, to_ns, on_gap)
+
+
+KEPT_RAW = "no columns, only in "
+
+
+def with_columns(journal: JournalFile, on_gap: OnGap) -> set[str]:
+    """Name the items of a file whose messages can be unrolled; the others are told as gaps."""
+    found: set[str] = set()
+    reasons: dict[str, str] = {}
+    for stream in journal.streams.values():
+        try:
+            stream.unroller()
+            found.add(stream.item)
+        except AmberboxError as error:
+            reasons[stream.item] = error.what
+    edges = np.array([journal.start_ns, journal.end_ns])
+    start_ns, end_ns = ClockTable(journal.clock).received(edges).tolist()
+    for item, why in reasons.items():
+        if item not in found and journal.items.get(item):
+            reason = f"{KEPT_RAW}{journal.name}: {why}"
+            on_gap(Gap(journal.writer, journal.run, start_ns, end_ns + 1, reason, item,
+                       journal.items[item]))  # fmt: skip
+    return found
 
 
 def batches_of(

@@ -22,6 +22,7 @@ from amberbox.blackbox.formats.recording import (
     RecordedMessage,
     Recording,
     Report,
+    Stretch,
     TopicTable,
 )
 from amberbox.blackbox.formats.ros1_chunk import (
@@ -102,6 +103,11 @@ class _Bag:
             if chunk.start_ns is None or not self.connections.keys() >= chunk.expected.keys():
                 self._look_into(chunk)
         self.chunks = [chunk for chunk in self.chunks if chunk.start_ns is not None]
+        places = [
+            Stretch(c.offset, c.data_offset + c.data_length, c.start_ns or 0, c.end_ns)
+            for c in self.chunks
+        ]
+        self.report.damage = [damage.between(places) for damage in self.report.damage]
         self._make_topics()
 
     def _note(self, record: Record) -> None:

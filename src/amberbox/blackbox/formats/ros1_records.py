@@ -155,9 +155,9 @@ def _shorten(source: ByteSource, record: Record, on_damage: OnDamage) -> Record 
         return record  # the next one is damaged
     if end == source.size and not is_chunk:
         return None
-    what = "chunk cut short" if is_chunk else "record with a wrong length"
-    missing = record.end - end
-    on_damage(record.offset, end - record.offset, f"{what}, {missing} bytes are missing")
+    more = record.end - end
+    cut, wrong = f"chunk cut short, {more} bytes are missing", f"claims {more} bytes too many"
+    on_damage(record.offset, end - record.offset, cut if is_chunk else wrong)
     return record._replace(data_length=end - record.data_offset)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Container, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -10,8 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from amberbox.blackbox.follow.read import JournalFile, batches_of, journal_file
+from amberbox.blackbox.follow.read import JournalFile, batches_of, journal_file, sound_chunks
 from amberbox.blackbox.journal import reserved
+from amberbox.blackbox.journal.chunk import sequences
 from amberbox.blackbox.journal.clocktable import ClockPoints, ClockTable
 from amberbox.blackbox.query.catalogue import Catalogue, item_of, union
 from amberbox.blackbox.query.rates import Place, Share, deleted_places, rate_hz
@@ -29,7 +30,7 @@ class ItemInfo:
     ``rate_hz`` is over the time of recording: pauses between runs, and what was deleted whole, do
     not count; None where no two rows came in one run. ``stamp_offset_s`` is how far stamps lie
     behind receipt (median over the record), None without stamps; ``bytes`` counts the messages as
-    received (0 for child tables).
+    received (0 for child tables). ``no_columns`` says why the messages are there only as they came.
     """
 
     name: str
@@ -42,6 +43,7 @@ class ItemInfo:
     rate_hz: float | None
     stamp_offset_s: float | None
     bytes: int
+    no_columns: str | None = None
 
     def to_json(self) -> dict[str, Any]:
         """Return the item as JSON has it: times are RFC 3339 strings."""
@@ -56,6 +58,7 @@ class ItemInfo:
             "rate_hz": self.rate_hz,
             "stamp_offset_s": self.stamp_offset_s,
             "bytes": self.bytes,
+            **({"no_columns": self.no_columns} if self.no_columns else {}),
         }
 
 
@@ -64,6 +67,8 @@ def overview(catalogue: Catalogue) -> list[ItemInfo]:
     holes = list(deleted_places(catalogue))
     infos = [_info(catalogue, table, holes) for table in sorted(catalogue.schemas)]
     known = [info for info in infos if info is not None]
+    known += _without_rows(catalogue, {info.name for info in known})
+    known.sort(key=lambda info: info.name)
     return sorted(known, key=lambda info: info.source == reserved.SOURCE)
 
 
@@ -142,3 +147,38 @@ def _share(place: Place, pieces: Sequence[Flat], size: int) -> Share:
     last = max(int(piece.received_ns.max()) for piece in pieces)
     ages = [p.received_ns - p.timestamp_ns for p in pieces if p.schema.stamp]
     return Share(place, sum(map(len, pieces)), first, last, size, median(ages))
+
+
+def _without_rows(catalogue: Catalogue, named: Container[str]) -> Iterator[ItemInfo]:
+    """Describe items of which no message can be unrolled, by their receipt alone."""
+    found: dict[str, list[JournalFile]] = {}
+    for journal in catalogue.journals(skip=catalogue.columns_done):
+        for item, count in journal.items.items():
+            if count and item not in named:
+                found.setdefault(item, []).append(journal)
+    for item, journals in found.items():
+        stream = next(s for s in journals[-1].streams.values() if s.item == item)
+        shares = [share for journal in journals for share in _raw_shares(journal, item)]
+        if shares:
+            raw = catalogue.raw.get(item)
+            why = raw[-1][1].reason.partition(": ")[2] if raw else "no message fits its definition"
+            yield ItemInfo(
+                item, stream.source, stream.topic.name,
+                stream.topic.schema.name if stream.topic.schema else "",
+                sum(share.rows for share in shares),
+                min(share.first_ns for share in shares), max(share.last_ns for share in shares),
+                rate_hz(shares, ()), None, sum(share.bytes for share in shares), why,
+            )  # fmt: skip
+
+
+def _raw_shares(journal: JournalFile, item: str) -> Iterator[Share]:
+    """Count an item's messages in the chunks of a journal."""
+    numbers = [n for n, s in journal.streams.items() if s.item == item and not s.repeated]
+    clock = ClockTable(journal.clock)
+    for chunk in sound_chunks(journal):
+        rows = np.flatnonzero(np.isin(chunk.channel, numbers))
+        if len(rows):
+            received = clock.received(chunk.log_ns[rows])
+            size = int((chunk.ends[rows] - chunk.starts[rows]).sum())
+            place = journal.writer, journal.run, int(sequences(chunk, journal.first_seq)[rows[0]])
+            yield Share(place, len(rows), int(received.min()), int(received.max()), size, None)
