@@ -13,10 +13,14 @@ from rosbags.rosbag1 import Writer
 from rosbags.typesys import Stores, get_typestore
 
 import amberbox
+from amberbox.blackbox.follow import batching
+from amberbox.blackbox.formats import open_recording
 from amberbox.blackbox.formats.recording import Recording
 from amberbox.blackbox.importing import import_recordings
 from amberbox.blackbox.keeper.keeper import seal
 from amberbox.blackbox.store import open_store
+from amberbox.blackbox.unroll import definition
+from amberbox.cli.main import main
 from amberbox.core.errors import AmberboxError, UsageError
 from amberbox.core.source import TopicOptions
 from amberbox.testing.box import COUNT, ManualBox, events, last_counters, number, own_records
@@ -198,6 +202,87 @@ def test_a_truncated_bag_gives_what_can_be_read(bag: Path, tmp_path: Path, share
     assert "damaged" in "\n".join(report.lines())
     told = events(tmp_path / "store", "recording_damaged")
     assert [event["text"] for event in told] == report.damage
+
+
+def test_damage_is_a_gap_of_the_time_around_it(tmp_path: Path) -> None:
+    """What lies before and behind the damaged chunk is no gap, nor is anything of a whole bag."""
+    whole = write_bag(tmp_path / "whole.bag", 400)
+    content = bytearray(whole.read_bytes())
+    middle = content.find(b"op=\x02", len(content) // 2)
+    content[middle : middle + 2000] = bytes(2000)
+    broken = tmp_path / "broken.bag"
+    broken.write_bytes(content)
+    import_recordings([broken], tmp_path / "store")
+    record = amberbox.open(tmp_path / "store")
+    (gap,) = record.gaps()
+    assert gap.reason.startswith("damaged: broken.bag: ")
+    missing = sorted({*range(400)} - {*numbers(tmp_path / "store")})
+    assert missing
+    assert gap.from_ns <= START_NS + missing[0] * 10**7
+    assert START_NS + missing[-1] * 10**7 < gap.to_ns
+    assert gap.to_ns - gap.from_ns < 200 * 10**7
+    with amberbox.open(whole) as record:
+        assert record.gaps() == []
+
+
+def test_items_without_columns_are_listed_with_the_reason_and_can_be_had_raw(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """One type has no definition that can be read, messages of the other fit theirs never."""
+    with Writer(tmp_path / "a.bag") as writer:
+        types = {"/unknown": "float32 ] x\n", "/misfit": "float64 x\n", "/good": "int32 x\n"}
+        for topic, text in types.items():
+            connection = writer.add_connection(topic, "a/msg/B", msgdef=text, md5sum="0" * 32)
+            for n in range(3):
+                writer.write(connection, START_NS + n * 10**9, n.to_bytes(4, "little"))
+    store, output = str(tmp_path / "store"), str(tmp_path / "raw.mcap")
+    import_recordings([tmp_path / "a.bag"], Path(store), segments=False)
+    for _ in range(2):
+        items = {item.name: item for item in amberbox.open(store).items()}
+        for name in ("ros_unknown", "ros_misfit"):
+            found = items[name]
+            assert (found.rows, found.bytes, found.type, found.rate_hz) == (3, 12, "a/B", 1.0)
+            assert (found.first_ns, found.last_ns) == (START_NS, START_NS + 2 * 10**9)
+            (gap,) = amberbox.open(store).gaps(name)
+            assert (gap.from_ns, gap.to_ns, gap.count) == (START_NS, START_NS + 2 * 10**9 + 1, 3)
+        assert "cannot read the definition of a/B" in str(items["ros_unknown"].no_columns)
+        assert items["ros_misfit"].no_columns == "no message fits its definition"
+        assert items["ros_good"].no_columns is None
+        assert amberbox.open(store).gaps("ros_good") == []
+        seal(open_store(Path(store)))  # and again from what the manifest says
+    assert main(["items", store]) == 0
+    assert "ros_unknown has no columns: cannot read" in capsys.readouterr().err
+    assert main(["gaps", store, "ros_unknown"]) == 0
+    assert "no columns, only in" in capsys.readouterr().out
+    assert main(["query", store, "ros_unknown"]) == 2
+    error = capsys.readouterr().err
+    assert "hint: its messages are kept as they came" in error
+    assert "--format mcap --item ros_unknown" in error
+    assert main(["query", store, "ros_misfit"]) == 0
+    assert "messages do not fit the definition of a/B" in capsys.readouterr().err
+    assert main(["export", store, "--item", "ros_unknown", "-o", output]) == 0
+    with open_recording(output) as recording:
+        assert [m.data[0] for m in recording.messages()] == [0, 1, 2]
+
+
+def test_a_definition_that_is_understood_later_has_columns_at_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A store whose segments were built when roslib/Header was not known answers by its journal."""
+    header = "MSG: roslib/Header\nuint32 seq\ntime stamp\nstring frame_id\n"
+    text = f"Header header\n{'=' * 80}\n{header}"
+    with Writer(tmp_path / "a.bag") as writer:
+        connection = writer.add_connection("/h", "a/msg/B", msgdef=text, md5sum="0" * 32)
+        writer.write(connection, START_NS, (7).to_bytes(4, "little") + bytes(12))
+    monkeypatch.setattr(definition, "current_names", str)
+    batching._unroller.cache_clear()
+    import_recordings([tmp_path / "a.bag"], tmp_path / "store")
+    monkeypatch.undo()
+    batching._unroller.cache_clear()
+    record = amberbox.open(tmp_path / "store")
+    assert record.query("ros_h", ["header/seq"]).values("header_seq") == [7]
+    assert [item.no_columns for item in record.items() if item.name == "ros_h"] == [None]
+    assert record.gaps() == []
 
 
 @pytest.mark.needs_data

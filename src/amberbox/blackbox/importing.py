@@ -10,7 +10,14 @@ from pathlib import Path
 from amberbox.blackbox.formats import csv_table, mongodump
 from amberbox.blackbox.formats.open import find_dump, open_recording
 from amberbox.blackbox.formats.options import ReadOptions
-from amberbox.blackbox.formats.recording import Account, Origin, Recording, Report
+from amberbox.blackbox.formats.recording import (
+    Account,
+    Damage,
+    Origin,
+    RecordedGap,
+    Recording,
+    Report,
+)
 from amberbox.blackbox.journal import reserved
 from amberbox.blackbox.keeper.keeper import seal
 from amberbox.blackbox.recorder.messageclock import MessageClock
@@ -23,6 +30,8 @@ from amberbox.core.source import TopicOptions
 from amberbox.core.types import Topic
 
 TICK_BYTES = 1 << 20
+MOST_NAMED = 5
+"""Damaged places of one stretch of time that the reason of a gap names."""
 _NO_OPTIONS = ReadOptions()
 _WORTH_TELLING = {
     "undecodable", "type_changed", "malformed", "schema_unstable", "filter_failed", "unused_names",
@@ -193,7 +202,7 @@ class _Import:
             )
 
     def _write_gaps(self) -> None:
-        for gap in self._recording.report.gaps:
+        for gap in [*self._recording.report.gaps, *_damaged(self._recording.report)]:
             self._pipeline.own(
                 reserved.GAP,
                 {
@@ -232,6 +241,18 @@ class _Import:
     def _left_out(self) -> set[int]:
         topics = enumerate(self._recording.topics)
         return {index for index, topic in topics if not self._wants(topic)}
+
+
+def _damaged(report: Report) -> Iterator[RecordedGap]:
+    """Say when something may be missing because the recording is damaged."""
+    whole = report.start_ns or 0, report.end_ns or 0
+    found: dict[tuple[int, int], list[Damage]] = {}
+    for damage in report.damage:
+        found.setdefault(damage.span_ns or whole, []).append(damage)
+    for (from_ns, to_ns), damages in found.items():
+        reason = "; ".join(map(str, damages[:MOST_NAMED]))
+        more = f"; and {len(damages) - MOST_NAMED} more" if len(damages) > MOST_NAMED else ""
+        yield RecordedGap(from_ns, to_ns + 1, f"damaged: {reason}{more}")
 
 
 def account_lines(account: Account, report: Report, left_out: set[int]) -> list[str]:

@@ -74,8 +74,14 @@ def drawing(record: Record, args: argparse.Namespace) -> Drawing:
 
 def _gaps(record: Record, item: str, times: IntArray) -> tuple[tuple[int, int, str], ...]:
     first, last = int(times.min()), int(times.max())
-    found = [_clipped(gap, first, last) for gap in record.gaps(item, first, last + 1)]
+    known = [gap for gap in record.gaps(item, first, last + 1) if not _is_of_one(gap, times)]
+    found = [_clipped(gap, first, last) for gap in known]
     return tuple(gap for gap in found if gap[1] > gap[0])
+
+
+def _is_of_one(gap: Gap, times: IntArray) -> bool:
+    """Tell whether only one publisher was missing, while others were recorded."""
+    return bool(gap.peer and ((times >= gap.from_ns) & (times < gap.to_ns)).any())
 
 
 def _clipped(gap: Gap, first_ns: int, last_ns: int) -> tuple[int, int, str]:

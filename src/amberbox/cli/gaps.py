@@ -14,7 +14,7 @@ from amberbox.core.clock import NS
 from amberbox.core.timetext import format_time
 from amberbox.core.types import Gap
 
-_HEADER = ("from (UTC)", "to (UTC)", "seconds", "item", "messages", "reason")
+_HEADER = ("from (UTC)", "to (UTC)", "seconds", "item", "publisher", "messages", "reason")
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -29,7 +29,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Print the gaps of a record."""
     with opened(args.where) as record:
-        if args.item is not None:
+        if args.item is not None and args.item not in {info.name for info in record.items()}:
             record.variables(args.item)  # a name that is not there is an error, not an empty list
         spans = windows(args, record)
         found = [g for g in record.gaps(args.item) if any(_meets(g, span) for span in spans)]
@@ -50,7 +50,7 @@ def _row(gap: Gap) -> tuple[str, ...]:
     seconds = f"{(gap.to_ns - gap.from_ns) / NS:.3f}"
     start, end = (format_time(time_ns)[:23] for time_ns in (gap.from_ns, gap.to_ns))
     count = "-" if gap.count is None else str(gap.count)
-    return start, end, seconds, gap.item or _all(gap), count, gap.reason
+    return start, end, seconds, gap.item or _all(gap), gap.peer or "-", count, gap.reason
 
 
 def _all(gap: Gap) -> str:
@@ -61,6 +61,7 @@ def _all(gap: Gap) -> str:
 def _as_json(gap: Gap) -> dict[str, Any]:
     return {
         "item": gap.item or None,
+        "publisher": gap.peer or None,
         "from": format_time(gap.from_ns),
         "to": format_time(gap.to_ns),
         "count": gap.count,

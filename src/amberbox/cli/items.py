@@ -34,7 +34,7 @@ def run(args: argparse.Namespace) -> int:
     shown = [item for item in items if args.all or item not in own]
     if shown:
         print_grid(_HEADER, map(_row, shown))
-    tell(notes)
+    tell([*notes, *(_raw(item, args.where) for item in shown if item.no_columns)])
     if own and not args.all:
         print(f"and {len(own)} items of the box itself (--all shows them)")
     if not items:
@@ -53,6 +53,12 @@ def _row(item: ItemInfo) -> tuple[object, ...]:
         None if item.stamp_offset_s is None else round(item.stamp_offset_s, 4),
         in_bytes(item.bytes) if item.bytes else None,
     )
+
+
+def _raw(item: ItemInfo, where: str) -> str:
+    """Say why an item has no columns, and how its messages can be had."""
+    export = f"amberbox export {where} --format mcap --item {item.name} -o FILE"
+    return f"{item.name} has no columns: {item.no_columns}; its messages: {export}"
 
 
 def _short(time_ns: int) -> str:

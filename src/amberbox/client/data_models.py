@@ -52,6 +52,7 @@ class Gap(Answer, frozen=True):
     reason: str
     kind: str = ""
     count: int | None = None
+    publisher: str = ""
 
 
 class Gaps(Answer, frozen=True):

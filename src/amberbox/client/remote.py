@@ -101,7 +101,16 @@ class RemoteRecord(Record):
     def gaps(self, item: str | None = None, from_: Time = None, to: Time = None) -> list[Gap]:
         """Return what is missing in ``[from_, to)`` and why, also what never came to the server."""
         return [
-            Gap(g.writer, g.run, time_ns(g.from_), time_ns(g.to), g.reason, g.item, g.count)
+            Gap(
+                g.writer,
+                g.run,
+                time_ns(g.from_),
+                time_ns(g.to),
+                g.reason,
+                g.item,
+                g.count,
+                peer=g.publisher,
+            )
             for g in self.fleet.gaps(self.robot, item or "", from_, to)
         ]
 

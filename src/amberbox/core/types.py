@@ -188,6 +188,7 @@ class Gap:
     """A range of the record that is not there, and why.
 
     ``item`` is empty when the whole writer is meant; ``count`` is None when nobody can know.
+    ``peer`` names the publisher that was not heard, whose topic others may have published.
     """
 
     writer: str
@@ -200,6 +201,7 @@ class Gap:
     from_seq: int | None = None
     to_seq: int | None = None
     cursor: Cursor = field(default_factory=Cursor)
+    peer: str = ""
 
 
 @dataclass(frozen=True, slots=True)

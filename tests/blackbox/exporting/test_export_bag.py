@@ -229,9 +229,11 @@ string frame_id
 """.replace("{line}", "=" * 80)
 
 
-def test_md5_of_a_definition_as_it_is_written() -> None:
+@pytest.mark.parametrize("header", ["std_msgs/Header", "roslib/Header"])
+def test_md5_of_a_definition_as_it_is_written(header: str) -> None:
     """The sum of rosgraph_msgs/Log as ``rosmsg md5`` prints it: comments do not count."""
-    schema = Schema("rosgraph_msgs/Log", "ros1msg", LOG.encode())
+    text = LOG.replace("std_msgs/Header", header)
+    schema = Schema("rosgraph_msgs/Log", "ros1msg", text.encode())
     assert md5sum(schema) == "acffd30cd6b6de30f120938c17c593fb"
 
 

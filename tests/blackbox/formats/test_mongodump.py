@@ -275,11 +275,17 @@ WHEEL = "std_msgs/Header header\nInput[] commands # of this package\nint32 count
 INPUT = "uint8 NONE=0\nuint8 LINEAR=1\nfloat64 speed\nuint8 kind\n"
 
 
-@pytest.mark.parametrize("layout", ["", "own_msgs/msg", "src/own_msgs/own_msgs/msg", "own_msgs"])
-def test_definitions_come_from_a_folder(tmp_path: Path, layout: str) -> None:
+@pytest.mark.parametrize(
+    ("layout", "header_type"),
+    [
+        *(("", "std_msgs/Header"), ("own_msgs/msg", "roslib/Header")),
+        *(("src/own_msgs/own_msgs/msg", "Header"), ("own_msgs", "std_msgs/Header")),
+    ],
+)
+def test_definitions_come_from_a_folder(tmp_path: Path, layout: str, header_type: str) -> None:
     place = tmp_path / "definitions" / layout
     place.mkdir(parents=True)
-    (place / "Wheel.msg").write_text(WHEEL)
+    (place / "Wheel.msg").write_text(WHEEL.replace("std_msgs/Header", header_type))
     (place / "Input.msg").write_text(INPUT)
     folder = tmp_path / "dump"
     write_metadata(folder, ("ros_wheel", "/wheel", "own_msgs/Wheel"))

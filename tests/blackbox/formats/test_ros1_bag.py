@@ -14,6 +14,7 @@ from rosbags.rosbag1 import Reader
 from amberbox.blackbox.formats import Recording, open_recording
 from amberbox.blackbox.formats.ros1_records import parse_fields
 from amberbox.core.errors import AmberboxError
+from tests.fuzzing import examples, fuzz
 
 Messages = list[tuple[str, int, bytes]]
 WriteBag = Callable[..., None]
@@ -115,6 +116,71 @@ def test_damage_costs_only_what_it_touches(
     touched = length // (smallest_chunk if compression else chunk) + 2
     assert len(set(found) & set(messages)) >= 600 - touched * (chunk // 50)
     assert len(found) == 600 or recording.report.damage
+
+
+def overwrite(content: bytes, at: int, value: bytes) -> bytes:
+    return content[:at] + value + content[at + len(value) :]
+
+
+def test_a_wrong_length_costs_no_other_message(
+    tmp_path: Path, messages: Messages, ros1_bag: WriteBag
+) -> None:
+    """A message that claims those behind it as well ends where the next one starts."""
+    ros1_bag(tmp_path / "a.bag", messages[:300])
+    content = (tmp_path / "a.bag").read_bytes()
+    for claimed in (3, 500, 1 << 30):
+        for number in (0, 99, 130):
+            data = messages[number][2]
+            length = (len(data) + claimed).to_bytes(4, "little")
+            (tmp_path / "b.bag").write_bytes(overwrite(content, content.find(data) - 4, length))
+            found, recording = read_all(tmp_path / "b.bag")
+            assert found == messages[:300], (claimed, number)
+            assert any("too many" in d.reason for d in recording.report.damage)
+
+
+@pytest.mark.parametrize("compression", ["", "bz2", "lz4"])
+def test_a_damaged_chunk_header_costs_no_message(
+    tmp_path: Path, messages: Messages, ros1_bag: WriteBag, compression: str
+) -> None:
+    ros1_bag(tmp_path / "a.bag", messages[:300], compression)
+    content = (tmp_path / "a.bag").read_bytes()
+    name = f"compression={compression or 'none'}".encode()
+    at = content.find(name, content.find(name) + 1)  # of the second chunk
+    ends = content.find(b"size=", at) + 9
+    length = int.from_bytes(content[ends : ends + 4], "little")
+    broken = [
+        overwrite(content, ends, (length + 5000).to_bytes(4, "little")),
+        overwrite(content, ends, (1 << 30).to_bytes(4, "little")),
+        overwrite(content, ends - 4, (100).to_bytes(4, "little")),
+        overwrite(content, at, b"compression=?"),
+    ]
+    for number, changed in enumerate(broken):
+        (tmp_path / "b.bag").write_bytes(changed)
+        found, recording = read_all(tmp_path / "b.bag")
+        assert found == messages[:300], number
+        assert recording.report.damage or (number == 2 and not compression)
+
+
+@fuzz
+@settings(
+    max_examples=examples(60),
+    deadline=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
+)
+@given(share=st.floats(0, 1, exclude_max=True), bit=st.integers(0, 7))
+def test_a_flipped_bit_costs_one_message_at_most(
+    tmp_path: Path, messages: Messages, ros1_bag: WriteBag, share: float, bit: int
+) -> None:
+    whole = tmp_path / "whole.bag"
+    if not whole.exists():
+        ros1_bag(whole, messages[:200])
+    content = bytearray(whole.read_bytes())
+    first, last = content.find(b"op=\x05"), content.rfind(b"op=\x04")
+    at = first + int(share * (last - first))  # the chunks and what the index says of each
+    content[at] ^= 1 << bit
+    (tmp_path / "flipped.bag").write_bytes(content)
+    found, _ = read_all(tmp_path / "flipped.bag")
+    assert len(set(found) & set(messages[:200])) >= 199
 
 
 def test_report_names_where_a_bag_is_cut(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 import threading
 import time
@@ -27,7 +28,7 @@ from amberbox.blackbox.sources import recording as recording_source
 from amberbox.blackbox.sources import ros as ros_source
 from amberbox.blackbox.store import open_store
 from amberbox.core.source import ChangeOptions, Sink, TopicOptions
-from amberbox.core.types import Topic
+from amberbox.core.types import Schema, Topic
 from amberbox.testing.box import (
     COUNT,
     ManualBox,
@@ -58,6 +59,34 @@ def running(folder: Path, black_box: str) -> Iterator[tuple[Recorder, threading.
         recorder.stop.set()
         thread.join(10)
         assert not thread.is_alive()
+
+
+@pytest.mark.parametrize("lossless", [False, True])
+def test_what_is_configured_is_known_from_the_first_file_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, lossless: bool
+) -> None:
+    """The answer to a question without variables is the same before and after a rotation."""
+    topic = Topic("/pose", "ros1", Schema("a/Pose", "ros1msg", b"float64 x\nfloat64 y\n"))
+    began = threading.Event()
+
+    def run(self: object, sink: Sink, stop: threading.Event) -> None:
+        began.wait()
+        sink.message(sink.topic(topic), bytes(16), sink.now_ns())
+        stop.wait()
+
+    monkeypatch.setattr(ros_source.Source, "run", run)
+    monkeypatch.setattr(ros_source.Source, "lossless", lossless)
+    options = "{name: /pose, variable_names: [y], max_frequency: 5}"
+    blocks = ROS.replace("{name: /count}", options)
+    with running(tmp_path / "robot", blocks) as (recorder, _):
+        store = recorder.store.path
+        wait_until(lambda: own_records(store, "amberbox/run"), 10, "the first file began")
+        began.set()
+        wait_until(lambda: raw_messages(store, "/pose"), 10, "a message is recorded")
+        before = amberbox.open(store).query("ros_pose").names
+    (record,) = own_records(store, "amberbox/run")
+    assert json.loads(record["items"])["ros_pose"]["max_frequency"] == 5
+    assert before == amberbox.open(store).query("ros_pose").names == ["timestamp", "y"]
 
 
 def test_events_do_not_put_off_the_next_write(

@@ -90,6 +90,7 @@ def test_anything_else_is_an_error(data: bytes, error: type[Exception]) -> None:
     [
         (b"Header header\nfloat64 x\n", True),
         (b"# text\n\nuint8 A=1 # one\n  std_msgs/Header   header # stamp\n", True),
+        (b"roslib/Header header\nfloat64 x\n", True),
         (b"float64 x\nHeader header\n", False),
         (b"Header h\n", False),
         (b"", False),

@@ -210,9 +210,32 @@ def test_constants_label_the_fields_they_were_written_for() -> None:
 
 
 def test_definitions_that_rosbags_refuses_lose_only_their_labels() -> None:
-    kept = ros1("uint8 kRate=1\r\nuint8 A__B=2\r\nuint8 value # = 3\r\n")
+    kept = ros1("uint8 A=1<<2\r\nuint8 A__B=2\r\nuint8 value # = 3\r\n")
     assert [column.path for column in kept.schema.columns] == ["value"]
     assert values(kept.rows([b"\7"]), "value") == [7]
+
+
+def test_names_that_ros_1_allows_and_rosbags_does_not() -> None:
+    text = "uint8 kRate=1\nuint8 A__B=2\nuint8 rate\nMyPkg/Old__Type x\n"
+    kept = ros1(text + SEPARATOR + "MSG: MyPkg/Old__Type\nint8 a\n", "MyPkg/T_")
+    assert [column.path for column in kept.schema.columns] == ["rate", "x/a"]
+    assert dict(kept.schema.columns[0].labels) == {1: "kRate", 2: "A__B"}
+
+
+@pytest.mark.parametrize("field", ["Header", "roslib/Header", "std_msgs/Header"])
+@pytest.mark.parametrize("package", ["roslib", "std_msgs"])
+def test_a_header_is_known_by_its_old_name(field: str, package: str) -> None:
+    """Definitions of ROS before Diamondback say roslib/Header (REP 100)."""
+    text = f"{field} header\nint32 x\n" + HEADER.replace("std_msgs", package)
+    topic = ros1(text)
+    assert topic.schema.stamp == "header/stamp"
+    rows = topic.rows([struct.pack("<IIIIi", 1, 5, 6, 0, 9)])
+    assert (values(rows, "header_stamp"), values(rows, "x")) == ([5 * NS + 6], [9])
+
+
+def test_a_header_of_old_may_be_the_whole_message() -> None:
+    root = ros1("uint32 seq\ntime stamp\nstring frame_id\n", "roslib/Header")
+    assert (root.schema.type, root.schema.stamp) == ("roslib/Header", "stamp")
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ import hashlib
 import re
 from collections.abc import Mapping
 
+from amberbox.blackbox.unroll.definition import current_names
 from amberbox.core.errors import AmberboxError
 from amberbox.core.types import Schema
 
@@ -23,12 +24,14 @@ def md5sum(schema: Schema) -> str:
     It covers constants, then fields, without comments; a structure counts by its own sum
     (http://wiki.ros.org/ROS/Technical%20Overview). Raises AmberboxError when a type is missing.
     """
-    first, *rest = _SEPARATOR.split(schema.data.decode("utf-8", "replace").replace("\r\n", "\n"))
-    known = {schema.name: first}
+    text = current_names(schema.data.decode("utf-8", "replace").replace("\r\n", "\n"))
+    first, *rest = _SEPARATOR.split(text)
+    root = current_names(schema.name)
+    known = {root: first}
     for part in rest:
         head, _, body = part.partition("\n")
         known[head.removeprefix("MSG:").strip()] = body
-    return _sum_of(schema.name, known, ())
+    return _sum_of(root, known, ())
 
 
 def _sum_of(name: str, known: Mapping[str, str], inside: tuple[str, ...]) -> str:

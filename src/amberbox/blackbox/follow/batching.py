@@ -123,10 +123,9 @@ def _without_bad(
 ) -> Made:
     bad = np.array(error.bad, np.int64)
     good = np.setdiff1d(np.arange(len(messages)), bad)
-    gaps = [
-        _undecodable(origin, seq[row : row + 1], log_ns[row : row + 1], error.what)
-        for row in bad.tolist()
-    ]
+    reason = f"messages do not fit the definition of {error.type_name}"
+    in_a_row = np.split(bad, np.flatnonzero(np.diff(bad) > 1) + 1)
+    gaps = [_undecodable(origin, seq[rows], log_ns[rows], reason) for rows in in_a_row]
     if not len(good):
         return Made(None, gaps)
     rest = [messages[row] for row in good.tolist()]
@@ -135,11 +134,12 @@ def _without_bad(
 
 
 def _undecodable(origin: Origin, seq: IntArray, log_ns: IntArray, why: str) -> Gap:
+    from_ns, to_ns = origin.clock.received(log_ns[[0, -1]]).tolist()
     return Gap(
         origin.writer,
         origin.run,
-        int(log_ns[0]),
-        int(log_ns[-1]) + 1,
+        from_ns,
+        to_ns + 1,
         f"undecodable: {why}",
         origin.stream.item,
         len(seq),

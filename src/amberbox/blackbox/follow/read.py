@@ -23,6 +23,7 @@ from amberbox.blackbox.journal.growing import GrowingIndex, UnindexedError
 from amberbox.blackbox.journal.scan import ChunkPlace, FileScan, Tally, read_chunk, scan
 from amberbox.blackbox.journal.walk import Damage
 from amberbox.blackbox.store import Store, being_written, open_store
+from amberbox.core.errors import AmberboxError
 from amberbox.core.types import Batch, Gap, IntArray
 
 BATCH_ROWS = 4096
@@ -216,15 +217,6 @@ def run_messages(journal: JournalFile) -> dict[str, Any]:
     return {}
 
 
-def selection(store: Path) -> dict[str, list[str]]:
-    """Return the variables configured for each item, the newest run's word counting."""
-    chosen: dict[str, list[str]] = {}
-    for journal in journals(store):
-        items = msgspec.json.decode(run_messages(journal).get("items") or "{}")
-        chosen.update({item: o["variables"] for item, o in items.items() if o.get("variables")})
-    return chosen
-
-
 @dataclass(slots=True)
 class _Pile:
     """Messages of one stream waiting to be unrolled together."""
@@ -261,6 +253,29 @@ def batches(
     for journal in journals(store):
         if journal.name not in skip:
             yield from batches_of(journal, items, from_ns, to_ns, on_gap)
+
+
+KEPT_RAW = "no columns, only in "
+
+
+def with_columns(journal: JournalFile, on_gap: OnGap) -> set[str]:
+    """Name the items of a file whose messages can be unrolled; the others are told as gaps."""
+    found: set[str] = set()
+    reasons: dict[str, str] = {}
+    for stream in journal.streams.values():
+        try:
+            stream.unroller()
+            found.add(stream.item)
+        except AmberboxError as error:
+            reasons[stream.item] = error.what
+    edges = np.array([journal.start_ns, journal.end_ns])
+    start_ns, end_ns = ClockTable(journal.clock).received(edges).tolist()
+    for item, why in reasons.items():
+        if item not in found and journal.items.get(item):
+            reason = f"{KEPT_RAW}{journal.name}: {why}"
+            on_gap(Gap(journal.writer, journal.run, start_ns, end_ns + 1, reason, item,
+                       journal.items[item]))  # fmt: skip
+    return found
 
 
 def batches_of(

@@ -18,25 +18,34 @@ _LOOK_BYTES = 32 << 20
 _PIECE = 1 << 16
 _ZSTD_PIECE = 1 << 11
 """zstd has no limit of its own; each 4 bytes can become a block of 128 KiB."""
+_MAGIC = {"bz2": b"BZh", "lz4": b"\x04\x22\x4d\x18", "zstd": b"\x28\xb5\x2f\xfd"}
+_BELIEVED = 16 << 20
+"""What may be unpacked though less was promised: the promise may be what is damaged."""
 
 
 def unpack(compression: str, data: bytes, size: int) -> tuple[bytes, str]:
-    """Unpack at most ``size`` bytes; the second value says what went wrong, if anything.
+    """Unpack ``size`` bytes or what there is; the second value says what went wrong, if anything.
 
     ``compression`` is ``none`` (or empty), ``bz2``, ``lz4`` or ``zstd``.
     """
     if compression in ("", "none"):
         return data, ""
-    if size > MOST_BYTES:
-        return b"", f"says that it unpacks to {size} bytes, {MOST_BYTES} are allowed"
     decompressor = _decompressor(compression)
     if decompressor is None:
         return b"", f"compression {compression!r} is not known"
     # one byte more than promised, to notice data that would unpack to more
-    unpacked, problem = _unpack_pieces(decompressor, data, size + 1)
+    room = max(size if size <= MOST_BYTES else 0, _BELIEVED) + 1
+    unpacked, problem = _unpack_pieces(decompressor, data, room)
+    if size > MOST_BYTES:
+        problem = f"says that it unpacks to {size} bytes, {MOST_BYTES} are allowed"
     if not problem and len(unpacked) != size:
         problem = f"unpacks to {len(unpacked)} bytes instead of {size}"
-    return unpacked[:size], problem
+    return unpacked[: room - 1], problem
+
+
+def compression_of(data: bytes) -> str:
+    """Tell by its first bytes how a piece is compressed; ``none`` if it is not."""
+    return next((name for name, magic in _MAGIC.items() if data.startswith(magic)), "none")
 
 
 def unpack_message(data: bytes) -> bytes | None:

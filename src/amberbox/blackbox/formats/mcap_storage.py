@@ -18,6 +18,7 @@ from amberbox.blackbox.formats.recording import (
     Part,
     RecordedMessage,
     Report,
+    Stretch,
     TopicTable,
 )
 from amberbox.blackbox.formats.ros2_qos import is_latched
@@ -65,7 +66,10 @@ def open_mcap(path: Path, report: Report) -> McapFile:
             f"cannot open {path}: {error.strerror}", "check the path and its permissions"
         ) from None
     file = McapFile(path, report, contents, buffer, mapping.close)
+    known = len(report.damage)
     _note_state(file)
+    places = [Stretch(p.offset, p.offset + 1, p.start_ns, p.end_ns) for p in contents.places]
+    report.damage[known:] = [damage.between(places) for damage in report.damage[known:]]
     file.torn = _torn_chunk(file)
     return file
 

@@ -9,7 +9,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from amberbox.blackbox.unroll.definition import SIZES
+from amberbox.blackbox.unroll.definition import SIZES, current_names
 from amberbox.core.errors import AmberboxError, UsageError
 from amberbox.core.types import Schema
 
@@ -58,7 +58,7 @@ class MessageTypes:
 
         Raises AmberboxError when a file cannot be read.
         """
-        root = type_name.replace("/msg/", "/")
+        root = current_names(type_name).replace("/msg/", "/")
         texts: dict[str, str] = {}
         places: list[str] = []
         missing = [root]
@@ -94,7 +94,7 @@ def _read(path: Path) -> str:
 def _needed(name: str, text: str) -> Iterator[str]:
     """Give the full names of the structures in a definition; constants are no fields."""
     package = name.partition("/")[0]
-    for base in _FIELD.findall(text):
+    for base in map(current_names, _FIELD.findall(text)):
         if base == "Header":
             yield "std_msgs/Header"
         elif base not in _PRIMITIVES:

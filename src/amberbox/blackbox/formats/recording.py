@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from bisect import bisect_left
+from bisect import bisect_left, bisect_right
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import chain
 from operator import itemgetter
 from pathlib import Path
@@ -14,6 +14,7 @@ from typing import NamedTuple
 from amberbox.core.types import Schema, Topic
 
 _topic_index, _log_time = itemgetter(0), itemgetter(1)
+_offset, _end = itemgetter(0), itemgetter(1)
 
 
 class RecordedMessage(NamedTuple):
@@ -25,14 +26,39 @@ class RecordedMessage(NamedTuple):
     data: bytes
 
 
+class Stretch(NamedTuple):
+    """A piece of a file that can be read, and the times of its messages."""
+
+    offset: int
+    end: int
+    start_ns: int
+    end_ns: int
+
+
 @dataclass(frozen=True, slots=True)
 class Damage:
-    """A range of a file that could not be read, and why."""
+    """A range of a file that could not be read, and why.
+
+    ``span_ns`` are the times that its messages may be of; None if they may be of any.
+    """
 
     file: str
     offset: int
     length: int
     reason: str
+    span_ns: tuple[int, int] | None = field(default=None, compare=False)
+
+    def between(self, places: Sequence[Stretch]) -> Damage:
+        """Return the same with its times: from what is read before it to what is read after it.
+
+        ``places`` come in the order of the file; one that is damaged itself counts whole.
+        """
+        first = bisect_right(places, self.offset, key=_end)
+        after = bisect_left(places, self.offset + self.length, lo=first, key=_offset)
+        edges = [place.end_ns for place in places[max(first - 1, 0) : first]]
+        edges += [ns for place in places[first:after] for ns in (place.start_ns, place.end_ns)]
+        edges += [place.start_ns for place in places[after : after + 1]]
+        return replace(self, span_ns=(min(edges), max(edges)) if edges else None)
 
     def __str__(self) -> str:
         where = f"{self.file}: {self.length} bytes at byte {self.offset}"
@@ -190,7 +216,7 @@ class Recording:
         self.report.messages, self.report.per_topic = 0, [0] * len(self.topics)
         parts = [part for part in self._parts if _overlaps(part, from_ns, to_ns)]
         total, done = max(1, sum(part.size for part in parts)), 0
-        for block, size in _in_time_order(parts):
+        for block, size in _in_time_order(parts, self._load):
             done += size
             self.progress = done / total
             inside = _between(block, from_ns, to_ns)
@@ -198,17 +224,29 @@ class Recording:
             yield inside
         self.progress = 1.0
 
+    def _load(self, part: Part) -> list[RecordedMessage]:
+        """Load a part; damage that is found on the way lies in its time."""
+        known = len(self.report.damage)
+        messages = part.load()
+        self.report.damage[known:] = [
+            replace(damage, span_ns=damage.span_ns or (part.start_ns, part.end_ns))
+            for damage in self.report.damage[known:]
+        ]
+        return messages
+
     def _count(self, block: Sequence[RecordedMessage]) -> None:
         self.report.messages += len(block)
         for topic_index, count in Counter(map(_topic_index, block)).items():
             self.report.per_topic[topic_index] += count
 
 
-def _in_time_order(parts: Sequence[Part]) -> Iterator[tuple[list[RecordedMessage], int]]:
+def _in_time_order(
+    parts: Sequence[Part], load: Callable[[Part], list[RecordedMessage]]
+) -> Iterator[tuple[list[RecordedMessage], int]]:
     """Merge parts sorted by their start; each block comes with the size of the part read for it."""
     pending: list[RecordedMessage] = []
     for number, part in enumerate(parts):
-        pending += part.load()
+        pending += load(part)
         pending.sort(key=_log_time)
         if number + 1 < len(parts):
             cut = bisect_left(pending, parts[number + 1].start_ns, key=_log_time)

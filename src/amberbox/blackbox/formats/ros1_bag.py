@@ -15,13 +15,14 @@ from pathlib import Path
 import numpy as np
 
 from amberbox.blackbox.formats.bytesource import FileBytes
-from amberbox.blackbox.formats.compression import unpack
+from amberbox.blackbox.formats.compression import compression_of, unpack
 from amberbox.blackbox.formats.recording import (
     Damage,
     Part,
     RecordedMessage,
     Recording,
     Report,
+    Stretch,
     TopicTable,
 )
 from amberbox.blackbox.formats.ros1_chunk import (
@@ -102,6 +103,11 @@ class _Bag:
             if chunk.start_ns is None or not self.connections.keys() >= chunk.expected.keys():
                 self._look_into(chunk)
         self.chunks = [chunk for chunk in self.chunks if chunk.start_ns is not None]
+        places = [
+            Stretch(c.offset, c.data_offset + c.data_length, c.start_ns or 0, c.end_ns)
+            for c in self.chunks
+        ]
+        self.report.damage = [damage.between(places) for damage in self.report.damage]
         self._make_topics()
 
     def _note(self, record: Record) -> None:
@@ -189,6 +195,8 @@ class _Bag:
     def _read(self, chunk: _Chunk, topic_of: Mapping[int, int]) -> ChunkContent:
         data = self.file.read(chunk.data_offset, chunk.data_length)
         raw, problem = unpack(chunk.compression, data, chunk.unpacked_size)
+        if not raw and (seen := compression_of(data)) != chunk.compression:
+            raw, _ = unpack(seen, data, chunk.unpacked_size)
         if problem:
             self.damaged(chunk.offset, self._length(chunk), f"chunk {problem}")
         content = read_chunk(raw, topic_of)

@@ -15,6 +15,7 @@ from amberbox.blackbox.formats.ros1_records import (
     Fields,
     Record,
     parse_fields,
+    read_record,
     time_ns,
     u32,
     walk,
@@ -58,11 +59,9 @@ def _take(raw: bytes, record: Record, topic_of: Mapping[int, int], content: Chun
         _add_connection(raw, record, content)
     if record.operation != MESSAGE:
         return record.end
-    layout = _layout_of(raw, record)
-    if layout is not None:
-        return _read_run(raw, record.offset, layout, topic_of, content.messages)
     content.messages.append(_message_of(raw, record, topic_of))
-    return record.end
+    layout = _layout_of(raw, record)
+    return record.end if layout is None else _read_run(raw, record.end, layout, topic_of, content)
 
 
 class _Layout(NamedTuple):
@@ -95,11 +94,15 @@ def _read_run(
     offset: int,
     layout: _Layout,
     topic_of: Mapping[int, int],
-    messages: list[RecordedMessage],
+    content: ChunkContent,
 ) -> int:
-    """Read messages as long as their headers have this layout; return where the run ends."""
+    """Read messages as long as their headers have this layout; return where the run ends.
+
+    A message that is followed by no record is left to ``walk``: its length may be wrong.
+    """
     unpack, (k0, k1, k2), conn_first, size = layout
-    new, append, size_of_raw = tuple.__new__, messages.append, len(raw)
+    new, append, size_of_raw = tuple.__new__, content.messages.append, len(raw)
+    last = start = offset
     while offset <= size_of_raw - size:
         c0, first, c1, second, c2, length = unpack(raw, offset)
         end = offset + size + length
@@ -109,7 +112,10 @@ def _read_run(
         stamp = (time & 0xFFFFFFFF) * NS + (time >> 32)
         data = raw[offset + size : end]
         append(new(RecordedMessage, (topic_of.get(conn, -1), stamp, None, data)))
-        offset = end
+        last, offset = offset, end
+    if start < offset < size_of_raw and read_record(MemoryBytes(raw), offset) is None:
+        content.messages.pop()
+        return last
     return offset
 
 

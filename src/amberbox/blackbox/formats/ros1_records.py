@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import re
 import struct
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Container, Iterator, Mapping
 from typing import NamedTuple
 
 from amberbox.blackbox.formats.bytesource import ByteSource
 
 MESSAGE, BAG_HEADER, INDEX, CHUNK, CHUNK_INFO, CONNECTION = 2, 3, 4, 5, 6, 7
+_ANY = frozenset(range(MESSAGE, CONNECTION + 1))
 
 # per operation: the fields a header must have, and their lengths (0: any)
 _REQUIRED: Mapping[int, Mapping[bytes, int]] = {
@@ -94,13 +95,13 @@ def _is_valid(fields: Fields) -> bool:
     )
 
 
-def find_record(source: ByteSource, offset: int, operation: int | None = None) -> int:
+def find_record(source: ByteSource, offset: int, operations: Container[int] = _ANY) -> int:
     """Find the next place at or after ``offset`` where a record starts; the end if none does."""
     block_start = offset
     while block_start < source.size:
         block = source.read(block_start, _BLOCK + _LOOK_BACK)
         for match in _OPERATION.finditer(block):
-            if operation in (None, block[match.end() - 1]):
+            if block[match.end() - 1] in operations:
                 found = _record_around(source, offset, block_start + match.start())
                 if found is not None:
                     return found
@@ -124,12 +125,13 @@ def _fits(source: ByteSource, record: Record) -> bool:
 def walk(source: ByteSource, offset: int, on_damage: OnDamage) -> Iterator[Record]:
     """Give all records from ``offset`` on; what is none is reported and skipped.
 
-    A chunk that claims more bytes than there are ends where the next chunk starts, or with the
-    file; other records that are cut short are reported and left out.
+    The length of a record that is followed by no other one is not believed: if a record starts
+    inside, the first one ends there. A chunk that claims more bytes than there are ends with the
+    file at the latest; other records that are cut short are reported and left out.
     """
     while offset < source.size:
         record = read_record(source, offset)
-        if record is not None and record.end > source.size:
+        if record is not None and not _is_followed(source, record):
             record = _shorten(source, record, on_damage)
         if record is None:
             found = find_record(source, offset + 1)
@@ -140,12 +142,22 @@ def walk(source: ByteSource, offset: int, on_damage: OnDamage) -> Iterator[Recor
         offset = record.end
 
 
+def _is_followed(source: ByteSource, record: Record) -> bool:
+    """Tell whether a record ends where the next one starts, or with the file."""
+    return record.end == source.size or read_record(source, record.end) is not None
+
+
 def _shorten(source: ByteSource, record: Record, on_damage: OnDamage) -> Record | None:
-    if record.operation != CHUNK:
+    """End a record where the next one starts; None if it is cut short."""
+    is_chunk = record.operation == CHUNK
+    end = find_record(source, record.data_offset, (CHUNK, INDEX) if is_chunk else _ANY)
+    if record.end <= end and record.end <= source.size:
+        return record  # the next one is damaged
+    if end == source.size and not is_chunk:
         return None
-    end = find_record(source, record.data_offset, CHUNK)
-    missing = record.end - end
-    on_damage(record.offset, end - record.offset, f"chunk cut short, {missing} bytes are missing")
+    more = record.end - end
+    cut, wrong = f"chunk cut short, {more} bytes are missing", f"claims {more} bytes too many"
+    on_damage(record.offset, end - record.offset, cut if is_chunk else wrong)
     return record._replace(data_length=end - record.data_offset)
 
 

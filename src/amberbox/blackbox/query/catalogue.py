@@ -12,7 +12,7 @@ from typing import TypeVar
 import numpy as np
 
 from amberbox.blackbox.follow.batching import Stream
-from amberbox.blackbox.follow.read import JournalFile, journal_file
+from amberbox.blackbox.follow.read import KEPT_RAW, JournalFile, journal_file, with_columns
 from amberbox.blackbox.journal.clocktable import ClockReading, ClockTable
 from amberbox.blackbox.query.clockbook import UNKNOWN_BOOT, ClockBook, JournalClock, book_of
 from amberbox.blackbox.query.variables import closest
@@ -25,7 +25,7 @@ from amberbox.blackbox.segments.manifest import Manifest, Part, Segment
 from amberbox.blackbox.segments.parquet import stored_name
 from amberbox.blackbox.store import Store, open_store
 from amberbox.core.errors import AmberboxError, UsageError
-from amberbox.core.types import Column
+from amberbox.core.types import Column, Gap
 
 _ATTEMPTS = 5
 Answer = TypeVar("Answer")
@@ -72,13 +72,40 @@ class Catalogue:
         return self.manifest.journals.keys() if self.with_segments else ()
 
     @cached_property
+    def columns_done(self) -> Collection[str]:
+        """Names of the journals that need not be opened to know their columns.
+
+        Others had messages without columns when their segments were built: they may have some now.
+        """
+        told = (
+            done.name
+            for done in self.manifest.journals.values()
+            if any(
+                gap.item not in self.manifest.segments or gap.reason.startswith(KEPT_RAW)
+                for gap in done.gaps
+            )
+        )
+        return {*self.done} - {*told}
+
+    @cached_property
+    def raw(self) -> dict[str, list[tuple[JournalFile, Gap]]]:
+        """Return, by item, the journal files with messages of it that have no columns, and why."""
+        found: dict[str, list[tuple[JournalFile, Gap]]] = {}
+        for journal in self.journals(skip=self.columns_done):
+            told: list[Gap] = []
+            with_columns(journal, told.append)
+            for gap in told:
+                found.setdefault(gap.item, []).append((journal, gap))
+        return found
+
+    @cached_property
     def schemas(self) -> dict[str, list[TableSchema]]:
         """Return the versions of each table's schema, oldest first."""
         found: dict[str, list[TableSchema]] = {}
         for segments in self.manifest.segments.values() if self.with_segments else ():
             for segment in segments:
                 _add(found, self.manifest.schemas[segment.schema])
-        for journal in self.journals(skip=self.done):
+        for journal in self.journals(skip=self.columns_done):
             for schema in journal_tables(journal):
                 _add(found, schema)
         return found
@@ -90,7 +117,7 @@ class Catalogue:
         found: dict[str, list[TableSchema]] = {}
         for segment in self.manifest.segments.get(table, ()) if self.with_segments else ():
             _add(found, self.manifest.schemas[segment.schema])
-        for journal in self.journals(skip=self.done):
+        for journal in self.journals(skip=self.columns_done):
             for schema in journal_tables(journal, table):
                 _add(found, schema)
         return found.get(table, [])
@@ -104,9 +131,17 @@ class Catalogue:
         if versions:
             return union(versions)
         name = _by_case(table, self.schemas)
+        if name is None and table in self.raw:
+            why = self.raw[table][-1][1].reason.partition(": ")[2]
+            hint = (
+                "its messages are kept as they came: "
+                f"amberbox export WHERE --format mcap --item {table} -o FILE"
+            )
+            raise UsageError(f"{table} has no columns: {why}", hint)
         if name is None:
             raise UsageError(
-                f"there is no data item {table!r}", closest(table, sorted(self.schemas))
+                f"there is no data item {table!r}",
+                closest(table, sorted({*self.schemas, *self.raw})),
             )
         return union(self.schemas[name])
 

@@ -1,15 +1,16 @@
-"""What is missing from a record and why: recorded gaps, damage, deletions."""
+"""What is missing from a record and why: recorded gaps, damage, deletions, what does not decode."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 
 from amberbox.blackbox.follow.follow import RECORDED
-from amberbox.blackbox.follow.read import journal_file
+from amberbox.blackbox.follow.read import KEPT_RAW, batches_of, journal_file, with_columns
 from amberbox.blackbox.follow.tail import Delivery, WriterTail
 from amberbox.blackbox.journal import reserved
 from amberbox.blackbox.journal.clocktable import ClockTable
@@ -22,13 +23,14 @@ from amberbox.blackbox.segments.parquet import overlaps
 from amberbox.blackbox.store import Store, open_store
 from amberbox.core.types import Gap, WriterCursor
 
-_SAME = ("writer", "run", "item", "reason")
+_SAME = ("writer", "run", "item", "reason", "peer")
 _FIELDS = ("item", "peer", "from_ns", "to_ns", "reason", "count")
 
 
 def gaps(catalogue: Catalogue, item: str | None, span: Span) -> list[Gap]:
     """List gaps that meet ``[from, to)``, in order of time, of one item or of all."""
-    return chosen(known(catalogue, [*_holes(catalogue), *_deleted(catalogue)]), item, span)
+    then = [*_holes(catalogue), *_deleted(catalogue), *_undecodable(catalogue)]
+    return chosen(known(catalogue, then), item, span)
 
 
 def known(catalogue: Catalogue, then: Iterable[Gap]) -> list[Gap]:
@@ -87,8 +89,8 @@ def _recorded(catalogue: Catalogue) -> Iterator[Gap]:
     still_open: dict[tuple[object, ...], Gap] = {}
     pieces = gather(catalogue, Request(table, _FIELDS)).pieces
     for piece in sorted(pieces, key=lambda piece: (piece.run, int(piece.seq[0]))):
-        for gap, peer, is_open in _gap_rows(piece):
-            key = (gap.run, gap.item, peer, gap.reason)
+        for gap, is_open in _gap_rows(piece):
+            key = (gap.run, gap.item, gap.peer, gap.reason)
             if is_open:  # of a publisher one gap is open at a time
                 still_open[key] = gap
             else:
@@ -99,14 +101,16 @@ def _recorded(catalogue: Catalogue) -> Iterator[Gap]:
         yield replace(gap, to_ns=max(ends.get(gap.run, gap.from_ns), gap.from_ns + 1))
 
 
-def _gap_rows(piece: Flat) -> Iterator[tuple[Gap, str, bool]]:
+def _gap_rows(piece: Flat) -> Iterator[tuple[Gap, bool]]:
     columns = [plain(piece.columns[name]) for name in _FIELDS]
     offsets = (piece.received_ns - piece.log_time_ns).tolist()
     for offset, row in zip(offsets, zip(*columns, strict=True), strict=True):
         item, peer, from_ns, to_ns, reason, count = row
         end = (from_ns if to_ns is None else to_ns) + offset
-        gap = Gap(piece.writer, piece.run, from_ns + offset, end, reason, item, count)
-        yield gap, peer, to_ns is None
+        gap = Gap(
+            piece.writer, piece.run, from_ns + offset, end, reason, item, count, peer=peer or ""
+        )
+        yield gap, to_ns is None
 
 
 def _run_ends(catalogue: Catalogue) -> dict[int, int]:
@@ -194,7 +198,30 @@ def _piece(gap: Gap, from_seq: int, to_seq: int, from_ns: int, to_ns: int) -> Ga
 def _deleted(catalogue: Catalogue) -> Iterator[Gap]:
     existing, sealed = set(catalogue.existing), catalogue.manifest.sealed
     for journal in catalogue.manifest.journals.values():
-        if journal.name not in existing:
-            yield from journal.gaps
         if journal.name not in existing or journal.name in catalogue.done:
             yield from sealed[journal.name].gaps() if journal.name in sealed else ()
+
+
+def _undecodable(catalogue: Catalogue) -> Iterator[Gap]:
+    """Name messages without columns: as the manifest says, else by unrolling the journal once."""
+    raw = {(journal.name, item) for item, found in catalogue.raw.items() for journal, _ in found}
+    for done in catalogue.manifest.journals.values():
+        for gap in done.gaps:
+            has_columns_now = gap.reason.startswith(KEPT_RAW) and (done.name, gap.item) not in raw
+            if not (has_columns_now and done.name in catalogue.existing):
+                yield gap
+    store = open_store(catalogue.store)
+    for name in catalogue.existing:
+        if name not in catalogue.manifest.journals:
+            path = store.journal_path(name)
+            status = path.stat()
+            yield from _misfits(path, name, status.st_mtime_ns, status.st_size)
+
+
+@lru_cache(maxsize=256)
+def _misfits(path: Path, name: str, _mtime_ns: int, _size: int) -> tuple[Gap, ...]:
+    """Unroll a journal for what does not decode; remembered until the file changes."""
+    journal, found = journal_file(path, name), list[Gap]()
+    for _ in batches_of(journal, with_columns(journal, found.append), on_gap=found.append):
+        pass
+    return tuple(found)

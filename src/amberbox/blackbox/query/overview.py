@@ -6,7 +6,7 @@ unrolled: a list of items has to come at once, also of an hour that is just bein
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
@@ -41,7 +41,8 @@ class ItemInfo:
     behind receipt (median over the record), None without stamps; ``bytes`` counts the messages as
     received (0 for child tables). ``estimated`` tells that ``rows`` of a child table come from a
     sample of messages. Of items the rows are all messages: those that turn out not to decode are
-    left out when their journal becomes segments, and ``gaps`` names them.
+    left out when their journal becomes segments, and ``gaps`` names them. ``no_columns`` says why
+    the messages are there only as they came.
     """
 
     name: str
@@ -55,6 +56,7 @@ class ItemInfo:
     stamp_offset_s: float | None
     bytes: int
     estimated: bool = False
+    no_columns: str | None = None
 
     def to_json(self) -> dict[str, Any]:
         """Return the item as JSON has it: times are RFC 3339 strings."""
@@ -70,6 +72,7 @@ class ItemInfo:
             "stamp_offset_s": self.stamp_offset_s,
             "bytes": self.bytes,
             **({"estimated": True} if self.estimated else {}),
+            **({"no_columns": self.no_columns} if self.no_columns else {}),
         }
 
 
@@ -78,6 +81,8 @@ def overview(catalogue: Catalogue) -> list[ItemInfo]:
     holes = list(deleted_places(catalogue))
     infos = [_info(catalogue, table, holes) for table in sorted(catalogue.schemas)]
     known = [info for info in infos if info is not None]
+    known += _without_rows(catalogue, {info.name for info in known})
+    known.sort(key=lambda info: info.name)
     return sorted(known, key=lambda info: info.source == reserved.SOURCE)
 
 
@@ -257,3 +262,35 @@ def _share(
         messages = samples.get(table.parent, _Sample()).rows
         rows = round(total.rows * sample.rows / max(messages, 1))
     return Share(place, rows, first_ns, last_ns, size, median(sample.ages), estimated)
+
+
+def _without_rows(catalogue: Catalogue, named: Container[str]) -> Iterator[ItemInfo]:
+    """Describe items of which no message can be unrolled, by their receipt alone."""
+    found: dict[str, list[tuple[JournalFile, Tally]]] = {}
+    for journal in catalogue.journals(skip=catalogue.columns_done):
+        for item, count in journal.items.items():
+            if count and item not in named:
+                numbers = [n for n, s in journal.streams.items() if s.item == item]
+                tallies = _tallies(journal)
+                for number in numbers:
+                    if number in tallies and not journal.streams[number].repeated:
+                        found.setdefault(item, []).append((journal, tallies[number]))
+    for item, told in found.items():
+        stream = next(s for s in told[-1][0].streams.values() if s.item == item)
+        shares = [_raw_share(journal, tally) for journal, tally in told]
+        raw = catalogue.raw.get(item)
+        why = raw[-1][1].reason.partition(": ")[2] if raw else "no message fits its definition"
+        yield ItemInfo(
+            item, stream.source, stream.topic.name,
+            stream.topic.schema.name if stream.topic.schema else "",
+            sum(share.rows for share in shares),
+            min(share.first_ns for share in shares), max(share.last_ns for share in shares),
+            rate_hz(shares, ()), None, sum(share.bytes for share in shares), no_columns=why,
+        )  # fmt: skip
+
+
+def _raw_share(journal: JournalFile, tally: Tally) -> Share:
+    place = journal.writer, journal.run, journal.first_seq
+    edges = np.array([tally.first_ns, tally.last_ns])
+    first_ns, last_ns = ClockTable(journal.clock).received(edges).tolist()
+    return Share(place, tally.rows, first_ns, last_ns, tally.bytes, None)

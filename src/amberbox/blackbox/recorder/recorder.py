@@ -84,6 +84,8 @@ class Recorder:
         """Record until ``stop`` is set (by a signal handler, say) or all files have ended."""
         gc.collect()
         gc.freeze()  # what exists now lives as long as the process: leave it out of collections
+        for source in self._sources:
+            source.prepare()
         self.pipeline.event("started", f"recording {self.folder.robot.id}")
         for source in self._sources:
             source.thread.start()

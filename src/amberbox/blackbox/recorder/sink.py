@@ -38,10 +38,13 @@ class BlockSink:
         self.now_ns = pipeline.clock.now_ns
 
     def expect_topics(self) -> None:
-        """Open the gap of each configured topic: nothing of it is heard yet."""
+        """Make each configured topic an item and open its gap, as nothing of it is heard yet.
+
+        Files have no gaps of this kind.
+        """
         for options in self._options.values():
             item = self._pipeline.item(self._name, options.name, options)
-            if options.keep != "none":
+            if options.keep != "none" and not self._waits:
                 self._pipeline.gaps.expect(item.name)
 
     def topic(self, topic: Topic) -> int:

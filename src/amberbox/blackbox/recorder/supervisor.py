@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from contextlib import suppress
 from typing import Any
 
 from amberbox.blackbox.folder.blocks import SourceBlock
@@ -24,9 +25,20 @@ class Supervisor:
         self._block = block
         self._stop = stop
         self._module = get(SOURCES, block.plugin).load()
+        self._source: Any = None
         self._sink: BlockSink | None = None
         self._lossless = False
         self.thread = threading.Thread(target=self._run, name=block.name, daemon=True)
+
+    def prepare(self) -> None:
+        """Make the configured topics known, so that the first file says what is configured.
+
+        A source that fails here fails again in its thread, which records why.
+        """
+        with suppress(Exception):
+            source = self._module.Source(self._block.config, self._block.name)
+            self._sink = self._make_sink(source)
+            self._source = source
 
     def _run(self) -> None:
         backoff_s = _FIRST_BACKOFF_S
@@ -44,7 +56,9 @@ class Supervisor:
 
     def _run_once(self) -> Exception | None:
         try:
-            source = self._module.Source(self._block.config, self._block.name)
+            source, self._source = self._source, None
+            if source is None:
+                source = self._module.Source(self._block.config, self._block.name)
             if self._sink is None:
                 self._sink = self._make_sink(source)
             source.run(self._sink, self._stop)
@@ -56,8 +70,7 @@ class Supervisor:
         self._lossless = source.lossless
         name = self._block.name
         sink = BlockSink(self._pipeline, name, source.topics(), lossless=source.lossless)
-        if not source.lossless:
-            sink.expect_topics()
+        sink.expect_topics()
         return sink
 
     def _is_spent(self) -> bool:

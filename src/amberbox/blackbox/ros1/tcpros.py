@@ -16,7 +16,7 @@ from amberbox.core.types import Schema, Topic
 
 HEADER_LIMIT = 16 << 20
 _LENGTH = struct.Struct("<I")
-_STARTS_WITH_HEADER = re.compile(rb"(std_msgs/)?Header[ \t]+header[ \t]*(#.*)?")
+_STARTS_WITH_HEADER = re.compile(rb"((std_msgs|roslib)/)?Header[ \t]+header[ \t]*(#.*)?")
 
 
 @dataclass(frozen=True)

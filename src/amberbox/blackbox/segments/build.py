@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from amberbox.blackbox.follow.read import JournalFile, batches_of, run_messages
+from amberbox.blackbox.follow.read import JournalFile, batches_of, run_messages, with_columns
 from amberbox.blackbox.journal.clocktable import ClockTable
 from amberbox.blackbox.segments import manifest as mf
 from amberbox.blackbox.segments.condense import kept_records
@@ -21,7 +21,6 @@ from amberbox.blackbox.segments.flat import Flat, TableSchema, flatten, join
 from amberbox.blackbox.segments.lines import CHECKPOINT
 from amberbox.blackbox.segments.manifest import Part, Segment
 from amberbox.blackbox.segments.parquet import TableFile, describe, read_segment
-from amberbox.core.errors import AmberboxError
 from amberbox.core.files import below
 from amberbox.core.types import ColumnData, Gap, IntArray, Ragged
 
@@ -170,25 +169,11 @@ def _flats(
     known: mf.Manifest, journal: JournalFile, gaps: list[Gap], sizes: dict[str, int]
 ) -> Iterator[Flat]:
     """Give the rows that are not in a segment yet (all of them, but after a rebuild)."""
-    items = set()
-    for stream in journal.streams.values():
-        try:
-            stream.unroller()
-            items.add(stream.item)
-        except AmberboxError as error:
-            gaps.append(_kept_raw(journal, stream.item, error.what))
+    items = with_columns(journal, gaps.append)
     for batch in batches_of(journal, items, on_gap=gaps.append, sizes=sizes):
         for flat in flatten(batch):
             if len(flat) and journal.name not in known.complete(flat.schema.item):
                 yield flat
-
-
-def _kept_raw(journal: JournalFile, item: str, reason: str) -> Gap:
-    reason = f"no columns, only in {journal.name}: {reason}"
-    count = journal.items.get(item)
-    return Gap(
-        journal.writer, journal.run, journal.start_ns, journal.end_ns + 1, reason, item, count
-    )
 
 
 def _builder(

@@ -26,6 +26,7 @@ class UnrollError(AmberboxError):
 
     def __init__(self, type_name: str, bad: Sequence[int], count: int) -> None:
         self.bad = tuple(sorted(bad))
+        self.type_name = type_name
         super().__init__(
             f"{len(self.bad)} of {count} messages do not fit the definition of {type_name} "
             f"(first: number {self.bad[0]} of the batch)",

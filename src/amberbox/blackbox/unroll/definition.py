@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cache
 from typing import TYPE_CHECKING
 
 from amberbox.core.errors import AmberboxError
@@ -12,6 +13,7 @@ from amberbox.core.types import Schema
 
 if TYPE_CHECKING:
     from rosbags.interfaces.typing import FieldDesc, Typesdict
+    from rosbags.typesys.msg import MSGParser
 
 HEADER = "std_msgs/msg/Header"
 SIZES = {
@@ -37,6 +39,7 @@ FILLER = "structure_needs_at_least_one_member"
 
 _SEPARATOR = re.compile(r"^={80}[ \t]*$\n?", re.MULTILINE)
 _CONSTANT = re.compile(r"^[ \t]*[\w/<=]+[ \t]+\w+[ \t]*=.*$", re.MULTILINE)
+_OLD_HEADER = re.compile(r"\broslib/(msg/)?Header\b")
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,10 +81,18 @@ def parse_definition(schema: Schema) -> Definition:
     from rosbags.typesys.msg import normalize_msgtype
 
     types = parse_types(schema)
-    root = normalize_msgtype(schema.name)
+    root = normalize_msgtype(current_names(schema.name))
     structures: dict[str, Structure] = {}
     _collect(root, types, structures, schema, ())
     return Definition(root, structures)
+
+
+def current_names(text: str) -> str:
+    """Return a ROS 1 definition, or the name of a type, with ``std_msgs/Header`` for its old name.
+
+    Until ROS Diamondback the type was ``roslib/Header`` (REP 100), with the same fields.
+    """
+    return _OLD_HEADER.sub("std_msgs/Header", text)
 
 
 def parse_types(schema: Schema) -> Typesdict:
@@ -89,7 +100,7 @@ def parse_types(schema: Schema) -> Typesdict:
     text = schema.data.decode("utf-8", "replace").replace("\r\n", "\n")
     parse = _parse_idl if schema.encoding in ("ros2idl", "omgidl") else _parse_msg
     try:
-        return parse(text, schema.name)
+        return parse(current_names(text), current_names(schema.name))
     except Exception as error:  # rosbags raises many kinds on text that is no definition
         raise AmberboxError(
             f"cannot read the definition of {schema.name}: {_last_line(error)}",
@@ -102,14 +113,27 @@ def _last_line(error: Exception) -> str:
 
 
 def _parse_msg(text: str, name: str) -> Typesdict:
-    from rosbags.typesys import TypesysError, get_types_from_msg
+    from rosbags.typesys import TypesysError
+    from rosbags.typesys.base import make_typesdict
 
     normal = _SEPARATOR.sub("=" * 80 + "\n", text)
     try:
-        return get_types_from_msg(normal, name)
-    except TypesysError:
-        # rosbags refuses constants such as kRate=1 or A__B=1, which ROS allows
-        return get_types_from_msg(_CONSTANT.sub("", normal), name)
+        parsed = _parser()(f"MSG: {name}\n{normal}").specification()
+    except TypesysError:  # a constant whose value is none: labels are lost, columns are not
+        parsed = _parser()(f"MSG: {name}\n{_CONSTANT.sub('', normal)}").specification()
+    return make_typesdict(parsed)
+
+
+@cache
+def _parser() -> type[MSGParser]:
+    from rosbags.typesys.msg import MSGParser
+
+    class Parser(MSGParser):
+        """Takes every name that ROS 1 allows: ``kRate=1``, ``A__B=1``, ``MyPackage/My__Type``."""
+
+        ConstantName = PackageName = MessageName = MSGParser.MixedSnake
+
+    return Parser
 
 
 def _parse_idl(text: str, _name: str) -> Typesdict:

@@ -74,6 +74,7 @@ class Gap(Shown):
     ``kind``: ``to_come`` (the robot has it), ``waiting`` (the server has it, and has not read it
     in yet), ``refused`` (the server has the file, and set it aside as damaged), ``deleted``,
     ``filtered`` (the value did not change), ``lost``, ``uncovered`` (nothing was recorded).
+    ``publisher`` is the one that was not heard; others of the item may have been.
     """
 
     item: str
@@ -84,6 +85,7 @@ class Gap(Shown):
     kind: GapKind
     reason: str
     count: int | None
+    publisher: str = ""
 
 
 class Gaps(Shown):

@@ -53,7 +53,7 @@ def _gap(gap: Gap) -> dict[str, Any]:
     return {
         "item": gap.item, "writer": gap.writer, "run": gap.run, "from": format_time(gap.from_ns),
         "to": format_time(gap.to_ns), "kind": kind_of(gap.reason), "reason": gap.reason,
-        "count": gap.count,
+        "count": gap.count, "publisher": gap.peer,
     }  # fmt: skip
 
 
