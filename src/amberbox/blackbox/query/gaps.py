@@ -14,11 +14,20 @@ from amberbox.blackbox.follow.tail import Delivery, WriterTail
 from amberbox.blackbox.journal import reserved
 from amberbox.blackbox.journal.clocktable import ClockTable
 from amberbox.blackbox.query.catalogue import Catalogue
-from amberbox.blackbox.query.gather import Request, Span, gather
+from amberbox.blackbox.query.gather import (
+    DamagedSegmentError,
+    Request,
+    Span,
+    gap_of_part,
+    gather,
+    may_hold,
+    noticing_damage,
+)
 from amberbox.blackbox.query.tabletext import plain
 from amberbox.blackbox.segments.flat import Flat
-from amberbox.blackbox.segments.manifest import Journal
-from amberbox.blackbox.segments.parquet import overlaps
+from amberbox.blackbox.segments.manifest import Journal, Segment
+from amberbox.blackbox.segments.parquet import overlaps, row_groups
+from amberbox.blackbox.segments.restoring import has_size
 from amberbox.blackbox.store import Store, open_store
 from amberbox.core.types import Gap, WriterCursor
 
@@ -28,7 +37,8 @@ _FIELDS = ("item", "peer", "from_ns", "to_ns", "reason", "count")
 
 def gaps(catalogue: Catalogue, item: str | None, span: Span) -> list[Gap]:
     """List gaps that meet ``[from, to)``, in order of time, of one item or of all."""
-    return chosen(known(catalogue, [*_holes(catalogue), *_deleted(catalogue)]), item, span)
+    found = [*_holes(catalogue), *_deleted(catalogue), *_lost_columns(catalogue, span)]
+    return chosen(known(catalogue, found), item, span)
 
 
 def known(catalogue: Catalogue, then: Iterable[Gap]) -> list[Gap]:
@@ -198,3 +208,26 @@ def _deleted(catalogue: Catalogue) -> Iterator[Gap]:
             yield from journal.gaps
         if journal.name not in existing or journal.name in catalogue.done:
             yield from sealed[journal.name].gaps() if journal.name in sealed else ()
+
+
+def _lost_columns(catalogue: Catalogue, span: Span) -> Iterator[Gap]:
+    """Give what damaged segments held of journals whose file is gone; pages are not read."""
+    wanted = Request("", (), span)
+    listed = (s for found in catalogue.manifest.segments.values() for s in found)
+    lost = {segment.path for segment in catalogue.manifest.lost}
+    for segment in (*catalogue.manifest.lost, *(listed if catalogue.with_segments else ())):
+        gone = [part for part in segment.parts if part.journal not in catalogue.existing]
+        if not gone or not may_hold(segment, wanted):
+            continue
+        if segment.path in lost or not _can_be_opened(catalogue, segment):
+            yield from (gap_of_part(segment, part, f"{segment.path} is damaged") for part in gone)
+
+
+def _can_be_opened(catalogue: Catalogue, segment: Segment) -> bool:
+    schema = catalogue.manifest.schemas[segment.schema]
+    try:
+        with noticing_damage(catalogue, segment):
+            row_groups(catalogue.store, segment, schema, "received")
+    except DamagedSegmentError:
+        return False
+    return has_size(catalogue.store, segment)
