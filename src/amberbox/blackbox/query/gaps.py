@@ -220,7 +220,9 @@ def _lost_columns(catalogue: Catalogue, span: Span) -> Iterator[Gap]:
         if not gone or not may_hold(segment, wanted):
             continue
         if segment.path in lost or not _can_be_opened(catalogue, segment):
-            yield from (gap_of_part(segment, part, f"{segment.path} is damaged") for part in gone)
+            there = (catalogue.store / segment.path).exists()
+            reason = f"{segment.path} is {'damaged' if there else 'gone'}"
+            yield from (gap_of_part(segment, part, reason) for part in gone)
 
 
 def _can_be_opened(catalogue: Catalogue, segment: Segment) -> bool:

@@ -379,6 +379,6 @@ def remove_leftovers(store: Path) -> int:
 def _is_merged(store: Path, name: str, known: mf.Manifest) -> bool:
     try:
         _, segment = describe(store, name)
-    except (OSError, *MALFORMED):
+    except mf.UNREADABLE:
         return False
     return all(part.journal in known.complete(segment.item) for part in segment.parts)
