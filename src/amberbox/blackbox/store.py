@@ -81,7 +81,7 @@ class Store:
 
     def next_run(self) -> int:
         """Count one more run, never one that was used before, also after a power cut."""
-        run = 1 + max([self._counted(), *self._runs_on_disk()])
+        run = 1 + max([self._counted(), *self.runs()])
         replace_file(self.path / _RUN, str(run))
         return run
 
@@ -91,7 +91,8 @@ class Store:
         except (OSError, ValueError):
             return 0
 
-    def _runs_on_disk(self) -> list[int]:
+    def runs(self) -> list[int]:
+        """Return the numbers of the runs of which there are journals."""
         return [run_and_number(p)[0] for w in FOLDERS for p in self.journal_files(w)]
 
 

@@ -22,6 +22,7 @@ from amberbox.blackbox.keeper import remarks
 from amberbox.blackbox.keeper.options import KeeperOptions
 from amberbox.blackbox.keeper.ownjournal import OwnJournal, event
 from amberbox.blackbox.keeper.situation import Situations
+from amberbox.blackbox.recorder.names import new_names, stated_names
 from amberbox.blackbox.segments import manifest
 from amberbox.blackbox.segments.build import (
     build_segments,
@@ -90,6 +91,7 @@ class Keeper:
         self._make_room()
         self._deleter.condense(self._notary.signature_of)
         self._deleter.report()
+        self._note_names()
         self._notary.sign()
 
     def _drop_gone(self) -> None:
@@ -138,6 +140,14 @@ class Keeper:
             if told:
                 text = "damage was found and made up for as far as segments and journals tell: "
                 self.journal.write([event("restored", text + in_short(told), "keeper")])
+
+    def _note_names(self) -> None:
+        """Enter the items' names in the manifest, where they are signed."""
+        path = self._store.path
+        with manifest.CHANGING, suppress(OSError):  # no room for it just now
+            new = new_names(stated_names(path) or {}, manifest.read(path).names)
+            if new:
+                manifest.append(path, [manifest.names_record(new)])
 
     def build(self, stop: threading.Event) -> None:
         """Seal the journals that nobody writes any more, and build their segments."""

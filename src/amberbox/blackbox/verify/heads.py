@@ -146,7 +146,7 @@ def _not_reached(writer: str, reach: Reach, checked: Checked, at_ns: int) -> Ite
 class OwnHeads:
     """The statement that lies in a store: its bytes, and what they say if they can be read."""
 
-    content: bytes = b""
+    content: bytes | None = None
     heads: SignedHeads | None = None
 
 
@@ -167,7 +167,7 @@ def check_own_heads(
 ) -> tuple[list[Finding], SignedHeads | None]:
     """Check the statement that lies in the store; None where there is none to go by."""
     heads = own.heads
-    if heads is None and not own.content:
+    if own.content is None:
         text = "there is none: nobody states how far the journals reach"
         return list(_unstated(known, text)), None
     if heads is None:
