@@ -173,10 +173,27 @@ def load_all(store: Store) -> list[Incident]:
 
 
 def unreadable(store: Store) -> list[Path]:
-    """Return the files of incidents that cannot be read, or are gone while they hold a window."""
+    """Return the files of incidents that are damaged, or are gone while they hold a window."""
     pinned = (incident.id for incident in load_all(store))
     paths = {*_files(store), *(folder_of(store, i) / FILE for i in pinned)}
-    return sorted(path for path in paths if _read(path) is None)
+    return sorted(path for path in paths if _is_damaged(store, path))
+
+
+def _is_damaged(store: Store, path: Path) -> bool:
+    found, said = _read(path), _registered(store, path.parent.name)
+    if found is None or said is None:
+        return found is None
+    return found.told == found.state and not same_window(found, said)
+
+
+def same_window(found: Incident, said: Incident) -> bool:
+    """Tell whether an incident's file says the same as the manifest."""
+    return _compared(found) == _compared(said)
+
+
+def _compared(incident: Incident) -> dict[str, Any]:
+    line = to_line(incident, 0)
+    return {key: value for key, value in line.items() if key != "at_ns"}
 
 
 def written_again(store: Store, incident_id: str) -> bool:

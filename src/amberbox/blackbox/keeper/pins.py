@@ -143,7 +143,7 @@ class Pins:
             if path not in self._unreadable:
                 self._unreadable.add(path)
                 name = path.relative_to(self._store.path)
-                text = f"{name} cannot be read or is gone"
+                text = f"{name} is damaged or gone"
                 with pin_lock(self._store):
                     if written_again(self._store, path.parent.name):
                         text += "; it was written again as the manifest has it"

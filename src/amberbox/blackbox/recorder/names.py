@@ -37,7 +37,8 @@ class ItemNames:
         self._names = stated_names(store) or {}
         wrong = wrong_names(self._names, recorded_names(store))
         if wrong:
-            self._names = {**self._names, **wrong}
+            taken = set(wrong.values())  # a damaged line may give the name to another topic
+            self._names = {k: v for k, v in self._names.items() if v not in taken} | wrong
             self._save()
             self.restored = f"{NAMES} was damaged: {', '.join(sorted(wrong.values()))} restored"
 

@@ -24,6 +24,8 @@ FOLDER = "segments"
 _MOST_TOLD = 5
 
 Described = tuple[TableSchema, Segment]
+Key = tuple[str, str, str]
+"""Names rows of a segment: those of one table, version and journal."""
 
 
 def restored(store: Path, known: Manifest) -> Manifest:
@@ -49,7 +51,11 @@ def restore(store: Path) -> list[str]:
         if made_up != Restored() or len(records) > 1:
             mf.append(store, records)
         missing = [f"{segment.path} is gone or was cut" for segment in gone]
-        unlisted = [f"no line told of {segment.path}" for segment in found.adopted]
+        unlisted = [
+            f"no line told of {segment.path}"
+            for segment in found.adopted
+            if segment not in found.manifest.lost
+        ]
         return [*told, *_damage(known), *missing, *unlisted]
 
 
@@ -153,7 +159,7 @@ def _find(store: Path, known: Manifest) -> _Found:
     rows_of = {*_keys(live), *_keys(adopted)}
     usable = {segment.path for segment in live}
     absent = [s for path, s in segments.items() if path not in usable]
-    needed = [s for s in absent if not _keys([s]) <= rows_of and not _has_raw(store, s)]
+    needed = [lost for s in absent if (lost := _lost(store, s, rows_of)) is not None]
     kept = [*live, *adopted]
     here = {name for name in known.journals if (store / name).exists()}
     undone = sorted(here if _damage(known) else here & _journals(absent))
@@ -169,14 +175,30 @@ def _find(store: Path, known: Manifest) -> _Found:
         known, schemas=schemas, segments=mf.by_item(kept), journals=journals, lost=tuple(needed)
     )
     new = [schema for name, schema in schemas.items() if name not in known.schemas]
-    replaced = sorted(s.path for s in absent if s not in needed)
-    return _Found(manifest, new, adopted, more, undone, replaced)
+    still = {segment.path for segment in needed}
+    trimmed = [s for s in needed if s != segments[s.path]]
+    replaced = sorted(s.path for s in absent if s.path not in still)
+    return _Found(manifest, new, [*adopted, *trimmed], more, undone, replaced)
 
 
 def _missing(store: Path, known: Manifest) -> list[Segment]:
     """List the segments whose file is gone or was cut although a journal could still tell."""
-    found = [s for segments in known.segments.values() for s in segments if _has_raw(store, s)]
-    return [s for s in found if not has_size(store, s)]
+    listed = (s for segments in known.segments.values() for s in segments)
+    return [
+        s for s in listed
+        if not has_size(store, s) and any((store / part.journal).exists() for part in s.parts)
+    ]  # fmt: skip
+
+
+def _lost(store: Path, segment: Segment, rows_of: Collection[Key]) -> Segment | None:
+    """Return what a segment held that no journal and no other segment holds; None if nothing."""
+    parts = tuple(
+        part
+        for part in segment.parts
+        if (segment.item, segment.schema, part.journal) not in rows_of
+        and not (store / part.journal).exists()
+    )
+    return replace(segment, parts=parts) if parts else None
 
 
 def has_size(store: Path, segment: Segment) -> bool:
@@ -246,8 +268,8 @@ def _journals(segments: Iterable[Segment]) -> set[str]:
     return {part.journal for segment in segments for part in segment.parts}
 
 
-def _keys(segments: Iterable[Segment]) -> set[tuple[str, str, str]]:
-    """Name the rows of segments: those of one table, version and journal."""
+def _keys(segments: Iterable[Segment]) -> set[Key]:
+    """Name the rows of segments."""
     return {(s.item, s.schema, part.journal) for s in segments for part in s.parts}
 
 

@@ -15,14 +15,12 @@ from amberbox.blackbox.incidents.incident import (
     folder_of,
     from_line,
     load_all,
-    to_line,
+    same_window,
 )
 from amberbox.blackbox.segments.manifest import Manifest
 from amberbox.blackbox.store import INCIDENTS, Store
 from amberbox.blackbox.verify.findings import Finding, State
 from amberbox.blackbox.verify.place import TROUBLE
-
-_NOT_COMPARED = {"at_ns", "ring", "bytes"}
 
 
 def check_incidents(store: Store, known: Manifest) -> Iterator[tuple[str, list[Finding]]]:
@@ -71,13 +69,8 @@ def _compare(
         yield _finding("altered", name, "reasons or versions are not those written down", said)
     elif found.told != found.state:
         yield _finding("unsigned", name, "was changed after it was written down last", found)
-    elif _values(found) != _values(said) or line.get("bytes", found.bytes) != found.bytes:
+    elif not same_window(found, said) or line.get("bytes", found.bytes) != found.bytes:
         yield _finding("altered", name, "is not as it was written down in the manifest", said)
-
-
-def _values(incident: Incident) -> dict[str, Any]:
-    line = to_line(incident, 0)
-    return {key: value for key, value in line.items() if key not in _NOT_COMPARED}
 
 
 def _said(line: Mapping[str, Any] | None) -> Incident | None:

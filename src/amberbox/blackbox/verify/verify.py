@@ -13,7 +13,7 @@ from amberbox.blackbox.segments import manifest as mf
 from amberbox.blackbox.segments.manifest import Manifest, Segment
 from amberbox.blackbox.signing.keys import PUBLIC, can_sign
 from amberbox.blackbox.signing.signing import HEADS, LOCKS, SignedHeads
-from amberbox.blackbox.store import IDENTITY, INCIDENTS, is_locked, open_store
+from amberbox.blackbox.store import IDENTITY, INCIDENTS, Store, is_locked, open_store
 from amberbox.blackbox.verify.continuity import Graves, check_continuity
 from amberbox.blackbox.verify.derived import check_derived, uncovered
 from amberbox.blackbox.verify.findings import BAD, Collected, Finding, HeadLine, Report
@@ -97,7 +97,7 @@ class _Verification:
         for name, findings in check_incidents(self.store, manifest):
             self.collected.take(name, findings)
         sealed = {name: entry for name, (_, entry) in lines.sealed.items()}
-        for name, findings in check_derived(self.store, manifest, trust.key):
+        for name, findings in check_derived(Store(path, store_id), manifest, trust.key):
             self.collected.take(name, findings)
         known = Known(store_id, lines, journals.by_name, sealed, graves)
         heads = self._heads(known, trust.key)
