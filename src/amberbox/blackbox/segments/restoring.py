@@ -162,9 +162,14 @@ def _find(store: Path, known: Manifest) -> _Found:
     needed = [lost for s in absent if (lost := _lost(store, s, rows_of)) is not None]
     kept = [*live, *adopted]
     here = {name for name in known.journals if (store / name).exists()}
-    undone = sorted(here if _damage(known) else here & _journals(absent))
+    if _damage(known):  # of a journal that left only events and the like, the tombstone is lost
+        data = [s for s in (*kept, *needed) if s.schema in schemas]
+        data = [s for s in data if not mf.is_kept(schemas[s.schema])]
+        undone = sorted(here | (known.journals.keys() - _journals(data)))
+    else:
+        undone = sorted(here & _journals(absent))
     journals = {n: j for n, j in known.journals.items() if n not in undone}
-    said = {*journals, *known.columns_gone, *_journals(needed)}
+    said = {*journals, *known.columns_gone, *_journals(needed), *undone}
     more = [
         journal
         for journal in journals_of(kept, known)
