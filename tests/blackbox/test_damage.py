@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
 import amberbox
@@ -160,8 +160,9 @@ _DERIVED = ("manifest", "heads.json", IDENTITY, "names.json", "head", "run", "ro
 
 @fuzz
 @settings(
-    max_examples=examples(14), deadline=None, suppress_health_check=[HealthCheck.too_slow,
-    HealthCheck.function_scoped_fixture],
+    max_examples=examples(8), deadline=None,
+    phases=[Phase.generate],  # each takes a second: what fails is short enough as it is
+    suppress_health_check=[HealthCheck.too_slow, HealthCheck.function_scoped_fixture],
 )  # fmt: skip
 @given(data=st.data())
 def test_whatever_is_damaged_nothing_raises_or_is_invented(
@@ -185,7 +186,7 @@ def test_whatever_is_damaged_nothing_raises_or_is_invented(
             assert now.rows.get(item) == rows, "damage of a derived file cost rows"
         elif kind == "segments" and now.rows.get(item) != rows:
             assert any(name in note for note in now.notes), "lost, and nothing is said"
-    assert name in named(store) or name in _MAY_GO
+    assert name in named(store) or not (kind in _NAMED or name.endswith("/head"))
     restart(store)
     again = answers(store)
     for item, rows in before.rows.items():
@@ -195,8 +196,8 @@ def test_whatever_is_damaged_nothing_raises_or_is_invented(
     verify(store)
 
 
-_MAY_GO = ("key", "room", "run")
-"""What a copy of a store need not have: nothing is to be said where it is not there."""
+_NAMED = ("manifest", "segments", "heads.json", IDENTITY, "names.json", "key.pub")
+"""What verify names itself, whatever was done to it: others may go, or show it elsewhere."""
 
 
 def damaged(path: Path, data: st.DataObject) -> None:
