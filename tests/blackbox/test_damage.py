@@ -160,7 +160,7 @@ _DERIVED = ("manifest", "heads.json", IDENTITY, "names.json", "head", "run", "ro
 
 @fuzz
 @settings(
-    max_examples=examples(8), deadline=None,
+    max_examples=examples(6), deadline=None,
     phases=[Phase.generate],  # each takes a second: what fails is short enough as it is
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.function_scoped_fixture],
 )  # fmt: skip
