@@ -42,11 +42,11 @@ def journal(name: str) -> mf.Journal:
 
 
 def test_what_is_appended_is_read(tmp_path: Path) -> None:
-    assert mf.read(tmp_path) == mf.Manifest()
+    assert mf.read_lines(tmp_path) == mf.Manifest()
     done = journal("journal/0.mcap")
     mf.append(tmp_path, [mf.schema_record(SCHEMA), mf.segment_record(segment(0))])
     mf.append(tmp_path, [mf.journal_record(done)])
-    known = mf.read(tmp_path)
+    known = mf.read_lines(tmp_path)
     assert known.schemas == {SCHEMA.id: SCHEMA}
     assert known.segments == {"odom": (segment(0),)}
     assert known.journals == {"journal/0.mcap": done}
@@ -65,14 +65,14 @@ def test_a_segment_takes_the_place_of_those_it_replaces(tmp_path: Path) -> None:
     mf.append(tmp_path, [mf.segment_record(s) for s in small])
     merged = segment(0, tuple(s.parts[0].journal for s in small))
     mf.append(tmp_path, [mf.segment_record(merged, [s.path for s in small])])
-    known = mf.read(tmp_path)
+    known = mf.read_lines(tmp_path)
     assert known.segments == {"odom": (merged,)}
     assert known.complete("odom") == {f"journal/{n}.mcap" for n in range(3)}
 
 
 def test_a_journal_counts_when_all_files_of_its_schema_versions_are_there(tmp_path: Path) -> None:
     mf.append(tmp_path, [mf.segment_record(segment(0, files=2))])
-    known = mf.read(tmp_path)
+    known = mf.read_lines(tmp_path)
     assert known.complete("odom") == frozenset()
     assert known.complete("odom", existing=()) == {"journal/0.mcap"}
     assert known.complete("odom", existing={"journal/0.mcap"}) == frozenset()
@@ -88,12 +88,12 @@ def test_a_torn_end_costs_the_last_record_only(tmp_path: Path, data: st.DataObje
     last = content.rstrip(b"\n").rfind(b"\n") + 1
     cut = data.draw(st.integers(last, len(content) - 1))
     path.write_bytes(content[:cut])
-    torn = mf.read(tmp_path)
+    torn = mf.read_lines(tmp_path)
     whole = cut == len(content) - 1  # only the newline is missing
     assert len(torn.segments["odom"]) == (3 if whole else 2)
     assert bool(torn.damage) == (last < cut < len(content) - 1)
     mf.append(tmp_path, [mf.segment_record(segment(7))])
-    again = mf.read(tmp_path)
+    again = mf.read_lines(tmp_path)
     assert [s.path for s in again.segments["odom"]][-1] == segment(7).path
     assert len(again.segments["odom"]) == (4 if whole else 3)
 
@@ -103,15 +103,15 @@ def test_a_changed_line_is_left_out_and_named(tmp_path: Path) -> None:
     path = tmp_path / mf.NAME
     content = path.read_bytes()
     at = content.index(b"1.parquet")
-    path.write_bytes(content[:at] + b"9" + content[at + 1 :])
-    known = mf.read(tmp_path)
+    path.write_bytes(content[:at] + b"6" + content[at + 1 :])
+    known = mf.read_lines(tmp_path)
     assert [s.path for s in known.segments["odom"]] == [segment(0).path, segment(2).path]
     assert known.damage == ("line 2: damaged", "line 3: does not follow the line before")
 
 
 def test_unknown_kinds_of_records_are_chained_and_passed_over(tmp_path: Path) -> None:
     mf.append(tmp_path, [{"kind": "signature", "by": "key"}, mf.segment_record(segment(0))])
-    known = mf.read(tmp_path)
+    known = mf.read_lines(tmp_path)
     assert not known.damage
     assert known.segments == {"odom": (segment(0),)}
 

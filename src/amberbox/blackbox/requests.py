@@ -12,6 +12,7 @@ import os
 import time
 import uuid
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -47,7 +48,7 @@ def submit(store: Store, kind: str, values: Mapping[str, Any]) -> Path:
 def pending(store: Store) -> list[Request]:
     """Return the requests that nobody has seen to yet, oldest first.
 
-    A file that is no request is moved aside to ``<name>.refused``.
+    A file that is no request is moved aside to ``<name>.refused``; only the keeper calls this.
     """
     found = []
     for path in sorted((store.path / FOLDER).glob("*.json")):
@@ -57,8 +58,12 @@ def pending(store: Store) -> list[Request]:
             found.append(Request(path, str(document["kind"]), *times, dict(document["values"])))
         except FileNotFoundError:
             continue
-        except (ValueError, KeyError, TypeError):
-            path.rename(path.with_suffix(".refused"))
+        except (ValueError, KeyError, TypeError, AttributeError, OverflowError):
+            text = f"{FOLDER}/{path.name} cannot be read: what it asked for was not done"
+            with suppress(OSError):  # a full disk: it is refused with the next step
+                about = {"kind": "request_refused", "text": text, "source": "keeper"}
+                submit(store, "event", about)
+                path.rename(path.with_suffix(".refused"))
     return found
 
 

@@ -7,11 +7,15 @@ import json
 import os
 import time
 import uuid
+from collections import Counter
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
 
+from amberbox.blackbox.journal.head import read_head
+from amberbox.blackbox.journal.scan import start_record
 from amberbox.core.errors import AmberboxError, UsageError
 from amberbox.core.files import below, replace_file
 
@@ -26,10 +30,12 @@ FOLDERS = {
 """Folder of each writer's journal, inside the store."""
 INCIDENTS = "incidents"
 SEGMENTS = "segments"
-_IDENTITY = "store.json"
+IDENTITY = "store.json"
 _RUN = "run"
 _LOCKS = {"keep": "keeper", "kept": "keeper"}
 """Locks of the writers that are not called like these."""
+_WITNESSES = 3
+"""How many journals of each writer are asked for the store's identity."""
 _LOCK_TRIES = 10
 _LOCK_PAUSE_S = 0.02
 """A reader that asks whether a lock is held holds it itself for some microseconds."""
@@ -80,7 +86,7 @@ class Store:
 
     def next_run(self) -> int:
         """Count one more run, never one that was used before, also after a power cut."""
-        run = 1 + max([self._counted(), *self._runs_on_disk()])
+        run = 1 + max([self._counted(), *self.runs()])
         replace_file(self.path / _RUN, str(run))
         return run
 
@@ -90,29 +96,76 @@ class Store:
         except (OSError, ValueError):
             return 0
 
-    def _runs_on_disk(self) -> list[int]:
+    def runs(self) -> list[int]:
+        """Return the numbers of the runs of which there are journals."""
         return [run_and_number(p)[0] for w in FOLDERS for p in self.journal_files(w)]
 
 
 def is_store(path: Path) -> bool:
-    """Tell whether a folder is a store."""
-    return (path / _IDENTITY).is_file()
+    """Tell whether a folder is a store, also one that lost its identity's file."""
+    return (path / IDENTITY).is_file() or bool(_witnesses(path))
 
 
 def open_store(path: Path) -> Store:
-    """Open a store that exists.
+    """Open a store that exists; where its identity cannot be read, its files tell it.
 
-    Raises AmberboxError when there is none, or its identity cannot be read.
+    Raises UsageError when there is none, AmberboxError when nothing tells its identity.
     """
+    stated = stated_id(path)
+    if stated:
+        return Store(path, stated)
+    witnesses = _witnesses(path)
+    if witnesses:
+        return Store(path, witnesses.most_common(1)[0][0])
+    if not (path / IDENTITY).exists():
+        raise UsageError(f"{path} is not a store", "name a store or a robot folder")
+    raise AmberboxError(f"{path / IDENTITY} cannot be read", "restore the file from a copy")
+
+
+def stated_id(path: Path) -> str:
+    """Return the identity that a store's own file states; empty where it states none."""
     try:
-        identity = json.loads((path / _IDENTITY).read_text())
-        return Store(path, str(identity["store_id"]))
-    except FileNotFoundError:
-        raise UsageError(f"{path} is not a store", "name a store or a robot folder") from None
-    except (OSError, ValueError, KeyError) as error:
-        raise AmberboxError(
-            f"{path / _IDENTITY} cannot be read: {error}", "restore the file from a copy"
-        ) from error
+        content = (path / IDENTITY).read_text()
+        found = str(uuid.UUID(json.loads(content)["store_id"]))
+    except (OSError, ValueError, LookupError, TypeError, AttributeError):
+        return ""
+    return found if found in content else ""
+
+
+def identity_text(store_id: str) -> str:
+    """Return what a store's own file says."""
+    return json.dumps({"store_id": store_id, "format": 1})
+
+
+def _witnesses(path: Path) -> Counter[str]:
+    """Count the files of a store by the identity that each of them states."""
+    store, found = Store(path, ""), Counter[str]()
+    for writer, folder in FOLDERS.items():
+        head = read_head(path / folder)
+        found.update([head.store_id] if head is not None else [])
+        for journal in store.journal_files(writer)[-_WITNESSES:]:
+            with suppress(OSError):
+                found.update(filter(None, [start_record(journal).get("store_id")]))
+    return found
+
+
+def open_to_write(path: Path) -> Store:
+    """Open a store that exists; put right its identity first where all its files name another.
+
+    Raises what ``open_store`` does.
+    """
+    stated, witnesses = stated_id(path), _witnesses(path)
+    found, count = witnesses.most_common(1)[0] if witnesses else ("", 0)
+    is_sure = len(witnesses) == 1 and count > 1  # else a journal's first bytes may be the damage
+    if found != stated and found and (is_sure or not stated):
+        from amberbox.blackbox.keeper.remarks import remark  # the keeper imports stores
+
+        with suppress(OSError):  # a store that cannot be written now: this process knows better
+            replace_file(path / IDENTITY, identity_text(found))
+        text = f"{IDENTITY} was damaged: the identity that the journals state is in it again"
+        remark(Store(path, found), "restored", text, "store")
+        return Store(path, found)
+    return open_store(path)
 
 
 def create_store(path: Path) -> Store:
@@ -121,10 +174,10 @@ def create_store(path: Path) -> Store:
     Raises AmberboxError when the folder cannot be written.
     """
     if is_store(path):
-        return open_store(path)
+        return open_to_write(path)
     try:
         path.mkdir(mode=0o750, parents=True, exist_ok=True)
-        replace_file(path / _IDENTITY, json.dumps({"store_id": str(uuid.uuid4()), "format": 1}))
+        replace_file(path / IDENTITY, identity_text(str(uuid.uuid4())))
     except OSError as error:
         raise AmberboxError(
             f"cannot write to the store {path}: {error.strerror}",

@@ -57,6 +57,8 @@ def _lines(report: Report) -> Iterator[str]:
     yield f"{len(report.files)} files, {in_bytes(report.bytes)}: {states or 'nothing to verify'}"
     heads = [("head", h.what, h.hash, _short(h.at_ns), h.file) for h in report.heads]
     yield from in_columns(heads, "")
+    for file, reason in report.uncovered.items():
+        yield f"not covered  {file}: {reason}"
 
 
 def _place(finding: Finding) -> str:
@@ -84,6 +86,7 @@ def _as_json(report: Report, *, good: bool) -> dict[str, object]:
         "signed": report.signed,
         "bytes": report.bytes,
         "files": dict(report.files),
+        "uncovered": dict(report.uncovered),
         "findings": [finding.to_json() for finding in report.findings],
         "heads": [{**asdict(head), "at": as_text(head.at_ns)} for head in report.heads],
         "notes": list(report.notes),

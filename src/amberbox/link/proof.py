@@ -54,13 +54,14 @@ def proofs_of(store: Path, journals: Sequence[str]) -> dict[str, Proof]:
             continue
         name = next((name for name, mark in marks.items() if mark in line), None)
         if name is not None:
-            found[name] = Proof(b"\n".join(_to_signature(lines, at)).decode(), gone)
+            found[name] = Proof(b"\n".join(_to_signature(lines, at)).decode(errors="replace"), gone)
     return found
 
 
 def _gone(lines: Sequence[bytes]) -> list[bytes]:
     """Return the lines of what was deleted unconfirmed, the newest when there are very many."""
-    return [n for n in lines if b',"kind":"gone",' in n and b'"confirmed":false' in n][-_MOST_GONE:]
+    found = [n for n in lines if b',"kind":"gone",' in n and b'"confirmed":false' in n]
+    return [line for line in found[-_MOST_GONE:] if decode(line) is not None]
 
 
 def _to_signature(lines: Sequence[bytes], at: int) -> list[bytes]:

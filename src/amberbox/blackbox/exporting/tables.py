@@ -151,7 +151,7 @@ def _tell_without_pyarrow(looking: Looking, request: Request) -> None:
 
 def _segment_parts(catalogue: Catalogue, segment: Segment, request: Request) -> Iterator[TablePart]:
     schema = catalogue.manifest.schemas[segment.schema]
-    with noticing_damage(segment):
+    with noticing_damage(catalogue, segment):
         groups = row_groups(catalogue.store, segment, schema, request.by)
     for group in groups:
         if overlaps(group.low_ns, group.high_ns, request.span):
@@ -162,7 +162,7 @@ def _segment_parts(catalogue: Catalogue, segment: Segment, request: Request) -> 
 def _load_group(
     catalogue: Catalogue, segment: Segment, schema: TableSchema, request: Request, number: int
 ) -> list[Flat]:
-    with noticing_damage(segment):
+    with noticing_damage(catalogue, segment):
         flats = read_row_group(catalogue.store, segment, schema, request.names, number)
     return [within(flat, request.span, request.by) for flat in flats]
 

@@ -48,7 +48,7 @@ class TableRows:
         self.schema = schema
         self.damage = ""
         self._store = store
-        self._known = mf.read(store)
+        self._segment = segment
         self._path = segment.path
         self._flats = _row_groups(store, segment, schema, of)
         self._none = _empty(schema, of)
@@ -76,10 +76,10 @@ class TableRows:
     def _read_on(self) -> None:
         try:
             self._next = next((flat for flat in self._flats if len(flat)), self._none)
-        except (OSError, ValueError) as error:
-            if mf.read(self._store) is not self._known:  # it may be joined or deleted by now
+        except mf.UNREADABLE as error:
+            if not mf.is_listed(self._store, self._segment):  # joined or deleted meanwhile
                 raise FileNotFoundError(self._path) from error
-            self.damage = f"{self._path} is damaged: {str(error).splitlines()[0]}"
+            self.damage = f"{self._path} is damaged: {mf.why(error)}"
             self._next = self._none
 
 

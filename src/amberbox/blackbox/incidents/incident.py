@@ -88,7 +88,7 @@ class Incident:
     after_ns: int
     state: State = "open"
     confirmed: bool = False
-    told: str = ""
+    told: State | Literal[""] = ""
     bytes: int = 0
 
     @property
@@ -163,16 +163,49 @@ def folder_of(store: Store, incident_id: str) -> Path:
 def load_all(store: Store) -> list[Incident]:
     """Return the incidents of a store, released ones included, in order of their windows.
 
-    Where a file cannot be read, what the manifest says of its incident holds.
+    Where a file cannot be read or is gone, what the manifest says of its incident holds.
     """
-    read = (_read(path) or _registered(store, path.parent.name) for path in _files(store))
-    found = [incident for incident in read if incident is not None]
+    paths = {path.parent.name: path for path in _files(store)}
+    ids = paths.keys() | manifest.read(store.path).incidents.keys()
+    read = ((paths.get(i) and _read(paths[i])) or _registered(store, i) for i in sorted(ids))
+    found = [i for i in read if i is not None and (i.id in paths or i.is_pinned)]
     return sorted(found, key=lambda incident: (incident.from_ns, incident.id))
 
 
 def unreadable(store: Store) -> list[Path]:
-    """Return the files of incidents that cannot be read."""
-    return [path for path in _files(store) if path.exists() and _read(path) is None]
+    """Return the files of incidents that are damaged, or are gone while they hold a window."""
+    pinned = (incident.id for incident in load_all(store))
+    paths = {*_files(store), *(folder_of(store, i) / FILE for i in pinned)}
+    return sorted(path for path in paths if _is_damaged(store, path))
+
+
+def _is_damaged(store: Store, path: Path) -> bool:
+    found, said = _read(path), _registered(store, path.parent.name)
+    if found is None or said is None:
+        return found is None
+    return found.told == found.state and not same_window(found, said)
+
+
+def same_window(found: Incident, said: Incident) -> bool:
+    """Tell whether an incident's file says the same as the manifest."""
+    return _compared(found) == _compared(said)
+
+
+def _compared(incident: Incident) -> dict[str, Any]:
+    line = to_line(incident, 0)
+    return {key: value for key, value in line.items() if key != "at_ns"}
+
+
+def written_again(store: Store, incident_id: str) -> bool:
+    """Write the file of an incident as the manifest says; tell whether it says anything of it.
+
+    Whoever calls holds the pin lock.
+    """
+    incident = _registered(store, incident_id)
+    if incident is not None:
+        folder_of(store, incident_id).mkdir(parents=True, exist_ok=True)
+        save(store, incident)
+    return incident is not None
 
 
 def _files(store: Store) -> list[Path]:
@@ -196,7 +229,7 @@ def _decoded(path: Path, _mtime_ns: int, _inode: int) -> Incident | None:
 def _registered(store: Store, incident_id: str) -> Incident | None:
     """Read what the keeper has written down of an incident; None if it has not yet."""
     line = manifest.read(store.path).incidents.get(incident_id)
-    with suppress(KeyError, TypeError, IndexError):
+    with suppress(KeyError, TypeError, IndexError, AttributeError, ValueError):
         return None if line is None else from_line(line)
     return None
 
@@ -240,6 +273,7 @@ def from_line(line: Mapping[str, Any]) -> Incident:
         after_ns=line["after_ns"],
         state=about["state"],
         told=about["state"],
+        bytes=line.get("bytes", 0),
     )
 
 

@@ -46,6 +46,12 @@ class HeadFile:
         os.close(self._fd)
 
 
+def is_padded(folder: Path) -> bool:
+    """Tell whether nothing but padding follows the content of a journal's head."""
+    content = (folder / NAME).read_bytes()
+    return content == content.rstrip(b" ").ljust(_SIZE) and content.rstrip(b" ").endswith(b"}\n")
+
+
 def read_head(folder: Path) -> Head | None:
     """Read a journal's head; None when there is none or it was read while being written."""
     try:

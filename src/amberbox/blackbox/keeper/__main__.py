@@ -14,7 +14,7 @@ from pathlib import Path
 from amberbox.blackbox.keeper.keeper import PATIENCE_S, Keeper, wait_for_lock
 from amberbox.blackbox.keeper.options import KeeperOptions
 from amberbox.blackbox.segments.build import can_build
-from amberbox.blackbox.store import open_store
+from amberbox.blackbox.store import open_to_write
 from amberbox.core.errors import UsageError
 
 PERIOD_S = 2.0
@@ -33,7 +33,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: stop.set())
     try:
-        store = open_store(options.store)
+        store = open_to_write(options.store)
         lock = wait_for_lock(store, PATIENCE_S if options.parent else 0.0, stop)
     except UsageError as error:
         print(f"amberbox keeper: {error}", file=sys.stderr)

@@ -20,8 +20,9 @@ from amberbox.blackbox.follow.chain import previous_chain
 from amberbox.blackbox.follow.read import journal_file
 from amberbox.blackbox.keeper import remarks
 from amberbox.blackbox.keeper.options import KeeperOptions
-from amberbox.blackbox.keeper.ownjournal import OwnJournal
+from amberbox.blackbox.keeper.ownjournal import OwnJournal, event
 from amberbox.blackbox.keeper.situation import Situations
+from amberbox.blackbox.recorder.names import new_names, stated_names
 from amberbox.blackbox.segments import manifest
 from amberbox.blackbox.segments.build import (
     build_segments,
@@ -30,6 +31,7 @@ from amberbox.blackbox.segments.build import (
     remove_leftovers,
 )
 from amberbox.blackbox.segments.dropping import drop_gone
+from amberbox.blackbox.segments.restoring import in_short, restore
 from amberbox.blackbox.signing.notary import Notary
 from amberbox.blackbox.store import Store, WriterLock
 from amberbox.core.clock import Clock
@@ -89,6 +91,7 @@ class Keeper:
         self._make_room()
         self._deleter.condense(self._notary.signature_of)
         self._deleter.report()
+        self._note_names()
         self._notary.sign()
 
     def _drop_gone(self) -> None:
@@ -125,9 +128,26 @@ class Keeper:
         """Finish what a keeper before this one was killed over."""
         if not self._recovered:
             self._recovered = True
+            self._restore()
             self._deleter.recover()
             if self._with_segments:
                 remove_leftovers(self._store.path)
+
+    def _restore(self) -> None:
+        """Put the manifest right where lines of it, or segments, are damaged, and say so."""
+        with suppress(OSError):  # no room for it just now: the next keeper tries again
+            told = restore(self._store.path)
+            if told:
+                text = "damage was found and made up for as far as segments and journals tell: "
+                self.journal.write([event("restored", text + in_short(told), "keeper")])
+
+    def _note_names(self) -> None:
+        """Enter the items' names in the manifest, where they are signed."""
+        path = self._store.path
+        with manifest.CHANGING, suppress(OSError):  # no room for it just now
+            new = new_names(stated_names(path) or {}, manifest.read(path).names)
+            if new:
+                manifest.append(path, [manifest.names_record(new)])
 
     def build(self, stop: threading.Event) -> None:
         """Seal the journals that nobody writes any more, and build their segments."""

@@ -22,6 +22,7 @@ from amberbox.blackbox.incidents.incident import (
     to_line,
     triggered,
     unreadable,
+    written_again,
 )
 from amberbox.blackbox.incidents.pin import Wish, advance, pin
 from amberbox.blackbox.incidents.timeline import look_back
@@ -126,14 +127,15 @@ class Pins:
         if incident.told == incident.state:
             return
         ring = sorted(p.name for p in (folder_of(self._store, incident.id) / RING).glob("*.mcap"))
-        line = {**to_line(incident, self._journal.now_ns()), "ring": ring}
+        held = held_bytes(self._store, [incident])
+        line = {**to_line(incident, self._journal.now_ns()), "ring": ring, "bytes": held}
         self._write([(reserved.INCIDENT, line["incident"]), _event(incident)])
         with_reserve(self._store, lambda: manifest.append(self._store.path, [line]))
         with pin_lock(self._store):
             now = {other.id: other for other in load_all(self._store)}.get(incident.id)
             if now is not None:
-                held = held_bytes(self._store, [now])
                 told = incident.state if now.reasons == incident.reasons else ""
+                held = held if told else held_bytes(self._store, [now])
                 save(self._store, replace(now, told=told, bytes=held))
 
     def _damage(self) -> Iterator[Record]:
@@ -141,7 +143,11 @@ class Pins:
             if path not in self._unreadable:
                 self._unreadable.add(path)
                 name = path.relative_to(self._store.path)
-                yield event("incident_unreadable", f"{name} cannot be read", path=str(name))
+                text = f"{name} is damaged or gone"
+                with pin_lock(self._store):
+                    if written_again(self._store, path.parent.name):
+                        text += "; it was written again as the manifest has it"
+                yield event("incident_unreadable", text, path=str(name))
 
     def _write(self, records: list[Record]) -> None:
         if records:

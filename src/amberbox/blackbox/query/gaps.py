@@ -15,11 +15,20 @@ from amberbox.blackbox.follow.tail import Delivery, WriterTail
 from amberbox.blackbox.journal import reserved
 from amberbox.blackbox.journal.clocktable import ClockTable
 from amberbox.blackbox.query.catalogue import Catalogue
-from amberbox.blackbox.query.gather import Request, Span, gather
+from amberbox.blackbox.query.gather import (
+    DamagedSegmentError,
+    Request,
+    Span,
+    gap_of_part,
+    gather,
+    may_hold,
+    noticing_damage,
+)
 from amberbox.blackbox.query.tabletext import plain
 from amberbox.blackbox.segments.flat import Flat
-from amberbox.blackbox.segments.manifest import Journal
-from amberbox.blackbox.segments.parquet import overlaps
+from amberbox.blackbox.segments.manifest import Journal, Segment
+from amberbox.blackbox.segments.parquet import overlaps, row_groups
+from amberbox.blackbox.segments.restoring import has_size
 from amberbox.blackbox.store import Store, open_store
 from amberbox.core.types import Gap, WriterCursor
 
@@ -29,8 +38,11 @@ _FIELDS = ("item", "peer", "from_ns", "to_ns", "reason", "count")
 
 def gaps(catalogue: Catalogue, item: str | None, span: Span) -> list[Gap]:
     """List gaps that meet ``[from, to)``, in order of time, of one item or of all."""
-    then = [*_holes(catalogue), *_deleted(catalogue), *_undecodable(catalogue)]
-    return chosen(known(catalogue, then), item, span)
+    found = [
+        *_holes(catalogue), *_deleted(catalogue), *_undecodable(catalogue),
+        *_lost_columns(catalogue, span),
+    ]  # fmt: skip
+    return chosen(known(catalogue, found), item, span)
 
 
 def known(catalogue: Catalogue, then: Iterable[Gap]) -> list[Gap]:
@@ -225,3 +237,28 @@ def _misfits(path: Path, name: str, _mtime_ns: int, _size: int) -> tuple[Gap, ..
     for _ in batches_of(journal, with_columns(journal, found.append), on_gap=found.append):
         pass
     return tuple(found)
+
+
+def _lost_columns(catalogue: Catalogue, span: Span) -> Iterator[Gap]:
+    """Give what damaged segments held of journals whose file is gone; pages are not read."""
+    wanted = Request("", (), span)
+    listed = (s for found in catalogue.manifest.segments.values() for s in found)
+    lost = {segment.path for segment in catalogue.manifest.lost}
+    for segment in (*catalogue.manifest.lost, *(listed if catalogue.with_segments else ())):
+        gone = [part for part in segment.parts if part.journal not in catalogue.existing]
+        if not gone or not may_hold(segment, wanted):
+            continue
+        if segment.path in lost or not _can_be_opened(catalogue, segment):
+            there = (catalogue.store / segment.path).exists()
+            reason = f"{segment.path} is {'damaged' if there else 'gone'}"
+            yield from (gap_of_part(segment, part, reason) for part in gone)
+
+
+def _can_be_opened(catalogue: Catalogue, segment: Segment) -> bool:
+    schema = catalogue.manifest.schemas[segment.schema]
+    try:
+        with noticing_damage(catalogue, segment):
+            row_groups(catalogue.store, segment, schema, "received")
+    except DamagedSegmentError:
+        return False
+    return has_size(catalogue.store, segment)

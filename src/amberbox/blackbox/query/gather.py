@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
 from typing import TypeAlias
 
 import numpy as np
@@ -12,6 +15,7 @@ import numpy as np
 from amberbox.blackbox.follow.read import JournalFile, batches_of
 from amberbox.blackbox.query.catalogue import Catalogue, item_of
 from amberbox.blackbox.segments import columns as col
+from amberbox.blackbox.segments import manifest as mf
 from amberbox.blackbox.segments.flat import Flat, TableSchema, flatten
 from amberbox.blackbox.segments.manifest import Part, Segment
 from amberbox.blackbox.segments.parquet import overlaps, read_segment
@@ -58,6 +62,9 @@ def gather(catalogue: Catalogue, request: Request) -> Gathered:
             tell_damaged(found, catalogue, damage.segment, str(damage))
             catalogue = catalogue.without(damage.segment)
     _add_journals(found, catalogue, request)
+    for segment in catalogue.manifest.lost:
+        if segment.item == request.table and may_hold(segment, request):
+            tell_damaged(found, catalogue, segment, "it or its line of the manifest is gone")
     if not catalogue.with_segments:
         tell_unreadable(found, catalogue, request)
     pieces = (within(piece, request.span, request.by) for piece in found.pieces)
@@ -70,7 +77,7 @@ def _segment_rows(catalogue: Catalogue, request: Request) -> Iterator[Flat]:
         if not may_hold(segment, request):
             continue
         schema = catalogue.manifest.schemas[segment.schema]
-        with noticing_damage(segment):
+        with noticing_damage(catalogue, segment):
             flats = read_segment(
                 catalogue.store, segment, schema, request.names, request.span, request.by,
                 catalogue.stored,
@@ -79,20 +86,47 @@ def _segment_rows(catalogue: Catalogue, request: Request) -> Iterator[Flat]:
 
 
 @contextmanager
-def noticing_damage(segment: Segment) -> Iterator[None]:
+def noticing_damage(catalogue: Catalogue, segment: Segment) -> Iterator[None]:
     """Turn what goes wrong when a segment is read into ``DamagedSegmentError``."""
     try:
         yield
-    except FileNotFoundError:  # joined or deleted meanwhile: whoever asks looks again
-        raise
-    except (OSError, ValueError) as error:
-        raise DamagedSegmentError(segment, str(error).splitlines()[0]) from error
+    except FileNotFoundError as error:
+        if not mf.is_listed(catalogue.store, segment):
+            raise  # joined or deleted meanwhile: whoever asks looks again
+        raise DamagedSegmentError(segment, "it is gone") from error
+    except mf.UNREADABLE as error:
+        raise DamagedSegmentError(segment, mf.why(error)) from error
 
 
 def may_hold(segment: Segment, request: Request) -> bool:
     """Tell whether a segment may hold rows of a request's range."""
     bounds = segment.received_range_ns if request.by == "received" else segment.stamp_range_ns
     return overlaps(*bounds, request.span)
+
+
+def without_damage(catalogue: Catalogue, table: str) -> tuple[Catalogue, list[str]]:
+    """Leave out the segments of a table that are not as they were written; say what that costs.
+
+    For readers that do not check the checksums of pages. A file is hashed once.
+    """
+    found = Gathered()
+    for segment in catalogue.segments(table):
+        path = catalogue.store / segment.path
+        try:
+            with noticing_damage(catalogue, segment):
+                status = path.stat()
+                if not _is_as_written(path, segment.sha256, status.st_mtime_ns, status.st_size):
+                    raise DamagedSegmentError(segment, "it is not as it was written")
+        except DamagedSegmentError as damage:
+            tell_damaged(found, catalogue, segment, str(damage))
+            catalogue = catalogue.without(segment)
+    return catalogue, found.notes
+
+
+@lru_cache(maxsize=65536)
+def _is_as_written(path: Path, sha256: str, _mtime_ns: int, _size: int) -> bool:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest() == sha256
 
 
 def tell_damaged(found: Gathered, catalogue: Catalogue, segment: Segment, reason: str) -> None:
@@ -102,7 +136,7 @@ def tell_damaged(found: Gathered, catalogue: Catalogue, segment: Segment, reason
         found.notes.append(f"{segment.path} is damaged, its journal was read instead ({reason})")
     for part in lost:
         found.notes.append(f"{segment.path} is damaged, {part.rows} rows are lost ({reason})")
-        found.gaps.append(_gap_of(segment, part, f"{segment.path} is damaged"))
+        found.gaps.append(gap_of_part(segment, part, f"{segment.path} is damaged"))
 
 
 def tell_unreadable(found: Gathered, catalogue: Catalogue, request: Request) -> None:
@@ -111,10 +145,11 @@ def tell_unreadable(found: Gathered, catalogue: Catalogue, request: Request) -> 
         for part in segment.parts if may_hold(segment, request) else ():
             if part.journal not in catalogue.existing:
                 found.notes.append(f"{segment.path}: {part.rows} rows need pyarrow to be read")
-                found.gaps.append(_gap_of(segment, part, "needs pyarrow to be read"))
+                found.gaps.append(gap_of_part(segment, part, "needs pyarrow to be read"))
 
 
-def _gap_of(segment: Segment, part: Part, reason: str) -> Gap:
+def gap_of_part(segment: Segment, part: Part, reason: str) -> Gap:
+    """Return the rows of a part of a segment as a gap."""
     return Gap(part.writer, part.run, part.from_ns, part.to_ns + 1, reason, segment.item, part.rows)
 
 

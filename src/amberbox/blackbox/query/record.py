@@ -24,6 +24,7 @@ from amberbox.blackbox.query.variables import Wanted, resolve, select
 from amberbox.blackbox.segments import columns as col
 from amberbox.blackbox.segments.build import can_build
 from amberbox.blackbox.segments.flat import TableSchema
+from amberbox.blackbox.segments.restoring import notes as damage_notes
 from amberbox.blackbox.store import is_store
 from amberbox.blackbox.where import store_path
 from amberbox.core.errors import UsageError
@@ -50,7 +51,8 @@ class Record:
     """A record opened for reading; a live one shows more each time it is asked.
 
     ``temporary`` holds the store that recording files were imported into; it goes with this
-    object, or with ``close``. ``notes`` say what of them could not be read.
+    object, or with ``close``. ``notes`` say what of them,
+    or of the store's manifest, could not be read.
     """
 
     path: Path
@@ -180,7 +182,8 @@ def open(where: str | Path) -> Record:
     path = Path(where)
     if _is_recording(path):
         return _import(path)
-    return Record(store_path(path))
+    store = store_path(path)
+    return Record(store, notes=tuple(damage_notes(store)))
 
 
 def _is_recording(path: Path) -> bool:

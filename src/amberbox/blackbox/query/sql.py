@@ -10,7 +10,13 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 from amberbox.blackbox.journal.clocktable import ClockTable, Piece
 from amberbox.blackbox.query.catalogue import Catalogue
-from amberbox.blackbox.query.gather import Request, from_journals, gather, merge
+from amberbox.blackbox.query.gather import (
+    Request,
+    from_journals,
+    gather,
+    merge,
+    without_damage,
+)
 from amberbox.blackbox.query.table import Table
 from amberbox.blackbox.segments.columns import NUMPY_TYPES, element_type
 from amberbox.blackbox.segments.columns_io import arrow_type, from_arrow
@@ -68,8 +74,10 @@ def run_sql(catalogue: Catalogue, statement: str) -> Table:
     """
     named, names = _Named(statement), sorted(catalogue.schemas)
     for reading in (named, replace(named, all_columns=True), replace(named, all_tables=True)):
+        notes: list[str] = []
         try:
-            return run_views(partial(_create_views, catalogue, reading), names, statement)
+            create = partial(_create_views, catalogue, reading, notes)
+            return replace(run_views(create, names, statement), notes=tuple(notes))
         except AmberboxError as error:
             if reading.all_tables or _UNREAD not in error.what:
                 raise
@@ -106,12 +114,15 @@ class _Named:
 
 
 def _create_views(
-    catalogue: Catalogue, named: _Named, connection: duckdb.DuckDBPyConnection
+    catalogue: Catalogue, named: _Named, notes: list[str], connection: duckdb.DuckDBPyConnection
 ) -> list[str]:
+    """Create a view for each table; ``notes`` get what is damaged of those that are read."""
     files: list[str] = []
     for table in sorted(catalogue.schemas):
         if named.table(table):
-            _create_view(connection, catalogue, table, named, files)
+            sound, damage = without_damage(catalogue, table)  # DuckDB checks no checksums
+            notes.extend(damage)
+            _create_view(connection, sound, table, named, files)
         else:
             _create_unread_view(connection, catalogue.schema(table))
     return files

@@ -117,6 +117,8 @@ class Pipeline:
         if start < now_ns:
             self.gaps.pause(now_ns)
         self._admission: Admission | None = None
+        if self.names.restored:
+            self.event("restored", self.names.restored)
         if self.room is not None:
             self._admission = Admission(self.room, self.intake, self.gaps, self.event)
 

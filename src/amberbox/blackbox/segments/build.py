@@ -21,10 +21,10 @@ from amberbox.blackbox.segments.flat import Flat, TableSchema, flatten, join
 from amberbox.blackbox.segments.lines import CHECKPOINT
 from amberbox.blackbox.segments.manifest import Part, Segment
 from amberbox.blackbox.segments.parquet import TableFile, describe, read_segment
+from amberbox.blackbox.segments.restoring import FOLDER, journals_of
 from amberbox.core.files import below
 from amberbox.core.types import ColumnData, Gap, IntArray, Ragged
 
-FOLDER = "segments"
 GROUP_ROWS = 60_000
 _GROUP_BYTES = 16 << 20
 SMALL_ROWS = 6_000
@@ -313,7 +313,7 @@ def rebuild(store: Path) -> list[str]:
         name = str(path.relative_to(store))
         try:
             schema, segment = describe(store, name)
-        except (OSError, ValueError, KeyError, TypeError):
+        except mf.UNREADABLE:
             bad.append(name)
             continue
         schemas[schema.id] = schema
@@ -327,27 +327,12 @@ def rebuild(store: Path) -> list[str]:
     records += [mf.segment_record(segment) for segment in kept]
     records += [
         mf.journal_record(journal)
-        for journal in _journals_of(kept)
+        for journal in journals_of(kept, before)
         if not (store / journal.name).exists() and journal.name not in before.columns_gone
     ]
     records += kept_records(replace(before, journals={}), lambda name: True)
     mf.replace(store, records)
     return bad
-
-
-def _journals_of(segments: Sequence[Segment]) -> list[mf.Journal]:
-    """Tell from segments which journals they came from, and how far these reached."""
-    parts: dict[str, list[Part]] = {}
-    for part in (part for segment in segments for part in segment.parts):
-        parts.setdefault(part.journal, []).append(part)
-    return [
-        mf.Journal(
-            name, found[0].head, found[0].writer, found[0].run,
-            min(part.first_seq for part in found), 1 + max(part.last_seq for part in found),
-            min(part.from_ns for part in found), max(part.to_ns for part in found),
-        )
-        for name, found in parts.items()
-    ]  # fmt: skip
 
 
 def _without_replaced(segments: Sequence[Segment]) -> list[Segment]:
@@ -380,6 +365,6 @@ def remove_leftovers(store: Path) -> int:
 def _is_merged(store: Path, name: str, known: mf.Manifest) -> bool:
     try:
         _, segment = describe(store, name)
-    except (OSError, ValueError, KeyError, TypeError):
+    except mf.UNREADABLE:
         return False
     return all(part.journal in known.complete(segment.item) for part in segment.parts)

@@ -72,7 +72,8 @@ def _beginning(known: Manifest, exists: Callable[[str], bool], sign: SignHead) -
 
 def live_records(known: Manifest, exists: Callable[[str], bool]) -> Iterator[Record]:
     """Give the records that say the same as all of a manifest's lines do."""
-    segments = [segment for found in known.segments.values() for segment in found]
+    listed = [segment for found in known.segments.values() for segment in found]
+    segments = [*listed, *known.lost]
     used = {segment.schema for segment in segments}
     for name, schema in known.schemas.items():
         if name in used:
@@ -88,6 +89,8 @@ def kept_records(known: Manifest, exists: Callable[[str], bool]) -> Iterator[Rec
     for sealed in known.sealed.values():
         if sealed.journal in alive:
             yield to_record(sealed)
+    if known.names:
+        yield mf.names_record(known.names)
     for journal in known.journals.values():
         yield mf.journal_record(journal)
     for tombstone in joined(known.tombstones):

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from amberbox.blackbox.segments import columns as col
@@ -42,8 +43,7 @@ class TableSchema:
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> TableSchema:
         """Read what ``to_json`` returned."""
-        columns = tuple(_column_from_json(column) for column in data["columns"])
-        return cls(**{**data, "columns": columns})
+        return msgspec.convert(data, cls, str_keys=True)
 
     @property
     def id(self) -> str:
@@ -65,11 +65,6 @@ def _column_to_json(column: Column) -> dict[str, Any]:
     if column.labels:
         data["labels"] = {str(number): text for number, text in column.labels.items()}
     return data
-
-
-def _column_from_json(data: Mapping[str, Any]) -> Column:
-    labels = {int(number): text for number, text in data.get("labels", {}).items()}
-    return Column(data["name"], data["path"], data["type"], data.get("unit", ""), labels)
 
 
 @lru_cache(maxsize=4096)

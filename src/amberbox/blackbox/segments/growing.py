@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO, Generic, Protocol, TypeVar
 
-from amberbox.blackbox.segments.lines import LineReader
+from amberbox.blackbox.segments.lines import MALFORMED, NONSENSE, LineReader, Record
 
 Result = TypeVar("Result")
 Result_co = TypeVar("Result_co", covariant=True)
@@ -30,6 +30,7 @@ class GrowingLines(Generic[Result]):
     def __init__(self, path: Path, begin: Callable[[], State[Result]]) -> None:
         self._path = path
         self._begin = begin
+        self._nothing = begin().result(LineReader())
         self._lock = threading.Lock()
         self._start_again()
 
@@ -37,7 +38,7 @@ class GrowingLines(Generic[Result]):
         self._state, self._lines = self._begin(), LineReader()
         self._size, self._last_line = 0, b""
         self._seen: tuple[int, int, int] | None = None
-        self._result = self._begin().result(LineReader())
+        self._result = self._nothing
 
     def read(self) -> Result:
         """Return what the file says now; nothing when it is not there."""
@@ -46,7 +47,7 @@ class GrowingLines(Generic[Result]):
                 with self._path.open("rb") as file:
                     return self._read(file)
             except FileNotFoundError:
-                return self._begin().result(LineReader())
+                return self._nothing
 
     def _read(self, file: BinaryIO) -> Result:
         status = os.fstat(file.fileno())
@@ -69,8 +70,7 @@ class GrowingLines(Generic[Result]):
         file.seek(self._size)
         whole, newline, torn = file.read().rpartition(b"\n")
         if newline:
-            for record in self._lines.take(whole):
-                self._state.take(record)
+            _take(self._state, self._lines, self._lines.take(whole))
             self._size += len(whole) + 1
             self._last_line = whole[whole.rfind(b"\n") + 1 :] + newline
         return self._with_torn(file) if torn else self._state.result(self._lines)
@@ -79,6 +79,14 @@ class GrowingLines(Generic[Result]):
         """Read all of it aside: what has no end yet may come differently next time."""
         file.seek(0)
         state, reader = self._begin(), LineReader()
-        for record in reader.take(file.read(), ends=False):
-            state.take(record)
+        _take(state, reader, reader.take(file.read(), ends=False))
         return state.result(reader)
+
+
+def _take(state: State[Any], reader: LineReader, records: Iterable[tuple[int, Record]]) -> None:
+    """Add records; one that cannot be understood although its hash holds is named as damage."""
+    for number, record in records:
+        try:
+            state.take(record)
+        except MALFORMED:
+            reader.damage.append(f"line {number}: {NONSENSE}")

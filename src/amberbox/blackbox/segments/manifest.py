@@ -8,8 +8,10 @@ from collections import Counter
 from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import lru_cache
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
+
+import msgspec
 
 from amberbox.blackbox.journal import reserved
 from amberbox.blackbox.journal.clocktable import ClockPoints, ClockTable
@@ -21,6 +23,11 @@ from amberbox.core.files import sync_folder
 from amberbox.core.types import Gap
 
 NAME = "manifest"
+UNREADABLE = (
+    OSError, ValueError, LookupError, TypeError, AttributeError, RuntimeError, ArithmeticError,
+    MemoryError, msgspec.MsgspecError,
+)  # fmt: skip
+"""What a damaged segment may raise when it is read: its footer has no checksum of its own."""
 CHANGING = threading.RLock()
 """Held by the thread of the keeper that appends to the manifest or deletes what it names."""
 
@@ -90,14 +97,21 @@ class Segment:
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> Segment:
         """Read what ``to_json`` returned."""
-        parts = tuple(part_from_json(part) for part in data["parts"])
-        return cls(**{**data, "parts": parts})
+        segment = msgspec.convert(data, cls)
+        if not segment.parts or not is_inside(segment.path):
+            raise ValueError(f"{segment.path} is no segment of a store")
+        return segment
 
 
 def part_from_json(data: Mapping[str, Any]) -> Part:
     """Read a part as it stands in the manifest and in a segment's own metadata."""
-    clock = tuple((int(log_ns), int(offset_ns)) for log_ns, offset_ns in data["clock"])
-    return Part(**{**data, "clock": clock})
+    return msgspec.convert(data, Part)
+
+
+def is_inside(path: str) -> bool:
+    """Tell whether a path of the manifest stays below the store."""
+    found = PurePosixPath(path)
+    return bool(found.parts) and not found.is_absolute() and ".." not in found.parts
 
 
 def part_clock(part: Part) -> ClockPoints:
@@ -138,7 +152,10 @@ class Manifest:
     far as the manifest has not been condensed since; ``gone_segments`` are files that went thus.
     ``incidents`` is what was said last of each; ``lines`` is how many there are. ``unsigned`` are
     the journals that were sealed after the last signature; ``unconfirmed`` those that a server had
-    confirmed and lacks now.
+    confirmed and lacks now. ``names`` are the items' names by source and topic. ``damage`` names
+    lines that cannot be read, ``mended`` those of which one bit is flipped, ``restored`` the damage
+    that later lines make up for. ``lost`` are segments that are listed and cannot be used, as far
+    as that is known without opening them.
     """
 
     schemas: Mapping[str, TableSchema] = field(default_factory=dict)
@@ -157,6 +174,16 @@ class Manifest:
     incidents: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     unsigned: frozenset[str] = frozenset()
     unconfirmed: frozenset[str] = frozenset()
+    names: Mapping[str, str] = field(default_factory=dict)
+    mended: tuple[str, ...] = ()
+    restored: frozenset[str] = frozenset()
+    lost: tuple[Segment, ...] = ()
+
+    @property
+    def open_damage(self) -> tuple[str, ...]:
+        """Return the damage that no later line makes up for; a torn end is none."""
+        found = (d for d in self.damage if d not in self.restored)
+        return tuple(d for d in found if not d.endswith(text.TORN))
 
     def complete(self, item: str, existing: Container[str] | None = None) -> frozenset[str]:
         """Return the journals whose rows of this item are all in segments.
@@ -198,6 +225,8 @@ class _State:
     incidents: dict[str, Mapping[str, Any]] = field(default_factory=dict)
     unsigned: set[str] = field(default_factory=set)
     unconfirmed: set[str] = field(default_factory=set)
+    names: dict[str, str] = field(default_factory=dict)
+    restored: set[str] = field(default_factory=set)
 
     def take(self, record: Mapping[str, Any]) -> None:
         """Add one record."""
@@ -205,31 +234,43 @@ class _State:
             case "segment":
                 self._take_segment(record)
             case "schema":
-                self.schemas[record["id"]] = TableSchema.from_json(record["schema"])
+                self.schemas[str(record["id"])] = TableSchema.from_json(record["schema"])
             case "journal":
-                self.journals[record["journal"]] = _journal_from_json(record)
+                journal = _journal_from_json(record)
+                self.journals[journal.name] = journal
             case "confirmed":
-                self.confirmed.update(record["journals"])
-                self.unconfirmed.difference_update(record["journals"])
+                self.confirmed.update(_names(record["journals"]))
+                self.unconfirmed.difference_update(_names(record["journals"]))
             case "unconfirmed":
-                self.confirmed.difference_update(record["journals"])
-                self.unconfirmed.update(record["journals"])
+                self.confirmed.difference_update(_names(record["journals"]))
+                self.unconfirmed.update(_names(record["journals"]))
             case "incident":
                 said = {k: v for k, v in record.items() if k not in ("hash", "prev")}
-                self.incidents[record["incident"]["id"]] = said
+                self.incidents[str(record["incident"]["id"])] = said
+            case "names":
+                self.names.update(msgspec.convert(record["names"], dict[str, str]))
+            case "restored":
+                self._take_restored(msgspec.convert(record, Restored))
             case text.CHECKPOINT:
-                self.columns_gone.update(record["columns_gone"])
+                self.columns_gone.update(_names(record["columns_gone"]))
             case _:
                 self._take_entry(from_record(record))
 
     def _take_segment(self, record: Mapping[str, Any]) -> None:
-        for path in record.get("replaces", ()):
-            self.live.pop(path, None)
         segment = Segment.from_json(record["segment"])
+        for path in _names(record.get("replaces", ())):
+            self.live.pop(path, None)
         self.live[segment.path] = segment
         self.gone_segments.discard(segment.path)
         for part in segment.parts:
             self.paths_of.setdefault(part.journal, set()).add(segment.path)
+
+    def _take_restored(self, restored: Restored) -> None:
+        self.restored.update(restored.damage)
+        for name in restored.undone:
+            self.journals.pop(name, None)
+        for path in restored.gone:
+            self.live.pop(path, None)
 
     def _take_entry(self, entry: Sealed | Tombstone | Signature | None) -> None:
         if isinstance(entry, Sealed):
@@ -239,6 +280,8 @@ class _State:
             self.signatures.append(entry)
             self.unsigned.clear()
         elif isinstance(entry, Tombstone):
+            if not (entry.journals and all(map(is_inside, entry.journals))):
+                raise ValueError("a tombstone of nothing in the store")
             self.tombstones.append(entry)
             if entry.what != "columns":
                 self.raw_gone.update(entry.journals)
@@ -264,35 +307,62 @@ class _State:
     def result(self, read: text.LineReader) -> Manifest:
         """Return what it all says, not touched by records to come."""
         return Manifest(
-            dict(self.schemas), _by_item(self.live.values()), dict(self.journals),
+            dict(self.schemas), by_item(self.live.values()), dict(self.journals),
             dict(self.sealed), tuple(self.tombstones),
             frozenset(self.confirmed), tuple(self.signatures), tuple(read.damage), read.last_hash,
             frozenset(self.columns_gone), frozenset(self.raw_gone), frozenset(self.gone_segments),
             read.number, dict(self.incidents), frozenset(self.unsigned),
-            frozenset(self.unconfirmed),
+            frozenset(self.unconfirmed), dict(self.names), tuple(read.mended),
+            frozenset(self.restored),
         )  # fmt: skip
 
 
+class _Reader:
+    """Reads one store's manifest, and restores it once for each state of its lines."""
+
+    def __init__(self, store: Path) -> None:
+        self.lines: GrowingLines[Manifest] = GrowingLines(store / NAME, _State)
+        self._store = store
+        self._last: tuple[Manifest, Manifest] | None = None
+
+    def read(self) -> Manifest:
+        from amberbox.blackbox.segments.restoring import restored  # it reads segments
+
+        known, last = self.lines.read(), self._last
+        if last is None or last[0] is not known:
+            self._last = last = known, restored(self._store, known)
+        return last[1]
+
+
 @lru_cache(maxsize=8)
-def _reader(path: Path) -> GrowingLines[Manifest]:
-    return GrowingLines(path, _State)
+def _reader(store: Path) -> _Reader:
+    return _Reader(store)
 
 
 def read(store: Path) -> Manifest:
-    """Read a store's manifest; lines that do not hold are left out and named in ``damage``."""
-    return _reader(store / NAME).read()
+    """Read a store's manifest; lines that do not hold are named in ``damage``.
+
+    What these said is made up for in memory, as far as segments and journals tell.
+    """
+    return _reader(store).read()
 
 
-def of_records(records: Iterable[Mapping[str, Any]]) -> Manifest:
-    """Return what records add up to, as one has them who mended a damaged manifest."""
-    state, reader = _State(), text.LineReader()
-    for record in records:
-        state.take(record)
-        reader.last_hash, reader.number = record["hash"], reader.number + 1
-    return state.result(reader)
+def why(error: BaseException) -> str:
+    """Return the first line of what an error says."""
+    return next(iter(str(error).splitlines()), type(error).__name__)
 
 
-def _by_item(segments: Iterable[Segment]) -> dict[str, tuple[Segment, ...]]:
+def is_listed(store: Path, segment: Segment) -> bool:
+    """Tell whether the manifest says that a segment is there now."""
+    return any(s.path == segment.path for s in read(store).segments.get(segment.item, ()))
+
+
+def read_lines(store: Path) -> Manifest:
+    """Read a store's manifest as its lines say, and nothing else."""
+    return _reader(store).lines.read()
+
+
+def by_item(segments: Iterable[Segment]) -> dict[str, tuple[Segment, ...]]:
     grouped: dict[str, list[Segment]] = {}
     for segment in segments:
         grouped.setdefault(segment.item, []).append(segment)
@@ -326,12 +396,39 @@ _GAP_FIELDS = (
 
 
 def _journal_from_json(record: Mapping[str, Any]) -> Journal:
-    fields = {name: record[name] for name in _JOURNAL_FIELDS}
-    return Journal(record["journal"], gaps=tuple(Gap(**g) for g in record["gaps"]), **fields)
+    fields = {name: record[name] for name in (*_JOURNAL_FIELDS, "gaps")}
+    return msgspec.convert({"name": record["journal"], **fields}, Journal)
+
+
+def _names(value: object) -> tuple[str, ...]:
+    return msgspec.convert(value, tuple[str, ...])
 
 
 def _gap_to_json(gap: Gap) -> dict[str, Any]:
     return {name: getattr(gap, name) for name in _GAP_FIELDS}
+
+
+@dataclass(frozen=True, slots=True)
+class Restored:
+    """What the keeper found out about damaged lines of the manifest.
+
+    ``damage`` names the lines, ``undone`` the journals that have to be looked through again,
+    ``gone`` segments that are listed and not there. The lines after it say again what was lost.
+    """
+
+    damage: tuple[str, ...] = ()
+    undone: tuple[str, ...] = ()
+    gone: tuple[str, ...] = ()
+
+
+def restored_record(restored: Restored) -> dict[str, Any]:
+    """Say that damaged lines were made up for."""
+    return {"kind": "restored", **asdict(restored)}
+
+
+def names_record(names: Mapping[str, str]) -> dict[str, Any]:
+    """State the item names of sources' topics."""
+    return {"kind": "names", "names": dict(names)}
 
 
 def append(store: Path, records: Sequence[Mapping[str, Any]]) -> None:

@@ -141,16 +141,22 @@ def _sync_and_hash(path: Path) -> tuple[str, int]:
 
 
 def describe(store: Path, path: str) -> tuple[TableSchema, Segment]:
-    """Read back from a segment's own metadata what the manifest says about it."""
+    """Read back from a segment's own metadata what the manifest says about it, and hash it."""
+    schema, segment = outline(store, path)
+    sha256, size = _sync_and_hash(store / path)
+    return schema, replace(segment, sha256=sha256, bytes=size)
+
+
+def outline(store: Path, path: str) -> tuple[TableSchema, Segment]:
+    """Do the same without hashing the file."""
     import pyarrow.parquet as pq
 
     metadata = pq.read_metadata(store / path)
     data = json.loads(metadata.metadata[METADATA])
     schema = TableSchema.from_json(data["schema"])
     parts = tuple(part_from_json(part) for part in data["parts"])
-    sha256, size = _sync_and_hash(store / path)
-    rows = int(metadata.num_rows)
-    return schema, Segment(path, schema.item, schema.id, rows, size, sha256, parts)
+    rows, size = int(metadata.num_rows), (store / path).stat().st_size
+    return schema, Segment(path, schema.item, schema.id, rows, size, "", parts)
 
 
 def read_segment(

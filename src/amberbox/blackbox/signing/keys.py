@@ -138,6 +138,16 @@ def _from_pem(content: bytes) -> str:
     return key.public_bytes_raw().hex()
 
 
+def is_private_key(public: str, store: Path) -> bool | None:
+    """Tell whether a store's private key belongs to this public one; None if it may not be read."""
+    try:
+        return _load(store / PRIVATE).public == public
+    except PermissionError:
+        return None
+    except (OSError, ValueError, TypeError):
+        return False
+
+
 def is_key(public: str, content: bytes) -> bool:
     """Tell whether the bytes of a file hold this public key (hex)."""
     try:

@@ -60,7 +60,10 @@ class HeadLine:
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """Everything that was found in a store; ``files`` says the worst state of each file."""
+    """Everything that was found in a store; ``files`` says the worst state of each file.
+
+    ``uncovered`` says why nothing vouches for other files that are there, and what that means.
+    """
 
     findings: Sequence[Finding]
     files: Mapping[str, State]
@@ -68,6 +71,7 @@ class Report:
     notes: Sequence[str] = ()
     bytes: int = 0
     signed: bool = False
+    uncovered: Mapping[str, str] = field(default_factory=dict)
 
     def is_good(self, *, strict: bool = False) -> bool:
         """Tell whether all is as it was; ``strict`` takes an unsigned end for a fault."""

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 from amberbox.blackbox.segments import manifest as mf
@@ -146,7 +147,7 @@ def _not_reached(writer: str, reach: Reach, checked: Checked, at_ns: int) -> Ite
 class OwnHeads:
     """The statement that lies in a store: its bytes, and what they say if they can be read."""
 
-    content: bytes = b""
+    content: bytes | None = None
     heads: SignedHeads | None = None
 
 
@@ -167,17 +168,25 @@ def check_own_heads(
 ) -> tuple[list[Finding], SignedHeads | None]:
     """Check the statement that lies in the store; None where there is none to go by."""
     heads = own.heads
-    if heads is None and not own.content:
+    if own.content is None:
         text = "there is none: nobody states how far the journals reach"
         return list(_unstated(known, text)), None
     if heads is None:
         return [_bad_heads(own.content, "cannot be read")], None
+    if not heads.signature and not _is_plain(own.content):
+        return [_bad_heads(own.content, "is not as it was written")], None
     if heads.signature and key and (heads.key != key or not heads.holds()):
         return [_bad_heads(own.content, "is not signed with the robot's key")], None
     if heads.store_id != known.store_id:
         return [Finding("altered", HEADS, f"is that of another store ({heads.store_id})")], None
     unsigned = _unstated(known, "is not signed") if not heads.signature else ()
     return [*unsigned, *check_heads(heads, known, HEADS)], heads
+
+
+def _is_plain(content: bytes) -> bool:
+    """Tell whether a statement has no other keys than those that are written."""
+    known = {field.name for field in fields(SignedHeads)}
+    return set(json.loads(content)) <= known
 
 
 def _unstated(known: Known, text: str) -> Iterator[Finding]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import fields
 from typing import Any
 
 import msgspec
@@ -14,14 +15,12 @@ from amberbox.blackbox.incidents.incident import (
     folder_of,
     from_line,
     load_all,
-    to_line,
+    same_window,
 )
 from amberbox.blackbox.segments.manifest import Manifest
 from amberbox.blackbox.store import INCIDENTS, Store
 from amberbox.blackbox.verify.findings import Finding, State
 from amberbox.blackbox.verify.place import TROUBLE
-
-_NOT_COMPARED = {"at_ns", "ring"}
 
 
 def check_incidents(store: Store, known: Manifest) -> Iterator[tuple[str, list[Finding]]]:
@@ -44,6 +43,7 @@ def _check(
     try:
         content = (folder_of(store, incident_id) / FILE).read_bytes()
         found = msgspec.json.decode(content, type=Incident)
+        document = msgspec.json.decode(content)
     except FileNotFoundError:
         if said is not None and said.is_pinned:
             yield _finding("missing", name, f"is gone: {said.text or 'no reason given'}", said)
@@ -51,10 +51,16 @@ def _check(
     except (msgspec.MsgspecError, UnicodeDecodeError):
         yield _finding("damaged", name, "cannot be read; the manifest says what it holds", said)
         return
-    yield from _compare(name, found, said)
+    plain = msgspec.json.format(msgspec.json.encode(document), indent=2)
+    if not document.keys() <= {f.name for f in fields(Incident)} or plain != content:
+        yield _finding("damaged", name, "is not as it was written", said)
+        return
+    yield from _compare(name, found, said, line or {})
 
 
-def _compare(name: str, found: Incident, said: Incident | None) -> Iterator[Finding]:
+def _compare(
+    name: str, found: Incident, said: Incident | None, line: Mapping[str, Any]
+) -> Iterator[Finding]:
     if said is None:
         yield _finding("unsigned", name, "no line of the manifest speaks of it yet", found)
         return
@@ -63,13 +69,8 @@ def _compare(name: str, found: Incident, said: Incident | None) -> Iterator[Find
         yield _finding("altered", name, "reasons or versions are not those written down", said)
     elif found.told != found.state:
         yield _finding("unsigned", name, "was changed after it was written down last", found)
-    elif _values(found) != _values(said):
+    elif not same_window(found, said) or line.get("bytes", found.bytes) != found.bytes:
         yield _finding("altered", name, "is not as it was written down in the manifest", said)
-
-
-def _values(incident: Incident) -> dict[str, Any]:
-    line = to_line(incident, 0)
-    return {key: value for key, value in line.items() if key not in _NOT_COMPARED}
 
 
 def _said(line: Mapping[str, Any] | None) -> Incident | None:

@@ -15,12 +15,6 @@ from amberbox.blackbox.segments.manifest import Manifest
 from amberbox.blackbox.signing.keys import holds
 from amberbox.blackbox.signing.signing import signature_message
 from amberbox.blackbox.verify.findings import Finding, State
-from amberbox.blackbox.verify.mended import without_one_bit
-from amberbox.blackbox.verify.place import TROUBLE
-
-_MOST_BYTES = 16_000
-"""Longer lines are not searched for a flipped bit: it would take minutes."""
-_BEGIN = b'\n{"hash":"'
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,83 +69,41 @@ def check_manifest(store: Path, store_id: str, *, can_check: bool) -> CheckedMan
     _check_order(found, checked)
     for line in found:
         _take(line, store_id, checked, can_check=can_check)
-    try:
-        checked.known = mf.of_records(line.record for line in found)
-    except TROUBLE:
-        text = "a line cannot be understood: nothing of what it lists is checked"
-        checked.findings.append(_finding("altered", text, 0, len(content)))
+    checked.known = mf.read_lines(store)
+    for text in checked.known.damage:
+        if text.endswith(lines.NONSENSE):
+            checked.findings.append(_finding("altered", text, 0, len(content)))
     return checked
 
 
 def _lines(content: bytes, checked: CheckedManifest) -> Iterator[Line]:
     """Give the lines whose hash holds; say of the others what is wrong with them."""
-    pieces = content.split(b"\n")
-    number, offset, last_hash = 0, 0, lines.FIRST_HASH
-    while number < len(pieces):
-        piece, taken = pieces[number], 1
-        found = [record] if (record := _decoded(piece)) else []
-        if piece and not found:
-            found, taken = _mended(pieces, number)
-            after = _next_record(pieces, number + taken)
-            checked.findings += _bad_line(piece, number + 1, offset, found, after, last_hash)
-        for record in found:
-            yield Line(number + 1, offset, record)
+    found = list(lines.split(content))
+    last_hash = lines.FIRST_HASH
+    for place, line in enumerate(found):
+        if line.damaged or line.mended:
+            piece = content[line.offset : line.offset + line.size].split(b"\n")[0]
+            after = next((later.records[0] for later in found[place + 1 :] if later.records), None)
+            checked.findings += _bad_line(line, piece, after, last_hash)
+        for record in line.records:
+            yield Line(line.number, line.offset, record)
             last_hash = record["hash"]
-        offset += sum(len(p) + 1 for p in pieces[number : number + taken])
-        number += taken
-
-
-def _decoded(line: bytes) -> dict[str, Any] | None:
-    try:
-        record = lines.decode(line)
-    except ValueError:
-        return None
-    return record if record is not None and {"kind", "prev"} <= record.keys() else None
-
-
-def _next_record(pieces: Sequence[bytes], start: int) -> dict[str, Any] | None:
-    return next((r for p in pieces[start:] if (r := _decoded(p)) is not None), None)
-
-
-def _mended(pieces: Sequence[bytes], number: int) -> tuple[list[dict[str, Any]], int]:
-    """Undo one flipped bit: in the line, in the line's end, or where it became a line's end."""
-    piece = pieces[number]
-    if len(piece) > _MOST_BYTES:
-        return [], 1
-    cut = piece.find(_BEGIN[1:], 1)
-    if cut > 0:
-        parts = [_decoded(piece[: cut - 1]), _decoded(piece[cut:])]
-        if None not in parts:
-            return [part for part in parts if part is not None], 1
-    candidates = [(piece, 1)]
-    if number + 1 < len(pieces) and pieces[number + 1]:
-        candidates.append((piece + b"\n" + pieces[number + 1], 2))
-    for content, taken in candidates:
-        whole = without_one_bit(content, lambda c: _decoded(c) is not None)
-        record = _decoded(whole) if whole is not None else None
-        if record is not None:
-            return [record], taken
-    return [], 1
 
 
 def _bad_line(
-    line: bytes,
-    number: int,
-    offset: int,
-    found: Sequence[dict[str, Any]],
-    after: dict[str, Any] | None,
-    last_hash: str,
+    line: lines.Line, piece: bytes, after: Mapping[str, Any] | None, last_hash: str
 ) -> Iterator[Finding]:
     """Say what became of a line whose hash does not hold; nothing of one torn by a crash."""
-    if found:
-        yield _finding("damaged", f"line {number}: one bit is flipped", offset, len(line))
+    number, where = line.number, (line.offset, len(piece))
+    if line.mended:
+        yield _finding("damaged", f"line {number}: one bit is flipped", *where)
     elif after is not None and after["prev"] != last_hash:
-        yield _finding("altered", f"line {number} was changed", offset, len(line))
-    elif _is_json(line):
-        yield _finding("altered", f"line {number} was added or changed", offset, len(line))
+        yield _finding("altered", f"line {number} was changed", *where)
+    elif _is_json(piece):
+        yield _finding("altered", f"line {number} was added or changed", *where)
     elif after is None:
         text = f"line {number} is torn: it was being written at a crash or power cut"
-        yield _finding("unsigned", text, offset, len(line))
+        yield _finding("unsigned", text, *where)
 
 
 def _is_json(line: bytes) -> bool:
@@ -193,11 +145,10 @@ def _break(line: Line, *, moved: bool) -> Finding:
 def _take(line: Line, store_id: str, checked: CheckedManifest, *, can_check: bool) -> None:
     try:
         entry = from_record(line.record)
-    except TROUBLE:
-        text = f"line {line.number} cannot be understood"
-        checked.findings.append(_finding("altered", text, line.offset, 0))
-        return
-    checked.claims += [(line.number, *claim) for claim in _claims(line.record, entry)]
+        claims = list(_claims(line.record, entry))
+    except lines.MALFORMED:
+        return  # the manifest's reader has named it
+    checked.claims += [(line.number, *claim) for claim in claims]
     if isinstance(entry, Sealed):
         first, known = checked.sealed.setdefault(entry.journal, (line.number, entry))
         if known != entry:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from amberbox.blackbox.segments import manifest as mf
 from amberbox.blackbox.segments.entries import Signature
-from amberbox.blackbox.signing.keys import PUBLIC, can_sign, is_key, public_key
+from amberbox.blackbox.signing.keys import PUBLIC, can_sign, is_key, public_key, to_pem
 from amberbox.blackbox.signing.signing import STATED, SignedHeads
 from amberbox.blackbox.verify.findings import BAD, Finding, as_text
 from amberbox.blackbox.verify.journal import Checked
@@ -66,6 +66,15 @@ def _choose(
         return published, [note], []
     text = "is gone or cannot be read; the key that the signatures state is believed"
     return "" if last is None else last.key, [], [Finding("damaged", PUBLIC, text)]
+
+
+def check_public(store: Path, trust: Trust) -> Iterator[Finding]:
+    """Compare the bytes of the public key's file with what was written."""
+    if any(finding.file == PUBLIC for finding in trust.findings):
+        return
+    content, published = (store / PUBLIC).read_bytes(), public_key(store)
+    if published is not None and content.decode("ascii", "replace") != to_pem(published):
+        yield Finding("damaged", PUBLIC, "holds the key, but is not as it was written")
 
 
 def _was(path: Path, key: str) -> bool:

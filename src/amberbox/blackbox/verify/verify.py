@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from amberbox.blackbox.journal.buffer import open_buffer
@@ -12,9 +12,10 @@ from amberbox.blackbox.journal.scan import start_record
 from amberbox.blackbox.segments import manifest as mf
 from amberbox.blackbox.segments.manifest import Manifest, Segment
 from amberbox.blackbox.signing.keys import PUBLIC, can_sign
-from amberbox.blackbox.signing.signing import LOCKS, SignedHeads
-from amberbox.blackbox.store import is_locked, open_store
+from amberbox.blackbox.signing.signing import HEADS, LOCKS, SignedHeads
+from amberbox.blackbox.store import IDENTITY, INCIDENTS, Store, is_locked, open_store
 from amberbox.blackbox.verify.continuity import Graves, check_continuity
+from amberbox.blackbox.verify.derived import check_derived, uncovered
 from amberbox.blackbox.verify.findings import BAD, Collected, Finding, HeadLine, Report
 from amberbox.blackbox.verify.heads import (
     Known,
@@ -31,7 +32,7 @@ from amberbox.blackbox.verify.links import links
 from amberbox.blackbox.verify.manifest import CheckedManifest, check_manifest
 from amberbox.blackbox.verify.place import TROUBLE
 from amberbox.blackbox.verify.segments import check_segment
-from amberbox.blackbox.verify.signed import Trust, check_trust, unsigned_ends
+from amberbox.blackbox.verify.signed import Trust, check_public, check_trust, unsigned_ends
 from amberbox.blackbox.verify.targets import target_of
 
 THREADS = 2
@@ -96,6 +97,8 @@ class _Verification:
         for name, findings in check_incidents(self.store, manifest):
             self.collected.take(name, findings)
         sealed = {name: entry for name, (_, entry) in lines.sealed.items()}
+        for name, findings in check_derived(Store(path, store_id), manifest, trust.key):
+            self.collected.take(name, findings)
         known = Known(store_id, lines, journals.by_name, sealed, graves)
         heads = self._heads(known, trust.key)
         ends = unsigned_ends(trust, lines, journals.by_writer, heads)
@@ -104,7 +107,7 @@ class _Verification:
         return Report(
             self.collected.findings, self.collected.files,
             [*_head_lines(lines, journals.by_writer, trust)], self.notes, self.bytes,
-            trust.is_signed,
+            trust.is_signed, uncovered(self.store, self.collected.files, manifest),
         )  # fmt: skip
 
     def _store_id(self) -> str:
@@ -116,7 +119,7 @@ class _Verification:
         if len(stated) == 1 and self.store.id not in stated and len(paths) > 1:
             other = stated.pop()
             text = f"names another store than all of its {len(paths)} journals ({other})"
-            self.collected.take("store.json", [Finding("altered", "store.json", text)])
+            self.collected.take(IDENTITY, [Finding("altered", IDENTITY, text)])
             return other
         return self.store.id
 
@@ -124,6 +127,8 @@ class _Verification:
         trust = check_trust(self.key, self.store.path, lines)
         for finding in trust.findings:
             self.collected.take(finding.file, [finding])
+        if trust.key and lines.signatures:
+            self.collected.take(PUBLIC, list(check_public(self.store.path, trust)))
         self.notes += trust.notes
         return trust
 
@@ -152,7 +157,16 @@ class _Verification:
                 live = locked and place == len(paths)
                 yield target_of(self.store, path, sealed=sealed, before=before, live=live,
                                 store_id=store_id)  # fmt: skip
+                if writer == "ring":
+                    yield from self._copies(path, store_id)
                 before = sealed.chain if sealed is not None else _last_link(path)
+
+    def _copies(self, path: Path, store_id: str) -> Iterator[Target]:
+        """Give what incidents hold of a journal of the ring where it is a file of its own."""
+        for held in sorted((self.store.path / INCIDENTS).glob(f"*/{path.parent.name}/{path.name}")):
+            if held != path and not held.samefile(path):
+                target = target_of(self.store, held, store_id=store_id)
+                yield replace(target, name=str(held.relative_to(self.store.path)))
 
     def _continuity(self, lines: CheckedManifest, journals: _Journals, graves: Graves) -> None:
         sealed = {name: entry for name, (_, entry) in lines.sealed.items()}
@@ -178,6 +192,8 @@ class _Verification:
 
     def _heads(self, known: Known, key: str) -> SignedHeads | None:
         findings, heads = check_own_heads(self.own, known, key)
+        if heads is not None and heads.signature:
+            self.collected.take(HEADS, [])
         for finding in findings:
             self.collected.take(finding.file, [finding])
         for noted in self.noted:
