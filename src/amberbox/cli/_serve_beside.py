@@ -57,6 +57,36 @@ def add_robot(folder: Path, robot: str, groups: Sequence[str]) -> int:
     return 0
 
 
+def judge_clock(folder: Path, *, confirm: bool) -> int:
+    """Print whether the machine's clock agrees with confirmed time; 1 while a jump is held."""
+    from amberbox.core.clock import NS
+    from amberbox.fleet.archive.ageclock import AgeClock
+    from amberbox.fleet.audit.entry import Entry
+    from amberbox.fleet.audit.log import append
+    from amberbox.fleet.database.database import Database
+
+    database = Database(_database(folder))
+    ages = AgeClock(database, SystemClock())
+    try:
+        found = ages.read()
+        if found.jump and confirm:
+            with database.begin() as connection:
+                held = ages.confirm(connection, _who())
+                details = {"jump": held.jump, "by_s": round(held.ahead_ns / NS)}
+                append(
+                    connection, held.wall_ns, Entry(_who(), "", "clock.confirm", "", "ok", details)
+                )
+    finally:
+        database.close()
+    if not found.jump:
+        print("the server's clock agrees with the confirmed time: nothing is held")
+        return 0
+    print("confirmed: recordings grow old by the server's clock again" if confirm else found.text)
+    if not confirm:
+        print(f"hint: if it is right: amberbox serve clock --data {folder} --confirm")
+    return 0 if confirm else 1
+
+
 def verify_audit(folder: Path, heads: Sequence[str]) -> int:
     """Follow the audit log from its first row to its last; 1 when it does not hold."""
     from amberbox.fleet.audit.log import Head

@@ -18,6 +18,7 @@ _PORT = 8443
 _USAGE = """amberbox serve --data DIR [options]
        amberbox serve cert --data DIR --host NAME...
        amberbox serve add-robot ID --data DIR [--group GROUP]...
+       amberbox serve clock --data DIR [--confirm]
        amberbox serve verify-audit --data DIR [--head "NUMBER HASH"]..."""
 _EXIT = "exit status: 0 after an orderly end, 1 it cannot go on, 2 wrong usage"
 
@@ -26,8 +27,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
     parser.usage = _USAGE
     parser.epilog = _EXIT
-    parser.add_argument("words", nargs="*", metavar="cert | add-robot ID | verify-audit",
-                        help="make a certificate, add a robot, verify the audit log")  # fmt: skip
+    parser.add_argument("words", nargs="*", metavar="cert | add-robot ID | clock | verify-audit",
+                        help="make a certificate, add a robot, judge the clock, verify the "
+                        "audit log")  # fmt: skip
     parser.add_argument("--data", required=True, metavar="DIR", help="the server's data folder")
     parser.add_argument("--host", action="append", metavar="NAME",
                         help="address to listen at (127.0.0.1); cert: what the server is called, "
@@ -41,6 +43,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
                         help="make a code that lets somebody become an admin")  # fmt: skip
     parser.add_argument("--group", action="append", default=[], metavar="GROUP",
                         help="add-robot: a group that the robot is in")  # fmt: skip
+    parser.add_argument("--confirm", action="store_true",
+                        help="clock: it is right, recordings may grow old by it")  # fmt: skip
     parser.add_argument("--head", action="append", default=[], metavar="HEAD",
                         help="verify-audit: a head that was noted elsewhere")  # fmt: skip
     parser.add_argument("--quiet", action="store_true", help="print troubles only")
@@ -59,8 +63,9 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _serve(args: argparse.Namespace) -> int:
-    if args.group or args.head:
-        raise UsageError("--group is for add-robot, --head for verify-audit", _USAGE)
+    if args.group or args.head or args.confirm:
+        what = "--group is for add-robot, --head for verify-audit, --confirm for clock"
+        raise UsageError(what, _USAGE)
     if args.host is not None and len(args.host) > 1:
         raise UsageError("a server listens at one address", "--host 0.0.0.0 for all of them")
     check_installed()
@@ -117,6 +122,12 @@ def _add_robot(args: argparse.Namespace) -> int:
     return add_robot(Path(args.data), args.words[1], args.group)
 
 
+def _clock(args: argparse.Namespace) -> int:
+    from amberbox.cli._serve_beside import judge_clock
+
+    return judge_clock(Path(args.data), confirm=args.confirm)
+
+
 def _verify_audit(args: argparse.Namespace) -> int:
     from amberbox.cli._serve_beside import verify_audit
 
@@ -126,5 +137,6 @@ def _verify_audit(args: argparse.Namespace) -> int:
 _BESIDE: Mapping[str, Callable[[argparse.Namespace], int]] = {
     "cert": _cert,
     "add-robot": _add_robot,
+    "clock": _clock,
     "verify-audit": _verify_audit,
 }
