@@ -2,8 +2,8 @@
 
 For room: (1) what a server has confirmed, oldest first; (2) unconfirmed data of the ring; (3) of
 class bulk; (4) all other unconfirmed data, oldest first, but never the newest ``keep_min_s``;
-(5) confirmed incidents. Never what is pinned, and never events and statuses: their tables are no
-part of a unit.
+(5) columns of what has to stay, where its journal holds the same; (6) confirmed incidents. Never
+what is pinned, and never events and statuses: their tables are no part of a unit.
 """
 
 from __future__ import annotations
@@ -99,6 +99,20 @@ def for_room(units: Sequence[Unit], needed_bytes: int, options: KeeperOptions) -
             break
         found.append(removal)
         freed += removal.freed_bytes
+    return found
+
+
+def spared_columns(units: Iterable[Unit], needed_bytes: int) -> list[Removal]:
+    """Return whose columns go for room while the journals, which hold the same rows, stay.
+
+    For units that have to stay, when nothing else may go.
+    """
+    found, freed = [], 0
+    for unit in by_age(u for u in units if u.raw_bytes and u.column_bytes):
+        if freed >= needed_bytes:
+            break
+        found.append(Removal(unit, "columns", ROOM))
+        freed += unit.column_bytes
     return found
 
 

@@ -13,6 +13,7 @@ from amberbox.blackbox.deletion.rule import Unit, Window, ages_s
 from amberbox.blackbox.deletion.usage import DiskUse
 from amberbox.blackbox.follow.follow import RECORDED
 from amberbox.blackbox.follow.read import JournalFile, journal_file
+from amberbox.blackbox.incidents.extent import extent
 from amberbox.blackbox.journal.clocktable import ClockTable
 from amberbox.blackbox.segments import manifest as mf
 from amberbox.blackbox.segments.manifest import Manifest
@@ -89,7 +90,8 @@ class Stock:
         self, known: Manifest, windows: Mapping[str, Window], pending: Callable[[str], bool]
     ) -> list[Unit]:
         """Return everything that the rule chooses from."""
-        ages, columns = ages_s(list(windows.values())), self._column_bytes(known)
+        ages = ages_s([*windows.values(), *self._growing()])
+        columns = self._column_bytes(known)
         units = [
             Unit(
                 w.name, w.writer, w.run, w.start_ns, w.end_ns, ages[w.name],
@@ -99,6 +101,23 @@ class Stock:
             for w in windows.values()
         ]  # fmt: skip
         return [unit for unit in units if unit.raw_bytes or unit.column_bytes]
+
+    def _growing(self) -> list[Window]:
+        """Return the file that is being written: what it holds makes all others older.
+
+        Also while nothing but events is recorded, or nothing would become old enough to go.
+        """
+        if not is_locked(self._store, "main"):
+            return []
+        paths = self._store.journal_files("main")[-1:]
+        founds = (extent(path) for path in paths)
+        return [
+            Window(
+                found.name, "main", found.run, _place(found.name)[1], 0, 0,
+                found.start_ns + found.offset_ns, found.end_ns + found.offset_ns, "",
+            )
+            for found in founds if found is not None
+        ]  # fmt: skip
 
     def ring(self) -> list[tuple[Window, float]]:
         """Return the files of the ring that nobody writes any more, and their ages."""
