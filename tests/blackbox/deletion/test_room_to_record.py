@@ -85,7 +85,7 @@ def robot(
     rate: int = 1_000_000,
     share: float = 0.5,
 ) -> Iterator[Robot]:
-    with tempfile.TemporaryDirectory(prefix="amberbox-room-") as folder:
+    with tempfile.TemporaryDirectory(prefix="amberbox-room-", ignore_cleanup_errors=True) as folder:
         made = Robot(Path(folder) / "store", store, classes, rate, share)
         try:
             yield made
