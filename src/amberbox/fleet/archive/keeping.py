@@ -80,6 +80,7 @@ class Keeping:
         self._said = "disk_ok"
         self._trouble = ""
         bus.on("journal", self._hear)
+        bus.on("robot", self._hear)  # its signing key may have been confirmed
         bus.on("connected", self._hear_connected)
         bus.on("gone", lambda change: self._ages.forget(change.robot))
 
@@ -147,7 +148,9 @@ class Keeping:
 
     async def _commit_once(self) -> float | None:
         """Commit what is due; return after how many seconds more is, None if nothing waits."""
-        await self._apart(partial(settling.note_lost, self._archive, self._database))
+        archive, database = self._archive, self._database
+        await self._apart(partial(settling.take_confirmed, archive, database, self._folder))
+        await self._apart(partial(settling.note_lost, archive, database))
         self._tell(await self._apart(partial(settling.settle, self._database, self._clock)))
         if not await self._apart(self._has_work):
             return None
