@@ -100,9 +100,7 @@ def decide_signing_key(folder: Path, robot: str, *, confirm: bool) -> int:
     finally:
         database.close()
     took = "; a server that runs takes them over with the next that comes" if confirm else ""
-    print(
-        f"{'confirmed' if confirm else 'refused'}: {keys[0]}, {journals} journals were waiting{took}"
-    )
+    print(f"{'confirmed' if confirm else 'refused'}: {keys[0]}, {journals} journals waited{took}")
     return 0
 
 
