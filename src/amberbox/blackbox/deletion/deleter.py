@@ -168,7 +168,7 @@ class Deleter:
         with mf.CHANGING:
             known = mf.read(self._store.path)
             windows = self.stock.windows(known)
-            units = self.stock.units(known, windows, self._pending)
+            units = self.stock.units(known, windows, self._pending, sure=True)
             chosen = too_old(self._free(units), self._options)[:_BATCH]
             return self._remove(chosen, windows)
 

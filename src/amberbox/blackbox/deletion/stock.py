@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 
@@ -75,7 +75,8 @@ class Stock:
         if sealed is not None:
             return Window(
                 name, sealed.writer, sealed.run, sealed.number, sealed.first_seq, sealed.end_seq,
-                sealed.start_ns, sealed.end_ns, sealed.chain,
+                sealed.start_ns, sealed.end_ns, sealed.chain, _stepped_ns(sealed.clock),
+                sealed.synchronised,
             )  # fmt: skip
         if done is not None:
             _, number = _place(name)
@@ -87,10 +88,15 @@ class Stock:
         return self._looked.get(name)
 
     def units(
-        self, known: Manifest, windows: Mapping[str, Window], pending: Callable[[str], bool]
+        self,
+        known: Manifest,
+        windows: Mapping[str, Window],
+        pending: Callable[[str], bool],
+        *,
+        sure: bool = False,
     ) -> list[Unit]:
-        """Return everything that the rule chooses from."""
-        ages = ages_s([*windows.values(), *self._growing()])
+        """Return everything that the rule chooses from; ``sure`` ages are those of ``ages_s``."""
+        ages = ages_s([*windows.values(), *self._growing()], sure=sure)
         columns = self._column_bytes(known)
         units = [
             Unit(
@@ -154,5 +160,11 @@ def window_of(journal: JournalFile) -> Window:
     )
     return Window(
         journal.name, journal.writer, journal.run, journal.number, journal.first_seq,
-        journal.end_seq, start_ns, end_ns, journal.chain,
+        journal.end_seq, start_ns, end_ns, journal.chain, _stepped_ns(journal.clock),
+        journal.readings[-1].synchronised if journal.readings else None,
     )  # fmt: skip
+
+
+def _stepped_ns(clock: Sequence[tuple[int, int]]) -> int:
+    """Return by how much the wall clock was set against log time within a file."""
+    return clock[-1][1] - clock[0][1] if clock else 0
