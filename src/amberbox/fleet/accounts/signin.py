@@ -116,7 +116,7 @@ def change_password(
         set_password(connection, now_ns, account, new_hash)
         revoked = revoke_tokens(connection, now_ns, user.user_id) if with_tokens else 0
         told = {"tokens_revoked": str(revoked)} if with_tokens else {}
-        append(connection, now_ns, _entry(account, caller, CHANGE, **told))
+        append(connection, now_ns, _entry(account, caller, CHANGE, "ok", **told))
         return begin_session(connection, now_ns, user.user_id, caller.address, caller.agent)
 
 
