@@ -321,7 +321,7 @@ def test_journals_and_reserve_fit_into_a_small_quota(tmp_path: Path) -> None:
     path = folder(tmp_path, "- ros: {topics: [{name: /a}]}")
     (path / "robot.yaml").write_text("id: small\nstore: {quota: 80 MB}\n")
     store = load_folder(path).robot.store
-    assert (store.rotate_bytes, store.reserve_bytes) == (10_000_000, 10_000_000)
+    assert (store.rotate_bytes, store.reserve_bytes) == (5_000_000, 10_000_000)
     (path / "robot.yaml").write_text("id: small\nstore: {quota: 80 MB, rotate_mb: 4, reserve: 0}\n")
     store = load_folder(path).robot.store
     assert (store.rotate_bytes, store.reserve_bytes) == (4_000_000, 0)

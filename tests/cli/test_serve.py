@@ -27,9 +27,12 @@ from amberbox.blackbox.signing.keys import open_keys
 from amberbox.blackbox.store import open_store
 from amberbox.cli.main import main
 from amberbox.fleet.accounts.robotkeys import revoke_keys
+from amberbox.fleet.archive.ageclock import OPTION, Mark
 from amberbox.fleet.archive.tables import JOURNALS
+from amberbox.fleet.audit.tables import AUDIT
 from amberbox.fleet.database.database import Database
 from amberbox.fleet.linkend.tables import COMMITTED, ROW
+from amberbox.fleet.options import options
 from amberbox.link.frames import Bye, Hello, encode, from_server
 from amberbox.link.joining import JoinLine, read_join_line
 from amberbox.robot.link.copying import Copier, HttpSending
@@ -278,6 +281,26 @@ def test_the_audit_log_holds_while_the_server_runs(
     assert "rewritten" in capsys.readouterr().out
 
 
+def test_a_jump_of_the_clock_is_told_and_confirmed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    database = Database(tmp_path / "server.db")
+    mark = Mark(time.time_ns() - 32 * 86_400 * 10**9, "an earlier boot")
+    with database.begin() as connection:
+        options.write(connection, 0, OPTION, mark)
+    clock = ["serve", "clock", "--data", str(tmp_path)]
+    assert main(clock) == 1
+    said = capsys.readouterr().out
+    assert "ahead of the confirmed time" in said
+    assert f"hint: if it is right: amberbox serve clock --data {tmp_path} --confirm" in said
+    assert main([*clock, "--confirm"]) == 0
+    assert "confirmed" in capsys.readouterr().out
+    assert main(clock) == 0
+    with database.reading() as connection:
+        assert connection.scalars(select(AUDIT.c.action)).all() == ["clock.confirm"]
+    database.close()
+
+
 def test_it_ends_in_order_and_says_goodbye(server: Server, line: JoinLine, tmp_path: Path) -> None:
     async def scene() -> tuple[int, str, float]:
         context = await asyncio.to_thread(context_for, line.url, line.ca, tmp_path)
@@ -308,6 +331,8 @@ def test_it_ends_in_order_and_says_goodbye(server: Server, line: JoinLine, tmp_p
         (["add-robot"], "takes one ID"),
         (["add-robot", "r1"], "no data folder"),
         (["verify-audit"], "no data folder"),
+        (["clock"], "no data folder"),
+        (["--confirm"], "--confirm for clock"),
         (["certt"], "knows no 'certt'"),
         (["--head", "1 abc"], "--head for verify-audit"),
     ],

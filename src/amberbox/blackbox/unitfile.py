@@ -47,8 +47,9 @@ class Service:
 
 def service_of(folder: RobotFolder, name: str, user: str, verb: str = "record") -> Service:
     """Describe the service of a robot folder; raise UsageError for a name systemd cannot use."""
-    if not is_id(name):
-        raise UsageError(f"'{name}' is no name for a service", f"--name {derive_id(name)}")
+    if not is_id(name) or name.startswith("-"):  # systemctl would take it for an option
+        hint = f"--name {derive_id(name.lstrip('-') or 'robot')}"
+        raise UsageError(f"'{name}' is no name for a service", hint)
     path, store = folder.path.resolve(), folder.store_path.resolve()
     options = folder.robot.store
     ring = (path / options.ring_path).resolve() if options.ring_path else None

@@ -83,6 +83,83 @@ def _warn_readable() -> None:
               "hint: chmod 600 it now; next time: --line-file FILE", file=sys.stderr)  # fmt: skip
 
 
+def list_signing_keys(folder: Path) -> int:
+    """Print the keys that robots sign with since and that wait for an admin; 1 if there are any."""
+    from amberbox.core.timetext import format_time
+    from amberbox.fleet.database.database import Database
+    from amberbox.fleet.linkend.signingkeys import pending_keys
+
+    database = Database(_database(folder))
+    try:
+        with database.reading() as connection:
+            found = pending_keys(connection)
+    finally:
+        database.close()
+    for key in found:
+        print(f"{key.robot}: signs with {key.public_key} since {format_time(key.first_seen_ns)}")
+        print(f"hint: amberbox serve signing-key {key.robot} confirm --data {folder}, or refuse")
+    if not found:
+        print("no robot signs with another key than before")
+    return 1 if found else 0
+
+
+def decide_signing_key(folder: Path, robot: str, *, confirm: bool) -> int:
+    """Confirm or refuse the key that a robot signs with since."""
+    from amberbox.fleet.audit.entry import Entry
+    from amberbox.fleet.audit.log import append
+    from amberbox.fleet.database.database import Database
+    from amberbox.fleet.linkend.signingkeys import decide, pending_keys
+
+    word = "confirm" if confirm else "refuse"
+    database = Database(_database(folder))
+    try:
+        with database.begin() as connection:
+            now_ns = SystemClock().wall_ns()
+            keys = list(dict.fromkeys(k.public_key for k in pending_keys(connection, robot)))
+            if len(keys) != 1:
+                what = f"{len(keys) or 'no'} keys of {robot} wait for a decision"
+                raise UsageError(what, "amberbox serve signing-key shows all; or at /admin/robots")
+            journals = decide(connection, now_ns, robot, keys[0], confirm=confirm)
+            details = {"public_key": keys[0], "journals": journals}
+            entry = Entry(_who(), "", f"robots.signing_key.{word}", robot, details=details)
+            append(connection, now_ns, entry)
+    finally:
+        database.close()
+    took = "; a server that runs takes them over with the next that comes" if confirm else ""
+    print(f"{'confirmed' if confirm else 'refused'}: {keys[0]}, {journals} journals waited{took}")
+    return 0
+
+
+def judge_clock(folder: Path, *, confirm: bool) -> int:
+    """Print whether the machine's clock agrees with confirmed time; 1 while a jump is held."""
+    from amberbox.core.clock import NS
+    from amberbox.fleet.archive.ageclock import AgeClock
+    from amberbox.fleet.audit.entry import Entry
+    from amberbox.fleet.audit.log import append
+    from amberbox.fleet.database.database import Database
+
+    database = Database(_database(folder))
+    ages = AgeClock(database, SystemClock())
+    try:
+        found = ages.read()
+        if found.jump and confirm:
+            with database.begin() as connection:
+                held = ages.confirm(connection, _who())
+                details = {"jump": held.jump, "by_s": round(held.ahead_ns / NS)}
+                append(
+                    connection, held.wall_ns, Entry(_who(), "", "clock.confirm", "", "ok", details)
+                )
+    finally:
+        database.close()
+    if not found.jump:
+        print("the server's clock agrees with the confirmed time: nothing is held")
+        return 0
+    print("confirmed: recordings grow old by the server's clock again" if confirm else found.text)
+    if not confirm:
+        print(f"hint: if it is right: amberbox serve clock --data {folder} --confirm")
+    return 0 if confirm else 1
+
+
 def verify_audit(folder: Path, heads: Sequence[str]) -> int:
     """Follow the audit log from its first row to its last; 1 when it does not hold."""
     from amberbox.fleet.audit.log import Head

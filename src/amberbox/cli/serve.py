@@ -18,6 +18,8 @@ _PORT = 8443
 _USAGE = """amberbox serve --data DIR [options]
        amberbox serve cert --data DIR --host NAME...
        amberbox serve add-robot ID --data DIR [--group GROUP]... [--line-file FILE]
+       amberbox serve signing-key [ID confirm|refuse] --data DIR
+       amberbox serve clock --data DIR [--confirm]
        amberbox serve verify-audit --data DIR [--head "NUMBER HASH"]..."""
 _EXIT = "exit status: 0 after an orderly end, 1 it cannot go on, 2 wrong usage"
 
@@ -26,8 +28,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
     parser.usage = _USAGE
     parser.epilog = _EXIT
-    parser.add_argument("words", nargs="*", metavar="cert | add-robot ID | verify-audit",
-                        help="make a certificate, add a robot, verify the audit log")  # fmt: skip
+    words = "cert | add-robot ID | signing-key | clock | verify-audit"
+    parser.add_argument("words", nargs="*", metavar=words,
+                        help="make a certificate, add a robot, decide on a robot's new signing "
+                        "key, judge the clock, verify the audit log")  # fmt: skip
     parser.add_argument("--data", required=True, metavar="DIR", help="the server's data folder")
     parser.add_argument("--host", action="append", metavar="NAME",
                         help="address to listen at (127.0.0.1); cert: what the server is called, "
@@ -44,6 +48,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--line-file", metavar="FILE",
                         help="add-robot: write the line into a new file with mode 0600, "
                         "instead of printing it")  # fmt: skip
+    parser.add_argument("--confirm", action="store_true",
+                        help="clock: it is right, recordings may grow old by it")  # fmt: skip
     parser.add_argument("--head", action="append", default=[], metavar="HEAD",
                         help="verify-audit: a head that was noted elsewhere")  # fmt: skip
     parser.add_argument("--quiet", action="store_true", help="print troubles only")
@@ -62,8 +68,11 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _serve(args: argparse.Namespace) -> int:
-    if args.group or args.line_file or args.head:
-        what = "--group and --line-file are for add-robot, --head for verify-audit"
+    if args.group or args.line_file or args.head or args.confirm:
+        what = (
+            "--group and --line-file are for add-robot, --head for verify-audit, "
+            "--confirm for clock"
+        )
         raise UsageError(what, _USAGE)
     if args.host is not None and len(args.host) > 1:
         raise UsageError("a server listens at one address", "--host 0.0.0.0 for all of them")
@@ -125,6 +134,23 @@ def _add_robot(args: argparse.Namespace) -> int:
     return add_robot(Path(args.data), args.words[1], args.group, file)
 
 
+def _signing_key(args: argparse.Namespace) -> int:
+    from amberbox.cli._serve_beside import decide_signing_key, list_signing_keys
+
+    words = args.words[1:]
+    if not words:
+        return list_signing_keys(Path(args.data))
+    if len(words) != 2 or words[1] not in ("confirm", "refuse"):
+        raise UsageError("signing-key takes ID and confirm or refuse, or nothing", _USAGE)
+    return decide_signing_key(Path(args.data), words[0], confirm=words[1] == "confirm")
+
+
+def _clock(args: argparse.Namespace) -> int:
+    from amberbox.cli._serve_beside import judge_clock
+
+    return judge_clock(Path(args.data), confirm=args.confirm)
+
+
 def _verify_audit(args: argparse.Namespace) -> int:
     from amberbox.cli._serve_beside import verify_audit
 
@@ -134,5 +160,7 @@ def _verify_audit(args: argparse.Namespace) -> int:
 _BESIDE: Mapping[str, Callable[[argparse.Namespace], int]] = {
     "cert": _cert,
     "add-robot": _add_robot,
+    "signing-key": _signing_key,
+    "clock": _clock,
     "verify-audit": _verify_audit,
 }

@@ -23,7 +23,7 @@ def derive_id(text: str) -> str:
     if is_id(text):
         return text
     ascii_text = unicodedata.normalize("NFKD", text).encode("ascii", "ignore").decode().lower()
-    readable = re.sub(r"[^a-z0-9_.-]+", "_", ascii_text).strip("_.")
+    readable = re.sub(r"[^a-z0-9_.-]+", "_", ascii_text).strip("_.-")
     digits = hashlib.sha256(text.encode("utf-8", "surrogateescape")).hexdigest()[:4]
     if not readable:
         return f"id_{digits}"

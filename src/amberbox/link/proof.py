@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -71,6 +72,15 @@ def _to_signature(lines: Sequence[bytes], at: int) -> list[bytes]:
         if b',"kind":"signed",' in line[:200]:
             break
     return taken
+
+
+def signing_key(proof: Proof) -> str:
+    """Return the key (hex) that a proof says it is signed with; empty where it says none."""
+    record = decode(proof.lines.rpartition("\n")[2].encode())
+    with suppress(ProofError):
+        found = _entry(record) if record is not None else None
+        return found.key if isinstance(found, Signature) else ""
+    return ""
 
 
 def prove(proof: Proof, store_id: str, journal: str, public_key: str) -> Proven:

@@ -140,6 +140,17 @@ def test_ages_count_recorded_time_whatever_the_clock_did() -> None:
     assert ages_s(files) == {"3": 0.0, "2": 10.0, "1": 9509.0, "0": 9519.0}
 
 
+def test_lifetimes_count_no_pause_that_a_wrong_clock_makes() -> None:
+    month = 32 * 86_400
+    files = [
+        replace(window("0", 1, 1000, 1010), synchronised=True),
+        replace(window("1", 2, 1020, 1030), synchronised=True),
+        replace(window("2", 3, month, month + 10), synchronised=False),
+        replace(window("3", 4, 2000, 2010 + month), synchronised=True, stepped_ns=month * NS),
+    ]
+    assert ages_s(files, sure=True) == {"3": 0.0, "2": 10.0, "1": 20.0, "0": 40.0}
+
+
 def test_other_writers_are_placed_among_the_main_journals() -> None:
     files = [
         *(window(str(n), 1, n * 10, n * 10 + 10) for n in range(1, 5)),

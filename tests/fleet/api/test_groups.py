@@ -32,6 +32,19 @@ def test_a_group_is_added_once(home: House) -> None:
     assert [one["name"] for one in admin.get(GROUPS, params={"limit": 1}).json()] == ["cellar"]
 
 
+@pytest.mark.parametrize("name", ["-cellar", "--data", "-"])
+def test_no_new_name_looks_like_an_option(home: House, name: str) -> None:
+    admin = home.client("admin")
+    for path, body in (
+        (GROUPS, {"name": name}),
+        ("/api/v1/robots", {"robot": name}),
+        ("/api/v1/users", {"name": name, "role": "viewer"}),
+    ):
+        found = admin.post(path, json=body)
+        assert found.status_code == 400, path
+        assert "hyphen (not first)" in found.text
+
+
 def test_a_group_that_is_removed_grants_nothing_any_more(home: House) -> None:
     heard: list[Change] = []
     home.services.bus.on("robot", heard.append)

@@ -114,6 +114,17 @@ def test_a_new_password_ends_all_sessions_but_a_new_one(home: House) -> None:
     assert [change.data["name"] for change in heard] == ["operator"]
 
 
+@pytest.mark.parametrize("revokes", [True, False])
+def test_a_new_password_revokes_ones_tokens_if_asked_to(home: House, revokes: bool) -> None:
+    program = home.token_client("operator", "read:status")
+    others = home.token_client("technician", "read:status")
+    body = {"old": PASSWORD, "new": NEW, "revoke_tokens": revokes}
+    assert signed_in(home).put(f"{PATH}/password", json=body).status_code == 200
+    assert program.get("/api/v1/robots").status_code == (401 if revokes else 200)
+    assert others.get("/api/v1/robots").status_code == 200
+    assert "revoke_tokens" in home.client("technician").get("/account").text
+
+
 @pytest.mark.parametrize(
     ("old", "new", "status"),
     [(PASSWORD, "short", 400), ("wrong passphrase", NEW, 401), (PASSWORD, "x" * 2000, 422)],

@@ -12,6 +12,7 @@ import pytest
 from amberbox.fleet.accounts.onetime import ALPHABET, one_time_password
 from amberbox.fleet.accounts.passwords import refuse_weak
 from amberbox.fleet.accounts.signin import Caller, WrongLoginError, sign_in
+from amberbox.fleet.accounts.tokens import working_tokens
 from amberbox.fleet.audit.tables import AUDIT
 from amberbox.fleet.bus import Change
 from tests.fleet.house import PASSWORD, House, house
@@ -145,6 +146,19 @@ def test_a_reset_password_ends_all_sessions(home: House) -> None:
     assert viewer.get("/api/v1/session").status_code == 401
     assert not _sign_in(home, "viewer", PASSWORD)
     assert _sign_in(home, "viewer", password)
+
+
+@pytest.mark.parametrize("revokes", [True, False])
+def test_a_reset_password_revokes_tokens_if_asked_to(home: House, revokes: bool) -> None:
+    program = home.token_client("technician", "read:status")
+    admin = home.client("admin")
+    assert "New password, revoke tokens" in admin.get("/admin/users").text
+    body = {"revoke_tokens": revokes}
+    assert admin.post(f"{USERS}/technician/password", json=body).status_code == 200
+    assert program.get("/api/v1/robots").status_code == 401, "the account must change its password"
+    with home.services.database.reading() as connection:
+        left = working_tokens(connection, home.clock.wall_ns())
+    assert ("technician" in left) is not revokes
 
 
 def test_ones_own_password_takes_the_old_one(home: House) -> None:

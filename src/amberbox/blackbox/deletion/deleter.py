@@ -15,7 +15,15 @@ from amberbox.blackbox.deletion.limit import FullMark, Room, room, with_reserve
 from amberbox.blackbox.deletion.log import DeletionLog
 from amberbox.blackbox.deletion.pinlock import pin_lock
 from amberbox.blackbox.deletion.removal import Remover
-from amberbox.blackbox.deletion.rule import Removal, Unit, Window, for_room, too_old, unpinned
+from amberbox.blackbox.deletion.rule import (
+    Removal,
+    Unit,
+    Window,
+    for_room,
+    spared_columns,
+    too_old,
+    unpinned,
+)
 from amberbox.blackbox.deletion.stock import Stock
 from amberbox.blackbox.deletion.usage import DiskUse
 from amberbox.blackbox.keeper.options import KeeperOptions
@@ -139,8 +147,11 @@ class Deleter:
     def _delete_some(self, needed_bytes: int) -> int:
         known = mf.read(self._store.path)
         windows = self.stock.windows(known)
-        units = self._free(self.stock.units(known, windows, self._pending))
-        return self._remove(for_room(units, needed_bytes, self._options)[:_BATCH], windows)
+        units = self.stock.units(known, windows, self._pending)
+        chosen = for_room(self._free(units), needed_bytes, self._options)
+        if not chosen:  # then recording would stop: what is there twice goes first
+            chosen = spared_columns((u for u in units if u.name != self._busy), needed_bytes)
+        return self._remove(chosen[:_BATCH], windows)
 
     def _free(self, units: Sequence[Unit]) -> list[Unit]:
         return unpinned((u for u in units if u.name != self._busy), pinning(self._store))
@@ -157,7 +168,7 @@ class Deleter:
         with mf.CHANGING:
             known = mf.read(self._store.path)
             windows = self.stock.windows(known)
-            units = self.stock.units(known, windows, self._pending)
+            units = self.stock.units(known, windows, self._pending, sure=True)
             chosen = too_old(self._free(units), self._options)[:_BATCH]
             return self._remove(chosen, windows)
 

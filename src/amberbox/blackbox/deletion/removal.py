@@ -34,11 +34,13 @@ class Remover:
     ) -> list[tuple[Removal, Tombstone]]:
         """Delete what is not pinned; return what went, with its tombstone.
 
+        Of what is pinned columns may go whose rows the journal still holds.
+
         Raises OSError when the disk does not take the tombstones: then nothing went.
         """
         with pin_lock(self.store):
             free = {u.name for u in unpinned([r.unit for r in removals], self.pins())}
-            chosen = [removal for removal in removals if removal.unit.name in free]
+            chosen = [r for r in removals if r.unit.name in free or self._stays_in_raw(r)]
             return self._remove(chosen, places) if chosen else []
 
     def _remove(
@@ -60,6 +62,9 @@ class Remover:
             self._unlink_raw(tombstone)
         self._unlink_segments(known)
         return gone
+
+    def _stays_in_raw(self, removal: Removal) -> bool:
+        return removal.what == "columns" and (self.store.path / removal.unit.name).exists()
 
     def _what(self, removal: Removal, known: Manifest) -> What | None:
         """Say what really goes: what is not there cannot, raw alone is all there is without."""

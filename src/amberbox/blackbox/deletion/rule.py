@@ -2,8 +2,8 @@
 
 For room: (1) what a server has confirmed, oldest first; (2) unconfirmed data of the ring; (3) of
 class bulk; (4) all other unconfirmed data, oldest first, but never the newest ``keep_min_s``;
-(5) confirmed incidents. Never what is pinned, and never events and statuses: their tables are no
-part of a unit.
+(5) columns of what has to stay, where its journal holds the same; (6) confirmed incidents. Never
+what is pinned, and never events and statuses: their tables are no part of a unit.
 """
 
 from __future__ import annotations
@@ -102,6 +102,20 @@ def for_room(units: Sequence[Unit], needed_bytes: int, options: KeeperOptions) -
     return found
 
 
+def spared_columns(units: Iterable[Unit], needed_bytes: int) -> list[Removal]:
+    """Return whose columns go for room while the journals, which hold the same rows, stay.
+
+    For units that have to stay, when nothing else may go.
+    """
+    found, freed = [], 0
+    for unit in by_age(u for u in units if u.raw_bytes and u.column_bytes):
+        if freed >= needed_bytes:
+            break
+        found.append(Removal(unit, "columns", ROOM))
+        freed += unit.column_bytes
+    return found
+
+
 def _in_order(units: Sequence[Unit], options: KeeperOptions) -> Iterator[Removal]:
     candidates = list(_by_the_rule(units, options))
     raw_s, columns_s = _lifetimes(options)
@@ -143,7 +157,11 @@ def _lifetimes(options: KeeperOptions) -> tuple[float, float]:
 
 @dataclass(frozen=True, slots=True)
 class Window:
-    """Where a journal file lies in its writer's run, and when it was received."""
+    """Where a journal file lies in its writer's run, and when it was received.
+
+    ``stepped_ns`` is by how much its clock was set meanwhile; ``synchronised`` whether it was right
+    at its end, as far as that is known.
+    """
 
     name: str
     writer: str
@@ -154,36 +172,50 @@ class Window:
     start_ns: int
     end_ns: int
     chain: str
+    stepped_ns: int = 0
+    synchronised: bool | None = None
 
 
-def ages_s(windows: Sequence[Window]) -> dict[str, float]:
+def ages_s(windows: Sequence[Window], *, sure: bool = False) -> dict[str, float]:
     """Tell how much record there is after the end of each journal, whatever clocks did.
 
     Files of a run follow each other without a pause: where their times do not, the clock was
-    set. What other writers wrote is placed among the main journals of its run.
+    set. What other writers wrote is placed among the main journals of its run. With ``sure`` a
+    pause between runs counts only where the clock was synchronised before and after.
     """
+    if sure:
+        windows = [_by_log_time(window) for window in windows]
     main = _in_turn(w for w in windows if w.writer == "main")
-    ages = _chained(main)
+    ages = _chained(main, sure=sure)
     for writer in {w.writer for w in windows} - {"main"}:
         others = _in_turn(w for w in windows if w.writer == writer)
         if not main:
-            ages |= _chained(others)
+            ages |= _chained(others, sure=sure)
             continue
         for window in others:
             ages[window.name] = _placed(window, main, ages)
     return {name: age_ns / NS for name, age_ns in ages.items()}
 
 
+def _by_log_time(window: Window) -> Window:
+    """Leave out by how much the clock was set within a file; end times stay."""
+    if not window.end_ns:
+        return window
+    return replace(window, start_ns=window.start_ns + window.stepped_ns)
+
+
 def _in_turn(windows: Iterable[Window]) -> list[Window]:
     return sorted((w for w in windows if w.end_ns), key=lambda w: (w.run, w.number))
 
 
-def _chained(windows: Sequence[Window]) -> dict[str, int]:
+def _chained(windows: Sequence[Window], *, sure: bool) -> dict[str, int]:
     ages: dict[str, int] = {}
     age_ns, after = 0, None
     for window in reversed(windows):
         if after is not None:
             pause_ns = after.start_ns - window.end_ns if after.run != window.run else 0
+            if sure and not (window.synchronised and after.synchronised):
+                pause_ns = 0
             age_ns += max(0, pause_ns) + max(0, after.end_ns - after.start_ns)
         ages[window.name] = age_ns
         after = window

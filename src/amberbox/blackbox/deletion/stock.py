@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 
@@ -13,6 +13,7 @@ from amberbox.blackbox.deletion.rule import Unit, Window, ages_s
 from amberbox.blackbox.deletion.usage import DiskUse
 from amberbox.blackbox.follow.follow import RECORDED
 from amberbox.blackbox.follow.read import JournalFile, journal_file
+from amberbox.blackbox.incidents.extent import extent
 from amberbox.blackbox.journal.clocktable import ClockTable
 from amberbox.blackbox.segments import manifest as mf
 from amberbox.blackbox.segments.manifest import Manifest
@@ -74,7 +75,8 @@ class Stock:
         if sealed is not None:
             return Window(
                 name, sealed.writer, sealed.run, sealed.number, sealed.first_seq, sealed.end_seq,
-                sealed.start_ns, sealed.end_ns, sealed.chain,
+                sealed.start_ns, sealed.end_ns, sealed.chain, _stepped_ns(sealed.clock),
+                sealed.synchronised,
             )  # fmt: skip
         if done is not None:
             _, number = _place(name)
@@ -86,10 +88,16 @@ class Stock:
         return self._looked.get(name)
 
     def units(
-        self, known: Manifest, windows: Mapping[str, Window], pending: Callable[[str], bool]
+        self,
+        known: Manifest,
+        windows: Mapping[str, Window],
+        pending: Callable[[str], bool],
+        *,
+        sure: bool = False,
     ) -> list[Unit]:
-        """Return everything that the rule chooses from."""
-        ages, columns = ages_s(list(windows.values())), self._column_bytes(known)
+        """Return everything that the rule chooses from; ``sure`` ages are those of ``ages_s``."""
+        ages = ages_s([*windows.values(), *self._growing()], sure=sure)
+        columns = self._column_bytes(known)
         units = [
             Unit(
                 w.name, w.writer, w.run, w.start_ns, w.end_ns, ages[w.name],
@@ -99,6 +107,23 @@ class Stock:
             for w in windows.values()
         ]  # fmt: skip
         return [unit for unit in units if unit.raw_bytes or unit.column_bytes]
+
+    def _growing(self) -> list[Window]:
+        """Return the file that is being written: what it holds makes all others older.
+
+        Also while nothing but events is recorded, or nothing would become old enough to go.
+        """
+        if not is_locked(self._store, "main"):
+            return []
+        paths = self._store.journal_files("main")[-1:]
+        founds = (extent(path) for path in paths)
+        return [
+            Window(
+                found.name, "main", found.run, _place(found.name)[1], 0, 0,
+                found.start_ns + found.offset_ns, found.end_ns + found.offset_ns, "",
+            )
+            for found in founds if found is not None
+        ]  # fmt: skip
 
     def ring(self) -> list[tuple[Window, float]]:
         """Return the files of the ring that nobody writes any more, and their ages."""
@@ -135,5 +160,11 @@ def window_of(journal: JournalFile) -> Window:
     )
     return Window(
         journal.name, journal.writer, journal.run, journal.number, journal.first_seq,
-        journal.end_seq, start_ns, end_ns, journal.chain,
+        journal.end_seq, start_ns, end_ns, journal.chain, _stepped_ns(journal.clock),
+        journal.readings[-1].synchronised if journal.readings else None,
     )  # fmt: skip
+
+
+def _stepped_ns(clock: Sequence[tuple[int, int]]) -> int:
+    """Return by how much the wall clock was set against log time within a file."""
+    return clock[-1][1] - clock[0][1] if clock else 0

@@ -22,6 +22,7 @@ def keeper_options(folder: RobotFolder) -> KeeperOptions:
         when_full=store.when_full,
         lifetime=Lifetime(store.lifetime.raw, store.lifetime.columns),
         headroom=store.rotate_bytes,
+        reserve=store.reserve_bytes,
         incident_share=robot.incidents.share / 100,
         incidents_per_hour=robot.incidents.per_hour,
         triggers=tuple(map(_trigger, robot.triggers)),

@@ -16,6 +16,10 @@ from amberbox.core.options import option
 WhenFull = Literal["overwrite", "stop"]
 _SHARE = 8
 """A journal file, or the reserve, takes at most this part of the quota."""
+_ROTATE_SHARE = 16
+"""By itself a journal file takes at most this part: several grow, and as much is held free."""
+_LEAST_QUOTA = 10_000_000
+"""In less there is no room for events, the manifest and files that grow beside the record."""
 
 
 @dataclass(frozen=True)
@@ -55,15 +59,23 @@ class StoreOptions:
     @property
     def rotate_bytes(self) -> int:
         """Size of a journal file; smaller than its default where the quota is small."""
-        return self._share(int(self.rotate_mb * 1e6))
+        size = int(self.rotate_mb * 1e6)
+        is_set = self.rotate_mb != StoreOptions.rotate_mb
+        return self._share(size, _SHARE if is_set else _ROTATE_SHARE)
 
     @property
     def reserve_bytes(self) -> int:
         """Size of the reserve; smaller than its default where the quota is small."""
         return self._share(self.reserve)
 
-    def _share(self, size: int) -> int:
-        return size if self.quota is None else min(size, self.quota // _SHARE)
+    def _share(self, size: int, share: int = _SHARE) -> int:
+        return size if self.quota is None else min(size, self.quota // share)
+
+    def _too_small(self, quota: int) -> str:
+        if quota <= 0:
+            return "must be above 0"
+        least = f"{_LEAST_QUOTA / 1e6:g} MB"
+        return f"must be at least {least}: in less there is no room to record beside what stays"
 
     def _too_large(self) -> Iterator[tuple[str, str]]:
         """Name what was set to more than its share of the quota; the defaults shrink instead."""
@@ -84,8 +96,8 @@ class StoreOptions:
         for key in ("min_free", "keep_min", "reserve"):
             if getattr(self, key) < 0:
                 yield key, "must not be below 0"
-        if self.quota is not None and self.quota <= 0:
-            yield "quota", "must be above 0"
+        if self.quota is not None and self.quota < _LEAST_QUOTA:
+            yield "quota", self._too_small(self.quota)
         else:
             yield from self._too_large()
         if not 0 < self.quota_percent <= 100:

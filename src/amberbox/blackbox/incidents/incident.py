@@ -74,7 +74,8 @@ class Incident:
     """A window of all items that is not deleted before it is confirmed or released.
 
     ``spans`` are what is pinned; while it is ``open``, so is everything from ``since`` on, and the
-    window ends ``after_ns`` later. ``told`` is the state that the keeper's journal knows of.
+    window ends ``after_ns`` later. ``told`` is the state that the keeper's journal knows of;
+    ``cut`` says that the window ended early, for incidents may not hold more.
     """
 
     id: str
@@ -90,6 +91,7 @@ class Incident:
     confirmed: bool = False
     told: State | Literal[""] = ""
     bytes: int = 0
+    cut: bool = False
 
     @property
     def is_pinned(self) -> bool:

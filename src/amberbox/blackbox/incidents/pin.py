@@ -41,6 +41,9 @@ from amberbox.core.clock import NS
 from amberbox.core.errors import UsageError
 from amberbox.core.files import replace_file, sync_folder
 
+_CUTS = 8
+"""A window that holds too much ends after this many parts of it less one, or two, and so on."""
+
 
 @dataclass(frozen=True, slots=True)
 class Wish:
@@ -227,10 +230,11 @@ def _copy(path: Path, target: Path) -> None:
     part.replace(target)
 
 
-def advance(store: Store, incident: Incident) -> Incident:
+def advance(store: Store, incident: Incident, options: KeeperOptions | None = None) -> Incident:
     """Take in what came since an incident was opened; complete it once its window has passed.
 
-    Where nobody records any more, what is there is all there will be.
+    Where nobody records any more, what is there is all there will be. With ``options`` a window
+    ends early, ``cut``, before incidents hold more than they may.
     """
     with pin_lock(store):
         current = next((i for i in load_all(store) if i.id == incident.id), None)
@@ -246,16 +250,38 @@ def advance(store: Store, incident: Incident) -> Incident:
         )
         is_over = end_age_ns >= 0 or not alive
         hold_ring(store, current, folder_of(store, current.id), is_over=is_over)
-        if not is_over:
+        if is_over:
+            return _complete(store, current, timeline, max(end_age_ns, 0))
+        if options is None or _fits(store, current, options):
             return current
-        return _complete(store, current, timeline, max(end_age_ns, 0))
+        return _cut(store, current, timeline, options)
+
+
+def _fits(store: Store, incident: Incident, options: KeeperOptions) -> bool:
+    return refused_by_budget(store, incident, load_all(store), options) is None
+
+
+def _cut(store: Store, incident: Incident, timeline: Timeline, options: KeeperOptions) -> Incident:
+    """Complete a window early, with as much of it as incidents may hold."""
+    since_age_ns = timeline.age_ns(incident.since) or 0
+    ended = (_ended(incident, timeline, since_age_ns * part // _CUTS) for part in range(_CUTS + 1))
+    done = next((one for one in ended if _fits(store, one, options)), None)
+    return _completed(store, replace(done or _ended(incident, timeline, since_age_ns), cut=True))
 
 
 def _complete(store: Store, incident: Incident, timeline: Timeline, end_age_ns: int) -> Incident:
+    return _completed(store, _ended(incident, timeline, end_age_ns))
+
+
+def _ended(incident: Incident, timeline: Timeline, end_age_ns: int) -> Incident:
+    """Return an incident as it is complete when its window ends so long before the record's end."""
     since_age_ns = timeline.age_ns(incident.since) or 0
     spans = joined(incident.spans, timeline.spans(since_age_ns, end_age_ns))
     to_ns = timeline.received_ns(timeline.at(end_age_ns)) + 1
-    done = replace(incident, spans=spans, to_ns=to_ns, state="complete", told="")
+    return replace(incident, spans=spans, to_ns=to_ns, state="complete", told="")
+
+
+def _completed(store: Store, done: Incident) -> Incident:
     _let_go_beyond(store, done)
     return save(store, done)
 

@@ -61,7 +61,8 @@ class KeeperOptions:
     """Everything that the keeper of one store goes by. Sizes are bytes, times are seconds.
 
     ``quota`` is None where only the partition sets the limit (``quota_percent`` of it);
-    ``incident_share`` is the part of the quota that incidents may hold.
+    ``incident_share`` is the part of the quota that incidents may hold. ``headroom`` is the size of
+    a journal file, ``reserve`` that of the file that holds room free for the last events.
     """
 
     robot: str = ""
@@ -75,6 +76,7 @@ class KeeperOptions:
     when_full: Literal["overwrite", "stop"] = "overwrite"
     lifetime: Lifetime = Lifetime()
     headroom: int = 0
+    reserve: int = 0
     incident_share: float = 0.5
     incidents_per_hour: int = 10
     triggers: tuple[Trigger, ...] = ()

@@ -116,7 +116,7 @@ class Pins:
 
     def _follow(self, incident: Incident) -> None:
         if incident.state == "open":
-            incident = advance(self._store, incident)
+            incident = advance(self._store, incident, self._options)
         if incident.state == "released":
             shutil.rmtree(folder_of(self._store, incident.id) / RING, ignore_errors=True)
         if incident.told != incident.state:
@@ -159,6 +159,8 @@ _KINDS = {"open": "incident", "complete": "incident_complete", "released": "inci
 
 def _event(incident: Incident) -> Record:
     text = f"{incident.id} {incident.state}: {incident.text or 'no reason given'}"
+    if incident.cut and incident.state == "complete":
+        text += "; it ends early, for incidents would hold more than they may"
     return event(
         _KINDS[incident.state], text, incident.trigger, id=incident.id, who=incident.who,
         trigger=incident.trigger, from_ns=incident.from_ns, to_ns=incident.to_ns,

@@ -52,11 +52,11 @@ def set_groups(
 
 
 def refuse_name(name: str, kind: str) -> None:
-    """Raise UsageError for a name that is no id."""
-    if not is_id(name):
+    """Raise UsageError for a new name that is no id, or that a command would take for an option."""
+    if not is_id(name) or name.startswith("-"):
         raise UsageError(
             f"not a name of a {kind}: {name!r}",
-            "take 1 to 64 of a-z, 0-9, point, hyphen and underscore",
+            "take 1 to 64 of a-z, 0-9, point, hyphen (not first) and underscore",
         )
 
 

@@ -12,6 +12,7 @@ from amberbox.fleet.accounts.backoff import Wait, attempt_was_right, begin_attem
 from amberbox.fleet.accounts.passwords import Passwords, refuse_weak
 from amberbox.fleet.accounts.sessions import NewSession, begin_session
 from amberbox.fleet.accounts.tables import USERS
+from amberbox.fleet.accounts.tokens import revoke_tokens
 from amberbox.fleet.accounts.users import User, find_user, set_password
 from amberbox.fleet.audit.entry import Entry, Result
 from amberbox.fleet.audit.log import append
@@ -96,8 +97,10 @@ def change_password(
     old: str,
     new: str,
     caller: Caller,
+    *,
+    with_tokens: bool = False,
 ) -> NewSession:
-    """Change one's own password: all sessions end, a new one begins.
+    """Change one's own password: all sessions end (``with_tokens`` these, too), a new one begins.
 
     Raises UsageError for a weak one, and what ``sign_in`` raises: the old one is asked for, so that
     a browser that was left open does not give the account away.
@@ -111,7 +114,9 @@ def change_password(
         user = _still_there(connection, account, old_hash)
         attempt_was_right(connection, now_ns, user.user_id, account, caller.address)
         set_password(connection, now_ns, account, new_hash)
-        append(connection, now_ns, _entry(account, caller, CHANGE))
+        revoked = revoke_tokens(connection, now_ns, user.user_id) if with_tokens else 0
+        told = {"tokens_revoked": str(revoked)} if with_tokens else {}
+        append(connection, now_ns, _entry(account, caller, CHANGE, "ok", **told))
         return begin_session(connection, now_ns, user.user_id, caller.address, caller.agent)
 
 

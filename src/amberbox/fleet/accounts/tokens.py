@@ -151,6 +151,12 @@ def revoke_token(connection: Connection, now_ns: int, user_id: int, token_id: st
     return bool(connection.execute(open_ones.values(revoked_ns=now_ns)).rowcount)
 
 
+def revoke_tokens(connection: Connection, now_ns: int, user_id: int) -> int:
+    """Revoke all tokens of somebody, at once; return how many there were."""
+    chosen = update(TOKENS).where(TOKENS.c.user_id == user_id, TOKENS.c.revoked_ns.is_(None))
+    return int(connection.execute(chosen.values(revoked_ns=now_ns)).rowcount)
+
+
 def _refuse(name: str, scopes: Collection[str], lasts_ns: int) -> None:
     for scope in sorted(scopes):
         if scope not in SCOPES:

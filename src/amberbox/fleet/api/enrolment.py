@@ -17,6 +17,7 @@ from amberbox.fleet.accounts.keys import Secret
 from amberbox.fleet.api.access import Caller, Fleet, OfRobot, Routes, Who
 from amberbox.fleet.api.forms import Form, Id, Named, shown
 from amberbox.fleet.bus import Change
+from amberbox.fleet.linkend import signingkeys
 from amberbox.fleet.services import Services
 from amberbox.link.joining import join_line
 
@@ -62,6 +63,30 @@ class RevokedKeys:
     """How many keys worked until now."""
 
     revoked: int
+
+
+@dataclass(frozen=True, slots=True)
+class WaitingKey:
+    """A key that a robot signs with instead of the one before; it waits for an admin."""
+
+    robot: str
+    store_id: str
+    public_key: str
+    first_seen: str
+
+
+@dataclass(frozen=True, slots=True)
+class DecidedKey:
+    """How many journals were waiting for the decision."""
+
+    journals: int
+
+
+class KeyDecision(Form):
+    """The key that waits, and whether it is the robot's own."""
+
+    public_key: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+    confirm: bool
 
 
 class NewRobot(Form):
@@ -140,6 +165,32 @@ def replace_key(fleet: Fleet, who: Who, robot: OfRobot, new: NewKey | None = Non
         who.note(connection, now_ns, "robots.key", robot.id, details=told)
     _tell(fleet, robot.id)
     return enrolled
+
+
+@routes.get("/signing-keys", "robots.write")
+def list_waiting_keys(fleet: Fleet) -> list[WaitingKey]:
+    """List the keys that robots sign with since, and that no admin has confirmed or refused."""
+    with fleet.database.reading() as connection:
+        return [
+            WaitingKey(key.robot, key.store_id, key.public_key, format_time(key.first_seen_ns))
+            for key in signingkeys.pending_keys(connection)
+        ]
+
+
+@routes.post("/robots/{robot}/signing-key", "robots.write")
+def decide_key(fleet: Fleet, who: Who, robot: OfRobot, decision: KeyDecision) -> DecidedKey:
+    """Confirm the new key of a robot, as after a reinstallation, or refuse it.
+
+    Journals that it signed were kept aside; they are verified with the confirmation.
+    """
+    with fleet.database.begin() as connection:
+        now_ns, key = fleet.clock.wall_ns(), decision.public_key
+        journals = signingkeys.decide(connection, now_ns, robot.id, key, confirm=decision.confirm)
+        told = {"public_key": key, "journals": journals}
+        action = f"robots.signing_key.{'confirm' if decision.confirm else 'refuse'}"
+        who.note(connection, now_ns, action, robot.id, details=told)
+    _tell(fleet, robot.id)
+    return DecidedKey(journals)
 
 
 @routes.delete("/robots/{robot}/keys/{key}", "robots.write")

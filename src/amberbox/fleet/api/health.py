@@ -30,7 +30,7 @@ def read_health(fleet: Fleet, response: Response) -> Health:
     """Return 200 if the server and its database answer, else 503.
 
     ``poor``: it answers, and needs somebody soon (the disk is nearly full, nothing is committed,
-    files that robots copied are damaged).
+    files that robots copied are damaged, a jump of the clock is held).
     """
     try:
         with fleet.database.reading() as connection:

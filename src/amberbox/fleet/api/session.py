@@ -46,10 +46,11 @@ class Login(Form):
 
 
 class NewPassword(Form):
-    """The password as it is, and as it shall be."""
+    """The password as it is, and as it shall be; whether all of one's tokens are revoked."""
 
     old: Text
     new: Text
+    revoke_tokens: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,7 +150,7 @@ async def change_password(
     """Change one's password: all sessions end, and a new one begins here."""
     session = await fleet.passwords.apart(
         signin.change_password, fleet.database, fleet.clock, fleet.passwords, who.principal.id,
-        passwords.old, passwords.new, came_from(request),
+        passwords.old, passwords.new, came_from(request), with_tokens=passwords.revoke_tokens,
     )  # fmt: skip
     _tell(fleet, who)
     set_cookie(response, fleet, session)

@@ -13,6 +13,7 @@ from amberbox.core.timetext import format_time
 from amberbox.fleet.accounts import sessions, users
 from amberbox.fleet.accounts.actions import Role
 from amberbox.fleet.accounts.onetime import one_time_password
+from amberbox.fleet.accounts.tokens import revoke_tokens
 from amberbox.fleet.api.access import Fleet, Routes, Who
 from amberbox.fleet.api.forms import AfterName, Form, Id, Limit, Named, missing, shown
 from amberbox.fleet.api.session import EndedSessions, OpenSession
@@ -51,6 +52,12 @@ class NewPerson(Form):
     name: Id
     role: Role
     groups: Groups | None = None
+
+
+class Reset(Form):
+    """Whether all tokens of the person are revoked with the password."""
+
+    revoke_tokens: bool = False
 
 
 class ChangedPerson(Form):
@@ -118,17 +125,21 @@ def _apply(connection: Connection, now_ns: int, name: str, change: ChangedPerson
 
 
 @routes.post("/users/{name}/password", "users.write")
-def reset_password(fleet: Fleet, who: Who, name: Named) -> OneTimePassword:
-    """Give somebody a one-time password; all their sessions end."""
+def reset_password(
+    fleet: Fleet, who: Who, name: Named, reset: Reset | None = None
+) -> OneTimePassword:
+    """Give somebody a one-time password; all their sessions end, and their tokens if asked for."""
     if name == who.principal.id:
         raise UsageError("this is your own account", "change your password with the old one")
     password = one_time_password()
     hashed = fleet.passwords.hash(password)
     with fleet.database.begin() as connection:
-        find(connection, name)
-        now_ns = fleet.clock.wall_ns()
+        user_id, now_ns = find(connection, name).user_id, fleet.clock.wall_ns()
         users.set_password(connection, now_ns, name, hashed, must_change=True)
-        who.note(connection, now_ns, "users.password", name)
+        details = {}
+        if reset is not None and reset.revoke_tokens:
+            details = {"tokens_revoked": revoke_tokens(connection, now_ns, user_id)}
+        who.note(connection, now_ns, "users.password", name, details=details)
     _tell(fleet, name)
     return OneTimePassword(name, password)
 

@@ -12,6 +12,7 @@ from amberbox.core.clock import Clock, SystemClock
 from amberbox.core.errors import AmberboxError
 from amberbox.core.files import sync_folder
 from amberbox.fleet.archive import committing, compacting, retaining, suspects
+from amberbox.fleet.archive.ageclock import AgeClock
 from amberbox.fleet.archive.catalogue import PUT, REFUSED, Catalogue, Source
 from amberbox.fleet.archive.committing import Progress
 from amberbox.fleet.archive.files import Layout
@@ -42,6 +43,7 @@ class FolderArchive:
         self.layout.tables.mkdir(parents=True, exist_ok=True)
         self.layout.journals.mkdir(exist_ok=True)
         self.catalogue = Catalogue(database or Database(folder / FILE, self.clock))
+        self.ages = AgeClock(self.catalogue.database, self.clock)
 
     def put(self, key: JournalKey, path: Path, *, is_checked: bool = False) -> Stored:
         """Move a verified journal file to its place; one that is here already changes nothing.
@@ -61,7 +63,7 @@ class FolderArchive:
                 )
             if known.state != REFUSED:
                 return Stored(False, place)
-        arrived = inspect(key, path, self.clock.wall_ns(), is_checked=is_checked)
+        arrived = inspect(key, path, self.ages.came_ns(), is_checked=is_checked)
         _move(path, place)
         if known is not None:  # what had changed here is replaced by what the robot has
             self.catalogue.change([known], state=PUT, facts=arrived.row["facts"])
@@ -92,9 +94,13 @@ class FolderArchive:
         """Join small files of the tables; return how many files went."""
         return compacting.compact(self.layout, self.catalogue)
 
-    def retain(self, rules: Sequence[Retention]) -> int:
-        """Delete what is older than the rules say; return how many journals it concerned."""
-        return retaining.retain(self.layout, self.catalogue, rules, self.clock.wall_ns())
+    def retain(self, rules: Sequence[Retention], now_ns: int | None = None) -> int:
+        """Delete what is older than the rules say; return how many journals it concerned.
+
+        The worker is given the time by which to count, for it is the server that hears robots.
+        """
+        now_ns = self.ages.read().age_ns if now_ns is None else now_ns
+        return retaining.retain(self.layout, self.catalogue, rules, now_ns)
 
     def sweep(self) -> int:
         """Delete files that nothing refers to; return how many. Readers look again."""

@@ -11,6 +11,7 @@ import logging
 import shutil
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -30,6 +31,7 @@ from amberbox.fleet.linkend.events import note
 from amberbox.fleet.options import options
 from amberbox.fleet.uploads.pieces import Incoming
 from amberbox.link.backoff import Backoff
+from amberbox.link.frames import Hello
 from amberbox.link.uploads import Proof
 
 T = TypeVar("T")
@@ -68,6 +70,7 @@ class Keeping:
         self._bus = bus
         self._clock = clock
         self._archive = archive
+        self._ages = archive.ages
         self._every_s = every_s
         self._usage = usage
         self._worker = Worker(folder)
@@ -77,7 +80,9 @@ class Keeping:
         self._said = "disk_ok"
         self._trouble = ""
         bus.on("journal", self._hear)
+        bus.on("robot", self._hear)  # its signing key may have been confirmed
         bus.on("connected", self._hear_connected)
+        bus.on("gone", lambda change: self._ages.forget(change.robot))
 
     @property
     def is_full(self) -> bool:
@@ -91,8 +96,8 @@ class Keeping:
 
     def troubles(self) -> list[str]:
         """Say what is wrong with the archive and its disk; nothing when all is well."""
-        low = [f"the disk is nearly full: {self._room}"] if self._room.is_low else []
-        return [*low, *([self._trouble] if self._trouble else [])]
+        low = f"the disk is nearly full: {self._room}" if self._room.is_low else ""
+        return [text for text in (low, self._trouble, self._ages.read().text) if text]
 
     def note_deleted(self, incoming: Incoming, proof: Proof) -> None:
         """Tell the archive what the robot says it deleted before it could be copied."""
@@ -117,6 +122,9 @@ class Keeping:
         self._woken.set()
 
     def _hear_connected(self, change: Change) -> None:
+        hello = change.data.get("hello")
+        if isinstance(hello, Hello):
+            self._ages.hear(change.robot, hello.wall_ns)
         if getattr(change.data.get("admission"), "aside", ()):
             self._woken.set()
 
@@ -145,7 +153,9 @@ class Keeping:
 
     async def _commit_once(self) -> float | None:
         """Commit what is due; return after how many seconds more is, None if nothing waits."""
-        await self._apart(partial(settling.note_lost, self._archive, self._database))
+        archive, database = self._archive, self._database
+        await self._apart(partial(settling.take_confirmed, archive, database, self._folder))
+        await self._apart(partial(settling.note_lost, archive, database))
         self._tell(await self._apart(partial(settling.settle, self._database, self._clock)))
         if not await self._apart(self._has_work):
             return None
@@ -194,12 +204,13 @@ class Keeping:
         """Tidy the archive once; blocks. Raises AmberboxError when the worker could not."""
         with self._database.reading() as connection:
             rules = options.read(connection, RETENTION, tuple[Retention, ...])
+        now_ns = self._ages.look().age_ns
         if is_daily:
-            forget(self._database, rules, self._clock.wall_ns())
+            forget(self._database, rules, now_ns)
         if not self._archive.catalogue.revision():
             return
         if is_daily:
-            self._worker.retain(*rules)
+            self._worker.retain(now_ns, *rules)
         self._worker.compact()
         self._worker.sweep()
 
@@ -217,10 +228,15 @@ class Keeping:
     async def _look_at_disk(self) -> None:
         """Look at the disk; when its state changes an event says so."""
         self._room = await asyncio.to_thread(room_of, self._folder, self._usage)
+        await asyncio.to_thread(self._look_at_clock)
         state = _state(self._room)
         if state != self._said:
             self._said = state
             await asyncio.to_thread(self._note_disk, state)
+
+    def _look_at_clock(self) -> None:
+        with suppress(AmberboxError):  # the database is busy: the next look does as well
+            self._ages.look()
 
     def _note_disk(self, state: str) -> None:
         text = _TEXTS[state].format(self._room)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
-from sqlalchemy import Connection, Row, and_, exists, func, select
+from sqlalchemy import Connection, Row, and_, exists, func, select, update
 
 from amberbox.blackbox.segments.entries import Tombstone, from_record
 from amberbox.blackbox.segments.lines import decode
@@ -80,6 +80,24 @@ def take_over(archive: FolderArchive, database: Database, folder: Path) -> int:
             for row in rows
         ]
     return sum(_taken(archive, key, path) for key, path in found if path.exists())
+
+
+def take_confirmed(archive: FolderArchive, database: Database, folder: Path) -> int:
+    """Hand journals to the archive whose key was confirmed since; return how many it took."""
+    confirmed = and_(UPLOAD.c.state == "verified", UPLOAD.c.path.like("aside/%"))
+    with database.reading() as connection:
+        rows = connection.execute(select(UPLOAD).where(confirmed)).all()
+    taken = 0
+    for row in rows:
+        key = JournalKey(row.robot, row.store_id, row.journal, row.sha256)
+        path = archive.layout.journal(row.robot, row.store_id, row.journal)
+        taken += (folder / row.path).exists() and _taken(archive, key, folder / row.path)
+        if path.exists():
+            moved = {"path": path.relative_to(folder).as_posix()}
+            mine = and_(UPLOAD.c.path == row.path, UPLOAD.c.sha256 == row.sha256)
+            with database.begin() as connection:
+                connection.execute(update(UPLOAD).where(mine).values(**moved))
+    return taken
 
 
 def _taken(archive: FolderArchive, key: JournalKey, path: Path) -> bool:

@@ -55,7 +55,8 @@ def handle(archive: FolderArchive, request: Mapping[str, Any], progress: Progres
         case "compact":
             return archive.compact()
         case "retain":
-            return archive.retain(msgspec.convert(request["rules"], list[Retention]))
+            rules = msgspec.convert(request["rules"], list[Retention])
+            return archive.retain(rules, int(request["now_ns"]))
         case "sweep":
             return archive.sweep()
         case other:
@@ -177,9 +178,9 @@ class Worker:
         """Have small files joined; return how many went."""
         return int(self.ask("compact"))
 
-    def retain(self, *rules: Retention) -> int:
-        """Have what is too old deleted; return how many journals it concerned."""
-        return int(self.ask("retain", rules=msgspec.to_builtins(rules)))
+    def retain(self, now_ns: int, *rules: Retention) -> int:
+        """Have what is too old deleted as of ``now_ns``; return how many journals it concerned."""
+        return int(self.ask("retain", rules=msgspec.to_builtins(rules), now_ns=now_ns))
 
     def sweep(self) -> int:
         """Have files deleted that nothing refers to; return how many."""

@@ -15,6 +15,7 @@ from amberbox.fleet.database.upsert import upsert
 from amberbox.fleet.linkend import board
 from amberbox.fleet.linkend.committed import without_committed
 from amberbox.fleet.linkend.events import note
+from amberbox.fleet.linkend.signingkeys import admit_key
 from amberbox.fleet.linkend.tables import ASIDE, ROBOT, ROW, RUN, STORE, WRITER
 from amberbox.link.frames import Hello, Row
 from amberbox.link.history import LOST, OTHER, Aside, Held, aside, set_back
@@ -79,18 +80,15 @@ def _next_epoch(connection: Connection, hello: Hello, now_ns: int) -> int:
 
 def _note_store(connection: Connection, hello: Hello, now_ns: int) -> bool:
     """Enter a store; tell whether it is another one than this robot had before."""
-    stores = select(STORE.c.store_id, STORE.c.public_key).where(STORE.c.robot == hello.robot)
-    known = {row.store_id: row.public_key for row in connection.execute(stores)}
+    stores = select(STORE.c.store_id).where(STORE.c.robot == hello.robot)
+    known = set(connection.scalars(stores))
     if known and hello.store_id not in known:
         text = f"it has a new store ({hello.store_id}): its disk was replaced, or made anew"
         note(connection, hello.robot, now_ns, "new_store", text)
-    before = known.get(hello.store_id)
-    if before and hello.public_key and before != hello.public_key:  # a store begins without a key
-        text = f"the store {hello.store_id} signs with another key than before: {hello.public_key}"
-        note(connection, hello.robot, now_ns, "new_key", text)
+    is_trusted = admit_key(connection, hello.robot, hello.store_id, hello.public_key, now_ns)
     values = {"robot": hello.robot, "store_id": hello.store_id, "first_seen_ns": now_ns,
-              "public_key": hello.public_key}  # fmt: skip
-    change = ["public_key"] if hello.public_key else []
+              "public_key": hello.public_key if is_trusted else ""}  # fmt: skip
+    change = ["public_key"] if hello.public_key and is_trusted else []
     connection.execute(upsert(connection.dialect, STORE, ["robot", "store_id"], change), [values])
     return hello.store_id not in known
 

@@ -52,6 +52,17 @@ STORE = Table(
     Column("public_key", _Word, nullable=False),
 )
 
+SIGNING_KEY = Table(
+    "link_signing_key",
+    METADATA,
+    Column("robot", Id, primary_key=True),
+    Column("store_id", _Word, primary_key=True),
+    Column("public_key", _Word, primary_key=True),
+    Column("first_seen_ns", Time, nullable=False),
+    Column("state", _Word, nullable=False),
+)
+"""Keys that took the place of another: ``pending`` until an admin has decided."""
+
 WRITER = Table(
     "link_writer",
     METADATA,

@@ -5,6 +5,7 @@ from __future__ import annotations
 from sqlalchemy import Connection, select
 
 from amberbox.fleet.archive.suspects import KIND
+from amberbox.fleet.linkend.signingkeys import pending_keys
 from amberbox.fleet.linkend.tables import EVENT
 from amberbox.fleet.notifying.settings import LOST_HINT, NAME, Notifications
 from amberbox.fleet.options.options import read
@@ -21,6 +22,7 @@ def troubles(services: Services) -> list[str]:
         damaged = damaged_files(connection, now_ns)
         refused = _refused(connection, now_ns - NEW_NS)
         notified = read(connection, NAME, Notifications)
+        waiting = pending_keys(connection)
     lately = {robot: one.new for robot, one in damaged.items() if one.new}
     files = sum(lately.values())
     what = "1 file was" if files == 1 else f"{files} files were"
@@ -28,6 +30,10 @@ def troubles(services: Services) -> list[str]:
     said = [f"{what} damaged and set aside in the last 24 hours, of {whose}"] if files else []
     if notified.has_lost_secrets:
         said.append(f"secrets of notifications cannot be read: {LOST_HINT}")
+    said += [
+        f"{key.robot} signs with another key than before, which waits for an admin: /admin/robots"
+        for key in waiting
+    ]
     return [*services.keeping.troubles(), *said, *refused]
 
 

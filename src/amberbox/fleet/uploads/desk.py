@@ -11,19 +11,21 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from sqlalchemy import ColumnElement, Connection, and_, select
+from sqlalchemy import ColumnElement, Connection, and_
 
 from amberbox.core.clock import NS, Clock, SystemClock
 from amberbox.core.files import sync_folder
 from amberbox.fleet.database.database import Database
 from amberbox.fleet.database.upsert import upsert
 from amberbox.fleet.linkend.events import note
+from amberbox.fleet.linkend.signingkeys import key_state, waiting_reason
 from amberbox.fleet.uploads import pieces
 from amberbox.fleet.uploads.holdings import is_held, known_uploads
 from amberbox.fleet.uploads.pieces import Incoming, PieceError
-from amberbox.fleet.uploads.tables import UPLOAD
+from amberbox.fleet.uploads.tables import UPLOAD, is_other_history
 from amberbox.fleet.uploads.verifying import Claim, Result, Verifier
 from amberbox.link.limits import PIECE_BYTES
+from amberbox.link.proof import signing_key
 from amberbox.link.uploads import JOURNAL_BYTES, Proof, State, Verdict
 
 _KEY = ("robot", "store_id", "journal", "sha256")
@@ -150,8 +152,12 @@ class Desk:
         at = pieces.held(self.root, incoming)
         if at != incoming.size:
             return Answer(409, at, text=f"{incoming.size - at} bytes are missing")
-        key = self.public_key(incoming.robot, incoming.store_id)
-        if not key and proof is not None and ',"kind":"signed",' in proof.lines:
+        signed_by = "" if proof is None else signing_key(proof)
+        with self.database.reading() as connection:
+            new = key_state(connection, incoming.robot, signed_by) if signed_by else None
+        is_trusted = new in ("pending", "confirmed")
+        key = signed_by if is_trusted else self.public_key(incoming.robot, incoming.store_id)
+        if not key and new is None and proof is not None and ',"kind":"signed",' in proof.lines:
             return Answer(503, at, text="the robot has to say first with which key it signs")
         path = self.root / incoming.part
         result = self.verifier.check(
@@ -167,12 +173,16 @@ class Desk:
         if not result.reason and sealed and not result.signed:
             reason = "it is not signed, and this server takes signed journals only"
             result = replace(result, reason=reason)
+        if new == "refused":
+            result = replace(result, reason="it is signed with a key that an admin refused")
+        if new == "pending" and not result.reason:
+            return self._place(incoming, replace(result, reason=waiting_reason(key)), waits=True)
         return self._place(incoming, result)
 
-    def _place(self, incoming: Incoming, result: Result) -> Answer:
-        """Move a file to where it belongs, enter it, and tell."""
+    def _place(self, incoming: Incoming, result: Result, *, waits: bool = False) -> Answer:
+        """Move a file to where it belongs, enter it, and tell; it ``waits`` for its key aside."""
         with self.database.reading() as connection:
-            state = _state(connection, incoming, result)
+            state = "aside" if waits else _state(connection, incoming, result)
         path = _home(incoming, state)
         _move(self.root / incoming.part, self.root / path)
         now_ns = self.clock.wall_ns()
@@ -208,22 +218,14 @@ def _state(connection: Connection, incoming: Incoming, result: Result) -> State:
     """
     if result.reason:
         return "quarantined"
-    table = UPLOAD.c
-    other_content = and_(
-        table.robot == incoming.robot, table.store_id == incoming.store_id,
-        table.state == "verified", table.sha256 != incoming.sha256,
-    )  # fmt: skip
-    overlapping = and_(
-        table.writer == result.writer, table.run == result.run,
-        table.first_seq < max(result.end_seq, result.first_seq + 1),
-        table.end_seq > result.first_seq,
-    )  # fmt: skip
-    same_name = table.journal == incoming.journal
-    wanted = select(table.journal).where(other_content, overlapping | same_name).limit(1)
-    return "verified" if connection.execute(wanted).first() is None else "aside"
+    keys = incoming.robot, incoming.store_id, incoming.journal, incoming.sha256
+    held = result.writer, result.run, result.first_seq, result.end_seq
+    return "aside" if is_other_history(connection, keys, held) else "verified"
 
 
 def _told(incoming: Incoming, state: State, result: Result) -> str:
+    if state == "aside" and result.reason:
+        return f"{incoming.journal} is kept aside: {result.reason}"
     if state == "quarantined":
         return f"{incoming.journal} is not taken: {result.reason}"
     return f"{incoming.journal} is of another history of its store than what is held: kept aside"

@@ -2,7 +2,18 @@
 
 from __future__ import annotations
 
-from sqlalchemy import BigInteger, Boolean, Column, Index, String, Table, Text
+from sqlalchemy import (
+    BigInteger,
+    Boolean,
+    Column,
+    Connection,
+    Index,
+    String,
+    Table,
+    Text,
+    and_,
+    select,
+)
 
 from amberbox.fleet.database.metadata import METADATA, Digest, Id, Time
 
@@ -37,3 +48,25 @@ UPLOAD = Table(
 aside is sound, too, but of another history of the same store than the file held under its name.
 ``start_ns`` and ``end_ns`` are the robot's corrected times of receipt.
 """
+
+
+Held = tuple[str, int, int, int]
+"""Writer and run of a journal, its first row's number, and the one behind its last."""
+
+
+def is_other_history(connection: Connection, keys: tuple[str, str, str, str], held: Held) -> bool:
+    """Tell whether the record of a store holds these rows, or a journal of this name, already.
+
+    ``keys`` are robot, store, journal and its SHA-256: the same bytes are no other history.
+    """
+    table, (writer, run, first_seq, end_seq) = UPLOAD.c, held
+    record = and_(
+        table.robot == keys[0], table.store_id == keys[1], table.state == "verified",
+        table.sha256 != keys[3],
+    )  # fmt: skip
+    other = and_(
+        table.writer == writer, table.run == run,
+        table.first_seq < max(end_seq, first_seq + 1), table.end_seq > first_seq,
+    )  # fmt: skip
+    wanted = select(table.journal).where(record, other | (table.journal == keys[2])).limit(1)
+    return connection.execute(wanted).first() is not None

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from fastapi import Request, Response
 
 from amberbox.fleet.api.access import Fleet, services_of
+from amberbox.fleet.api.clock import read_clock
 from amberbox.fleet.api.health import read_health
 from amberbox.fleet.api.system import read_status
 from amberbox.fleet.metrics.figures import families
@@ -44,7 +45,7 @@ def show_health(request: Request, fleet: Fleet) -> Response:
     disk = Disk(found["amberbox_disk_free_bytes"], found["amberbox_disk_bytes"])
     return render(request, "admin/health.html", figures=found, disk=disk,
                   health=read_health(fleet, Response()).status,
-                  troubles=troubles(fleet), damaged=damaged)  # fmt: skip
+                  troubles=troubles(fleet), damaged=damaged, clock=read_clock(fleet))  # fmt: skip
 
 
 @routes.get("/admin/system", "status.read")

@@ -7,6 +7,7 @@ from fastapi import Request, Response
 from amberbox.fleet.accounts.actions import Role
 from amberbox.fleet.accounts.tokens import working_tokens
 from amberbox.fleet.api.access import Fleet, Who
+from amberbox.fleet.api.enrolment import list_waiting_keys
 from amberbox.fleet.api.forms import shown
 from amberbox.fleet.api.groups import list_groups
 from amberbox.fleet.api.robots import list_cards
@@ -40,7 +41,7 @@ def show_teams(request: Request, fleet: Fleet, who: Who) -> Response:
 def show_robots(request: Request, fleet: Fleet, who: Who) -> Response:
     """Show which robots may connect, and whether they do."""
     return render(request, "admin/robots.html", cards=list_cards(fleet, who, "", "", _MOST),
-                  teams=_teams(fleet))  # fmt: skip
+                  teams=_teams(fleet), waiting_keys=list_waiting_keys(fleet))  # fmt: skip
 
 
 def _teams(fleet: Services) -> list[str]:
