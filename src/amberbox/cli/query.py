@@ -7,7 +7,6 @@ import sys
 from collections.abc import Callable
 from typing import IO
 
-from amberbox.blackbox.query.livequery import follow_tables
 from amberbox.blackbox.query.record import Record
 from amberbox.blackbox.query.table import Table
 from amberbox.blackbox.query.tabletext import write_grid
@@ -114,6 +113,8 @@ def _follow(record: Record, args: argparse.Namespace, form: str) -> int:
         raise UsageError("--follow prints rows as they come", hint)
     if args.by != "received" or args.mission is not None:
         raise UsageError("--follow goes by time of receipt", "leave out --by and --mission")
+    from amberbox.blackbox.query.livequery import follow_tables  # what only asks starts sooner
+
     with text_output(args.output) as file:
         first = True
         try:

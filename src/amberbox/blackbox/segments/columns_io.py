@@ -42,12 +42,20 @@ def to_arrow(column: ColumnData, column_type: str) -> pa.Array:
     kind = arrow_type(column_type)
     if column.dtype == object:
         return pa.array(column.tolist(), type=kind)
-    if isinstance(column, np.ma.MaskedArray):
-        plain = np.ascontiguousarray(column.data)
-        array = pa.array(plain, mask=np.ma.getmaskarray(column))
-    else:
-        array = pa.array(np.ascontiguousarray(column))
+    null = np.ma.getmaskarray(column) if isinstance(column, np.ma.MaskedArray) else None
+    array = _of_numbers(np.ascontiguousarray(np.ma.getdata(column)), null)
     return array if array.type == kind else _as_type(array, kind)
+
+
+def _of_numbers(numbers: NDArray[Any], null: NDArray[np.bool_] | None) -> pa.Array:
+    """Lay numbers into an Arrow array: pyarrow's own way imports pandas where there is one."""
+    import pyarrow as pa
+
+    if numbers.dtype.kind not in "iuf" or not numbers.dtype.isnative:
+        return pa.array(numbers, mask=null)
+    known = None if null is None else pa.py_buffer(np.packbits(~null, bitorder="little"))
+    kind = pa.from_numpy_dtype(numbers.dtype)
+    return pa.Array.from_buffers(kind, len(numbers), [known, pa.py_buffer(numbers)])
 
 
 def _as_type(array: pa.Array, kind: pa.DataType) -> pa.Array:
@@ -63,8 +71,8 @@ def _list_array(column: Ragged, column_type: str) -> pa.Array:
     inner = col.element_type(column_type)
     values = to_arrow(lists.values, inner or "binary")
     if len(lists.values) > _LARGEST_OFFSET:
-        return pa.LargeListArray.from_arrays(pa.array(lists.offsets), values)
-    return pa.ListArray.from_arrays(pa.array(lists.offsets.astype(np.int32)), values)
+        return pa.LargeListArray.from_arrays(_of_numbers(lists.offsets, None), values)
+    return pa.ListArray.from_arrays(_of_numbers(lists.offsets.astype(np.int32), None), values)
 
 
 def from_arrow(array: pa.ChunkedArray | pa.Array, column_type: str) -> ColumnData:
