@@ -48,16 +48,18 @@ def peak_bytes(work: Callable[[], object]) -> int:
 
 
 @pytest.mark.parametrize("name", PACKERS)
-def test_no_more_is_unpacked_than_was_promised(bombs: dict[str, bytes], name: str) -> None:
+def test_little_more_is_unpacked_than_was_promised(bombs: dict[str, bytes], name: str) -> None:
+    """The promise may be what is damaged, so 16 MB are unpacked all the same."""
     unpacked, problem = unpack(name, bombs[name], 1000)
-    assert unpacked == bytes(1000) and "instead of 1000" in problem
+    assert 1000 < len(unpacked) <= 16 << 20 and "instead of 1000" in problem
     assert peak_bytes(lambda: unpack(name, bombs[name], 1000)) < 100_000_000
 
 
 @pytest.mark.parametrize("name", PACKERS)
 def test_a_promise_of_gigabytes_is_refused(bombs: dict[str, bytes], name: str) -> None:
     unpacked, problem = unpack(name, bombs[name], 0xFFFFFFFF)
-    assert unpacked == b"" and "4294967295 bytes" in problem
+    assert len(unpacked) <= 16 << 20 and "4294967295 bytes" in problem
+    assert peak_bytes(lambda: unpack(name, bombs[name], 0xFFFFFFFF)) < 100_000_000
 
 
 def test_a_message_that_unpacks_to_too_much_is_kept_as_it_is(
