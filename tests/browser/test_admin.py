@@ -72,7 +72,7 @@ def test_an_admin_revokes_a_token_of_somebody(page_as: PageAs, site: Site) -> No
     expect(dialog.get_by_text(prefix)).to_be_visible()
     axe(page)
     shot(page, "admin-tokens")
-    dialog.get_by_role("button", name="Revoke").click()
+    dialog.get_by_role("button", name="Revoke", exact=True).click()
     page.get_by_role("dialog").get_by_role("button", name="Yes").click()
     expect(page.get_by_text(prefix)).to_have_count(0)
     assert all(one["revoked"] for one in site.ask("/users/operator/tokens"))
