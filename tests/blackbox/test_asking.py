@@ -19,6 +19,7 @@ from amberbox.blackbox.follow import read
 from amberbox.blackbox.follow.read import journal_file, journals, sound_chunks
 from amberbox.blackbox.journal import chunk as chunks
 from amberbox.blackbox.journal import growing, scan
+from amberbox.blackbox.query import overview
 from amberbox.blackbox.query.overview import ItemInfo
 from amberbox.blackbox.query.record import Record
 from amberbox.blackbox.recorder.pipeline import PipelineOptions
@@ -55,8 +56,12 @@ def record_some(box: ManualBox, writes: int, chance: random.Random) -> None:
 
 
 @pytest.fixture
-def live(tmp_path: Path) -> Iterator[ManualBox]:
-    """A box that is recording: a finished file, and 300 writes in the one that grows."""
+def live(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[ManualBox]:
+    """A box that is recording: a finished file, and 300 writes in the one that grows.
+
+    No journal counts as small, so that what holds for long ones is seen.
+    """
+    monkeypatch.setattr(overview, "_SMALL_BYTES", 0)
     box = ManualBox(tmp_path / "store", OPTIONS)
     record_some(box, 30, random.Random(1))
     box.pipeline.rotate()

@@ -42,7 +42,8 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[House]:
 @pytest.fixture
 def worker(home: House, monkeypatch: pytest.MonkeyPatch) -> Worker:
     found = Worker()
-    monkeypatch.setattr(home.services.asking, "ask", found.ask)
+    for workers in (home.services.asking, home.services.preparing):
+        monkeypatch.setattr(workers, "ask", found.ask)
     return found
 
 

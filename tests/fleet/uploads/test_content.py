@@ -69,7 +69,7 @@ def test_long_names_and_names_of_other_scripts_from_topics_are_taken(tmp_path: P
     assert verified(tmp_path, path).reason == ""
     long, derived = sorted(journal_file(path).items)
     assert len(long) == 200 and long.startswith("aaa")
-    assert derived == "test_______od_m"
+    assert derived == "test_______odom"
 
 
 @fuzz

@@ -28,6 +28,8 @@ from amberbox.core.clock import NS
 from amberbox.core.timetext import format_time
 from amberbox.core.types import IntArray
 
+_SMALL_BYTES = 1 << 20
+"""A journal that is no larger is unpacked whole: then every count is exact."""
 _CHUNKS = 16
 """Chunks of an item that are unpacked for what the index does not say."""
 
@@ -212,7 +214,7 @@ def _chosen(
 ) -> tuple[list[ChunkPlace], set[str]]:
     """Choose chunks to be unpacked, and name the items of which these are all.
 
-    Of each item that has more chunks than that, ``_CHUNKS`` are taken evenly.
+    All are of a small journal. In others ``_CHUNKS`` are taken evenly of each item with more.
     """
     holding: dict[int, list[int]] = {n: [] for found in numbers.values() for n in found}
     for index, place in enumerate(journal.places):
@@ -223,7 +225,7 @@ def _chosen(
     whole = set()
     for item, found in numbers.items():
         held = sorted({index for number in found for index in holding[number]})
-        if len(held) <= _CHUNKS:
+        if len(held) <= _CHUNKS or journal.bytes <= _SMALL_BYTES:
             whole.add(item)
             chosen.update(held)
         elif item in sampled:
