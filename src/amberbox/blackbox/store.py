@@ -119,6 +119,9 @@ def open_store(path: Path) -> Store:
         return Store(path, witnesses.most_common(1)[0][0])
     if not (path / IDENTITY).exists():
         raise UsageError(f"{path} is not a store", "name a store or a robot folder")
+    stated = stated_id(path)  # it may have been written since
+    if stated:
+        return Store(path, stated)
     raise AmberboxError(f"{path / IDENTITY} cannot be read", "restore the file from a copy")
 
 

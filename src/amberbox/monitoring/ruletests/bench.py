@@ -53,6 +53,9 @@ class _Told(Recorded):
     def stored(self, name: str) -> ItemSchema | None:
         return None
 
+    def rate_hz(self, name: str) -> float | None:
+        return None
+
 
 def _items(file: RuleFile) -> Iterator[Item]:
     columns: dict[str, dict[str, str]] = defaultdict(dict)
