@@ -12,7 +12,6 @@ import struct
 import subprocess
 import sys
 import tempfile
-import threading
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -29,7 +28,7 @@ from amberbox.core.timetext import format_time
 from amberbox.testing.box import WRITE_S, ManualBox
 from amberbox.testing.clock import ManualClock
 from benchmarks import mix
-from benchmarks.common import Row
+from benchmarks.common import Row, meanwhile
 
 REPEATS = 7
 HOUR_S = 3600
@@ -76,19 +75,10 @@ class _Robot:
     @contextmanager
     def recording(self) -> Iterator[None]:
         """Go on in real time until the block is left."""
-        stop = threading.Event()
-
-        def go_on() -> None:
-            while not stop.wait(WRITE_S):
-                self.record(WRITE_S)
-
-        thread = threading.Thread(target=go_on)
-        thread.start()
         try:
-            yield
+            with meanwhile(lambda: self.record(WRITE_S), WRITE_S):
+                yield
         finally:
-            stop.set()
-            thread.join()
             self.box.close()
 
 

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import gc
 import statistics
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 
@@ -23,6 +25,24 @@ class Row:
     peer: str = ""
     ratio: float | None = None
     note: str = ""
+
+
+@contextmanager
+def meanwhile(work: Callable[[], object], every_s: float) -> Iterator[None]:
+    """Call ``work`` every so often in another thread until the block is left."""
+    stop = threading.Event()
+
+    def go_on() -> None:
+        while not stop.wait(every_s):
+            work()
+
+    thread = threading.Thread(target=go_on)
+    thread.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        thread.join()
 
 
 def cpu_s(work: Callable[[], object], repeats: int = 5) -> float:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import statistics
 import tempfile
-import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
@@ -22,7 +22,7 @@ from amberbox.blackbox.store import WriterLock, create_store, open_store
 from amberbox.core.clock import NS
 from amberbox.core.types import Schema, Topic
 from benchmarks import mix
-from benchmarks.common import Row, cpu_s, wall_s
+from benchmarks.common import Row, cpu_s, meanwhile, wall_s
 
 START_NS = 1_790_000_000 * NS
 PERIOD_NS = NS // 100
@@ -130,26 +130,23 @@ def _fifty_columns(store: Path) -> Iterator[Row]:
 @contextmanager
 def _recording(store: Path, messages: NDArray[Any]) -> Iterator[None]:
     """Go on at 100 Hz in another run until the block is left: a store is asked while it grows."""
-    lock, stop = WriterLock(open_store(store), "main"), threading.Event()
+    lock = WriterLock(open_store(store), "main")
     writer = _writer(store, run=2)
     channel = writer.channel(_topic(messages), {"item": "fifty", "source": "bench"})
     size, raw = messages.dtype.itemsize, messages.tobytes()
 
-    def go_on() -> None:
-        at_ns, row = START_NS + HOURS * 3600 * NS, 0
-        while not stop.wait(0.1):
-            rows = [raw[n * size : (n + 1) * size] for n in range(row, row + 10)]
-            times = at_ns + (row + np.arange(10)) * PERIOD_NS
-            writer.write(np.full(10, channel), times, times, rows)
-            row += 10
+    starts = itertools.count(0, 10)
 
-    thread = threading.Thread(target=go_on)
-    thread.start()
+    def write() -> None:
+        row = next(starts)
+        rows = [raw[n * size : (n + 1) * size] for n in range(row, row + 10)]
+        times = START_NS + HOURS * 3600 * NS + (row + np.arange(10)) * PERIOD_NS
+        writer.write(np.full(10, channel), times, times, rows)
+
     try:
-        yield
+        with meanwhile(write, 0.1):
+            yield
     finally:
-        stop.set()
-        thread.join()
         writer.close()
         lock.release()
 

@@ -248,7 +248,7 @@ def test_a_flipped_bit_of_the_manifest_is_undone_by_the_keeper(store: Path) -> N
     was = path.read_bytes()
     newline = was.index(b"\n")
     for place in (newline, newline + 30, newline + 300):
-        change(path, lambda c, p=place: c.__setitem__(p, c[p] ^ 4))  # type: ignore[misc]
+        change(path, lambda c, p=place: c.__setitem__(p, c[p] ^ 4))  # type: ignore[misc]  # a lambda for one statement
         assert mf.read(store).mended
         keep(store, clock_after())
         assert path.read_bytes().startswith(was)
@@ -307,7 +307,7 @@ def test_sql_reads_no_page_that_was_changed(store: Path) -> None:
     known = {row["data"] for row in amberbox.open(store).sql(asked).rows()}
     for place in range(20, 600, 97):
         was = path.read_bytes()
-        change(path, lambda c, p=place: c.__setitem__(p, c[p] ^ 16))  # type: ignore[misc]
+        change(path, lambda c, p=place: c.__setitem__(p, c[p] ^ 16))  # type: ignore[misc]  # a lambda for one statement
         found = amberbox.open(store).sql(asked)
         assert {row["data"] for row in found.rows()} < known
         assert found.notes
