@@ -25,7 +25,8 @@ from amberbox.blackbox.segments import manifest as mf
 from amberbox.blackbox.store import is_store
 from amberbox.core.types import Batch, Gap, Schema, Topic
 from amberbox.testing.box import COUNT, ManualBox, events, last_counters, number, own_records
-from amberbox.testing.realros import free_port, wait_until
+from amberbox.testing.patience import PATIENCE_S, wait_until
+from amberbox.testing.realros import free_port
 
 pytest.importorskip("zmq", reason="the sender speaks ZMQ; pip install 'amberbox[zmq]'")
 
@@ -126,7 +127,7 @@ def recorder(folder: Path, *, keeper: bool) -> Iterator[subprocess.Popen[bytes]]
         yield process
     finally:
         process.terminate()
-        _, said = process.communicate(timeout=30)
+        _, said = process.communicate(timeout=PATIENCE_S)
     assert process.returncode in (0, -signal.SIGKILL), said.decode()
     assert b"Traceback" not in said, said.decode()
 
@@ -189,17 +190,17 @@ def test_recording_resumes_when_somebody_else_makes_room(
     with sending() as (port, sender):
         store = robot(tmp_path / "robot", disk, port)
         with recorder(tmp_path / "robot", keeper=keeper):
-            wait_until(lambda: heard(store) > 50, 20, "a record")
+            wait_until(lambda: heard(store) > 50, "a record")
             assert (store / "reserve").stat().st_blocks * 512 >= RESERVE == reserved(store)
             filler = fill(disk)
-            wait_until(lambda: reserved(store) == 0, 10, "the disk is full")
+            wait_until(lambda: reserved(store) == 0, "the disk is full")
             full_at = len(sender.sent_ns)
-            wait_until(lambda: len(sender.sent_ns) > full_at + 200, 10, "messages meanwhile")
+            wait_until(lambda: len(sender.sent_ns) > full_at + 200, "messages meanwhile")
             filler.unlink()
-            wait_until(lambda: told(store, "recording_resumed"), 10, "there is room")
+            wait_until(lambda: told(store, "recording_resumed"), "there is room")
             resumed_at = len(sender.sent_ns)
             assert reserved(store) == RESERVE
-            wait_until(lambda: len(sender.sent_ns) > resumed_at + 100, 10, "messages after")
+            wait_until(lambda: len(sender.sent_ns) > resumed_at + 100, "messages after")
             sender.stop()
     numbers = kept(store)
     lost = check_drops(store, sender.sent_ns, numbers)
@@ -221,15 +222,15 @@ def test_a_disk_that_the_record_fills_itself(
     with sending(0.01, 90_000) as (port, sender):
         store = robot(tmp_path / "robot", disk, port)
         with recorder(tmp_path / "robot", keeper=False):
-            wait_until(lambda: reserved(store) == 0, 30, "it is full")
+            wait_until(lambda: reserved(store) == 0, "it is full")
             full_at = len(sender.sent_ns)
-            wait_until(lambda: len(sender.sent_ns) > full_at + 100, 10, "messages meanwhile")
+            wait_until(lambda: len(sender.sent_ns) > full_at + 100, "messages meanwhile")
             oldest = sorted((store / "journal").glob("*.mcap"))[:4]
             for path in oldest:
                 path.unlink()
-            wait_until(lambda: reserved(store) == RESERVE, 10, "there is room")
+            wait_until(lambda: reserved(store) == RESERVE, "there is room")
             resumed_at = len(sender.sent_ns)
-            wait_until(lambda: len(sender.sent_ns) > resumed_at + 20, 10, "messages after")
+            wait_until(lambda: len(sender.sent_ns) > resumed_at + 20, "messages after")
             sender.stop()
     numbers = np.array(amberbox.open(store).query(ITEM, ["n"]).values("n"))
     gaps = [g for g in amberbox.open(store).gaps(ITEM) if g.reason == "dropped: disk full"]
@@ -248,18 +249,18 @@ def test_a_recorder_killed_while_the_disk_is_full(
     with sending() as (port, sender):
         store = robot(tmp_path / "robot", disk, port)
         with recorder(tmp_path / "robot", keeper=False) as process:
-            wait_until(lambda: heard(store) > 50, 20, "a record")
+            wait_until(lambda: heard(store) > 50, "a record")
             filler = fill(disk)
-            wait_until(lambda: reserved(store) == 0, 10, "the disk is full")
-            wait_until(lambda: own_records(store, "amberbox/gap")[-1]["count"], 10, "an account")
+            wait_until(lambda: reserved(store) == 0, "the disk is full")
+            wait_until(lambda: own_records(store, "amberbox/gap")[-1]["count"], "an account")
             process.kill()
         with recorder(tmp_path / "robot", keeper=False):
-            wait_until(lambda: len(told(store, "events_only")) == 2, 20, "a run that is full")
+            wait_until(lambda: len(told(store, "events_only")) == 2, "a run that is full")
             assert len(told(store, "recovered")) == 1
             filler.unlink()
-            wait_until(lambda: reserved(store) == RESERVE, 10, "there is room")
+            wait_until(lambda: reserved(store) == RESERVE, "there is room")
             numbers = len(kept(store))
-            wait_until(lambda: len(kept(store)) > numbers + 50, 10, "a record")
+            wait_until(lambda: len(kept(store)) > numbers + 50, "a record")
     found = kept(store)
     covered = amberbox.open(store).gaps(ITEM)
     lost = set(range(found[0], found[-1])) - set(found)

@@ -24,6 +24,7 @@ from amberbox.cli.main import main
 from amberbox.core.errors import AmberboxError, UsageError
 from amberbox.core.source import TopicOptions
 from amberbox.testing.box import COUNT, ManualBox, events, last_counters, number, own_records
+from amberbox.testing.patience import PATIENCE_S
 
 TYPES = get_typestore(Stores.ROS1_NOETIC)
 COUNT_MESSAGES = 4000
@@ -119,7 +120,7 @@ def killed(bag: Path, store: Path, after: int) -> None:
 def run_until_killed(work: Callable[..., None], *arguments: Any) -> None:
     process = multiprocessing.get_context("fork").Process(target=work, args=arguments)
     process.start()
-    process.join(30)
+    process.join(PATIENCE_S)
     assert process.exitcode == 9
 
 

@@ -14,6 +14,7 @@ import pytest
 from amberbox.blackbox.folder.folder import load_folder
 from amberbox.blackbox.recorder.recorder import Recorder
 from amberbox.blackbox.service import Notifier, notify, watchdog_s
+from amberbox.testing.patience import PATIENCE_S
 
 SIM = "- sim:\n    seed: 1\n    topics: [{name: odom}]\n"
 
@@ -64,7 +65,7 @@ def test_a_message_reaches_an_abstract_socket() -> None:
     name = f"amberbox-test-{os.getpid()}"
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as link:
         link.bind(f"\0{name}")
-        link.settimeout(5)
+        link.settimeout(PATIENCE_S)
         assert notify("READY=1", {"NOTIFY_SOCKET": f"@{name}"})
         assert link.recv(100) == b"READY=1"
 
@@ -138,14 +139,14 @@ def test_the_recorder_is_ready_once_bytes_are_there_and_says_when_it_stops(
     thread = threading.Thread(target=recorder.run)
     assert journal_bytes(tmp_path) == 0
     thread.start()
-    manager.link.settimeout(10)
+    manager.link.settimeout(PATIENCE_S)
     try:
         assert manager.link.recv(100) == b"READY=1"
         assert journal_bytes(tmp_path) > 0
         assert manager.link.recv(100).startswith(b"WATCHDOG=1\nSTATUS=")
     finally:
         recorder.stop.set()
-        thread.join(20)
+        thread.join(PATIENCE_S)
     manager.link.setblocking(False)
     assert manager.heard()[-1].startswith("STOPPING=1")
 
@@ -168,17 +169,17 @@ def test_a_recorder_that_hangs_gives_no_sign_of_life(
     def tick_then_hang() -> None:
         if signs >= 2:
             hangs.set()
-            assert goes_on.wait(20)
+            assert goes_on.wait(PATIENCE_S)
         tick()
 
     monkeypatch.setattr(recorder.pipeline, "tick", tick_then_hang)
     thread = threading.Thread(target=recorder.run)
     thread.start()
-    manager.link.settimeout(10)
+    manager.link.settimeout(PATIENCE_S)
     try:
         while signs < 2:
             signs += manager.link.recv(200).startswith(b"WATCHDOG=1")
-        assert hangs.wait(10)
+        assert hangs.wait(PATIENCE_S)
         manager.link.setblocking(False)
         manager.heard()
         manager.link.settimeout(0.3)  # three intervals
@@ -187,4 +188,4 @@ def test_a_recorder_that_hangs_gives_no_sign_of_life(
     finally:
         goes_on.set()
         recorder.stop.set()
-        thread.join(20)
+        thread.join(PATIENCE_S)

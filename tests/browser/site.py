@@ -26,6 +26,7 @@ from amberbox.fleet.database.database import FILE, Database
 from amberbox.fleet.linkend.tables import ROBOT
 from amberbox.link.folders import pack
 from amberbox.robot.link.options import LinkOptions
+from amberbox.testing.patience import PATIENCE_S
 from tests.browser import hostile, record, story
 from tests.browser.robot import Robot
 from tests.browser.robotclock import RobotClock
@@ -83,7 +84,7 @@ class Site:
         """Ask the API as somebody; return what it answers."""
         headers = {"Cookie": f"{COOKIE}={self.session(name)}"}
         request = urllib.request.Request(f"{self.url}/api/v1{path}", headers=headers)
-        with urllib.request.urlopen(request, timeout=10) as answer:
+        with urllib.request.urlopen(request, timeout=PATIENCE_S) as answer:
             return json.load(answer)
 
     @property
@@ -95,7 +96,7 @@ class Site:
     def start(self) -> None:
         """Start the server on its port and wait until it answers."""
         self.launch()
-        until(self.answers, "the server answers", 30)
+        until(self.answers, "the server answers")
 
     def launch(self) -> None:
         """Start the server without waiting for it."""
@@ -135,15 +136,15 @@ class Site:
         assert self.process is not None
         assert self.process.poll() is None, (self.folder / "server.log").read_text()[-4000:]
         try:
-            with urllib.request.urlopen(f"{self.url}/api/v1/health", timeout=5):
+            with urllib.request.urlopen(f"{self.url}/api/v1/health", timeout=PATIENCE_S):
                 return True
         except OSError:
             return False
 
 
-def until(what: Callable[[], object], words: str, timeout_s: float = 10.0) -> None:
+def until(what: Callable[[], object], words: str) -> None:
     """Wait until something is so; fail after a time, saying what never came to be."""
-    end_s = time.monotonic() + timeout_s
+    end_s = time.monotonic() + PATIENCE_S
     while not what():
         assert time.monotonic() < end_s, f"it never came to be that {words}"
         time.sleep(0.05)
@@ -164,7 +165,7 @@ def made(folder: Path) -> Iterator[Site]:
     try:
         site.launch()
         _let_happen(site, boot)
-        until(site.answers, "the server answers", 30)
+        until(site.answers, "the server answers")
         _let_come(site)
         yield site
     finally:
@@ -267,8 +268,8 @@ def _let_come(site: Site) -> None:
     """Let the robots connect, and wait until the server knows what they have to say."""
     for robot in site.robots.values():
         robot.come()
-    until(lambda: site.is_online(*site.robots), "the robots are here", 20)
-    until(lambda: _has_alarm(site), "the alarm of the laser is there", 20)
+    until(lambda: site.is_online(*site.robots), "the robots are here")
+    until(lambda: _has_alarm(site), "the alarm of the laser is there")
 
 
 def _has_alarm(site: Site) -> bool:

@@ -18,6 +18,7 @@ from amberbox.fleet.accounts.sessions import csrf_token
 from amberbox.fleet.alarms.alarm import Alarm
 from amberbox.fleet.alarms.tables import ALARM, ALARM_ROBOT, HISTORY
 from amberbox.fleet.api.who import COOKIE, CSRF_HEADER
+from amberbox.testing.patience import PATIENCE_S
 from tests.browser import hostile
 from tests.browser.conftest import PageAs
 from tests.browser.expecting import expect
@@ -66,7 +67,7 @@ def say(site: Site, number: int, deed: str, **body: Any) -> Any:
         {"Cookie": f"{COOKIE}={session}", CSRF_HEADER: csrf_token(session),
          "Content-Type": "application/json"},
     )  # fmt: skip
-    with urllib.request.urlopen(request, timeout=10) as answer:
+    with urllib.request.urlopen(request, timeout=PATIENCE_S) as answer:
         return json.load(answer)
 
 

@@ -12,6 +12,7 @@ import pytest
 
 from amberbox.fleet.api.who import COOKIE
 from amberbox.fleet.serving.app import rooms
+from amberbox.testing.patience import PATIENCE_S
 from tests.browser.conftest import PageAs
 from tests.browser.expecting import expect
 from tests.browser.looks import axe, no_sideways_scroll, no_squeezed_values, shot
@@ -108,7 +109,7 @@ def got(site: Site, name: str, path: str) -> tuple[int, str]:
     headers = {"Cookie": f"{COOKIE}={site.session(name)}", "Accept": "text/html"}
     request = urllib.request.Request(site.url + path, headers=headers)
     try:
-        with urllib.request.urlopen(request, timeout=20) as answer:
+        with urllib.request.urlopen(request, timeout=PATIENCE_S) as answer:
             return answer.status, answer.read().decode("utf-8", "replace")
     except urllib.error.HTTPError as error:
         return error.code, ""

@@ -135,7 +135,7 @@ def test_the_robots_are_as_they_say(site: Site) -> None:
     assert cards["ropod_001"]["level"] == "error" and cards["ropod_001"]["alarms"] == 1
     assert cards["ropod_001"]["diagnosis"]["faults"] == ["laser_front#silent"]
     assert cards["ropod_002"]["level"] == "warn"
-    until(lambda: card(site, "ropod_002")["model"] == hostile.MODEL, "its folder is read", 30)
+    until(lambda: card(site, "ropod_002")["model"] == hostile.MODEL, "its folder is read")
     assert not cards["ropod_003"]["online"] and cards["ropod_003"]["backlog_rows"] == 1234
 
 

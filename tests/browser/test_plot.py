@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from amberbox.fleet.pages.assets import address
+from amberbox.testing.patience import PATIENCE_S
 from tests.browser import hostile, record
 from tests.browser.conftest import PageAs
 from tests.browser.expecting import expect
@@ -396,7 +397,7 @@ def test_an_older_answer_never_covers_a_newer_one(page_as: PageAs, site: Site) -
 
 
 def _until(page: Page, held: list[Route], number: int) -> None:
-    end_s = time.monotonic() + 5
+    end_s = time.monotonic() + PATIENCE_S
     while len(held) < number:
         assert time.monotonic() < end_s
         page.wait_for_timeout(20)

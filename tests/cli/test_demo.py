@@ -14,6 +14,7 @@ import pytest
 from amberbox.cli.main import main
 from amberbox.demo.recorder import FAULT, SLOW, SLOWED
 from amberbox.demo.story import CAUSE
+from amberbox.testing.patience import PATIENCE_S
 
 STORY = [
     "4 people signed in by their links; none works a second time",
@@ -68,7 +69,7 @@ def test_the_story_goes_through_by_itself_and_leaves_nothing_behind(tmp_path: Pa
     assert re.search(".*".join(STORY), done.stdout, re.DOTALL), done.stdout
     assert "Traceback" not in done.stderr
     assert list(tmp_path.glob("amberbox-demo-*")) == []
-    end_s = time.monotonic() + 15
+    end_s = time.monotonic() + PATIENCE_S
     while still_running(tmp_path) and time.monotonic() < end_s:
         time.sleep(0.2)  # what a recorder had started notices its end by itself
     assert still_running(tmp_path) == []

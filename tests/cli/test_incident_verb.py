@@ -23,8 +23,7 @@ from amberbox.cli.main import main
 from amberbox.core.clock import NS
 from amberbox.core.source import TopicOptions
 from amberbox.testing.box import COUNT, ManualBox, number
-
-_PATIENCE_S = 30.0
+from amberbox.testing.patience import PATIENCE_S
 
 
 @pytest.fixture
@@ -173,7 +172,7 @@ def recorder(folder: Path) -> Iterator[subprocess.Popen[bytes]]:
         yield process
     finally:
         process.send_signal(signal.SIGINT)
-        process.wait(_PATIENCE_S)
+        process.wait(PATIENCE_S)
 
 
 def keeper_of(parent: int) -> int | None:
@@ -189,7 +188,7 @@ def keeper_of(parent: int) -> int | None:
 
 
 def wait_for(what: Any) -> Any:
-    end = time.monotonic() + _PATIENCE_S
+    end = time.monotonic() + PATIENCE_S
     while time.monotonic() < end:
         found = what()
         if found:

@@ -21,6 +21,7 @@ from amberbox.blackbox.unitfile import MARK, Service, argument, command_line, se
 from amberbox.cli.install_service import apply, installation, owner, removal
 from amberbox.cli.main import main, verbs
 from amberbox.core.errors import AmberboxError, UsageError
+from amberbox.testing.patience import PATIENCE_S
 
 SIM = "- sim:\n    seed: 1\n    topics: [{name: odom}]\n"
 ME = getpass.getuser()
@@ -141,7 +142,7 @@ def test_the_installed_command_records_and_says_so(
     address = str(tmp_path / "notify")
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
         manager.bind(address)
-        manager.settimeout(30)
+        manager.settimeout(PATIENCE_S)
         environ = {**os.environ, "NOTIFY_SOCKET": address, "WATCHDOG_USEC": "200000"}
         process = subprocess.Popen(command, env=environ)
         try:
@@ -152,7 +153,7 @@ def test_the_installed_command_records_and_says_so(
                 assert said.startswith(b"WATCHDOG=1\nSTATUS=")
         finally:
             process.send_signal(signal.SIGTERM)
-            process.wait(20)
+            process.wait(PATIENCE_S)
         while not (said := manager.recv(200)).startswith(b"STOPPING=1"):
             assert said.startswith(b"WATCHDOG=1")
     assert process.returncode == 0

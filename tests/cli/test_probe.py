@@ -15,7 +15,8 @@ import amberbox
 from amberbox.cli.main import main
 from amberbox.core.probe import ProbeOrder
 from amberbox.testing.box import recording
-from amberbox.testing.realros import free_port, wait_until
+from amberbox.testing.patience import PATIENCE_S, wait_until
+from amberbox.testing.realros import free_port
 
 COMPONENT = "component_name: laser\nmodes: [laser_device.yaml]\n"
 MODE = """\
@@ -167,7 +168,7 @@ def test_rows_are_printed_until_a_signal(folder: Path, tmp_path: Path) -> None:
     device.touch()
     assert process.stdout.readline().rstrip() == f"path_exists  {device}  ok"
     process.send_signal(signal.SIGTERM)
-    assert process.communicate(timeout=10) == ("", "")
+    assert process.communicate(timeout=PATIENCE_S) == ("", "")
     assert process.returncode == 0
 
 
@@ -181,11 +182,11 @@ def test_what_is_published_is_recorded_by_a_box_elsewhere(folder: Path, tmp_path
     try:
         with recording(box) as recorder:
             wait_until(
-                lambda: any(i.name == item and i.received for i in recorder.state().items), 10, item
+                lambda: any(i.name == item and i.received for i in recorder.state().items), item
             )
     finally:
         process.send_signal(signal.SIGINT)
-        _, errors = process.communicate(timeout=10)
+        _, errors = process.communicate(timeout=PATIENCE_S)
     assert errors == f"1 probe, published at {address}; only this computer can read them\n"
     assert process.returncode == 0
     with amberbox.open(box) as record:

@@ -14,6 +14,7 @@ from typing import Any
 import pytest
 
 from amberbox.cli.main import main
+from amberbox.testing.patience import PATIENCE_S
 from amberbox.testing.records import T0_NS, FakeRun, build_segments_of, fill_store
 
 
@@ -142,7 +143,7 @@ def test_follow_prints_rows_until_it_is_stopped(store: str) -> None:
         lines = [process.stdout.readline() for _ in range(6)]
         process.stdout.close()  # as ``| head`` does
         process.terminate()
-        _, errors = process.communicate(timeout=20)
+        _, errors = process.communicate(timeout=PATIENCE_S)
     assert [json.loads(line)["pose_x"] for line in lines] == [294.0 + n for n in range(6)]
     assert b"Traceback" not in errors
 
@@ -152,7 +153,9 @@ def test_a_closed_pipe_is_quiet(store: str) -> None:
     os.close(reading)
     code = "import sys; from amberbox.cli.main import main; sys.exit(main(sys.argv[1:]))"
     command = [sys.executable, "-c", code, "query", store, "odom"]
-    done = subprocess.run(command, stdout=writing, stderr=subprocess.PIPE, timeout=30, check=False)
+    done = subprocess.run(
+        command, stdout=writing, stderr=subprocess.PIPE, timeout=PATIENCE_S, check=False
+    )
     os.close(writing)
     assert done.stderr == b""
 

@@ -20,7 +20,7 @@ from amberbox.cli.main import main
 from amberbox.cli.record import summary, table
 from amberbox.core.errors import UsageError
 from amberbox.testing.box import events
-from amberbox.testing.realros import wait_until
+from amberbox.testing.patience import PATIENCE_S, wait_until
 
 SIM = "- sim:\n    seed: 1\n    topics: [{name: odom}, {name: wifi}]\n"
 STATE = RecorderState(
@@ -75,7 +75,7 @@ def test_the_summary_adds_up() -> None:
 def test_it_ends_by_itself_and_prints_json_meanwhile(folder: Path) -> None:
     began = time.monotonic()
     process = record(folder, "--for", "2.6 s", "--json")
-    output, errors = process.communicate(timeout=40)
+    output, errors = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 0, errors
     assert time.monotonic() - began >= 2.6
     states = [json.loads(line) for line in output.splitlines()]
@@ -91,9 +91,9 @@ def test_it_ends_by_itself_and_prints_json_meanwhile(folder: Path) -> None:
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_a_signal_ends_it_cleanly(folder: Path, number: int) -> None:
     process = record(folder, "--quiet")
-    wait_until(lambda: rows(folder) > 20, 30, "rows")
+    wait_until(lambda: rows(folder) > 20, "rows")
     process.send_signal(number)
-    output, errors = process.communicate(timeout=20)
+    output, errors = process.communicate(timeout=PATIENCE_S)
     assert (process.returncode, output, errors) == (0, "", "")
     assert [event["kind"] for event in events(folder / "store", "stopped")] == ["stopped"]
     files = read.journals(folder / "store")
@@ -153,10 +153,10 @@ def test_wrong_usage(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_the_keeper_goes_with_the_recorder(folder: Path) -> None:
     process = record(folder, "--quiet")
-    wait_until(lambda: keepers(folder), 30, "a keeper")
+    wait_until(lambda: keepers(folder), "a keeper")
     process.kill()
-    process.communicate(timeout=20)
-    wait_until(lambda: not keepers(folder), 20, "its end")
+    process.communicate(timeout=PATIENCE_S)
+    wait_until(lambda: not keepers(folder), "its end")
 
 
 def keepers(folder: Path) -> list[int]:

@@ -39,6 +39,7 @@ from amberbox.robot.link.copying import Copier, HttpSending
 from amberbox.robot.link.dialing import RefusedError, dial
 from amberbox.robot.link.options import LinkOptions
 from amberbox.robot.link.tls import PinError, context_for, fingerprint
+from amberbox.testing.patience import PATIENCE_S
 from tests.robot.link.rig import Watcher, client_of, held, linked, recorded, until
 
 PASSWORD = "four words without meaning"
@@ -69,10 +70,10 @@ class Server:
     ) -> tuple[int, bytes, Mapping[str, str]]:  # fmt: skip
         """Send one request; raises OSError while nobody answers."""
         if self.context is None:
-            client = http.client.HTTPConnection("127.0.0.1", self.port, timeout=10)
+            client = http.client.HTTPConnection("127.0.0.1", self.port, timeout=PATIENCE_S)
         else:
             client = http.client.HTTPSConnection(
-                "localhost", self.port, timeout=10, context=self.context
+                "localhost", self.port, timeout=PATIENCE_S, context=self.context
             )
         try:
             client.request(method, path, body, dict(headers or {}))
@@ -92,12 +93,11 @@ class Server:
                 time.sleep(0.01)
         raise AssertionError("it does not answer")
 
-    def stop(self) -> tuple[int, str, float]:
-        """End it as systemd does; return its status, what it said, and how long that took."""
-        began_s = time.monotonic()
+    def stop(self) -> tuple[int, str]:
+        """End it as systemd does; return its status and what it said."""
         self.process.send_signal(signal.SIGTERM)
-        _, said = self.process.communicate(timeout=20)
-        return self.process.returncode, said, time.monotonic() - began_s
+        _, said = self.process.communicate(timeout=PATIENCE_S)
+        return self.process.returncode, said
 
 
 def started(data: Path, *words: object, context: ssl.SSLContext | None = None) -> Server:
@@ -191,8 +191,8 @@ def test_what_a_robot_says_arrives_and_its_journals_become_columns(
             while await asyncio.to_thread(copier.step):
                 pass
             sending.close()
-            await until(lambda: committed(with_database) == {"committed"}, 30)
-            await until(lambda: held(with_database) == {}, 10)
+            await until(lambda: committed(with_database) == {"committed"})
+            await until(lambda: held(with_database) == {})
 
     asyncio.run(scene())
     with with_database.reading() as connection:
@@ -245,7 +245,7 @@ def test_a_key_that_is_revoked_ends_the_open_connection(server: Server, tmp_path
         with database.begin() as connection:
             revoke_keys(connection, time.time_ns(), "r3")
         database.close()
-        answer = from_server(await asyncio.wait_for(socket_.receive(), 10))
+        answer = from_server(await asyncio.wait_for(socket_.receive(), PATIENCE_S))
         assert isinstance(answer, Bye) and "key" in answer.reason
         with pytest.raises(RefusedError):
             await dial(options_of(mine), context)
@@ -302,19 +302,18 @@ def test_a_jump_of_the_clock_is_told_and_confirmed(
 
 
 def test_it_ends_in_order_and_says_goodbye(server: Server, line: JoinLine, tmp_path: Path) -> None:
-    async def scene() -> tuple[int, str, float]:
+    async def scene() -> tuple[int, str]:
         context = await asyncio.to_thread(context_for, line.url, line.ca, tmp_path)
         socket_ = await dial(options_of(line), context)
         await socket_.send(encode(hello("r1")))
         await socket_.receive()
         ending = asyncio.create_task(asyncio.to_thread(server.stop))
-        answer = from_server(await asyncio.wait_for(socket_.receive(), 10))
+        answer = from_server(await asyncio.wait_for(socket_.receive(), PATIENCE_S))
         assert answer == Bye("the server stops")
         return await ending
 
-    status, said, took_s = asyncio.run(scene())
+    status, said = asyncio.run(scene())
     assert (status, said.partition("\n")[0][:19]) == (0, "To become an admin ")
-    assert took_s < 5
     log = (server.data / "log" / "access.log").read_text().splitlines()
     assert any(json.loads(entry)["principal"] == "robot:r1" for entry in log)
 

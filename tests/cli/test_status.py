@@ -380,7 +380,7 @@ def test_wait_names_the_chain_when_time_is_up(
     say(store, *found)
     started = time.monotonic()
     assert main(["status", str(store), "navigation", "--wait", "0.3"]) == 1
-    assert 0.3 <= time.monotonic() - started < 2
+    assert time.monotonic() - started >= 0.3
     assert capsys.readouterr().err == f"error: navigation: not initialised: {CHAIN}\n"
 
 

@@ -19,6 +19,7 @@ from amberbox.blackbox.store import is_store, open_store
 from amberbox.cli.main import main
 from amberbox.consult.journal import said_until
 from amberbox.core.types import Diagnosis
+from amberbox.testing.patience import PATIENCE_S
 from tests.monitoring.test_teams import files_of_the_page, write
 
 SILENT, LOST = "laser_rear#silent", "ropod_001:carry_carts#lost"
@@ -96,7 +97,7 @@ def running(folders: Sequence[Path]) -> Iterator[None]:
         for process in started:
             process.terminate()
         for process in started:
-            process.wait(30)
+            process.wait(PATIENCE_S)
 
 
 def start(verb: str, folder: Path) -> subprocess.Popen[bytes]:

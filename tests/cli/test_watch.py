@@ -26,6 +26,7 @@ from amberbox.monitoring.watcher.memory import Place, recall
 from amberbox.monitoring.watcher.reader import Reader
 from amberbox.monitoring.watcher.replay import replay
 from amberbox.testing.box import ManualBox
+from amberbox.testing.patience import PATIENCE_S
 from tests.monitoring.watcher.stand import line_of, written
 
 TEMPERATURE = Topic("/temperature", "ros1", Schema("t/T", "ros1msg", b"float64 data\n"))
@@ -227,7 +228,7 @@ def test_watchers_killed_at_random_lose_and_double_nothing(folder: Path) -> None
     plan, _ = load_plan(loaded)
     wait_until_evaluated(plan, open_store(store))
     process.send_signal(signal.SIGTERM)
-    output, _ = process.communicate(timeout=30)
+    output, _ = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 0, output
     live = written(store)
     diagnoser, _ = diagnoser_of(loaded, plan)

@@ -18,6 +18,7 @@ from amberbox.fleet.accounts.tokens import add_token
 from amberbox.fleet.accounts.users import find_user
 from amberbox.fleet.linkend.tables import STATUS
 from amberbox.monitoring.messages.records import encoded
+from amberbox.testing.patience import PATIENCE_S
 from tests.fleet.archive.recordings import Robot
 from tests.fleet.data.filled import fill
 from tests.fleet.house import House, house
@@ -124,11 +125,11 @@ def _say(home: House) -> None:
 
 
 def _await(found: Served, log: Path) -> None:
-    end_s = time.monotonic() + 30
+    end_s = time.monotonic() + PATIENCE_S
     while True:
         assert found.process is not None and found.process.poll() is None, log.read_text()
         try:
-            socket.create_connection(("127.0.0.1", found.port), 1.0).close()
+            socket.create_connection(("127.0.0.1", found.port), PATIENCE_S).close()
             return
         except OSError:
             assert time.monotonic() < end_s, log.read_text()

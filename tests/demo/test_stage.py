@@ -8,8 +8,6 @@ import signal
 import socket
 import subprocess
 import sys
-import time
-from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 
@@ -27,6 +25,7 @@ from amberbox.demo.relay import Relay
 from amberbox.demo.robots import IDS, place_of
 from amberbox.demo.show import free_port
 from amberbox.demo.stage import Stage
+from amberbox.testing.patience import wait_until
 
 
 def test_a_port_that_is_taken_is_passed_over() -> None:
@@ -108,24 +107,17 @@ def test_orders_are_read_line_by_line_as_they_are_added(tmp_path: Path) -> None:
     assert orders.new() == ["heal a"]
 
 
-@pytest.mark.timeout(60)
+@pytest.mark.timeout(180)
 def test_nothing_is_left_when_the_demonstration_is_killed(tmp_path: Path) -> None:
     place = tmp_path / "place"
     command = [sys.executable, "-m", "amberbox", "demo", "--seconds", "60", "--keep", str(place)]
     process = subprocess.Popen(
         [*command, "--port", "18543"], stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL
     )
-    _until(lambda: len(_working_below(place)) > 4, 30)
+    wait_until(lambda: len(_working_below(place)) > 4, "its processes run")
     process.send_signal(signal.SIGKILL)
     process.wait()
-    _until(lambda: _working_below(place) == [], 30)
-
-
-def _until(is_so: Callable[[], bool], within_s: float) -> None:
-    end_s = time.monotonic() + within_s
-    while not is_so():
-        assert time.monotonic() < end_s
-        time.sleep(0.1)
+    wait_until(lambda: _working_below(place) == [], "their end")
 
 
 def _working_below(place: Path) -> list[str]:

@@ -17,11 +17,10 @@ from typing import Any
 from amberbox.blackbox.query.record import open as open_record
 from amberbox.blackbox.store import is_store, open_store
 from amberbox.monitoring.messages.board import BoardReader
-from amberbox.testing.realros import wait_until
+from amberbox.testing.patience import PATIENCE_S, wait_until
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "laser"
 DEVICE, HEARTBEAT = "laser_device_monitor", "laser_heartbeat_monitor"
-WAIT_S = 20.0
 
 
 @dataclass(frozen=True)
@@ -42,7 +41,7 @@ class Laser:
         """Wait until modes have these levels (``component`` stands for the laser itself)."""
         names = {"component": "", "device": DEVICE, "heartbeat": HEARTBEAT}
         wanted = {names[name]: level for name, level in levels.items()}
-        wait_until(lambda: self.levels().items() >= wanted.items(), WAIT_S, f"{levels}")
+        wait_until(lambda: self.levels().items() >= wanted.items(), f"{levels}")
 
     def messages(self) -> dict[str, Any]:
         """Return what the paper's messages say, by the monitor's name."""
@@ -72,14 +71,14 @@ def watched(place: Path, uri: str, topic: str) -> Iterator[Laser]:
     _replace(laser.folder / "components/laser/device.yaml", "/dev/front_laser", str(laser.device))
     laser.device.touch()
     started = [subprocess.Popen(_amberbox("record", str(laser.folder), "--quiet"))]
-    wait_until(lambda: is_store(laser.folder / "store"), WAIT_S, "a store")
+    wait_until(lambda: is_store(laser.folder / "store"), "a store")
     started.append(subprocess.Popen(_amberbox("watch", str(laser.folder), "--quiet")))
     try:
         yield laser
     finally:
         for process in reversed(started):
             process.send_signal(signal.SIGTERM)
-            process.wait(30)
+            process.wait(PATIENCE_S)
 
 
 def play(laser: Laser, stop_driver: Callable[[], None], start_driver: Callable[[], None]) -> None:

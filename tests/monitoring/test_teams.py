@@ -23,6 +23,7 @@ from amberbox.monitoring.configuration.load import load_plan
 from amberbox.monitoring.messages.board import Board, BoardReader
 from amberbox.monitoring.watcher.watcher import Watch, Watcher
 from amberbox.testing.box import recording
+from amberbox.testing.patience import PATIENCE_S
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "teams.md"
 ROBOT = """\
@@ -43,7 +44,6 @@ mappings:
       outputs:
         - output: {name: base_alive, type: bool}
 """
-DEADLINE_S = 20.0
 
 
 def files_of_the_page() -> dict[str, str]:
@@ -88,7 +88,7 @@ def watching(folder: Path) -> Iterator[None]:
         yield
     finally:
         stop.set()
-        thread.join(20)
+        thread.join(PATIENCE_S)
         assert not thread.is_alive()
 
 
@@ -109,7 +109,7 @@ class Level1:
 
     def wait_for(self, component: str, level: Level) -> Status:
         """Wait until a component has a level."""
-        until = time.monotonic() + DEADLINE_S
+        until = time.monotonic() + PATIENCE_S
         while time.monotonic() < until:
             status = self.board().components.get(component)
             if status is not None and status.level == level:
@@ -174,7 +174,7 @@ def hear(socket: Any, alive: bool | None) -> None:
         "monitorName": "base_heartbeat_monitor",
         "healthStatus": {"base_alive": alive},
     }
-    until = time.monotonic() + DEADLINE_S
+    until = time.monotonic() + PATIENCE_S
     while time.monotonic() < until:
         if socket.poll(100) and json.loads(socket.recv()) == wanted:
             return

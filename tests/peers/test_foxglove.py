@@ -26,6 +26,7 @@ from amberbox.blackbox.foxglove.server import Listener, Server, is_loopback
 from amberbox.cli.main import main
 from amberbox.core.types import Schema, Topic
 from amberbox.testing.box import COUNT, ManualBox, number, raw_messages
+from amberbox.testing.patience import PATIENCE_S
 from amberbox.testing.records import fill_store
 
 PLAYING, PAUSED, ENDED = 0, 1, 3
@@ -60,9 +61,9 @@ class Viewer:
     times: list[int] = field(default_factory=list)
     states: list[State] = field(default_factory=list)
 
-    def wait(self, condition: Callable[[], object], timeout_s: float = 10) -> None:
+    def wait(self, condition: Callable[[], object]) -> None:
         """Receive until a condition holds."""
-        end_s = time.monotonic() + timeout_s
+        end_s = time.monotonic() + PATIENCE_S
         while not condition():
             self._take(self.socket.recv(timeout=max(end_s - time.monotonic(), 0)))
 
@@ -126,7 +127,7 @@ def live(store: Path, kind: Any = LiveMessages) -> Iterator[int]:
         yield server.websocket.port
     finally:
         stop.set()
-        thread.join(10)
+        thread.join(PATIENCE_S)
         server.stop()
         assert not thread.is_alive()
 
@@ -237,7 +238,7 @@ def test_a_range_is_played_to_its_end_and_again(store: Path) -> None:
         assert (answer.status, answer.at_ns, answer.did_seek) == (PLAYING, times[0], True)
         client.wait(lambda: len(client.messages("/count")) == 100)
         process.send_signal(signal.SIGINT)
-        assert process.wait(10) == 0
+        assert process.wait(PATIENCE_S) == 0
 
 
 def test_a_viewer_controls_the_playback(store: Path) -> None:
@@ -269,7 +270,7 @@ def test_a_range_of_columns_keeps_its_pace(store: Path) -> None:
         client.wait(lambda: client.messages("ros_count"))
         started = time.monotonic()
         client.wait(lambda: len(client.messages("ros_count")) == 6)
-        assert 0.15 < time.monotonic() - started < 20  # a second; the client may see it late
+        assert time.monotonic() - started > 0.15  # a second; the client may see the first one late
     rows = [json.loads(message) for message in client.messages("ros_count")]
     expected = amberbox.open(store).query("ros_count", None, last - 600_000_000, last)
     assert [row["data"] for row in rows] == expected.values("data")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import socket
 import threading
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -18,6 +17,7 @@ import amberbox
 from amberbox.blackbox.sources.zmq import Config, Source, ZmqTopic
 from amberbox.testing.box import ManualBox, events, last_counters
 from amberbox.testing.contract import ObservedSink, observe
+from amberbox.testing.patience import PATIENCE_S, wait_until
 
 
 @pytest.fixture
@@ -46,17 +46,10 @@ def is_bound(publisher: zmq.Socket[Any], port: int) -> bool:
 
 
 def await_subscription(publisher: zmq.Socket[Any]) -> bytes:
-    assert publisher.poll(5000), "nobody subscribed"
+    assert publisher.poll(round(PATIENCE_S * 1000)), "nobody subscribed"
     subscription = publisher.recv()
     assert subscription[:1] == b"\1"
     return subscription[1:]
-
-
-def wait_until(condition: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + 5
-    while not condition():
-        assert time.monotonic() < deadline, "it did not happen within 5 s"
-        time.sleep(0.005)
 
 
 def links(sink: ObservedSink) -> list[tuple[str, str, str]]:
@@ -179,7 +172,7 @@ def test_another_subscriber_misses_nothing(context: zmq.Context[Any]) -> None:
             publisher.send_multipart([b"t", str(number).encode()])
         sink.wait_for("t", 300)
     for number in range(300):
-        assert other.poll(2000)
+        assert other.poll(round(PATIENCE_S * 1000))
         assert other.recv_multipart() == [b"t", str(number).encode()]
     assert not publisher.poll(0) or publisher.recv() == b"\0"  # at most the unsubscription
 
@@ -219,12 +212,10 @@ def test_wrong_curve_key_is_an_event(context: zmq.Context[Any]) -> None:
     assert links(sink) == []
 
 
-def test_stop_is_heard_within_a_fifth_of_a_second(context: zmq.Context[Any]) -> None:
+def test_stop_is_heard_while_nothing_comes(context: zmq.Context[Any]) -> None:
     publisher, port = bind_publisher(context)
     with observe(Source(Config(endpoint=f"tcp://127.0.0.1:{port}"), "zmq")):
-        await_subscription(publisher)
-        before = time.monotonic()
-    assert time.monotonic() - before < 0.2
+        await_subscription(publisher)  # leaving fails when the source does not end
 
 
 def test_what_a_high_water_mark_hides_is_a_gap_with_a_count(tmp_path: Path) -> None:
@@ -243,7 +234,7 @@ def test_what_a_high_water_mark_hides_is_a_gap_with_a_count(tmp_path: Path) -> N
         counters = box.pipeline.items["zmq_odom"].counters
         wait_until(lambda: counters.received == 12)
         stop.set()
-        thread.join(5)
+        thread.join(PATIENCE_S)
         publisher.close(linger=0)
     box.write()
     box.close()
@@ -309,5 +300,5 @@ def test_all_topics_of_the_last_run_are_gaps_until_they_are_heard(
         wait_until(lambda: len(again.links) == 2)
     finally:
         stop.set()
-        thread.join(5)
+        thread.join(PATIENCE_S)
     assert links(again)[:2] == [("down", "a", "publisher not connected yet"), ("up", "a", "")]

@@ -17,6 +17,7 @@ from amberbox.core.errors import UsageError
 from amberbox.sim import Robot, catalogue
 from amberbox.sim.__main__ import main, parse_fault
 from amberbox.sim.live import Plan, listen, obey, publish
+from amberbox.testing.patience import PATIENCE_S
 
 
 class _Wire:
@@ -137,7 +138,7 @@ def test_a_subscriber_hears_everything_until_sigterm(tmp_path: Path) -> None:
         socket.connect(endpoint)
         heard = [socket.recv_multipart() for _ in range(150)]
         process.send_signal(signal.SIGTERM)
-        out, err = process.communicate(timeout=20)
+        out, err = process.communicate(timeout=PATIENCE_S)
         socket.setsockopt(zmq.RCVTIMEO, 500)
         with pytest.raises(zmq.Again):
             while True:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import socket
 import threading
 
+from amberbox.testing.patience import PATIENCE_S
 from amberbox.testing.proxy import Faults, Proxy, plan
 from amberbox.testing.proxyframes import FrameFaults, Mangler
 
@@ -68,10 +69,10 @@ def test_a_connection_ends_in_the_middle_after_so_many_bytes() -> None:
             client.sendall(bytes(9_000))
             try:
                 client.sendall(bytes(50_000))
-                client.settimeout(5)
+                client.settimeout(PATIENCE_S)
                 assert client.recv(1) == b""
             except ConnectionError:
                 pass  # a reset is an end, too
-        thread.join(5)
+        thread.join(PATIENCE_S)
     listener.close()
     assert len(got) == 10_000 and proxy.struck == ["mid_frame"]

@@ -23,6 +23,7 @@ from amberbox.core.clock import RunClock
 from amberbox.core.source import TopicOptions
 from amberbox.core.types import Schema, Topic
 from amberbox.testing.clock import ManualClock
+from amberbox.testing.patience import PATIENCE_S
 
 WRITE_S = 0.1
 
@@ -83,7 +84,7 @@ def recording(folder: Path) -> Iterator[Recorder]:
         yield recorder
     finally:
         recorder.stop.set()
-        thread.join(20)
+        thread.join(PATIENCE_S)
         assert not thread.is_alive()
 
 

@@ -8,13 +8,13 @@ import os
 import signal
 import socket
 import subprocess
-import time
 import xmlrpc.client
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from amberbox.testing.patience import PATIENCE_S, wait_until
 from amberbox.testing.sink import MemorySink
 
 PYTHON = "/usr/bin/python3"
@@ -43,15 +43,6 @@ def free_port() -> int:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
-
-
-def wait_until(condition: Callable[[], object], timeout_s: float, what: str) -> None:
-    """Wait until a condition holds; raise TimeoutError naming it."""
-    end_s = time.monotonic() + timeout_s
-    while not condition():
-        if time.monotonic() > end_s:
-            raise TimeoutError(f"not within {timeout_s} s: {what}")
-        time.sleep(0.01)
 
 
 @dataclass
@@ -85,7 +76,7 @@ class Processes:
     def master(self, port: int) -> subprocess.Popen[bytes]:
         """Start a master and wait until it answers."""
         process = self.start(["/usr/bin/rosmaster", "--core", "-p", str(port)], port)
-        wait_until(lambda: answers(port), 15, "the ROS master answers")
+        wait_until(lambda: answers(port), "the ROS master answers")
         return process
 
 
@@ -128,7 +119,7 @@ def end(process: subprocess.Popen[bytes], number: int = signal.SIGTERM) -> None:
     """Send a signal and wait for the end. (A roscore in the background ignores SIGINT.)"""
     if process.poll() is None:
         process.send_signal(number)
-        process.wait(20)
+        process.wait(PATIENCE_S)
 
 
 def answers(port: int) -> bool:

@@ -14,6 +14,7 @@ from typing import Any
 from xmlrpc.server import SimpleXMLRPCServer
 
 from amberbox.blackbox.ros1.tcpros import encode_header
+from amberbox.testing.patience import PATIENCE_S
 
 _LENGTH = struct.Struct("<I")
 
@@ -151,11 +152,11 @@ class RosPublisher:
         for connection in list(self.topics[topic].connections):
             connection.sendall(data)
 
-    def wait_for_subscribers(self, topic: str, count: int = 1, timeout_s: float = 5.0) -> None:
+    def wait_for_subscribers(self, topic: str, count: int = 1) -> None:
         """Wait until so many connections are open; raise TimeoutError."""
         with self._changed:
             connections = self.topics[topic].connections
-            if not self._changed.wait_for(lambda: len(connections) >= count, timeout_s):
+            if not self._changed.wait_for(lambda: len(connections) >= count, PATIENCE_S):
                 raise TimeoutError(f"{len(connections)} of {count} subscribers")
 
     def hang_up(self, topic: str) -> None:

@@ -10,6 +10,7 @@ from typing import Any
 
 from amberbox.core.source import Power
 from amberbox.core.types import Topic
+from amberbox.testing.patience import PATIENCE_S
 
 
 @dataclass
@@ -87,7 +88,7 @@ class MemorySink:
         with self._lock:
             return [data for s, data, _ in self.messages if self.topics[s].name == topic]
 
-    def wait_for(self, topic: str, count: int, timeout_s: float = 10.0) -> list[bytes]:
+    def wait_for(self, topic: str, count: int, timeout_s: float = PATIENCE_S) -> list[bytes]:
         """Wait until a topic has that many messages; raise TimeoutError if it never does."""
         with self._lock:
             if not self._lock.wait_for(lambda: len(self._of(topic)) >= count, timeout_s):

@@ -14,6 +14,7 @@ from amberbox.blackbox.keeper.keeper import Keeper
 from amberbox.blackbox.keeper.options import KeeperOptions
 from amberbox.blackbox.store import open_store
 from amberbox.testing.box import COUNT, ManualBox, number
+from amberbox.testing.patience import PATIENCE_S
 
 OPTIONS = KeeperOptions(quota=50_000_000, min_free=0)
 
@@ -50,7 +51,7 @@ def test_what_ends_the_thread_ends_the_keeper(
     ManualBox(tmp_path / "store").close()
     keeper = Keeper(open_store(tmp_path / "store"), OPTIONS)
     keeper.mind_room()
-    assert looked.wait(10)
+    assert looked.wait(PATIENCE_S)
     assert keeper._room is not None
     keeper._room.stop()
     with pytest.raises(RuntimeError, match="a defect"):

@@ -27,7 +27,7 @@ from amberbox.testing.box import (
     raw_messages,
     recording,
 )
-from amberbox.testing.realros import wait_until
+from amberbox.testing.patience import PATIENCE_S, wait_until
 from amberbox.testing.rosnet import RosMaster, RosPublisher, RosTopic
 
 RATE_HZ = 1000
@@ -117,14 +117,14 @@ def test_a_stalling_disk_neither_slows_the_robot_nor_hides_a_loss(
         node.wait_for_subscribers(TOPIC)
         slowest_s = publish(node, before, 0)
         disk.works.clear()
-        assert disk.stalled.wait(5)
+        assert disk.stalled.wait(PATIENCE_S)
         slowest_s = max(slowest_s, publish(node, during, before))
         disk.works.set()
-        wait_until(lambda: recorder.pipeline.intake.size_bytes < 100_000, 10, "written")
+        wait_until(lambda: recorder.pipeline.intake.size_bytes < 100_000, "written")
         slowest_s = max(slowest_s, publish(node, after, before + during))
         sent = before + during + after
         received = recorder.pipeline.items[ITEM].counters
-        wait_until(lambda: received.received == sent, 10, "everything has arrived")
+        wait_until(lambda: received.received == sent, "everything has arrived")
     store = tmp_path / "robot" / "store"
     kept, counters = numbers(store), last_counters(store)[ITEM]
     lost = sorted(set(range(sent)) - set(kept))
@@ -229,11 +229,11 @@ def test_the_recorder_lives_through_a_full_disk(
         node.wait_for_subscribers(TOPIC)
         disk.room = 50_000
         publish(node, 400, 0)
-        wait_until(lambda: recorder.pipeline.disk_error, 5, "the disk is full")
+        wait_until(lambda: recorder.pipeline.disk_error, "the disk is full")
         time_of_trouble = time.monotonic()
-        wait_until(lambda: time.monotonic() > time_of_trouble + 1.2, 5, "a sync fails, too")
+        wait_until(lambda: time.monotonic() > time_of_trouble + 1.2, "a sync fails, too")
         disk.room = None
-        wait_until(lambda: not recorder.pipeline.disk_error, 5, "the disk has room")
+        wait_until(lambda: not recorder.pipeline.disk_error, "the disk has room")
     store = tmp_path / "robot" / "store"
     assert numbers(store) == list(range(400))
     assert len(events(store, "disk")) == 2

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -18,7 +17,7 @@ from amberbox.blackbox.recorder.syncer import Syncer
 from amberbox.blackbox.store import open_store
 from amberbox.core.source import Power
 from amberbox.testing.box import COUNT, ManualBox, events, number, recording
-from amberbox.testing.realros import wait_until
+from amberbox.testing.patience import wait_until
 
 BOX = "- ros: {ros_master_uri: 'http://127.0.0.1:1', topics: [{name: /count}]}\n"
 
@@ -110,17 +109,17 @@ def test_on_battery_what_is_heard_is_soon_durable(tmp_path: Path) -> None:
 
     with recording(robot(tmp_path / "robot", 60.0)) as recorder:
         sink = recorder._sources[0]
-        wait_until(lambda: sink._sink is not None, 5, "the source runs")
+        wait_until(lambda: sink._sink is not None, "the source runs")
         assert sink._sink is not None
         sink._sink.power("mains", "on")
-        wait_until(lambda: recorder.pipeline.bytes_written, 5, "a file")
+        wait_until(lambda: recorder.pipeline.bytes_written, "a file")
         assert durable(recorder) == 0
         sink._sink.power("battery", "off")
-        wait_until(lambda: durable(recorder) > 0, 5, "a sync at once")
+        wait_until(lambda: durable(recorder) > 0, "a sync at once")
         for _ in range(3):
             before = durable(recorder)
             sink._sink.message(sink._sink.topic(COUNT), number(1), sink._sink.now_ns())
-            wait_until(partial(_is_beyond, durable, recorder, before), 2, "a sync soon")
+            wait_until(partial(_is_beyond, durable, recorder, before), "a sync soon")
 
 
 def _is_beyond(value: Callable[[Recorder], int], recorder: Recorder, before: int) -> bool:
@@ -134,17 +133,15 @@ def _has_kept(counters: Counters, n: int) -> bool:
 def test_a_low_battery_leaves_finished_files(tmp_path: Path) -> None:
     with recording(robot(tmp_path / "robot", 60.0)) as recorder:
         source = recorder._sources[0]
-        wait_until(lambda: source._sink is not None, 5, "the source runs")
+        wait_until(lambda: source._sink is not None, "the source runs")
         assert source._sink is not None
         source._sink.power("battery", "off")
         for n in range(2):
             source._sink.message(source._sink.topic(COUNT), number(n), source._sink.now_ns())
             kept = recorder.pipeline.items["ros_count"].counters
-            wait_until(partial(_has_kept, kept, n), 5, "a write, and one more")
-        began = time.monotonic()
+            wait_until(partial(_has_kept, kept, n), "a write, and one more")
         source._sink.power("low", "10 %")
-        wait_until(recorder.stop.is_set, 10, "the end of the run")
-        assert time.monotonic() - began < 5
+        wait_until(recorder.stop.is_set, "the end of the run")
     (stopped,) = events(tmp_path / "robot" / "store", "stopped")
     assert stopped["text"] == "recording stopped: the battery is low"
     assert all(journal.finished for journal in read.journals(tmp_path / "robot" / "store"))

@@ -38,7 +38,7 @@ from amberbox.testing.box import (
     own_records,
     raw_messages,
 )
-from amberbox.testing.realros import wait_until
+from amberbox.testing.patience import PATIENCE_S, wait_until
 
 ROS = "- ros: {ros_master_uri: 'http://127.0.0.1:1', topics: [{name: /count}]}\n"
 FILE = "- recording: {path: absent.bag}\n"
@@ -57,7 +57,7 @@ def running(folder: Path, black_box: str) -> Iterator[tuple[Recorder, threading.
         yield recorder, thread
     finally:
         recorder.stop.set()
-        thread.join(10)
+        thread.join(PATIENCE_S)
         assert not thread.is_alive()
 
 
@@ -80,9 +80,9 @@ def test_what_is_configured_is_known_from_the_first_file_on(
     blocks = ROS.replace("{name: /count}", options)
     with running(tmp_path / "robot", blocks) as (recorder, _):
         store = recorder.store.path
-        wait_until(lambda: own_records(store, "amberbox/run"), 10, "the first file began")
+        wait_until(lambda: own_records(store, "amberbox/run"), "the first file began")
         began.set()
-        wait_until(lambda: raw_messages(store, "/pose"), 10, "a message is recorded")
+        wait_until(lambda: raw_messages(store, "/pose"), "a message is recorded")
         before = amberbox.open(store).query("ros_pose").names
     (record,) = own_records(store, "amberbox/run")
     assert json.loads(record["items"])["ros_pose"]["max_frequency"] == 5
@@ -105,7 +105,7 @@ def test_events_do_not_put_off_the_next_write(
     monkeypatch.setattr(ros_source.Source, "run", run)
     with running(tmp_path / "robot", ROS) as (recorder, _):
         wait_until(
-            lambda: heard_at and recorder.pipeline.items["ros_count"].counters.kept, 5, "a write"
+            lambda: heard_at and recorder.pipeline.items["ros_count"].counters.kept, "a write"
         )
         assert time.monotonic() - heard_at[0] < 0.5
 
@@ -125,8 +125,8 @@ def test_the_gap_of_a_source_that_fails_lasts_until_it_hears_again(
 
     monkeypatch.setattr(ros_source.Source, "run", run)
     with running(tmp_path / "robot", ROS) as (recorder, _):
-        wait_until(lambda: len(runs) == 2, 5, "a second run")
-        wait_until(lambda: recorder.pipeline.items["ros_count"].counters.kept == 2, 5, "both")
+        wait_until(lambda: len(runs) == 2, "a second run")
+        wait_until(lambda: recorder.pipeline.items["ros_count"].counters.kept == 2, "both")
     gaps = amberbox.open(tmp_path / "robot").gaps("ros_count")
     (gap,) = (gap for gap in gaps if gap.reason == "ros failed")
     assert gap.from_ns >= runs[0]
@@ -145,7 +145,7 @@ def test_a_file_that_fails_halfway_is_not_played_again(
 
     monkeypatch.setattr(recording_source.Source, "run", run)
     with running(tmp_path / "robot", FILE) as (_, thread):
-        thread.join(5)  # all sources have ended
+        thread.join(PATIENCE_S)  # all sources have ended
         assert not thread.is_alive()
     store = tmp_path / "robot" / "store"
     (told,) = events(store, "source_failed")
@@ -176,9 +176,9 @@ def test_a_stop_sends_those_away_who_wait_for_room() -> None:
     intake.put_waiting(count, bytes(200), 1)
     waiting = threading.Thread(target=intake.put_waiting, args=(count, bytes(200), 2))
     waiting.start()
-    assert intake.wake.wait(5)
+    assert intake.wake.wait(PATIENCE_S)
     intake.wait_no_more()
-    waiting.join(5)
+    waiting.join(PATIENCE_S)
     assert not waiting.is_alive()
     assert (len(intake.take()), count.counters.received) == (1, 1)
 

@@ -19,7 +19,7 @@ from amberbox.core.errors import AmberboxError
 from amberbox.core.source import TopicOptions
 from amberbox.core.types import Batch
 from amberbox.testing.box import COUNT, ManualBox, number, recording
-from amberbox.testing.realros import wait_until
+from amberbox.testing.patience import wait_until
 
 RING = [TopicOptions("/count", keep="ring")]
 
@@ -118,7 +118,7 @@ def test_robot_yaml_says_where_the_ring_lies(tmp_path: Path) -> None:
         "- sim: {topics: [{name: odom, keep: ring}, {name: wifi}]}\n"
     )
     with recording(folder) as recorder:
-        wait_until(lambda: _kept(recorder) > 5, 10, "messages")
+        wait_until(lambda: _kept(recorder) > 5, "messages")
     store = recorder.store
     found = list((tmp_path / "memory" / store.id / "ring").glob("*.mcap"))
     assert len(found) == 1

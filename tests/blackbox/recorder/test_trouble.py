@@ -27,7 +27,8 @@ from amberbox.testing.box import (
     raw_messages,
     recording,
 )
-from amberbox.testing.realros import free_port, wait_until
+from amberbox.testing.patience import wait_until
+from amberbox.testing.realros import free_port
 from amberbox.testing.rosnet import RosMaster, RosPublisher, RosTopic
 
 INT, FLOAT = (
@@ -96,7 +97,7 @@ def test_a_topic_nobody_publishes_is_a_gap(tmp_path: Path) -> None:
     with recording(robot(tmp_path / "robot", ros_block(master.uri, "/chat", "/nothing"))) as box:
         publisher.wait_for_subscribers("/chat")
         publisher.publish("/chat", b"\x02\0\0\0hi")
-        wait_until(lambda: box.pipeline.items["ros_chat"].counters.received == 1, 5, "a message")
+        wait_until(lambda: box.pipeline.items["ros_chat"].counters.received == 1, "a message")
     publisher.kill()
     master.stop()
     record = amberbox.open(tmp_path / "robot")
@@ -117,12 +118,12 @@ def test_a_master_that_comes_late_is_waited_for(tmp_path: Path) -> None:
     port = free_port()
     folder = robot(tmp_path / "robot", ros_block(f"http://127.0.0.1:{port}", "/chat"))
     with recording(folder) as box:
-        wait_until(lambda: events(folder / "store", "ros_master_unreachable"), 10, "an event")
+        wait_until(lambda: events(folder / "store", "ros_master_unreachable"), "an event")
         master = RosMaster(port)
         publisher = RosPublisher("/robot", {"/chat": RosTopic()}, master)
-        publisher.wait_for_subscribers("/chat", timeout_s=15)
+        publisher.wait_for_subscribers("/chat")
         publisher.publish("/chat", b"\x02\0\0\0hi")
-        wait_until(lambda: box.pipeline.items["ros_chat"].counters.received == 1, 5, "a message")
+        wait_until(lambda: box.pipeline.items["ros_chat"].counters.received == 1, "a message")
     publisher.kill()
     master.stop()
     (told,) = events(folder / "store", "ros_master_unreachable")
@@ -146,7 +147,7 @@ def test_a_source_that_fails_is_told_and_started_again(
     monkeypatch.setattr(Source, "run", fail)
     folder = robot(tmp_path / "robot", ros_block("http://127.0.0.1:1", "/odom"))
     with recording(folder):
-        wait_until(lambda: len(runs) == 2, 5, "a second run")
+        wait_until(lambda: len(runs) == 2, "a second run")
     (told,) = events(folder / "store", "source_failed")
     assert "ros failed and starts again in 1 s: no such device" in told["text"]
 

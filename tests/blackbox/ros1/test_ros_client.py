@@ -17,7 +17,8 @@ from amberbox.blackbox.ros1.client import Client
 from amberbox.blackbox.ros1.settings import Settings
 from amberbox.core.types import Topic
 from amberbox.testing import MemorySink
-from amberbox.testing.realros import free_port, wait_until
+from amberbox.testing.patience import PATIENCE_S, wait_until
+from amberbox.testing.realros import free_port
 from amberbox.testing.rosnet import RosMaster, RosPublisher, RosTopic
 
 TOPIC = "/chat"
@@ -71,7 +72,7 @@ def listening(
         yield
     finally:
         stop.set()
-        thread.join(10)
+        thread.join(PATIENCE_S)
     if errors:
         raise errors[0]
 
@@ -81,11 +82,11 @@ def ways(sink: MemorySink) -> list[tuple[str, str, str]]:
 
 
 def wait_for_link(sink: MemorySink, way: str, count: int = 1) -> None:
-    wait_until(lambda: [w for w, *_ in ways(sink)].count(way) >= count, 5, f"{count} links {way}")
+    wait_until(lambda: [w for w, *_ in ways(sink)].count(way) >= count, f"{count} links {way}")
 
 
 def wait_for_event(sink: MemorySink, kind: str) -> str:
-    wait_until(lambda: any(k == kind for k, _, _ in list(sink.events)), 5, f"event {kind}")
+    wait_until(lambda: any(k == kind for k, _, _ in list(sink.events)), f"event {kind}")
     return next(text for k, text, _ in sink.events if k == kind)
 
 
@@ -127,7 +128,7 @@ def test_what_has_arrived_is_delivered_when_the_box_stops(network: Network) -> N
 def test_a_publisher_that_leaves_is_gone(network: Network) -> None:
     sink = MemorySink()
     with listening(network.settings(poll_s=5.0), sink):
-        wait_until(lambda: network.master.subscribers.get(TOPIC), 5, "registered")
+        wait_until(lambda: network.master.subscribers.get(TOPIC), "registered")
         talker = network.talker()
         talker.wait_for_subscribers(TOPIC)
         wait_for_link(sink, "up")
@@ -177,7 +178,7 @@ def test_the_gap_of_a_new_publisher_begins_before_it_registered(network: Network
     with listening(network.settings(), sink):
         say(network, sink, b"a", node="/a")
         calls = len(network.master.calls)
-        wait_until(lambda: len(network.master.calls) > calls + 2, 5, "two more polls")
+        wait_until(lambda: len(network.master.calls) > calls + 2, "two more polls")
         polled_ns = sink.now_ns() - 300_000_000
         registered_ns = sink.now_ns()
         say(network, sink, b"b", node="/b")
@@ -194,7 +195,7 @@ def test_a_master_that_was_restarted_gets_the_registration_again(network: Networ
         talker.publish(TOPIC, b"without master")
         network.master = RosMaster(network.master.port)
         wait_for_event(sink, "ros_registered_again")
-        wait_until(lambda: network.master.subscribers.get(TOPIC), 5, "registered")
+        wait_until(lambda: network.master.subscribers.get(TOPIC), "registered")
         talker.publish(TOPIC, b"after")
         sink.wait_for(TOPIC, 3)
         say(network, sink, b"other", node="/other")
@@ -222,7 +223,7 @@ def test_a_box_that_restarts_comes_back_under_the_same_address(network: Network)
     sink, addresses = MemorySink(), []
     for _ in range(2):
         with listening(network.settings(), sink):
-            wait_until(lambda: network.master.subscribers.get(TOPIC), 5, "registered")
+            wait_until(lambda: network.master.subscribers.get(TOPIC), "registered")
             addresses.append(network.master.subscribers[TOPIC]["/amberbox"])
     assert addresses[0] == addresses[1]
 
@@ -252,7 +253,7 @@ def test_the_latched_messages_of_several_nodes_are_told_apart(network: Network) 
         ]
         for talker in talkers:
             talker.hang_up(TOPIC)
-        wait_until(lambda: kinds(sink).count("ros_latched_repeat") == 2, 5, "two repeats")
+        wait_until(lambda: kinds(sink).count("ros_latched_repeat") == 2, "two repeats")
     assert sink.of(TOPIC) == [b"a", b"b"]
 
 
@@ -357,12 +358,14 @@ def test_a_master_that_hangs_does_not_hold_up_the_end() -> None:
     silent = socket.create_server(("127.0.0.1", 0))
     with silent:
         sink, stop = MemorySink(), threading.Event()
-        settings = Settings(f"http://127.0.0.1:{silent.getsockname()[1]}/", timeout_s=5.0)
+        settings = Settings(
+            f"http://127.0.0.1:{silent.getsockname()[1]}/", timeout_s=4 * PATIENCE_S
+        )
         thread = threading.Thread(target=Client(settings, {TOPIC: ""}, sink).run, args=(stop,))
         thread.start()
         connection, _ = silent.accept()
         stop.set()
-        thread.join(1.0)
+        thread.join(PATIENCE_S)
         assert not thread.is_alive()
         connection.close()
 
@@ -396,7 +399,7 @@ def test_one_process_under_two_addresses_is_heard_once(network: Network) -> None
         talker = say(network, sink, b"one")
         other_name = talker.uri.replace("127.0.0.1", "localhost")
         network.master.register(TOPIC, "/alias", other_name)
-        wait_until(lambda: len(talker.requests) >= 2, 5, "second connection")
+        wait_until(lambda: len(talker.requests) >= 2, "second connection")
         talker.topics[TOPIC].connections[0].sendall(struct.pack("<I", 3) + b"two")
         sink.wait_for(TOPIC, 2)
     assert ways(sink)[:1] == [("up", NODE, "")] and len(ways(sink)) == 2
@@ -458,7 +461,7 @@ def test_a_remembered_publisher_that_is_dead_is_a_gap_and_an_event(
     again = MemorySink(saved={"publishers": {TOPIC: {NODE: network.publishers[0].uri}}})
     with listening(network.settings(all_topics=all_topics), again, topics):
         wait_for_event(again, "ros_publisher_silent")
-        wait_until(lambda: again.saved["publishers"][TOPIC] == {}, 5, "not for the next run")
+        wait_until(lambda: again.saved["publishers"][TOPIC] == {}, "not for the next run")
         assert len(again.links) == 1
         say(network, again, b"back at another address")
     assert ways(again)[0][:2] == ("down", NODE)
@@ -473,7 +476,7 @@ def test_a_node_that_publishes_a_topic_no_more_is_not_missed(network: Network) -
     remembered = {"/old": {NODE: talker.uri}, TOPIC: {NODE: talker.uri}}
     sink.saved = {"publishers": remembered}
     with listening(network.settings(all_topics=True), sink, {}):
-        wait_until(lambda: sink.saved["publishers"].get("/old") == {}, 5, "forgotten")
+        wait_until(lambda: sink.saved["publishers"].get("/old") == {}, "forgotten")
         wait_for_link(sink, "up")
     assert [topic for _, topic, *_ in sink.links] == [TOPIC, TOPIC]
 
@@ -498,7 +501,7 @@ def test_a_sink_that_is_stuck_holds_nobody_else(network: Network) -> None:
     class StuckSink(MemorySink):
         def message(self, stream: int, data: bytes, received_ns: int) -> None:
             if data == b"stuck":
-                release.wait(10)
+                release.wait(PATIENCE_S)
             super().message(stream, data, received_ns)
 
     sink = StuckSink()
@@ -518,7 +521,7 @@ def test_messages_that_wait_for_their_type_are_stamped_when_they_come(network: N
     class SlowTypes(MemorySink):
         def topic(self, topic: Topic) -> int:
             asked.set()
-            is_built.wait(10)
+            is_built.wait(PATIENCE_S)
             return super().topic(topic)
 
     sink = SlowTypes()
@@ -526,11 +529,11 @@ def test_messages_that_wait_for_their_type_are_stamped_when_they_come(network: N
         talker = network.talker()
         talker.wait_for_subscribers(TOPIC)
         wait_for_link(sink, "up")
-        assert asked.wait(5)
+        assert asked.wait(PATIENCE_S)
         calls = len(network.master.calls)
         talker.publish(TOPIC, b"one", b"two")
         talker.hang_up(TOPIC)
-        wait_until(lambda: len(network.master.calls) > calls + 2, 5, "two more polls")
+        wait_until(lambda: len(network.master.calls) > calls + 2, "two more polls")
         released_ns = sink.now_ns()
         is_built.set()
         sink.wait_for(TOPIC, 2)

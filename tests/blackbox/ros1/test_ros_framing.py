@@ -19,6 +19,7 @@ from amberbox.blackbox.ros1.framing import (
     Reader,
 )
 from amberbox.blackbox.ros1.settings import MalformedError
+from amberbox.testing.patience import PATIENCE_S
 from tests.fuzzing import examples, fuzz
 
 LIMIT = 1 << 30
@@ -123,9 +124,9 @@ def test_a_reader_stamps_after_each_receive_and_ends_with_the_connection() -> No
     thread = threading.Thread(target=reader.run, args=(deliver,))
     thread.start()
     theirs.sendall(framed(b"a", b"b"))
-    assert first_heard.wait(5)
+    assert first_heard.wait(PATIENCE_S)
     theirs.sendall(framed(b"c"))
     theirs.close()
-    thread.join(5)
+    thread.join(PATIENCE_S)
     assert heard == [(b"a", 1), (b"b", 1), (b"c", 2)]
     assert reader.has_read and reader.last_ns == 2

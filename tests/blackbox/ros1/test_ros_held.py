@@ -8,6 +8,7 @@ import pytest
 
 from amberbox.blackbox.ros1 import held as held_module
 from amberbox.blackbox.ros1.held import HeldDelivery
+from amberbox.testing.patience import PATIENCE_S
 
 
 def test_what_is_held_is_delivered_first_and_in_order() -> None:
@@ -31,7 +32,7 @@ def test_too_much_waits_for_the_release(monkeypatch: pytest.MonkeyPatch) -> None
     reader.join(0.05)
     assert reader.is_alive()
     held.release(lambda data, received_ns: heard.append(data))
-    reader.join(5)
+    reader.join(PATIENCE_S)
     assert heard == [b"12345678", b"abcdefgh"]
 
 

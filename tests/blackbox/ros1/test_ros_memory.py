@@ -8,7 +8,7 @@ from amberbox.blackbox.ros1.latched import LatchedFilter, digest
 from amberbox.blackbox.ros1.memory import MOST_PER_TOPIC, Memory
 from amberbox.blackbox.ros1.sightings import Sightings
 from amberbox.testing import MemorySink
-from amberbox.testing.realros import wait_until
+from amberbox.testing.patience import PATIENCE_S, wait_until
 
 
 def test_publishers_are_remembered_across_restarts() -> None:
@@ -57,9 +57,9 @@ def test_changes_are_saved_by_a_thread_of_their_own() -> None:
     thread = threading.Thread(target=memory.keep_saving)
     thread.start()
     memory.remember("/a", "/n", "http://h:1/")
-    wait_until(lambda: sink.saved, 5, "saved")
+    wait_until(lambda: sink.saved, "saved")
     memory.end_saving()
-    thread.join(5)
+    thread.join(PATIENCE_S)
     assert not thread.is_alive() and Memory(sink).uris("/a") == ["http://h:1/"]
 
 

@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from amberbox.blackbox.ros1.node import MOST_BYTES, Node
+from amberbox.testing.patience import PATIENCE_S
 
 Updates = list[tuple[str, Sequence[str]]]
 
@@ -58,7 +59,7 @@ def test_an_unknown_or_wrong_call_is_a_fault(node: Node) -> None:
 
 @pytest.mark.parametrize("length", [str(MOST_BYTES + 1), "-5", "many"])
 def test_a_request_without_end_is_refused(node: Node, length: str) -> None:
-    with socket.create_connection(("127.0.0.1", node.port), 5) as sock:
+    with socket.create_connection(("127.0.0.1", node.port), PATIENCE_S) as sock:
         sock.sendall(f"POST / HTTP/1.0\r\nContent-Length: {length}\r\n\r\n".encode())
         assert b"413" in sock.recv(100)
 

@@ -21,6 +21,7 @@ from amberbox.testing.contract import (
     observe,
     source_problems,
 )
+from amberbox.testing.patience import PATIENCE_S
 
 PLUGINS = find("amberbox.blackbox.sources", defines=("Config", "Source"))
 
@@ -135,7 +136,7 @@ def say(topic: Topic, *messages: tuple[Any, int]) -> Any:
 )
 def test_kit_finds_faulty_runs(act: Any, words: str) -> None:
     with pytest.raises(AssertionError, match=words), observe(Faulty(act=act)) as sink:
-        assert sink.ended.wait(5)
+        assert sink.ended.wait(PATIENCE_S)
 
 
 def test_kit_finds_a_source_that_does_not_stop(monkeypatch: pytest.MonkeyPatch) -> None:

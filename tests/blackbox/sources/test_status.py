@@ -16,6 +16,7 @@ from amberbox.blackbox.sources import status
 from amberbox.core.clock import NS
 from amberbox.core.source import TopicOptions
 from amberbox.testing.contract import ObservedSink, assert_source_contract, observe
+from amberbox.testing.patience import PATIENCE_S
 from amberbox.testing.records import FakeRun
 
 
@@ -167,7 +168,7 @@ def test_silent_member_is_a_lost_link_until_it_speaks_again(member: FakeRun, qui
 
 
 def _wait_for_links(sink: ObservedSink, way: str, count: int) -> Iterator[Any]:
-    until = time.monotonic() + 10
+    until = time.monotonic() + PATIENCE_S
     while time.monotonic() < until:
         found = [link for link in sink.links if link[0] == way]
         if len(found) >= count:

@@ -15,6 +15,7 @@ from amberbox.core.errors import AmberboxError, UsageError
 from amberbox.fleet.accounts import passwords as module
 from amberbox.fleet.accounts.passwords import Cost, Passwords, TooManyError, refuse_weak
 from amberbox.fleet.accounts.weak import weakness
+from amberbox.testing.patience import PATIENCE_S
 from tests.fleet.accounts.stand import CHEAP, PASSWORD
 
 
@@ -90,7 +91,7 @@ class _Held(Passwords):
 
     def _matches(self, held: str, password: str) -> bool:
         self.began.release()
-        assert self.go.wait(10)
+        assert self.go.wait(PATIENCE_S)
         return super()._matches(held, password)
 
 
@@ -115,8 +116,8 @@ def test_two_at_a_time_and_a_queue_that_ends(monkeypatch: pytest.MonkeyPatch) ->
     held = made.hash(PASSWORD)
     with ThreadPoolExecutor(3) as threads:
         running = [threads.submit(made.verify, held, PASSWORD) for _ in range(2)]
-        assert made.began.acquire(timeout=10)
-        assert made.began.acquire(timeout=10)
+        assert made.began.acquire(timeout=PATIENCE_S)
+        assert made.began.acquire(timeout=PATIENCE_S)
         running.append(threads.submit(made.verify, held, PASSWORD))
         _until(lambda: made._queue._value == 0)
         assert not made.began.acquire(blocking=False)
@@ -128,7 +129,7 @@ def test_two_at_a_time_and_a_queue_that_ends(monkeypatch: pytest.MonkeyPatch) ->
 
 
 def _until(true: Callable[[], bool]) -> None:
-    end = time.monotonic() + 10
+    end = time.monotonic() + PATIENCE_S
     while not true():
         assert time.monotonic() < end
         threading.Event().wait(0.001)

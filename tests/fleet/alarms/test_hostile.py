@@ -14,6 +14,7 @@ from amberbox.core.errors import AmberboxError
 from amberbox.fleet.alarms.alarms import Alarms
 from amberbox.fleet.alarms.inbox import News
 from amberbox.link.frames import Row
+from amberbox.testing.patience import PATIENCE_S
 from tests.fleet.alarms.stand import Stand, alarm, blocked, stand
 
 
@@ -92,5 +93,5 @@ def test_a_sender_that_fails_tries_again(home: Stand, monkeypatch: pytest.Monkey
         running.cancel()
 
     sender = home.alarms.sender
-    asyncio.run(asyncio.wait_for(scene(), 10))
+    asyncio.run(asyncio.wait_for(scene(), PATIENCE_S))
     home.alarms.sender = sender

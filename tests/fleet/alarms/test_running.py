@@ -6,9 +6,8 @@ import asyncio
 import time
 from pathlib import Path
 
+from amberbox.testing.patience import PATIENCE_S
 from tests.fleet.alarms.stand import Stand, alarm, stand
-
-PATIENCE_S = 20.0
 
 
 def test_it_listens_acts_and_stops(tmp_path: Path) -> None:

@@ -27,6 +27,7 @@ from amberbox.fleet.jobs import ledger
 from amberbox.fleet.jobs.jobs import SETTING
 from amberbox.fleet.jobs.wanted import Downloads, Wanted
 from amberbox.fleet.options.options import write
+from amberbox.testing.patience import PATIENCE_S
 from amberbox.testing.records import T0_NS
 from tests.fleet.data.filled import ROWS, fill
 from tests.fleet.house import House, house
@@ -48,7 +49,7 @@ def work(home: House, until: Callable[[], bool]) -> None:
 
     async def run() -> None:
         task = asyncio.create_task(home.services.jobs.run())
-        ends = time.monotonic() + 20
+        ends = time.monotonic() + PATIENCE_S
         while not until() and time.monotonic() < ends:
             await asyncio.sleep(0.02)
         task.cancel()

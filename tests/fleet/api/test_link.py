@@ -27,6 +27,7 @@ from amberbox.link import uploads
 from amberbox.link.frames import Bye, Hello, ServerFrame, Welcome, encode, from_server
 from amberbox.link.limits import PIECE_BYTES
 from amberbox.link.uploads import Proof
+from amberbox.testing.patience import PATIENCE_S
 from tests.fleet.house import House, house
 
 STORE = str(uuid.UUID(int=7, version=4))
@@ -213,7 +214,7 @@ def test_a_key_that_stops_ends_the_open_connection_at_once(tmp_path: Path, how: 
             await asyncio.sleep(0.01)
         _stop(home, how)
         services.bus.publish(Change("robot", "ropod_001"))
-        await asyncio.wait_for(serving, 2)
+        await asyncio.wait_for(serving, PATIENCE_S)
         looking.cancel()
         return socket.sent
 

@@ -32,6 +32,7 @@ from amberbox.fleet.uploads.tables import UPLOAD
 from amberbox.link.history import LOST
 from amberbox.link.uploads import Proof
 from amberbox.testing.clock import ManualClock
+from amberbox.testing.patience import PATIENCE_S, until
 from tests.fleet.archive.recordings import Robot
 
 _GB = 1 << 30
@@ -78,17 +79,12 @@ class Scene:
             self.bus.attach(asyncio.get_running_loop())
             task = asyncio.create_task(self.keeping.run())
             try:
-                await asyncio.wait_for(play(), 30)
+                await asyncio.wait_for(play(), PATIENCE_S)
             finally:
                 task.cancel()
                 await asyncio.gather(task, return_exceptions=True)
 
         asyncio.run(both())
-
-
-async def until(what: Callable[[], bool]) -> None:
-    while not what():
-        await asyncio.sleep(0.02)
 
 
 @pytest.fixture

@@ -21,6 +21,7 @@ from amberbox.fleet.audit.log import Head, append, head, rows
 from amberbox.fleet.audit.tables import AUDIT, AUDIT_HEAD
 from amberbox.fleet.audit.verify import Broken, Verified, follow, verify
 from amberbox.fleet.database.database import Database
+from amberbox.testing.patience import PATIENCE_S
 
 START_NS = 1_700_000_000_000_000_000
 ENTRY = Entry("user:anna", "10.0.0.7", "users.write", "bert", details={"role": "operator"})
@@ -208,7 +209,7 @@ def test_threads_and_processes_write_one_chain(database: Database) -> None:
             thread.start()
         for thread in threads:
             thread.join()
-        assert process.wait(30) == 0
+        assert process.wait(PATIENCE_S) == 0
     found = _verified(database)
     assert (found.rows, found.broken) == (80, None)
 

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from amberbox.fleet.database.database import FILE, Database
+from amberbox.testing.patience import PATIENCE_S
 from tests.fleet.endtoend import disaster
 from tests.fleet.endtoend.judging import is_caught_up, judge_data, judge_journals, judge_rows
 from tests.fleet.endtoend.robotprocess import END
@@ -110,7 +111,8 @@ def _settle(world: World, result: Result) -> None:
     for robot in world.robots:
         (robot.folder / END).touch()
     for robot in world.robots:
-        assert robot.box is not None and robot.box.wait(30) == 0, robot.log.read_text()[-3000:]
+        assert robot.box is not None
+        assert robot.box.wait(PATIENCE_S) == 0, robot.log.read_text()[-3000:]
     begin = time.monotonic()
     database = Database(world.data / FILE, read_only=True)
     waiting = list(world.robots)
@@ -124,7 +126,8 @@ def _settle(world: World, result: Result) -> None:
         assert robot.link is not None
         robot.link.terminate()
     for robot in world.robots:
-        assert robot.link is not None and robot.link.wait(15) == 0, robot.log.read_text()[-3000:]
+        assert robot.link is not None
+        assert robot.link.wait(PATIENCE_S) == 0, robot.log.read_text()[-3000:]
 
 
 def _reports(robots: list[Robot]) -> str:

@@ -20,6 +20,7 @@ from amberbox.fleet.accounts.robotkeys import add_robot
 from amberbox.fleet.accounts.users import add_user
 from amberbox.fleet.database.database import FILE, Database
 from amberbox.robot.joining.writing import write_key
+from amberbox.testing.patience import PATIENCE_S
 from amberbox.testing.proxy import Faults, Proxy
 from amberbox.testing.proxyframes import FrameFaults
 
@@ -104,7 +105,7 @@ class Robot:
 
     def wait(self) -> None:
         """Wait until it writes in this life."""
-        end_s = time.monotonic() + 40
+        end_s = time.monotonic() + PATIENCE_S
         while not set(self.store.glob("watch/*.mcap")) - self.written:
             assert time.monotonic() < end_s, self.log.read_text()[-3000:]
             time.sleep(0.05)
@@ -157,10 +158,10 @@ class World:
 
     def wait_for_server(self) -> None:
         """Wait until the server listens."""
-        end_s = time.monotonic() + 40
+        end_s = time.monotonic() + PATIENCE_S
         while True:
             try:
-                socket.create_connection(("127.0.0.1", self.port), 1.0).close()
+                socket.create_connection(("127.0.0.1", self.port), PATIENCE_S).close()
                 return
             except OSError:
                 assert time.monotonic() < end_s, (self.folder / "server.log").read_text()[-3000:]

@@ -18,9 +18,8 @@ from amberbox.fleet.accounts.users import find_user
 from amberbox.fleet.api.who import COOKIE
 from amberbox.fleet.bus import Change
 from amberbox.link.frames import Row
+from amberbox.testing.patience import PATIENCE_S
 from tests.fleet.house import URL, House
-
-PATIENCE_S = 5.0
 
 
 class Stage:

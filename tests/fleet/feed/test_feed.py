@@ -23,6 +23,7 @@ from amberbox.fleet.feed import feed as feed_module
 from amberbox.fleet.feed.delta import Ring
 from amberbox.fleet.feed.feed import MOST_EACH
 from amberbox.fleet.state.said import LONGEST, SaidStatus, heard
+from amberbox.testing.patience import PATIENCE_S
 from tests.fleet.feed.listening import Stage, ask, hear, heard_within, stage
 from tests.fleet.house import URL, House, house
 from tests.fleet.state.lives import put_alarm
@@ -265,7 +266,7 @@ def test_an_ended_session_closes_its_socket(home: House) -> None:
             home.services.bus.publish(Change("account", data={"name": "viewer"}))
             on.status("ropod_001", "error")
             with pytest.raises(ConnectionClosed) as caught:
-                async with asyncio.timeout(5):
+                async with asyncio.timeout(PATIENCE_S):
                     while True:
                         await socket.recv()
             assert caught.value.rcvd is not None and caught.value.rcvd.code == 4401
@@ -452,7 +453,7 @@ def test_a_robot_whose_past_cannot_be_read_ends_nothing(
         assert running.cancelled()
 
     monkeypatch.setattr(state.latest, "load", load)
-    asyncio.run(asyncio.wait_for(scene(), 10))
+    asyncio.run(asyncio.wait_for(scene(), PATIENCE_S))
     assert read == ["ropod_001", "ropod_002", "ropod_003"]
 
 
@@ -471,7 +472,7 @@ def test_what_fails_in_the_feed_leaves_nothing_behind_that_goes_on(
         return len(asyncio.all_tasks()) - before
 
     monkeypatch.setattr(feed, "_lives", fails)
-    assert asyncio.run(asyncio.wait_for(scene(), 10)) == 0
+    assert asyncio.run(asyncio.wait_for(scene(), PATIENCE_S)) == 0
 
 
 def test_a_record_that_is_too_long_to_look_at_is_passed_over() -> None:

@@ -11,6 +11,7 @@ from amberbox.core.errors import UsageError
 from amberbox.fleet.bus import Change
 from amberbox.fleet.knowledge.explained import Explained
 from amberbox.fleet.knowledge.notebook import Given, keep_answer
+from amberbox.testing.patience import PATIENCE_S
 from tests.fleet.house import House, house
 from tests.fleet.knowledge import robot as sim
 
@@ -48,7 +49,7 @@ def worker(home: House, monkeypatch: pytest.MonkeyPatch) -> Worker:
 
 
 async def until_known(explained: Explained, robot: str) -> None:
-    async with asyncio.timeout(5):
+    async with asyncio.timeout(PATIENCE_S):
         while explained.known(robot, FOUND, {}) is None:
             await asyncio.sleep(0.01)
 
@@ -115,7 +116,7 @@ def test_what_an_answer_gave_is_told_and_not_asked_again(home: House, worker: Wo
 
     async def start() -> None:
         running = asyncio.create_task(home.services.explained.run())
-        async with asyncio.timeout(5):
+        async with asyncio.timeout(PATIENCE_S):
             while not told:
                 await asyncio.sleep(0.01)
         running.cancel()
@@ -139,4 +140,4 @@ def test_one_that_cannot_be_explained_keeps_no_other_one_waiting(
         await until_known(home.services.explained, "ropod_001")
         running.cancel()
 
-    asyncio.run(asyncio.wait_for(go_on(), 5))
+    asyncio.run(asyncio.wait_for(go_on(), PATIENCE_S))

@@ -39,6 +39,7 @@ from amberbox.link.frames import (
 )
 from amberbox.link.positions import Place, Reach, RunEnd
 from amberbox.link.serverend import ServerEnd
+from amberbox.testing.patience import PATIENCE_S
 
 REACH = Reach(Place(1, 0), Place(1, 9), Place(1, 5), (RunEnd(1, "b", 9, closed=False),))
 HELLO = Hello("r1", "s", "boot", {"watch": REACH}, "", 0, 0, "1")
@@ -79,7 +80,7 @@ class FakeSocket:
             self.up.put_nowait(encode(frame))
 
     async def hear(self) -> ServerFrame:
-        return from_server(await asyncio.wait_for(self.down.get(), 5))
+        return from_server(await asyncio.wait_for(self.down.get(), PATIENCE_S))
 
 
 def status(seq: int, component: str, level: str = "ok", log_ns: int = 0) -> Row:
@@ -97,11 +98,11 @@ def test_a_robot_that_connects_again_ends_its_older_connection(database: Databas
         second.say(HELLO)
         new = await second.hear()
         assert isinstance(old, Welcome) and isinstance(new, Welcome) and new.epoch > old.epoch
-        await asyncio.wait_for(serving[0], 5)
+        await asyncio.wait_for(serving[0], PATIENCE_S)
         assert first.closed and list(link.robots) == ["r1"]
         second.say(Rows(old.epoch, 1, [status(1, "a")], {}))
         assert isinstance(await second.hear(), Bye)
-        await asyncio.wait_for(serving[1], 5)
+        await asyncio.wait_for(serving[1], PATIENCE_S)
         link.close()
 
     asyncio.run(scene())
@@ -160,7 +161,7 @@ def test_what_cannot_be_answered_ends_the_connection(
         await socket.hear()
         monkeypatch.setattr(ServerEnd, "stored", lambda *_: 1 / 0)
         socket.say(Rows(1, 1, [status(0, "a")], {}))
-        await asyncio.wait_for(task, 5)
+        await asyncio.wait_for(task, PATIENCE_S)
         assert socket.closed and not link.robots
         link.close()
 
@@ -183,7 +184,7 @@ def test_numbers_out_of_range_end_the_connection(database: Database, place: dict
         socket.say(Rows(1, 1, [msgspec.structs.replace(status(0, "a"), **place)], {}))
         bye = await socket.hear()
         assert isinstance(bye, Bye) and "no frame: Expected `int`" in bye.reason
-        await asyncio.wait_for(task, 5)
+        await asyncio.wait_for(task, PATIENCE_S)
         link.close()
 
     asyncio.run(scene())
@@ -202,8 +203,8 @@ def test_one_that_takes_nothing_holds_up_nobody(database: Database) -> None:
         socket.say(HELLO)
         while not socket.down.qsize():
             await asyncio.sleep(0.01)
-        assert not await asyncio.wait_for(link.send("r1", Bye("x")), 5)
-        await asyncio.wait_for(task, 5)
+        assert not await asyncio.wait_for(link.send("r1", Bye("x")), PATIENCE_S)
+        await asyncio.wait_for(task, PATIENCE_S)
         link.close()
 
     asyncio.run(scene())
@@ -236,7 +237,7 @@ def test_silence_is_noticed_and_the_robot_is_offline(database: Database) -> None
         task = asyncio.create_task(link.serve(socket, "r1"))
         socket.say(HELLO)
         await socket.hear()
-        await asyncio.wait_for(task, 5)
+        await asyncio.wait_for(task, PATIENCE_S)
         assert socket.closed and not link.robots
         link.close()
 

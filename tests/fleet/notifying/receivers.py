@@ -13,6 +13,8 @@ from email.message import Message
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from typing import Any
 
+from amberbox.testing.patience import PATIENCE_S
+
 
 @dataclass
 class MailServer:
@@ -69,7 +71,7 @@ def mail_server() -> Iterator[MailServer]:
         server.close()
 
     with _running(serve()):
-        ready.wait(5)
+        ready.wait(PATIENCE_S)
         try:
             yield peer
         finally:
@@ -83,7 +85,7 @@ def _running(work: Coroutine[Any, Any, None]) -> Iterator[None]:
     try:
         yield
     finally:
-        thread.join(10)
+        thread.join(PATIENCE_S)
 
 
 @dataclass
@@ -125,5 +127,5 @@ def hook_server() -> Iterator[Hook]:
         yield hook
     finally:
         server.shutdown()
-        thread.join(10)
+        thread.join(PATIENCE_S)
         server.server_close()

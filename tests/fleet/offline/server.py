@@ -22,6 +22,7 @@ from amberbox.fleet.database.database import FILE, Database
 from amberbox.fleet.serving import starting
 from amberbox.fleet.serving.app import rules
 from amberbox.fleet.serving.binding import Wanted
+from amberbox.testing.patience import PATIENCE_S
 
 
 def main(folder: Path, port: int) -> None:
@@ -31,7 +32,7 @@ def main(folder: Path, port: int) -> None:
     found: dict[str, int] = {}
     asking = threading.Thread(target=_ask, args=(port, secret, found), daemon=True)
     starting.run(folder, Wanted(port=port), begun=lambda _: asking.start())
-    asking.join(10)
+    asking.join(PATIENCE_S)
     print(json.dumps(found))
 
 
@@ -61,7 +62,7 @@ def _ask(port: int, secret: str, found: dict[str, int]) -> None:
 
 
 def _get(port: int, secret: str, path: str, found: dict[str, int]) -> bytes:
-    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=30)
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=PATIENCE_S)
     known = {"robot": "ropod_001", "name": "admin"}
     url = re.sub(r"{(\w+)}", lambda name: known.get(name[1], "nothing"), path)
     connection.request("GET", url, headers={"Cookie": f"{COOKIE}={secret}"})

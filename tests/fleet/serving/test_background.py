@@ -10,6 +10,7 @@ import pytest
 
 from amberbox.fleet.serving import background
 from amberbox.link.backoff import Backoff
+from amberbox.testing.patience import PATIENCE_S
 
 
 class Failing:
@@ -37,7 +38,7 @@ def test_a_part_that_fails_is_started_again_and_the_failure_is_told(
         part = Failing(3)
         waits = Backoff(random.Random(1), 0.001, 0.01)
         task = asyncio.create_task(background.keep_running(part, waits))
-        await asyncio.wait_for(part.works.wait(), 5)
+        await asyncio.wait_for(part.works.wait(), PATIENCE_S)
         await background.end([task])
         assert task.cancelled()
         return part.starts
@@ -53,7 +54,7 @@ def test_parts_do_not_hold_each_other_up() -> None:
     async def scene() -> None:
         parts = [Failing(1000), Failing(0)]
         tasks = background.start(parts)
-        await asyncio.wait_for(parts[1].works.wait(), 5)
+        await asyncio.wait_for(parts[1].works.wait(), PATIENCE_S)
         await background.end(tasks)
 
     asyncio.run(scene())

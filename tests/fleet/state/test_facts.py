@@ -16,6 +16,7 @@ from amberbox.fleet.asking.asking import Asking
 from amberbox.fleet.asking.errors import BrokenError, BusyError, too_long
 from amberbox.fleet.folders.folders import Folders
 from amberbox.fleet.state.facts import AGAIN_S, Facts, FactsBook
+from amberbox.testing.patience import PATIENCE_S
 
 GOOD = msgspec.json.encode(Facts(model="Ropod 2"))
 
@@ -77,7 +78,7 @@ def test_those_who_ask_at_the_same_time_wait_for_one_answer() -> None:
     slow, answer = threading.Event(), desk.ask_now
 
     def ask_now(*words: Any, **more: Any) -> bytes:
-        slow.wait(5)
+        slow.wait(PATIENCE_S)
         return answer(*words, **more)
 
     desk.ask_now = ask_now  # type: ignore[method-assign]  # the same, later

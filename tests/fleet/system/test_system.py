@@ -22,6 +22,7 @@ from amberbox.fleet.system.runner import Runner
 from amberbox.link.backoff import Backoff
 from amberbox.link.frames import Hello, Row
 from amberbox.monitoring.messages.records import encoded
+from amberbox.testing.patience import PATIENCE_S
 from tests.fleet.house import House, house
 
 DEADLINE_S = 60.0
@@ -230,7 +231,7 @@ def test_what_ends_is_started_again_later_each_time() -> None:
         task.cancel()
         await asyncio.gather(task, return_exceptions=True)
 
-    asyncio.run(asyncio.wait_for(play(), 20))
+    asyncio.run(asyncio.wait_for(play(), PATIENCE_S))
     assert runner.trouble == "no room"
 
 
@@ -246,5 +247,5 @@ def test_what_runs_is_ended_with_the_server() -> None:
         await asyncio.gather(task, return_exceptions=True)
         return pid
 
-    pid = asyncio.run(asyncio.wait_for(play(), 20))
+    pid = asyncio.run(asyncio.wait_for(play(), PATIENCE_S))
     assert not Path(f"/proc/{pid}").exists()

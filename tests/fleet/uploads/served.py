@@ -17,6 +17,7 @@ from amberbox.fleet.uploads.pieces import Incoming
 from amberbox.link import uploads
 from amberbox.link.limits import PIECE_BYTES
 from amberbox.link.uploads import PROOF_BYTES, Proof
+from amberbox.testing.patience import PATIENCE_S
 
 
 def application(desk: Desk) -> Any:
@@ -83,5 +84,5 @@ def served(desk: Desk) -> Iterator[int]:
         yield server.servers[0].sockets[0].getsockname()[1]
     finally:
         server.should_exit = True
-        thread.join(10)
+        thread.join(PATIENCE_S)
         desk.close()

@@ -15,6 +15,7 @@ import pytest
 from amberbox.core.errors import AmberboxError
 from amberbox.fleet.uploads import verifying
 from amberbox.fleet.uploads.verifying import Claim, Result, Verifier
+from amberbox.testing.patience import PATIENCE_S
 
 CLAIM = Claim(Path("/nowhere"), "r1", "s", "journal/000001-a-0001.mcap", "0" * 64, None, "")
 
@@ -49,7 +50,7 @@ def test_an_end_does_not_wait_for_a_file_nor_judge_it() -> None:
     stopped(verifier)
     thread = asked(verifier, said)
     verifier.close()
-    thread.join(5)
+    thread.join(PATIENCE_S)
     assert said == ["the server stops"]
 
 
@@ -58,7 +59,7 @@ def test_a_worker_that_was_killed_is_replaced_and_the_file_looked_at_again() -> 
     process = stopped(verifier)
     thread = asked(verifier, said)
     os.kill(process, signal.SIGKILL)
-    thread.join(10)
+    thread.join(PATIENCE_S)
     assert said == ["no file"]
     verifier.close()
 

@@ -14,6 +14,7 @@ import pytest
 
 from amberbox.core.errors import AmberboxError
 from amberbox.monitoring.probes.container import ask
+from amberbox.testing.patience import PATIENCE_S
 
 RUNNING = {"State": {"Status": "running", "Running": True}, "RestartCount": 2}
 SICK = {"State": {"Status": "running", "Health": {"Status": "unhealthy"}}, "RestartCount": 0}
@@ -55,7 +56,7 @@ def engine(tmp_path: Path) -> Iterator[Path]:
         thread.start()
         yield path
         server.shutdown()
-        thread.join(5)
+        thread.join(PATIENCE_S)
 
 
 @pytest.mark.parametrize(

@@ -15,6 +15,7 @@ import pytest
 
 from amberbox.core.errors import AmberboxError, UsageError
 from amberbox.monitoring.probes.ping import by_program, echo_s, measure, repeated, split
+from amberbox.testing.patience import PATIENCE_S
 from amberbox.testing.realros import free_port
 
 IPUTILS = """\
@@ -136,7 +137,7 @@ def echo_server(answer: Callable[[bytes], Sequence[bytes]]) -> Iterator[tuple[ob
         thread = threading.Thread(target=serve, daemon=True)
         thread.start()
         yield server.getsockname()
-        thread.join(5)
+        thread.join(PATIENCE_S)
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ import pytest
 
 from amberbox.core.errors import UsageError
 from amberbox.monitoring.probes.process import Usage, find, judge, measure, usage
-from amberbox.testing.realros import wait_until
+from amberbox.testing.patience import wait_until
 
 PROC = Path("/proc")
 Start = Callable[..., "subprocess.Popen[bytes]"]
@@ -45,7 +45,7 @@ def test_a_program_is_found_by_its_name_while_it_runs(tmp_path: Path, start: Sta
     shutil.copy2(shutil.which("sleep") or "/bin/sleep", program)
     assert measure("laser_driver_amber")["ok"] is False
     first, second = start(str(program), "60"), start(str(program), "60")
-    wait_until(lambda: len(find(PROC, "laser_driver_amber")) == 2, 5, "both run")
+    wait_until(lambda: len(find(PROC, "laser_driver_amber")) == 2, "both run")
     found = measure("laser_driver_amber")
     assert (found["ok"], found["count"]) == (True, 2)
     assert 0.1 < found["rss_mb"] < 100
@@ -76,7 +76,7 @@ def test_a_process_that_is_dead_but_not_buried_does_not_count(start: Start) -> N
     process = start("sleep", "60")
     process.send_signal(signal.SIGKILL)
     stat = PROC / str(process.pid) / "stat"
-    wait_until(lambda: ") Z " in stat.read_text(), 5, "the process is a zombie")
+    wait_until(lambda: ") Z " in stat.read_text(), "the process is a zombie")
     assert usage(PROC, [process.pid]) == {}
 
 

@@ -12,6 +12,7 @@ import pytest
 from amberbox.core.probe import ProbeOrder
 from amberbox.monitoring.probing.probe import Row
 from amberbox.monitoring.probing.runner import ProbeRunner, next_due_s
+from amberbox.testing.patience import PATIENCE_S
 
 COUNTING = """\
 import itertools
@@ -69,7 +70,7 @@ class Rows:
 
     def wait(self, condition: Callable[[], bool]) -> None:
         with self._changed:
-            assert self._changed.wait_for(condition, 5), self.all
+            assert self._changed.wait_for(condition, PATIENCE_S), self.all
 
     def of(self, kind: str) -> list[Row]:
         return [row for _, order, row in self.all if order.kind == kind]
@@ -192,7 +193,7 @@ def test_nothing_is_put_after_close_not_even_by_a_look_under_way(
     file.touch()
     for thread in threading.enumerate():
         if thread.name == f"probe hanging {file}":
-            thread.join(5)
+            thread.join(PATIENCE_S)
     assert len(rows.all) == count
     assert "probe counting a" not in [thread.name for thread in threading.enumerate()]
 
@@ -206,7 +207,7 @@ def test_what_put_raises_comes_out_of_close(probes: Path) -> None:
 
     runner = ProbeRunner([ProbeOrder("counting", "a")], put, [probes])
     runner.start()
-    assert asked.wait(5)
+    assert asked.wait(PATIENCE_S)
     with pytest.raises(OSError, match="the disk is full"):
         runner.close()
     assert isinstance(runner.failure, OSError)

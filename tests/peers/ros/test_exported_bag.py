@@ -15,7 +15,8 @@ from amberbox.blackbox.exporting import ExportOptions, View, export
 from amberbox.blackbox.exporting.job import Compression
 from amberbox.core.types import Schema, Topic
 from amberbox.testing.box import ManualBox
-from amberbox.testing.realros import PYTHON, Ros, end, wait_until
+from amberbox.testing.patience import wait_until
+from amberbox.testing.realros import PYTHON, Ros, end
 
 LISTENER = Path(__file__).with_name("listener.py")
 TYPES = get_typestore(Stores.ROS1_NOETIC)
@@ -79,7 +80,7 @@ def test_rosbag_play_publishes_every_message(ros: Ros, tmp_path: Path) -> None:
     play = ["/usr/bin/rosbag", "play", "--wait-for-subscribers", "-d", "0.5", "-k", "-r", "2"]
     player = ros.processes.start([*play, str(bag)], ros.port)
     try:
-        wait_until(lambda: heard.exists() and count(heard) >= 41, 20, "41 messages are heard")
+        wait_until(lambda: heard.exists() and count(heard) >= 41, "41 messages are heard")
     finally:
         end(player)  # it ends its own child, which kill -9 would leave behind
     lines = [json.loads(line) for line in heard.read_text().splitlines()]

@@ -5,7 +5,8 @@ from __future__ import annotations
 import signal
 
 from amberbox.monitoring.probes import ros_master, ros_node, ros_topic
-from amberbox.testing.realros import Ros, end, wait_until
+from amberbox.testing.patience import wait_until
+from amberbox.testing.realros import Ros, end
 
 
 def test_a_node_that_is_killed_is_seen_though_the_master_still_lists_it(ros: Ros) -> None:
@@ -15,7 +16,7 @@ def test_a_node_that_is_killed_is_seen_though_the_master_still_lists_it(ros: Ros
     assert ros_master.measure(address)["ok"] is True
     assert ros_node.measure(f"/robot@{address}")["registered"] is False
     robot = ros.robot("--topics", "odom")
-    wait_until(lambda: ros_topic.measure(f"/robot/odom@{address}")["ok"], 15, "odom is published")
+    wait_until(lambda: ros_topic.measure(f"/robot/odom@{address}")["ok"], "odom is published")
     found = ros_node.measure(f"/robot@{address}")
     assert found == {"ok": True, "registered": True, "answers": True}
     end(robot, signal.SIGKILL)

@@ -18,6 +18,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from amberbox.blackbox.sources.ros import Config, Source
 from amberbox.core.source import TopicOptions
+from amberbox.testing.patience import PATIENCE_S, wait_until
 from amberbox.testing.realros import (
     GapSink,
     Ros,
@@ -27,7 +28,6 @@ from amberbox.testing.realros import (
     judge,
     read_truth,
     system_state,
-    wait_until,
 )
 
 NAMES = ("odom", "scan", "imu", "battery", "state", "map")
@@ -47,7 +47,7 @@ def box(ros: Ros, sink: GapSink, *names: str, invisible: bool = False) -> Iterat
         yield
     finally:
         stop.set()
-        thread.join(20)
+        thread.join(PATIENCE_S)
         assert not thread.is_alive()
 
 
@@ -78,7 +78,7 @@ def count_ups(sink: GapSink, peer: str = "/robot") -> int:
 
 
 def wait_for_links(sink: GapSink, count: int) -> None:
-    wait_until(lambda: count_ups(sink) >= count, 15, f"{count} links")
+    wait_until(lambda: count_ups(sink) >= count, f"{count} links")
 
 
 def wait_for_more(sink: GapSink, topic: str = "/robot/odom", count: int = 15) -> None:
@@ -90,8 +90,8 @@ def test_a_healthy_robot_is_recorded_whole(ros: Ros) -> None:
     sink = GapSink()
     with box(ros, sink):
         robot = ros.robot("--wait-for", "1", "--duration", "2")
-        assert robot.wait(20) == 0
-        wait_until(lambda: len(sink.open_gaps) == len(NAMES), 5, "all links closed")
+        assert robot.wait(PATIENCE_S) == 0
+        wait_until(lambda: len(sink.open_gaps) == len(NAMES), "all links closed")
     found = verdicts(ros, sink)
     assert_right(found)
     assert {topic: verdict.missing for topic, verdict in found.items()} == {
@@ -105,7 +105,8 @@ def test_definitions_come_from_the_wire(ros: Ros) -> None:
     ros.master()
     sink = GapSink()
     with box(ros, sink):
-        assert ros.robot("--wait-for", "1", "--map-after", "0.1", "--duration", "0.3").wait(20) == 0
+        robot = ros.robot("--wait-for", "1", "--map-after", "0.1", "--duration", "0.3")
+        assert robot.wait(PATIENCE_S) == 0
     types = read_truth(ros.truths()[0])[0]["types"]
     schemas = {topic.name: topic.schema for topic in sink.topics}
     for topic, (name, md5sum) in types.items():
@@ -120,7 +121,7 @@ def test_definitions_come_from_the_wire(ros: Ros) -> None:
 
 def kill_robot(ros: Ros, sink: GapSink, robot: subprocess.Popen[bytes]) -> None:
     end(robot, signal.SIGKILL)
-    wait_until(lambda: len(sink.open_gaps) == len(NAMES), 5, "links down")
+    wait_until(lambda: len(sink.open_gaps) == len(NAMES), "links down")
 
 
 @pytest.mark.parametrize("invisible", [False, True])
@@ -195,7 +196,7 @@ def test_the_box_returns_under_the_same_address(ros: Ros) -> None:
     for _ in range(2):
         sink = GapSink(saved=saved)
         with box(ros, sink, "/chatter"):
-            wait_until(lambda: _subscribers(ros, "/chatter") == ["/amberbox"], 5, "registered")
+            wait_until(lambda: _subscribers(ros, "/chatter") == ["/amberbox"], "registered")
             addresses.append(_node_uri(ros, "/amberbox"))
         saved = sink.saved
     assert addresses[0] == addresses[1]
@@ -230,7 +231,7 @@ def test_clock_and_another_definition_of_a_type(ros: Ros) -> None:
     with box(ros, sink, "/clock", "/robot/state"):
         for kind in ("a", "b"):
             options = ["--topics", "clock,state", "--sim-time", "--state-type", kind]
-            assert ros.robot(*options, "--wait-for", "1", "--duration", "0.5").wait(20) == 0
+            assert ros.robot(*options, "--wait-for", "1", "--duration", "0.5").wait(PATIENCE_S) == 0
     found = verdicts(ros, sink)
     assert found["/clock"].recorded >= 80
     assert_right(found)
@@ -245,7 +246,7 @@ def test_a_publisher_that_waits_for_subscribers_is_not_held_up(ros: Ros) -> None
     sink = GapSink()
     with box(ros, sink):
         options = ("--queue-size", "none", "--rate", "imu=1000", "--scan-beams", "50000")
-        assert ros.robot(*options, "--wait-for", "1", "--duration", "1.5").wait(20) == 0
+        assert ros.robot(*options, "--wait-for", "1", "--duration", "1.5").wait(PATIENCE_S) == 0
     found = verdicts(ros, sink)
     assert_right(found)
     assert sum(verdict.missing for verdict in found.values()) == 0
@@ -267,11 +268,11 @@ def test_a_box_that_hangs_does_not_stop_the_master(ros: Ros) -> None:
     hanging = ros.processes.start(
         [sys.executable, "-c", script, ros.uri, ",".join(NAMES)], ros.port
     )
-    wait_until(lambda: "/hanging" in _subscribers(ros, "/robot/odom"), 10, "other box registered")
+    wait_until(lambda: "/hanging" in _subscribers(ros, "/robot/odom"), "other box registered")
     os.kill(hanging.pid, signal.SIGSTOP)
     sink = GapSink()
     with box(ros, sink):
-        wait_until(lambda: "/amberbox" in _subscribers(ros, "/robot/map"), 5, "registered")
+        wait_until(lambda: "/amberbox" in _subscribers(ros, "/robot/map"), "registered")
         robot = ros.robot()
         wait_for_links(sink, len(NAMES))
         wait_for_more(sink)

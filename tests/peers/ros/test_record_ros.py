@@ -17,16 +17,8 @@ import pytest
 import amberbox
 from amberbox.blackbox.follow import read
 from amberbox.core.errors import UsageError
-from amberbox.testing.realros import (
-    Published,
-    Ros,
-    Verdict,
-    body_of,
-    end,
-    judge,
-    read_truth,
-    wait_until,
-)
+from amberbox.testing.patience import PATIENCE_S, wait_until
+from amberbox.testing.realros import Published, Ros, Verdict, body_of, end, judge, read_truth
 
 NAMES = ("odom", "scan", "imu", "battery", "state", "map")
 POLL_S = 0.25
@@ -74,7 +66,7 @@ class Box:
 
     def wait_for_more(self, item: str = "ros_robot_odom", count: int = 15) -> None:
         before = self.rows(item)
-        wait_until(lambda: self.rows(item) >= before + count, 20, f"more rows of {item}")
+        wait_until(lambda: self.rows(item) >= before + count, f"more rows of {item}")
 
     def bodies(self, item: str) -> list[str]:
         """Return what is recorded of an item, raw and in order, as the truth file names it."""
@@ -110,7 +102,7 @@ def running(ros: Ros, *, invisible: bool = False, all_topics: bool = False) -> I
     box = Box(ros, invisible, all_topics)
     box.start()
     try:
-        wait_until(lambda: box.rows("amberbox_run"), 20, "the box records")
+        wait_until(lambda: box.rows("amberbox_run"), "the box records")
         yield box
     finally:
         if box.process is not None and box.process.poll() is None:
@@ -121,7 +113,7 @@ def test_values_are_equal_to_what_was_published(ros: Ros) -> None:
     ros.master()
     with running(ros) as box:
         robot = ros.robot("--wait-for", "1", "--duration", "2")
-        assert robot.wait(20) == 0
+        assert robot.wait(PATIENCE_S) == 0
         time.sleep(0.3)
     assert_all_accounted_for(ros, box)
     record = amberbox.open(box.folder)

@@ -11,7 +11,8 @@ from amberbox.blackbox.folder.folder import load_folder
 from amberbox.blackbox.journal import writer
 from amberbox.blackbox.recorder.recorder import Recorder
 from amberbox.testing.box import last_counters, raw_messages
-from amberbox.testing.realros import Ros, body_of, read_truth, wait_until
+from amberbox.testing.patience import PATIENCE_S, wait_until
+from amberbox.testing.realros import Ros, body_of, read_truth
 
 RATE_HZ = 1000
 STALL_S = 5.0
@@ -50,15 +51,15 @@ def test_a_publisher_without_a_queue_is_not_slowed_by_a_stalling_disk(
     try:
         robot = ros.robot("--topics", "odom", "--rate", f"odom={RATE_HZ}", "--queue-size", "none",
                           "--wait-for", "1", "--duration", "7")  # fmt: skip
-        wait_until(lambda: received(recorder) > 500, 20, "messages")
+        wait_until(lambda: received(recorder) > 500, "messages")
         works.clear()
         threading.Event().wait(STALL_S)
         works.set()
-        assert robot.wait(20) == 0
+        assert robot.wait(PATIENCE_S) == 0
     finally:
         works.set()
         recorder.stop.set()
-        thread.join(20)
+        thread.join(PATIENCE_S)
     truth = read_truth(ros.truths()[0])
     sent = [entry["body"] for entry in truth if entry["k"] == "pub"]
     messages = raw_messages(folder / "store", "/robot/odom")

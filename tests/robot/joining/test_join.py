@@ -19,6 +19,7 @@ from amberbox.fleet.serving import assembly
 from amberbox.fleet.serving.app import make_app
 from amberbox.fleet.serving.settings import Settings
 from amberbox.robot.joining.trial import Trial
+from amberbox.testing.patience import PATIENCE_S
 
 OTHER_KEY = "abr_0123456789ab_" + "K" * 43
 
@@ -37,7 +38,7 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[int, str]
         time.sleep(0.01)
     yield running.servers[0].sockets[0].getsockname()[1], key
     running.should_exit = True
-    thread.join(10)
+    thread.join(PATIENCE_S)
     assembly.close(services)
 
 

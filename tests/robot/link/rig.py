@@ -27,6 +27,7 @@ from amberbox.link.backoff import Backoff
 from amberbox.robot.link.client import LinkClient
 from amberbox.robot.link.network import Network
 from amberbox.robot.link.options import LinkOptions
+from amberbox.testing.patience import PATIENCE_S
 
 Position = tuple[str, str, int, int]
 """Store, writer, run, seq."""
@@ -188,12 +189,12 @@ async def linked(client: LinkClient) -> AsyncIterator[asyncio.Event]:
         yield stop
     finally:
         stop.set()
-        await asyncio.wait_for(task, 15)
+        await asyncio.wait_for(task, PATIENCE_S)
 
 
-async def until(what: Callable[[], bool], timeout_s: float = 10.0) -> None:
+async def until(what: Callable[[], bool]) -> None:
     """Wait until something is so."""
-    end = asyncio.get_running_loop().time() + timeout_s
+    end = asyncio.get_running_loop().time() + PATIENCE_S
     while not await asyncio.to_thread(what):
         assert asyncio.get_running_loop().time() < end, "it never came to be"
         await asyncio.sleep(0.02)

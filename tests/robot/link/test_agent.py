@@ -9,7 +9,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -25,15 +25,9 @@ from amberbox.core.source import TopicOptions
 from amberbox.robot.joining.writing import write_key
 from amberbox.robot.link.state import LinkState, write_state
 from amberbox.testing.box import COUNT, ManualBox, number, raw_messages
+from amberbox.testing.patience import PATIENCE_S, wait_until
 
 KEY = "abr_0123456789ab_" + "K" * 43
-
-
-def wait_until(is_so: Callable[[], bool], most_s: float = 30.0) -> None:
-    end_s = time.monotonic() + most_s
-    while not is_so():
-        assert time.monotonic() < end_s, "it never came to be"
-        time.sleep(0.02)
 
 
 @pytest.fixture
@@ -99,7 +93,7 @@ def test_it_ends_in_order_and_tells_how_it_is(
     assert main(["link", str(folder)]) == 2, "a second one is refused"
     assert "is being written by process" in capsys.readouterr().err
     process.terminate()
-    assert process.wait(15) == 0
+    assert process.wait(PATIENCE_S) == 0
     assert not is_locked(store, LOCK)
     [finding] = link(subject(folder), Host())
     assert "nothing links this robot" in finding.found

@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import time
 from pathlib import Path
 
 from amberbox.core.source import TopicOptions
 from amberbox.robot.link.docking import Dock
 from amberbox.testing.box import COUNT, ManualBox, number
+from amberbox.testing.patience import wait_until
 
 
 def wait_for(dock: Dock, docked: bool) -> None:
-    end_s = time.monotonic() + 10
-    while dock.docked is not docked:
-        assert time.monotonic() < end_s, (dock.docked, dock.problem)
-        time.sleep(0.02)
+    wait_until(lambda: dock.docked is docked, f"docked={docked} {dock.problem}")
 
 
 def test_the_last_value_counts(tmp_path: Path) -> None:

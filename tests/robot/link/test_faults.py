@@ -51,7 +51,7 @@ async def carry(path: Path, database: Database, faults: Faults, seed: int) -> Pr
                     watcher.write(10, 1, sync=False)
                     await asyncio.sleep(0.03)
                 watcher.close()
-                await until(lambda: held(database) == recorded(path), 20)
+                await until(lambda: held(database) == recorded(path))
     return proxy
 
 

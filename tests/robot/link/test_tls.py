@@ -19,6 +19,7 @@ from cryptography.x509.oid import NameOID
 
 from amberbox.core.errors import UsageError
 from amberbox.robot.link.tls import FILE, PinError, context_for, fingerprint, normal
+from amberbox.testing.patience import PATIENCE_S
 
 LONG_AGO = datetime.datetime(2001, 1, 1, tzinfo=datetime.UTC)
 DAY = datetime.timedelta(days=1)
@@ -80,12 +81,12 @@ def served(authority: Authority) -> Iterator[int]:
     yield listener.getsockname()[1]
     listener.shutdown(socket.SHUT_RDWR)
     listener.close()
-    thread.join(5)
+    thread.join(PATIENCE_S)
 
 
 def shake_hands(port: int, context: ssl.SSLContext, name: str = "localhost") -> None:
     with (
-        socket.create_connection(("127.0.0.1", port), 5) as plain,
+        socket.create_connection(("127.0.0.1", port), PATIENCE_S) as plain,
         context.wrap_socket(plain, server_hostname=name),
     ):
         pass

@@ -11,6 +11,7 @@ import pytest
 
 from amberbox.robot.supervisor.footprint import footprint, recorded_by
 from amberbox.robot.supervisor.judgement import LIMIT_S, Judgement, Judging, read
+from amberbox.testing.patience import PATIENCE_S
 
 
 def problem(line: int, *, is_error: bool = True) -> dict[str, object]:
@@ -38,7 +39,7 @@ def test_no_answer_is_no_approval() -> None:
 
 
 def answer_of(question: Judging) -> Judgement:
-    end_s = time.monotonic() + 30
+    end_s = time.monotonic() + PATIENCE_S
     while (answer := question.answer(0.0)) is None:
         assert time.monotonic() < end_s
         time.sleep(0.02)

@@ -19,6 +19,7 @@ from amberbox.robot.supervisor.child import Child
 from amberbox.robot.supervisor.life import Life
 from amberbox.robot.supervisor.output import Voice
 from amberbox.robot.supervisor.process import MARK, Process, RealProcess
+from amberbox.testing.patience import PATIENCE_S, wait_until
 from tests.robot.supervisor.puppet import Theatre
 
 LIVELY = """\
@@ -36,13 +37,6 @@ while True:
 def child(text: str, **more: float | bool) -> Child:
     made = Child("one", [sys.executable, "-S", "-c", text], watchdog_s=0.5, start_s=10.0)
     return replace(made, **more)  # type: ignore[arg-type]  # each test knows the types it gives
-
-
-def wait_until(is_so: Callable[[], bool], most_s: float = 10.0) -> None:
-    end_s = time.monotonic() + most_s
-    while not is_so():
-        assert time.monotonic() < end_s
-        time.sleep(0.01)
 
 
 @pytest.fixture
@@ -143,7 +137,7 @@ def test_one_that_nobody_listens_to_is_not_held_up(lives: Begin) -> None:
     life, _ = lives(child(flood))
     life.step(0.0)
     assert isinstance(life.process, RealProcess)
-    assert life.process._process.wait(10) == 0
+    assert life.process._process.wait(PATIENCE_S) == 0
 
 
 PARENT = """\
