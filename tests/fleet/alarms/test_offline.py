@@ -192,3 +192,28 @@ def test_who_stays_away_after_a_restart_is_missed(home: Stand) -> None:
     home.connect("r1")
     home.wait(70, 10)
     assert home.only().state == "resolved"
+
+
+@pytest.mark.parametrize("step_s", [3600.0, -3600.0, 86_400.0 * 400])
+def test_a_step_of_the_servers_clock_neither_raises_nor_clears(home: Stand, step_s: float) -> None:
+    home.lose("r1")
+    home.wait(60)
+    home.clock.step(step_s)
+    home.wait(40)
+    assert home.found() == [], "away for 100 s, whatever the wall clock says"
+    home.wait(30)
+    (alarm,) = home.found()
+    now_ns = home.clock.wall_ns()
+    assert now_ns - 131 * NS <= alarm.opened_ns <= now_ns, "told by the clock as it is now"
+    assert len(home.told) == 1
+    home.connect("r1")
+    home.wait(10)
+    home.clock.step(step_s)
+    home.wait(40)
+    assert (home.only().active, home.only().state) == (False, "open"), "quiet for 50 s"
+    home.wait(15)
+    assert home.only().state == "resolved"
+    home.clock.step(step_s)
+    home.lose("r1")
+    home.wait(130)
+    assert (home.only().count, home.only().active) == (2, True), "away again soon"

@@ -14,7 +14,7 @@ Statuses = Sequence[Mapping[str, Any]]
 
 @dataclass(slots=True)
 class Absence:
-    """Who is away since when, by the server's clock; who is missed already."""
+    """Who is away since when, in ns since boot, which never step; who is missed already."""
 
     away: dict[str, int] = field(default_factory=dict)
     settled: set[str] = field(default_factory=set)

@@ -8,7 +8,7 @@ import threading
 from collections.abc import Callable
 from typing import Any, Final
 
-from amberbox.core.clock import Clock
+from amberbox.core.clock import NS, Clock
 from amberbox.core.errors import AmberboxError
 from amberbox.fleet.alarms import inbox as boxes
 from amberbox.fleet.alarms.absence import Absence
@@ -18,7 +18,7 @@ from amberbox.fleet.alarms.register import Register
 from amberbox.fleet.alarms.reports import Received, is_of_interest, reports
 from amberbox.fleet.alarms.settings import NAME, AlarmSettings
 from amberbox.fleet.alarms.taking import take, take_explanation
-from amberbox.fleet.alarms.timing import Lateness, is_due, pass_time
+from amberbox.fleet.alarms.timing import Lateness, is_due, move_times, pass_time
 from amberbox.fleet.alarms.words import Explanation, explanation_of
 from amberbox.fleet.bus import Bus, Change
 from amberbox.fleet.database.database import Database
@@ -26,6 +26,8 @@ from amberbox.fleet.notifying.sending import Sender
 from amberbox.fleet.options.options import read
 
 _TICK_S: Final = 1.0
+_STEP_NS: Final = 2 * NS
+"""The wall clock was set if it is off by so much since the last look; less is slewing."""
 
 
 class Alarms:
@@ -40,6 +42,7 @@ class Alarms:
         self._clock = clock
         self._url = public_url
         self._made_ns = clock.wall_ns()
+        self._base_ns = clock.wall_ns() - clock.boot_ns()
         self._inbox = Inbox()
         self._absence: Absence | None = None
         self._late = Lateness()
@@ -63,7 +66,7 @@ class Alarms:
         self._inbox.put(Came(change.robot, hello.boot_id, now_ns - hello.wall_ns, now_ns))
 
     def _gone(self, change: Change) -> None:
-        self._inbox.put(Went(change.robot, self._clock.wall_ns()))
+        self._inbox.put(Went(change.robot, self._clock.boot_ns()))
 
     def _explained(self, change: Change) -> None:
         found = explanation_of(change.robot, change.data["answer"])
@@ -93,6 +96,7 @@ class Alarms:
     def step(self) -> None:
         """Take all that is new, and do what is due by now; publishes the alarms that changed."""
         with self._stepping:
+            self._follow_clock()
             changed = self._start() if self._absence is None else set()
             while news := self._inbox.next():
                 changed |= self._taken(news)
@@ -101,11 +105,21 @@ class Alarms:
         for number, robot in sorted(self._robots(changed)):
             self._bus.publish(Change("alarm", robot, {"id": number}))
 
+    def _follow_clock(self) -> None:
+        """Move what is timed by the wall clock when that was set: no time has passed by it."""
+        base_ns = self._clock.wall_ns() - self._clock.boot_ns()
+        step_ns = base_ns - self._base_ns
+        if abs(step_ns) >= _STEP_NS:
+            with self._database.begin() as connection:
+                move_times(connection, self._clock.wall_ns(), step_ns)
+            self._offsets = {of: ns + step_ns for of, ns in self._offsets.items()}
+            self._late.move(step_ns)
+        self._base_ns = base_ns
+
     def _start(self) -> set[int]:
         """Begin: nobody is missed yet; take what came while nobody looked."""
-        now_ns = self._clock.wall_ns()
         with self._database.reading() as connection:
-            absence = absent_since_start(Register(connection), now_ns)
+            absence = absent_since_start(Register(connection), self._clock.boot_ns())
             left: list[News] = list(boxes.missed_rows(connection, self._made_ns))
         self._absence = absence
         self._note_clocks(self._inbox.next())
@@ -161,7 +175,7 @@ class Alarms:
             if isinstance(one, Came):
                 self._absence.back(one.robot)
             elif isinstance(one, Went):
-                self._absence.gone(one.robot, one.at_ns)
+                self._absence.gone(one.robot, one.boot_ns)
 
     def _tick(self) -> set[int]:
         """Do what is due by now."""
@@ -176,7 +190,7 @@ class Alarms:
         try:
             with self._database.begin() as connection:
                 register = Register(connection)
-                miss(register, absence, now_ns, settings)
+                miss(register, absence, now_ns, self._clock.boot_ns(), settings)
                 pass_time(register, self._late, now_ns, settings, self._url)
         except BaseException:  # nothing of it is kept: it is decided again
             absence.settled = before

@@ -35,10 +35,10 @@ class Came:
 
 @dataclass(frozen=True, slots=True)
 class Went:
-    """The connection to a robot has ended."""
+    """The connection to a robot has ended; ``boot_ns`` counts from the boot of the server."""
 
     robot: str
-    at_ns: int
+    boot_ns: int
 
 
 News: TypeAlias = Received | Came | Went | Explanation

@@ -25,11 +25,11 @@ CONNECTION: Final = "connection"
 _NAMED = 5
 
 
-def absent_since_start(register: Register, now_ns: int) -> Absence:
+def absent_since_start(register: Register, boot_ns: int) -> Absence:
     """Return who is away when the server starts: nobody is missed for the time it was down."""
     connection = register.connection
     known = {robot.id for robot in list_robots(connection) if robot.disabled_ns is None}
-    absence = Absence({one.robot: now_ns for one in presences(connection) if one.robot in known})
+    absence = Absence({one.robot: boot_ns for one in presences(connection) if one.robot in known})
     absence.settled = {robot for robot, _ in _away(register)} & absence.away.keys()
     return absence
 
@@ -44,15 +44,21 @@ def _away(register: Register) -> list[tuple[str, int]]:
     return [(row.robot, row.alarm) for row in register.connection.execute(chosen)]
 
 
-def miss(register: Register, absence: Absence, now_ns: int, settings: AlarmSettings) -> None:
-    """Open alarms for robots that have been away for too long without an excuse."""
+def miss(
+    register: Register, absence: Absence, now_ns: int, boot_ns: int, settings: AlarmSettings
+) -> None:
+    """Open alarms for robots that have been away for too long without an excuse.
+
+    How long is counted from boot (``boot_ns``): a step of the wall clock misses nobody. What an
+    alarm tells is wall time (``now_ns``).
+    """
     if not absence.away.keys() - absence.settled:
         return
     robots = {robot.id: robot for robot in list_robots(register.connection)}
     for name in absence.away.keys() - robots.keys():
         absence.back(name)
     found = absence.missed(
-        now_ns, lambda name: _after_ns(robots[name], settings), settings.ns("together_s")
+        boot_ns, lambda name: _after_ns(robots[name], settings), settings.ns("together_s")
     )
     for together in found:
         absence.settled.update(together)
@@ -64,7 +70,8 @@ def miss(register: Register, absence: Absence, now_ns: int, settings: AlarmSetti
         ]  # fmt: skip
         if missing:
             told = {name: statuses[name] for name in missing}
-            _open(register, absence, robots, told, now_ns, settings)
+            since = {name: now_ns - (boot_ns - absence.away[name]) for name in missing}
+            _open(register, since, robots, told, now_ns, settings)
 
 
 def _after_ns(robot: KnownRobot, settings: AlarmSettings) -> int:
@@ -81,7 +88,7 @@ def _after_ns(robot: KnownRobot, settings: AlarmSettings) -> int:
 
 def _open(
     register: Register,
-    absence: Absence,
+    away_ns: Mapping[str, int],
     robots: Mapping[str, KnownRobot],
     missing: Mapping[str, Statuses],
     now_ns: int,
@@ -91,7 +98,7 @@ def _open(
     robot = names[0] if len(names) == 1 else ""
     origin = CONNECTION if robot else _shared(robots, missing, settings)
     severity: Severity = "urgent" if robot else "critical"
-    since = [(name, absence.away[name]) for name in names]
+    since = [(name, away_ns[name]) for name in names]
     known = register.newest(robot, origin, "offline")
     if known is not None and _goes_on(register, known, names, now_ns, settings):
         _again(register, known, since, now_ns, settings)

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from typing import Final
 
-from sqlalchemy import ColumnElement, Connection, and_, or_, select
+from sqlalchemy import ColumnElement, Connection, and_, or_, select, update
 
 from amberbox.core.clock import NS
 from amberbox.fleet.accounts.tables import ROBOT_GROUPS
@@ -15,13 +15,16 @@ from amberbox.fleet.alarms.alarm import Alarm, is_worse
 from amberbox.fleet.alarms.register import Register
 from amberbox.fleet.alarms.reports import Report
 from amberbox.fleet.alarms.settings import AlarmSettings
-from amberbox.fleet.alarms.tables import ALARM, ALARM_ROBOT
+from amberbox.fleet.alarms.tables import ALARM, ALARM_ROBOT, MARK
 from amberbox.fleet.notifying import followups
 from amberbox.fleet.notifying.outbox import Told, put
 from amberbox.fleet.notifying.settings import NAME, Notifications
+from amberbox.fleet.notifying.tables import CHANGED
 from amberbox.fleet.options.options import read
 
 _ASTRAY_NS: Final = 60 * NS
+_RECENT_NS: Final = 3600 * NS
+"""Alarms that were resolved in this time may still open again."""
 _AT_ONCE: Final = 50
 """Alarms that are told in one transaction, the oldest first; the others a moment later."""
 
@@ -37,6 +40,24 @@ class Lateness:
         for report in told:
             if report.late:
                 self.until[report.robot] = now_ns
+
+    def move(self, step_ns: int) -> None:
+        """Move all times by a step of the wall clock."""
+        self.until = {robot: at_ns + step_ns for robot, at_ns in self.until.items()}
+
+
+def move_times(connection: Connection, now_ns: int, step_ns: int) -> None:
+    """Move what alarms wait for by a step of the wall clock: no time has passed by it.
+
+    Until when an alarm is shelved is what a person chose, and stays.
+    """
+    moving = or_(ALARM.c.state != "resolved", ALARM.c.resolved_ns > now_ns - step_ns - _RECENT_NS)
+    times = (ALARM.c.cleared_ns, ALARM.c.notify_ns, ALARM.c.resolved_ns)
+    moved = {column.name: column + step_ns for column in times}  # NULL stays NULL
+    connection.execute(update(ALARM).where(moving).values(moved))
+    connection.execute(update(CHANGED).values(due_ns=CHANGED.c.due_ns + step_ns))
+    ahead = update(MARK).where(MARK.c.received_ns > now_ns)
+    connection.execute(ahead.values(received_ns=now_ns))
 
 
 def is_due(connection: Connection, now_ns: int, settings: AlarmSettings) -> bool:
