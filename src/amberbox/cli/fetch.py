@@ -72,6 +72,7 @@ def _show(found: list[Fetch], *, as_json: bool) -> None:
         print_json([msgspec.to_builtins(one) for one in found])
     elif found:
         print_grid(_HEADER, map(_row, found))
+        tell(f"{one.id}: {one.reason}" for one in found if one.reason)
     else:
         print("nothing was asked of this robot")
 

@@ -166,6 +166,7 @@ class Fetch(Answer, frozen=True):
     to: str
     who: str
     state: str
+    reason: str = ""
     copied: int = 0
     journals: tuple[FetchedJournal, ...] = ()
     asked: str = ""

@@ -13,7 +13,7 @@ from typing import Any, Literal, TypeAlias, get_args
 
 Kind: TypeAlias = Literal[
     "rows", "live", "connected", "gone", "journal", "committed", "robot", "alarm", "job", "fetch",
-    "account", "diagnosis", "explained", "has",
+    "account", "diagnosis", "explained", "has", "holdings",
 ]  # fmt: skip
 """What a change is about.
 
@@ -25,6 +25,7 @@ another folder. ``alarm`` (data: id), ``job`` (data: id, owner), ``fetch`` (data
 ``account`` (data: name; its sessions may have ended), ``diagnosis`` (data: id).
 ``explained``: a diagnosis was put into words (data: answer, as ``POST .../diagnose`` gives it).
 ``has``: a robot told which journals hold a window (data: store_id, id, files).
+``holdings``: a robot asked which of its journals are here, to send again those that are not.
 """
 
 KINDS = frozenset(get_args(Kind))

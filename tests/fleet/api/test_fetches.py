@@ -14,6 +14,7 @@ from amberbox.fleet.fetches import ledger
 from amberbox.fleet.uploads.tables import UPLOAD
 from amberbox.link.frames import Fetch, ServerFrame
 from amberbox.link.limits import FILES
+from amberbox.testing.clock import ManualClock
 from tests.fleet.house import House, house
 
 FETCHES = "/api/v1/robots/ropod_001/fetches"
@@ -134,6 +135,54 @@ def test_what_the_robot_deletes_before_it_is_copied_is_not_waited_for(
     lost = ("journal/000002-a-0002.mcap", 10)
     told(home, [has(other, lost)], lambda: state(home, other)["state"] == "copying")
     told(home, [has(other)], lambda: state(home, other)["state"] == "gone")
+
+
+@pytest.fixture
+def hour(home: House, monkeypatch: pytest.MonkeyPatch) -> Callable[[float], None]:
+    """Let time go by for what waits for robots, and let it look after them."""
+    fetches, clock = home.services.fetches, ManualClock()
+    monkeypatch.setattr(fetches, "_clock", clock)
+
+    def wait(hours: float) -> None:
+        clock.advance(3600 * hours)
+        asyncio.run(fetches._look())
+
+    return wait
+
+
+def test_a_robot_that_takes_for_copied_what_is_not_here_is_not_waited_for_for_ever(
+    home: House, frames: list[ServerFrame], hour: Callable[[float], None]
+) -> None:
+    """An amberbox that never asks what the server holds; the server was restored."""
+    one, other = ask(home, item="lost"), ask(home, item="half")
+    files = [("journal/000009-a-0000.mcap", 10), ("journal/000009-a-0001.mcap", 20)]
+    named = [Change("connected", "ropod_001"), has(one, files[0]), has(other, *files)]
+    told(home, named, lambda: state(home, other)["state"] == "copying")
+    hour(0)
+    hour(0.9)
+    told(home, [arrived(home, files[1][0])], lambda: state(home, other)["copied"] == 1)
+    hour(0.9)
+    assert state(home, one)["state"] == "copying", "something came half an hour ago"
+    assert state(home, one)["reason"] == ""
+    hour(1.1)
+    assert (state(home, one)["state"], state(home, other)["state"]) == ("gone", "ready")
+    assert state(home, one)["ended"]
+    assert "1 of 1 journals did not come" in state(home, one)["reason"]
+    assert "update it on the robot" in state(home, one)["reason"]
+    assert [file["state"] for file in state(home, other)["journals"]] == ["late", "verified"]
+
+
+def test_a_robot_that_sends_again_what_is_missing_is_waited_for(
+    home: House, frames: list[ServerFrame], hour: Callable[[float], None]
+) -> None:
+    one = ask(home, item="later")
+    asks = [Change("connected", "ropod_001"), Change("holdings", "ropod_001")]
+    named = has(one, ("journal/000008-a-0000.mcap", 10))
+    told(home, [*asks, named], lambda: state(home, one)["state"] == "copying")
+    for _ in range(30):
+        hour(1)
+    assert state(home, one)["state"] == "copying"
+    home.client("technician").delete(f"{FETCHES}/{one['id']}")
 
 
 def test_another_robot_cannot_answer(home: House) -> None:

@@ -64,7 +64,7 @@ def test_a_link_killed_20_times_leaves_no_gap(
     store = box.pipeline.store
     for kill in range(20):
         started.append(start(folder))
-        end_s = time.monotonic() + (2.0 if kill < 3 else 0.15)  # some get to work, some do not
+        end_s = time.monotonic() + (PATIENCE_S if kill < 3 else 0.15)  # some get to work
         while time.monotonic() < end_s and not is_locked(store, LOCK):
             box.hear(COUNT, number(count))
             box.write()

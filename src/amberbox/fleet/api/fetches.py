@@ -34,7 +34,7 @@ class NewFetch(Form):
 
 
 class FetchedJournal(Shown):
-    """A journal of the window; ``state`` is empty until it has come."""
+    """A journal of the window; ``state`` is empty until it has come, ``late`` when it did not."""
 
     store_id: str
     journal: str
@@ -46,7 +46,8 @@ class Fetch(Shown):
     """What was asked of a robot.
 
     ``state``: ``waiting`` for the robot, ``asked``, ``copying`` (``copied`` of ``journals``),
-    ``ready``, ``gone`` when the robot has nothing of it (any more), ``cancelled``.
+    ``ready``, ``gone`` when nothing of it comes (any more), ``cancelled``. ``reason`` says why
+    journals did not come that the robot had named.
     """
 
     id: str
@@ -56,6 +57,7 @@ class Fetch(Shown):
     to: str
     who: str
     state: State
+    reason: str
     copied: int
     journals: list[FetchedJournal]
     asked: str
@@ -125,7 +127,7 @@ def _shown(one: Fetched) -> Fetch:
     ]
     return Fetch(
         id=one.id, robot=one.robot, item=one.item, from_=format_time(one.from_ns),
-        to=format_time(one.to_ns), who=one.who, state=one.state,
+        to=format_time(one.to_ns), who=one.who, state=one.state, reason=one.reason,
         copied=sum(bool(file.state) for file in files), journals=files,
         asked=format_time(one.asked_ns), sent=shown(one.sent_ns), ended=shown(one.ended_ns),
     )  # fmt: skip

@@ -10,6 +10,7 @@ from fastapi import HTTPException, Path, Request, Response, WebSocket
 
 from amberbox.fleet.accounts.authority import CERTIFICATE
 from amberbox.fleet.api.access import Fleet, Open, Routes, Who
+from amberbox.fleet.bus import Change
 from amberbox.fleet.linkend.sockets import StarletteSocket
 from amberbox.fleet.serving.doorkeeper import KeyedSocket
 from amberbox.fleet.uploads.desk import Answer, verdict
@@ -90,6 +91,7 @@ async def held(store_id: Store, request: Request, fleet: Fleet, who: Who) -> Res
         question = _question(await body_of(request, holdings.QUESTION_BYTES))
         work = partial(answer_held, fleet.database, fleet.folder, robot, store_id, question)
         answer = await fleet.threads.piece(work)
+    fleet.bus.publish(Change("holdings", robot))
     return Response(msgspec.msgpack.encode(answer), media_type="application/x-msgpack")
 
 

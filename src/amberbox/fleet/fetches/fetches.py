@@ -1,9 +1,18 @@
-"""Asks robots for windows of their record as soon as they are connected, and sees what comes."""
+"""Asks robots for windows of their record as soon as they are connected, and sees what comes.
+
+A robot whose amberbox is older than the question what the server holds (``amberbox.link.holdings``)
+never sends again what a restored server has lost: it takes it for copied. A window of such a robot
+is given up when the robot was connected for ``ledger.IDLE_NS`` and nothing came.
+"""
 
 from __future__ import annotations
 
 import asyncio
 from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from sqlalchemy import func, select
 
 from amberbox.core.clock import Clock
 from amberbox.fleet.bus import Bus, Change
@@ -11,35 +20,52 @@ from amberbox.fleet.database.database import Database
 from amberbox.fleet.fetches import ledger
 from amberbox.fleet.fetches.ledger import Fetched, File
 from amberbox.fleet.linkend.server import LinkServer
+from amberbox.fleet.uploads import pieces
+from amberbox.fleet.uploads.tables import UPLOAD
 from amberbox.link.frames import Fetch
 
 _LOOK_S = 60.0
 
 
+@dataclass(frozen=True, slots=True)
+class _Idle:
+    """Since when (ns since boot) a connected robot has sent nothing, and what it had sent."""
+
+    since_ns: int
+    held: tuple[int, int]
+
+
 class Fetches:
     """Sends what is waited for; what happened to it is in the database, nothing is in memory."""
 
-    def __init__(self, database: Database, bus: Bus, clock: Clock, links: LinkServer) -> None:
+    def __init__(
+        self, folder: Path, database: Database, bus: Bus, clock: Clock, links: LinkServer
+    ) -> None:
+        self._folder = folder
         self._database = database
         self._bus = bus
         self._clock = clock
         self._links = links
         self._changes: asyncio.Queue[Change] = asyncio.Queue()
-        for kind in ("connected", "has", "journal", "fetch"):
+        self._restoring: set[str] = set()  # robots that send again what the server lacks
+        self._idle: dict[str, _Idle] = {}
+        for kind in ("connected", "has", "journal", "fetch", "holdings"):
             bus.on(kind, self._hear)
 
     async def run(self) -> None:
         """Work until cancelled."""
         changes = self._changes = asyncio.Queue()
-        await self._look()
+        loop, next_s = asyncio.get_running_loop(), 0.0
         while True:
+            if loop.time() >= next_s:
+                await self._look()
+                next_s = loop.time() + _LOOK_S
             try:
-                async with asyncio.timeout(_LOOK_S):  # wait_for may swallow the end of the server
+                async with asyncio.timeout_at(next_s):  # wait_for may swallow the server's end
                     change = await changes.get()
             except TimeoutError:
-                await self._look()
-            else:
-                await self._do(change)
+                continue
+            await self._do(change)
 
     def close(self) -> None:
         """Nothing is held."""
@@ -50,7 +76,11 @@ class Fetches:
             self._changes.put_nowait(change)
 
     async def _do(self, change: Change) -> None:
-        if change.kind in ("connected", "fetch"):
+        if change.kind == "holdings":
+            self._restoring.add(change.robot)
+        elif change.kind in ("connected", "fetch"):
+            if change.kind == "connected":
+                self._restoring.discard(change.robot)
             await self._send(change.robot)
         elif change.kind == "has":
             data = change.data
@@ -63,7 +93,43 @@ class Fetches:
         """See to all robots: something may have been missed while nobody listened."""
         for robot in await asyncio.to_thread(self._robots):
             await asyncio.to_thread(self._arrived, robot)
+            if self._is_idle(robot):
+                await asyncio.to_thread(self._give_up, robot)
             await self._send(robot)
+
+    def _is_idle(self, robot: str) -> bool:
+        """Tell whether a robot that may take things for copied has long sent nothing."""
+        if robot in self._restoring or robot not in self._links.robots:
+            self._idle.pop(robot, None)
+            return False
+        now_ns, held = self._clock.boot_ns(), self._held(robot)
+        known = self._idle.get(robot)
+        if known is None or known.held != held:
+            self._idle[robot] = _Idle(now_ns, held)
+            return False
+        return now_ns - known.since_ns >= ledger.IDLE_NS
+
+    def _held(self, robot: str) -> tuple[int, int]:
+        """Return how many files have come of a robot, and bytes of those that are coming."""
+        with self._database.reading() as connection:
+            chosen = select(func.count()).select_from(UPLOAD).where(UPLOAD.c.robot == robot)
+            count = connection.scalar(chosen) or 0
+        return count, sum(path.stat().st_size for path in pieces.parts(self._folder, robot))
+
+    def _give_up(self, robot: str) -> None:
+        """Wait no longer for windows that the robot has answered long ago."""
+        now_ns = self._clock.wall_ns()
+        with self._database.begin() as connection:
+            open_ones = ledger.waiting(connection, robot)
+            ended = [
+                ledger.give_up(connection, now_ns, one)
+                for one in open_ones
+                if one.state == "copying"
+            ]
+        self._idle.pop(robot, None)
+        for one in ended:
+            if one is not None:
+                self._tell(one)
 
     def _robots(self) -> Sequence[str]:
         with self._database.reading() as connection:

@@ -10,17 +10,22 @@ from typing import Any, Literal
 import msgspec
 from sqlalchemy import Connection, Row, func, select, update
 
+from amberbox.core.clock import NS
 from amberbox.core.errors import UsageError
+from amberbox.core.timetext import format_duration
 from amberbox.fleet.fetches.tables import FETCH
 from amberbox.fleet.uploads.tables import UPLOAD
 from amberbox.link.limits import FILES
 
 State = Literal["waiting", "asked", "copying", "ready", "gone", "cancelled"]
 OPEN: Sequence[State] = ("waiting", "asked", "copying")
+IDLE_NS = 3600 * NS
+"""Time that a robot is connected and sends nothing, after which a window is given up."""
 MOST_OPEN = 100
 """Windows that wait for one robot."""
 
 _GONE = "gone"
+_LATE = "late"
 _ENDED = ("verified", "aside", "quarantined")
 """States of an upload that nothing more comes of."""
 
@@ -28,7 +33,8 @@ _ENDED = ("verified", "aside", "quarantined")
 class File(msgspec.Struct, frozen=True):
     """A journal of a window: ``state`` is empty while it is to come, then that of its upload.
 
-    ``gone`` is one that the robot had named and has deleted before it was copied.
+    ``gone`` is one that the robot had named and has deleted before it was copied, ``late`` one that
+    did not come although the robot was connected for long.
     """
 
     store_id: str
@@ -52,6 +58,19 @@ class Fetched:
     asked_ns: int
     sent_ns: int | None
     ended_ns: int | None
+
+    @property
+    def reason(self) -> str:
+        """Say why not all has come, and what helps; empty where nothing was given up."""
+        late = sum(file.state == _LATE for file in self.files)
+        if not late:
+            return ""
+        return (
+            f"{late} of {len(self.files)} journals did not come although {self.robot} was "
+            f"connected for {format_duration(IDLE_NS)}. An amberbox from before servers could be "
+            "restored takes them for copied: update it on the robot, and ask again. Over a metered "
+            "network nothing is copied"
+        )
 
 
 def add(
@@ -141,12 +160,19 @@ def looked(
     if here is not None:
         found = [file if _is_expected(file, here) else _gone(file) for file in found]
     done = all(file.state for file in found)
-    nothing = all(file.state == _GONE for file in found)
+    nothing = all(file.state in (_GONE, _LATE) for file in found)
     state: State = "copying" if not done else "gone" if nothing else "ready"
     if (list(one.files), one.state) == (found, state):
         return None
     text = msgspec.json.encode(found).decode()
     return _change(connection, one, state=state, files=text, ended_ns=now_ns if done else None)
+
+
+def give_up(connection: Connection, now_ns: int, one: Fetched) -> Fetched | None:
+    """Wait no longer for the journals of a window; None where all has come meanwhile."""
+    files = [_with_state(connection, one.robot, file) for file in one.files]
+    late = [file if file.state else msgspec.structs.replace(file, state=_LATE) for file in files]
+    return looked(connection, now_ns, one, late)
 
 
 def cancel(connection: Connection, now_ns: int, one: Fetched) -> bool:

@@ -129,17 +129,14 @@ class Desk:
         return Answer(200, at)
 
     def _waiting_bytes(self, robot: str) -> int:
-        return sum(path.stat().st_size for path in self._parts(robot))
+        return sum(path.stat().st_size for path in pieces.parts(self.root, robot))
 
     def _drop_old(self, robot: str) -> None:
         """Forget pieces of which none came for long: their robot may not have the file any more."""
         oldest_s = self.clock.wall_ns() / NS - _KEPT_S
-        for path in self._parts(robot):
+        for path in pieces.parts(self.root, robot):
             if path.stat().st_mtime < oldest_s:
                 path.unlink(missing_ok=True)
-
-    def _parts(self, robot: str) -> list[Path]:
-        return list((self.root / "incoming" / robot).glob("*/*.part"))
 
     def _lock(self, incoming: Incoming) -> threading.Lock:
         """Let one request at a time work on a file, whatever is sent twice."""

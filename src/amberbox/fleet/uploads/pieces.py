@@ -45,6 +45,11 @@ class Incoming:
         return Path("incoming", self.robot, self.store_id, name)
 
 
+def parts(root: Path, robot: str) -> list[Path]:
+    """Return the files of a robot that are coming in."""
+    return list((root / "incoming" / robot).glob("*/*.part"))
+
+
 def held(root: Path, incoming: Incoming) -> int:
     """Return how many bytes of it are here."""
     try:

@@ -99,5 +99,5 @@ function writeDownload(about) {
 }
 
 function writeFetch(about) {
-  return { text: t(`data.works.fetch.${about.state}`, { copied: about.copied, n: about.journals.length }) };
+  return { text: t(`data.works.fetch.${about.state}`, { copied: about.copied, n: about.journals.length }) + (about.reason ? ` ${about.reason}` : "") };
 }
