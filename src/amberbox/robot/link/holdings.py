@@ -39,7 +39,6 @@ class Holdings:
     def step(self) -> None:
         """Ask if there is a connection for which that was not done.
 
-        A robot that counts on nothing asks, too: so the server knows that it can.
         Raises CopyError for another time, OSError when the disk does not take what is found.
         """
         contact = self._contact()
@@ -47,8 +46,7 @@ class Holdings:
             return
         self._asked = contact  # before it is asked: look_again may come meanwhile
         try:
-            stretches = holdings.stretches_of(self._counted_on())
-            for asked in holdings.questions(stretches) if stretches else [()]:
+            for asked in holdings.questions(holdings.stretches_of(self._counted_on())):
                 answer = self._ask(asked)
                 if answer is None:
                     return
