@@ -19,6 +19,7 @@ class Item(Answer, frozen=True):
     first: str | None = None
     last: str | None = None
     rate_hz: float | None = None
+    no_columns: str = ""
 
 
 class Variable(Answer, frozen=True):

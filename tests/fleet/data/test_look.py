@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 
 from amberbox.blackbox.query.gather import Request
 from amberbox.core.errors import UsageError
+from amberbox.core.types import Schema, Topic
 from amberbox.fleet.archive.files import Layout
 from amberbox.fleet.archive.folder import FolderArchive
 from amberbox.fleet.archive.reading import Reader
@@ -16,10 +18,11 @@ from amberbox.fleet.asking.errors import LimitError
 from amberbox.fleet.data import look as looking
 from amberbox.fleet.data import rows as reading
 from amberbox.fleet.data.asked import Asked
+from amberbox.fleet.data.items import described_json, item_json, items_json
 from amberbox.fleet.data.look import Look, look
 from amberbox.fleet.data.rows import rows
 from amberbox.testing.clock import ManualClock
-from amberbox.testing.records import T0_NS
+from amberbox.testing.records import POSE, T0_NS, FakeItem, FakeRun, pose
 from tests.fleet.archive.recordings import Robot
 
 _MS = 1_000_000
@@ -110,3 +113,41 @@ def test_only_files_of_the_range_are_read(archive: FolderArchive) -> None:
 def test_a_robot_without_data_has_no_items(archive: FolderArchive) -> None:
     with pytest.raises(UsageError, match="no data item"):
         look(archive.layout.folder, "r9", lambda seen: seen.schema("odom"))
+
+
+@dataclass(frozen=True)
+class Blob(FakeItem):
+    """Messages whose definition cannot be read, or that do not fit it."""
+
+    definition: bytes = b""
+
+    def mcap_topic(self) -> Topic:
+        return Topic(f"/{self.name}", "ros1", Schema("a/B", "ros1msg", self.definition))
+
+
+def test_items_without_columns_are_listed_with_the_reason(tmp_path: Path) -> None:
+    """While their journal waits, when it is in columns, and when there are others besides."""
+    archive = FolderArchive(tmp_path / "server", clock=ManualClock())
+    blob = Blob("ros_blob", [{"x": 1}], source="ros", definition=b"nothing/Known x\n")
+    unfit = Blob("ros_misfit", [{"x": 1}], source="ros", definition=b"float64 x\n")
+    robot = Robot("r1", tmp_path, items=[POSE, blob, unfit])
+    run = FakeRun(robot.store, items=robot.items)
+    run.write([(T0_NS + n, item, pose(n)) for n in range(3) for item in robot.items])
+    run.close()
+    robot.hand_in_all(archive)
+    for committed in (False, True):
+        if committed:
+            archive.commit(0)
+        found = {one["name"]: one for one in look(archive.layout.folder, "r1", items_json)}
+        raw = found["ros_blob"]
+        assert raw["rows"] == 3 and raw["source"] == "ros", committed
+        assert "nothing/msg/Known is missing" in raw["no_columns"]
+        assert found["odom"]["no_columns"] == ""
+        misfit = found["ros_misfit"]
+        assert misfit["rows"] == 3
+        assert ("do not fit" in misfit["no_columns"]) is committed, "known when it is read"
+        detail = look(archive.layout.folder, "r1", lambda seen: item_json(seen, "ros_blob"))
+        assert detail is not None and detail["columns"] == [], committed
+        assert look(archive.layout.folder, "r1", lambda seen: item_json(seen, "other")) is None
+        described = look(archive.layout.folder, "r1", described_json)
+        assert "ros_blob" not in {one["name"] for one in described}

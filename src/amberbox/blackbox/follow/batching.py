@@ -17,6 +17,9 @@ from amberbox.core.errors import AmberboxError
 from amberbox.core.names import child_name, fitted, identifier, is_item, item_name
 from amberbox.core.types import Batch, Gap, IntArray, Rows, Schema, Topic
 
+UNDECODABLE = "undecodable: "
+"""So begins the reason of a gap of messages that do not fit their definition."""
+
 
 @dataclass(frozen=True, slots=True)
 class Stream:
@@ -140,7 +143,7 @@ def _undecodable(origin: Origin, seq: IntArray, log_ns: IntArray, why: str) -> G
         origin.run,
         from_ns,
         to_ns + 1,
-        f"undecodable: {why}",
+        f"{UNDECODABLE}{why}",
         origin.stream.item,
         len(seq),
         int(seq[0]),

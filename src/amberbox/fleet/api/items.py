@@ -18,7 +18,8 @@ routes = Routes("data")
 class Item:
     """A data item or child table; ``source`` is ``amberbox`` for what the box says of itself.
 
-    ``first`` and ``last`` are when its first and its last row was received.
+    ``first`` and ``last`` are when its first and its last row was received. ``no_columns`` says why
+    its messages are there only as they came; empty for an item with columns.
     """
 
     name: str
@@ -29,6 +30,7 @@ class Item:
     first: str | None
     last: str | None
     rate_hz: float | None
+    no_columns: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,11 +65,12 @@ class ItemDetail:
     children: list[str]
     chosen: list[str]
     columns: list[Variable]
+    no_columns: str = ""
 
 
 @routes.get("/robots/{robot}/items", "items.read")
 def list_items(fleet: Fleet, who: Who, robot: OfRobot) -> list[Item]:
-    """List the data items of a robot that the server has rows of, the box's own at the end."""
+    """List the data items of a robot that the server has messages of, the box's own at the end."""
     answer = fleet.asking.ask_now(f"{WORKER}:items", {"robot": robot.id}, asker=who.asker)
     return msgspec.json.decode(answer, type=list[Item])
 
