@@ -13,6 +13,12 @@ BEGUN = re.compile(r"""["'`]([a-z][\w-]*\.[\w.-]*)(?:["'] ~|\$?\{)""")
 """A name whose end is worked out: ``"alarms.tabs." ~ tab``, ``f"error.hint.{name}"``."""
 WHOLE = ("words.", "robot.time.windows.")
 """Every word stands on the page of help; chips are put together of two names."""
+WRITES = re.compile(
+    r"""\.textContent\s*=[^=]|\.title\s*=[^=]|\.innerText\b|\.innerHTML\b|insertAdjacent|\.ariaLabel\b"""
+    r"""|setAttribute\(\s*["'](?:title|alt|placeholder|label|aria-label|aria-description|data-label)["']"""
+    r"""|fillText\((?!visible\()|strokeText\("""
+)
+"""Ways to write a text past ``visible``, which writes out what a text hides."""
 ONE_OR_MANY = ("alarms.acknowledged_one", "alarms.not_acknowledged_one")
 """Names that modules put together from two ends."""
 
@@ -37,3 +43,13 @@ def test_every_text_is_used() -> None:
         and not name.startswith((*heads, *WHOLE)) and not asked(name).startswith(heads)
     }  # fmt: skip
     assert unused == set()
+
+
+def test_no_module_writes_texts_past_the_function_that_writes_out_what_they_hide() -> None:
+    found = [
+        f"{path.name}: {line.strip()}"
+        for path in sorted(PAGES.glob("static/js/**/*.js"))
+        for line in path.read_text(encoding="utf-8").splitlines()
+        if path.name != "dom.js" and WRITES.search(line) and "document.title" not in line
+    ]
+    assert found == []

@@ -1,7 +1,7 @@
 // Tables as cards where there is no room: each value gets the title of its column, which the style
 // sheet shows before it on narrow screens. One look at the head serves tables of all pages.
 
-import { all, one } from "./dom.js";
+import { all, one, setWords } from "./dom.js";
 
 const ROLES = [["thead, tbody", "rowgroup"], ["tr", "row"], ["thead th", "columnheader"], ["tbody th", "rowheader"], ["td", "cell"]];
 
@@ -29,6 +29,6 @@ function mark(table, heads) {
     for (const part of all(selector, table)) part.setAttribute("role", role);
   }
   for (const row of all("tbody tr", table)) {
-    [...row.children].forEach((cell, at) => heads[at] && cell.setAttribute("data-label", heads[at]));
+    [...row.children].forEach((cell, at) => heads[at] && setWords(cell, "data-label", heads[at]));
   }
 }

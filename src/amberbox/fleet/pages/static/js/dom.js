@@ -46,6 +46,15 @@ export function setText(element, said) {
   } else if (element && element.textContent !== text) element.textContent = text;
 }
 
+/** Set an attribute that is read: written out as all text is, and only if it is another one. */
+export function setWords(element, name, said) {
+  const text = visible(String(said ?? ""));
+  if (element && element.getAttribute(name) !== text) element.setAttribute(name, text);
+}
+
+/** Attributes that people read or hear. */
+const WORDS = new Set(["title", "alt", "placeholder", "label", "aria-label", "aria-description", "aria-valuetext", "data-label"]);
+
 const HIDDEN = /[\u0000-\u0008\u000b-\u001f\u007f-\u009f\u00ad\u061c\u180e\u200b-\u200f\u2028-\u202e\u2060-\u206f\ufeff\ufff9-\ufffb]/g;
 
 /** Write out what a text hides: controls, marks that reorder it, what has no width. */
@@ -64,6 +73,7 @@ function filled(element, about, inside) {
   for (const [name, value] of Object.entries(about)) {
     if (value === null || value === undefined || value === false) continue;
     if (name.startsWith("on")) element.addEventListener(name.slice(2), value);
+    else if (WORDS.has(name)) setWords(element, name, value);
     else element.setAttribute(name, value === true ? "" : String(value));
   }
   const there = inside.filter((one) => one !== null && one !== undefined);

@@ -1,6 +1,6 @@
 // What paper has to say by itself: when it was printed, by whom, from which address, of which time.
 
-import { one } from "./dom.js";
+import { one, setText } from "./dom.js";
 import { t } from "./strings.js";
 import { local, nowMs } from "./time.js";
 
@@ -8,9 +8,9 @@ import { local, nowMs } from "./time.js";
 export function start() {
   addEventListener("beforeprint", () => {
     const line = one("[data-printed]");
-    if (line) line.textContent = t("common.printed", { at: moment(nowMs()), who: line.dataset.printed, address: location.href });
+    if (line) setText(line, t("common.printed", { at: moment(nowMs()), who: line.dataset.printed, address: location.href }));
     const window = one("[data-printed-window]");
-    if (window) window.textContent = windowWords(window.dataset);
+    if (window) setText(window, windowWords(window.dataset));
   });
 }
 

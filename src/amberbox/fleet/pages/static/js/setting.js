@@ -1,7 +1,7 @@
 // A setting: its form, and what comes of it.
 
 import { ask, clear, fail, toast } from "./ask.js";
-import { all, brought, el, one } from "./dom.js";
+import { all, brought, el, one, setText } from "./dom.js";
 import { editor } from "./schemaform.js";
 import { t } from "./strings.js";
 import { local, nowMs } from "./time.js";
@@ -27,15 +27,15 @@ async function tryOut(button) {
   const place = button.closest("li");
   const said = one("[data-answer]", place);
   clear(place);
-  said.textContent = t("setting.sending");
+  setText(said, t("setting.sending"));
   button.disabled = true;
   try {
     const body = { destination: button.dataset.test };
     const { arrived, trouble } = await ask("/api/v1/settings/notifications/test", { method: "POST", body });
-    said.textContent = arrived ? t("setting.arrived", { at: local(nowMs(), "time") }) : "";
+    setText(said, arrived ? t("setting.arrived", { at: local(nowMs(), "time") }) : "");
     if (!arrived) fail({ message: t("setting.not_arrived"), hint: trouble }, place);
   } catch (error) {
-    said.textContent = "";
+    setText(said, "");
     fail(error, place);
   } finally {
     button.disabled = false;

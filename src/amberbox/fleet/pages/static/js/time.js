@@ -1,7 +1,7 @@
 // Times as the viewer reads them. Ages never believe the viewer's clock: they are counted from the
 // server's time as the page came, by a clock that only goes forward.
 
-import { all } from "./dom.js";
+import { all, setText, setWords } from "./dom.js";
 import { t } from "./strings.js";
 
 const TICK_MS = 1000;
@@ -74,9 +74,9 @@ function write(element) {
   if (Number.isNaN(ms)) return;
   const as = element.dataset.as;
   const text = as === "ago" ? ago(ms) : as === "span" ? span((nowMs() - ms) / 1000) : local(ms, as);
-  if (element.textContent !== text) element.textContent = text;
+  setText(element, text);
   const title = as === "ago" || as === "span" ? `${local(ms)} · ${utc(ms)}` : utc(ms);
-  if (element.title !== title) element.title = title;
+  setWords(element, "title", title);
 }
 
 function tick() {

@@ -4,7 +4,7 @@
  */
 
 import { ask, fail } from "./ask.js";
-import { el, icon, setText } from "./dom.js";
+import { el, icon, setText, setWords } from "./dom.js";
 import { t } from "./strings.js";
 
 const AGAIN_MS = 5000;
@@ -33,7 +33,7 @@ export function works(list, robot, { fetched }) {
     setText(known.text, text);
     known.bar.hidden = progress === null;
     known.bar.value = progress ?? 0;
-    known.bar.setAttribute("aria-label", text);
+    setWords(known.bar, "aria-label", text);
     if (!isOver(known)) return;
     known.picture.replaceChildren(icon("check"));
     if (link && !known.text.nextElementSibling.matches("a")) known.text.after(link);

@@ -3,7 +3,7 @@
  * shown, which one drags by its middle or its ends; arrow keys do the same.
  */
 
-import { all, el } from "../dom.js";
+import { all, el, setText } from "../dom.js";
 import { moment } from "../plot/time.js";
 import { t } from "../strings.js";
 
@@ -71,8 +71,8 @@ function showCover(state, { start, end, recorded, missing }) {
   state.cover.replaceChildren(
     ...recorded.map((one) => stretch(state, one, "brush-recorded", t("data.brush.recorded"))),
     ...missing.map((one) => stretch(state, one, `brush-missing brush-${one.kind} plot-hatch-${one.kind}`, one.reason)));
-  state.ends[0].textContent = moment(start, 60);
-  state.ends[1].textContent = moment(end, 60);
+  setText(state.ends[0], moment(start, 60));
+  setText(state.ends[1], moment(end, 60));
   const kinds = [...new Set(missing.map((one) => one.kind))];
   state.legend.replaceChildren(keyOf("brush-recorded", t("data.brush.recorded")),
     ...kinds.map((kind) => keyOf(`brush-missing brush-${kind} plot-hatch-${kind}`, t(`plot.hole.${kind}`))));

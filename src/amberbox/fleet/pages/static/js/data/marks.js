@@ -1,7 +1,7 @@
 /** Marking: the window as an incident that is kept, or a moment by a note. */
 
 import { ask, toast } from "../ask.js";
-import { el, one } from "../dom.js";
+import { el, one, setText } from "../dom.js";
 import { dialogForm } from "../dialogs.js";
 import { spanOf } from "./goto.js";
 import { moment } from "../plot/time.js";
@@ -20,7 +20,7 @@ export function marks(robot, { window, cursor, changed }) {
   dialogForm("mark", {
     opened(form) {
       const { from, to } = window();
-      one("[data-span]", form).textContent = t("data.span", { from: moment(from, 1), to: moment(to, 1) });
+      setText(one("[data-span]", form), t("data.span", { from: moment(from, 1), to: moment(to, 1) }));
     },
     async send({ reason }) {
       const { from, to } = window();
@@ -34,7 +34,7 @@ export function marks(robot, { window, cursor, changed }) {
     async opened(form) {
       const { from, to } = window();
       noted.at = cursor() ?? (from + to) / 2;
-      one("[data-at]", form).textContent = moment(noted.at, 0.1);
+      setText(one("[data-at]", form), moment(noted.at, 0.1));
       await missionsAt(form, path, noted.at);
     },
     async send({ text, mission }) {

@@ -1,7 +1,7 @@
 /** Taking data along: what is seen, or whole missions, made by the server into a file. */
 
 import { ask } from "../ask.js";
-import { el, one } from "../dom.js";
+import { el, one, setText } from "../dom.js";
 import { dialogForm } from "../dialogs.js";
 import { moment } from "../plot/time.js";
 import { t } from "../strings.js";
@@ -21,8 +21,8 @@ export function takeAlong(robot, { window, chosen, began }) {
     opened(form) {
       const { from, to } = window();
       const names = chosen().map((variable) => variable.address);
-      one("[data-span]", form).textContent = t("data.span", { from: moment(from, 1), to: moment(to, 1) });
-      one("[data-names]", form).textContent = names.length ? names.join(", ") : t("data.download.everything");
+      setText(one("[data-span]", form), t("data.span", { from: moment(from, 1), to: moment(to, 1) }));
+      setText(one("[data-names]", form), names.length ? names.join(", ") : t("data.download.everything"));
       direct(one("[data-direct]", form), robot, chosen(), { from, to });
       toggle(form);
       form.onchange = () => toggle(form);

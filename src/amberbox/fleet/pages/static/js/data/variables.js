@@ -3,7 +3,7 @@
  * Checking one shows it. Keys are those of any tree; Space checks.
  */
 
-import { all, el, icon, one } from "../dom.js";
+import { all, el, icon, one, setText } from "../dom.js";
 import { breakable } from "../names.js";
 import { spark, sparklines } from "./sparklines.js";
 import { t } from "../strings.js";
@@ -34,7 +34,7 @@ export function tree(element, about) {
     const focused = document.activeElement?.closest?.("[data-node]")?.dataset.node;
     const branches = state.words ? found(state) : [...firsts(state), ...about.items.map((item) => ofItem(item))];
     root.replaceChildren(...branches.map((branch) => branchOf(state, branch)));
-    note.textContent = noteOf(state, branches);
+    setText(note, noteOf(state, branches));
     rove(root, focused && one(`[data-node="${CSS.escape(focused)}"]`, root), Boolean(focused));
   }
 

@@ -1,6 +1,6 @@
 /** Choosing the window by its length, by two times, or live; and in which way it is drawn. */
 
-import { all, one } from "../dom.js";
+import { all, one, setText } from "../dom.js";
 import { t } from "../strings.js";
 import { fieldText, fieldTime } from "../timewords.js";
 
@@ -39,7 +39,7 @@ export function windowForm(form, to) {
     live(state) {
       button.dataset.state = state;
       button.setAttribute("aria-pressed", String(state === "on"));
-      one(".word", button).textContent = t(`data.live.${state}`);
+      setText(one(".word", button), t(`data.live.${state}`));
     },
     mode(mode) {
       for (const way of all("[data-mode]")) way.setAttribute("aria-pressed", String(way.dataset.mode === mode));

@@ -1,5 +1,6 @@
 /** Axes of plots: time in the viewer's zone, numbers with their unit, names of values. */
 
+import { visible } from "../dom.js";
 import { clockLabels, since } from "./time.js";
 
 const AXIS_WIDTH = 76;
@@ -36,10 +37,10 @@ export function valueAxis({ scale, unit, first, narrow, words, ink, line }) {
   const common = {
     scale, side: first ? 3 : 1, font: FONT, stroke: ink, ticks: { show: false }, gap: 6,
     size: axisWidth(narrow) - (unit ? LABEL_SIZE : 0), grid: { show: first, stroke: line, width: 1 },
-    label: unit || undefined, labelSize: LABEL_SIZE, labelFont: FONT, labelGap: 0,
+    label: visible(unit) || undefined, labelSize: LABEL_SIZE, labelFont: FONT, labelGap: 0,
   };
   if (!words.length) return { ...common, space: 34, values: (_, v, __, ___, s) => numbers(v, s) };
-  const shown = shortened(words, narrow ? 6 : 9);
+  const shown = shortened(words.map((word) => word && visible(word)), narrow ? 6 : 9);
   return {
     ...common,
     splits: () => words.map((_, n) => n).filter((n) => words[n] !== undefined),

@@ -1,7 +1,7 @@
 /** A canvas with axes for figures that are not over time: XY views and histograms. */
 
 import { plain } from "./axes.js";
-import { el } from "../dom.js";
+import { el, setWords, visible } from "../dom.js";
 import { colours, onTheme } from "./look.js";
 
 const LEFT = 64;
@@ -30,7 +30,7 @@ export function figure(element, { height, label, draw }) {
   const watcher = new ResizeObserver(redraw);
   watcher.observe(root);
   onTheme(redraw, end.signal);
-  const describe = (text) => canvas.setAttribute("aria-label", text);
+  const describe = (text) => setWords(canvas, "aria-label", text);
   function destroy() {
     end.abort();
     watcher.disconnect();
@@ -110,5 +110,5 @@ function rule(context, x1, y1, x2, y2) {
 
 function write(context, text, x, y, align) {
   context.textAlign = align;
-  context.fillText(text, x, y);
+  context.fillText(visible(String(text)), x, y);
 }

@@ -1,6 +1,6 @@
 /** What stands around the panels: buttons, flags, lanes, the legend of hatching, the table. */
 
-import { el, icon, setText } from "../dom.js";
+import { el, icon, setText, setWords } from "../dom.js";
 import { KINDS } from "./gaps.js";
 import { flagStrip, laneStrip, showFlags, showLanes } from "./strips.js";
 import { readout, valueAt } from "./table.js";
@@ -81,7 +81,7 @@ function showTime(stack, element) {
   }
   const text = options.relative ? since(cursor, step) : moment(cursor, step);
   setText(element, t("plot.at", { time: text }));
-  if (!options.relative) element.title = utc(cursor);
+  if (!options.relative) setWords(element, "title", utc(cursor));
 }
 
 /** The values at the cursor, for those who listen. */

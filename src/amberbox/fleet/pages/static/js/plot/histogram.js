@@ -2,7 +2,7 @@
 
 import { plain } from "./axes.js";
 import { ask } from "../ask.js";
-import { el } from "../dom.js";
+import { el, setText } from "../dom.js";
 import { figure } from "./canvas.js";
 import { asked } from "./data.js";
 import { t } from "../strings.js";
@@ -32,7 +32,7 @@ export function histogram(element, { trace, from, to }) {
     const found = await load(trace, begin, end, state.control.signal);
     const sums = found.variables[0];
     state.bars = sums?.histogram ?? null;
-    note.textContent = t(wordOf(sums, found.exact), { n: (sums?.count ?? 0).toLocaleString("en") });
+    setText(note, t(wordOf(sums, found.exact), { n: (sums?.count ?? 0).toLocaleString("en") }));
     list.replaceChildren(el("caption", {}, t("plot.histogram", { name })), ...rowsOf(state.bars, trace));
     shown.redraw();
   }

@@ -1,7 +1,7 @@
 /** One variable against another, coloured by time: early dots in one colour, late in another. */
 
 import { askPlot } from "../ask.js";
-import { el } from "../dom.js";
+import { el, setText } from "../dom.js";
 import { figure, roomy } from "./canvas.js";
 import { asked, firstFrom, placeAt, seriesOf } from "./data.js";
 import { moment } from "./time.js";
@@ -33,7 +33,7 @@ export function xyView(element, { x, y, from, to }) {
     const [first, second] = await Promise.all([x, y].map((one) => load(one, begin, end, signal)));
     Object.assign(state, { from: begin, to: end, points: paired(first, second) });
     legend.replaceChildren(moment(begin, 1), " ", el("span", { class: "plot-ramp", "aria-hidden": "true" }), " ", moment(end, 1));
-    note.textContent = noteOf(state.points, first, second);
+    setText(note, noteOf(state.points, first, second));
     shown.redraw();
   }
 

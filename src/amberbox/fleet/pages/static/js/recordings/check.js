@@ -1,7 +1,7 @@
 // Reading files anew: a few at a time, so that one sees how far it is and can stop it.
 
 import { ask } from "../ask.js";
-import { el, icon } from "../dom.js";
+import { el, icon, setText } from "../dom.js";
 import { t } from "../strings.js";
 
 const STEP = 20;
@@ -59,7 +59,7 @@ function progress(place, total, stop) {
   place.hidden = false;
   return (n) => {
     bar.value = n;
-    words.textContent = t("recordings.check.at", { n, all: total });
+    setText(words, t("recordings.check.at", { n, all: total }));
   };
 }
 

@@ -1,7 +1,7 @@
 // Downloads: what is asked for, and how far what was asked for is, as it happens.
 
 import { ask, AskError, clear, fail } from "../ask.js";
-import { all, el, one } from "../dom.js";
+import { all, el, one, setText } from "../dom.js";
 import { listen } from "../feed.js";
 import { keep } from "../pieces.js";
 import { t } from "../strings.js";
@@ -80,7 +80,7 @@ async function offer() {
 function chip(kind, value, text) {
   const place = one(`[data-chips="${kind}"]`, form);
   const there = all("button", place).find((button) => button.value === value);
-  if (there) there.replaceChildren(text);
+  if (there) setText(there, text);
   else place.append(el("button", { class: "chip", type: "button", value, "aria-pressed": "false" }, text));
 }
 

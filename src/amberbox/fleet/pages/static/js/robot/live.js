@@ -1,7 +1,7 @@
 // What changes many times a second on a robot's page: levels, values, ages. Each is written where
 // it stands, found by its key; nothing is fetched, and nothing moves.
 
-import { all, el, level as levelOf, one, setText } from "../dom.js";
+import { all, el, level as levelOf, one, setText, setWords } from "../dom.js";
 import { isMet } from "./expected.js";
 import { t } from "../strings.js";
 import { nowMs, span, when } from "../time.js";
@@ -84,7 +84,7 @@ export function robotLive(page) {
     setLevel(known.level, said.level);
     const why = said.level === "ok" ? "" : said.reason || said.state.replaceAll("_", " ");
     setText(known.why, why);
-    if (known.why.title !== said.reason) known.why.title = said.reason;
+    setWords(known.why, "title", said.reason);
     if (!said.mode) writeComponent(known.row.parentElement, said, k);
     else if (said.level !== "ok") unfold(known.row);
     return Object.entries(said.outputs).every(([name, value]) => writeValue(said, name, value));
