@@ -71,6 +71,7 @@ class Card(Answer, frozen=True):
     alarms_over: int = 0
     damaged_files: int = 0
     damaged_new: int = 0
+    signing_key: str = ""
 
 
 class Output(Answer, frozen=True):

@@ -57,6 +57,15 @@ def brought(home: House, store: Store, name: str) -> tuple[str, str]:
     return bring(home.services.desk, incoming, (store.path / name).read_bytes(), proof)
 
 
+def shown_key(home: House) -> str:
+    """Return what the API says of the robot's key; its pages say it, too."""
+    viewer = home.client("viewer")
+    said = str(viewer.get(f"/api/v1/robots/{ROBOT}").json()["signing_key"])
+    for page in ("/", f"/robots/{ROBOT}"):
+        assert ("signing key" in viewer.get(page).text) == bool(said), page
+    return said
+
+
 @pytest.mark.parametrize("by", ["page", "cli"])
 def test_what_a_new_key_signs_waits_for_an_admin(
     home: House, store: Store, by: str, capsys: pytest.CaptureFixture[str]
@@ -74,6 +83,7 @@ def test_what_a_new_key_signs_waits_for_an_admin(
         kinds = connection.scalars(select(EVENT.c.kind).where(EVENT.c.robot == ROBOT)).all()
     assert kinds == ["new_key", "aside"]
     admin = home.client("admin")
+    assert shown_key(home) == "pending"
     assert admin.get("/api/v1/health").json() == {"status": "poor"}
     if by == "page":
         assert key in admin.get("/admin/robots").text
@@ -87,6 +97,7 @@ def test_what_a_new_key_signs_waits_for_an_admin(
         assert key in capsys.readouterr().out
         assert main([*words[:2], ROBOT, "confirm", *words[2:]]) == 0
         assert main(words) == 0
+    assert shown_key(home) == ""
     assert settling.take_confirmed(home.services.archive, database, folder) == 1
     assert settling.take_confirmed(home.services.archive, database, folder) == 0
     assert len(home.services.archive.catalogue.waiting()) == 1

@@ -73,6 +73,13 @@ def pending_keys(connection: Connection, robot: str = "") -> list[SigningKey]:
     return [SigningKey(*row) for row in rows]
 
 
+def distrusted_stores(connection: Connection) -> dict[tuple[str, str], KeyState]:
+    """Return the stores, with their robot, that sign with a key that no admin has confirmed."""
+    chosen = select(SIGNING_KEY.c.robot, SIGNING_KEY.c.store_id, SIGNING_KEY.c.state)
+    rows = connection.execute(chosen.where(SIGNING_KEY.c.state != "confirmed"))
+    return {(row.robot, row.store_id): row.state for row in rows}
+
+
 def decide(
     connection: Connection, now_ns: int, robot: str, public_key: str, *, confirm: bool
 ) -> int:

@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 from sqlalchemy import Connection
 
 from amberbox.fleet.accounts.robots import KnownRobot
 from amberbox.fleet.linkend.presence import Presence, presences
 from amberbox.fleet.linkend.server import LinkServer
+from amberbox.fleet.linkend.signingkeys import KeyState, distrusted_stores
 from amberbox.fleet.state.damaged import Damaged, damaged_files
 from amberbox.fleet.state.facts import FactsBook
 from amberbox.fleet.state.latest import Latest, Recent
@@ -52,12 +54,12 @@ class Cards:
             statuses = standings(connection, names if len(names) <= FEW else None)
         seen = {presence.robot: presence for presence in presences(connection)}
         alarms, offsets = open_alarms(connection), clock_offsets_ns(connection)
-        damaged = damaged_files(connection, now_ns)
+        damaged, distrusted = damaged_files(connection, now_ns), distrusted_stores(connection)
         return [
             self._card(
                 robot, seen.get(robot.id), statuses.get(robot.id, []),
                 Moment(now_ns, offsets.get(robot.id)),
-                alarms.get(robot.id, OpenAlarms()), damaged.get(robot.id, Damaged()),
+                alarms.get(robot.id, OpenAlarms()), damaged.get(robot.id, Damaged()), distrusted,
             )
             for robot in robots
         ]  # fmt: skip
@@ -70,6 +72,7 @@ class Cards:
         when: Moment,
         alarms: OpenAlarms,
         damaged: Damaged,
+        distrusted: Mapping[tuple[str, str], KeyState],
     ) -> Card:
         link = self.links.robots.get(robot.id)
         online = link is not None
@@ -93,7 +96,12 @@ class Cards:
             _battery(statuses), _mission(recent), _lead(recent),
             link is not None and link.is_silent, alarms.over,
             damaged.count, damaged.new,
+            _distrust(distrusted.get((robot.id, presence.store_id)) if presence else None),
         )  # fmt: skip
+
+
+def _distrust(state: KeyState | None) -> Literal["", "pending", "refused"]:
+    return "" if state is None or state == "confirmed" else state
 
 
 def _worst(components: Sequence[SaidStatus]) -> SaidStatus | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Literal
 
 Value = bool | int | float | str | None
 
@@ -50,6 +51,8 @@ class Card:
     which ``alarms_over`` have stopped; ``severity`` is the highest of those that last, also of
     acknowledged ones. Of its files ``damaged_files`` are set aside as damaged, ``damaged_new``
     of these in the last 24 hours. ``silent``: its link holds, and three heartbeats are missing.
+    ``signing_key`` is ``pending`` or ``refused`` where it signs with another key than before that
+    no admin has confirmed: what it says of itself may come from somebody else.
     """
 
     robot: str
@@ -76,6 +79,7 @@ class Card:
     alarms_over: int = 0
     damaged_files: int = 0
     damaged_new: int = 0
+    signing_key: Literal["", "pending", "refused"] = ""
 
 
 @dataclass(frozen=True, slots=True)
