@@ -194,3 +194,33 @@ def test_an_unfinished_file_leaves_nothing(tmp_path: Path) -> None:
     file.write(flat)
     file.discard()
     assert list((tmp_path / "segments/item").iterdir()) == []
+
+
+@pytest.mark.parametrize("by", ["received", "timestamp"])
+def test_a_flipped_bit_in_the_statistics_loses_no_row(tmp_path: Path, by: str) -> None:
+    """The footer has no checksum; the bounds of a row group stand in it."""
+    flats = [table({"v": ("int64", np.arange(50))}, 50, start) for start in (0, 50, 100)]
+    segment = write(tmp_path, flats)
+    path = tmp_path / segment.path
+    sound, schema = path.read_bytes(), flats[0].schema
+    footer = len(sound) - 8 - int.from_bytes(sound[-8:-4], "little")
+    times = flats[1].log_time_ns if by == "received" else flats[1].timestamp_ns
+    span = int(times[10]), int(times[40])
+    bounds = [int(value).to_bytes(8, "little") for value in (times.min(), times.max())]
+    places = [at for bound in bounds for at in _places(sound, bound, footer)]
+    assert places, "the statistics are there"
+    for at in places:
+        for byte in range(8):
+            damaged = bytearray(sound)
+            damaged[at + byte] ^= 0x40
+            path.write_bytes(damaged)
+            found = read_segment(tmp_path, segment, schema, ["v"], span, by)
+            assert set(range(60, 90)) <= {int(n) for flat in found for n in flat.seq}, at
+
+
+def _places(content: bytes, wanted: bytes, start: int) -> list[int]:
+    found = []
+    while (start := content.find(wanted, start)) >= 0:
+        found.append(start)
+        start += 1
+    return found

@@ -7,6 +7,7 @@ import json
 import os
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -170,13 +171,17 @@ def read_segment(
 ) -> list[Flat]:
     """Read the named columns of the row groups that may hold rows of ``[from, to)``.
 
-    Row groups are chosen by their statistics: rows outside of the range may come along. Gives
-    one ``Flat`` per part of the segment. ``stored`` says how a variable is called in the file.
+    Row groups are chosen by their times: rows outside of the range may come along. Gives one
+    ``Flat`` per part of the segment. ``stored`` says how a variable is called in the file.
     """
-    with _opened(below(store, segment.path)) as file:
-        found = _row_groups(file.metadata, schema, segment, by)
-        chosen = [group for group in found if overlaps(group.low_ns, group.high_ns, span)]
-        return _read(file, segment, schema, names, [group.number for group in chosen], stored)
+    path = below(store, segment.path)
+    with _opened(path) as file:
+        if span == (None, None):
+            chosen = list(range(file.metadata.num_row_groups))
+        else:
+            found = _row_groups(path, schema, segment, by)
+            chosen = [g.number for g in found if overlaps(g.low_ns, g.high_ns, span)]
+        return _read(file, segment, schema, names, chosen, stored)
 
 
 @dataclass(frozen=True, slots=True)
@@ -190,8 +195,7 @@ class RowGroup:
 
 def row_groups(store: Path, segment: Segment, schema: TableSchema, by: str) -> list[RowGroup]:
     """List the row groups of a segment with the bounds of ``received`` or of the stamps."""
-    with _opened(below(store, segment.path)) as file:
-        return _row_groups(file.metadata, schema, segment, by)
+    return _row_groups(below(store, segment.path), schema, segment, by)
 
 
 def read_row_group(
@@ -233,17 +237,28 @@ def _first_rows(metadata: pq.FileMetaData) -> IntArray:
     return np.concatenate(([0], np.cumsum(counts, dtype=np.int64)))
 
 
-def _row_groups(
-    metadata: pq.FileMetaData, schema: TableSchema, segment: Segment, by: str
-) -> list[RowGroup]:
+def _row_groups(path: Path, schema: TableSchema, segment: Segment, by: str) -> list[RowGroup]:
     by_clock = by == "received" or not schema.stamp
     least, most = segment.offsets_ns if by_clock else (0, 0)
-    column = list(key_names(schema)).index("log_time" if by_clock else "timestamp")
+    column = "log_time" if by_clock else "timestamp"
+    status = path.stat()
+    bounds = _bounds(path, (status.st_ino, status.st_mtime_ns, status.st_size), column)
+    return [RowGroup(number, low + least, high + most) for number, low, high in bounds]
+
+
+@lru_cache(maxsize=1024)
+def _bounds(path: Path, _: tuple[int, int, int], column: str) -> Sequence[tuple[int, int, int]]:
+    """Return number, least and greatest time of each row group; remembered until the file changes.
+
+    They are those of the column, whose pages have checksums. The statistics in the footer have
+    none: a flipped bit in them would leave rows out without a word.
+    """
     found = []
-    for number in range(metadata.num_row_groups):
-        bounds = metadata.row_group(number).column(column).statistics
-        low, high = bounds.min_raw + least, bounds.max_raw + most
-        found.append(RowGroup(number, low, high))
+    with _opened(path) as file:
+        for number in range(file.metadata.num_row_groups):
+            times = _integers(file.read_row_group(number, columns=[column])[column])
+            if len(times):
+                found.append((number, int(times.min()), int(times.max())))
     return found
 
 
