@@ -47,7 +47,8 @@ def known_of_plan(plan: Plan) -> Known:
     ids = {component.name: component.id for component in plan.components}
     ids |= {component.id: component.id for component in plan.components}
     needs = {component.id: _needs(component, ids) for component in plan.components}
-    return Known(frozenset(outputs), frozenset(watched), needs)
+    files = {component.id: component.file for component in plan.components if component.modes}
+    return Known(frozenset(outputs), frozenset(watched), needs, files=files)
 
 
 def _watched(output: OutputPlan) -> bool:
