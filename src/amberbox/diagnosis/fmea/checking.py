@@ -17,9 +17,7 @@ from amberbox.diagnosis.fmea.propagation import Structure, links_by_mode
 from amberbox.diagnosis.fmea.reading import Sheet
 
 
-def check(
-    fmea: Fmea, sheet: Sheet, known: Known | None, problems: list[Problem]
-) -> Fmea | None:
+def check(fmea: Fmea, sheet: Sheet, known: Known | None, problems: list[Problem]) -> Fmea | None:
     """Return the analysis with all effects filled in; None if names or needs are wrong."""
     found = [*_name_problems(fmea, sheet, known), *_circles(fmea, sheet)]
     problems += _not_analysed(fmea, sheet, known) if known else ()

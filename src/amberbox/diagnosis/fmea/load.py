@@ -78,7 +78,9 @@ def _of_folder(
 ) -> dict[str, Component]:
     """Return the components without an entry that something needs, directly or not."""
     found: dict[str, Component] = {}
-    waiting = [name for of in (*components.values(), *functions.values()) for name in of.needs.names()]
+    waiting = [
+        name for of in (*components.values(), *functions.values()) for name in of.needs.names()
+    ]
     while waiting:
         name = waiting.pop()
         if name in sheet.folder and name not in found:
