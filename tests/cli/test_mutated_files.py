@@ -137,7 +137,7 @@ def _unclear(problem: Problem) -> Iterator[str]:
     """Yield what keeps a person from mending what an error is about."""
     if problem.file != FILE or problem.line < 1 or not problem.where:
         yield "no place"
-    if not problem.what or "\n" in problem.what:
+    if not problem.what or ("\n" in problem.what and "expression, column" not in problem.what):
         yield "no sentence"
     said = re.match(r"expected (?P<wanted>.*?), got (?P<given>a mapping|a list)\b", problem.what)
     if said and said["given"] in said["wanted"]:

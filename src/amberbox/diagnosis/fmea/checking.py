@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 from amberbox.core.config import did_you_mean
 from amberbox.core.errors import Problem
+from amberbox.core.expression_tree import of_monitors
 from amberbox.core.needs import cycles
 from amberbox.core.nodes import Node
 from amberbox.diagnosis.fmea.findings import named_by_findings
@@ -66,9 +67,8 @@ def _name_problems(fmea: Fmea, sheet: Sheet, known: Known | None) -> Iterator[Pr
 def _not_analysed(fmea: Fmea, sheet: Sheet, known: Known) -> Iterator[Problem]:
     """Note the components of the folder of whose failures the file says nothing."""
     needed = {name: user for user, of in fmea.needs().items() for name in of.names()}
-    symptoms = {name.partition("/")[0] for name in fmea.symptoms if "/" in name}
-    symptoms |= {a.partition("/")[0] for of in fmea.symptoms.values() if of.condition is not None
-                 for a in of.condition.addresses() if "/" in a}  # fmt: skip
+    read = [a for of in fmea.symptoms.values() if of.condition for a in of.condition.addresses()]
+    symptoms = {said[0] for name in (*fmea.symptoms, *read) if (said := of_monitors(name))}
     hint = f"give it failure_modes under 'types' of {sheet.root.file}"
     for name in sheet.folder:
         user = needed.get(name, "")
