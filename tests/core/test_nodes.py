@@ -100,6 +100,7 @@ def test_any_text_is_a_tree_or_a_problem(text: str) -> None:
         ("a: [b, j.position[0], c]", '"j.position[0]"'),
         ("a: {j.position[0]: 5}", '"j.position[0]"'),
         ("a: [ü, x[1][2]/y]", '"x[1][2]/y"'),
+        ("a: {when: max(abs(j.x[0]) over 1s) < 3.5}", '"max(abs(j.x[0]) over 1s) < 3.5"'),
     ],
 )
 def test_a_name_with_brackets_wants_quotes(text: str, quoted: str) -> None:

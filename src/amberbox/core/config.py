@@ -2,8 +2,8 @@
 
 A configuration class is a frozen dataclass whose fields are declared with
 ``core.options.option``. It may define ``check(self)`` that yields what is wrong with the values
-together: a sentence, or ``(key, sentence)`` to name the line of that key. A type with a
-``from_text`` class method (such as ``Expression``) is built from the text as written.
+together: a sentence, or ``(key, sentence)`` to name the line of that key, or these and a hint. A
+type with a ``from_text`` class method (such as ``Expression``) is built from the text as written.
 """
 
 from __future__ import annotations
@@ -217,9 +217,9 @@ def _instance(ctx: _Context, cls: type[Any], values: dict[str, Any], node: Node,
 
 def _tell(ctx: _Context, found: Sequence[Finding], node: Node, where: str) -> None:
     for finding in found:
-        key, what = ("", finding) if isinstance(finding, str) else finding
+        key, what, *hint = ("", finding) if isinstance(finding, str) else finding
         place = (node.mapping or {}).get(key, node)
-        ctx.fail(place, _join(where, key) if key else where, what)
+        ctx.fail(place, _join(where, key) if key else where, what, *hint)
 
 
 def _value(ctx: _Context, kind: Any, node: Node, where: str, marks: _Marks) -> Any:

@@ -23,8 +23,8 @@ _MOST_NODES = 200_000  # aliases can multiply a small file without end
 _DEEPEST = 60
 _INTEGER = re.compile(r"[-+]?(0|[1-9][0-9]*)")
 _FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?")
-_BEFORE = re.compile(r"[^\s,\[\]{}\"']*$")
-_AFTER = re.compile(r"(\[[^\s,\[\]{}\"']*\]?)+[^\s,\[\]{}\"':]*")
+_BEFORE = re.compile(r"(?:^|[\[{,\n]|:\s)\s*")
+_AFTER = re.compile(r"(?:\[[^\[\]\n]*\]|(?!:\s)[^,\[\]{}\n])*")
 _CONSTANTS: dict[str, Scalar] = {
     **dict.fromkeys(("", "~", "null", "Null", "NULL")),
     **dict.fromkeys(("true", "True", "TRUE"), True),
@@ -163,9 +163,9 @@ def _syntax_problem(error: yaml.MarkedYAMLError, file: str, text: str) -> Proble
 
 
 def _bracketed(text: str, at: int) -> str:
-    """Return the word around a bracket that YAML took for a list, in quotes."""
-    before, after = _BEFORE.search(text[:at]), _AFTER.match(text, at)
-    return f'"{before[0] if before else ""}{after[0] if after else "["}"'
+    """Return the text around a bracket that YAML took for a list, in quotes."""
+    before, after = _BEFORE.split(text[:at])[-1], _AFTER.match(text, at)
+    return f'"{before}{after[0].rstrip() if after else "["}"'
 
 
 class _TooLargeError(Exception):

@@ -12,6 +12,7 @@ from amberbox.core.expression import parse
 from amberbox.core.expression_tree import of_monitors
 from amberbox.core.ids import derive_id, is_id
 from amberbox.core.options import option
+from amberbox.core.standins import Finding
 from amberbox.core.units import parse_duration_s
 
 OWN = ("amberbox_", "probe_")
@@ -40,7 +41,7 @@ class TriggerOptions:
     hold_off: float = option(60.0, "after it has fired it does not fire again for", unit="s")
     reason: str = option("", "what is said of the incident; without, what fired")
 
-    def check(self) -> Iterator[tuple[str, str]]:
+    def check(self) -> Iterator[Finding]:
         """Say what is wrong with the values together."""
         if not is_id(self.name):
             yield "name", f"'{self.name}' is no id; '{derive_id(self.name)}' would be one"
@@ -52,7 +53,7 @@ class TriggerOptions:
             if getattr(self, key) < 0:
                 yield key, "must not be below 0"
         if self.when and (problem := expression_problem(self.when, with_monitors=True)):
-            yield "when", problem
+            yield "when", problem.what, problem.hint
         if self.silence and (problem := _silence_problem(self.silence)):
             yield "silence", problem
 
@@ -86,14 +87,15 @@ class IncidentOptions:
             yield "per_hour", "must be 1 or more"
 
 
-def expression_problem(text: str, *, with_monitors: bool = False) -> str:
-    """Say why a text is no condition over recorded variables; empty if it is one."""
+def expression_problem(text: str, *, with_monitors: bool = False) -> AmberboxError | None:
+    """Return why a text is no condition over recorded variables; None if it is one."""
     from amberbox.blackbox.keeper.conditions import condition_problem
 
     try:
-        return condition_problem(parse(text), with_monitors=with_monitors)
+        what = condition_problem(parse(text), with_monitors=with_monitors)
     except AmberboxError as error:
-        return error.what
+        return error
+    return UsageError(what) if what else None
 
 
 def silence_of(text: str) -> tuple[str, float]:
