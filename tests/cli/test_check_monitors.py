@@ -169,3 +169,26 @@ def test_monitors_wait_for_the_black_box(laser: Path, capsys: pytest.CaptureFixt
     assert main(["check", str(laser)]) == 2
     text = capsys.readouterr().out
     assert "components:1: note: file: is judged when robot.yaml and black_box.yaml are" in text
+
+
+def test_triggers_on_outputs_and_statuses_are_resolved(
+    laser: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    robot = laser / "robot.yaml"
+    device = "laser/laser_device_monitor"
+    text = robot.read_text() + "triggers:\n"
+    for number, when in enumerate((
+        f"not {device}/front_laser_working", "status(laser) == 'error'",
+        f"status({device}) != 'ok' for 5s",
+    )):  # fmt: skip
+        text += f'  - {{name: t{number}, when: "{when}"}}\n'
+    robot.write_text(text)
+    assert main(["check", str(laser)]) == 0
+    assert capsys.readouterr().out.endswith("laser: fine\n")
+    robot.write_text(text.replace("front_laser_w", "front_laser_v").replace("(laser)", "(lasr)"))
+    assert main(["check", str(laser)]) == 2
+    told = capsys.readouterr().out
+    line = len(robot.read_text().splitlines())
+    assert f"robot.yaml:{line - 2}: triggers[0].when: there is no output or status" in told
+    assert f"did you mean '{device}/front_laser_working'?" in told
+    assert "triggers[1].when: there is no output or status 'status(lasr)'; did you mean" in told

@@ -132,3 +132,21 @@ def test_a_file_that_is_wrong_is_refused_with_the_line(
                     "</define-fault-tree>\n</opsa-mef>")  # fmt: skip
     assert main(["faulttree", str(path)]) == 2
     assert f"{path}:3: g: the gate has no input" in capsys.readouterr().err
+
+
+def test_a_model_may_be_spread_over_files(
+    tmp_path: Path, file: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    whole = Path(file).read_text(encoding="utf-8")
+    begin, end = whole.index("<model-data>"), whole.index("</model-data>") + len("</model-data>")
+    gates, events = tmp_path / "gates.xml", tmp_path / "events.xml"
+    gates.write_text(whole[:begin] + whole[end:], encoding="utf-8")
+    events.write_text(f"<opsa-mef>{whole[begin:end]}</opsa-mef>", encoding="utf-8")
+    assert main(["faulttree", str(gates), "--json", str(events)]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["top_probability"] == pytest.approx(EXACT, rel=1e-12)
+    assert found["files"] == [str(gates), str(events)]
+    assert main(["faulttree", str(gates)]) == 2
+    assert "amberbox faulttree A.xml B.xml" in capsys.readouterr().err
+    assert main(["faulttree", str(tmp_path), str(events)]) == 2
+    assert "several can be given of FILE.xml only" in capsys.readouterr().err

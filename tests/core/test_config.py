@@ -46,6 +46,9 @@ class Everything:
     by_name: Mapping[str, Wheel] = option({})
     wheel: Wheel | None = option(None)
     text_or_number: float | str = option(0.0)
+    wheel_or_word: str | Wheel = option("")
+    wheels_or_words: Sequence[str | Wheel] = option(())
+    number_or_max: float | Literal["max"] = option(0.0, "how many", unit="s")
     words_or_word: str | Sequence[str] = option("")
     where: Path = option(Path())
     condition: Expression | None = option(None)
@@ -159,6 +162,23 @@ def test_values_convert_without_loss(line: str, key: str, value: Any) -> None:
         ("wheels: [{element: null, name: a}]", "hint: indent the lines that belong to 'element:'"),
         ("wheel: {name: a, radius: 1, radius_m: 1}", "are the same key; give one"),
         ("words_or_word: {}", "expected text or a list of text, got a mapping"),
+        ("words_or_word: [a, {}]", "words_or_word[1]: expected text, got a mapping"),
+        ("wheel_or_word: [a]", "wheel_or_word: expected text or a mapping, got a list"),
+        ("wheel_or_word: {nam: a}", "wheel_or_word: unknown key 'nam'; did you mean 'name'?"),
+        (
+            "wheels_or_words: [a, {name: a, radius: big}]",
+            "wheels_or_words[1].radius: expected a number, got text 'big'",
+        ),
+        (
+            "number_or_max: mx",
+            "expected a number or one of max, got text 'mx'; did you mean 'max'?",
+        ),
+        (
+            "number_or_max: 5 parsecs",
+            "expected a number or one of max, got text '5 parsecs', which has the unknown unit",
+        ),
+        ("number_or_max: mx", "hint: how many"),
+        ("bands: {a: 90 %}", "bands.a: expected a number, got text '90 %'; did you mean 0.9?"),
         ("condition: a.x >", "condition: expression, column 6: something is missing"),
         ("count: -1", "count: must not be below 0"),
         ("keep: all\nnmae: 3", "f.yaml:3: file: unknown key 'nmae'; did you mean 'name'?"),

@@ -346,3 +346,31 @@ def test_never_seen_variable_is_unknown() -> None:
     assert at("x > 1 for 1s", 5, x=x) is None
     assert at("count(x over 1s)", 5, x=x) == 0
     assert at("not known(x)", 5, x=x) is True
+
+
+@pytest.mark.parametrize(
+    ("text", "address"),
+    [
+        ("status(battery) == 'ok'", "status(battery)"),
+        ("status( battery/cells ) == 'ok'", "status(battery/cells)"),
+        ("status(`smart-wheel/pose.2`) == 'ok'", "status(smart-wheel/pose.2)"),
+    ],
+)
+def test_statuses_are_addresses_of_texts(text: str, address: str) -> None:
+    assert parse(text).addresses() == (address,)
+    assert parse(text).evaluate({address: "ok"}) is True
+    assert parse(text).resolve([address]).evaluate({address: "stale"}) is False
+
+
+@pytest.mark.parametrize(
+    ("text", "what"),
+    [
+        ("status() == 'ok'", "status takes a component, or component/mode"),
+        ("status(a, b) == 'ok'", "status takes a component, or component/mode"),
+        ("status(a) == 1", "a text never equals a number"),
+        ("status(a) and b", "'and' needs a condition, this is a text"),
+    ],
+)
+def test_what_is_no_status_is_refused(text: str, what: str) -> None:
+    with pytest.raises(ExpressionError, match=re.escape(what)):
+        parse(text)

@@ -91,3 +91,19 @@ def test_any_text_is_a_tree_or_a_problem(text: str) -> None:
     root = parse_yaml(text, "f", problems)
     assert root is not None or problems
     assert all(1 <= problem.line <= text.count("\n") + 2 for problem in problems)
+
+
+@pytest.mark.parametrize(
+    ("text", "quoted"),
+    [
+        ("a: [/joints.position[0]]", '"/joints.position[0]"'),
+        ("a: [b, j.position[0], c]", '"j.position[0]"'),
+        ("a: {j.position[0]: 5}", '"j.position[0]"'),
+        ("a: [ü, x[1][2]/y]", '"x[1][2]/y"'),
+        ("a: {when: max(abs(j.x[0]) over 1s) < 3.5}", '"max(abs(j.x[0]) over 1s) < 3.5"'),
+    ],
+)
+def test_a_name_with_brackets_wants_quotes(text: str, quoted: str) -> None:
+    problems: list[Problem] = []
+    assert parse_yaml(text, "f", problems) is None
+    assert problems[0].hint == f"quote a name that has brackets: {quoted}"

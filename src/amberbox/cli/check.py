@@ -20,6 +20,7 @@ from amberbox.blackbox.folder.triggers import trigger_problems
 from amberbox.cli._plantext import in_full, in_short
 from amberbox.cli._text import in_columns
 from amberbox.consult.knowledge import knowledge_of, rule_problems
+from amberbox.consult.known import addresses_of
 from amberbox.core.config import load_yaml
 from amberbox.core.errors import ConfigurationError, Problem
 from amberbox.core.redaction import as_plain
@@ -47,8 +48,8 @@ def run(args: argparse.Namespace) -> int:
     """Print all problems and notes, and the plan if there is no error; return 0 or 2."""
     folder, problems = inspect_folder(args.folder)
     items = planned_items(folder, problems) if folder else []
-    problems += _triggers(folder, items) if folder else []
     plan = _monitors(folder, problems) if folder and Path(args.folder).is_dir() else None
+    problems += _triggers(folder, items, plan) if folder else []
     problems += _not_judged(Path(args.folder)) if folder is None else []
     ok = not any(problem.is_error for problem in problems)
     if args.json:
@@ -78,15 +79,18 @@ def _monitors(folder: RobotFolder, problems: list[Problem]) -> Plan:
     return plan
 
 
-def _triggers(folder: RobotFolder, items: Sequence[PlannedItem]) -> list[Problem]:
-    """Judge the items that triggers name by the plan."""
+def _triggers(
+    folder: RobotFolder, items: Sequence[PlannedItem], plan: Plan | None
+) -> list[Problem]:
+    """Judge the items, outputs and statuses that triggers name by the plan."""
     path, unread = folder.path / ROBOT_FILE, list[Problem]()
     node = load_yaml(path, unread) if folder.robot.triggers else None
     if node is None:
         return []
     sources = [block.name for block in folder.blocks]
     names = [item.item for item in items]
-    return list(trigger_problems(node, folder.robot.triggers, sources, names))
+    monitors = None if plan is None else addresses_of(plan)
+    return list(trigger_problems(node, folder.robot.triggers, sources, names, monitors))
 
 
 def _report(

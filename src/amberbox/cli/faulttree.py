@@ -7,6 +7,7 @@ import math
 import time
 from pathlib import Path
 
+from amberbox.cli._anyorder import accept_any_order
 from amberbox.cli._faulttree_answer import show
 from amberbox.cli._output import accept_relative_times, print_json, tell, text_output
 from amberbox.cli._server import add_where
@@ -22,8 +23,12 @@ _SECONDS = 300.0
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
     accept_relative_times(parser)
+    accept_any_order(parser)
     what = "robot folder or fmea.yaml, or a fault tree in Open-PSA MEF"
     add_where(parser, what, "WHERE|FILE.xml")
+    parser.add_argument(
+        "more", nargs="*", metavar="FILE.xml", help="further files of the same model"
+    )
     parser.add_argument(
         "--effect", default="", metavar="NAME",
         help="the function or component that is lost; the top gate of a file with several",
@@ -70,7 +75,8 @@ def run(args: argparse.Namespace) -> int:
     ends = time.monotonic() + args.seconds
     budget = Budget(args.nodes, lambda: time.monotonic() > ends)
     if _is_tree(args.where):
-        return _one(read_mef(args.where, args.effect, args.mission_time), args, budget)
+        files = [args.where, *args.more]
+        return _one(read_mef(files, args.effect, args.mission_time), args, budget)
     return _compiled(args, budget)
 
 
@@ -104,7 +110,8 @@ def _one(tree: FaultTree, args: argparse.Namespace, budget: Budget) -> int:
     analysis = analyse(tree, args.order, args.importance, budget)
     if args.json:
         made = analysis_json(analysis, args.importance, args.cut_sets or 0)
-        print_json({"file": args.where, **made})
+        files = {"files": [args.where, *args.more]} if args.more else {}
+        print_json({"file": args.where, **files, **made})
     else:
         show(analysis, args)
     return _finished(analysis)
@@ -126,6 +133,8 @@ def _check(args: argparse.Namespace) -> None:
         given = getattr(args, name)
         if given is not None and not 0.0 <= given < math.inf:
             raise UsageError(f"--{name.replace('_', '-')} must be a number, 0 or more")
+    if args.more and not all(map(_is_tree, (args.where, *args.more))):
+        raise UsageError("several can be given of FILE.xml only", "amberbox faulttree A.xml B.xml")
     if _is_tree(args.where):
         _check_file(args)
     else:

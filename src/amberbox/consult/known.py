@@ -7,6 +7,7 @@ from dataclasses import replace
 
 from amberbox.blackbox.folder.folder import RobotFolder
 from amberbox.consult.rulefiles import with_rules
+from amberbox.core.expression_tree import status_address
 from amberbox.core.needs import Needs, all_of
 from amberbox.diagnosis.fmea.known import Known
 from amberbox.monitoring.configuration import load_plan
@@ -17,9 +18,18 @@ from amberbox.monitoring.plan import ComponentPlan, OutputPlan, Plan
 
 def known_of(folder: RobotFolder, plan: Plan | None = None) -> Known:
     """Return the outputs of a folder's monitors, what its components need, what is recorded."""
-    known = declared_of(folder, plan or load_plan(folder)[0])
-    variables = _variables(Recorded(folder))
-    return known if variables is None else replace(known, addresses={*variables, *known.outputs})
+    plan = plan or load_plan(folder)[0]
+    known, variables = declared_of(folder, plan), _variables(Recorded(folder))
+    return (
+        known if variables is None else replace(known, addresses={*variables, *addresses_of(plan)})
+    )
+
+
+def addresses_of(plan: Plan) -> frozenset[str]:
+    """Return what expressions can name of monitors: outputs, and statuses with and without mode."""
+    subjects = [f"{component.id}/{mode.id}" for component, mode in plan.modes()]
+    subjects += [component.id for component in plan.components]
+    return frozenset((*known_of_plan(plan).outputs, *map(status_address, subjects)))
 
 
 def declared_of(folder: RobotFolder, plan: Plan) -> Known:
@@ -47,7 +57,8 @@ def known_of_plan(plan: Plan) -> Known:
     ids = {component.name: component.id for component in plan.components}
     ids |= {component.id: component.id for component in plan.components}
     needs = {component.id: _needs(component, ids) for component in plan.components}
-    return Known(frozenset(outputs), frozenset(watched), needs)
+    files = {component.id: component.file for component in plan.components if component.modes}
+    return Known(frozenset(outputs), frozenset(watched), needs, files=files)
 
 
 def _watched(output: OutputPlan) -> bool:

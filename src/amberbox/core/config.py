@@ -2,8 +2,8 @@
 
 A configuration class is a frozen dataclass whose fields are declared with
 ``core.options.option``. It may define ``check(self)`` that yields what is wrong with the values
-together: a sentence, or ``(key, sentence)`` to name the line of that key. A type with a
-``from_text`` class method (such as ``Expression``) is built from the text as written.
+together: a sentence, or ``(key, sentence)`` to name the line of that key, or these and a hint. A
+type with a ``from_text`` class method (such as ``Expression``) is built from the text as written.
 """
 
 from __future__ import annotations
@@ -11,10 +11,11 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import math
+import re
 import types
 import typing
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin
 
@@ -37,6 +38,7 @@ WRAPPERS = frozenset(
 """Single keys that the paper's format wraps around the entries of a list."""
 
 _FAILED: Any = Unread()
+_PERCENT = re.compile(r"(\d+\.?\d*|\.\d+)\s*%")
 _YES_NO = {"yes": True, "on": True, "true": True, "no": False, "off": False, "false": False}
 
 
@@ -102,6 +104,9 @@ class _Marks:
 
     unit: str = ""
     secret: bool = False
+    doc: str = ""
+    expected: str = ""
+    """What a union expects as a whole, while its members are tried."""
 
     def show(self, node: Node) -> str:
         """Describe a wrong value without giving a secret away."""
@@ -183,7 +188,8 @@ def _field(
 ) -> Any:
     node, entries = parent
     given = [key for key in field_keys(field) if key in entries]
-    marks = _Marks(field.metadata.get("unit", ""), field.metadata.get("secret", False))
+    meta = field.metadata
+    marks = _Marks(meta.get("unit", ""), meta.get("secret", False), meta.get("doc", ""))
     if len(given) > 1:
         what = f"'{given[0]}' and '{given[1]}' are the same key; give one"
         return ctx.fail(entries[given[1]], where, what)
@@ -211,9 +217,9 @@ def _instance(ctx: _Context, cls: type[Any], values: dict[str, Any], node: Node,
 
 def _tell(ctx: _Context, found: Sequence[Finding], node: Node, where: str) -> None:
     for finding in found:
-        key, what = ("", finding) if isinstance(finding, str) else finding
+        key, what, *hint = ("", finding) if isinstance(finding, str) else finding
         place = (node.mapping or {}).get(key, node)
-        ctx.fail(place, _join(where, key) if key else where, what)
+        ctx.fail(place, _join(where, key) if key else where, what, *hint)
 
 
 def _value(ctx: _Context, kind: Any, node: Node, where: str, marks: _Marks) -> Any:
@@ -234,29 +240,51 @@ def _value(ctx: _Context, kind: Any, node: Node, where: str, marks: _Marks) -> A
 
 
 def _union(ctx: _Context, kind: Any, node: Node, where: str, marks: _Marks) -> Any:
-    """Take the first member that fits: one of exactly this type before one that converts."""
+    """Take the first member that fits: one of exactly this type before one that converts.
+
+    Where none fits, report what is wrong for the member of the same shape: mapping, list or word.
+    """
     members = [member for member in get_args(kind) if member is not types.NoneType]
     if node.value is None and len(members) < len(get_args(kind)):
         return None
     if len(members) == 1:
         return _value(ctx, members[0], node, where, marks)
+    names = " or ".join(type_text(member) for member in members)
+    alike: list[list[Problem]] = []
     for member in sorted(members, key=lambda member: not _is_exactly(member, node)):
         attempt = _Context([], ctx.legacy)
-        value = _value(attempt, member, node, where, marks)
+        is_word = _shape(member) is str
+        value = _value(
+            attempt, member, node, where, replace(marks, expected=names) if is_word else marks
+        )
         if not _failed(value):
             ctx.problems.extend(attempt.problems)
             return value
-    names = " or ".join(type_text(member) for member in members)
-    return ctx.fail(node, where, f"expected {names}, got {marks.show(node)}")
+        if _shape(member) is _shape_of(node):
+            alike.append(attempt.problems)
+    if not alike:
+        return ctx.fail(node, where, f"expected {names}, got {marks.show(node)}", marks.doc)
+    ctx.problems.extend(max(alike, key=lambda found: len(found[0].what)))  # it says most
+    return _FAILED
+
+
+def _shape(kind: Any) -> type:
+    """Return the shape in YAML that values of a type have: ``dict``, ``tuple`` or ``str``."""
+    origin = get_origin(kind) or kind
+    if origin in (Mapping, dict) or (dataclasses.is_dataclass(kind) and not _has_text_form(kind)):
+        return dict
+    return tuple if origin in (Sequence, tuple, list) else str
+
+
+def _shape_of(node: Node) -> type | None:
+    if node.value is None:
+        return None
+    return type(node.value) if isinstance(node.value, dict | tuple) else str
 
 
 def _is_exactly(kind: Any, node: Node) -> bool:
     origin = get_origin(kind) or kind
-    if node.mapping is not None:
-        return origin in (Mapping, dict) or dataclasses.is_dataclass(kind)
-    if node.items is not None:
-        return origin in (Sequence, tuple, list)
-    return type(node.value) is origin
+    return type(node.value) is origin or _shape(kind) is _shape_of(node) is not str
 
 
 def _literal(ctx: _Context, choices: tuple[Any, ...], node: Node, where: str, m: _Marks) -> Any:
@@ -266,14 +294,13 @@ def _literal(ctx: _Context, choices: tuple[Any, ...], node: Node, where: str, m:
             return choice
     names = [str(choice) for choice in choices]
     suggestion = did_you_mean(node.text, names)
-    return ctx.fail(
-        node, where, f"expected one of {', '.join(names)}, got {m.show(node)}{suggestion}"
-    )
+    expected = m.expected or f"one of {', '.join(names)}"
+    return ctx.fail(node, where, f"expected {expected}, got {m.show(node)}{suggestion}", m.doc)
 
 
 def _sequence(ctx: _Context, kind: Any, node: Node, where: str, marks: _Marks) -> Any:
     if node.items is None:
-        hint = f"write it as a list: [{node.text}]" if node.text and not marks.secret else ""
+        hint = f"write it as a list: [{node.text}]" if node.text and not marks.secret else marks.doc
         return ctx.fail(node, where, f"expected a list, got {marks.show(node)}", hint)
     values = tuple(
         _value(ctx, kind, _unwrapped(entry, kind), f"{where}[{index}]", marks)
@@ -294,7 +321,8 @@ def _unwrapped(node: Node, kind: Any) -> Node:
 
 def _mapping(ctx: _Context, kind: Any, node: Node, where: str, marks: _Marks) -> Any:
     if node.mapping is None:
-        return ctx.fail(node, where, f"expected a mapping (key: value), got {marks.show(node)}")
+        what = f"expected a mapping (key: value), got {marks.show(node)}"
+        return ctx.fail(node, where, what, marks.doc)
     values = {
         key: _value(ctx, kind, value, _join(where, key), marks)
         for key, value in node.mapping.items()
@@ -303,15 +331,24 @@ def _mapping(ctx: _Context, kind: Any, node: Node, where: str, marks: _Marks) ->
 
 
 def _scalar(ctx: _Context, kind: Any, node: Node, where: str, marks: _Marks) -> Any:
+    what = f"expected {marks.expected or type_text(kind)}, got {marks.show(node)}"
     if node.mapping is not None or node.items is not None or node.value is None:
-        return ctx.fail(node, where, f"expected {type_text(kind)}, got {marks.show(node)}")
+        return ctx.fail(node, where, what, marks.doc)
     try:
         return _from_scalar(kind, node, marks.unit)
     except AmberboxError as error:
         return ctx.fail(node, where, error.what, error.hint)
     except ValueError as error:
-        what = f"expected {type_text(kind)}, got {marks.show(node)}"
-        return ctx.fail(node, where, f"{what}, which {error}" if str(error) else what)
+        return ctx.fail(node, where, what + _reason(error, kind, node, marks), marks.doc)
+
+
+def _reason(error: ValueError, kind: Any, node: Node, marks: _Marks) -> str:
+    """Say why a word is no value of a type; of a share in percent, which number it is."""
+    is_plain = kind is float and not marks.unit and not marks.secret
+    percent = _PERCENT.fullmatch(node.text) if is_plain else None
+    if percent is not None:
+        return f"; did you mean {float(percent[1]) / 100:g}?"
+    return f", which {error}" if str(error) else ""
 
 
 def _from_scalar(kind: Any, node: Node, unit: str) -> Any:

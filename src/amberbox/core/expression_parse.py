@@ -183,6 +183,9 @@ class _Parser:
         return Address(token.at, token.text)
 
     def _call(self, name: Token) -> Tree:
+        if name.text == "status":
+            hint = "such as: status(battery) == 'error', status(battery/temperature) == 'ok'"
+            raise Fault("status takes a component, or component/mode", name.at, hint)
         if name.text not in FUNCTIONS:
             known = ", ".join(sorted(FUNCTIONS))
             what = f"there is no function '{name.text}'{did_you_mean(name.text, FUNCTIONS)}"

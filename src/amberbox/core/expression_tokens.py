@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
-from amberbox.core.expression_tree import Fault
+from amberbox.core.expression_tree import Fault, status_address
 
 Sort: TypeAlias = Literal["number", "text", "address", "word", "operator", "end"]
 
@@ -21,6 +21,7 @@ _PATTERNS = re.compile(
   | (?P<number>(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)(?P<unit>[A-Za-z_]\w*)?
   | (?P<text>'(?:[^'\\]|\\.)*'|"(?:[^"\\]|\\.)*")
   | (?P<quoted>`[^`]*`)
+  | (?P<status>status\(\s*(?P<subject>{_ROBOT}{_NAME}(?:/{_NAME})?|`[^`]*`)\s*\))
   | (?P<path>{_ROBOT}{_NAME}/{_NAME}/{_NAME}(?![\w/.\[]))
   | (?P<mode>{_ROBOT}{_NAME}\#{_NAME})
   | (?P<word>{_ROBOT}{_NAME}(?:\.{_NAME})*(?:\[\d+\])*)
@@ -77,6 +78,8 @@ def _token(match: re.Match[str], text: str) -> Token:
         return Token("operator", match[0], at)
     if sort == "quoted":
         return _quoted(match)
+    if sort == "status":
+        return Token("address", status_address(match["subject"].strip("`").strip()), at)
     if sort == "word":
         _refuse_half_path(match, text)
         return Token("word", match[0], at)

@@ -138,12 +138,38 @@ _KINDS: dict[type[Tree], Kind] = {
 }
 
 
+def status_address(subject: str) -> str:
+    """Return the address of the level of a ``component``, or of a ``component/mode``."""
+    return f"status({subject})"
+
+
+def status_of(address: str) -> tuple[str, str] | None:
+    """Return component and mode whose level an address is; the mode of a component is empty."""
+    if not address.startswith("status("):
+        return None
+    component, _, mode = address[len("status(") : -1].partition("/")
+    return component, mode
+
+
+def output_of(address: str) -> tuple[str, str, str] | None:
+    """Return component, mode and output of an address ``component/mode/output``; else None."""
+    component, *rest = address.split("/", 2)
+    return (component, rest[0], rest[1]) if len(rest) == 2 else None
+
+
+def of_monitors(address: str) -> tuple[str, ...] | None:
+    """Return component and mode of a status, or component, mode and output; None for others."""
+    return status_of(address) or output_of(address)
+
+
 def kind_of(tree: Tree) -> Kind:
     """Tell what a part gives, as far as its form says."""
     if isinstance(tree, Constant):
         return kind_of_value(tree.value)
     if isinstance(tree, Call):
         return "condition" if tree.name in ("known", "bit") else "number"
+    if isinstance(tree, Address) and status_of(tree.name) is not None:
+        return "text"
     return _KINDS.get(type(tree), "any")
 
 

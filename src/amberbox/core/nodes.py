@@ -23,6 +23,8 @@ _MOST_NODES = 200_000  # aliases can multiply a small file without end
 _DEEPEST = 60
 _INTEGER = re.compile(r"[-+]?(0|[1-9][0-9]*)")
 _FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?")
+_BEFORE = re.compile(r"(?:^|[\[{,\n]|:\s)\s*")
+_AFTER = re.compile(r"(?:\[[^\[\]\n]*\]|(?!:\s)[^,\[\]{}\n])*")
 _CONSTANTS: dict[str, Scalar] = {
     **dict.fromkeys(("", "~", "null", "Null", "NULL")),
     **dict.fromkeys(("true", "True", "TRUE"), True),
@@ -114,7 +116,7 @@ def parse_yaml(text: str, file: str, problems: list[Problem]) -> Node | None:
     try:
         root = _compose(text)
     except yaml.MarkedYAMLError as error:
-        problems.append(_syntax_problem(error, file))
+        problems.append(_syntax_problem(error, file, text))
     except yaml.reader.ReaderError as error:
         line = text[: error.position].count("\n") + 1
         what = f"the character {error.character!r} is not allowed in YAML"
@@ -147,15 +149,23 @@ def _tree(root: yaml.Node | None, file: str, problems: list[Problem]) -> Node | 
         return None
 
 
-def _syntax_problem(error: yaml.MarkedYAMLError, file: str) -> Problem:
+def _syntax_problem(error: yaml.MarkedYAMLError, file: str, text: str) -> Problem:
     mark = error.problem_mark or error.context_mark
     what = " ".join(part for part in (error.context, error.problem) if part)
     hint = ""
     if "'\\t'" in what:
         hint = "indent with blanks, not with tabs"
+    elif "but got '['" in what and mark is not None:
+        hint = f"quote a name that has brackets: {_bracketed(text, mark.index)}"
     elif "mapping values are not allowed" in what:
         hint = "look at the indentation here, or quote a text that contains ': '"
     return Problem(file, mark.line + 1 if mark else 1, "syntax", what, hint)
+
+
+def _bracketed(text: str, at: int) -> str:
+    """Return the text around a bracket that YAML took for a list, in quotes."""
+    before, after = _BEFORE.split(text[:at])[-1], _AFTER.match(text, at)
+    return f'"{before}{after[0].rstrip() if after else "["}"'
 
 
 class _TooLargeError(Exception):

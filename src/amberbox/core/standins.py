@@ -14,8 +14,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, TypeAlias, Union, get_args, get_origin
 
-Finding: TypeAlias = "str | tuple[str, str]"
-"""A sentence, or the key that it is about and the sentence."""
+Finding: TypeAlias = "str | tuple[str, str] | tuple[str, str, str]"
+"""A sentence, or the key that it is about and the sentence, and a hint where there is one."""
 
 _BY_TYPE: Mapping[Any, tuple[Any, ...]] = {
     str: ("", "x"),

@@ -140,6 +140,7 @@ class ComponentPlan:
     description: str = ""
     recovery_actions: Sequence[str] = ()
     needs: Needs | None = None
+    file: str = ""
 
 
 @dataclass(frozen=True, slots=True)

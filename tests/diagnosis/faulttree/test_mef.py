@@ -276,3 +276,38 @@ def test_a_constant_top_has_no_event() -> None:
 def test_a_file_that_is_not_there_is_said(tmp_path: Path) -> None:
     with pytest.raises(ConfigurationError, match=r"none\.xml:1: file: cannot be read: No such"):
         read_mef(tmp_path / "none.xml")
+
+
+SECOND = """<opsa-mef>
+  <define-fault-tree name="power">
+    <define-gate name="dark"> <and> <gate name="lost"/> <event name="fuse"/> </and> </define-gate>
+    <define-basic-event name="fuse"> <float value="0.5"/> </define-basic-event>
+  </define-fault-tree>
+</opsa-mef>
+"""
+
+
+def test_a_model_of_several_files_is_one_tree(tmp_path: Path) -> None:
+    first, second = tmp_path / "gates.xml", tmp_path / "power.xml"
+    first.write_text(GOOD.replace("<label>battery empty</label>", '<float value="0.25"/>'))
+    second.write_text(SECOND)
+    both = read_mef([second, first])
+    assert (both.top, both.name) == ("dark", "power") and "lost" in both.gates
+    assert analyse(both).top_probability == analyse(read_mef([first, second])).top_probability
+    alone = analyse(read_mef(first)).top_probability
+    assert alone is not None
+    assert analyse(both).top_probability == pytest.approx(alone / 2)
+
+
+def test_what_is_wrong_between_files_names_both(tmp_path: Path) -> None:
+    first, second = tmp_path / "gates.xml", tmp_path / "power.xml"
+    first.write_text(GOOD)
+    second.write_text(SECOND.replace('"fuse"> <float', '"right"> <float'))
+    with pytest.raises(ConfigurationError) as caught:
+        read_mef([first, second])
+    told = {(p.file, p.line, p.what) for p in caught.value.problems}
+    assert (str(second), 4, f"is defined twice, first in {first}:29") in told
+    assert (str(second), 3, "no such gate or basic event or house event") in told
+    with pytest.raises(ConfigurationError) as caught:
+        read_mef(second)
+    assert "amberbox faulttree A.xml B.xml" in caught.value.problems[0].hint

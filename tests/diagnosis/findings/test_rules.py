@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -15,7 +16,8 @@ from amberbox.diagnosis.fmea.model import Fmea
 from amberbox.diagnosis.knowledge import Knowledge
 from amberbox.diagnosis.rules import Program, ask, read_rules, read_text
 from amberbox.diagnosis.rules.faults import RuleError
-from amberbox.diagnosis.rules.virtual import Virtual
+from amberbox.diagnosis.rules.proof import Source
+from amberbox.diagnosis.rules.virtual import Sourced, Virtual
 from amberbox.diagnosis.situation import Situation, evidence
 
 TEXT = """\
@@ -164,3 +166,40 @@ short_circuit(X) :- robot(X), driver_initialising(X), initialisation_shutdown(X)
 """)
     diagnosis = conclude(Knowledge("team", FMEA), program, Facts(), HEADING)
     assert diagnosis.hypotheses[0].faults == {"ropod2#short_circuit"}
+
+
+DATED = """\
+short_circuit(R) :- component(R), present(S), atom_concat(R, '/power/on', S), REST.
+broken(x). strange(x).
+"""
+
+
+@pytest.mark.parametrize(
+    ("rest", "onset_ns"),
+    [
+        ("true", 40),
+        ("present('m1/turns/freely')", 70),
+        ("present('m2/turns/freely')", 40),
+        ("absent('ropod1/power/on')", 40),
+        ("held(old, 10, 95)", 40),
+        ("held(new, F, T)", 60),
+    ],
+)
+def test_a_finding_begins_with_the_last_of_its_goals(rest: str, onset_ns: int) -> None:
+    """What is absent has no beginning."""
+    present = [("ropod2/power/on", 40), ("m1/turns/freely", 70), ("m2/turns/freely", 20)]
+    symptoms = [
+        Symptom(name, "present", name, at, 90, evidence=((f"item.{name}", at, 90),))
+        for name, at in present
+    ]
+    gone = (("item.gone", 80, 90),)
+    symptoms.append(Symptom("ropod1/power/on", "absent", "", 80, 80, evidence=gone))
+    spans = {"old": (10, 95), "new": (60, 95)}
+    rows = [
+        Sourced((name, *span), Source("record", ((f"item.{name}", *span),)))
+        for name, span in spans.items()
+    ]
+    known = replace(facts(*symptoms), lookups=(Virtual("held", 3, lambda _: rows),))
+    found = rule_findings(read_text(DATED.replace("REST", rest)), FMEA, known, 99)
+    (symptom,) = found.symptoms
+    assert (symptom.id, symptom.onset_ns) == ("rule:short_circuit(ropod2)", onset_ns)

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from amberbox.core.needs import all_of, any_of
+from amberbox.core.needs import NOTHING, all_of, any_of
 from amberbox.diagnosis.fmea.load import load_fmea, read_fmea
 from amberbox.diagnosis.fmea.model import Link, Outcome
+from amberbox.diagnosis.fmea.propagation import lost
 from tests.diagnosis.fmea.small import KNOWN, TEXT, small
 
 
@@ -300,3 +302,72 @@ def test_files_that_are_not_there_or_no_yaml(tmp_path: Path) -> None:
     (tmp_path / "fmea.yaml").write_text("", encoding="utf-8")
     fmea, problems = load_fmea(tmp_path / "fmea.yaml")
     assert fmea is not None and not fmea.modes and not problems
+
+
+@pytest.mark.parametrize(
+    ("given", "what"),
+    [
+        ("90", "90 is above 1: expected a share from 0 to 1; did you mean 0.9?"),
+        ("90 %", "expected a number, got text '90 %'; did you mean 0.9?"),
+        ("[1]", "expected a number, got a list"),
+    ],
+)
+def test_a_wrong_share_of_a_symptom_is_told_with_its_key(given: str, what: str) -> None:
+    text = TEXT.replace("detects: 0.9,", f"detects: {given},")
+    fmea, problems = read_fmea(text, KNOWN)
+    assert fmea is None
+    assert [(p.where, p.what) for p in problems] == [
+        ("types.laser.failure_modes.dirty.symptoms[0].detects", what)
+    ]
+    assert problems[0].line == text[: text.index(f"detects: {given},")].count("\n") + 1
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "where"),
+    [
+        ("rate: 1.0e-4", "rate: 1000", "types.laser.failure_modes.dead.rate"),
+        ("description: the <side> laser\n", "rate: 1000\n", "types.laser.rate"),
+    ],
+)
+def test_a_rate_that_no_part_has_is_noted(old: str, new: str, where: str) -> None:
+    fmea, problems = read_fmea(TEXT.replace(old, new), KNOWN)
+    assert fmea is not None
+    (note,) = problems
+    assert (note.where, note.is_error) == (where, False)
+    assert note.what == "1000 per hour is one failure every 3.6 s; did you mean 0.001?"
+
+
+FOLDER = replace(
+    KNOWN,
+    outputs=(*KNOWN.outputs, "tray/full/ok", "lamp/on/ok"),
+    needs={**KNOWN.needs, "tray": all_of("feeder"), "feeder": all_of("host"), "lamp": NOTHING},
+    files={"tray": "components/tray.yaml", "lamp": "components/lamp.yaml"},
+)
+
+
+def test_functions_need_components_that_only_the_folder_has() -> None:
+    fmea, problems = read_fmea(TEXT.replace("needs: [see, hook]", "needs: [see, tray]"), FOLDER)
+    assert fmea is not None
+    assert "carry" in lost(fmea, ["host#off"]), "the tray needs the feeder, and that the host"
+    assert "lamp" not in fmea.components
+    assert [(p.file, p.where, p.what, p.is_error) for p in problems] == [
+        ("components/lamp.yaml", "component",
+         "'lamp' is monitored, but no failure mode is known: no diagnosis names it", False),
+        ("fmea.yaml", "carry.needs",
+         "of 'tray' no failure mode is known: it fails only with what it needs", False),
+    ]  # fmt: skip
+
+
+def test_what_is_monitored_for_the_symptoms_of_others_is_not_noted() -> None:
+    text = TEXT.replace("[host/heartbeat/alive]", "[host/heartbeat/alive, lamp/on/ok]")
+    watched = replace(FOLDER, watched=(*KNOWN.watched, "lamp/on/ok"))
+    fmea, problems = read_fmea(text, watched)
+    assert fmea is not None
+    assert [problem.file for problem in problems] == ["components/tray.yaml"]
+
+
+def test_without_the_folder_its_components_are_not_known() -> None:
+    _, problems = read_fmea(TEXT.replace("needs: [see, hook]", "needs: [see, tray]"))
+    assert ("carry.needs", "there is no component or function 'tray'") in [
+        (p.where, p.what) for p in problems
+    ]

@@ -62,6 +62,6 @@ def test_what_is_wrong_with_members_is_told(tmp_path: Path) -> None:
     assert fmea is None
     told = {(p.line, p.what) for p in problems if p.is_error}
     assert (9, "ropod_001 has no function 'cary'; did you mean 'carry'?") in told
-    assert (9, "1.02 is above 1") in told
+    assert (9, "1.02 is above 1: expected a share from 0 to 1") in told
     assert (13, "how probable is it? give probability or rate") in told
     assert any("no component or function 'ropod_001:carry'" in what for _, what in told)

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -233,3 +234,11 @@ def test_rows_that_are_held_already_are_not_taken_twice() -> None:
     again.feed(rows("x", times(20), a=np.zeros(200)))
     for name, samples in again.samples().items():
         assert samples.times_ns.tolist() == [seconds(at) for at in times(20) if at >= 14], name
+
+
+def test_levels_of_modes_and_components_come_from_statuses() -> None:
+    made = conditions("status(motor/drive) == 'ok' and status(motor) != 'error'")
+    for at in range(1, 4):
+        made.take(status(at, "motor", "drive"))
+        made.take(replace(status(at, "motor", ""), level="ok" if at < 3 else "error"))
+    assert advance(made, 4) == [(1.0, "present"), (3.0, "absent")]

@@ -153,3 +153,50 @@ mappings:
     (error,) = errors(problems)
     assert error.startswith("mode.yaml:5: mappings[0], arguments: ros_odom has no variable")
     assert mode.problem
+
+
+DIAGNOSTICS = """\
+- ros:
+    topics:
+      - {name: /x/diagnostics, type: diagnostic_msgs/DiagnosticArray}
+      - {name: /y/diagnostics}
+"""
+
+
+@pytest.mark.parametrize(
+    "text", ["ros_x_diagnostics__status", "ros_x_diagnostics__status__values",
+             "ros_y_diagnostics__status"],
+)  # fmt: skip
+def test_child_tables_before_they_are_recorded(tmp_path: Path, text: str) -> None:
+    mode, problems = mode_of(tmp_path, ITEM.format(text=text), DIAGNOSTICS)
+    assert errors(problems) == []
+    entry = mode.mappings[0].inputs[0]
+    assert (entry.kind, entry.item) == ("item", text)
+    told = ["variables of ros_y_diagnostics are judged when they have been recorded"]
+    assert [note.partition("inputs: ")[2] for note in notes(problems)] == (
+        told if "_y_" in text else []
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "what"),
+    [
+        ("ros_x_diagnostics__statu", "ros_x_diagnostics has no table 'ros_x_diagnostics__statu'; "
+         "did you mean 'ros_x_diagnostics__status'?"),
+        ("ros_z_diagnostics__status", "nothing that is recorded is called"),
+    ],
+)  # fmt: skip
+def test_tables_that_will_not_be(tmp_path: Path, text: str, what: str) -> None:
+    _, problems = mode_of(tmp_path, ITEM.format(text=text), DIAGNOSTICS)
+    assert errors(problems)[0].startswith(f"mode.yaml:4: mappings[0].inputs[0]: {what}")
+
+
+def test_variables_of_child_tables_before_they_are_recorded(tmp_path: Path) -> None:
+    text = VARIABLE.format(text="ros_x_diagnostics__status.level")
+    mode, problems = mode_of(tmp_path, text, DIAGNOSTICS)
+    assert errors(problems) == [] and notes(problems) == []
+    entry = mode.mappings[0].inputs[0]
+    assert (entry.item, entry.variable) == ("ros_x_diagnostics__status", "level")
+    wrong = VARIABLE.format(text="ros_x_diagnostics__status.levl")
+    _, problems = mode_of(tmp_path, wrong, DIAGNOSTICS)
+    assert "has no variable 'levl'; did you mean 'level'?" in errors(problems)[0]

@@ -32,12 +32,24 @@ DIAGNOSED = Trigger("diagnosed", when="amberbox_diagnosis.state == 'open'", befo
 STATUS = Trigger(
     "status", when="amberbox_status.level == 'error'", before_s=1, after_s=0.5, hold_off_s=600
 )
+OUTPUT = Trigger("output", when="base/m/good == false for 500ms", before_s=1, after_s=0.5)
+MODE = Trigger("mode", when="status(base/m) == 'error'", before_s=1, after_s=0.5)
+PART = Trigger("part", when="status(base) == 'error' and ros_main.data < 0", before_s=1)
 TRANSITION = Trigger("transition", event="component_state", before_s=1, after_s=0.5, hold_off_s=600)
 
 
 @pytest.mark.parametrize(
     ("trigger", "killed"),
-    [(ALARM, True), (OPENED, False), (DIAGNOSED, False), (STATUS, False), (TRANSITION, False)],
+    [
+        (ALARM, True),
+        (OPENED, False),
+        (DIAGNOSED, False),
+        (STATUS, False),
+        (OUTPUT, True),
+        (MODE, False),
+        (PART, True),
+        (TRANSITION, False),
+    ],
 )
 def test_a_trigger_on_a_status_makes_an_incident(
     tmp_path: Path, trigger: Trigger, killed: bool

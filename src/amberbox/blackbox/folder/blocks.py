@@ -136,7 +136,7 @@ def _is_known(block: _Block, plugins: Mapping[str, Plugin], problems: list[Probl
     known = (*plugins, DEFAULTS, *NOT_BUILT_YET)
     what = f"there is no source '{block.plugin}'{did_you_mean(block.plugin, known)}"
     hint = f"sources: {', '.join(plugins)}"
-    problems.append(block.node.problem(block.plugin, what, hint))
+    problems.append(block.node.problem(block.plugin or "block", what, hint))
     return False
 
 

@@ -13,6 +13,7 @@ from amberbox.core.errors import AmberboxError, Problem, UsageError
 from amberbox.core.expression import parse
 from amberbox.core.ids import derive_id, is_id
 from amberbox.core.options import option
+from amberbox.core.standins import Finding
 
 
 @dataclass(frozen=True)
@@ -27,17 +28,17 @@ class MissionOptions:
     parameters: Mapping[str, str] = option({}, "expressions, read at the start, by name")
     max: float | None = option(None, "it ends by itself after this, as timeout", unit="s")
 
-    def check(self) -> Iterator[tuple[str, str]]:
+    def check(self) -> Iterator[Finding]:
         """Say what is wrong with the values together."""
         if not is_id(self.name):
             yield "name", f"'{self.name}' is no id; '{derive_id(self.name)}' would be one"
         for key in ("start", "end", "failed"):
             text = getattr(self, key)
             if text and (problem := expression_problem(text)):
-                yield key, problem
+                yield key, problem.what, problem.hint
         for key, text in (("outcome", self.outcome), *self._parameters()):
             if text and (problem := _value_problem(text)):
-                yield key, problem
+                yield key, problem.what, problem.hint
         if self.max is not None and self.max <= 0:
             yield "max", "must be above 0"
 
@@ -52,13 +53,14 @@ class MissionOptions:
         )  # fmt: skip
 
 
-def _value_problem(text: str) -> str:
+def _value_problem(text: str) -> AmberboxError | None:
     from amberbox.blackbox.keeper.conditions import address_problem
 
     try:
-        return address_problem(parse(text))
+        what = address_problem(parse(text))
     except AmberboxError as error:
-        return error.what
+        return error
+    return UsageError(what) if what else None
 
 
 def read_rules(path: Path) -> tuple[MissionRule, ...]:

@@ -13,6 +13,7 @@ from amberbox.blackbox.folder.triggers import expression_problem
 from amberbox.core.errors import Problem
 from amberbox.core.nodes import Node
 from amberbox.core.options import option
+from amberbox.core.standins import Finding
 
 KEY_FILE = "server.key"
 """The robot's key, beside ``robot.yaml``: no part of the configuration, never sent on."""
@@ -39,9 +40,12 @@ class ServerOptions:
     metered_sends: MeteredSends = option("statuses", "what goes there: urgent, or statuses, too")
     live: bool = option(True, "whether somebody on the server may look at values as they come")
 
-    def check(self) -> Iterator[tuple[str, str]]:
+    def check(self) -> Iterator[Finding]:
         """Say which values cannot work."""
         yield from ((key, what) for key, what in self._wrong() if what)
+        problem = expression_problem(self.docked) if self.docked else None
+        if problem is not None:
+            yield "docked", problem.what, problem.hint
 
     def _wrong(self) -> Iterator[tuple[str, str]]:
         yield "url", url_problem(self.url)
@@ -49,7 +53,6 @@ class ServerOptions:
         yield "copy", rule_problem(self.copy)
         if self.copy == "docked" and not self.docked:
             yield "docked", "is needed by 'copy: docked': an expression that is true in the dock"
-        yield "docked", expression_problem(self.docked) if self.docked else ""
         yield "rate", "must not be below 0" if self.rate < 0 else ""
 
 

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
 from amberbox.core.config import Node, did_you_mean
 from amberbox.core.errors import AmberboxError, Problem, UsageError
 from amberbox.core.expression import parse
+from amberbox.core.expression_tree import of_monitors
 from amberbox.core.ids import derive_id, is_id
 from amberbox.core.options import option
+from amberbox.core.standins import Finding
 from amberbox.core.units import parse_duration_s
 
 OWN = ("amberbox_", "probe_")
@@ -39,7 +41,7 @@ class TriggerOptions:
     hold_off: float = option(60.0, "after it has fired it does not fire again for", unit="s")
     reason: str = option("", "what is said of the incident; without, what fired")
 
-    def check(self) -> Iterator[tuple[str, str]]:
+    def check(self) -> Iterator[Finding]:
         """Say what is wrong with the values together."""
         if not is_id(self.name):
             yield "name", f"'{self.name}' is no id; '{derive_id(self.name)}' would be one"
@@ -50,8 +52,8 @@ class TriggerOptions:
         for key in ("before", "after", "hold_off"):
             if getattr(self, key) < 0:
                 yield key, "must not be below 0"
-        if self.when and (problem := expression_problem(self.when)):
-            yield "when", problem
+        if self.when and (problem := expression_problem(self.when, with_monitors=True)):
+            yield "when", problem.what, problem.hint
         if self.silence and (problem := _silence_problem(self.silence)):
             yield "silence", problem
 
@@ -59,8 +61,15 @@ class TriggerOptions:
         """Name the items it looks at, as far as it can be read."""
         if self.silence:
             return (silence_of(self.silence)[0],)
-        names = parse(self.when).addresses() if self.when else ()
-        return tuple(dict.fromkeys(name.partition(".")[0] for name in names))
+        names = (a.partition(".")[0] for a in self._addresses() if of_monitors(a) is None)
+        return tuple(dict.fromkeys(names))
+
+    def of_monitors(self) -> tuple[str, ...]:
+        """Name the outputs of monitors and the statuses that it reads."""
+        return tuple(a for a in self._addresses() if of_monitors(a) is not None)
+
+    def _addresses(self) -> tuple[str, ...]:
+        return parse(self.when).addresses() if self.when else ()
 
 
 @dataclass(frozen=True)
@@ -78,14 +87,15 @@ class IncidentOptions:
             yield "per_hour", "must be 1 or more"
 
 
-def expression_problem(text: str) -> str:
-    """Say why a text is no condition over recorded variables; empty if it is one."""
+def expression_problem(text: str, *, with_monitors: bool = False) -> AmberboxError | None:
+    """Return why a text is no condition over recorded variables; None if it is one."""
     from amberbox.blackbox.keeper.conditions import condition_problem
 
     try:
-        return condition_problem(parse(text))
+        what = condition_problem(parse(text), with_monitors=with_monitors)
     except AmberboxError as error:
-        return error.what
+        return error
+    return UsageError(what) if what else None
 
 
 def silence_of(text: str) -> tuple[str, float]:
@@ -114,12 +124,17 @@ def repeated(named: Sequence[Named]) -> Iterator[str]:
 
 
 def trigger_problems(
-    root: Node, triggers: Sequence[TriggerOptions], sources: Sequence[str], items: Sequence[str]
+    root: Node,
+    triggers: Sequence[TriggerOptions],
+    sources: Sequence[str],
+    items: Sequence[str],
+    monitors: Collection[str] | None = None,
 ) -> Iterator[Problem]:
     """Judge the items that triggers name by what the folder would record.
 
     ``root`` is ``robot.yaml``, ``sources`` are the names of the blocks, ``items`` the ones that
-    are configured. A source that names none records what it hears.
+    are configured. A source that names none records what it hears. ``monitors`` are all outputs
+    and statuses that there are, None if that is not known.
     """
     entries = ((root.mapping or {}).get("triggers") or root).items or ()
     for index, (node, trigger) in enumerate(zip(entries, triggers, strict=False)):
@@ -127,7 +142,13 @@ def trigger_problems(
             what = _unknown(item, sources, items)
             if what:
                 yield node.problem(f"triggers[{index}]", what)
-    if any(trigger.when for trigger in triggers):
+        for address in trigger.of_monitors():
+            if monitors is not None and address not in monitors:
+                what = f"there is no output or status '{address}'{did_you_mean(address, monitors)}"
+                when = (node.mapping or {}).get("when", node)
+                hint = "outputs are component/mode/output, statuses status(component/mode)"
+                yield when.problem(f"triggers[{index}].when", what, hint)
+    if any(trigger.when and trigger.items() for trigger in triggers):
         what = "names of variables are judged when they have been recorded"
         yield root.problem("triggers", what, is_error=False)
 

@@ -12,15 +12,18 @@ from typing import Any
 
 import numpy as np
 
+from amberbox.blackbox.journal import reserved
 from amberbox.core.clock import NS
 from amberbox.core.config import did_you_mean
 from amberbox.core.errors import AmberboxError, UsageError
 from amberbox.core.expression import Expression, Value
-from amberbox.core.expression_tree import Fault
+from amberbox.core.expression_tree import Fault, of_monitors
 from amberbox.core.expression_values import element_of, values_of
 from amberbox.core.names import identifier
 from amberbox.core.types import Batch, IntArray
 
+STATUS = identifier(reserved.STATUS)
+"""The item in which the watcher writes statuses."""
 TICK_NS = NS // 10
 """Conditions that depend on an age are looked at this often between samples, too."""
 
@@ -56,7 +59,8 @@ class Edge:
 
 
 class Conditions:
-    """Watches named conditions over addresses ``item.variable``.
+    """Watches named conditions over ``item.variable``, and over what the watcher writes:
+    ``component/mode/output`` and ``status(component)``.
 
     Times are those of the batches unless others are given; they must not decrease per item.
     While it is unknown whether a condition is true, it counts as it was known last.
@@ -66,7 +70,7 @@ class Conditions:
 
     def __init__(self, conditions: Mapping[str, Condition]) -> None:
         self._conditions = dict(conditions)
-        self._samples = {a: _Samples(a) for c in conditions.values() for a in addresses_of(c)}
+        self._samples = {a: _samples(a) for c in conditions.values() for a in addresses_of(c)}
         self._was_true = dict.fromkeys(conditions, False)
         self._until_ns = _LONG_AGO
         self.problems: dict[str, str] = {}
@@ -74,7 +78,7 @@ class Conditions:
     @property
     def items(self) -> frozenset[str]:
         """Names of the items whose batches are wanted: those named, or parents of child tables."""
-        found = {address.partition(".")[0] for address in self._samples}
+        found = map(item_of, self._samples)
         return frozenset(name for item in found for name in _with_parents(item))
 
     @property
@@ -121,7 +125,7 @@ class Conditions:
 
     def begin_anew(self) -> None:
         """Forget all rows, as at the start of a run, but not what was true."""
-        self._samples = {address: _Samples(address) for address in self._samples}
+        self._samples = {address: _samples(address) for address in self._samples}
         self._until_ns = _LONG_AGO
 
     def start_at(self, at_ns: int) -> None:
@@ -236,25 +240,85 @@ class _Samples:
             self._times_ns, self._values = [times_ns[first:]], [values[first:]]
 
 
+class _Said(_Samples):
+    """The level of a component or mode, or an output of it, as the watcher writes them."""
+
+    def __init__(self, address: str, component: str, mode: str, output: str = "") -> None:
+        super().__init__(f"{STATUS}.level")
+        self.address = address
+        self._of = (component, mode)
+        self._output = output
+
+    def add(self, batch: Batch, times_ns: IntArray) -> None:
+        """Take the statuses that are meant; an output that one does not have is unknown then."""
+        components, modes = batch.columns["component"], batch.columns["mode"]
+        rows = [n for n in range(len(batch)) if (components[n], modes[n]) == self._of]
+        if not rows:
+            return
+        values = np.full(len(rows), None, object)
+        if self._output:
+            outputs = batch.children.get("outputs")
+            by_seq = {} if outputs is None else _outputs(outputs, self._output)
+            values[:] = [by_seq.get(int(seq)) for seq in batch.seq[rows]]
+        else:
+            values[:] = [str(batch.columns["level"][row]) for row in rows]
+        self._times_ns.append(times_ns[rows])
+        self._values.append(values)
+
+
+def _outputs(rows: Batch, name: str) -> dict[int, Value]:
+    """Return an output's values by the ``seq`` of the statuses that have it."""
+    columns = rows.columns
+    found = np.flatnonzero(np.asarray(columns["name"], object) == name).tolist()
+    return {int(columns["parent_seq"][n]): _output(columns, n) for n in found}
+
+
+def _output(columns: Mapping[str, Any], row: int) -> Value:
+    kind, value = columns["type"][row], columns["value"][row]
+    if kind == "string":
+        return str(columns["text"][row])
+    if kind == "float" and value is np.ma.masked:
+        return float(columns["text"][row])  # NaN and infinities, for which JSON has no number
+    if value is np.ma.masked or kind == "null":
+        return None
+    return bool(value) if kind == "bool" else int(value) if kind == "int" else float(value)
+
+
+def _samples(address: str) -> _Samples:
+    said = of_monitors(address)
+    return _Samples(address) if said is None else _Said(address, *said)
+
+
+def item_of(address: str) -> str:
+    """Return the item in which an address is recorded."""
+    return STATUS if of_monitors(address) is not None else address.partition(".")[0]
+
+
 def addresses_of(condition: Condition) -> Iterator[str]:
     """Name what a condition reads, each address once."""
     yield from dict.fromkeys(a for e in condition.expressions() for a in e.addresses())
 
 
-def address_problem(expression: Expression) -> str:
-    """Say which address cannot be one of a recorded variable; empty if all can."""
+def address_problem(expression: Expression, *, with_monitors: bool = False) -> str:
+    """Say which address cannot be one of a recorded variable; empty if all can.
+
+    ``with_monitors``: outputs of monitors and statuses of this robot can be named, too.
+    """
     for address in expression.addresses():
+        if with_monitors and ":" not in address and of_monitors(address) is not None:
+            continue
         item, dot, variable = address.partition(".")
         if not (dot and item and variable) or any(mark in address for mark in "/#:"):
-            return f"'{address}' is no recorded variable; write item.variable"
+            more = ", component/mode/output or status(component)" if with_monitors else ""
+            return f"'{address}' is no recorded variable; write item.variable{more}"
     return ""
 
 
-def condition_problem(expression: Expression) -> str:
+def condition_problem(expression: Expression, *, with_monitors: bool = False) -> str:
     """Say why an expression cannot tell when something is the case; empty if it can."""
     if expression.kind not in ("condition", "any"):
         return "is no condition: compare it with something, such as: x > 0"
-    return address_problem(expression)
+    return address_problem(expression, with_monitors=with_monitors)
 
 
 def instants_of(

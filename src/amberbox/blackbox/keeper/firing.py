@@ -10,7 +10,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from amberbox.blackbox.journal import reserved
-from amberbox.blackbox.keeper.conditions import Condition, Conditions
+from amberbox.blackbox.keeper.conditions import Condition, Conditions, item_of
 from amberbox.blackbox.keeper.options import Trigger
 from amberbox.core.expression import parse
 from amberbox.core.names import identifier
@@ -158,7 +158,7 @@ def waits_for(trigger: Trigger) -> frozenset[str]:
         return frozenset({trigger.silence})
     if trigger.event:
         return frozenset()
-    return frozenset(a.partition(".")[0] for a in parse(trigger.when).addresses())
+    return frozenset(map(item_of, parse(trigger.when).addresses()))
 
 
 def reads_watch(trigger: Trigger) -> bool:

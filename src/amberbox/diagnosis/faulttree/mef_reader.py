@@ -6,17 +6,18 @@ event trees) is an error that names the line.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path as FilePath
 
 from amberbox.core.config import did_you_mean, refuse
-from amberbox.core.errors import ConfigurationError, Problem, UsageError
+from amberbox.core.errors import Problem, UsageError
 from amberbox.diagnosis.faulttree.expression import Expression, Number, parameter_names, value
 from amberbox.diagnosis.faulttree.formula import Constant, Formula
 from amberbox.diagnosis.faulttree.mef_formula import boolean, content, expression, formula
 from amberbox.diagnosis.faulttree.mef_scope import (
     ID_ATTRIBUTE,
     KINDS,
+    OTHER_FILES,
     Definition,
     Path,
     Scope,
@@ -52,37 +53,47 @@ _NOT_READ = {
 
 
 def read_mef(
-    path: FilePath | str, top: str = "", mission_time_h: float = DEFAULT_MISSION_TIME_H
+    path: FilePath | str | Sequence[FilePath | str],
+    top: str = "",
+    mission_time_h: float = DEFAULT_MISSION_TIME_H,
 ) -> FaultTree:
-    """Read the fault tree of a file.
+    """Read the fault tree of a file, or of several that name each other's gates and events.
 
     ``top`` is the gate to analyse; without, the one that no other gate uses. Raises
     ConfigurationError with the line of everything that is wrong, UsageError when there are
     several gates to choose from.
     """
-    found: list[Problem] = []
-    try:
-        data = FilePath(path).read_bytes()
-    except OSError as error:
-        what = f"cannot be read: {error.strerror}"
-        raise ConfigurationError([Problem(str(path), 1, "file", what)]) from error
-    root = parse(data, str(path), found)
-    refuse(found)
-    scope = Scope(str(path), found)
-    if root is None or root.tag != "opsa-mef":
-        line = root.line if root is not None else 1
-        hint = "fault trees are read from Open-PSA MEF files"
-        found.append(Problem(str(path), line, "file", "does not begin with <opsa-mef>", hint))
-        raise ConfigurationError(found)
-    _collect(root, scope)
-    tree = _tree(scope, root, top, mission_time_h)
+    paths = [path] if isinstance(path, str | FilePath) else list(path)
+    scope = Scope([])
+    roots = [root for given in paths if (root := _root(str(given), scope.problems)) is not None]
+    _refuse(scope)
+    for root in roots:
+        _collect(root, scope)
+    tree = _tree(scope, roots, top, mission_time_h)
     _refuse(scope)
     return tree
 
 
+def _root(file: str, problems: list[Problem]) -> Element | None:
+    """Read one file; None and a problem if it is no Open-PSA file."""
+    try:
+        data = FilePath(file).read_bytes()
+    except OSError as error:
+        problems.append(Problem(file, 1, "file", f"cannot be read: {error.strerror}"))
+        return None
+    before = len(problems)
+    root = parse(data, file, problems)
+    if len(problems) == before and (root is None or root.tag != "opsa-mef"):
+        line = root.line if root is not None else 1
+        hint = "fault trees are read from Open-PSA MEF files"
+        problems.append(Problem(file, line, "file", "does not begin with <opsa-mef>", hint))
+    return root
+
+
 def _refuse(scope: Scope) -> None:
-    """Raise ConfigurationError with all problems, in the order of the file."""
-    refuse(sorted(scope.problems, key=lambda problem: problem.line))
+    """Raise ConfigurationError with all problems, in the order of the files."""
+    files = list(dict.fromkeys(problem.file for problem in scope.problems))
+    refuse(sorted(scope.problems, key=lambda p: (files.index(p.file), p.line)))
 
 
 def _collect(root: Element, scope: Scope) -> None:
@@ -115,6 +126,7 @@ def _allowed(tag: str) -> tuple[str, ...]:
 def _unknown(element: Element, inside: Element, scope: Scope) -> None:
     if element.tag in _NOT_READ:
         what, hint = f"{_NOT_READ[element.tag]} are not supported", "write the gates out"
+        hint = OTHER_FILES if element.tag == "include" else hint
     else:
         known = (*_allowed(inside.tag), "label", "attributes")
         what = f"unknown element in <{inside.tag}>"
@@ -122,7 +134,7 @@ def _unknown(element: Element, inside: Element, scope: Scope) -> None:
     scope.fail(element, f"<{element.tag}>", what, hint)
 
 
-def _tree(scope: Scope, root: Element, top: str, mission_time_h: float) -> FaultTree:
+def _tree(scope: Scope, roots: Sequence[Element], top: str, mission_time_h: float) -> FaultTree:
     gates = {entry.name: _gate(entry, scope) for entry in scope.of_kind("gate")}
     houses = {entry.name: _house(entry, scope) for entry in scope.of_kind("house event")}
     parameters = {entry.name: _parameter(entry, scope) for entry in scope.of_kind("parameter")}
@@ -131,17 +143,18 @@ def _tree(scope: Scope, root: Element, top: str, mission_time_h: float) -> Fault
         entry.name: _event(entry, scope, values, mission_time_h)
         for entry in scope.of_kind("basic event")
     }
-    _check_gates(gates, events, scope)
+    files = [root.file for root in roots]
+    _check_gates(gates, files[0], scope)
     _refuse(scope)
-    chosen = _top(gates, top, scope.file)
-    name = _tree_name(scope.known[False, chosen], root)
+    chosen = _top(gates, top, ", ".join(files))
+    name = _tree_name(scope.known[False, chosen], roots)
     tree = FaultTree(name, chosen, gates, events, houses, parameters, mission_time_h)
     scope.problems += problems(tree, _places(scope))
     return tree
 
 
 def _places(scope: Scope) -> Places:
-    return Places(scope.file, {d.name: d.element.line for d in scope.by_path.values()})
+    return Places(places={d.name: (d.element.file, d.element.line) for d in scope.by_path.values()})
 
 
 def _gate(definition: Definition, scope: Scope) -> Gate:
@@ -235,14 +248,14 @@ def _event(
     return BasicEvent(definition.name, chance, definition.label, written)
 
 
-def _check_gates(gates: Mapping[str, Gate], events: Mapping[str, BasicEvent], scope: Scope) -> None:
+def _check_gates(gates: Mapping[str, Gate], file: str, scope: Scope) -> None:
     path = cycle(gates)
     if path:
         what = f"the gate depends on itself: {' > '.join(path)}"
         hint = "take one of these inputs out"
         scope.problems.append(_places(scope).problem(path[0], what, hint))
     elif not gates and not scope.problems:
-        scope.problems.append(Problem(scope.file, 1, "file", "defines no gate"))
+        scope.problems.append(Problem(file, 1, "file", "defines no gate"))
 
 
 def _top(gates: Mapping[str, Gate], wanted: str, file: str) -> str:
@@ -257,12 +270,11 @@ def _top(gates: Mapping[str, Gate], wanted: str, file: str) -> str:
     return found[0]
 
 
-def _tree_name(definition: Definition, root: Element) -> str:
+def _tree_name(definition: Definition, roots: Sequence[Element]) -> str:
     """Return the name of the fault tree that a gate stands in."""
     if not definition.path:
         return ""
     name = definition.path[0]
-    inside = (
-        tree for tree in root.of_tag("define-fault-tree") if tree.attributes.get("name") == name
-    )
-    return next((attribute(tree, ID_ATTRIBUTE) for tree in inside), "") or name
+    trees = (tree for root in roots for tree in root.of_tag("define-fault-tree"))
+    own = (attribute(tree, ID_ATTRIBUTE) for tree in trees if tree.attributes.get("name") == name)
+    return next(filter(None, own), name)

@@ -1,4 +1,4 @@
-"""Names in an Open-PSA file: what is private to a component, what everybody may use."""
+"""Names in an Open-PSA model: what is private to a component, what everybody may use."""
 
 from __future__ import annotations
 
@@ -14,6 +14,8 @@ Path = tuple[str, ...]
 
 ID_ATTRIBUTE = "amberbox_id"
 """Attribute that keeps a name which the format does not allow."""
+
+OTHER_FILES = "a model of several files is read when all are named: amberbox faulttree A.xml B.xml"
 
 KINDS = {
     "define-gate": "gate",
@@ -40,13 +42,12 @@ class Definition:
 
 @dataclass
 class Scope:
-    """All definitions of a file by their full path, and the public ones by their bare name.
+    """All definitions of a model by their full path, and the public ones by their bare name.
 
     Parameters (True) and what gates refer to (False) have names of their own. ``known`` holds
     what the tree will call each.
     """
 
-    file: str
     problems: list[Problem]
     by_path: dict[tuple[bool, Path], Definition] = field(default_factory=dict)
     public: dict[tuple[bool, str], Definition] = field(default_factory=dict)
@@ -67,7 +68,9 @@ class Scope:
         if not private and first is definition:
             first = self.public.setdefault((is_parameter, name), definition)
         if first is not definition:
-            what = f"is defined twice, first in line {first.element.line}"
+            there = first.element
+            place = "line " if there.file == element.file else f"{there.file}:"
+            what = f"is defined twice, first in {place}{there.line}"
             self.fail(element, name, what)
 
     def of_kind(self, kind: str) -> Iterator[Definition]:
@@ -81,7 +84,7 @@ class Scope:
         found = self._lookup(is_parameter, name, path)
         if found is None:
             known = {entry for parameter, entry in self.public if parameter == is_parameter}
-            hint = did_you_mean(name, known).removeprefix("; ")
+            hint = did_you_mean(name, known).removeprefix("; ") or OTHER_FILES
             self.fail(element, name or f"<{element.tag}>", f"no such {_either(kinds)}", hint)
         elif found.kind not in kinds:
             self.fail(element, name, f"is a {found.kind}, not a {_either(kinds)}")
@@ -90,7 +93,7 @@ class Scope:
 
     def fail(self, element: Element, where: str, what: str, hint: str = "") -> None:
         """Note a problem at an element."""
-        self.problems.append(Problem(self.file, element.line, where, what, hint))
+        self.problems.append(Problem(element.file, element.line, where, what, hint))
 
     def _first(self, definition: Definition, is_parameter: bool) -> Definition:
         return self.known.setdefault((is_parameter, definition.name), definition)

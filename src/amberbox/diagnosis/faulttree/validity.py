@@ -14,14 +14,15 @@ from amberbox.diagnosis.faulttree.tree import FaultTree, Gate
 
 @dataclass(frozen=True, slots=True)
 class Places:
-    """Where the elements of a tree stand: a file and the line of each name."""
+    """Where the elements of a tree stand: file and line of each name."""
 
     file: str = "fault tree"
-    lines: Mapping[str, int] = field(default_factory=dict)
+    places: Mapping[str, tuple[str, int]] = field(default_factory=dict)
 
     def problem(self, name: str, what: str, hint: str = "") -> Problem:
         """Say something about an element."""
-        return Problem(self.file, self.lines.get(name, 1), name, what, hint)
+        file, line = self.places.get(name, (self.file, 1))
+        return Problem(file, line, name, what, hint)
 
 
 NOWHERE = Places()

@@ -20,6 +20,7 @@ class Element:
     line: int
     children: list[Element] = field(default_factory=list)
     text: str = ""
+    file: str = ""
 
     def of_tag(self, tag: str) -> Iterator[Element]:
         """Yield the elements of a kind directly inside."""
@@ -32,7 +33,7 @@ class _RefusedError(Exception):
 
 def parse(data: bytes, file: str, problems: list[Problem]) -> Element | None:
     """Return the root element; None and a problem if the text cannot be read."""
-    builder = _Builder(expat.ParserCreate())
+    builder = _Builder(expat.ParserCreate(), file)
     try:
         builder.parser.Parse(data, True)
     except expat.ExpatError as error:
@@ -50,8 +51,9 @@ def parse(data: bytes, file: str, problems: list[Problem]) -> Element | None:
 class _Builder:
     """Builds elements from what the parser calls."""
 
-    def __init__(self, parser: expat.XMLParserType) -> None:
+    def __init__(self, parser: expat.XMLParserType, file: str) -> None:
         self.parser = parser
+        self.file = file
         self.root: Element | None = None
         self.open: list[Element] = []
         parser.buffer_text = True
@@ -65,7 +67,7 @@ class _Builder:
         """Open an element."""
         if len(self.open) >= _DEEPEST:
             raise _RefusedError(f"elements are nested deeper than {_DEEPEST}")
-        element = Element(tag, attributes, self.parser.CurrentLineNumber)
+        element = Element(tag, attributes, self.parser.CurrentLineNumber, file=self.file)
         if self.open:
             self.open[-1].children.append(element)
         else:

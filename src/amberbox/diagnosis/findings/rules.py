@@ -128,6 +128,7 @@ class _Collected:
         self._facts = facts
         self._at_ns = at_ns
         self._evidence: dict[str, dict[tuple[str, int, int], None]] = {}
+        self._onsets_ns: dict[str, list[int]] = {}
         self._conflicts: dict[str, frozenset[str]] = {}
         self._texts: list[str] = []
         self._proofs: dict[str, list[str]] = {}
@@ -162,6 +163,7 @@ class _Collected:
         else:
             measured = (m for node in proof for leaf in node.leaves() for m in self._measured(leaf))
             self._evidence.setdefault(name, {}).update(dict.fromkeys(measured))
+            self._onsets_ns.setdefault(name, []).extend(self._onset_ns(proof))
         self._proofs.setdefault(name, []).append("\n".join(node.text() for node in proof))
         return True
 
@@ -174,6 +176,22 @@ class _Collected:
         named = _status_of(leaf)
         return self._components.get(named) or leaf.source.evidence
 
+    def _onset_ns(self, proof: Sequence[Node]) -> Iterator[int]:
+        """Yield when an answer became true: with the last of the goals that it took.
+
+        What is absent or unknown has no beginning; nor has an answer of facts alone.
+        """
+        begun = [self._begun_ns(leaf) for node in proof for leaf in node.leaves()]
+        yield from sorted(at_ns for at_ns in begun if at_ns is not None)[-1:]
+
+    def _begun_ns(self, leaf: Node) -> int | None:
+        """Return since when a leaf of a proof holds, by its own measurements."""
+        found: Measured = leaf.source.evidence if leaf.source is not None else ()
+        if leaf.place is not None and leaf.place.file == SEEN and leaf.kind == "fact":
+            fact, of = self._facts.seen[leaf.place.line - 1]
+            found = of if fact[0] == "present" else ()
+        return min((from_ns for _, from_ns, _ in found), default=None)
+
     def findings(self) -> RuleFindings:
         """Return all of it."""
         symptoms = tuple(self._symptom(name, tuple(of)) for name, of in self._evidence.items())
@@ -182,7 +200,7 @@ class _Collected:
         return RuleFindings(symptoms, tuple(self._conflicts.values()), texts, proofs)
 
     def _symptom(self, name: str, evidence: Measured) -> Symptom:
-        onset_ns = min((from_ns for _, from_ns, _ in evidence), default=self._at_ns)
+        onset_ns = min(self._onsets_ns[name], default=self._at_ns)
         return Symptom(
             name, "present", name, onset_ns, self._at_ns, _BESIDE_OTHERS, SOURCE, evidence
         )

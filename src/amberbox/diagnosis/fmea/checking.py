@@ -7,18 +7,21 @@ from dataclasses import dataclass, replace
 
 from amberbox.core.config import did_you_mean
 from amberbox.core.errors import Problem
+from amberbox.core.expression_tree import of_monitors
 from amberbox.core.needs import cycles
 from amberbox.core.nodes import Node
 from amberbox.diagnosis.fmea.findings import named_by_findings
+from amberbox.diagnosis.fmea.known import Known
 from amberbox.diagnosis.fmea.model import Effects, FailureMode, Fmea
 from amberbox.diagnosis.fmea.places import child
 from amberbox.diagnosis.fmea.propagation import Structure, links_by_mode
 from amberbox.diagnosis.fmea.reading import Sheet
 
 
-def check(fmea: Fmea, sheet: Sheet, problems: list[Problem]) -> Fmea | None:
+def check(fmea: Fmea, sheet: Sheet, known: Known | None, problems: list[Problem]) -> Fmea | None:
     """Return the analysis with all effects filled in; None if names or needs are wrong."""
-    found = [*_name_problems(fmea, sheet), *_circles(fmea, sheet)]
+    found = [*_name_problems(fmea, sheet, known), *_circles(fmea, sheet)]
+    problems += _not_analysed(fmea, sheet, known) if known else ()
     problems += found
     if any(problem.is_error for problem in found):
         return None
@@ -47,7 +50,7 @@ class _Reach:
         return cls(structure.users, reached)
 
 
-def _name_problems(fmea: Fmea, sheet: Sheet) -> Iterator[Problem]:
+def _name_problems(fmea: Fmea, sheet: Sheet, known: Known | None) -> Iterator[Problem]:
     names = {*fmea.components, *sheet.names}
     for name in fmea.functions:
         if name in fmea.components:
@@ -57,7 +60,25 @@ def _name_problems(fmea: Fmea, sheet: Sheet) -> Iterator[Problem]:
         for name in of.names():
             if name not in names:
                 what = f"there is no component or function '{name}'{did_you_mean(name, names)}"
-                yield _needs_node(user, sheet, name).problem(f"{user}.needs", what)
+                hint = "" if known else "components of a robot folder are known with the folder"
+                yield _needs_node(user, sheet, name).problem(f"{user}.needs", what, hint)
+
+
+def _not_analysed(fmea: Fmea, sheet: Sheet, known: Known) -> Iterator[Problem]:
+    """Note the components of the folder of whose failures the file says nothing."""
+    needed = {name: user for user, of in fmea.needs().items() for name in of.names()}
+    read = [a for of in fmea.symptoms.values() if of.condition for a in of.condition.addresses()]
+    symptoms = {said[0] for name in (*fmea.symptoms, *read) if (said := of_monitors(name))}
+    hint = f"give it failure_modes under 'types' of {sheet.root.file}"
+    for name in sheet.folder:
+        user = needed.get(name, "")
+        if user in fmea.functions or any(part.component == user for part in sheet.parts):
+            what = f"of '{name}' no failure mode is known: it fails only with what it needs"
+            place = _needs_node(user, sheet, name)
+            yield place.problem(f"{user}.needs", what, hint, is_error=False)
+        elif name in known.files and name not in symptoms:
+            what = f"'{name}' is monitored, but no failure mode is known: no diagnosis names it"
+            yield Problem(known.files[name], 1, "component", what, hint, is_error=False)
 
 
 def _needs_node(user: str, sheet: Sheet, name: str = "") -> Node:

@@ -13,6 +13,10 @@ from amberbox.diagnosis.fmea.model import Severity
 Finding = str | tuple[str, str]
 _MOST = 1e9
 """No time, rate or exposure is larger; sums of times stay within 64 bits of nanoseconds."""
+MOST_PER_HOUR = 1.0
+"""A higher rate is a failure every few minutes: likely the time between failures was meant."""
+_LEAST_PERCENT = 2.0
+"""A share from here on was meant in percent; 1.2 may as well be 1 with a slip."""
 
 
 @dataclass(frozen=True)
@@ -263,6 +267,11 @@ class MemberFunctionFile:
     unobservable: str = option("", "why nothing shows it")
     remedy: str = option("", "what to do about it")
 
+    def wrong(self) -> Iterator[tuple[str, str]]:
+        """Yield each value out of its range, by key; the functions beside it are judged, too."""
+        yield from _shares(self, "probability")
+        yield from _not_below_zero(self, "rate")
+
 
 @dataclass(frozen=True)
 class MemberFile:
@@ -297,16 +306,17 @@ class FmeaFile:
         yield from _not_below_zero(self, "exposure_h", "remember_s")
 
 
-def _shares(entry: object, *keys: str) -> Iterator[Finding]:
+def _shares(entry: object, *keys: str) -> Iterator[tuple[str, str]]:
     """Yield each value that is no probability."""
     for key in keys:
         value = getattr(entry, key)
         if value is not None and not 0 <= value <= 1:
             side = "above 1" if value > 1 else "below 0"
-            yield key, f"{value:g} is {side}: expected a share from 0 to 1"
+            meant = f"; did you mean {value / 100:g}?" if _LEAST_PERCENT <= value <= 100 else ""
+            yield key, f"{value:g} is {side}: expected a share from 0 to 1{meant}"
 
 
-def _not_below_zero(entry: object, *keys: str) -> Iterator[Finding]:
+def _not_below_zero(entry: object, *keys: str) -> Iterator[tuple[str, str]]:
     for key in keys:
         value = getattr(entry, key)
         if value is not None and value < 0:

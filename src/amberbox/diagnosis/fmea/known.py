@@ -16,6 +16,7 @@ class Known:
     ``watched`` those of which something is expected: only they can be symptoms. ``needs`` is what
     component files say that a component needs; it counts where the failure modes' file says
     nothing. ``addresses`` is what conditions may read besides, None if that is not known.
+    ``needs`` has a key for every component of the folder; ``files`` those with monitors, and where.
     ``predicates`` are the names that a finding's goal may have, None if the rules are not known;
     ``heads`` those of rules that no other rule calls, with file and line.
     """
@@ -26,3 +27,4 @@ class Known:
     addresses: Collection[str] | None = None
     predicates: Collection[tuple[str, int]] | None = None
     heads: Mapping[tuple[str, int], tuple[str, int]] = field(default_factory=dict)
+    files: Mapping[str, str] = field(default_factory=dict)

@@ -13,7 +13,7 @@ from amberbox.diagnosis.fmea.entries import Scope, component_of, function_of, mo
 from amberbox.diagnosis.fmea.findings import mapped
 from amberbox.diagnosis.fmea.known import Known
 from amberbox.diagnosis.fmea.members import folders, members
-from amberbox.diagnosis.fmea.model import Fmea, FmeaTest, Other
+from amberbox.diagnosis.fmea.model import Component, Fmea, FmeaTest, Function, Other
 from amberbox.diagnosis.fmea.places import child
 from amberbox.diagnosis.fmea.reading import Sheet, read
 from amberbox.diagnosis.fmea.symptoms import Symptoms
@@ -62,6 +62,7 @@ def _made(root: Node, known: Known | None, problems: list[Problem], folder: Path
     }
     components = {part.component: component_of(part) for part in sheet.parts}
     components |= members(sheet.robots, root, scope, folder)
+    components |= _of_folder(components, functions, sheet)
     file = sheet.file.other
     other = Other(file.probability, file.detects, file.looks_like, file.together_s)
     fmea = Fmea(
@@ -69,7 +70,23 @@ def _made(root: Node, known: Known | None, problems: list[Problem], folder: Path
         other, sheet.file.exposure_h, mapped(sheet, scope.modes, known, problems),
         folders(sheet.robots, folder), sheet.file.remember_s,
     )  # fmt: skip
-    return check(fmea, sheet, problems)
+    return check(fmea, sheet, known, problems)
+
+
+def _of_folder(
+    components: Mapping[str, Component], functions: Mapping[str, Function], sheet: Sheet
+) -> dict[str, Component]:
+    """Return the components without an entry that something needs, directly or not."""
+    found: dict[str, Component] = {}
+    waiting = [
+        name for of in (*components.values(), *functions.values()) for name in of.needs.names()
+    ]
+    while waiting:
+        name = waiting.pop()
+        if name in sheet.folder and name not in found:
+            found[name] = Component(name, "", needs=sheet.folder[name])
+            waiting += sheet.folder[name].names()
+    return found
 
 
 def _symptoms(sheet: Sheet, known: Known | None, problems: list[Problem]) -> Symptoms:

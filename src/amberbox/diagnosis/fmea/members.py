@@ -12,6 +12,7 @@ from amberbox.diagnosis.fmea.entries import Scope, with_ranks
 from amberbox.diagnosis.fmea.file import MemberFile, MemberFunctionFile, RanksFile
 from amberbox.diagnosis.fmea.model import Component, FailureMode
 from amberbox.diagnosis.fmea.places import child
+from amberbox.diagnosis.fmea.reading import rate_notes
 
 LOST = "lost"
 """Name of the failure mode of a member's function."""
@@ -78,10 +79,9 @@ def _lost(
     links = scope.symptoms.links(entry.symptoms, place, f"{where}.symptoms", mode_id)
     if (entry.rate is None) == (entry.probability is None):
         scope.problems.append(node.problem(where, "how probable is it? give probability or rate"))
-    for key, value in (("probability", entry.probability), ("rate", entry.rate)):
-        if value is not None and (value < 0 or (key == "probability" and value > 1)):
-            what = f"{value:g} is {'below 0' if value < 0 else 'above 1'}"
-            scope.problems.append(child(node, key).problem(f"{where}.{key}", what))
+    for key, what in entry.wrong():
+        scope.problems.append(child(node, key).problem(f"{where}.{key}", what))
+    scope.problems.extend(rate_notes(entry.rate, node, where))
     mode = FailureMode(
         mode_id, component, LOST, text,
         severity=entry.severity, rate=entry.rate, probability=entry.probability,

@@ -11,6 +11,7 @@ from amberbox.core.errors import Problem
 from amberbox.core.needs import NOTHING, Needs, parse_needs
 from amberbox.core.nodes import Node
 from amberbox.diagnosis.fmea.file import (
+    MOST_PER_HOUR,
     FindingFile,
     FmeaFile,
     FunctionFile,
@@ -47,7 +48,10 @@ class Part:
 
 @dataclass(frozen=True, slots=True)
 class Sheet:
-    """Everything that could be read, and the names of all that is there."""
+    """Everything that could be read, and the names of all that is there.
+
+    ``folder`` has the components that only the robot folder has, with their needs.
+    """
 
     root: Node
     file: FmeaFile
@@ -57,6 +61,7 @@ class Sheet:
     symptoms: Mapping[str, SymptomFile]
     robots: Mapping[str, MemberFile]
     names: frozenset[str]
+    folder: Mapping[str, Needs]
     findings: Sequence[tuple[Node, FindingFile]] = ()
 
 
@@ -64,7 +69,9 @@ def read(root: Node, known: Known | None, problems: list[Problem]) -> Sheet:
     """Read the file; what is wrong is left out and told."""
     file = build(FmeaFile, root, problems) or FmeaFile()
     found = instances(root, problems)
-    names = {entry.component for entry in found} | set(child_keys(root, "functions"))
+    here = {entry.component for entry in found} | set(child_keys(root, "functions"))
+    others = {name: of for name, of in (known.needs if known else {}).items() if name not in here}
+    names = here | others.keys()
     return Sheet(
         root,
         file,
@@ -74,6 +81,7 @@ def read(root: Node, known: Known | None, problems: list[Problem]) -> Sheet:
         dict(_entries(SymptomFile, root, "symptoms", problems)),
         dict(_entries(MemberFile, root, "robots", problems)),
         frozenset(names),
+        {name: of.restricted(names.__contains__) for name, of in others.items()},
         list(_findings(root, problems)),
     )
 
@@ -91,6 +99,9 @@ def _part(entry: Instance, names: set[str], known: Known | None, problems: list[
     node = entry.node
     key = "failure_modes" if _modes_node(node) is child(node, "failure_modes") else "modes"
     modes = dict(_entries(ModeFile, node, key, problems, where))
+    problems += rate_notes(file.rate, node, where)
+    for name, mode in modes.items():
+        problems += rate_notes(mode.rate, child(node, key, name), f"{where}.{key}.{name}")
     problems += _ratio_problems(file, modes, node, where)
     return Part(
         entry.component,
@@ -154,6 +165,16 @@ def _findings(root: Node, problems: list[Problem]) -> Iterator[tuple[Node, Findi
         built = build(FindingFile, entry, problems, f"findings[{number}]")
         if built is not None:
             yield entry, built
+
+
+def rate_notes(rate: float | None, node: Node, where: str) -> Iterator[Problem]:
+    """Yield a note on a rate per hour that no part of a robot has."""
+    if rate is not None and rate > MOST_PER_HOUR:
+        hours = 1 / rate
+        every = f"{hours * 60:.3g} min" if hours * 60 >= 1 else f"{hours * 3600:.3g} s"
+        what = f"{rate:g} per hour is one failure every {every}; did you mean {hours:.3g}?"
+        hint = "a rate is failures per hour: 1 / (hours between two failures)"
+        yield child(node, "rate").problem(f"{where}.rate", what, hint, is_error=False)
 
 
 def _ratio_problems(

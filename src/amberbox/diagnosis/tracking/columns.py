@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from amberbox.core.expression_tree import Fault
+from amberbox.core.expression_tree import Fault, of_monitors
 from amberbox.core.expression_values import element_of
 from amberbox.core.samples import Samples
 from amberbox.core.types import Batch, IntArray, Ragged, Status
@@ -53,10 +53,14 @@ class Columns:
         self._by_item: dict[str, list[Column]] = {}
         self._by_mode: dict[tuple[str, str], list[tuple[str, Samples]]] = {}
         for address in addresses:
-            (self._add_output if "/" in address else self._add_column)(address)
+            said = of_monitors(address)
+            if said is None:
+                self._add_column(address)
+            else:
+                self._add_said(address, *said)
 
-    def _add_output(self, address: str) -> None:
-        component, mode, output = address.split("/", 2)
+    def _add_said(self, address: str, component: str, mode: str, output: str = "") -> None:
+        """Add an output, or where none is named a status."""
         samples = self.of_monitors[address] = Samples()
         self._by_mode.setdefault((component, mode), []).append((output, samples))
 
@@ -83,9 +87,9 @@ class Columns:
                     column.extend(batch.log_time_ns, _of_rows(column, batch, each))
 
     def take(self, status: Status) -> None:
-        """Take what a mode's outputs are."""
+        """Take what the level of a mode or component and its outputs are."""
         for output, samples in self._by_mode.get((status.component, status.mode), ()):
-            value = status.outputs.get(output)
+            value = status.outputs.get(output) if output else status.level
             samples.extend(np.array([status.measured_ns], np.int64), _single(value))
 
     def forget(self) -> None:

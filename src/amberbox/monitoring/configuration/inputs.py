@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from types import ModuleType
-from typing import Any
+from typing import Any, NamedTuple
 
 from amberbox.core.config import did_you_mean
 from amberbox.core.errors import AmberboxError
-from amberbox.core.names import item_name
+from amberbox.core.names import has_item_form, item_name
 from amberbox.core.probe import SOURCE, ProbeOrder
 from amberbox.core.types import ItemSchema
 from amberbox.monitoring.configuration.functions import Functions
@@ -19,12 +19,20 @@ from amberbox.monitoring.configuration.variables import (
     find_places,
     guessed,
     names_of,
+    tables_of,
 )
 from amberbox.monitoring.plan import InputPlan
 
 OWN_ITEMS = ("amberbox_",)
 """Items that the box writes by itself, and no block names."""
 _SHORT_MOST = 6
+
+
+class Table(NamedTuple):
+    """A child table: the item that it lies below, and its variables, None if nothing tells them."""
+
+    item: str
+    schema: ItemSchema | None
 
 
 class InputError(Exception):
@@ -62,9 +70,29 @@ class Inputs:
         """Find items by their name, or by their topic as configured."""
         plain = text.strip("/")
         found = [i for i in self.recorded.items if i.name == text or i.topic.strip("/") == plain]
-        if found or not self._is_open(text) or "." in text or "/" in text:
+        if found or not has_item_form(text):
             return [InputPlan(text, "item", item.name) for item in found]
-        return [InputPlan(text, "item", text)]
+        is_table = self._table(text) is not None
+        return [InputPlan(text, "item", text)] if is_table or self._is_open(text) else []
+
+    def _table(self, name: str) -> Table | None:
+        """Return a child table ``ITEM__PATH`` of an item that is configured; None if it is none.
+
+        Raises InputError where the item's variables are known, and this is none of its tables.
+        """
+        items = [item for item in self.recorded.items if name.startswith(f"{item.name}__")]
+        if not items or name in self.recorded.by_name:
+            return None
+        item = max(items, key=lambda item: len(item.name))
+        schema = self.recorded.schema(item)
+        if schema is None:
+            self.unknown_items.add(item.name)
+            return Table(item.name, None)
+        tables = tables_of(item.name, schema)
+        if name not in tables:
+            near = did_you_mean(name, tables) or _some(list(tables), "no tables")
+            raise InputError(f"{item.name} has no table '{name}'{near}")
+        return Table(item.name, tables[name])
 
     def _is_open(self, text: str) -> bool:
         """Tell whether a name may be an item that no block names."""
@@ -79,9 +107,13 @@ class Inputs:
             for path in _paths_in(text, item):
                 found += self._in_item(text, item, path)
         name, path = _split(text)
-        if not found and path and name not in self.recorded.by_name and self._is_open(text):
-            found += self._in_open_item(text, name, path)
-        return found
+        if found or not path or name in self.recorded.by_name:
+            return found
+        table = self._table(name) if has_item_form(name) else None
+        if table is not None and table.schema is not None:
+            return _of_places(text, _checked(text, name, path, table.schema))
+        is_open = table is not None or self._is_open(text)
+        return self._in_open_item(text, name, path) if is_open else []
 
     def _in_item(self, text: str, item: Item, path: str) -> list[InputPlan]:
         schema = self.recorded.schema(item)
@@ -181,8 +213,8 @@ def _checked(text: str, item: str, path: str, schema: ItemSchema) -> list[Place]
     raise InputError(f"{item} has no variable '{path}'{did_you_mean(path, names) or _some(names)}")
 
 
-def _some(names: Sequence[str]) -> str:
-    return f"; it has {', '.join(names[:8])}{' ...' if len(names) > 8 else ''}"
+def _some(names: Sequence[str], nothing: str = "none") -> str:
+    return f"; it has {', '.join(names[:8]) or nothing}{' ...' if len(names) > 8 else ''}"
 
 
 def _split(text: str) -> tuple[str, str]:

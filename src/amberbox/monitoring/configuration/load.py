@@ -74,7 +74,7 @@ def _component(source: ComponentSource, bench: Bench) -> Named:
     dependencies = read_dependencies(source.node, own)
     bench.problems.extend(own)
     modes = tuple(_modes(source, bench))
-    plan = ComponentPlan(derive_id(source.name), source.name, modes)
+    plan = ComponentPlan(derive_id(source.name), source.name, modes, file=source.node.file)
     if plan.id != plan.name:
         what = f"is '{plan.id}' in addresses"
         problem = source.node.problem("component_name", what, is_error=False)

@@ -57,6 +57,15 @@ def names_of(schema: ItemSchema) -> list[str]:
     ]
 
 
+def tables_of(item: str, schema: ItemSchema) -> dict[str, ItemSchema]:
+    """Return the child tables of an item by name, those of its child tables too."""
+    found: dict[str, ItemSchema] = {}
+    for path, child in schema.children.items():
+        name = child_name(item, path)
+        found |= {name: child, **tables_of(name, child)}
+    return found
+
+
 def guessed(item: str, text: str) -> Place:
     """Return what a name most likely stands for where nothing is known of the item.
 

@@ -18,6 +18,7 @@ from amberbox.monitoring.configuration.inputs import Inputs
 from amberbox.monitoring.configuration.modes import Bench, plan_mode
 from amberbox.monitoring.configuration.recorded import Item, Recorded
 from amberbox.monitoring.configuration.tree import ModeSource
+from amberbox.monitoring.configuration.variables import guessed
 from amberbox.monitoring.plan import ComponentPlan, Plan
 from amberbox.monitoring.ruletests.files import RuleFile
 from amberbox.monitoring.ruletests.notation import ABSENT, Series
@@ -62,7 +63,11 @@ def _items(file: RuleFile) -> Iterator[Item]:
     for test in file.tests:
         for name, series in test.series.items():
             item, _, variable = name.strip("/").partition(".")
-            columns[item] |= dict(_types({variable: series}))
+            place = guessed(item, variable) if "[" in variable else None
+            if place is not None and place.number is not None:
+                columns[place.item][place.variable] = "list<float64>"
+            else:
+                columns[item] |= dict(_types({variable: series}))
         for item, rows in test.rows.items():
             columns[item.strip("/")] |= dict(_types(rows))
         for name in (*test.received, *test.stamps, *(loss.item for loss in test.lost)):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -14,6 +15,7 @@ from amberbox.core.clock import NS
 from amberbox.core.errors import UsageError
 from amberbox.core.names import identifier
 from amberbox.core.types import Batch, Column, ColumnData, IntArray, ItemSchema, Ragged
+from amberbox.monitoring.configuration.variables import Place, guessed
 from amberbox.monitoring.plan import InputPlan, Plan
 from amberbox.monitoring.ruletests.files import Loss, RuleTest
 from amberbox.monitoring.ruletests.notation import ABSENT, Series, shown
@@ -83,9 +85,15 @@ def incoming(test: RuleTest, interval_s: float, plan: Plan) -> Incoming:
     """Read what a test says that comes in; raise UsageError with what cannot be read."""
     found = Incoming(round(interval_s * NS))
     by_text = {entry.text: entry for entry in plan.inputs()}
+    parts: dict[tuple[str, str], dict[int, list[Any]]] = defaultdict(dict)
     for name, series in test.series.items():
-        item, variable = _place(name, by_text.get(name))
-        found.items[item][variable] = list(series.values)
+        place = _place(name, by_text.get(name))
+        if place.number is None:
+            found.items[place.item][place.variable] = list(series.values)
+        else:
+            parts[place.item, place.variable][place.number] = list(series.values)
+    for (item, variable), elements in parts.items():
+        found.items[item][variable] = _lists(elements)
     for name, columns in test.rows.items():
         for column, series in columns.items():
             found.items[_item(name, by_text)][column] = list(series.values)
@@ -101,22 +109,38 @@ def incoming(test: RuleTest, interval_s: float, plan: Plan) -> Incoming:
     return found
 
 
-def _place(name: str, entry: InputPlan | None) -> tuple[str, str]:
-    """Return the item and variable that a name in a test means."""
+def _place(name: str, entry: InputPlan | None) -> Place:
+    """Return the item and variable that a name in a test means, and the element of a list."""
     if entry is not None and entry.kind == "probe":
-        return entry.item, "ok"
+        return Place(entry.item, "ok")
     if entry is not None:
-        return entry.item, entry.variable
+        return Place(entry.item, entry.variable, entry.index)
     item, _, variable = name.partition(".")
     if identifier(item) != item:
         raise UsageError(
             f"'{name}' is no input of these monitors", "write item.variable, an item, or an input"
         )
-    return item, variable
+    return guessed(item, variable) if variable else Place(item, "")
+
+
+def _lists(elements: Mapping[int, Sequence[Any]]) -> list[Any]:
+    """Return a list for each interval, up to its last element that has a value; NaN for others.
+
+    An element of a list, and a row of a list of structures, are read from it alike.
+    """
+    count = max(map(len, elements.values()))
+    padded = {index: _padded(list(values), count) for index, values in elements.items()}
+    lists: list[Any] = []
+    for number in range(count):
+        here = {index: v[number] for index, v in padded.items() if v[number] is not ABSENT}
+        known = {index: value for index, value in here.items() if value is not None}
+        long = [known.get(index, math.nan) for index in range(max(known, default=-1) + 1)]
+        lists.append(long if here else ABSENT)
+    return lists
 
 
 def _item(name: str, by_text: Mapping[str, InputPlan]) -> str:
-    return _place(name, by_text.get(name))[0]
+    return _place(name, by_text.get(name)).item
 
 
 def _padded(values: list[Any], count: int) -> list[Any]:
