@@ -16,7 +16,7 @@ import msgspec
 
 from amberbox.core.clock import NS
 from amberbox.core.errors import UsageError
-from amberbox.core.types import Batch, Diagnosis, Status, Symptom
+from amberbox.core.types import Batch, Diagnosis, FaultFacts, Status, Symptom
 from amberbox.diagnosis.answering import Effort, Heading, answer
 from amberbox.diagnosis.covering.budget import Budget
 from amberbox.diagnosis.knowledge import Knowledge
@@ -65,6 +65,11 @@ class Tracker:
     def history_s(self) -> float:
         """How far back rows have to be fed again after ``resume``, in seconds."""
         return self._conditions.history_s
+
+    @property
+    def facts(self) -> Mapping[str, FaultFacts]:
+        """What is known of failure modes: the gravest of what each costs, what it may show."""
+        return self.knowledge.facts(self._waits.shows)
 
     @property
     def troubles(self) -> Mapping[str, str]:
