@@ -19,7 +19,6 @@ from sqlalchemy import select
 
 from amberbox.blackbox.journal import reserved
 from amberbox.core.clock import NS
-from amberbox.diagnosis.tracking.tracker import Tracker
 from amberbox.fleet.accounts.robotkeys import add_robot
 from amberbox.fleet.alarms.alarm import Alarm
 from amberbox.fleet.alarms.alarms import Alarms
@@ -33,16 +32,14 @@ from amberbox.fleet.notifying.tables import OUTBOX
 from amberbox.fleet.options.options import write
 from amberbox.link.frames import Hello
 from amberbox.link.frames import Row as LinkRow
-from amberbox.monitoring.engine.engine import Engine
 from amberbox.monitoring.engine.findings import AlarmChange
 from amberbox.monitoring.messages.records import encoded
-from amberbox.monitoring.watcher.diagnosing import Diagnosing
 from amberbox.monitoring.watcher.instants import instant_of
 from amberbox.sim.robot import START_NS
 from amberbox.testing.clock import ManualClock
 from benchmarks.common import Row
-from benchmarks.diagnosis import FIRST_SEED, world
-from benchmarks.missions import Batches, Mission, live, nominal
+from benchmarks.diagnosis import FIRST_SEED, findings
+from benchmarks.missions import Mission, nominal
 
 HOURS = float(os.environ.get("BENCH_ALARM_HOURS", "0.5"))
 CHUNK_H = 0.25
@@ -91,17 +88,10 @@ def _nominal(number: int) -> list[Heard]:
 
 def written(mission: Mission) -> Iterator[Heard]:
     """Yield what the watcher of a robot writes in a mission and alarms are made of."""
-    at = world()
-    watcher = Diagnosing(Engine(at.plan), Tracker(at.knowledge))
-    watcher.begin(START_NS)
-    batches = Batches(at.wanted)
-    for until_s, messages in live(mission):
-        for batch in batches.of(messages):
-            watcher.feed(batch)
-        for found in watcher.advance(START_NS + round(until_s * NS)):
-            channel, data = encoded(found)
-            if channel in _CHANNELS:
-                yield Heard(instant_of(found), channel, data)
+    for found in findings(mission):
+        channel, data = encoded(found)
+        if channel in _CHANNELS:
+            yield Heard(instant_of(found), channel, data)
 
 
 def _storm(number: int) -> list[Heard]:

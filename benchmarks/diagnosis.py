@@ -34,6 +34,7 @@ from amberbox.diagnosis.knowledge import Knowledge
 from amberbox.diagnosis.tracking.tracker import Tracker
 from amberbox.monitoring.configuration import load_plan
 from amberbox.monitoring.engine.engine import Engine
+from amberbox.monitoring.engine.findings import Finding
 from amberbox.monitoring.plan import Plan
 from amberbox.monitoring.watcher.diagnosing import Diagnosing
 from amberbox.sim.catalogue import load_faults
@@ -124,8 +125,8 @@ def world() -> World:
     return World(plan, knowledge, wanted)
 
 
-def diagnoses(mission: Mission) -> Iterator[Diagnosis]:
-    """Yield the revisions of all diagnoses of a mission."""
+def findings(mission: Mission) -> Iterator[Finding]:
+    """Yield what the watcher of a robot finds in a mission."""
     at = world()
     watcher = Diagnosing(Engine(at.plan), Tracker(at.knowledge))
     watcher.begin(START_NS)
@@ -133,9 +134,12 @@ def diagnoses(mission: Mission) -> Iterator[Diagnosis]:
     for until_s, messages in live(mission):
         for batch in batches.of(messages):
             watcher.feed(batch)
-        for found in watcher.advance(START_NS + round(until_s * NS)):
-            if isinstance(found, Diagnosis):
-                yield found
+        yield from watcher.advance(START_NS + round(until_s * NS))
+
+
+def diagnoses(mission: Mission) -> Iterator[Diagnosis]:
+    """Yield the revisions of all diagnoses of a mission."""
+    return (found for found in findings(mission) if isinstance(found, Diagnosis))
 
 
 def judge(kind: str, mission: Mission, truth: Sequence[str]) -> Outcome:

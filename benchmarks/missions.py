@@ -35,11 +35,12 @@ NAMES = {
 
 @dataclass(frozen=True, slots=True)
 class Planted:
-    """A fault that is to begin ``at_s``, and how strong."""
+    """A fault that is to begin ``at_s``, and how strong; at ``until_s`` it is repaired."""
 
     fault: Fault
     magnitude: float
     at_s: float
+    until_s: float = math.inf
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,7 +113,7 @@ def live(mission: Mission) -> Iterator[tuple[float, list[Message]]]:
     """Yield what the robot says in pieces: (until so many seconds, messages)."""
     robot = Robot(mission.seed, scenario=mission.scenario)
     for planted in mission.faults:
-        robot.inject(planted.fault, planted.at_s, planted.magnitude)
+        robot.inject(planted.fault, planted.at_s, planted.magnitude, planted.until_s)
     until_s = 0.0
     while until_s < mission.seconds:
         first = until_s == 0.0

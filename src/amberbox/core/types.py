@@ -251,6 +251,13 @@ class Status:
 SymptomState: TypeAlias = Literal["present", "absent", "unknown"]
 
 
+class FaultFacts(NamedTuple):
+    """What is known of a failure mode: what the robot can still do, which symptoms it may show."""
+
+    severity: Literal["warning", "urgent", "critical", "fatal"]
+    shows: frozenset[str]
+
+
 @dataclass(frozen=True, slots=True)
 class Symptom:
     """One observation that speaks for or against faults.

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
+from amberbox.core.types import FaultFacts
 from amberbox.diagnosis.covering.check import Check
 from amberbox.diagnosis.covering.model import Model
 from amberbox.diagnosis.fmea.compile import compile_checks, compile_model
-from amberbox.diagnosis.fmea.model import Fmea
+from amberbox.diagnosis.fmea.model import SEVERITIES, Fmea
+from amberbox.diagnosis.fmea.propagation import Structure
 
 
 @dataclass(frozen=True)
@@ -29,6 +31,21 @@ class Knowledge:
     def model(self) -> Model:
         """The numbers that the covering engine reasons with."""
         return compile_model(self.fmea, self.exposure_h)
+
+    def facts(self, shows: Mapping[str, Collection[str]]) -> Mapping[str, FaultFacts]:
+        """Return the severity of each failure mode, by itself, beside the symptoms it shows.
+
+        It is the gravest of its own and of the system functions that are lost with it.
+        """
+        functions = {name: self.fmea.functions[name] for name in self.fmea.system_functions()}
+        structure = Structure.of(self.fmea.needs())
+        found: dict[str, FaultFacts] = {}
+        for mode in self.fmea.modes.values():
+            lost = structure.lost({mode.component}) if mode.takes_down else mode.effects.system
+            grave = [functions[name].severity for name in lost if name in functions]
+            severity = max([mode.severity, *grave], key=SEVERITIES.index)
+            found[mode.id] = FaultFacts(severity, frozenset(shows.get(mode.id, ())))
+        return found
 
     @cached_property
     def checks(self) -> Mapping[str, Check]:

@@ -76,9 +76,12 @@ def test_small_steps_add_up_to_a_revision() -> None:
     ]  # fmt: skip
 
 
-def test_evidence_that_ends_is_no_news_but_is_when_it_comes_again() -> None:
+def test_what_goes_is_told_from_what_comes() -> None:
     opening = Opening("d", BEFORE)
-    assert opening.take_evidence({"s": "present", "t": "absent", "u": ""})
-    assert not opening.take_evidence({"s": "present", "t": ""})
-    assert opening.take_evidence({"s": "present", "t": "absent"})
-    assert opening.take_evidence({"s": "absent", "t": "absent"})
+    assert opening.take_evidence({"s": "present", "t": "absent", "u": ""}) == "more"
+    assert opening.take_evidence({"s": "present", "t": ""}) == ""
+    assert opening.take_evidence({"s": "present", "t": "absent"}) == "more", "it never showed"
+    assert opening.take_evidence({"s": "", "t": "absent"}) == "less"
+    assert opening.take_evidence({"s": "absent", "t": "absent"}, fading=True) == "less"
+    assert opening.take_evidence({"s": "present", "t": "absent"}) == "more"
+    assert opening.take_evidence({"s": "absent", "t": "absent"}) == "more", "nothing else fades"

@@ -269,3 +269,49 @@ def test_looks_at_nothing_when_all_is_well() -> None:
     tracker = begun()
     run(tracker, WELL, 1)
     assert tracker.advance([], T0_NS + 86_400 * NS) == []
+
+
+def test_a_repaired_cause_leaves_an_answer_whose_other_cause_stays() -> None:
+    tracker = begun()
+    run(tracker, [*WELL, At(20, FOLLOWS), At(21, CLEAR), At(21, ALIVE), At(21, POWER)], 60)
+    assert leading(tracker.current()) == "laser#dead + motor#weak"
+    out = diagnoses(run(tracker, [gone(60.2, name) for name in (CLEAR, ALIVE, POWER)], 62.2))
+    assert [leading(one) for one in out] == [], "2 s of hold"
+    out = diagnoses(run(tracker, [], 64))
+    assert [(leading(one), one.at_ns, one.state) for one in out] == [
+        ("motor#weak", seconds(62.5), "open")
+    ]
+    assert not any("laser#dead" in one.faults for one in out[0].hypotheses[:1])
+
+
+DEAD = [At(20, CLEAR), At(20, ALIVE), At(20, POWER)]
+LONG = TEXT.replace(
+    "laser/scan/clear, {symptom", "{symptom: laser/scan/clear, hold_s: 300}, {symptom"
+)
+
+
+def test_what_goes_accuses_no_other_cause() -> None:
+    tracker = begun()
+    run(tracker, [*WELL, *DEAD], 50)
+    assert leading(tracker.current()) == "laser#dead"
+    out = diagnoses(run(tracker, [gone(60, ALIVE), gone(60, POWER), gone(65, CLEAR)], 66.5))
+    assert [leading(one) for one in out] == [], "with nothing but that it would be dirt"
+    assert states(tracker)[POWER] == "absent"
+    assert [one.state for one in diagnoses(run(tracker, [], 75))] == ["healed"]
+
+
+def test_what_is_remembered_long_goes_with_all_else_that_its_cause_has_shown() -> None:
+    tracker = begun(LONG)
+    run(tracker, [*WELL, *DEAD], 50)
+    out = diagnoses(run(tracker, [gone(60, ALIVE), gone(60, POWER), gone(63, CLEAR)], 120))
+    assert [(one.state, one.at_ns) for one in out] == [("healed", seconds(65))]
+    run(tracker, [At(200, CLEAR), gone(210, CLEAR)], 400)
+    assert tracker.current() is not None, "alone it is remembered for its 300 s"
+    assert [one.state for one in diagnoses(run(tracker, [], 520))] == ["healed"]
+
+
+def test_what_nobody_can_look_at_keeps_its_cause() -> None:
+    tracker = begun(LONG)
+    run(tracker, [*WELL, *DEAD], 50)
+    run(tracker, [gone(60, ALIVE), gone(60, POWER), At(63, CLEAR, "unknown")], 300)
+    assert leading(tracker.current()) == "laser#dead"

@@ -12,6 +12,7 @@ from amberbox.core.types import (
     AmbiguityGroup,
     Batch,
     Diagnosis,
+    FaultFacts,
     Hypothesis,
     Status,
     Symptom,
@@ -45,6 +46,7 @@ class PlainDiagnoser:
     def __init__(self) -> None:
         self.items = frozenset({ITEM})
         self.history_s = 0.5
+        self.facts: Mapping[str, FaultFacts] = {}
         self.present: dict[str, None] = {}
         self.last: float | None = None
         self.negative = False

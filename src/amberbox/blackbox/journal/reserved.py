@@ -141,6 +141,7 @@ _FIELDS: dict[str, dict[str, object]] = {
         "diagnosis": _TEXT,
         "config_hash": _TEXT,
         "live_only": {"type": "boolean"},
+        "also": _TEXTS,
     },
     SYMPTOM: {
         "id": _TEXT,

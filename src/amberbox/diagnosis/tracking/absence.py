@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 
 from amberbox.core.clock import NS
 from amberbox.diagnosis.fmea.model import Fmea, Link
@@ -22,6 +22,11 @@ class Waits:
         for cause, links in self._links.items():
             for symptom in links:
                 self._causes.setdefault(symptom, []).append(cause)
+
+    @property
+    def shows(self) -> Mapping[str, Collection[str]]:
+        """Return the symptoms of each cause."""
+        return {cause: links.keys() for cause, links in self._links.items()}
 
     def until_ns(self, onsets_ns: Mapping[str, int]) -> dict[str, int]:
         """Return until when absent symptoms are to be waited for, given what is present.

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
-from typing import Any
+from typing import Any, Literal, TypeAlias
 
 import msgspec
 
@@ -13,6 +13,8 @@ from amberbox.core.clock import NS
 from amberbox.core.types import Diagnosis
 from amberbox.diagnosis.tracking.presence import Counts
 
+News: TypeAlias = Literal["", "less", "more"]
+"""What is new in the evidence: nothing, only that something has gone, or something else."""
 LIKELY = 0.02
 """Hypotheses that are less probable than this may change their order without a revision."""
 MOVED = 0.01
@@ -27,7 +29,8 @@ _LONGEST_NAME = 46
 class Opening:
     """A diagnosis from its first symptom until all have healed.
 
-    ``evidence`` is what its last answer took into account, as far as it still counts.
+    ``evidence`` is what its last answer took into account, as far as it still counts; ``had`` are
+    symptoms that have counted as present.
     ``waiting`` are symptoms that it had and that have not been seen absent since.
     ``quiet_since_ns`` is since when none is present; None while one is.
     """
@@ -37,21 +40,29 @@ class Opening:
     evidence: dict[str, Counts] = field(default_factory=dict)
     waiting: set[str] = field(default_factory=set)
     quiet_since_ns: int | None = None
+    had: set[str] = field(default_factory=set)
 
     @property
     def next_revision(self) -> int:
         """Return the number of the next revision."""
         return 1 if self.last is None else self.last.revision + 1
 
-    def take_evidence(self, counting: Mapping[str, Counts]) -> bool:
-        """Take what counts now; tell whether anything of it is new.
+    def take_evidence(self, counting: Mapping[str, Counts], *, fading: bool = False) -> News:
+        """Take what counts now; return what is new in it.
 
-        That something no longer counts is no news: the answer stands until more is known.
+        ``more``: something shows, or an absence begins to count. ``less``: something that showed
+        counts no longer; while other symptoms are ``fading``, also if it counts as absent.
         """
         evidence: dict[str, Counts] = {name: counts for name, counts in counting.items() if counts}
-        is_new = any(self.evidence.get(name) != counts for name, counts in evidence.items())
+        changed = {name for name, counts in evidence.items() if self.evidence.get(name) != counts}
+        lost = {name for name, counts in self.evidence.items() if counts == "present"}
+        lost -= {name for name, counts in evidence.items() if counts == "present"}
+        is_more = any(
+            evidence[name] == "present" or name not in self.had or not fading for name in changed
+        )
+        self.had |= {name for name, counts in evidence.items() if counts == "present"}
         self.evidence = evidence
-        return is_new
+        return "more" if is_more else "less" if lost or changed else ""
 
     def revise(self, made: Diagnosis) -> bool:
         """Take an answer; tell whether it differs from the last revision."""
@@ -80,6 +91,7 @@ class Opening:
             "evidence": dict(self.evidence),
             "waiting": sorted(self.waiting),
             "quiet_since_ns": self.quiet_since_ns,
+            "had": sorted(self.had),
         }
 
     @classmethod

@@ -77,6 +77,21 @@ class Presence:
         """Tell whether it is known not to be there, whether that counts or not."""
         return self.told.state == "absent" and not self.told.blocked_by
 
+    def gone_ns(self, at_ns: int) -> int | None:
+        """Return since when it is seen to be gone; None while it is there, or hidden."""
+        if self.until_ns is None or (self.counts_present(at_ns) and not self._fades):
+            return None
+        return self.until_ns - self.hold_ns
+
+    @property
+    def _fades(self) -> bool:
+        return self.left_ns is None and self.is_absent
+
+    def forget(self, at_ns: int) -> None:
+        """Remember it no longer than to an instant."""
+        if self.until_ns is not None:
+            self.until_ns = min(self.until_ns, at_ns)
+
     @property
     def may_be_absent_ns(self) -> int:
         """From when on its absence can count: what takes long to come takes long to go."""
@@ -148,6 +163,9 @@ class Presences:
 
     def __getitem__(self, name: str) -> Presence:
         return self._all[name]
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._all
 
     def onsets(self, at_ns: int) -> dict[str, int]:
         """Return the symptoms that count as present, the analysis' own, with their onsets."""

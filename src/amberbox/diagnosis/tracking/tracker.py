@@ -16,7 +16,7 @@ import msgspec
 
 from amberbox.core.clock import NS
 from amberbox.core.errors import UsageError
-from amberbox.core.types import Batch, Diagnosis, Status, Symptom
+from amberbox.core.types import Batch, Diagnosis, FaultFacts, Status, Symptom
 from amberbox.diagnosis.answering import Effort, Heading, answer
 from amberbox.diagnosis.covering.budget import Budget
 from amberbox.diagnosis.knowledge import Knowledge
@@ -25,6 +25,7 @@ from amberbox.diagnosis.tracking.absence import Waits
 from amberbox.diagnosis.tracking.conditions import Conditions
 from amberbox.diagnosis.tracking.opening import FORGOTTEN_NS, Opening, identified
 from amberbox.diagnosis.tracking.presence import Counts, Presences
+from amberbox.diagnosis.tracking.repair import Repairs, leading_faults
 
 __all__ = ["Tracker"]
 
@@ -47,6 +48,7 @@ class Tracker:
         self._conditions = Conditions(knowledge.fmea)
         self._presences = Presences(knowledge.fmea)
         self._waits = Waits(knowledge.fmea)
+        self._repairs = Repairs(self._waits.shows)
         self._waits_ns: dict[str, int] = {}
         self._until_ns = 0
         self._pending: list[Symptom] = []
@@ -63,6 +65,11 @@ class Tracker:
     def history_s(self) -> float:
         """How far back rows have to be fed again after ``resume``, in seconds."""
         return self._conditions.history_s
+
+    @property
+    def facts(self) -> Mapping[str, FaultFacts]:
+        """What is known of failure modes: the gravest of what each costs, what it may show."""
+        return self.knowledge.facts(self._waits.shows)
 
     @property
     def troubles(self) -> Mapping[str, str]:
@@ -169,6 +176,9 @@ class Tracker:
         """Look at what counts at an instant: revise the open diagnosis, or close it."""
         opening = self._opening
         assert opening is not None, "only an open diagnosis is looked at"
+        for name, end_ns in self._ends_ns(opening, at_ns).items():
+            if end_ns <= at_ns:
+                self._presences[name].forget(at_ns)
         onsets_ns = self._presences.onsets(at_ns)
         if onsets_ns:
             opening.quiet_since_ns = None
@@ -183,12 +193,25 @@ class Tracker:
         else:
             self._due_ns = self._next_ns(opening, at_ns)
 
+    def _ends_ns(self, opening: Opening, at_ns: int) -> dict[str, int]:
+        """Return when symptoms are forgotten since the leading causes they have are over."""
+        if opening.last is None:
+            return {}
+        faults = frozenset[str]().union(*leading_faults(opening.last))
+        return self._repairs.ends_ns(faults, opening.had, self._presences, at_ns)
+
     def _revise(self, opening: Opening, at_ns: int, out: Out) -> None:
         counting = self._presences.counting(at_ns, self._waits_ns)
-        if not opening.take_evidence(counting):
+        present = [name for name, counts in counting.items() if counts == "present"]
+        fading = not all(self._presences[name].is_there for name in present)
+        news = opening.take_evidence(counting, fading=fading)
+        if not news:
             return
         heading = Heading(opening.id, opening.next_revision, at_ns)
         made = answer(self.knowledge, self._situation(counting), heading, EFFORT)
+        last = opening.last if news == "less" else None
+        if last is not None and not self._repairs.may_replace(last, made, present):
+            return
         if opening.revise(made):
             out.append(made)
 
@@ -196,7 +219,9 @@ class Tracker:
         """Return when something changes next although nothing is told."""
         if opening.quiet_since_ns is not None:
             return _half_from(opening.quiet_since_ns + FORGOTTEN_NS)
-        next_ns = self._presences.next_ns(at_ns, self._waits_ns)
+        times = [self._presences.next_ns(at_ns, self._waits_ns)]
+        times += self._ends_ns(opening, at_ns).values()
+        next_ns = min((time for time in times if time is not None and time > at_ns), default=None)
         return None if next_ns is None else _half_from(next_ns)
 
     def snapshot(self) -> dict[str, Any]:

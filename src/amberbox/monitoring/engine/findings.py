@@ -88,7 +88,8 @@ class AlarmChange:
 
     ``count`` is how often it has opened. ``who`` acknowledged or shelved it, ``until_ns`` is when
     a shelved one comes back. ``cause`` is the leading answer of the ``diagnosis`` (its id) that
-    the component is part of, both empty while there is none.
+    the component is part of, both empty while there is none. ``also`` are components whose own
+    alarms are part of this one, since they have the same leading cause.
     """
 
     robot: str
@@ -107,6 +108,7 @@ class AlarmChange:
     live_only: bool = False
     cause: str = ""
     diagnosis: str = ""
+    also: tuple[str, ...] = ()
 
 
 Finding: TypeAlias = "Status | Transition | AlarmChange | Symptom | Diagnosis"

@@ -210,5 +210,5 @@ _ALARM = Forms(AlarmChange, {
     "id": SAME, "robot": SAME, "component": SAME, "severity": SAME, "state": SAME, "level": SAME,
     "reason": SAME, "opened_ns": WHOLE, "changed_ns": WHOLE, "count": WHOLE, "who": SAME,
     "until_ns": TIME_IF_ANY, "cause": Form(default=""), "diagnosis": Form(default=""),
-    "config_hash": SAME, "live_only": FLAG,
+    "config_hash": SAME, "live_only": FLAG, "also": Form(read=tuple, default=()),
 })  # fmt: skip

@@ -6,14 +6,16 @@ Monitoring knows no diagnosis: whoever starts a watcher or a replay hands in wha
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from types import MappingProxyType
 from typing import Any, Protocol, TypeAlias
 
-from amberbox.core.types import Batch, Diagnosis, Status, Symptom
+from amberbox.core.types import Batch, Diagnosis, FaultFacts, Status, Symptom
 from amberbox.monitoring.engine.findings import TICK_NS, AlarmChange, Finding
 from amberbox.monitoring.engine.states import States
 from amberbox.monitoring.watcher.causes import Causes
 from amberbox.monitoring.watcher.evaluation import Evaluates
 from amberbox.monitoring.watcher.instants import instant_of
+from amberbox.monitoring.watcher.raising import Raised
 
 PART = "diagnosing"
 """Where the snapshot of an engine has what the diagnosis knew."""
@@ -32,6 +34,10 @@ class Diagnoser(Protocol):
     @property
     def history_s(self) -> float:
         """How far its conditions look back."""
+
+    @property
+    def facts(self) -> Mapping[str, FaultFacts]:
+        """What is known of failure modes, by id; empty where nothing is."""
 
     def begin(self, at_ns: int) -> None:
         """Begin an epoch: nothing is known; a diagnosis that is open stays open."""
@@ -60,7 +66,8 @@ class Diagnosing:
     def __init__(self, engine: Evaluates, diagnoser: Diagnoser | None = None) -> None:
         self._engine = engine
         self._diagnoser: Diagnoser = _Nobody() if diagnoser is None else diagnoser
-        self._causes = Causes()
+        plan = engine.states.plan
+        self._causes = Causes(self._diagnoser.facts, Raised(plan.robot, plan.config_hash))
 
     @property
     def items(self) -> frozenset[str]:
@@ -99,7 +106,7 @@ class Diagnosing:
         found = self._engine.advance(until_ns)
         wanted = [finding for finding in found if isinstance(finding, Status | Symptom)]
         said = self._diagnoser.advance(wanted, until_ns)
-        return list(self._causes.through(_merged(found, said) if said else found))
+        return list(self._causes.through(_merged(found, said) if said else found, until_ns))
 
     def statuses(self) -> Sequence[Status]:
         """Return the newest status of each mode and component."""
@@ -113,7 +120,9 @@ class Diagnosing:
         self, action: Any, alarm_id: str, who: str, at_ns: int, until_ns: int | None = None
     ) -> list[AlarmChange]:
         """Do what a person says of an alarm; raises UsageError if that makes no sense."""
-        changes = self.states.command(action, alarm_id, who, at_ns, until_ns)
+        changes = self._causes.command(action, alarm_id, who, at_ns, until_ns)
+        if changes is None:
+            changes = self.states.command(action, alarm_id, who, at_ns, until_ns)
         return [self._causes.take(change) for change in changes]
 
     def snapshot(self) -> dict[str, Any]:
@@ -150,6 +159,7 @@ class _Nobody:
 
     items: frozenset[str] = frozenset()
     history_s = 0.0
+    facts: Mapping[str, FaultFacts] = MappingProxyType({})
 
     def begin(self, at_ns: int) -> None:
         """Know nothing."""

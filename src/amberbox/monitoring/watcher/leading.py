@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Final
 
 from amberbox.core.sureness import percent, sure_word
@@ -26,8 +26,19 @@ def cause(diagnosis: Diagnosis) -> str:
     first = leading(diagnosis)
     if not first:
         return ""
-    probability = _probability(diagnosis, first)
-    return f"{either(first)} ({sure_word(probability)})"
+    return one_of([hypothesis.faults for hypothesis in first], share_of(diagnosis))
+
+
+def one_of(faults: Sequence[Collection[str]], probability: float) -> str:
+    """Name sets of faults of which one is meant, and how sure that is in a word."""
+    return f"{_either(faults)} ({sure_word(probability)})"
+
+
+def share_of(diagnosis: Diagnosis) -> float:
+    """Return how probable the leading answer is."""
+    if diagnosis.groups:
+        return diagnosis.groups[0].probability
+    return diagnosis.hypotheses[0].probability if diagnosis.hypotheses else 0.0
 
 
 def in_words(diagnosis: Diagnosis) -> str:
@@ -44,8 +55,12 @@ def in_words(diagnosis: Diagnosis) -> str:
 
 def either(hypotheses: Sequence[Hypothesis]) -> str:
     """Name hypotheses of which one is meant."""
-    names = [_name(hypothesis) for hypothesis in hypotheses[:_NAMED]]
-    more = len(hypotheses) - len(names)
+    return _either([hypothesis.faults for hypothesis in hypotheses])
+
+
+def _either(sets: Sequence[Collection[str]]) -> str:
+    names = [_name(faults) for faults in sets[:_NAMED]]
+    more = len(sets) - len(names)
     return " or ".join([*names, f"one of {more} more"] if more else names)
 
 
@@ -54,13 +69,6 @@ def _members(diagnosis: Diagnosis, group: AmbiguityGroup) -> tuple[Hypothesis, .
     return tuple(by_id[name] for name in group.members if name in by_id)
 
 
-def _probability(diagnosis: Diagnosis, first: Sequence[Hypothesis]) -> float:
-    return diagnosis.groups[0].probability if diagnosis.groups else first[0].probability
-
-
-def _name(hypothesis: Hypothesis) -> str:
-    faults = (
-        "not in the FMEA" if fault == UNKNOWN_FAULT else fault
-        for fault in sorted(hypothesis.faults)
-    )
-    return " + ".join(faults) or "a false alarm"
+def _name(faults: Collection[str]) -> str:
+    names = ("not in the FMEA" if fault == UNKNOWN_FAULT else fault for fault in sorted(faults))
+    return " + ".join(names) or "a false alarm"

@@ -22,6 +22,7 @@ class Surviving:
         self._diagnoser: Diagnoser | None = make()
         self.items = self._diagnoser.items
         self.history_s = self._diagnoser.history_s
+        self.facts = self._diagnoser.facts
         self._open: Diagnosis | None = None
         self.trouble = ""
         """Why it has failed; whoever has told it empties it."""
