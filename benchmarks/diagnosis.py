@@ -216,14 +216,15 @@ def jobs(singles: int, doubles: int, unknown: int, hours: float) -> list[Job]:
 def run(wanted: Sequence[Job], tell: Callable[[Outcome], None] = lambda _: None) -> list[Outcome]:
     """Judge missions on all cores, politely."""
     found = []
-    with get_context("spawn").Pool(min(2, os.cpu_count() or 1), _polite) as pool:
+    with get_context("spawn").Pool(min(2, os.cpu_count() or 1), polite) as pool:
         for outcome in pool.imap_unordered(work, wanted):
             tell(outcome)
             found.append(outcome)
     return sorted(found, key=lambda each: (each.kind, each.seed))
 
 
-def _polite() -> None:
+def polite() -> None:
+    """Give way to everything else on the machine."""
     os.nice(10)
 
 

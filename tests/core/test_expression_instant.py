@@ -34,7 +34,7 @@ def _both(template: str, *parts: Any) -> Any:
 
 def _deeper(inner: Any) -> Any:
     operators = st.sampled_from(("+", "-", "*", "/", "%"))
-    functions = st.sampled_from(("min", "max", "atan2"))
+    functions = st.sampled_from(("min", "max", "median", "atan2"))
     windows = st.sampled_from(("min", "max", "mean", "std", "rate", "count"))
     return st.one_of(
         _both("({} {} {})", inner, operators, inner),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import operator
+import statistics
 from collections.abc import Callable
 from typing import Any
 
@@ -109,6 +110,11 @@ def number_over(a: Part, sign: str, b: Part) -> Part:
     return Part(f"({a.text} {sign} {b.text})", join(a, b), lift(ARITHMETIC[sign], a, b))
 
 
+def middle_of(parts: list[Part]) -> Part:
+    text = f"median({', '.join(part.text for part in parts)})"
+    return Part(text, join(*parts), lift(lambda *x: float(statistics.median(x)), *parts))
+
+
 def compared(a: Part, sign: str, b: Part) -> Part:
     return Part(f"({a.text} {sign} {b.text})", join(a, b), lift(COMPARE[sign], a, b))
 
@@ -126,6 +132,7 @@ numbers = st.recursive(
         st.builds(
             lambda a, n: number_over(a, "+", Part(f"({n})", set(), lambda s, t: n)), inner, small
         ),
+        st.lists(inner, min_size=2, max_size=4).map(middle_of),
     ),
     max_leaves=4,
 )

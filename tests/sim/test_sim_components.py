@@ -91,6 +91,28 @@ def test_a_fault_is_found_where_it_is(plan: Plan, fault: str) -> None:
     assert list(opened) == [catalogue()[fault].component]
 
 
+@pytest.mark.parametrize("place", ["rear_right"])
+@pytest.mark.parametrize(
+    ("fault", "mode"), [("barometer_off", "barometer"), ("supply_sags", "supply")]
+)
+def test_a_sick_unit_makes_no_other_one_seem_sick(
+    plan: Plan, place: str, fault: str, mode: str
+) -> None:
+    robot = Robot(3)
+    robot.inject(f"wheel_{place}_{fault}", 5.0, magnitude=4.5)
+    findings = find(plan, list(robot.step_until(20.0)), 19.0)
+    blamed = {(found.component, found.mode) for found in failures(findings) if found.mode == mode}
+    assert blamed == {(f"wheel_{place}", mode)}
+
+
+def test_a_frozen_gyroscope_of_a_unit_is_no_fault_of_others(plan: Plan) -> None:
+    robot = Robot(3)
+    robot.inject("wheel_rear_left_bus_disconnected", 20.0)
+    findings = find(plan, list(robot.step_until(40.0)), 39.0)
+    blamed = {found.component for found in failures(findings)}
+    assert "bus" in blamed and "imu" not in blamed
+
+
 def test_what_depends_on_a_fault_is_blocked_and_has_no_alarm(plan: Plan) -> None:
     findings = find(plan, with_fault("wheel_rear_right_bus_disconnected", 12), FAULT_S + 10)
     assert list(alarms(findings)) == ["bus"]

@@ -322,6 +322,7 @@ _CALLS: dict[str, Callable[..., Any]] = {
     "atan2": _float_of(np.arctan2),
     "min": _float_of(np.minimum),
     "max": _float_of(np.maximum),
+    "median": lambda *numbers: float(on.median(*numbers)),
     "bit": _bit,
 }
 _BUILD: dict[type[Tree], Callable[[Any, Kinds], tuple[At, Kind]]] = {

@@ -29,7 +29,7 @@ WINDOWED = frozenset({"min", "max", "mean", "std", "rate", "count"})
 ARGUMENTS: dict[str, tuple[int, int]] = {
     **dict.fromkeys(("abs", "sqrt", "sin", "cos", "known"), (1, 1)),
     **dict.fromkeys(("atan2", "bit"), (2, 2)),
-    **dict.fromkeys(("min", "max"), (2, 99)),
+    **dict.fromkeys(("min", "max", "median"), (2, 99)),
     "age": (1, 1),
 }
 """Fewest and most arguments of a function without a window."""

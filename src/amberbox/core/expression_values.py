@@ -180,6 +180,14 @@ def call(name: str, arguments: list[Values]) -> Values:
     return Values(_CALLS[name](*(argument.data for argument in arguments)), null, "number")
 
 
+def median(*columns: Any) -> Any:
+    """Return the middle of several numbers, the mean of two middle ones; NaN if any is NaN."""
+    ordered = np.sort(np.stack(columns), axis=0)
+    low, high = ordered[(len(columns) - 1) // 2], ordered[len(columns) // 2]
+    middle = np.where(low == high, low, (low + high) / 2) + 0.0  # no -0, no overflow of equals
+    return np.where(np.isnan(ordered[-1]), np.nan, middle)
+
+
 def _bit(word: Array, number: Array, null: Mask) -> Values:
     """Tell whether a bit is set; null for what is no whole number of at most 53 bits."""
     fits = (word == np.floor(word)) & (np.abs(word) < 2.0**53)
@@ -252,4 +260,5 @@ _CALLS: dict[str, Callable[..., Array]] = {
     "atan2": np.arctan2,
     "min": lambda *columns: reduce(np.minimum, columns),
     "max": lambda *columns: reduce(np.maximum, columns),
+    "median": lambda *columns: median(*columns),
 }

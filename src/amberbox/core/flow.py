@@ -10,7 +10,10 @@ from numpy.typing import NDArray
 
 from amberbox.core.clock import NS
 from amberbox.core.samples import Now, Samples, is_one
+from amberbox.core.types import IntArray
 
+COUNTED_NS = 3 * NS // 2
+"""Recorders write what they counted once a second, or a little later."""
 NONE_OPEN = 1 << 62
 """Stands for the beginning of a gap where none is open."""
 
@@ -59,6 +62,46 @@ class Flow:
         if is_one(now):
             return kept if kept > counted or counted != counted else counted
         return np.fmax(counted, kept)[()]
+
+    def heard_ns(self, since_ns: int, until_ns: int) -> IntArray:
+        """Return when messages are known to have come, from the last time by ``since_ns`` on.
+
+        These are the times of rows, and of counts that tell of a message after the last row: one
+        that a filter left out, as it said nothing new.
+        """
+        rows, counts = self.rows.times_ns, self.last_ns.times_ns
+        first, end = (int(rows.searchsorted(at, "right")) for at in (since_ns, until_ns))
+        heard = rows[max(first - 1, 0) : end]
+        began = int(heard[0]) if first else since_ns
+        begin, stop = (int(counts.searchsorted(at, "right")) for at in (began, until_ns))
+        if begin == stop:
+            return heard
+        counts, newest = counts[begin:stop], self.last_ns.values[begin:stop]
+        last = heard.searchsorted(counts, "right") - 1
+        row_ns = np.where(last >= 0, heard[last], -1) if len(heard) else np.full(len(counts), -1)
+        left_out = (newest > row_ns) & (counts - newest <= COUNTED_NS)
+        return np.sort(np.concatenate([heard, counts[left_out]]))
+
+    def longest_gap_s(self, now_ns: int, seconds: float, heard_ns: IntArray) -> float:
+        """Return the longest time between messages of the last ``seconds``, and since the last.
+
+        ``heard_ns`` are those that count, of ``heard_ns()``. Counts come once a second: where a
+        filter leaves messages out, what is missing between two counts is no gap.
+        """
+        start_ns = now_ns - round(seconds * NS)
+        if not len(heard_ns) or heard_ns[0] > start_ns:
+            heard_ns = np.concatenate([[start_ns], heard_ns])
+        longest_ns = int(np.diff(np.append(heard_ns, now_ns)).max())
+        spared_ns = 2 * COUNTED_NS if self.is_filtered(now_ns) else 0
+        return max(0, longest_ns - spared_ns) / NS
+
+    def is_filtered(self, now_ns: int) -> bool:
+        """Tell whether a count that is not old tells of a message after the last row."""
+        last = int(self.last_ns.last(now_ns))
+        if last < 0 or now_ns - self.last_ns.times_ns[last] > 2 * COUNTED_NS:
+            return False
+        row_ns = _held(self.rows, now_ns, self.rows.times_ns, -1)
+        return bool(self.last_ns.values[last] > row_ns)
 
     def reaches_back(self, now: Now, seconds: float) -> Any:
         """Tell whether something had been heard of it ``seconds`` ago already."""

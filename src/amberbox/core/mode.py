@@ -31,7 +31,11 @@ machine. It may also define
 - ``probe_of(config, text)``: kind and subject of the probe that an input means which is no
   recorded variable; without it ``PROBE`` is the kind and the text is the subject;
 - ``explain(config, results)``: one sentence on why the results are not as they should be; bools
-  that are not known are None there, numbers NaN.
+  that are not known are None there, numbers NaN;
+- ``explain_unknown(config, results)``: one sentence on what is missing where a result is not known.
+
+A verdict needs evidence: before a window is full, or where its rows are missing, a bool is UNKNOWN
+unless what is still missing cannot change it.
 """
 
 from __future__ import annotations

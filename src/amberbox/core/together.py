@@ -80,7 +80,7 @@ def finite(values: Any) -> Any:
 
 def numbers(values: Any) -> NDArray[np.float64]:
     """Return values as numbers; texts and the like are NaN."""
-    column = np.asarray(values)
+    column = np.asarray(values, object if isinstance(values, str) else None)
     if column.dtype != object:
         return column.astype(np.float64)
     plain = [v if isinstance(v, int | float | np.number) else np.nan for v in column.flat]

@@ -222,12 +222,11 @@ class _Check:
             assert not well, f"{name} is {value} before there is any sample"
 
     def _check_explanations(self, found: Sequence[Mapping[str, Any]]) -> None:
-        explain = getattr(self.module, "explain", None)
-        if explain is None:
-            return
-        for results in found:
-            known = {name: self._known(name, value) for name, value in results.items()}
-            assert isinstance(explain(self.config, known), str)
+        for name in ("explain", "explain_unknown"):
+            explain = getattr(self.module, name, None)
+            for results in found if explain is not None else ():
+                known = {name: self._known(name, value) for name, value in results.items()}
+                assert isinstance(explain(self.config, known), str)
 
     def _known(self, name: str, value: Any) -> Any:
         if self.declared[name].type == "bool":

@@ -21,11 +21,12 @@ from amberbox.testing.modes import assert_mode_contract, at_s, one_input
 
 TWO_S = Config(window=2, min=-100, max=100)
 DRIVEN = Config(window=2, should_move=parse("cmd.v != 0"))
+GATED = Config(window=2, valid=parse("cmd.v != 0 or input_1 > 1"))
 STEADY = [n / 10 for n in range(100)]
 
 
 def test_contract() -> None:
-    assert_mode_contract(frozen, "frozen", configs=[Config(), TWO_S, DRIVEN])
+    assert_mode_contract(frozen, "frozen", configs=[Config(), TWO_S, DRIVEN, GATED])
 
 
 def moving(config: Config, inputs: Sequence[Input], *seconds: float) -> list[int]:
@@ -52,9 +53,36 @@ def test_garbage_between_frozen_values_is_no_movement(garbage: float | None) -> 
     assert moving(TWO_S, [wheel], 4, 7.5, 9) == [TRUE, FALSE, FALSE]
 
 
-def test_only_garbage_is_no_movement_either() -> None:
+def test_only_garbage_says_nothing_for_or_against() -> None:
     wheel = one_input(times_s=STEADY, values=[nan, inf] * 50)
-    assert moving(TWO_S, [wheel], 1, 5) == [UNKNOWN, FALSE]
+    assert moving(TWO_S, [wheel], 1, 5) == [UNKNOWN, UNKNOWN]
+
+
+def test_a_gap_of_rows_is_no_standing_still() -> None:
+    times = [second for second in STEADY if not 3 < second < 6]
+    wheel = one_input(times_s=times, values=times)
+    assert moving(TWO_S, [wheel], 2.9, 4, 5.2, 5.9, 6, 6.1) == [1, 1, UNKNOWN, UNKNOWN, 1, 1]
+    still = one_input(times_s=times, values=[7.0] * len(times))
+    assert moving(TWO_S, [still], 2.9, 5.2, 5.9, 6.1, 7.5, 7.9, 8.0) == [0, 2, 2, 2, 2, 2, 0]
+    found = frozen.evaluate(TWO_S, [still], at_s(5.9))
+    told = {"moving": None, "gap_s": float(found["gap_s"])}
+    assert frozen.explain_unknown(TWO_S, told) == (
+        "not judged: no valid row for 2.9 s of the last 2 s"
+    )
+
+
+def test_garbage_within_the_limits_is_no_movement_where_it_is_known_to_be_none() -> None:
+    values = stops_at_5(STEADY)
+    values[52::7] = [3.0] * len(values[52::7])
+    counter = [12.0] * 100
+    counter[52::7] = [9.0] * len(counter[52::7])
+    wheel = one_input(times_s=STEADY, values=values)
+    bus = one_input("bus.counter", times_s=STEADY, values=counter)
+    gated = Config(window=2, valid=parse("bus.counter == 12"))
+    assert frozen.reads(gated) == ("bus.counter",)
+    assert moving(TWO_S, [wheel], 4, 7.5, 9) == [TRUE, TRUE, TRUE]
+    assert moving(gated, [wheel, bus], 4, 7.5, 9) == [TRUE, FALSE, FALSE]
+    assert [moving(gated, [wheel, bus], at) for at in (4, 7.5, 9)] == [[TRUE], [FALSE], [FALSE]]
 
 
 def test_nothing_is_said_before_a_whole_window_was_seen() -> None:
@@ -72,6 +100,12 @@ def test_standing_still_on_purpose_is_no_fault_and_heals_none() -> None:
 
 def test_a_change_filter_leaves_values_out_and_the_one_before_counts() -> None:
     filtered = one_input(times_s=[0, 9.9], values=[5.0, 6.0])
+    assert moving(TWO_S, [filtered], 5, 9.95, 11, 12) == [UNKNOWN, TRUE, TRUE, UNKNOWN]
+    seconds = np.array([at_s(second) for second in range(13)])
+    filtered.flow.received.clear()
+    filtered.flow.last_ns.clear()
+    filtered.flow.received.extend(seconds, 10 * np.arange(1, 14))
+    filtered.flow.last_ns.extend(seconds, seconds - NS // 10)
     assert moving(TWO_S, [filtered], 5, 9.95, 11, 12) == [FALSE, TRUE, TRUE, FALSE]
 
 
@@ -143,3 +177,8 @@ def test_words_of_the_mode_file() -> None:
 )
 def test_what_cannot_be_judged_is_refused(config: Config) -> None:
     assert list(config.check())
+
+
+def test_text_is_no_evidence() -> None:
+    wheel = one_input(times_s=STEADY, values=[1.0, "off"] * 50)
+    assert moving(TWO_S, [wheel], 1, 5) == [UNKNOWN, FALSE]

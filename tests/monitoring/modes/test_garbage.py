@@ -15,7 +15,7 @@ from amberbox.testing.modes import assert_mode_contract, at_s, one_input
 
 def test_contract() -> None:
     configs = [Config(), Config(allowed=(0, 1, 2)), Config(mask=7, tolerated=20)]
-    assert_mode_contract(garbage, "garbage", configs=configs)
+    assert_mode_contract(garbage, "garbage", configs=configs, text=True)
 
 
 @pytest.mark.parametrize(
@@ -50,9 +50,38 @@ def test_garbage_that_does_not_change_is_still_there_when_a_filter_leaves_it_out
 
 
 def test_some_of_it_may_be_tolerated() -> None:
-    entry = one_input(times_s=[n / 10 for n in range(100)], values=[nan] + [1.0] * 99)
+    entry = one_input(times_s=[n / 10 for n in range(210)], values=[1.0, nan] + [1.0] * 208)
     config = Config(window=20, tolerated=1)
-    assert int(garbage.evaluate(config, [entry], at_s(10))["clean"]) == TRUE
+    assert int(garbage.evaluate(config, [entry], at_s(20))["clean"]) == TRUE
+
+
+def test_nothing_is_said_before_the_window_is_full_unless_too_much_is_garbage_already() -> None:
+    times, config = [n / 10 for n in range(400)], Config(window=30, tolerated=2)
+    bad = one_input(times_s=times, values=[1.0, nan] + [1.0] * 398)
+    worse = one_input(times_s=times, values=[1.0, *[nan] * 8, *[1.0] * 391])
+    for entry, expected in ((bad, [2, 2, 1]), (worse, [2, 0, 0])):
+        found = garbage.evaluate(config, [entry], at_s(0.1, 0.8, 30))
+        assert found["clean"].tolist() == expected
+    results = garbage.evaluate(config, [bad], at_s(0.8))
+    assert float(results["share"]) == pytest.approx(100 / 9)
+    told = {"clean": None, "missing_s": float(results["missing_s"])}
+    assert garbage.explain_unknown(config, told) == (
+        "not judged for another 29.2 s: it takes 30 s of values"
+    )
+
+
+def test_what_came_right_after_a_gap_is_no_full_window() -> None:
+    times = [n / 10 for n in range(400) if not 100 < n < 300]
+    values = [nan if second == 30.1 else 1.0 for second in times]
+    entry = one_input(times_s=times, values=values)
+    config = Config(window=5, tolerated=5)
+    found = garbage.evaluate(config, [entry], at_s(10, 30.05, 30.1, 30.5, 31, 36))
+    assert found["clean"].tolist() == [TRUE, TRUE, UNKNOWN, UNKNOWN, UNKNOWN, TRUE]
+
+
+def test_text_where_numbers_belong_is_garbage() -> None:
+    entry = one_input(times_s=[0, 1, 6], values=[1.0, "off", "off"])
+    assert int(garbage.evaluate(Config(), [entry], at_s(6))["clean"]) == FALSE
 
 
 def test_nothing_known_is_not_clean() -> None:

@@ -71,12 +71,34 @@ def test_one_message_more_or_less_in_the_window_is_no_fault() -> None:
 
 
 def test_explanations() -> None:
-    stopped = {"alive": False, "age_s": 3.21, "rate_hz": 0.0}
-    assert heartbeat.explain(TEN, stopped) == "no message for 3.2 s"
-    assert heartbeat.explain(TEN, {**stopped, "age_s": np.nan}) == "no message at all"
-    slow = {"alive": False, "age_s": 0.1, "rate_hz": 4.0}
-    assert heartbeat.explain(TEN, slow) == "4 messages per second, 10 expected"
-    assert heartbeat.explain(TEN, {**slow, "alive": True}) == ""
+    stopped = {"alive": False, "age_s": 3.21, "rate_hz": 0.0, "heard": False, "often_enough": None}
+    assert heartbeat.explain(TEN, stopped) == (
+        "silent: no message for 3.2 s (10 per second expected)"
+    )
+    assert heartbeat.explain(Config(), {**stopped, "age_s": np.nan}) == "silent: no message at all"
+    assert "while it is silent" in heartbeat.explain_unknown(TEN, stopped)
+    slow = {"alive": False, "age_s": 0.1, "rate_hz": 4.0, "heard": True, "often_enough": False}
+    assert heartbeat.explain(TEN, slow) == "too slow: 4 messages per second, 10 expected"
+    back = heartbeat.explain(TEN, {**slow, "often_enough": None})
+    assert back.startswith("comes again after a silence")
+    assert heartbeat.explain(TEN, {**slow, "alive": True, "often_enough": True}) == ""
+
+
+def test_silence_and_half_the_rate_are_told_apart() -> None:
+    def told(entry: Input, second: float) -> list[int]:
+        found = heartbeat.evaluate(TEN, [entry], at_s(second))
+        return [int(found[name]) for name in ("alive", "heard", "often_enough")]
+
+    half = one_input(times_s=[*beats(10, stop_s=5), *beats(5, start_s=5, stop_s=10)])
+    assert told(half, 4.9) == [TRUE, TRUE, TRUE]
+    assert told(half, 7.5) == [FALSE, TRUE, FALSE]
+    silent = one_input(times_s=[*beats(10, stop_s=5), *beats(10, start_s=9, stop_s=20)])
+    assert told(silent, 7.5) == [FALSE, FALSE, UNKNOWN]
+    assert told(silent, 9.5) == [FALSE, TRUE, UNKNOWN]
+    assert told(silent, 11.2) == [TRUE, TRUE, TRUE]
+    never = one_input()
+    never.flow.began_ns = at_s(0)
+    assert told(never, 3) == [FALSE, FALSE, UNKNOWN]
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ from amberbox.testing.modes import assert_mode_contract, at_s, one_input
 
 def test_contract() -> None:
     configs = [Config(min=0), Config(min=-3, max=50, hysteresis=2)]
-    assert_mode_contract(mode, "range", configs=configs)
+    assert_mode_contract(mode, "range", configs=configs, text=True)
 
 
 @pytest.mark.parametrize(

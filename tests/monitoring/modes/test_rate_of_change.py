@@ -17,7 +17,7 @@ LEAK = Config(min=-0.2, max=0.2, window=2)
 
 def test_contract() -> None:
     configs = [Config(max=3), Config(min=-1, max=1, turn=6.2832)]
-    assert_mode_contract(mode, "rate_of_change", configs=configs)
+    assert_mode_contract(mode, "rate_of_change", configs=configs, text=True)
 
 
 def test_a_ramp() -> None:

@@ -18,7 +18,7 @@ WHEEL = Config({"enabled": 0, "e_stop": Bit(2, nominal=False)})
 
 
 def test_contract() -> None:
-    assert_mode_contract(state_bits, "state_bits", configs=[WHEEL, Config({"top": 62})])
+    assert_mode_contract(state_bits, "state_bits", configs=[WHEEL, Config({"top": 62})], text=True)
 
 
 @pytest.mark.parametrize(

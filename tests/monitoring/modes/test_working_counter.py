@@ -24,7 +24,7 @@ def verdicts(config: Config, counts: list[int], at: Any) -> Any:
 
 def test_contract() -> None:
     configs = [Config(expected=3), Config(expected=0x32, samples=4, lasting=1.0)]
-    assert_mode_contract(mode, "working_counter", configs=configs)
+    assert_mode_contract(mode, "working_counter", configs=configs, text=True)
 
 
 def test_one_bad_sample_is_forgiven_and_two_in_a_row_are_not() -> None:

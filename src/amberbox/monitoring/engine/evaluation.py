@@ -114,6 +114,7 @@ class MappingRun:
         module: Any = mode.module
         self._evaluate: Callable[..., Mapping[str, Any]] = module.evaluate
         self._explain = getattr(module, "explain", None)
+        self._explain_unknown = getattr(module, "explain_unknown", None)
         self._columns = getattr(module, "COLUMNS", False)
         timed = getattr(module, "timed", None)
         self._timed = timed(mode.config) if timed else getattr(module, "TIMED", False)
@@ -241,17 +242,19 @@ class MappingRun:
         self, output: OutputRun, now: int, code: int, kept: Any, results: Mapping[str, Any]
     ) -> Found:
         why = ""
-        if code == BAD and self._explain is not None:
-            why = self._explained(results)
+        if code == BAD:
+            why = self._explained(self._explain, results)
         elif code == NOT_KNOWN:
-            why = f"{output.plan.name} is not known"
+            why = self._explained(self._explain_unknown, results)
+            why = why or f"{output.plan.name} is not known"
         return Found(now, output.number, _WHAT[code], output.judge.output(kept), why)
 
-    def _explained(self, results: Mapping[str, Any]) -> str:
-        assert self._explain is not None, "asked for where there is one"
+    def _explained(self, explain: Any, results: Mapping[str, Any]) -> str:
+        if explain is None:
+            return ""
         plain = {n: _plain(value, n in self._bools) for n, value in results.items()}
         try:
-            return readable(str(self._explain(self._config, plain)))
+            return readable(str(explain(self._config, plain)))
         except CRASHES as error:  # what was found stands, whatever its words
             return readable(f"no explanation: {type(error).__name__}: {error}")
 

@@ -78,7 +78,8 @@ def history_s(config: Config) -> float:
 def evaluate(config: Config, inputs: Sequence[Input], now: Now) -> Mapping[str, Any]:
     """Take the last entry of each name, and of these the worst."""
     entries = _newest(inputs[0], now, config.max_age)
-    heard = inputs[0].flow.reaches_back(now, config.max_age)
+    before = now - round(config.max_age * NS)
+    heard = inputs[0].flow.age_s(before) <= config.max_age
     worst = max((_of(pattern, entries) for pattern in config.names), key=lambda e: e.level)
     if worst.level == STALE and not worst.text and not heard:
         return {"ok": UNKNOWN}

@@ -5,18 +5,20 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from math import inf
+from math import inf, nan
 from typing import Any
 
 import numpy as np
 
 from amberbox.core.clock import NS
 from amberbox.core.expression import Expression, parse
+from amberbox.core.expression_windows import joined_times
 from amberbox.core.mode import FALSE, HOLD, TRUE, UNKNOWN, Input, Result
 from amberbox.core.options import option
 from amberbox.core.samples import Now, Samples, Window, is_one
 from amberbox.core.standins import Finding
-from amberbox.core.together import by_name, value_of
+from amberbox.core.together import by_name, numbers, reads_of, value_of
+from amberbox.core.types import IntArray
 
 ACCEPTS = ("variable", "list", "item")
 COLUMNS = True
@@ -25,6 +27,7 @@ TIMED = True
 RESULTS = (
     Result("moving", "bool", "it moves; while it need not, this stays as it was"),
     Result("spread", "float", "greatest less least value of the window", relation=">="),
+    Result("gap_s", "float", "while nothing moves: without a valid row", "s", relation="<="),
 )
 SAMPLE = """\
 name: wheel_frozen_monitor
@@ -41,6 +44,7 @@ arguments:
   min: -100
   max: 100
 """
+_MOST_MISSING = 0.75  # of a window: two rows in it, one of them late, are enough
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,6 +58,9 @@ class Config:
     tolerance: float = option(0.0, "how far it may move and still counts as the same")
     min: float = option(-inf, "what lies below is garbage, not movement")
     max: float = option(inf, "what lies above is garbage, not movement")
+    valid: Expression | None = option(
+        None, "what holds of a row that is evidence; without it, every row is"
+    )
 
     def check(self) -> Iterator[Finding]:
         """Refuse what cannot be judged."""
@@ -61,33 +68,38 @@ class Config:
             yield "window", "must lie above 0"
         if not 0 <= self.tolerance < inf:
             yield "tolerance", "must not lie below 0"
-        if self.should_move is not None and self.should_move.kind not in ("any", "condition"):
-            yield "should_move", "must be a condition, such as wheel_left.setpoint != 0"
+        for name in ("should_move", "valid"):
+            asked: Expression | None = getattr(self, name)
+            if asked is not None and asked.kind not in ("any", "condition"):
+                yield name, "must be a condition, such as wheel_left.setpoint != 0"
         if not self.min < self.max:
             yield "nothing lies between 'min' and 'max'"
 
 
 def history_s(config: Config) -> float:
     """Return how far back it looks."""
-    condition = config.should_move
-    return config.window + (condition.history_ns / NS if condition is not None else 0.0)
+    asked = (config.should_move, config.valid)
+    return config.window + max(0 if one is None else one.history_ns for one in asked) / NS
 
 
 def reads(config: Config) -> Sequence[str]:
-    """Return what says that it should move."""
-    return () if config.should_move is None else config.should_move.addresses()
+    """Return what says that it should move, and which rows are evidence."""
+    return reads_of(config.should_move, config.valid)
 
 
 def evaluate(config: Config, inputs: Sequence[Input], now: Now) -> Mapping[str, Any]:
-    """Look for movement from the value in force when the window began; garbage is none."""
-    entry, *others = inputs
-    start = now - round(config.window * NS)
-    low, high = (-inf, inf) if entry.is_item else (config.min, config.max)
-    samples = entry.stamps if entry.is_item else entry.samples
-    spread = _spread(samples, low, high, now, config.window)
-    seen = samples.last(start) >= 0
-    moving = _moving(spread > config.tolerance, _should_move(config, others, now), seen)
-    return {"moving": moving, "spread": spread}
+    """Look for movement between valid values, from the one in force when the window began on.
+
+    What moves is seen at once. It stands still where valid values came throughout the window.
+    """
+    entry = inputs[0]
+    named = by_name(inputs, reads(config))
+    samples = _numbers(config, entry, now)
+    spread = _spread(config, samples, named, now)
+    gap_s = _gaps_s(config, entry, samples, named, now, spread)
+    seen, should = gap_s <= _MOST_MISSING * config.window, _should_move(config, named, now)
+    moving = _moving(spread > config.tolerance, should, seen)
+    return {"moving": moving, "spread": spread, "gap_s": gap_s}
 
 
 def _moving(moves: Any, should: Any, seen: Any) -> Any:
@@ -96,26 +108,78 @@ def _moving(moves: Any, should: Any, seen: Any) -> Any:
     return np.where(moves, TRUE, np.where(seen, np.where(should, FALSE, HOLD), UNKNOWN))
 
 
-def _spread(samples: Samples, low: float, high: float, now: Now, seconds: float) -> Any:
-    """Return greatest less least value, NaN where all is garbage."""
-    near = samples.within(now, seconds)
-    values, null = near.values.astype(np.float64), near.null
+def _numbers(config: Config, entry: Input, now: Now) -> Samples:
+    """Return the samples near the windows as numbers, unknown where they are impossible."""
+    low, high = (-inf, inf) if entry.is_item else (config.min, config.max)
+    near = (entry.stamps if entry.is_item else entry.samples).within(now, config.window)
+    values = numbers(near.values)
     bad = ~np.isfinite(values) | (values < low) | (values > high)
-    bad = bad if null is None else bad | null
-    if is_one(now):
-        return np.ptp(values[~bad]) + 0.0 if not bad.all() else np.float64(np.nan)
-    good = near.derived(values, bad)
-    start, window = now - round(seconds * NS), Window(good, now, seconds)
-    held = np.where(good.known(start), good.at(start), np.nan)
+    return near.derived(values, bad if near.null is None else bad | near.null)
+
+
+def _is_valid(config: Config, named: Mapping[str, Input], times_ns: Now) -> Any:
+    """Tell where what was known at a time is evidence."""
+    return config.valid is None or value_of(config.valid, named, times_ns) == 1
+
+
+def _spread(config: Config, samples: Samples, named: Mapping[str, Input], now: Now) -> Any:
+    """Return greatest less least value that is evidence, NaN where none is."""
+    start = now - round(config.window * NS)
+    rows = samples
+    if config.valid is not None:
+        first = int(np.min(start))  # only rows after it lie in a window
+        valid = _is_valid(config, named, np.maximum(samples.times_ns, first))
+        rows = samples.derived(samples.values, samples.null | ~valid)
+    known = samples.known(start) & _is_valid(config, named, start)
+    held = np.where(known, samples.at(start), np.nan)[()]
+    window = Window(rows, now, config.window)
     return np.fmax(window.max(), held) - np.fmin(window.min(), held) + 0.0
 
 
-def _should_move(config: Config, others: Sequence[Input], now: Now) -> Any:
+def _gaps_s(
+    config: Config,
+    entry: Input,
+    samples: Samples,
+    named: Mapping[str, Input],
+    now: Now,
+    spread: Any,
+) -> Any:
+    """Return the longest time without evidence where nothing moves, NaN where something does."""
+    still = ~(spread > config.tolerance)
+    if is_one(now):
+        return _gap_s(config, entry, samples, named, int(now)) if still else nan
+    gaps_s = np.full(len(now), nan)
+    for place in np.flatnonzero(still).tolist():
+        gaps_s[place] = _gap_s(config, entry, samples, named, int(now[place]))
+    return gaps_s
+
+
+def _gap_s(
+    config: Config, entry: Input, samples: Samples, named: Mapping[str, Input], now: int
+) -> float:
+    """Return the longest time of a window without evidence; NaN before it is full.
+
+    A message that a change filter left out says that the value still is what it was.
+    """
+    start = now - round(config.window * NS)
+    heard = joined_times([entry.flow.heard_ns(start, now), _near(samples.times_ns, start, now)])
+    if not len(heard) or heard[0] > start:
+        return nan
+    good = samples.known(heard) & _is_valid(config, named, np.maximum(heard, start))
+    return entry.flow.longest_gap_s(now, config.window, heard[good])
+
+
+def _near(times_ns: IntArray, since_ns: int, until_ns: int) -> IntArray:
+    first, end = (int(times_ns.searchsorted(at, "right")) for at in (since_ns, until_ns))
+    return times_ns[max(first - 1, 0) : end]
+
+
+def _should_move(config: Config, named: Mapping[str, Input], now: Now) -> Any:
     """Tell whether it should have moved all the time."""
     if config.should_move is None:
         return True
     condition = _throughout(config.should_move.text, round(config.window * NS))
-    return value_of(condition, by_name(others, reads(config)), now) == 1
+    return value_of(condition, named, now) == 1
 
 
 @lru_cache
@@ -126,3 +190,11 @@ def _throughout(text: str, duration_ns: int) -> Expression:
 def explain(config: Config, results: Mapping[str, Any]) -> str:
     """Say for how long it has not moved."""
     return f"has not moved for {config.window:g} s" if results["moving"] is False else ""
+
+
+def explain_unknown(config: Config, results: Mapping[str, Any]) -> str:
+    """Say what was not judged: the window is not full, or valid rows are missing."""
+    gap_s = results["gap_s"]
+    if np.isnan(gap_s):
+        return f"not judged before it has been seen for {config.window:g} s"
+    return f"not judged: no valid row for {gap_s:.1f} s of the last {config.window:g} s"

@@ -14,6 +14,7 @@ from amberbox.core.mode import Input, Result, as_single, where_known
 from amberbox.core.options import option
 from amberbox.core.samples import Now, is_one
 from amberbox.core.standins import Finding
+from amberbox.core.together import numbers
 
 ACCEPTS = ("variable", "list")
 COLUMNS = True
@@ -23,6 +24,7 @@ RESULTS = (
     Result("clean", "bool", "no more of it is garbage than is tolerated"),
     Result("garbage", "int", "how many values of the window are garbage", relation="<="),
     Result("share", "float", "how many of a hundred are", "%", relation="<="),
+    Result("missing_s", "float", "how long until the window is full", "s", relation="<="),
 )
 SAMPLE = """\
 name: wheel_garbage_monitor
@@ -71,12 +73,40 @@ def history_s(config: Config) -> float:
 
 
 def evaluate(config: Config, inputs: Sequence[Input], now: Now) -> Mapping[str, Any]:
-    """Count over the window, with the value that was in force when it began."""
+    """Count over the window, with the value that was in force when it began.
+
+    It is judged when the window is full, or what is garbage is too much already: more than is
+    tolerated of all values that a window will have at the pace at which they come.
+    """
     (entry,) = inputs
     total, garbage = _counted(config, entry, now)
     share = np.where(total > 0, 100 * garbage / np.maximum(total, 1), np.nan)
-    clean = where_known(total > 0, share <= config.tolerated)
-    return {"clean": clean, "garbage": garbage, "share": share}
+    mixed = (share > config.tolerated) & (garbage < total)
+    missing_s, filled = _missing(config, entry, now, mixed)
+    too_much = (garbage > 0) & (share * filled > config.tolerated)
+    known = (total > 0) & ((missing_s <= 0) | too_much)
+    clean = where_known(known, share <= config.tolerated)
+    return {"clean": clean, "garbage": garbage, "share": share, "missing_s": missing_s}
+
+
+def _missing(config: Config, entry: Input, now: Now, mixed: Any) -> tuple[Any, Any]:
+    """Return how long until a window is full, and how much of one has been filled (1: all).
+
+    It is full where a value was in force when it began, unless nothing came for three quarters of
+    it afterwards and several values since, or a single one that is ``mixed`` with the old one.
+    """
+    window_ns = round(config.window * NS)
+    start, times_ns = now - window_ns, entry.samples.times_ns
+    before, end = (times_ns.searchsorted(at, "right") for at in (start, now))
+    times_ns = np.append(times_ns, np.int64(0))
+    first_ns, last_ns = times_ns[np.minimum(before, end)], times_ns[np.maximum(end - 1, 0)]
+    count = end - before
+    is_gap = ((count > 1) | ((count == 1) & mixed)) & (4 * (now - first_ns) < window_ns)
+    is_full = (before > 0) & ~is_gap
+    missing_s = np.where(is_full, 0.0, np.where(count > 0, first_ns - start, window_ns) / NS)
+    pace_ns = (last_ns - first_ns) / np.maximum(count - 1, 1)
+    filled = np.where(is_full, 1.0, np.minimum(count * pace_ns / window_ns, 1.0))
+    return missing_s[()], np.where((config.tolerated == 0) & (count > 0), 1.0, filled)[()]
 
 
 def _counted(config: Config, entry: Input, now: Now) -> tuple[Any, Any]:
@@ -94,7 +124,7 @@ def _counted(config: Config, entry: Input, now: Now) -> tuple[Any, Any]:
 
 def _in_values(config: Config, entry: Input) -> tuple[Any, Any]:
     """Return for each sample whether it is known (1 or 0), and whether it is garbage."""
-    values, null = entry.samples.values, entry.samples.null
+    values, null = numbers(entry.samples.values), entry.samples.null
     low, high = min(config.min, as_single(config.min)), max(config.max, as_single(config.max))
     good = np.isfinite(values) & (values >= low) & (values <= high)
     if config.allowed:
@@ -120,6 +150,14 @@ def _whole(numbers: Any) -> Any:
     floats = numbers.astype(np.float64)
     is_whole = (np.abs(floats) < 1 << 53) & (np.trunc(floats) == floats)
     return np.where(is_whole, floats, -1).astype(np.int64)
+
+
+def explain_unknown(config: Config, results: Mapping[str, Any]) -> str:
+    """Say how long it still takes until the window is full."""
+    missing_s = results["missing_s"]
+    if not missing_s > 0:
+        return ""
+    return f"not judged for another {missing_s:.3g} s: it takes {config.window:g} s of values"
 
 
 def explain(config: Config, results: Mapping[str, Any]) -> str:

@@ -8,9 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from amberbox.core.clock import NS
 from amberbox.core.mode import Input, Result, where_known
 from amberbox.core.options import option
-from amberbox.core.samples import Now
+from amberbox.core.samples import Now, is_one
 from amberbox.core.standins import Finding
 
 ACCEPTS = ("item", "variable", "list")
@@ -22,6 +23,8 @@ RESULTS = (
     Result("alive", "bool", "messages come, and often enough"),
     Result("rate_hz", "float", "messages per second over the window", "Hz", relation=">="),
     Result("age_s", "float", "time since the last message", "s", relation="<="),
+    Result("heard", "bool", "messages come at all"),
+    Result("often_enough", "bool", "messages that come do so as often as they should"),
 )
 SAMPLE = """\
 name: laser_heartbeat_monitor
@@ -82,19 +85,51 @@ def evaluate(config: Config, inputs: Sequence[Input], now: Now) -> Mapping[str, 
     heard = np.isfinite(age_s)
     whole = item.flow.reaches_back(now, config.window)
     rate_hz = np.where(whole, item.rate_hz(now, config.window), np.nan)
-    alive = (age_s <= config.max_age) & ~(rate_hz < config.least_hz)
+    told = heard | item.flow.listened(now, config.window)
+    comes, enough = age_s <= config.max_age, ~(rate_hz < config.least_hz)
+    judged = comes & whole & (enough | _is_steady(config, item, now, enough))
     return {
-        "alive": where_known(heard | item.flow.listened(now, config.window), alive),
+        "alive": where_known(told, comes & enough),
         "rate_hz": rate_hz,
         "age_s": np.where(heard, age_s, np.nan),
+        "heard": where_known(told, comes),
+        "often_enough": where_known(judged, enough),
     }
 
 
+def _is_steady(config: Config, item: Input, now: Now, enough: Any) -> Any:
+    """Tell, where there are too few, whether messages came throughout the window.
+
+    What has just come back after a silence is not slow: it was silent.
+    """
+
+    def at(now_ns: int) -> bool:
+        since_ns = now_ns - round(config.window * NS)
+        heard_ns = item.flow.heard_ns(since_ns, now_ns)
+        return item.flow.longest_gap_s(now_ns, config.window, heard_ns) <= config.window / 2
+
+    if is_one(now):
+        return not enough and at(int(now))
+    return np.array([not well and at(at_ns) for well, at_ns in zip(enough, now, strict=True)])
+
+
 def explain(config: Config, results: Mapping[str, Any]) -> str:
-    """Say whether it is silent, or too slow."""
+    """Say whether it is silent, too slow, or has been silent until now."""
     age_s, rate_hz = results["age_s"], results["rate_hz"]
-    if results["alive"] is not False:
+    if False not in (results["alive"], results["heard"], results["often_enough"]):
         return ""
+    expected = "" if config.rate is None else f", {config.rate:g} expected"
     if not age_s <= config.max_age:
-        return "no message at all" if np.isnan(age_s) else f"no message for {age_s:.1f} s"
-    return f"{rate_hz:.3g} messages per second, {config.rate:g} expected"
+        silent = "no message at all" if np.isnan(age_s) else f"no message for {age_s:.1f} s"
+        return f"silent: {silent}" + (f" ({config.rate:g} per second expected)" if expected else "")
+    rate = f"{rate_hz:.3g} messages per second{expected}"
+    if results["often_enough"] is False:
+        return f"too slow: {rate}"
+    return f"comes again after a silence, which counts: {rate}"
+
+
+def explain_unknown(config: Config, results: Mapping[str, Any]) -> str:
+    """Say that the rate is not judged while nothing comes, or before it was heard long enough."""
+    if results["heard"] is False:
+        return "its rate is not judged while it is silent"
+    return f"not judged before messages came for {config.window:g} s without a break"

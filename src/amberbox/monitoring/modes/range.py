@@ -13,6 +13,7 @@ from amberbox.core.mode import Input, Result, as_single, where_known, with_hyste
 from amberbox.core.options import option
 from amberbox.core.samples import Now
 from amberbox.core.standins import Finding
+from amberbox.core.together import numbers
 
 ACCEPTS = ("variable",)
 COLUMNS = True
@@ -58,7 +59,7 @@ class Config:
 def evaluate(config: Config, inputs: Sequence[Input], now: Now) -> Mapping[str, Any]:
     """Compare the last value with the limits."""
     (variable,) = inputs
-    value, known = variable.at(now), variable.samples.known(now)
+    value, known = numbers(variable.at(now))[()], variable.samples.known(now)
     low, high = min(config.min, as_single(config.min)), max(config.max, as_single(config.max))
     inside = (value >= low) & (value <= high)
     well = (value >= low + config.hysteresis) & (value <= high - config.hysteresis)

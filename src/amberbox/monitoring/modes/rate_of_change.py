@@ -14,6 +14,7 @@ from amberbox.core.mode import Input, Result, where_known
 from amberbox.core.options import option
 from amberbox.core.samples import Now
 from amberbox.core.standins import Finding
+from amberbox.core.together import numbers
 
 ACCEPTS = ("variable", "list")
 COLUMNS = True
@@ -66,20 +67,24 @@ def history_s(config: Config) -> float:
 
 
 def evaluate(config: Config, inputs: Sequence[Input], now: Now) -> Mapping[str, Any]:
-    """Compare the value with the one that was in force a window ago."""
+    """Compare the value with the one that was in force a window ago.
+
+    Over a gap of messages the change is that of the gap. Where nothing came since, that nothing
+    changed is no fault: what must change is not judged then.
+    """
     (variable,) = inputs
     before = now - round(config.window * NS)
     known = variable.samples.known(now) & variable.samples.known(before)
-    change = _number(variable.at(now)) - _number(variable.at(before))
+    change = numbers(variable.at(now))[()] - numbers(variable.at(before))[()]
+    newest_ns, oldest_ns = (variable.flow.last_received_ns(at) for at in (now, before))
+    apart_s = np.where(oldest_ns >= 0, (newest_ns - oldest_ns) / NS, 0.0)
     if config.turn is not None:
+        known = known & (apart_s <= 2 * config.window)  # it may have turned more than once
         change = (change + config.turn / 2) % config.turn - config.turn / 2
-    rate = np.where(known, change / config.window, np.nan)
+    rate = np.where(known, change / np.maximum(apart_s, config.window), np.nan)
     in_limits = (rate >= config.min) & (rate <= config.max)
-    return {"in_limits": where_known(np.isfinite(rate), in_limits), "rate": rate}
-
-
-def _number(value: Any) -> Any:
-    return np.asarray(value).astype(np.float64)
+    judged = np.isfinite(rate) & (in_limits | (change != 0) | (newest_ns > before))
+    return {"in_limits": where_known(judged, in_limits), "rate": rate}
 
 
 def explain(config: Config, results: Mapping[str, Any]) -> str:

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from amberbox.core.clock import NS
 from amberbox.core.expression import Expression
 from amberbox.core.mode import FALSE, Input, Result, where_known
 from amberbox.core.options import option
@@ -102,7 +103,7 @@ def results_of(config: Config, inputs: int, bools: int) -> tuple[Result, ...]:
 
 
 def evaluate(config: Config, inputs: Sequence[Input], now: Now) -> Mapping[str, Any]:
-    """Take the median distance of each member from what it should be."""
+    """Take the median distance of each member from what it should be, over a full window."""
     named = by_name(inputs, reads(config))
     windowed = timed(config)
     times_ns = sample_times(named.values(), now, config.window) if windowed else np.atleast_1d(now)
@@ -112,6 +113,9 @@ def evaluate(config: Config, inputs: Sequence[Input], now: Now) -> Mapping[str, 
     off = reduce(np.minimum, [np.abs(values - one) for one in should])
     off = np.where(np.isnan(should[0]), np.nan, np.where(np.isnan(values), inf, off))
     residuals = medians(times_ns, off, now, config.window)
+    before = now - round(config.window * NS)
+    full = np.array([named[place_name(place)].samples.last(before) >= 0 for place in places])
+    residuals = np.where(full, residuals, np.nan)
     found = _judged(config, worst_of(residuals, config.threshold), "agree", "residual")
     for k, residual in enumerate(residuals, 1):
         found |= _judged(config, residual, f"member_{k}", f"residual_{k}")

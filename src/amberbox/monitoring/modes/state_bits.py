@@ -12,6 +12,7 @@ from amberbox.core.mode import Input, Result, where_known
 from amberbox.core.options import option
 from amberbox.core.samples import Now
 from amberbox.core.standins import Finding
+from amberbox.core.together import numbers
 
 ACCEPTS = ("variable",)
 COLUMNS = True
@@ -79,7 +80,7 @@ def results_of(config: Config, inputs: int, bools: int) -> tuple[Result, ...]:
 def evaluate(config: Config, inputs: Sequence[Input], now: Now) -> Mapping[str, Any]:
     """Take the last word apart; what is no whole number has no bits."""
     (variable,) = inputs
-    value = np.asarray(variable.at(now)).astype(np.float64)
+    value = numbers(variable.at(now))
     known = variable.samples.known(now) & (np.abs(value) < 1 << 53) & (np.trunc(value) == value)
     word = np.where(known, value, 0).astype(np.int64)
     bits = {name: (word >> bit.bit) & 1 for name, bit in config.named()}

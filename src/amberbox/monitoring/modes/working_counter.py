@@ -14,6 +14,7 @@ from amberbox.core.mode import Input, Result, where_known
 from amberbox.core.options import option
 from amberbox.core.samples import Now
 from amberbox.core.standins import Finding
+from amberbox.core.together import numbers
 
 ACCEPTS = ("variable",)
 COLUMNS = True
@@ -70,7 +71,7 @@ def evaluate(config: Config, inputs: Sequence[Input], now: Now) -> Mapping[str, 
     stands = (last > good) & (now - began_ns >= round(config.lasting * NS))
     complete = ~((last - good >= config.samples) | stands)
     known = one.samples.known(now)
-    count = np.where(known, one.at(now), np.nan)[()]
+    count = np.where(known, numbers(one.at(now)), np.nan)[()]
     return {"complete": where_known(known, complete), "counter": count}
 
 

@@ -1,0 +1,161 @@
+"""How often each symptom shows for each fault of the catalogue, beside what the FMEA says of it.
+
+``python -m benchmarks.detects --missions 10`` simulates so many missions of each kind of fault with
+random magnitudes, on seeds that the figures of ``benchmarks.diagnosis`` are not measured on, and
+prints the links whose ``detects`` lies outside the 95 % interval of what was measured.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import random
+import re
+import sys
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from multiprocessing import get_context
+from pathlib import Path
+
+from amberbox.core.types import Symptom
+from amberbox.diagnosis.tracking.tracker import Tracker
+from amberbox.monitoring.engine.engine import Engine
+from amberbox.monitoring.watcher.diagnosing import Diagnosing
+from amberbox.sim import catalogue
+from amberbox.sim.catalogue import Fault
+from amberbox.sim.robot import START_NS
+from benchmarks.diagnosis import interval, polite, world
+from benchmarks.missions import Batches, live, mode_of, seconds_of, with_faults
+
+FIRST_SEED = 60_000
+_PLACES = re.compile("front_left|front_right|rear_left|rear_right")
+_MIRRORS = {"front": "rear", "rear": "front", "left": "right", "right": "left"}
+
+
+@dataclass(frozen=True, slots=True)
+class Shown:
+    """Which symptoms were present in one mission, and after how many seconds of its fault."""
+
+    fault: str
+    mode: str
+    magnitude: float
+    symptoms: Mapping[str, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """One mission with one fault: ``number`` of the missions of its kind."""
+
+    kind: str
+    number: int
+
+
+def work(job: Job) -> Shown:
+    """Simulate a mission and note which symptoms were present and not blocked."""
+    chance = random.Random(f"detects {job.kind} {job.number}")
+    fault = chance.choice(kinds()[job.kind])
+    mission = with_faults(FIRST_SEED + chance.randrange(10_000), [fault], chance)
+    at = world()
+    watcher = Diagnosing(Engine(at.plan), Tracker(at.knowledge))
+    watcher.begin(START_NS)
+    batches = Batches(at.wanted)
+    symptoms: dict[str, float] = {}
+    for until_s, messages in live(mission):
+        for batch in batches.of(messages):
+            watcher.feed(batch)
+        for found in watcher.advance(START_NS + round(until_s * 1e9)):
+            if isinstance(found, Symptom) and found.state == "present" and not found.blocked_by:
+                after_s = seconds_of(found.confirmed_ns or found.onset_ns or 0) - mission.onset_s
+                if after_s >= 0:
+                    symptoms.setdefault(found.id, after_s)
+    mode = mode_of(fault, at.knowledge.fmea.modes)
+    return Shown(fault.id, mode, mission.faults[0].magnitude, symptoms)
+
+
+def kinds() -> dict[str, list[Fault]]:
+    """Return the faults of the catalogue by kind: one that several units can have is one kind."""
+    found: dict[str, list[Fault]] = {}
+    for fault in catalogue().values():
+        found.setdefault(_pooled(fault.id, _place_of(fault.id)), []).append(fault)
+    return found
+
+
+def rows(shown: Iterable[Shown]) -> Iterator[tuple[str, str, float, int, int]]:
+    """Yield mode, symptom, what the FMEA says, in how many missions it showed, of how many."""
+    fmea = world().knowledge.fmea
+    missions: dict[str, list[Shown]] = defaultdict(list)
+    for each in shown:
+        missions[_pooled(each.mode, _place_of(each.mode))].append(each)
+    for kind, of in sorted(missions.items()):
+        said: dict[str, tuple[float, float]] = {}
+        came: dict[str, int] = defaultdict(int)
+        for link in fmea.modes[of[0].mode].symptoms:
+            name = _pooled(link.symptom, _place_of(of[0].mode))
+            said[name] = link.detects, link.within_s
+        for each in of:
+            for symptom, after_s in each.symptoms.items():
+                name = _pooled(symptom, _place_of(each.mode))
+                came[name] += after_s <= said.get(name, (0.0, 60.0))[1]
+        for name in sorted({*said, *came}, key=lambda n: -came[n]):
+            yield kind, name, said.get(name, (0.0, 0.0))[0], came[name], len(of)
+
+
+def _place_of(name: str) -> str:
+    found = _PLACES.search(name) or re.search("(?<=laser_)(front|rear)", name)
+    return found[0] if found else ""
+
+
+def _pooled(name: str, place: str) -> str:
+    """Name places by how they lie to the one that is faulty, as the FMEA's templates do."""
+    if "_" not in place:
+        other = _MIRRORS.get(place, "")
+        named = {place: "<place>", other: "<other>"} if place else {}
+        return re.sub("(?<=laser_)(front|rear)", lambda m: named.get(m[0], m[0]), name)
+    end, side = place.split("_")
+    named = {
+        place: "<place>",
+        f"{end}_{_MIRRORS[side]}": "<beside>",
+        f"{_MIRRORS[end]}_{side}": "<behind>",
+        f"{_MIRRORS[end]}_{_MIRRORS[side]}": "<across>",
+    }
+    return _PLACES.sub(lambda m: named[m[0]], name)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Simulate missions, or read what was kept of them, and print what the FMEA has otherwise."""
+    parser = argparse.ArgumentParser(description="Measure how often symptoms show.")
+    parser.add_argument("--missions", type=int, default=10, help="of each kind of fault")
+    parser.add_argument("--first", type=int, default=0, help="number of the first of each kind")
+    parser.add_argument("--kind", default="", help="a regular expression that kinds match")
+    parser.add_argument("--keep", type=Path, help="add what each mission gave to this file")
+    parser.add_argument("--read", type=Path, help="read such a file and simulate nothing")
+    parser.add_argument("--all", action="store_true", help="print the links that agree, too")
+    options = parser.parse_args(arguments)
+    if options.read:
+        shown = [Shown(**json.loads(line)) for line in options.read.read_text().splitlines()]
+    else:
+        wanted = [kind for kind in kinds() if re.search(options.kind, kind)]
+        numbers = range(options.first, options.first + options.missions)
+        jobs = [Job(kind, number) for number in numbers for kind in wanted]
+        shown = _run(jobs, options.keep)
+    for kind, symptom, said, came, count in rows(shown):
+        low, high = interval(came, count)
+        if options.all or not low <= said <= high:
+            print(f"{kind:34} {symptom:58} says {said:5.3f}, {came} of {count}")
+    return 0
+
+
+def _run(jobs: Sequence[Job], keep: Path | None) -> list[Shown]:
+    shown = []
+    with get_context("spawn").Pool(2, polite) as pool:
+        for each in pool.imap_unordered(work, jobs):
+            shown.append(each)
+            if keep is not None:
+                with keep.open("a") as file:
+                    print(json.dumps(asdict(each)), file=file)
+    return shown
+
+
+if __name__ == "__main__":
+    sys.exit(main())
