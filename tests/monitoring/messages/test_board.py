@@ -113,6 +113,25 @@ def test_what_is_only_seen_live_is_of_now(store: Store, watcher: FakeRun) -> Non
     assert read(store, 0).components["laser"].reason == "the recorder is dead"
 
 
+def test_board_of_a_watcher_that_goes_on_after_it_was_held_up(
+    store: Store, watcher: FakeRun
+) -> None:
+    """It said that nothing is known, found what was recorded meanwhile, and goes on there."""
+    for number, status in enumerate((OF_DEVICE, COMPONENT)):
+        silent = replace(status, level="unknown", measured_ns=T0_NS + 30 * NS, live_only=True)
+        channel, values = record_of(silent)
+        watcher.own(channel, T0_NS + 30 * NS + number, values)
+    past = replace(COMPONENT, measured_ns=T0_NS + 5 * NS, level="error")
+    watcher.own(channel, T0_NS + 31 * NS, record_of(past)[1])
+    board = read(store, 31)
+    assert board.silence == "the watcher is 26 s behind"
+    assert [status.mode for status in board.statuses] == [OF_DEVICE.mode, ""]
+    assert board.measured_ns == past.measured_ns
+    other = replace(OF_DEVICE, measured_ns=T0_NS + 5 * NS)
+    watcher.own(channel, T0_NS + 31 * NS, record_of(other)[1])
+    assert {status.measured_ns for status in read(store, 31).statuses} == {past.measured_ns}
+
+
 def test_status_from_the_future_is_not_believed(store: Store, watcher: FakeRun) -> None:
     say(watcher, T0_NS, COMPONENT)
     board = read(store, -3600)

@@ -64,21 +64,19 @@ class BoardReader:
         alarms = self._standing_alarms()
         if not written:
             return Board((), alarms, 0, self._silence("yet"))
-        newest = _newest([status_of(record.values) for record in written])
-        measured_ns = max(status.measured_ns for status in newest)
-        silence = self._judge(newest, measured_ns, written[-1].wall_ns, now_ns)
+        statuses = [status_of(record.values) for record in written]
+        silence = self._judge(statuses[-1], written[-1].wall_ns, now_ns)
+        newest = _newest(statuses)
         known = [_unknown(status, silence) for status in newest] if silence else newest
-        return Board(known, alarms, measured_ns, silence)
+        return Board(known, alarms, statuses[-1].measured_ns, silence)
 
-    def _judge(
-        self, newest: Sequence[Status], measured_ns: int, written_ns: int, now_ns: int
-    ) -> str:
+    def _judge(self, last: Status, written_ns: int, now_ns: int) -> str:
         if written_ns > now_ns + SILENT_NS:
             return "the watcher's last word is from the future: was a clock set?"
         if now_ns - written_ns > SILENT_NS:
             return self._silence(f"for {duration(now_ns - written_ns)}")
-        late_ns = written_ns - measured_ns
-        if late_ns > SILENT_NS and not any(status.live_only for status in newest):
+        late_ns = written_ns - last.measured_ns
+        if late_ns > SILENT_NS and not last.live_only:
             return f"the watcher is {duration(late_ns)} behind"
         return ""
 
@@ -99,7 +97,9 @@ class BoardReader:
 def _newest(statuses: Sequence[Status]) -> list[Status]:
     """Return the newest status of each mode and component that is still watched.
 
-    Their order is that of the last whole second, when all are said in the plan's order.
+    Their order is that of the last whole second, when all are said in the plan's order. What was
+    written last counts as the newest: a watcher that was held up says of the present that nothing
+    is known, then goes on with the past.
     """
     last: dict[tuple[str, str], Status] = {}
     for status in statuses:
@@ -107,7 +107,7 @@ def _newest(statuses: Sequence[Status]) -> list[Status]:
         if status.measured_ns % NS == 0:
             last.pop(key, None)
         last[key] = status
-    start_ns = max(status.measured_ns for status in statuses) - _ROUND_NS
+    start_ns = statuses[-1].measured_ns - _ROUND_NS
     return [status for status in last.values() if status.measured_ns >= start_ns]
 
 
