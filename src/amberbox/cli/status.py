@@ -8,6 +8,7 @@ import shutil
 import sys
 import time
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -118,7 +119,7 @@ def _read(reader: BoardReader, args: argparse.Namespace, plan: Plan | None) -> B
 def _only(board: Board, statuses: Sequence[Status]) -> Board:
     of = {status.component for status in statuses}
     alarms = [alarm for alarm in board.alarms if alarm.component in of]
-    return Board(statuses, alarms, board.measured_ns, board.silence)
+    return replace(board, statuses=statuses, alarms=alarms)
 
 
 def _verdict(board: Board, component: str | None) -> int:
@@ -234,6 +235,7 @@ def _as_json(board: Board) -> dict[str, Any]:
         "robot": board.robot,
         "measured": format_time(board.measured_ns) if board.measured_ns else None,
         "silence": board.silence,
+        "monitoring": board.monitoring and board.monitoring._asdict(),
         "components": [
             _status_json(status) | {"modes": [_mode_json(m) for m in board.modes_of(name)]}
             for name, status in board.components.items()

@@ -16,6 +16,7 @@ from amberbox.blackbox.store import Store, is_locked
 from amberbox.core.clock import NS
 from amberbox.core.types import Status
 from amberbox.monitoring.engine.findings import AlarmChange
+from amberbox.monitoring.messages.pulse import Monitoring, monitoring_of
 from amberbox.monitoring.messages.records import alarm_of, status_of
 
 WRITER = "watch"
@@ -28,12 +29,16 @@ _LOOKBACK_S = 4.0
 
 @dataclass(frozen=True, slots=True)
 class Board:
-    """The newest of each status and alarm; ``silence`` says why nothing is known, if so."""
+    """The newest of each status and alarm; ``silence`` says why nothing is known, if so.
+
+    ``monitoring`` is how the watcher is doing; None where nobody can tell.
+    """
 
     statuses: Sequence[Status] = ()
     alarms: Sequence[AlarmChange] = ()
     measured_ns: int = 0
     silence: str = ""
+    monitoring: Monitoring | None = None
 
     @property
     def robot(self) -> str:
@@ -62,17 +67,20 @@ class BoardReader:
         """Return what is known at a time of the wall clock."""
         written = newest_records(self._store, WRITER, {reserved.STATUS}, _LOOKBACK_S)
         alarms = self._standing_alarms()
+        monitoring = monitoring_of(self._store)
         if not written:
-            return Board((), alarms, 0, self._silence("yet"))
+            return Board((), alarms, 0, self._silence("yet"), monitoring)
         statuses = [status_of(record.values) for record in written]
-        silence = self._judge(statuses[-1], written[-1].wall_ns, now_ns)
+        silence = self._judge(statuses[-1], written[-1].wall_ns, now_ns, monitoring)
         newest = _newest(statuses)
         known = [_unknown(status, silence) for status in newest] if silence else newest
-        return Board(known, alarms, statuses[-1].measured_ns, silence)
+        return Board(known, alarms, statuses[-1].measured_ns, silence, monitoring)
 
-    def _judge(self, last: Status, written_ns: int, now_ns: int) -> str:
+    def _judge(self, last: Status, written_ns: int, now_ns: int, monitoring: Monitoring) -> str:
         if written_ns > now_ns + SILENT_NS:
             return "the watcher's last word is from the future: was a clock set?"
+        if monitoring.state == "overloaded":
+            return overloaded(monitoring.delay_s)
         if now_ns - written_ns > SILENT_NS:
             return self._silence(f"for {duration(now_ns - written_ns)}")
         late_ns = written_ns - last.measured_ns
@@ -92,6 +100,11 @@ class BoardReader:
             if alarm.state == "healed":
                 del self._alarms[alarm.id]
         return list(self._alarms.values())
+
+
+def overloaded(delay_s: float) -> str:
+    """Say that monitoring is late, and how much."""
+    return f"monitoring overloaded: the watcher is {duration(round(delay_s * NS))} behind"
 
 
 def _newest(statuses: Sequence[Status]) -> list[Status]:
