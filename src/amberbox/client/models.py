@@ -71,6 +71,8 @@ class Card(Answer, frozen=True):
     alarms_over: int = 0
     damaged_files: int = 0
     damaged_new: int = 0
+    monitoring: str = ""
+    monitoring_delay_s: float = 0.0
 
 
 class Output(Answer, frozen=True):

@@ -50,6 +50,8 @@ class Card:
     which ``alarms_over`` have stopped; ``severity`` is the highest of those that last, also of
     acknowledged ones. Of its files ``damaged_files`` are set aside as damaged, ``damaged_new``
     of these in the last 24 hours. ``silent``: its link holds, and three heartbeats are missing.
+    ``monitoring`` is how its watcher is doing by its link (``running``, ``overloaded``, ``silent``,
+    ``absent``; empty where that is not known), ``monitoring_delay_s`` how late that evaluates.
     """
 
     robot: str
@@ -76,6 +78,8 @@ class Card:
     alarms_over: int = 0
     damaged_files: int = 0
     damaged_new: int = 0
+    monitoring: str = ""
+    monitoring_delay_s: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
