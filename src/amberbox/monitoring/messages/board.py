@@ -55,6 +55,13 @@ class Board:
         return [s for s in self.statuses if s.mode and s.component == component]
 
 
+def works(status: Status) -> bool:
+    """Tell whether a component can be built on: one without a monitor if all that it needs can."""
+    if status.state == "not_monitored":
+        return not status.blocked_by
+    return status.level in ("ok", "warn") and status.state != "not_initialised"
+
+
 class BoardReader:
     """Reads the board of a store, again and again if need be; only what is new is read."""
 

@@ -26,6 +26,7 @@ from amberbox.core.types import Status
 from amberbox.monitoring.engine.engine import Engine
 from amberbox.monitoring.engine.findings import Finding
 from amberbox.monitoring.messages.publisher import Publisher
+from amberbox.monitoring.messages.watched import write_watched
 from amberbox.monitoring.plan import Plan
 from amberbox.monitoring.probing.runner import ProbeRunner
 from amberbox.monitoring.watcher import commands
@@ -123,6 +124,8 @@ class Watcher:
         self._stop = stop
         runner = self._probes()
         self._publisher.open()
+        if self._watch.folder is not None:
+            write_watched(self._watch.store, self._watch.folder)
         self._lateness.start()
         try:
             if runner is not None:
