@@ -75,8 +75,7 @@ class Recorder:
         self._ended_by = ""
         clock = clock or SystemClock()
         self.pipeline = _pipeline(folder, self.store, clock)
-        self._stalls = None if virtual_start_ns(folder) else StallMeter(clock.boot_ns)
-        self.pipeline.stalls = self._stalls
+        self._stalls = StallMeter(clock.boot_ns) if virtual_start_ns(folder) is None else None
         ring_path = folder.robot.store.ring_path
         place_ring(self.store, folder.path / ring_path if ring_path else None)
         self.pipeline.keep_elsewhere(writers_elsewhere(self.store))
@@ -99,12 +98,14 @@ class Recorder:
         syncer = Syncer(self.pipeline, options.sync_s)
         if self._stalls is not None:
             self._stalls.start()
+            self.pipeline.stalls = self._stalls
         power = PowerWatch(self.pipeline, syncer, options.sync_s)
         try:
             self._tick_until_stopped(syncer, power, keeper)
         finally:
             power.stop()
             if self._stalls is not None:
+                self.pipeline.stalls = None
                 self._stalls.close()
             self._finish(syncer, keeper)
 

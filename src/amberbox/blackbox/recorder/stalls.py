@@ -45,6 +45,7 @@ class StallMeter:
 
     def start(self) -> None:
         """Begin to measure."""
+        self._beat_ns = self._boot_ns()
         self._thread.start()
 
     def close(self) -> None:
@@ -60,7 +61,6 @@ class StallMeter:
         self._beat_ns = now_ns
 
     def _run(self) -> None:
-        self.beat()
         while not self._end.wait(BEAT_S):
             self.beat()
 
