@@ -223,6 +223,18 @@ def test_config_hash_is_of_names_and_contents(tmp_path: Path) -> None:
     assert hash_of(first) != before
 
 
+def test_config_hash_leaves_out_what_sources_are_told_while_they_run(tmp_path: Path) -> None:
+    orders = tmp_path / "state" / "orders"
+    (tmp_path / "robot.yaml").write_text("id: r\n")
+    (tmp_path / "black_box.yaml").write_text(f"- sim: {{orders: {orders}}}\n")
+    before = load_folder(tmp_path).config_hash
+    orders.parent.mkdir()
+    orders.write_text("fault laser_front_silent\n")
+    assert load_folder(tmp_path).config_hash == before
+    (tmp_path / "state" / "other").write_text("x")
+    assert load_folder(tmp_path).config_hash != before
+
+
 def test_config_hash_leaves_out_the_record_and_hidden_files(tmp_path: Path) -> None:
     place = folder(tmp_path, robot="id: r1\nstore: {path: data/rec}\n")
     before = hash_of(place)

@@ -13,6 +13,8 @@ from typing import Any, Literal
 import msgspec
 import pytest
 
+from amberbox.blackbox.journal.head import Head, read_head
+from amberbox.blackbox.keeper import reading
 from amberbox.blackbox.keeper.keeper import Keeper
 from amberbox.blackbox.keeper.missions import MissionKeeper
 from amberbox.blackbox.keeper.missiontracker import id_of
@@ -34,6 +36,7 @@ from amberbox.testing.box import ManualBox
 from amberbox.testing.clock import ManualClock
 
 TASK = Topic("/task", "json")
+OTHER = Topic("/other", "json")
 RULE = MissionRule(
     "transport", "ros_task.state == 'STARTED'", "ros_task.state != 'STARTED'",
     failed="ros_task.state == 'FAILED'", outcome="ros_task.state",
@@ -145,6 +148,46 @@ def test_a_mission_that_lasts_too_long_times_out(tmp_path: Path) -> None:
     rule = MissionRule("dock", "ros_task.state == 'DOCK'", "ros_task.state == 'OK'", max_s=5.0)
     robot = Robot(tmp_path / "store", [rule])
     robot.tell("DOCK", 9)
+    (mission,) = robot.missions
+    assert (mission.outcome, mission.failed, lasted_s(mission)) == ("timeout", True, 5.0)
+
+
+def test_a_mission_times_out_though_the_recorder_always_writes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On a busy machine the keeper takes longer to read than the recorder to write again."""
+    rule = MissionRule("dock", "ros_task.state == 'DOCK'", "ros_task.state == 'OK'", max_s=5.0)
+    robot = Robot(tmp_path / "store", [rule])
+
+    def read_and_write_on(folder: Path) -> Head | None:
+        head = read_head(folder)
+        if folder == robot.box.pipeline.store.folder("main"):
+            robot.box.hear(OTHER, b"{}")
+            robot.box.write(0.1)
+        return head
+
+    robot.tell("DOCK", 2)
+    monkeypatch.setattr(reading, "read_head", read_and_write_on)
+    robot.tell("DOCK", 9)
+    (mission,) = robot.missions
+    assert (mission.outcome, lasted_s(mission)) == ("timeout", 5.0)
+
+
+@pytest.mark.parametrize("restarts", [False, True])
+def test_a_mission_times_out_while_nothing_is_recorded(tmp_path: Path, restarts: bool) -> None:
+    """The recorder is gone: the keeper goes by the clock, and so does the one after it."""
+    rule = MissionRule("dock", "ros_task.state == 'DOCK'", "ros_task.state == 'OK'", max_s=5.0)
+    robot = Robot(tmp_path / "store", [rule])
+    robot.tell("DOCK", 2)
+    robot.box.close()
+    robot.keeper.step()
+    if restarts:
+        robot.keeper.close()
+        robot.keeper = robot._new_keeper()
+        robot.keeper.step()
+    assert [mission.to_ns for mission in robot.missions] == [None]
+    robot.clock.advance(60.0)
+    robot.keeper.step()
     (mission,) = robot.missions
     assert (mission.outcome, mission.failed, lasted_s(mission)) == ("timeout", True, 5.0)
 
@@ -385,6 +428,15 @@ def test_missions_are_found_in_what_was_recorded(tmp_path: Path) -> None:
     assert notes == []
     assert robot.missions == found
     assert detect(robot.store, [RULE]) == ([], [])
+
+
+def test_a_mission_without_end_in_what_was_recorded_times_out(tmp_path: Path) -> None:
+    robot = Robot(tmp_path / "store", [])
+    robot.tell("STARTED", 8)
+    robot.close()
+    rule = MissionRule("t", RULE.start, RULE.end, max_s=5.0)
+    (mission,), _ = detect(robot.store, [rule])
+    assert (mission.outcome, lasted_s(mission)) == ("timeout", 5.0)
 
 
 def test_live_and_later_find_the_same(three: Robot) -> None:

@@ -13,13 +13,18 @@ from typing import Any
 
 import pytest
 
+from amberbox.blackbox.doctor.supervised import LOCK as SUPERVISED
+from amberbox.blackbox.folder.folder import load_folder
+from amberbox.blackbox.store import WriterLock, create_store, open_store
 from amberbox.cli.main import main
-from amberbox.core.clock import NS
+from amberbox.core.clock import NS, SystemClock
 from amberbox.core.mode import Result
 from amberbox.core.needs import any_of
 from amberbox.core.types import Level, Output, Status
 from amberbox.monitoring.engine.findings import AlarmChange, Finding
+from amberbox.monitoring.messages.pulse import write_pulse
 from amberbox.monitoring.messages.records import record_of
+from amberbox.monitoring.messages.watched import write_watched
 from amberbox.monitoring.plan import (
     ComponentPlan,
     DependencyPlan,
@@ -232,6 +237,62 @@ def test_what_is_not_known_to_work_is_not_well(
     assert main(["status", str(store)]) == code
     assert main(["status", str(store), "navigation"]) == code
     assert main(["status", str(store), "laser"]) == 0, "the others do not matter"
+
+
+def test_component_without_a_monitor_is_judged_by_what_it_needs(
+    store: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The same for status and for --wait."""
+    for waits, blocked_by, code in (("0", (), 0), ("0", ("laser",), 1)):
+        say(store, *statuses(level="unknown", state="not_monitored", blocked_by=blocked_by))
+        assert main(["status", str(store), "navigation"]) == code
+        assert main(["status", str(store), "navigation", "--wait", waits]) == code
+    told = "error: navigation: it has no monitor, and what it needs does not work: laser\n"
+    assert told in capsys.readouterr().err
+
+
+def test_files_that_have_changed_since_the_watcher_began_are_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "robot.yaml").write_text("id: r\n")
+    orders = tmp_path / "orders"
+    (tmp_path / "black_box.yaml").write_text(f"- sim: {{orders: {orders}}}\n")
+    store = create_store(tmp_path / "store")
+    say(tmp_path / "store", *statuses())
+    lock = WriterLock(store, "watch")
+    write_watched(store, load_folder(tmp_path))
+    orders.write_text("fault laser_front_silent\n")  # is state, no configuration
+    main(["status", str(tmp_path)])
+    assert "has changed" not in capsys.readouterr().err
+    (tmp_path / "components").mkdir()
+    (tmp_path / "components" / "laser.yaml").write_text("component_name: laser\n")
+    with (tmp_path / "robot.yaml").open("a") as file:
+        file.write("model: m\n")
+    main(["status", str(tmp_path)])
+    said = "note: the robot folder has changed since the watcher began: "
+    told = capsys.readouterr().err
+    assert f"{said}components/laser.yaml (new), robot.yaml (changed)\n" in told
+    assert f"note: a restart of amberbox watch {tmp_path} takes it up\n" in told
+    supervisor = WriterLock(store, SUPERVISED)
+    main(["status", str(tmp_path)])
+    assert "amberbox run takes it up by itself" in capsys.readouterr().err
+    (tmp_path / "black_box.yaml").write_text("- no_such_source: {}\n")
+    main(["status", str(tmp_path)])
+    assert "note: the robot folder has errors: amberbox check" in capsys.readouterr().err
+    supervisor.release()
+    lock.release()
+
+
+def test_overloaded_monitoring_is_shown(store: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    say(store, *statuses())
+    lock = WriterLock(open_store(store), "watch")
+    write_pulse(open_store(store), SystemClock(), 12.4)
+    assert main(["status", str(store)]) == 1
+    assert "monitoring overloaded: the watcher is 12 s behind" in capsys.readouterr().out
+    main(["status", str(store), "--json"])
+    shown = json.loads(capsys.readouterr().out)
+    assert shown["monitoring"] == {"state": "overloaded", "delay_s": 12.4}
+    lock.release()
 
 
 def test_store_that_was_never_watched(store: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -24,7 +24,7 @@ from amberbox.core.errors import AmberboxError, UsageError
 from amberbox.core.terminal import OWN
 from amberbox.core.types import Status
 from amberbox.monitoring.engine.findings import AlarmChange
-from amberbox.monitoring.messages.board import Board
+from amberbox.monitoring.messages.board import Board, works
 from amberbox.monitoring.messages.diagnostics import text_of
 from amberbox.monitoring.messages.formats import FORMATS
 from amberbox.monitoring.messages.naming import Naming
@@ -109,9 +109,7 @@ def _judged(board: Board) -> list[str]:
 
 def _is_up(board: Board, name: str) -> bool:
     status = board.components.get(name)
-    return status is not None and status.level in ("ok", "warn") and (
-        status.state != "not_initialised"
-    )  # fmt: skip
+    return status is not None and works(status)
 
 
 def _statuses(robot: str, one: Component, silence: str) -> Iterator[Status]:

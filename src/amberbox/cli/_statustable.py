@@ -79,6 +79,9 @@ def waiting(board: Board, component: str) -> str:
         return f"{component}: {board.silence}"
     if status.state == "not_initialised":
         return f"{component}: not initialised: {status.reason}"
+    if status.state == "not_monitored":
+        needs = ", ".join(status.blocked_by)
+        return f"{component}: it has no monitor, and what it needs does not work: {needs}"
     state = f"{status.level} ({status.state})" if status.state != status.level else status.level
     return f"{component}: {state}: {status.reason}" if status.reason else f"{component}: {state}"
 

@@ -68,6 +68,19 @@ def _not_judged(path: Path) -> list[Problem]:
     return [Problem(str(path / COMPONENTS), 1, "file", what, is_error=False)]
 
 
+def _gates_without_monitor(folder: RobotFolder, plan: Plan) -> list[Problem]:
+    """Note components of which nothing can be known: waiting for one is over at once."""
+    place = str(folder.path / COMPONENTS)
+    what = (
+        "has no monitor, and needs nothing that has one: 'amberbox status --wait' is over at once"
+    )
+    return [
+        Problem(place, 1, component.id, what, is_error=False)
+        for component in plan.components
+        if not component.modes and not any(need.component for need in component.dependencies)
+    ]
+
+
 def _monitors(folder: RobotFolder, problems: list[Problem]) -> Plan:
     """Judge the monitors, run their tests, judge failure modes and rules; add what is wrong."""
     plan, found = load_plan(folder)
@@ -75,6 +88,7 @@ def _monitors(folder: RobotFolder, problems: list[Problem]) -> Plan:
     rules = find_rules(folder.path, skip=folder.store_path)
     problems += rules.problems
     problems += [problem for entry in rules.rules for problem in run_rules(entry, plan)]
+    problems += _gates_without_monitor(folder, plan)
     problems += [*knowledge_of(folder, plan)[1], *rule_problems(folder)]
     return plan
 

@@ -8,12 +8,14 @@ import shutil
 import sys
 import time
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
 from amberbox.blackbox.doctor.linked import LOCK, link_in_words, link_state
+from amberbox.blackbox.doctor.supervised import LOCK as SUPERVISED
 from amberbox.blackbox.folder.folder import inspect_folder, store_of
 from amberbox.blackbox.store import is_locked, is_store, open_store
 from amberbox.blackbox.where import store_path
@@ -30,13 +32,16 @@ from amberbox.core.terminal import OWN
 from amberbox.core.timetext import format_time
 from amberbox.core.types import Output, Status
 from amberbox.core.units import parse_duration_s
-from amberbox.monitoring.messages.board import Board, BoardReader
+from amberbox.monitoring.messages.board import Board, BoardReader, works
 from amberbox.monitoring.messages.formats import FORMATS
 from amberbox.monitoring.messages.naming import Naming
+from amberbox.monitoring.messages.watched import changed_files
 from amberbox.monitoring.plan import Plan
 
 _PERIOD_S = 1.0
 _WAIT_S = 0.2
+_NAMED = 5
+"""So many changed files are named."""
 _UNKNOWN_HINT = "amberbox watch {where} judges what is recorded"
 
 
@@ -118,19 +123,15 @@ def _read(reader: BoardReader, args: argparse.Namespace, plan: Plan | None) -> B
 def _only(board: Board, statuses: Sequence[Status]) -> Board:
     of = {status.component for status in statuses}
     alarms = [alarm for alarm in board.alarms if alarm.component in of]
-    return Board(statuses, alarms, board.measured_ns, board.silence)
+    return replace(board, statuses=statuses, alarms=alarms)
 
 
 def _verdict(board: Board, component: str | None) -> int:
     """Return 0 if nothing is in error, and every component that is meant is known to work."""
     meant = [s for s in board.statuses if component in (None, s.component)]
-    well = all(_is_well(status) for status in meant if not status.mode)
+    well = all(works(status) for status in meant if not status.mode)
     in_error = any(status.level == "error" for status in meant)
     return int(bool(board.silence) or in_error or not well)
-
-
-def _is_well(status: Status) -> bool:
-    return status.level in ("ok", "warn") or status.state == "not_monitored"
 
 
 def _show(board: Board, args: argparse.Namespace, plan: Plan | None) -> None:
@@ -144,10 +145,30 @@ def _show(board: Board, args: argparse.Namespace, plan: Plan | None) -> None:
     if args.format == "table" and not args.json and not args.component:
         for line in _link_lines(args.where):
             print(line)
-    if plan and {status.config_hash for status in board.statuses} - {plan.config_hash}:
-        tell(["the robot folder is not as it was when the watcher began"])
+    tell(_changes(args.where, board, plan))
     if board.silence:
         print(f"hint: {_UNKNOWN_HINT.format(where=args.where)}", file=sys.stderr)
+
+
+def _changes(where: str, board: Board, plan: Plan | None) -> Iterator[str]:
+    """Say what has changed in the robot folder since the watcher began, and what takes it up."""
+    folder = None if is_store(Path(where)) else inspect_folder(where)[0]
+    if folder is None and not is_store(Path(where)):
+        yield f"the robot folder has errors: amberbox check {where} names them; what runs goes on"
+        return
+    store = open_store(store_path(where))
+    changed = changed_files(store, folder) if folder is not None else []
+    if not changed:  # a watcher of an earlier version names no files
+        if plan and {status.config_hash for status in board.statuses} - {plan.config_hash}:
+            yield "the robot folder is not as it was when the watcher began"
+        return
+    more = f" and {len(changed) - _NAMED} more" if len(changed) > _NAMED else ""
+    names = ", ".join(changed[:_NAMED])
+    yield f"the robot folder has changed since the watcher began: {names}{more}"
+    if is_locked(store, SUPERVISED):
+        yield "amberbox run takes it up by itself once the folder is right and at rest"
+    else:
+        yield f"a restart of amberbox watch {where} takes it up"
 
 
 def _link_lines(where: str) -> Iterator[str]:
@@ -214,9 +235,7 @@ def _wanted(board: Board, component: str | None, plan: Plan | None) -> list[str]
 
 def _is_up(board: Board, component: str) -> bool:
     status = board.components.get(component)
-    if status is None or status.state == "not_initialised":
-        return False
-    return status.level in ("ok", "warn")
+    return status is not None and not board.silence and works(status)
 
 
 def _plan_of(where: str) -> Plan | None:
@@ -234,6 +253,7 @@ def _as_json(board: Board) -> dict[str, Any]:
         "robot": board.robot,
         "measured": format_time(board.measured_ns) if board.measured_ns else None,
         "silence": board.silence,
+        "monitoring": board.monitoring and board.monitoring._asdict(),
         "components": [
             _status_json(status) | {"modes": [_mode_json(m) for m in board.modes_of(name)]}
             for name, status in board.components.items()

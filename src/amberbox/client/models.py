@@ -72,6 +72,8 @@ class Card(Answer, frozen=True):
     damaged_files: int = 0
     damaged_new: int = 0
     signing_key: str = ""
+    monitoring: str = ""
+    monitoring_delay_s: float = 0.0
 
 
 class Output(Answer, frozen=True):

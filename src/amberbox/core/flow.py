@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from amberbox.core.clock import NS
 from amberbox.core.samples import Now, Samples, is_one
+from amberbox.core.stalls import Stalls
 from amberbox.core.types import IntArray
 
 COUNTED_NS = 3 * NS // 2
@@ -35,6 +36,8 @@ class Flow:
     """Since when its publishers are known to be lost, NONE_OPEN where they are not."""
     reasons: dict[int, str] = field(default_factory=dict)
     """Why they were lost, by since when."""
+    stalls: Stalls = field(default_factory=Stalls)
+    """When the recorder was held up: time that does not count for silence and rates."""
     began_ns: int | None = None
     """When listening began, as far as the record tells; before it nobody could have heard it."""
 
@@ -47,9 +50,10 @@ class Flow:
     def age_s(self, now: Now) -> Any:
         """Return for how long nothing has been received; infinite before the first message."""
         last_ns = self.last_received_ns(now)
+        stalled_ns = self.stalls.within_ns(last_ns, now) if len(self.stalls) else 0
         if is_one(now):
-            return max(now - last_ns, 0) / NS if last_ns >= 0 else np.inf
-        ages = np.maximum(now - last_ns, 0) / NS
+            return max(int(now - last_ns - stalled_ns), 0) / NS if last_ns >= 0 else np.inf
+        ages = np.maximum(now - last_ns - stalled_ns, 0) / NS
         return np.where(last_ns >= 0, ages, np.inf)[()]
 
     def rate_hz(self, now: Now, seconds: float) -> Any:
@@ -58,7 +62,8 @@ class Flow:
         Less is looked at where less is known; NaN before anything is. Counts come late where a
         robot runs faster than the box writes: then the rows show more.
         """
-        counted, kept = _rate(self.received, now, seconds), _rate(self.rows, now, seconds)
+        counted = _rate(self.received, now, seconds, self.stalls)
+        kept = _rate(self.rows, now, seconds, self.stalls)
         if is_one(now):
             return kept if kept > counted or counted != counted else counted
         return np.fmax(counted, kept)[()]
@@ -134,25 +139,26 @@ def _held(samples: Samples, now: Now, values: NDArray[Any], missing: int) -> Any
     return np.where(last >= 0, values[last], missing)
 
 
-def _rate(counts: Samples, now: Now, seconds: float) -> Any:
+def _rate(counts: Samples, now: Now, seconds: float, stalls: Stalls) -> Any:
     """Return how much a growing count has grown per second; NaN where nobody can know."""
     if not len(counts):
         return np.nan if is_one(now) else np.full(np.shape(now), np.nan)
     before = now - round(seconds * NS)
     if is_one(now):
-        return _rate_at(counts, int(now), int(before))
+        return _rate_at(counts, int(now), int(before), stalls)
     first, last = np.maximum(counts.last(before), 0), counts.last(now)
     began = np.maximum(before, counts.times_ns[first])
-    elapsed_s = (now - began) / NS
+    elapsed_s = (now - began - stalls.within_ns(began, now)) / NS
     grown = (counts.values[last] - counts.values[first]).astype(np.float64)
     known = (last >= 0) & (elapsed_s > 0)
     return np.where(known, grown / np.where(known, elapsed_s, 1.0), np.nan)
 
 
-def _rate_at(counts: Samples, now: int, before: int) -> float:
+def _rate_at(counts: Samples, now: int, before: int, stalls: Stalls) -> float:
     """Return the same for one instant, without the cost of arrays."""
     first, last = max(int(counts.last(before)), 0), int(counts.last(now))
     began = max(before, int(counts.times_ns[first]))
-    if last < 0 or now <= began:
+    elapsed_ns = now - began - (int(stalls.within_ns(began, now)) if len(stalls) else 0)
+    if last < 0 or elapsed_ns <= 0:
         return np.nan
-    return float(counts.values[last] - counts.values[first]) / ((now - began) / NS)
+    return float(counts.values[last] - counts.values[first]) / (elapsed_ns / NS)

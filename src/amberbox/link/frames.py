@@ -86,7 +86,9 @@ class Beat(Struct, frozen=True, tag="beat"):
     """The robot is there. ``mono_ns`` is its time since boot; ``backlog`` rows are not sent yet.
 
     ``offset_ns`` is its estimate of the server's clock minus its own, ``round_ns`` the round trip
-    that it comes from; None before there is one.
+    that it comes from; None before there is one. ``monitoring`` is how its watcher is doing
+    (running, overloaded, silent, absent; empty where that is not known), ``delay_s`` how late that
+    evaluates what is recorded, in seconds.
     """
 
     epoch: Count
@@ -96,6 +98,8 @@ class Beat(Struct, frozen=True, tag="beat"):
     offset_ns: TimeNs | None = None
     round_ns: TimeNs | None = None
     backlog_bytes: Count = 0
+    monitoring: Name = ""
+    delay_s: float = 0.0
 
 
 class Heads(Struct, frozen=True, tag="heads"):

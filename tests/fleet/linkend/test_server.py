@@ -16,10 +16,12 @@ from amberbox.fleet.linkend import ledger
 from amberbox.fleet.linkend.board import board
 from amberbox.fleet.linkend.committed import drop_committed
 from amberbox.fleet.linkend.grouped import GroupedWrites
-from amberbox.fleet.linkend.presence import presences
+from amberbox.fleet.linkend.presence import Presence, presences
 from amberbox.fleet.linkend.server import Hooks, LinkServer
 from amberbox.fleet.linkend.sockets import SocketClosedError
 from amberbox.fleet.linkend.tables import BOOT, EVENT, HEADS, ROW
+from amberbox.fleet.state.said import SaidStatus
+from amberbox.fleet.state.standing import Moment, Standing, silence
 from amberbox.link.frames import (
     Ack,
     Beat,
@@ -39,6 +41,7 @@ from amberbox.link.frames import (
 )
 from amberbox.link.positions import Place, Reach, RunEnd
 from amberbox.link.serverend import ServerEnd
+from amberbox.monitoring.messages.pulse import Monitoring
 from amberbox.testing.patience import PATIENCE_S
 
 REACH = Reach(Place(1, 0), Place(1, 9), Place(1, 5), (RunEnd(1, "b", 9, closed=False),))
@@ -273,6 +276,45 @@ def test_heartbeats_tell_backlog_and_clock_and_live_values_stay_in_memory(
     with database.reading() as connection:
         assert presences(connection)[0].backlog == 12
         assert connection.execute(select(BOOT.c.boot_id, BOOT.c.offset_ns)).all() == [("boot", 100)]
+
+
+@pytest.mark.parametrize(
+    ("said", "delay_s", "known"),
+    [
+        ("overloaded", 12.5, Monitoring("overloaded", 12.5)),
+        ("running", float("nan"), Monitoring("running", 0.0)),
+        ("silent", -1.0, Monitoring("silent", 0.0)),
+        ("", 0.0, None),
+        ("a word of a later version", 1.0, None),
+    ],
+)
+def test_a_heartbeat_says_how_the_watcher_is_doing(
+    database: Database, said: str, delay_s: float, known: Monitoring | None
+) -> None:
+    async def scene() -> None:
+        link, socket = LinkServer(database), FakeSocket()
+        task = asyncio.create_task(link.serve(socket, "r1"))
+        socket.say(HELLO)
+        await socket.hear()
+        socket.say(Beat(1, 7, 8, monitoring=said, delay_s=delay_s))
+        await socket.hear()
+        assert link.robots["r1"].monitoring == known
+        await socket.close()
+        await task
+        link.close()
+
+    asyncio.run(scene())
+
+
+def test_what_is_late_is_said_to_be_so_on_the_server() -> None:
+    status = Standing(SaidStatus("laser", level="error", measured_ns=1), 1, 1)
+    seen = Presence("r1", True, 1, 1, "s", "b", "", "1", 0, 0)
+    when = Moment(26_000_000_000, None)
+    late = Monitoring("overloaded", 25.0)
+    assert silence(seen, True, [status], when) == "its watcher has said nothing for 26 s"
+    told = silence(seen, True, [status], when, late)
+    assert told == "monitoring overloaded: the watcher is 25 s behind"
+    assert silence(seen, False, [status], when, late) == "offline, last seen 26 s ago"
 
 
 def test_the_board_goes_by_position_not_by_clock_or_arrival(database: Database) -> None:

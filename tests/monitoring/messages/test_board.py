@@ -69,7 +69,7 @@ def test_what_is_watched_no_more_is_left_out(store: Store, watcher: FakeRun) -> 
     assert list(read(store, 3).components) == ["laser"]
 
 
-@settings(max_examples=25)
+@settings(max_examples=25, deadline=None)
 @given(after_s=st.floats(3.01, 1e6))
 def test_nothing_stays_green_when_the_watcher_is_silent(
     tmp_path_factory: pytest.TempPathFactory, after_s: float
@@ -111,6 +111,25 @@ def test_what_is_only_seen_live_is_of_now(store: Store, watcher: FakeRun) -> Non
     channel, values = record_of(replace(dead, reason="the recorder is dead"))
     watcher.own(channel, T0_NS, values)
     assert read(store, 0).components["laser"].reason == "the recorder is dead"
+
+
+def test_board_of_a_watcher_that_goes_on_after_it_was_held_up(
+    store: Store, watcher: FakeRun
+) -> None:
+    """It said that nothing is known, found what was recorded meanwhile, and goes on there."""
+    for number, status in enumerate((OF_DEVICE, COMPONENT)):
+        silent = replace(status, level="unknown", measured_ns=T0_NS + 30 * NS, live_only=True)
+        channel, values = record_of(silent)
+        watcher.own(channel, T0_NS + 30 * NS + number, values)
+    past = replace(COMPONENT, measured_ns=T0_NS + 5 * NS, level="error")
+    watcher.own(channel, T0_NS + 31 * NS, record_of(past)[1])
+    board = read(store, 31)
+    assert board.silence == "the watcher is 26 s behind"
+    assert [status.mode for status in board.statuses] == [OF_DEVICE.mode, ""]
+    assert board.measured_ns == past.measured_ns
+    other = replace(OF_DEVICE, measured_ns=T0_NS + 5 * NS)
+    watcher.own(channel, T0_NS + 31 * NS, record_of(other)[1])
+    assert {status.measured_ns for status in read(store, 31).statuses} == {past.measured_ns}
 
 
 def test_status_from_the_future_is_not_believed(store: Store, watcher: FakeRun) -> None:

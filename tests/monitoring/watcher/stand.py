@@ -165,6 +165,12 @@ def written(store: Path, *, live_only: bool = False) -> list[bytes]:
     return [line for line, is_live in _written(store) if is_live == live_only]
 
 
+def values_of(lines: list[bytes], channel: str) -> list[dict[str, object]]:
+    """Return the records of a channel."""
+    parts = (line.partition(b" ") for line in lines)
+    return [msgspec.json.decode(data) for name, _, data in parts if name.decode() == channel]
+
+
 def _written(store: Path) -> Iterator[tuple[bytes, bool]]:
     channels = (
         *(reserved.STATUS, reserved.EVENT, reserved.ALARM),

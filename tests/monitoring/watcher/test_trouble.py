@@ -5,7 +5,6 @@ from __future__ import annotations
 import threading
 from pathlib import Path
 
-import msgspec
 import pytest
 
 from amberbox.blackbox.requests import pending, submit
@@ -23,15 +22,10 @@ from tests.monitoring.watcher.stand import (
     kill,
     plan_of,
     run_for,
+    values_of,
     variable,
     written,
 )
-
-
-def values(lines: list[bytes], channel: str) -> list[dict[str, object]]:
-    """Return the records of a channel."""
-    parts = (line.partition(b" ") for line in lines)
-    return [msgspec.json.decode(data) for name, _, data in parts if name.decode() == channel]
 
 
 def test_nothing_stays_green_when_the_recorder_dies(tmp_path: Path) -> None:
@@ -47,7 +41,7 @@ def test_nothing_stays_green_when_the_recorder_dies(tmp_path: Path) -> None:
     for _ in range(50):
         stand.clock.advance(0.1)
         watcher.step()
-    said = values(written(stand.path, live_only=True), "amberbox/status")
+    said = values_of(written(stand.path, live_only=True), "amberbox/status")
     everything = {(s.component, s.mode) for s in watcher._engine.statuses()}
     assert len(everything) == 8
     assert {(s["component"], s["mode"]) for s in said} == everything
@@ -61,8 +55,8 @@ def test_nothing_stays_green_when_the_recorder_dies(tmp_path: Path) -> None:
         watcher.step()
     watcher.close()
     stand.box.close()
-    assert len(values(written(stand.path, live_only=True), "amberbox/status")) == len(said)
-    newest = values(written(stand.path), "amberbox/status")[-1]
+    assert len(values_of(written(stand.path, live_only=True), "amberbox/status")) == len(said)
+    newest = values_of(written(stand.path), "amberbox/status")[-1]
     assert newest["level"] != "unknown" or newest["component"] == "laser"
 
 
@@ -91,7 +85,7 @@ def test_a_mode_that_hangs_is_unknown_and_the_others_go_on(
     watcher = stand.watcher(plan)
     stop = threading.Event()
     run_for(watcher, stop, 1.5)
-    found = values(written(stand.path), "amberbox/status")
+    found = values_of(written(stand.path), "amberbox/status")
     of = {s["component"]: s for s in found if s["mode"]}
     assert of["mill"]["level"] == "unknown"
     assert "no answer within" in str(of["mill"]["reason"])
@@ -116,13 +110,13 @@ def test_other_monitors_go_on_where_the_ones_before_were_left(tmp_path: Path) ->
         stand.tick()
         watcher.step()
     watcher.close()
-    before = values(written(stand.path), "amberbox/status")
+    before = values_of(written(stand.path), "amberbox/status")
     watcher = stand.watcher(plan_of(config_hash="other"))
     for _ in range(30):
         stand.tick()
         watcher.step()
     watcher.close()
-    after = values(written(stand.path), "amberbox/status")[len(before) :]
+    after = values_of(written(stand.path), "amberbox/status")[len(before) :]
     assert {s["config_hash"] for s in after} == {"other"}
     last_ns, first_ns = int(str(before[-1]["measured_ns"])), int(str(after[0]["measured_ns"]))
     assert last_ns < first_ns <= last_ns + NS
@@ -137,7 +131,7 @@ def test_what_a_person_says_of_an_alarm_is_remembered(tmp_path: Path) -> None:
         stand.tick()
         watcher.step()
     (alarm,) = [
-        a for a in values(written(stand.path), "amberbox/alarm") if a["component"] == "laser"
+        a for a in values_of(written(stand.path), "amberbox/alarm") if a["component"] == "laser"
     ]
     store = open_store(stand.path)
     submit(store, "alarm", {"action": "acknowledge", "id": alarm["id"], "who": "anna"})
@@ -145,7 +139,7 @@ def test_what_a_person_says_of_an_alarm_is_remembered(tmp_path: Path) -> None:
     stand.tick()
     watcher.step()
     assert pending(store) == []
-    (change,) = values(written(stand.path, live_only=True), "amberbox/alarm")
+    (change,) = values_of(written(stand.path, live_only=True), "amberbox/alarm")
     assert (change["id"], change["state"], change["who"]) == (alarm["id"], "acknowledged", "anna")
     kill(watcher)
     watcher = stand.watcher()
@@ -170,7 +164,7 @@ def test_probe_rows_are_read_back_and_replayed(tmp_path: Path) -> None:
     watcher.close()
     stand.box.close()
     live = written(stand.path)
-    levels = [s["level"] for s in values(live, "amberbox/status") if s["component"] == "laser"]
+    levels = [s["level"] for s in values_of(live, "amberbox/status") if s["component"] == "laser"]
     assert {"ok", "error"} <= set(levels)
     assert live == stand.replayed()[: len(live)]
 
@@ -196,13 +190,13 @@ def test_a_memory_that_makes_no_sense_is_said_and_begun_anew(
         watcher.step()
     monkeypatch.setattr(watcher._engine, "snapshot", lambda: {"version": "of tomorrow"})
     watcher.close()
-    before = values(written(stand.path), "amberbox/status")
+    before = values_of(written(stand.path), "amberbox/status")
     watcher = stand.watcher()
     for _ in range(30):
         stand.tick()
         watcher.step()
     watcher.close()
-    after = values(written(stand.path), "amberbox/status")[len(before) :]
+    after = values_of(written(stand.path), "amberbox/status")[len(before) :]
     assert int(str(after[0]["measured_ns"])) >= int(str(before[-1]["measured_ns"]))
     assert {s["level"] for s in after if s["component"] == "base"} & {"ok", "error"}
     (told,) = events(stand.path, "watch_anew")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -82,7 +82,9 @@ def inspect_folder(
     problems.sort(key=lambda problem: (problem.file, problem.line))
     if robot is None or any(problem.is_error for problem in problems):
         return None, problems
-    files = _files(place, robot) if path.is_dir() else [path, *_existing(place / ROBOT_FILE)]
+    files = [path, *_existing(place / ROBOT_FILE)]
+    if path.is_dir():
+        files = _files(place, robot, blocks.sources)
     digest = hash_files({_relative(file, place): file for file in files})
     notes = tuple(problem for problem in problems if not problem.is_error)
     folder = RobotFolder(place, robot, blocks.sources, digest, notes, blocks.not_built)
@@ -91,7 +93,8 @@ def inspect_folder(
 
 def configuration_files(folder: RobotFolder) -> dict[str, Path]:
     """Return the files that make a folder's ``config_hash``, by name relative to it."""
-    return {_relative(path, folder.path): path for path in _files(folder.path, folder.robot)}
+    files = _files(folder.path, folder.robot, folder.blocks)
+    return {_relative(path, folder.path): path for path in files}
 
 
 def hash_files(files: Mapping[str, Path]) -> str:
@@ -132,11 +135,17 @@ def _read_black_box(path: Path, sources: str, problems: list[Problem]) -> Blocks
     return read_blocks(node, sources, problems) if node else Blocks()
 
 
-def _files(place: Path, robot: RobotConfig) -> list[Path]:
-    """List the configuration: all files but the store's, hidden ones, compiled Python, the key."""
+def _files(place: Path, robot: RobotConfig, blocks: Sequence[SourceBlock]) -> list[Path]:
+    """List the configuration: all files but those that are none.
+
+    These are the store's, hidden ones, compiled Python, the key to the server, and the files in
+    which sources keep state, or are told what to do, while they run (``state_files``).
+    """
     store = (place / Path(robot.store.path).expanduser()).resolve()
-    files = (path for path in _walk(place) if path != place / KEY_FILE)
-    return [path for path in files if not path.resolve().is_relative_to(store)]
+    named = (name for block in blocks for name in getattr(block.config, "state_files", ()))
+    left_out = {(place / KEY_FILE).resolve(), *(Path(name).resolve() for name in named)}
+    found = ((path, path.resolve()) for path in _walk(place))
+    return [p for p, at in found if at not in left_out and not at.is_relative_to(store)]
 
 
 def _walk(place: Path) -> Iterator[Path]:

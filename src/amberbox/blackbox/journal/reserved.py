@@ -69,7 +69,9 @@ _FIELDS: dict[str, dict[str, object]] = {
                     "lost": _COUNT,
                 },
             },
-        }
+        },
+        "stalled_from_ns": _COUNT_IF_ANY,
+        "stalled_to_ns": _COUNT_IF_ANY,
     },
     EVENT: {"kind": _TEXT, "text": _TEXT, "source": _TEXT, "details": _TEXT},
     GAP: {

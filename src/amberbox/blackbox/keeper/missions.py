@@ -22,8 +22,8 @@ from amberbox.blackbox.keeper.ownjournal import (
 from amberbox.blackbox.keeper.reading import Reading, RunPart
 from amberbox.blackbox.missions.mission import DONE, Mission, Moment, book_of_store, load
 from amberbox.blackbox.requests import Request, finish, pending
-from amberbox.blackbox.store import Store
-from amberbox.core.clock import NS
+from amberbox.blackbox.store import Store, is_locked
+from amberbox.core.clock import NS, Clock
 
 KIND = "mission"
 READER = "missions"
@@ -99,7 +99,10 @@ class MissionKeeper:
     def _follow(self) -> None:
         if self._follower is None:
             self._follower = _Follower(self._store, self._rules)
+        is_idle = not is_locked(self._store, "main")  # before reading: then nothing is missed
         changed = self._follower.step(self._known())
+        if is_idle:
+            changed += self._known().expire(_now(self._journal.clock))
         self._unwritten += [mission.record() for mission in changed]
         for name, what in self._follower.problems.items():
             if name not in self._told:
@@ -204,6 +207,10 @@ def _started(name: str, values: Mapping[str, Any], moment: Moment) -> Mission:
     mission_id = str(values.get("id") or id_of(name, moment.received_ns))
     parameters = dict(values.get("parameters") or {})
     return Mission(mission_id, name, moment, who=str(values.get("who", "")), parameters=parameters)
+
+
+def _now(clock: Clock) -> Moment:
+    return Moment(clock.wall_ns(), boot=clock.boot_id()[:8], boot_ns=clock.boot_ns())
 
 
 def _moment_of(request: Request) -> Moment:

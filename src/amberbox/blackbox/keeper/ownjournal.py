@@ -70,8 +70,8 @@ class OwnJournal:
         self._store = store
         self._writer_name = writer
         self._about = {"robot": robot, "config_hash": config_hash, "input": ""}
-        self._clock = clock or SystemClock()
-        self._log: LogClock = RunClock(self._clock)
+        self.clock = clock or SystemClock()
+        self._log: LogClock = RunClock(self.clock)
         self._chain = chain
         self._each_file = first
         self._writer: JournalWriter | None = None
@@ -147,7 +147,7 @@ class OwnJournal:
         if self._writer is None:
             options = JournalOptions(
                 self._store.folder(self._writer_name), self._store.id, self._writer_name,
-                self._store.next_run(), self._clock.boot_id(),
+                self._store.next_run(), self.clock.boot_id(),
             )  # fmt: skip
             chain = {} if self._chain is None else {"chain": self._chain()}
             self._writer = JournalWriter(options, **chain)
@@ -159,7 +159,7 @@ class OwnJournal:
             "writer": self._writer_name,
             "run": writer.options.run,
             "store_id": self._store.id,
-            "boot_id": self._clock.boot_id(),
+            "boot_id": self.clock.boot_id(),
             "version": __version__,
             "items": "{}",
             **self._about,

@@ -153,6 +153,7 @@ class Reading:
         """Read the main journal, which says when runs and stretches of log time begin."""
         head = read_head(self._store.folder("main"))
         part = self._part
+        known = 0 if part is None else len(part.axis.starts)
         if part is None and tail.run:  # read on amid a run, which need have nothing of ours here
             part = self._part = RunPart(tail.run, Axis())
         if part is not None:
@@ -167,7 +168,8 @@ class Reading:
                 part = self._part = RunPart(delivery.run, Axis())
             self._take(part, delivery, tail.last_ns)
         if part is not None:
-            part.reach(_complete_ns(part, head, tail))
+            if not known or len(part.axis.starts) == known or tail.seq == _next_seq(head):
+                part.reach(_complete_ns(part, head, tail))
             yield part
 
     def _take(self, part: RunPart, batch: Batch, last_ns: int | None) -> None:
@@ -184,13 +186,18 @@ class Reading:
 def _complete_ns(part: RunPart, head: Head | None, tail: WriterTail) -> int | None:
     """Return the log time up to which all journals of a run are written and read.
 
-    None where the recorder is just writing: what belongs to the newest rows may be on its way.
+    Where the recorder has written on since ``head`` was read that is as far as the head says: what
+    belongs to the newest rows may be on its way.
     """
     if head is None or head.run != part.run or head.next_seq > tail.seq:
         return tail.last_ns
     if head.next_seq < tail.seq:
-        return None if part.until_ns else head.watermark_ns
+        return head.watermark_ns
     return max(head.watermark_ns, tail.last_ns or 0)
+
+
+def _next_seq(head: Head | None) -> int | None:
+    return None if head is None else head.next_seq
 
 
 def _sort_in(parts: list[RunPart], writer: str, tail: WriterTail) -> None:

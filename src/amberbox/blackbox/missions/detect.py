@@ -40,7 +40,9 @@ def find(record: Record, rules: Sequence[MissionRule]) -> tuple[list[Mission], l
     last_ns = record.last_ns()
     if last_ns is None:
         return [], notes
-    changed = Tracker(rules).take(conditions.edges(last_ns), Moment)
+    tracker = Tracker(rules)
+    changed = tracker.take(conditions.edges(last_ns), Moment)
+    changed += tracker.expire(Moment(last_ns))
     missions = {mission.id: mission for mission in changed}
     return list(missions.values()), [*notes, *conditions.problems.values()]
 

@@ -30,9 +30,10 @@ from amberbox.blackbox.recorder.journals import Journals
 from amberbox.blackbox.recorder.messageclock import MessageClock
 from amberbox.blackbox.recorder.names import ItemNames
 from amberbox.blackbox.recorder.room import DISK_FULL, Room
+from amberbox.blackbox.recorder.stalls import StallMeter
 from amberbox.blackbox.recorder.streams import Item, Stream
 from amberbox.blackbox.store import Store, WriterLock
-from amberbox.core.clock import NS
+from amberbox.core.clock import NS, RunClock
 from amberbox.core.errors import AmberboxError
 from amberbox.core.source import Power, TopicOptions
 
@@ -41,6 +42,8 @@ SPARING_CLOCK_PERIOD_NS = 60 * NS
 """The same while only events are recorded, so that their room lasts."""
 CLOCK_STEP_NS = 50_000_000
 EPOCH_STEP_NS = NS
+STALL_EVENT_NS = NS
+"""A stall of the recorder is an event of its own if it was that long."""
 HEARTBEAT_NS = NS
 """In silence the counters are still written this often, so that replay's watermark advances."""
 
@@ -110,6 +113,8 @@ class Pipeline:
         self._filter_error = ""
         self.power: Power | None = None
         """How the box is powered, as a source has said last; None if none has."""
+        self.stalls: StallMeter | None = None
+        """Measures when the recorder is held up; None where messages bring their time."""
         self.on_event: Callable[[str, str], None] | None = None
         now_ns = self.clock.now_ns()  # the clock may have been set back since the last run
         start = now_ns if self.start_gap_ns is None else min(self.start_gap_ns, now_ns)
@@ -271,11 +276,31 @@ class Pipeline:
                 item.reported = copy(item.counters)
                 changed.append({"item": item.name, **item.counters.record()})
         silent = self.options.counts_silence and now_ns - self._counted_ns >= HEARTBEAT_NS
-        if changed or silent:
+        stalled = self._stalled(now_ns)
+        if changed or silent or stalled:
             self._counted_ns = now_ns
             with self._own_lock:
-                encoded = msgspec.json.encode({"items": changed})
+                encoded = msgspec.json.encode({"items": changed, **stalled})
                 self._own.append((reserved.COUNTERS, encoded, now_ns))
+
+    def _stalled(self, now_ns: int) -> dict[str, int]:
+        """Return when the recorder was held up since the last count; empty if it was not.
+
+        It is part of the counts, which say up to when the record is complete: whoever goes by
+        these knows of it before evaluating an instant of it.
+        """
+        stall = self.stalls.take() if self.stalls is not None else None
+        if stall is None:
+            return {}
+        shift_ns = now_ns - self.clock.boot_ns(now_ns) if isinstance(self.clock, RunClock) else 0
+        from_ns = max(stall[0] + shift_ns, self._counted_ns, self._last_tick_ns)
+        to_ns = min(stall[1] + shift_ns, now_ns)
+        if to_ns <= from_ns:
+            return {}
+        if to_ns - from_ns >= STALL_EVENT_NS:
+            text = f"the recorder was held up for {(to_ns - from_ns) / NS:.1f} s"
+            self.event("recorder_stalled", text, from_ns=from_ns, to_ns=to_ns)
+        return {"stalled_from_ns": from_ns, "stalled_to_ns": to_ns}
 
     def _preamble(self, writer: str, at_ns: int) -> list[tuple[str, bytes]]:
         """Return the own records that each file begins with: the run and the clock."""

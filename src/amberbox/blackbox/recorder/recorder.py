@@ -18,6 +18,7 @@ from amberbox.blackbox.recorder.power import PowerWatch
 from amberbox.blackbox.recorder.recovery import previous_end_ns, report_recovery
 from amberbox.blackbox.recorder.ringfolder import place_ring, writers_elsewhere
 from amberbox.blackbox.recorder.room import Room
+from amberbox.blackbox.recorder.stalls import StallMeter
 from amberbox.blackbox.recorder.supervisor import Supervisor
 from amberbox.blackbox.recorder.syncer import Syncer
 from amberbox.blackbox.service import SPENT, Notifier
@@ -72,7 +73,9 @@ class Recorder:
         self._notifier = Notifier()
         self._keeper_wanted = keeper
         self._ended_by = ""
-        self.pipeline = _pipeline(folder, self.store, clock or SystemClock())
+        clock = clock or SystemClock()
+        self.pipeline = _pipeline(folder, self.store, clock)
+        self._stalls = StallMeter(clock.boot_ns) if virtual_start_ns(folder) is None else None
         ring_path = folder.robot.store.ring_path
         place_ring(self.store, folder.path / ring_path if ring_path else None)
         self.pipeline.keep_elsewhere(writers_elsewhere(self.store))
@@ -93,11 +96,17 @@ class Recorder:
         kept = keeper_options(self.folder)
         keeper = KeeperProcess(self.pipeline, kept) if self._keeper_wanted else None
         syncer = Syncer(self.pipeline, options.sync_s)
+        if self._stalls is not None:
+            self._stalls.start()
+            self.pipeline.stalls = self._stalls
         power = PowerWatch(self.pipeline, syncer, options.sync_s)
         try:
             self._tick_until_stopped(syncer, power, keeper)
         finally:
             power.stop()
+            if self._stalls is not None:
+                self.pipeline.stalls = None
+                self._stalls.close()
             self._finish(syncer, keeper)
 
     def _tick_until_stopped(

@@ -95,6 +95,11 @@ class Config:
         """Whether messages are stamped with the robot's virtual time."""
         return self.times == "virtual" if self.times else self.speed == "max"
 
+    @property
+    def state_files(self) -> Sequence[str]:
+        """Files that are no configuration, wherever they lie: new orders change nothing in it."""
+        return (self.orders,) if self.orders else ()
+
     def start_ns(self) -> int:
         """Return the virtual start: as configured, else now, or a fixed day in virtual time."""
         if self.start is not None:

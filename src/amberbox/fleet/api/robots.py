@@ -108,7 +108,8 @@ def _status(fleet: Services, robot: KnownRobot, read: Callable[[str, str], Facts
     online = robot.id in fleet.links.robots
     facts = read(robot.id, seen.config_hash if seen else "")
     when = Moment(now_ns, offset_ns)
-    silent = silence(seen, online, statuses, when)
+    link = fleet.links.robots.get(robot.id)
+    silent = silence(seen, online, statuses, when, link.monitoring if link else None)
     return status_tree(robot.id, online, silent, statuses, facts, when)
 
 

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass
+from math import isfinite
+from typing import get_args
 
 from sqlalchemy import Connection, select, update
 
 from amberbox.fleet.database.upsert import upsert
 from amberbox.fleet.linkend.tables import BOOT, HEADS, ROBOT
 from amberbox.link.frames import Beat
+from amberbox.monitoring.messages.pulse import Monitoring, State
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,6 +53,14 @@ def seen(connection: Connection, robot: str, epoch: int, beat: Beat, boot: str, 
                "round_ns": beat.round_ns, "at_ns": at_ns}  # fmt: skip
         change = ("offset_ns", "round_ns", "at_ns")
         connection.execute(upsert(connection.dialect, BOOT, ("robot", "boot_id"), change), [row])
+
+
+def monitoring_said(beat: Beat) -> Monitoring | None:
+    """Return what a heartbeat says of the robot's watcher; None where it says nothing we know."""
+    state = next((state for state in get_args(State) if state == beat.monitoring), None)
+    if state is None:
+        return None
+    return Monitoring(state, max(beat.delay_s, 0.0) if isfinite(beat.delay_s) else 0.0)
 
 
 def gone(connection: Connection, robot: str, epoch: int, last_seen_ns: int) -> None:

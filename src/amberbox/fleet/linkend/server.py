@@ -38,6 +38,7 @@ from amberbox.link.frames import (
 )
 from amberbox.link.ledger import Admission, StaleEpochError, Stored
 from amberbox.link.serverend import Admit, Deed, Keep, Say, ServerEnd
+from amberbox.monitoring.messages.pulse import Monitoring
 
 Value = tuple[int, float | str | None]
 _SEEN_EVERY_NS = 10 * 1_000_000_000
@@ -85,6 +86,8 @@ class Connected:
     last_seen_ns: int
     written_ns: int = 0
     backlog: int = 0
+    monitoring: Monitoring | None = None
+    """How its watcher is doing; None where it has not said."""
     answers: asyncio.Queue[Answer | None] = field(default_factory=lambda: asyncio.Queue(_WAITING))
     heard_s: float = field(default_factory=time.monotonic)
     """When something came last, by a clock that nobody sets."""
@@ -236,6 +239,7 @@ class LinkServer:
 
     def _beat(self, one: Connected, beat: Beat) -> None:
         one.backlog = beat.backlog
+        one.monitoring = presence.monitoring_said(beat)
         now_ns = one.last_seen_ns
         if now_ns - one.written_ns >= _SEEN_EVERY_NS and one.end.hello is not None:
             one.written_ns = now_ns

@@ -76,7 +76,8 @@ class Cards:
     ) -> Card:
         link = self.links.robots.get(robot.id)
         online = link is not None
-        silent = silence(presence, online, statuses, when)
+        monitoring = link.monitoring if link is not None else None
+        silent = silence(presence, online, statuses, when, monitoring)
         components = [status.said for status in statuses if not status.said.mode]
         worst = _worst(components)
         last_level = worst.level if worst else "unknown"
@@ -97,6 +98,7 @@ class Cards:
             link is not None and link.is_silent, alarms.over,
             damaged.count, damaged.new,
             _distrust(distrusted.get((robot.id, presence.store_id)) if presence else None),
+            monitoring.state if monitoring else "", monitoring.delay_s if monitoring else 0.0,
         )  # fmt: skip
 
 

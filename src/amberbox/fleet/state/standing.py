@@ -11,7 +11,8 @@ from amberbox.core.clock import NS
 from amberbox.fleet.linkend.presence import Presence
 from amberbox.fleet.linkend.tables import BOOT, ROBOT, STATUS
 from amberbox.fleet.state.said import SaidStatus, heard, moment
-from amberbox.monitoring.messages.board import duration
+from amberbox.monitoring.messages.board import duration, overloaded
+from amberbox.monitoring.messages.pulse import Monitoring
 
 SILENT_NS = 10 * NS
 """The watcher says everything each second; over a bad network that may come a little later."""
@@ -84,9 +85,16 @@ def clock_offsets_ns(connection: Connection, robots: Sequence[str] | None = None
 
 
 def silence(
-    presence: Presence | None, online: bool, statuses: Sequence[Standing], when: Moment
+    presence: Presence | None,
+    online: bool,
+    statuses: Sequence[Standing],
+    when: Moment,
+    monitoring: Monitoring | None = None,
 ) -> str:
-    """Say why nothing is known of a robot now; empty where something is."""
+    """Say why nothing is known of a robot now; empty where something is.
+
+    ``monitoring`` is what its link says of its watcher, apart from the statuses.
+    """
     now_ns = when.now_ns
     if presence is None:
         return "it has never connected"
@@ -94,6 +102,8 @@ def silence(
         return f"offline, last seen {duration(now_ns - presence.last_seen_ns)} ago"
     if not statuses:
         return "it has said nothing of its components yet"
+    if monitoring is not None and monitoring.state == "overloaded":
+        return overloaded(monitoring.delay_s)
     newest_ns = max(status.received_ns for status in statuses)
     if now_ns - newest_ns > SILENT_NS:
         return f"its watcher has said nothing for {duration(now_ns - newest_ns)}"

@@ -53,6 +53,8 @@ class Card:
     of these in the last 24 hours. ``silent``: its link holds, and three heartbeats are missing.
     ``signing_key`` is ``pending`` or ``refused`` where it signs with another key than before that
     no admin has confirmed: what it says of itself may come from somebody else.
+    ``monitoring`` is how its watcher is doing by its link (``running``, ``overloaded``, ``silent``,
+    ``absent``; empty where that is not known), ``monitoring_delay_s`` how late that evaluates.
     """
 
     robot: str
@@ -80,6 +82,8 @@ class Card:
     damaged_files: int = 0
     damaged_new: int = 0
     signing_key: Literal["", "pending", "refused"] = ""
+    monitoring: str = ""
+    monitoring_delay_s: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)

@@ -40,6 +40,8 @@ class Engine:
         self.history_s = max((table.keep_ns / NS for table in self._tables), default=1.0)
         self._until_ns = 0
         self._forgot_ns = 0
+        self._put_off_ns = 0
+        """Up to when a stall of the recorder has put off what lasts."""
         self._began_ns: int | None = None
         self._pending: list[Finding] = []
         self._view = _View(plan, self._outputs)
@@ -66,6 +68,8 @@ class Engine:
         """
         for table in self._tables:
             table.forget()
+        self._tables.stalls.clear()
+        self._put_off_ns = 0
         for group in self._groups:
             group.forget()
         self._until_ns = self._forgot_ns = at_ns // TICK_NS * TICK_NS
@@ -79,7 +83,12 @@ class Engine:
 
     def feed(self, batch: Batch) -> None:
         """Take rows of any item; its log times must not decrease from batch to batch."""
-        self._tables.feed(batch, self._until_ns)
+        self._tables.feed(batch, self._evaluated_ns())
+
+    def _evaluated_ns(self) -> int:
+        """Return up to when rows are evaluated: not those of a stall that is being left out."""
+        stall = self._tables.stalls.next_after(self._until_ns)
+        return self._until_ns if stall is None else min(self._until_ns, stall[0])
 
     def advance(self, until_ns: int) -> list[Finding]:
         """Return what is found up to an instant, for which the record must be complete."""
@@ -88,7 +97,15 @@ class Engine:
         with np.errstate(all="ignore"):
             while self._until_ns < until_ns:
                 end_ns = min(until_ns, self._until_ns + _BLOCK_NS)
-                findings += self._block(self._until_ns, end_ns)
+                stall = self._tables.stalls.next_after(self._until_ns)
+                if stall is None or stall[0] // TICK_NS * TICK_NS >= end_ns:
+                    findings += self._block(self._until_ns, end_ns)
+                elif stall[0] // TICK_NS * TICK_NS > self._until_ns:
+                    end_ns = stall[0] // TICK_NS * TICK_NS
+                    findings += self._block(self._until_ns, end_ns)
+                else:
+                    end_ns = min(until_ns, -(-stall[1] // TICK_NS) * TICK_NS)
+                    findings += self._stalled(stall, end_ns)
                 self._until_ns = end_ns
         if until_ns - self._forgot_ns >= _FORGET_NS:
             self._forgot_ns = until_ns
@@ -99,15 +116,27 @@ class Engine:
     def _block(self, after_ns: int, until_ns: int) -> list[Finding]:
         self._view.begin_block()
         found: list[Found] = []
-        came = {table.item: _ticks(table, until_ns) for table in self._tables}
+        came = {table.item: _ticks(table, after_ns, until_ns) for table in self._tables}
         quarters = _multiples(QUARTER_NS, after_ns, until_ns)
         for group in self._groups:
             block = _block_of(group, came, quarters)
             if block is not None:
                 for run in group.runs:
-                    run.run(block, found)
+                    run.run(block.without(self._tables.stalls, run.window_ns), found)
         found.sort(key=_order)
         return self.states.advance(found, until_ns, self._view)
+
+    def _stalled(self, stall: tuple[int, int], until_ns: int) -> list[Finding]:
+        """Evaluate nothing while the recorder was held up: all stays as it was found before.
+
+        What rows say that came meanwhile is evaluated at the first instant after it.
+        """
+        from_ns, over_ns = stall
+        if over_ns > self._put_off_ns:
+            self.states.hold_up(max(from_ns, self._put_off_ns), over_ns)
+            self._put_off_ns = over_ns
+        self._view.begin_block()
+        return self.states.advance((), until_ns, self._view)
 
     def statuses(self) -> list[Status]:
         """Return the newest status of every mode and component."""
@@ -121,6 +150,8 @@ class Engine:
             "version": 1,
             "until_ns": self._until_ns,
             "began_ns": self._began_ns,
+            "stalls": self._tables.stalls.snapshot(),
+            "put_off_ns": self._put_off_ns,
             "tables": tables,
             "runs": runs,
             "states": self.states.snapshot(),
@@ -133,6 +164,9 @@ class Engine:
         """
         self._until_ns = self._forgot_ns = int(snapshot["until_ns"])
         self._listen_since(snapshot["began_ns"])
+        self._put_off_ns = int(snapshot.get("put_off_ns", 0))
+        for stall in snapshot.get("stalls", ()):
+            self._tables.stalls.add(*stall)
         for table in self._tables:
             if table.item in snapshot["tables"]:
                 table.resume(snapshot["tables"][table.item])
@@ -166,14 +200,18 @@ def _order(found: Found) -> tuple[int, int]:
     return found.at_ns, found.output
 
 
-def _ticks(table: Table, until_ns: int) -> IntArray:
-    """Return the instants up to one at which rows of an item have come since the one before."""
+def _ticks(table: Table, after_ns: int, until_ns: int) -> IntArray:
+    """Return the instants up to one at which rows of an item have come since the one before.
+
+    Rows that no instant was evaluated for, as the recorder was held up, count for the first.
+    """
     if not table.fresh:
         return _NONE
     times = table.fresh[0] if len(table.fresh) == 1 else np.concatenate(table.fresh)
     taken = int(times.searchsorted(until_ns, "right"))
     table.fresh = [times[taken:]] if taken < len(times) else []
-    return _distinct(-(-times[:taken] // TICK_NS) * TICK_NS)
+    ticks = -(-times[:taken] // TICK_NS) * TICK_NS
+    return _distinct(np.maximum(ticks, after_ns // TICK_NS * TICK_NS + TICK_NS))
 
 
 def _distinct(sorted_ns: IntArray) -> IntArray:

@@ -15,6 +15,7 @@ import numpy as np
 
 from amberbox.core.clock import NS
 from amberbox.core.mode import FALSE, HOLD, TRUE, UNKNOWN, Input, shortest_window_s
+from amberbox.core.stalls import Stalls
 from amberbox.core.types import IntArray, Output
 from amberbox.monitoring.engine import freshness
 from amberbox.monitoring.engine.findings import Found, What
@@ -56,6 +57,13 @@ class Block:
         self.is_quarter = instants % QUARTER_NS == 0
         self.codes: dict[tuple[int, float | None], Any] = {}
         self.few = len(self.times) <= _FEW
+
+    def without(self, stalls: Stalls, window_ns: int) -> Block:
+        """Return the block without instants whose window holds a stall of the recorder."""
+        if not window_ns or not len(stalls):
+            return self
+        keep = ~stalls.spoils(self.instants, window_ns)
+        return self if keep.all() else Block(self.instants[keep], self.has_rows[keep])
 
     def flow_codes(self, entry: Input, stale_s: float | None) -> Any:
         """Return the freshness of an input's item, computed once for all that ask."""
@@ -120,6 +128,11 @@ class MappingRun:
         self._timed = timed(mode.config) if timed else getattr(module, "TIMED", False)
         self._is_short = 0 < shortest_window_s(module, mode.config) < SHORT_S
         self._sees_silence = getattr(module, "SEES_SILENCE", False)
+        history = getattr(module, "history_s", None)
+        self.window_ns = 0
+        """How far back it looks at values; silence and rates know themselves of stalls."""
+        if history is not None and not self._sees_silence:
+            self.window_ns = round(float(history(mode.config)) * NS)
         self._config, self._stale_s = mode.config, mode.stale_s
         results = [*getattr(module, "RESULTS", ()), *(output.plan.result for output in outputs)]
         self._bools = {result.name for result in results if result.type == "bool"}
@@ -149,7 +162,7 @@ class MappingRun:
 
     def run(self, block: Block, found: list[Found]) -> None:
         """Evaluate a block; a function that raises is not called again, its outputs are unknown."""
-        if self.crashed:
+        if self.crashed or not block.times:
             return
         codes = self._codes(block)
         if self._columns and not block.few:

@@ -91,6 +91,13 @@ class OutputState:
         elif what == "ok" and self._fault is not False:
             self.due_ns = at_ns if self._fault is None else _tick(at_ns + self._heal_ns)
 
+    def hold_up(self, from_ns: int, to_ns: int) -> bool:
+        """Put off when what is found will count, by a stretch that is not known; tell whether."""
+        if self.due_ns is None or self.due_ns <= from_ns:
+            return False
+        self.due_ns = _tick(self.due_ns + to_ns - from_ns)
+        return True
+
     def settle(self, now_ns: int) -> None:
         """Let what is found count if it is time, and tell whether it flaps."""
         if self.due_ns is not None and now_ns >= self.due_ns:

@@ -155,6 +155,12 @@ class States:
         self._done_ns = max(self._done_ns, until_ns)
         return findings
 
+    def hold_up(self, from_ns: int, to_ns: int) -> None:
+        """Put off what lasts until a time: while the recorder was held up nothing is known."""
+        for number, output in enumerate(self._outputs):
+            if output.hold_up(from_ns, to_ns):
+                self._await(number, output)
+
     def _next_ns(self) -> int:
         """Return when something happens next by itself, no earlier than what is done."""
         next_ns = self._timers[0][0] if self._timers else NEVER_NS

@@ -16,6 +16,7 @@ from amberbox.core.flow import NONE_OPEN, Flow
 from amberbox.core.mode import Input
 from amberbox.core.names import identifier
 from amberbox.core.samples import Samples
+from amberbox.core.stalls import Stalls
 from amberbox.core.types import Batch, IntArray, ItemSchema, Ragged
 from amberbox.monitoring.engine.keeping import as_json, of_json
 from amberbox.monitoring.engine.lists import FIGURES, figures_of
@@ -212,6 +213,8 @@ class Tables:
     def __init__(self) -> None:
         self._tables: dict[str, Table] = {}
         self._families: dict[str, list[Table]] = {}
+        self.stalls = Stalls()
+        """When the recorder was held up."""
 
     @property
     def items(self) -> frozenset[str]:
@@ -225,6 +228,7 @@ class Tables:
     def input(self, plan: InputPlan, history_s: float, parts: bool) -> Input:
         """Return what a mode reads, which grows as rows come."""
         table = self._tables.setdefault(plan.item, Table(plan.item))
+        table.flow.stalls = self.stalls
         table.keep_ns = max(table.keep_ns, round((history_s + 1.0) * NS))
         return _INPUT[plan.kind](plan, table, parts)
 
@@ -250,7 +254,16 @@ class Tables:
             if table.item != batch.item:
                 table.feed_rows(batch, rows)
 
+    def _take_stalls(self, batch: Batch) -> None:
+        names = ("stalled_from_ns", "stalled_to_ns")
+        if all(name in batch.columns for name in names):
+            columns = (_objects(batch.columns[name]) for name in names)
+            for from_ns, to_ns in zip(*columns, strict=True):
+                if from_ns is not None and to_ns is not None:
+                    self.stalls.add(int(from_ns), int(to_ns))
+
     def _take_counters(self, batch: Batch) -> None:
+        self._take_stalls(batch)
         rows = batch.children.get("items")
         if rows is None:
             return

@@ -16,6 +16,7 @@ from amberbox.blackbox.store import Store, is_locked
 from amberbox.core.clock import NS
 from amberbox.core.types import Status
 from amberbox.monitoring.engine.findings import AlarmChange
+from amberbox.monitoring.messages.pulse import Monitoring, monitoring_of
 from amberbox.monitoring.messages.records import alarm_of, status_of
 
 WRITER = "watch"
@@ -28,12 +29,16 @@ _LOOKBACK_S = 4.0
 
 @dataclass(frozen=True, slots=True)
 class Board:
-    """The newest of each status and alarm; ``silence`` says why nothing is known, if so."""
+    """The newest of each status and alarm; ``silence`` says why nothing is known, if so.
+
+    ``monitoring`` is how the watcher is doing; None where nobody can tell.
+    """
 
     statuses: Sequence[Status] = ()
     alarms: Sequence[AlarmChange] = ()
     measured_ns: int = 0
     silence: str = ""
+    monitoring: Monitoring | None = None
 
     @property
     def robot(self) -> str:
@@ -50,6 +55,13 @@ class Board:
         return [s for s in self.statuses if s.mode and s.component == component]
 
 
+def works(status: Status) -> bool:
+    """Tell whether a component can be built on: one without a monitor if all that it needs can."""
+    if status.state == "not_monitored":
+        return not status.blocked_by
+    return status.level in ("ok", "warn") and status.state != "not_initialised"
+
+
 class BoardReader:
     """Reads the board of a store, again and again if need be; only what is new is read."""
 
@@ -62,23 +74,24 @@ class BoardReader:
         """Return what is known at a time of the wall clock."""
         written = newest_records(self._store, WRITER, {reserved.STATUS}, _LOOKBACK_S)
         alarms = self._standing_alarms()
+        monitoring = monitoring_of(self._store)
         if not written:
-            return Board((), alarms, 0, self._silence("yet"))
-        newest = _newest([status_of(record.values) for record in written])
-        measured_ns = max(status.measured_ns for status in newest)
-        silence = self._judge(newest, measured_ns, written[-1].wall_ns, now_ns)
+            return Board((), alarms, 0, self._silence("yet"), monitoring)
+        statuses = [status_of(record.values) for record in written]
+        silence = self._judge(statuses[-1], written[-1].wall_ns, now_ns, monitoring)
+        newest = _newest(statuses)
         known = [_unknown(status, silence) for status in newest] if silence else newest
-        return Board(known, alarms, measured_ns, silence)
+        return Board(known, alarms, statuses[-1].measured_ns, silence, monitoring)
 
-    def _judge(
-        self, newest: Sequence[Status], measured_ns: int, written_ns: int, now_ns: int
-    ) -> str:
+    def _judge(self, last: Status, written_ns: int, now_ns: int, monitoring: Monitoring) -> str:
         if written_ns > now_ns + SILENT_NS:
             return "the watcher's last word is from the future: was a clock set?"
+        if monitoring.state == "overloaded":
+            return overloaded(monitoring.delay_s)
         if now_ns - written_ns > SILENT_NS:
             return self._silence(f"for {duration(now_ns - written_ns)}")
-        late_ns = written_ns - measured_ns
-        if late_ns > SILENT_NS and not any(status.live_only for status in newest):
+        late_ns = written_ns - last.measured_ns
+        if late_ns > SILENT_NS and not last.live_only:
             return f"the watcher is {duration(late_ns)} behind"
         return ""
 
@@ -96,10 +109,17 @@ class BoardReader:
         return list(self._alarms.values())
 
 
+def overloaded(delay_s: float) -> str:
+    """Say that monitoring is late, and how much."""
+    return f"monitoring overloaded: the watcher is {duration(round(delay_s * NS))} behind"
+
+
 def _newest(statuses: Sequence[Status]) -> list[Status]:
     """Return the newest status of each mode and component that is still watched.
 
-    Their order is that of the last whole second, when all are said in the plan's order.
+    Their order is that of the last whole second, when all are said in the plan's order. What was
+    written last counts as the newest: a watcher that was held up says of the present that nothing
+    is known, then goes on with the past.
     """
     last: dict[tuple[str, str], Status] = {}
     for status in statuses:
@@ -107,7 +127,7 @@ def _newest(statuses: Sequence[Status]) -> list[Status]:
         if status.measured_ns % NS == 0:
             last.pop(key, None)
         last[key] = status
-    start_ns = max(status.measured_ns for status in statuses) - _ROUND_NS
+    start_ns = statuses[-1].measured_ns - _ROUND_NS
     return [status for status in last.values() if status.measured_ns >= start_ns]
 
 

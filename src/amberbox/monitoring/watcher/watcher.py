@@ -26,12 +26,14 @@ from amberbox.core.types import Status
 from amberbox.monitoring.engine.engine import Engine
 from amberbox.monitoring.engine.findings import Finding
 from amberbox.monitoring.messages.publisher import Publisher
+from amberbox.monitoring.messages.watched import write_watched
 from amberbox.monitoring.plan import Plan
 from amberbox.monitoring.probing.runner import ProbeRunner
 from amberbox.monitoring.watcher import commands
 from amberbox.monitoring.watcher.diagnosing import Diagnosing, MakeDiagnoser
 from amberbox.monitoring.watcher.evaluation import Evaluation
 from amberbox.monitoring.watcher.guard import guarded
+from amberbox.monitoring.watcher.lateness import Lateness
 from amberbox.monitoring.watcher.memory import Checkpoint, Memory, Place, recall
 from amberbox.monitoring.watcher.reader import Reader
 from amberbox.monitoring.watcher.silence import Silence, silent, unknown
@@ -103,6 +105,7 @@ class Watcher:
         probes = [order.item for order in own_probes(watch)]
         self._reader = Reader(watch.store, self._engine.items, probes, self._start)
         self._silence = Silence(watch.clock_s)
+        self._lateness = Lateness(watch.store, watch.clock)
         self._is_sound = True
         """Everything that was evaluated is written down."""
         self._silent: list[Status] = []
@@ -121,6 +124,9 @@ class Watcher:
         self._stop = stop
         runner = self._probes()
         self._publisher.open()
+        if self._watch.folder is not None:
+            write_watched(self._watch.store, self._watch.folder)
+        self._lateness.start()
         try:
             if runner is not None:
                 runner.start()
@@ -132,6 +138,7 @@ class Watcher:
                     stop.wait(POLL_S)
         finally:
             self._notifier.stopping()
+            self._lateness.close()
             if runner is not None:
                 runner.close()
             self.close()
@@ -142,6 +149,8 @@ class Watcher:
         Raises OSError when the disk does not take it; the next watcher goes on before that.
         """
         self._is_sound = False
+        self._lateness.began()
+        self._silence.looked()
         self._write_measured()
         for block in self._reader.step():
             self._silence.heard()
@@ -151,6 +160,7 @@ class Watcher:
             if self._stop.is_set():  # amid much that is behind: the next one goes on from here
                 return
         self._settle()
+        self._tell_lateness(self._lateness.ended())
         self._carry_out_requests()
         self._say_silence()
         if self._publisher.is_due():
@@ -221,6 +231,16 @@ class Watcher:
             self._journal.found(changes, ())
             self._tell(changes)
 
+    def _tell_lateness(self, late_s: float | None) -> None:
+        """Write that monitoring has become overloaded, or is no more."""
+        if late_s is None or self._evaluation.place is None:
+            return
+        if late_s:
+            text = f"monitoring overloaded: what was recorded was evaluated {late_s:.1f} s late"
+            self._journal.told("monitoring_overloaded", text)
+        else:
+            self._journal.told("monitoring_recovered", "monitoring is up to date again")
+
     def _known_now(self) -> Sequence[Status]:
         """Return the statuses as of now: old ones, while it catches up, are not how things are."""
         if self._silent:
@@ -238,6 +258,8 @@ class Watcher:
     def _told(self) -> str:
         """Say in one line what is being watched, for whoever looks after this process."""
         behind = "; catching up with the record" if self._evaluation.is_behind else ""
+        if self._lateness.is_overloaded:
+            behind += f"; overloaded, {self._lateness.delay_s():.0f} s late"
         return f"{len(self._watch.plan.components)} components{behind}"
 
     def _first(self, place: Place) -> Progress:

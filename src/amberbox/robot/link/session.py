@@ -28,6 +28,7 @@ from amberbox.link.frames import (
 )
 from amberbox.link.positions import START, Place, Reach
 from amberbox.link.robotend import RobotEnd
+from amberbox.monitoring.messages.pulse import monitoring_of
 from amberbox.robot.link.dialing import Line, LinkDownError
 from amberbox.robot.link.network import Allowed, allowed
 from amberbox.robot.link.reaching import Reaches
@@ -234,7 +235,7 @@ class Session:
         return Beat(
             self._end.epoch, client.clock.wall_ns(), client.clock.boot_ns(),
             client.progress.backlog, offset.offset_ns, offset.round_ns,
-            client.progress.backlog_bytes,
+            client.progress.backlog_bytes, *monitoring_of(client.store, client.clock),
         )  # fmt: skip
 
     async def _look_at_network(self) -> None:
