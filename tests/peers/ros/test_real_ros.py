@@ -107,7 +107,8 @@ def test_definitions_come_from_the_wire(ros: Ros) -> None:
     with box(ros, sink):
         robot = ros.robot("--wait-for", "1", "--map-after", "0.1", "--duration", "0.3")
         assert robot.wait(PATIENCE_S) == 0
-    types = read_truth(ros.truths()[0])[0]["types"]
+    entries = read_truth(ros.truths()[0])
+    types = next(entry["types"] for entry in entries if entry["k"] == "start")
     schemas = {topic.name: topic.schema for topic in sink.topics}
     for topic, (name, md5sum) in types.items():
         schema = schemas[topic]

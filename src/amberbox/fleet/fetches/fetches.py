@@ -29,10 +29,10 @@ _LOOK_S = 60.0
 
 @dataclass(frozen=True, slots=True)
 class _Idle:
-    """Since when (ns since boot) a connected robot has sent nothing, and what it had sent."""
+    """Since when (ns since boot) nothing of a connected robot came, nor was asked; what is held."""
 
     since_ns: int
-    held: tuple[int, int]
+    held: tuple[int, int, int]
 
 
 class Fetches:
@@ -93,7 +93,7 @@ class Fetches:
         """See to all robots: something may have been missed while nobody listened."""
         for robot in await asyncio.to_thread(self._robots):
             await asyncio.to_thread(self._arrived, robot)
-            if self._is_idle(robot):
+            if await asyncio.to_thread(self._is_idle, robot):
                 await asyncio.to_thread(self._give_up, robot)
             await self._send(robot)
 
@@ -109,12 +109,14 @@ class Fetches:
             return False
         return now_ns - known.since_ns >= ledger.IDLE_NS
 
-    def _held(self, robot: str) -> tuple[int, int]:
-        """Return how many files have come of a robot, and bytes of those that are coming."""
+    def _held(self, robot: str) -> tuple[int, int, int]:
+        """Count windows that are open, files that have come, and bytes of those that are coming."""
         with self._database.reading() as connection:
             chosen = select(func.count()).select_from(UPLOAD).where(UPLOAD.c.robot == robot)
             count = connection.scalar(chosen) or 0
-        return count, sum(path.stat().st_size for path in pieces.parts(self._folder, robot))
+            open_ones = len(ledger.waiting(connection, robot))
+        coming = sum(path.stat().st_size for path in pieces.parts(self._folder, robot))
+        return open_ones, count, coming
 
     def _give_up(self, robot: str) -> None:
         """Wait no longer for windows that the robot has answered long ago."""
