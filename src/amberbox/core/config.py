@@ -250,7 +250,7 @@ def _union(ctx: _Context, kind: Any, node: Node, where: str, marks: _Marks) -> A
     if len(members) == 1:
         return _value(ctx, members[0], node, where, marks)
     names = " or ".join(type_text(member) for member in members)
-    alike: list[list[Problem]] = []
+    alike: list[Sequence[Problem]] = []
     for member in sorted(members, key=lambda member: not _is_exactly(member, node)):
         attempt = _Context([], ctx.legacy)
         is_word = _shape(member) is str
@@ -264,8 +264,13 @@ def _union(ctx: _Context, kind: Any, node: Node, where: str, marks: _Marks) -> A
             alike.append(attempt.problems)
     if not alike:
         return ctx.fail(node, where, f"expected {names}, got {marks.show(node)}", marks.doc)
-    ctx.problems.extend(max(alike, key=lambda found: len(found[0].what)))  # it says most
+    ctx.problems.extend(max(alike, key=_said))
     return _FAILED
+
+
+def _said(problems: Sequence[Problem]) -> int:
+    """Return how much problems say, to choose the reading that explains most."""
+    return max((len(problem.what) for problem in problems), default=0)
 
 
 def _shape(kind: Any) -> type:
