@@ -14,7 +14,7 @@ import math
 import re
 import types
 import typing
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin
@@ -250,7 +250,7 @@ def _union(ctx: _Context, kind: Any, node: Node, where: str, marks: _Marks) -> A
     if len(members) == 1:
         return _value(ctx, members[0], node, where, marks)
     names = " or ".join(type_text(member) for member in members)
-    alike: list[Sequence[Problem]] = []
+    alike: list[list[Problem]] = []
     for member in sorted(members, key=lambda member: not _is_exactly(member, node)):
         attempt = _Context([], ctx.legacy)
         is_word = _shape(member) is str
@@ -268,7 +268,7 @@ def _union(ctx: _Context, kind: Any, node: Node, where: str, marks: _Marks) -> A
     return _FAILED
 
 
-def _said(problems: Sequence[Problem]) -> int:
+def _said(problems: Iterable[Problem]) -> int:
     """Return how much problems say, to choose the reading that explains most."""
     return max((len(problem.what) for problem in problems), default=0)
 

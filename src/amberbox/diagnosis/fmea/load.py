@@ -81,18 +81,17 @@ def _of_folder(
 
     One in a circle, which a monitor may judge in the folder, is taken to need nothing.
     """
+    users = {name: component.needs for name, component in components.items()}
+    users |= {name: function.needs for name, function in functions.items()}
     found: dict[str, Component] = {}
-    waiting = [
-        name for of in (*components.values(), *functions.values()) for name in of.needs.names()
-    ]
+    waiting = [name for needs in users.values() for name in needs.names()]
     while waiting:
         name = waiting.pop()
         if name in sheet.folder and name not in found:
             found[name] = Component(name, "", needs=sheet.folder[name])
             waiting += sheet.folder[name].names()
-    users = {name: of.needs for name, of in (*components.items(), *functions.items())}
-    while round_ := _first_circle(users | {name: of.needs for name, of in found.items()}, found):
-        found |= {name: Component(name, "") for name in round_}
+    while circle := _first_circle(users | {name: of.needs for name, of in found.items()}, found):
+        found |= {name: Component(name, "") for name in circle}
     return found
 
 

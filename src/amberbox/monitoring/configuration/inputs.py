@@ -107,11 +107,11 @@ class Inputs:
         name, path = _split(text)
         if found or not path or name in self.recorded.by_name:
             return found
-        item = self._above(name)
-        schema = None if item is None else self._table(item, name)
+        above = self._above(name)
+        schema = None if above is None else self._table(above, name)
         if schema is not None:
             return _of_places(text, _checked(text, name, path, schema))
-        is_there = item is not None or self._is_open(text)
+        is_there = above is not None or self._is_open(text)
         return self._in_open_item(text, name, path) if is_there else []
 
     def _in_item(self, text: str, item: Item, path: str) -> list[InputPlan]:
