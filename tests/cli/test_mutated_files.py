@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import pytest
 import yaml
-from hypothesis import given, settings
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from amberbox.blackbox.folder.blocks import read_blocks
@@ -151,7 +151,9 @@ def _unclear(problem: Problem) -> Iterator[str]:
 def test_a_changed_file_is_accepted_or_refused_with_its_place(
     shipped: Mapping[str, list[Shipped]], kind: str
 ) -> None:
-    @settings(max_examples=examples(30), deadline=None)
+    @settings(
+        max_examples=examples(30), deadline=None, suppress_health_check=[HealthCheck.too_slow]
+    )
     @given(st.data())
     def run(data: st.DataObject) -> None:
         entry = data.draw(st.sampled_from(shipped[kind]))

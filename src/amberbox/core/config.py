@@ -14,7 +14,7 @@ import math
 import re
 import types
 import typing
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin
@@ -264,8 +264,13 @@ def _union(ctx: _Context, kind: Any, node: Node, where: str, marks: _Marks) -> A
             alike.append(attempt.problems)
     if not alike:
         return ctx.fail(node, where, f"expected {names}, got {marks.show(node)}", marks.doc)
-    ctx.problems.extend(max(alike, key=lambda found: len(found[0].what)))  # it says most
+    ctx.problems.extend(max(alike, key=_said))
     return _FAILED
+
+
+def _said(problems: Iterable[Problem]) -> int:
+    """Return how much problems say, to choose the reading that explains most."""
+    return max((len(problem.what) for problem in problems), default=0)
 
 
 def _shape(kind: Any) -> type:

@@ -371,3 +371,11 @@ def test_without_the_folder_its_components_are_not_known() -> None:
     assert ("carry.needs", "there is no component or function 'tray'") in [
         (p.where, p.what) for p in problems
     ]
+
+
+def test_a_circle_in_the_folder_alone_is_no_error() -> None:
+    needs = {**FOLDER.needs, "feeder": all_of("tray"), "hook": all_of("tray", "host")}
+    text = TEXT.replace("needs: [see, hook]", "needs: [see, hook, tray]")
+    fmea, problems = read_fmea(text, replace(FOLDER, needs=needs))
+    assert fmea is not None, problems
+    assert "hook" in lost(fmea, ["host#off"])

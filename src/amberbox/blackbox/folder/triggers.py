@@ -47,15 +47,15 @@ class TriggerOptions:
             yield "name", f"'{self.name}' is no id; '{derive_id(self.name)}' would be one"
         given = [kind for kind in _KINDS if getattr(self, kind)]
         if len(given) != 1:
-            what = " and ".join(given) if given else "none"
-            yield "name", f"one of when, event and silence is needed, {what} is given"
+            named = " and ".join(given) if given else "none"
+            yield "name", f"one of when, event and silence is needed, {named} is given"
         for key in ("before", "after", "hold_off"):
             if getattr(self, key) < 0:
                 yield key, "must not be below 0"
         if self.when and (problem := expression_problem(self.when, with_monitors=True)):
             yield "when", problem.what, problem.hint
-        if self.silence and (problem := _silence_problem(self.silence)):
-            yield "silence", problem
+        if self.silence and (what := _silence_problem(self.silence)):
+            yield "silence", what
 
     def items(self) -> tuple[str, ...]:
         """Name the items it looks at, as far as it can be read."""

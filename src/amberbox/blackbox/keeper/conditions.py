@@ -59,9 +59,9 @@ class Edge:
 
 
 class Conditions:
-    """Watches named conditions over ``item.variable``, and over what the watcher writes:
-    ``component/mode/output`` and ``status(component)``.
+    """Watches named conditions over what is recorded and what monitors say.
 
+    Addresses are ``item.variable``, ``component/mode/output`` and ``status(component)``.
     Times are those of the batches unless others are given; they must not decrease per item.
     While it is unknown whether a condition is true, it counts as it was known last.
     What a condition cannot be judged by (a text where a number was expected) is told in
@@ -275,11 +275,12 @@ def _outputs(rows: Batch, name: str) -> dict[int, Value]:
 
 def _output(columns: Mapping[str, Any], row: int) -> Value:
     kind, value = columns["type"][row], columns["value"][row]
+    is_missing = value is None or value is np.ma.masked
     if kind == "string":
         return str(columns["text"][row])
-    if kind == "float" and value is np.ma.masked:
+    if kind == "float" and is_missing:
         return float(columns["text"][row])  # NaN and infinities, for which JSON has no number
-    if value is np.ma.masked or kind == "null":
+    if kind == "null" or is_missing:
         return None
     return bool(value) if kind == "bool" else int(value) if kind == "int" else float(value)
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from amberbox.core.config import parse_yaml
 from amberbox.core.errors import Problem
+from amberbox.core.needs import Needs, cycles
 from amberbox.core.nodes import Node, load_yaml
 from amberbox.diagnosis.fmea.checking import check
 from amberbox.diagnosis.fmea.entries import Scope, component_of, function_of, mode_of
@@ -76,17 +77,28 @@ def _made(root: Node, known: Known | None, problems: list[Problem], folder: Path
 def _of_folder(
     components: Mapping[str, Component], functions: Mapping[str, Function], sheet: Sheet
 ) -> dict[str, Component]:
-    """Return the components without an entry that something needs, directly or not."""
+    """Return the components without an entry that something needs, directly or not.
+
+    One in a circle, which a monitor may judge in the folder, is taken to need nothing.
+    """
+    users = {name: component.needs for name, component in components.items()}
+    users |= {name: function.needs for name, function in functions.items()}
     found: dict[str, Component] = {}
-    waiting = [
-        name for of in (*components.values(), *functions.values()) for name in of.needs.names()
-    ]
+    waiting = [name for needs in users.values() for name in needs.names()]
     while waiting:
         name = waiting.pop()
         if name in sheet.folder and name not in found:
             found[name] = Component(name, "", needs=sheet.folder[name])
             waiting += sheet.folder[name].names()
+    while circle := _first_circle(users | {name: of.needs for name, of in found.items()}, found):
+        found |= {name: Component(name, "") for name in circle}
     return found
+
+
+def _first_circle(needs: Mapping[str, Needs], among: Mapping[str, Component]) -> list[str]:
+    """Return which of some components lie on a circle of needs; none if there is no such circle."""
+    parts = ([name for name in circle if name in among] for circle in cycles(needs))
+    return next(filter(None, parts), [])
 
 
 def _symptoms(sheet: Sheet, known: Known | None, problems: list[Problem]) -> Symptoms:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from types import ModuleType
-from typing import Any, NamedTuple
+from typing import Any
 
 from amberbox.core.config import did_you_mean
 from amberbox.core.errors import AmberboxError
@@ -26,13 +26,6 @@ from amberbox.monitoring.plan import InputPlan
 OWN_ITEMS = ("amberbox_",)
 """Items that the box writes by itself, and no block names."""
 _SHORT_MOST = 6
-
-
-class Table(NamedTuple):
-    """A child table: the item that it lies below, and its variables, None if nothing tells them."""
-
-    item: str
-    schema: ItemSchema | None
 
 
 class InputError(Exception):
@@ -72,27 +65,32 @@ class Inputs:
         found = [i for i in self.recorded.items if i.name == text or i.topic.strip("/") == plain]
         if found or not has_item_form(text):
             return [InputPlan(text, "item", item.name) for item in found]
-        is_table = self._table(text) is not None
-        return [InputPlan(text, "item", text)] if is_table or self._is_open(text) else []
+        item = self._above(text)
+        if item is not None:
+            self._table(item, text)
+        is_there = item is not None or self._is_open(text)
+        return [InputPlan(text, "item", text)] if is_there else []
 
-    def _table(self, name: str) -> Table | None:
-        """Return a child table ``ITEM__PATH`` of an item that is configured; None if it is none.
+    def _above(self, name: str) -> Item | None:
+        """Return the configured item that ``ITEM__PATH`` is a child table of, if it is one's."""
+        items = [item for item in self.recorded.items if name.startswith(f"{item.name}__")]
+        is_table = has_item_form(name) and name not in self.recorded.by_name
+        return max(items, key=lambda item: len(item.name), default=None) if is_table else None
+
+    def _table(self, item: Item, name: str) -> ItemSchema | None:
+        """Return the variables of a child table; None where nothing tells them before.
 
         Raises InputError where the item's variables are known, and this is none of its tables.
         """
-        items = [item for item in self.recorded.items if name.startswith(f"{item.name}__")]
-        if not items or name in self.recorded.by_name:
-            return None
-        item = max(items, key=lambda item: len(item.name))
         schema = self.recorded.schema(item)
         if schema is None:
             self.unknown_items.add(item.name)
-            return Table(item.name, None)
+            return None
         tables = tables_of(item.name, schema)
         if name not in tables:
             near = did_you_mean(name, tables) or _some(list(tables), "no tables")
             raise InputError(f"{item.name} has no table '{name}'{near}")
-        return Table(item.name, tables[name])
+        return tables[name]
 
     def _is_open(self, text: str) -> bool:
         """Tell whether a name may be an item that no block names."""
@@ -109,11 +107,12 @@ class Inputs:
         name, path = _split(text)
         if found or not path or name in self.recorded.by_name:
             return found
-        table = self._table(name) if has_item_form(name) else None
-        if table is not None and table.schema is not None:
-            return _of_places(text, _checked(text, name, path, table.schema))
-        is_open = table is not None or self._is_open(text)
-        return self._in_open_item(text, name, path) if is_open else []
+        above = self._above(name)
+        schema = None if above is None else self._table(above, name)
+        if schema is not None:
+            return _of_places(text, _checked(text, name, path, schema))
+        is_there = above is not None or self._is_open(text)
+        return self._in_open_item(text, name, path) if is_there else []
 
     def _in_item(self, text: str, item: Item, path: str) -> list[InputPlan]:
         schema = self.recorded.schema(item)
