@@ -52,16 +52,16 @@ class Life:
     unalarmed: bool
 
 
-def row_of(faults: Sequence[str], seed: int = SEED) -> Mission:
+def row_of(faults: Sequence[str], lasts_s: float = LASTS_S, after_s: float = AFTER_S) -> Mission:
     """Return a mission in which faults come one after the other, each repaired before the next."""
     planted = []
     at_s = FIRST_S
     for name in faults:
         fault = catalogue()[name]
-        planted.append(Planted(fault, fault.magnitude.default, at_s, at_s + LASTS_S))
-        at_s += LASTS_S + PAUSE_S
+        planted.append(Planted(fault, fault.magnitude.default, at_s, at_s + lasts_s))
+        at_s += lasts_s + PAUSE_S
     scenario = next((p.fault.scenario for p in planted), "transport")
-    return Mission(seed, scenario, scenario == "transport", tuple(planted), at_s + AFTER_S)
+    return Mission(SEED, scenario, scenario == "transport", tuple(planted), at_s + after_s)
 
 
 def pairs(seed: int = SEED) -> Iterator[tuple[str, str]]:

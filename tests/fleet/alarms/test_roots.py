@@ -277,3 +277,47 @@ def test_times_are_those_of_the_server(home: Stand) -> None:
     home.send("r1", rows)
     home.alarms.step()
     assert (home.only().opened_ns, home.only().late) == (home.clock.wall_ns(), False)
+
+
+def test_the_part_that_is_named_is_the_one_whose_reason_is_given(home: Stand) -> None:
+    home.say("r1", alarm(home, "laser", reason="new_scans is false"))
+    home.say("r1", alarm(home, "log", reason="errors is 3"))
+    home.say(
+        "r1", diagnosis(home, "laser#silent"), explained(home, "laser"), explained(home, "log")
+    )
+    assert home.only().origin == "laser"
+    home.say("r1", alarm(home, "log", reason="errors is 3"))
+    home.say("r1", alarm(home, "laser", "healed", reason="new_scans is false"))
+    one = home.only()
+    assert (one.origin, one.reason, one.active) == ("log", "errors is 3", True)
+
+
+def test_alarms_of_which_the_robot_names_different_causes_stay_two(home: Stand) -> None:
+    home.say(
+        "r1", diagnosis(home, "laser#silent"), explained(home, "laser", "laser#silent"),
+        explained(home, "log", "log#full"),
+    )  # fmt: skip
+    assert [(one.origin, one.cause) for one in home.found()] == [
+        ("laser", "laser#silent"), ("log", "log#full"),
+    ]  # fmt: skip
+
+
+def test_the_second_of_two_faults_is_not_the_alarm_of_the_first(home: Stand) -> None:
+    follows = alarm(home, "log", "healed", reason="follows from laser")
+    home.say("r1", alarm(home, "laser"), alarm(home, "log"), follows)
+    home.say("r1", alarm(home, "laser", "healed"))
+    home.wait(20)  # repaired, and not over yet
+    home.say("r1", alarm(home, "log", source="log-2"))
+    home.say("r1", alarm(home, "motor", cause="motor#weak", diagnosis="d1"))
+    home.say("r1", alarm(home, "log", "healed", source="log-2", reason="follows from motor"))
+    told = [(one.origin, one.active) for one in home.found() if one.merged_into is None]
+    assert sorted(told) == [("laser", False), ("motor", True)]
+
+
+def test_what_belongs_to_an_alarm_is_listed_while_it_fails(home: Stand) -> None:
+    home.say("r1", alarm(home, "laser"), alarm(home, "log"), blocked(home, "log"))
+    home.say("r1", alarm(home, "log", "healed", reason="follows from laser"))
+    number = home.only().number
+    assert home.suffering(number) == {"log": True}
+    home.say("r1", blocked(home, "log", level="ok"))
+    assert home.suffering(number) == {"log": False}

@@ -98,6 +98,17 @@ def test_a_warning_raises_nothing() -> None:
     assert told(causes, worn, until_s=100) == []
 
 
+def test_a_guess_raises_nothing() -> None:
+    weak = answer(["motor#weak"], ["motor/push/pushes"], at_ns=10 * NS)
+    guess = replace(weak, groups=(AmbiguityGroup(("motor#weak",), 0.4),))
+    causes = causes_of()
+    assert told(causes, guess, until_s=60) == []
+    assert told(causes, replace(weak, revision=2, at_ns=61 * NS), until_s=70) != []
+    assert told(causes, replace(guess, revision=3, at_ns=71 * NS), until_s=90) == [
+        ("motor", "open", "motor#weak (possible)")
+    ], "what has been raised stays"
+
+
 def test_one_of_several_keeps_its_alarm_when_it_becomes_sure() -> None:
     causes = causes_of()
     one, other = (Hypothesis(name, frozenset([name]), 0.45, ("battery.warm",))

@@ -69,7 +69,16 @@ def show_consequences(register: Register, robot: str) -> None:
         for part in parts:
             if part.component not in own and part.active:
                 found[part.component] = (part.level, part.reason, part.opened_ns)
+            elif part.component not in own and alarm.active and _still_fails(part, blocked):
+                row = blocked[part.component]
+                found[part.component] = (row["level"], row["reason"], row["since_ns"])
         _keep(register, alarm, found, blocked)
+
+
+def _still_fails(part: Part, blocked: Mapping[str, Any]) -> bool:
+    """Tell whether a component fails whose alarm has become part of another."""
+    row = blocked.get(part.component)
+    return row is not None and row["level"] in ("warn", "stale", "error")
 
 
 def _below(roots: set[str], blocked: Mapping[str, Any]) -> dict[str, tuple[str, str, int]]:

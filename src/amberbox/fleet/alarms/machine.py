@@ -28,10 +28,10 @@ class AlarmStateError(UsageError):
 
 def judged(alarm: Alarm, parts: Sequence[Part], now_ns: int, settings: AlarmSettings) -> Step:
     """Bring an alarm of a robot up to what its parts say."""
-    root = [part for part in parts if part.component == alarm.origin] or list(parts)
     lasting = [part for part in parts if part.active]
-    speaking = root if any(part.active for part in root) else lasting or root
-    latest = max(speaking, key=lambda part: (part.active, part.changed_ns))
+    alarm = _about_what_lasts(alarm, parts, lasting)
+    root = [part for part in parts if part.component == alarm.origin] or list(parts)
+    latest = max(root, key=lambda part: (part.active, part.changed_ns))
     named = next((part for part in [latest, *lasting] if part.diagnosis), None)
     count = max(1, sum(part.count for part in root))
     came_back = count > alarm.count or (bool(lasting) and not alarm.active)
@@ -51,6 +51,17 @@ def judged(alarm: Alarm, parts: Sequence[Part], now_ns: int, settings: AlarmSett
         changed = replace(changed, revision=changed.revision + 1)
     worse, more = worsened(changed, changed.effect or heard, now_ns, settings)
     return worse, [*entries, *more]
+
+
+def _about_what_lasts(alarm: Alarm, parts: Sequence[Part], lasting: Sequence[Part]) -> Alarm:
+    """Make an alarm about the first part that lasts if what it was about is over.
+
+    What it names and the reason that it gives are of one component.
+    """
+    is_over = any(part.component == alarm.origin for part in parts) and not any(
+        part.component == alarm.origin for part in lasting
+    )
+    return replace(alarm, origin=lasting[0].component) if is_over and lasting else alarm
 
 
 def revised(alarm: Alarm, revision: int) -> Alarm:

@@ -102,13 +102,16 @@ def _housed(
 
 
 def _unresolved(register: Register, part: Part, settings: AlarmSettings) -> Alarm | None:
-    """Return the alarm that has this component already; one that had been over is resolved."""
+    """Return the alarm that has this component already; one that had been over is resolved.
+
+    An alarm about another component has it only while it lasts: what comes later is another fault.
+    """
     for other in register.of_component(part.robot, part.component):
         alarm = register.alarm(other.alarm)
         if alarm is None:
             continue
         kept = register.keep(alarm, machine.settled(alarm, part.opened_ns, settings))
-        if kept.state != "resolved":
+        if kept.state != "resolved" and (kept.active or kept.origin == part.component):
             return kept
     return None
 
@@ -150,13 +153,23 @@ def _follow(
 ) -> None:
     """Fold an alarm into that of the component which turned out to be to blame."""
     root = root_of(register, part.robot, origin)
-    if root is not None and root.alarm != part.alarm:
+    if root is not None and root.alarm != part.alarm and _is_other(register, part):
+        register.keep_part(replace(part, alarm=root.alarm))
+        _judge(register, root.alarm, now_ns, settings, late=False)
+    elif root is not None and root.alarm != part.alarm:
         _merge(register, sorted((root.alarm, part.alarm)), root.component, now_ns, settings)
     elif root is not None:
         alarm = register.alarm(part.alarm)
         if alarm is not None and alarm.origin == part.component:
             register.keep(alarm, (replace(alarm, origin=root.component), []))
             _judge(register, part.alarm, now_ns, settings, late=alarm.late)
+
+
+def _is_other(register: Register, part: Part) -> bool:
+    """Tell whether a part belongs to an alarm that is about another component."""
+    alarm = register.alarm(part.alarm)
+    others = [one.component for one in register.parts(part.alarm) if one.source != part.source]
+    return alarm is not None and alarm.origin != part.component and alarm.origin in others
 
 
 def _merge(
@@ -237,6 +250,8 @@ def _join(
         return
     names = json.loads(roots["components"])
     parts = [part for part in register.lasting(robot) if part.diagnosis == diagnosis]
+    if len({part.cause for part in parts}) > 1:  # the robot tells their causes apart
+        return
     numbers = sorted({part.alarm for part in parts})
     if not names or len(numbers) < 2:
         return

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+import re
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any, Final, Literal, TypeAlias
 
 import msgspec
@@ -17,14 +18,20 @@ CauseKind: TypeAlias = Literal["fault", "false_alarm", "other"]
 _MOST: Final = 20
 """Causes, and names of failure modes, that are kept."""
 _LONG: Final = 500
+_FAULT: Final = re.compile(r"[^\s#()]+#[^\s#()]+")
+"""A failure mode, as robots name a cause."""
 
 
 @dataclass(frozen=True, slots=True)
 class LeadingCause:
-    """What may be broken; ``kind`` tells a failure from none, and from one nobody described."""
+    """What may be broken; ``kind`` tells a failure from none, and from one nobody described.
+
+    ``faults`` are the ids of failure modes that are broken together.
+    """
 
     text: str
     kind: CauseKind = "fault"
+    faults: Sequence[str] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,6 +50,21 @@ class Words:
         """Whether it is a described failure, rather than not."""
         described = [cause.kind == "fault" for cause in self.causes]
         return bool(described) and all(described) and self.probability >= LIKELY
+
+    def about(self, cause: str) -> Words:
+        """Return these words as far as they are about what a robot names as an alarm's cause.
+
+        An answer of several faults is about several alarms, each of which names its own.
+        """
+        named = set(_FAULT.findall(cause))
+        causes = [self._part(one, named) for one in self.causes]
+        return replace(self, causes=list({one.text: one for one in causes}.values()))
+
+    def _part(self, one: LeadingCause, named: Collection[str]) -> LeadingCause:
+        ids = [fault for fault in one.faults if fault in named and fault in self.names]
+        if not ids or len(ids) == len(one.faults):
+            return one
+        return LeadingCause(" and ".join(self.names[fault] for fault in ids), one.kind, ids)
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,8 +86,9 @@ def explanation_of(robot: str, answer: Mapping[str, Any]) -> Explanation | None:
     broken, severity = told["broken"], told["use"]["severity"]
     members = broken["members"] if broken else ()
     causes = [
-        LeadingCause(_cut(one["text"]), kind_of([fault["id"] for fault in one["faults"]]))
+        LeadingCause(_cut(one["text"]), kind_of(ids), ids)
         for one in members[:_MOST]
+        for ids in ([fault["id"] for fault in one["faults"]],)
     ]
     groups = [*([broken] if broken else ()), *told["others"]]
     faults = [f for group in groups for one in group["members"] for f in one["faults"]]

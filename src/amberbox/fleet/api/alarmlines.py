@@ -114,6 +114,7 @@ def line_of(alarm: Alarm, robots: list[RowMapping]) -> AlarmLine:
         AlarmRobot(robot=r["robot"], from_=format_time(r["from_ns"]), to=shown(r["to_ns"]))
         for r in robots
     ]
+    words = read(alarm.words)
     end_ns = None if alarm.cleared_ns is None else alarm.cleared_ns + _AROUND_NS
     window = Window(
         robot=alarm.robot or (about[0].robot if about else ""),
@@ -127,7 +128,7 @@ def line_of(alarm: Alarm, robots: list[RowMapping]) -> AlarmLine:
         cleared=shown(alarm.cleared_ns), count=alarm.count, late=alarm.late, owner=alarm.owner,
         acknowledged=_acknowledged(alarm), shelved=_shelved(alarm), resolved=_resolved(alarm),
         merged_into=alarm.merged_into, window=window, revision=alarm.revision,
-        diagnosis_revision=alarm.revised, explained=read(alarm.words),
+        diagnosis_revision=alarm.revised, explained=words.about(alarm.cause) if words else None,
     )  # fmt: skip
 
 

@@ -16,16 +16,21 @@ from amberbox.monitoring.watcher.leading import leading, one_of, share_of
 Share: TypeAlias = tuple[frozenset[str], ...]
 """The faults that an alarm comes from: sets, of which one is meant."""
 URGENT: Final[frozenset[Severity]] = frozenset(SEVERITIES[SEVERITIES.index("urgent") :])
+_POSSIBLE: Final = 0.2
 _ENDS = re.compile(r"[/#.]")
 """What ends a component in the address of an output, in a failure mode, in a symptom's name."""
 
 
 class Cause(NamedTuple):
-    """A leading cause by itself: one of some failure modes, the first of them gives the name."""
+    """A leading cause by itself: one of some failure modes, the first of them gives the name.
+
+    ``is_credible``: it is likely, or possible where the robot must not go on.
+    """
 
     faults: tuple[str, ...]
     severity: Severity
     symptoms: tuple[str, ...]
+    is_credible: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,7 +111,10 @@ class Blame:
         for faults in alternatives:
             severities = [self.facts[fault].severity for fault in faults if fault in self.facts]
             if len(severities) == len(faults) and highest(severities) in URGENT:
-                yield Cause(faults, highest(severities), self._shown_by(faults))
+                severity = highest(severities)
+                least = LIKELY if severity == "urgent" else _POSSIBLE
+                shown = self._shown_by(faults)
+                yield Cause(faults, severity, shown, self.probability >= least)
 
     def _shown_by(self, faults: Sequence[str]) -> tuple[str, ...]:
         shows = frozenset[str]().union(*(self.facts[fault].shows for fault in faults))

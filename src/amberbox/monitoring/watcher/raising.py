@@ -52,7 +52,7 @@ class Raised:
         new = [key for key in causes if key not in standing | self._had | self._due_ns.keys()]
         self._had = (self._had | covered) & causes.keys()
         for key in causes:
-            if key in self._had:
+            if key in self._had or not causes[key].is_credible:
                 self._due_ns.pop(key, None)
             else:  # an alarm whose cause is another now is not given up before that has its own
                 self._due_ns.setdefault(key, now_ns if gone else now_ns + GATHER_NS)
