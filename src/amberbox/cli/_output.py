@@ -8,7 +8,7 @@ import os
 import re
 import shutil
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
@@ -19,6 +19,7 @@ from amberbox.cli._server import remote_record
 from amberbox.client.address import is_url
 from amberbox.core.errors import UsageError
 from amberbox.core.terminal import for_data
+from amberbox.core.timetext import in_order
 from amberbox.fleet.archive.where import archive_in
 
 if TYPE_CHECKING:
@@ -111,6 +112,21 @@ def add_range_only(parser: argparse.ArgumentParser) -> None:
     times = "ISO (UTC), epoch, -10m before the last record, now or now-10m"
     parser.add_argument("--from", dest="from_", metavar="T", help=f"first time: {times}")
     parser.add_argument("--to", metavar="T", help="end of the range, not included")
+
+
+def span_of(args: argparse.Namespace, record: Record) -> tuple[int | None, int | None]:
+    """Return ``--from`` and ``--to``; raises UsageError if they cannot be, naming the option."""
+    return in_order(
+        time_of("--from", args.from_, record.time_ns), time_of("--to", args.to, record.time_ns)
+    )
+
+
+def time_of(option: str, text: str | None, read: Callable[[str | None], int | None]) -> int | None:
+    """Read the time that an option gives; raises UsageError that names the option."""
+    try:
+        return read(text)
+    except UsageError as error:
+        raise UsageError(f"{option}: {error.what}", error.hint) from error
 
 
 def add_range(parser: argparse.ArgumentParser) -> None:

@@ -9,6 +9,7 @@ import msgspec
 
 from amberbox.cli._output import print_json, tell, text_output
 from amberbox.cli._server import refuse_options, robot_at
+from amberbox.cli._text import print_lines
 from amberbox.client.times import time_ns
 from amberbox.core.errors import UsageError
 from amberbox.core.timetext import format_time
@@ -36,7 +37,7 @@ def run_remote(args: argparse.Namespace, lookback: str) -> int:
     if args.json:
         print_json(found)
     elif args.svg != "-":
-        print(_text(args.engine, found, explanation))
+        print_lines([_text(args.engine, found, explanation)])
     return int(found["state"] == "open")
 
 

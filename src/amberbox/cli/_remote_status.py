@@ -7,6 +7,7 @@ import shutil
 import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
+from typing import NoReturn
 
 import msgspec
 
@@ -14,7 +15,7 @@ from amberbox.cli._colour import painter
 from amberbox.cli._output import tell
 from amberbox.cli._server import robot_at
 from amberbox.cli._statustable import View, alarms_of, overview, statuses_table, waiting
-from amberbox.cli._text import in_columns
+from amberbox.cli._text import in_columns, print_lines
 from amberbox.client.alarm_models import AlarmLine
 from amberbox.client.fleet import Fleet
 from amberbox.client.models import Component, Condition, StatusTree
@@ -66,7 +67,7 @@ def show_remote(board: Board, tree: StatusTree, args: argparse.Namespace) -> Non
         for message in FORMATS[args.format](board.statuses, Naming.of(None)):
             print(msgspec.json.encode(message).decode())
         return
-    print("\n".join(_lines(board, tree, args)))
+    print_lines(_lines(board, tree, args))
     tell([tree.note] if tree.note else [])
 
 
@@ -87,8 +88,8 @@ def wait_remote(args: argparse.Namespace, seconds: float) -> int:
             time.sleep(min(_WAIT_S, max(until_s - time.monotonic(), 0)))
 
 
-def watch_remote(args: argparse.Namespace) -> Board:
-    """Draw again every second until Ctrl-C; return what was drawn last."""
+def watch_remote(args: argparse.Namespace) -> NoReturn:
+    """Draw again every second until Ctrl-C."""
     fleet, robot = robot_at(args.where)
     with fleet:
         while True:
@@ -97,10 +98,7 @@ def watch_remote(args: argparse.Namespace) -> Board:
                 print(f"{OWN}[H{OWN}[J", end="")
             show_remote(board, tree, args)
             sys.stdout.flush()
-            try:
-                time.sleep(_WAIT_S)
-            except KeyboardInterrupt:
-                return board
+            time.sleep(_WAIT_S)
 
 
 def _judged(board: Board) -> list[str]:
@@ -165,7 +163,10 @@ def _lines(board: Board, tree: StatusTree, args: argparse.Namespace) -> Iterator
     if not args.component:
         yield from overview(board, view)
         return
-    component = next(one for one in tree.components if one.component == args.component)
+    component = next((one for one in tree.components if one.component == args.component), None)
+    if component is None:  # nothing has come of this robot yet
+        yield from overview(board, view)
+        return
     yield from statuses_table(board, args.component, view)
     yield from _outputs(component)
     yield from _needs(component)

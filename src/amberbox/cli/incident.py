@@ -16,7 +16,7 @@ from amberbox.blackbox.store import Store, open_store
 from amberbox.blackbox.where import store_path
 from amberbox.cli._output import print_grid, print_json, tell
 from amberbox.cli._server import add_robot, named
-from amberbox.cli._text import in_columns
+from amberbox.cli._text import in_columns, print_lines
 from amberbox.client.address import is_url
 from amberbox.core.clock import NS
 from amberbox.core.errors import UsageError
@@ -104,9 +104,9 @@ def _show(rest: list[str], as_json: bool) -> None:
         print_json({**incident.to_json(), "bytes": held_bytes(store, [incident]),
                     "files": found, "items": rows})  # fmt: skip
         return
-    print("\n".join(_described(incident, held_bytes(store, [incident]))))
-    print("\n".join(["files:", *in_columns([(name, in_bytes(count)) for name, count in files])]))
-    print("\n".join(["items:", *in_columns([(name, f"{n} rows") for name, n in rows.items()])]))
+    print_lines(_described(incident, held_bytes(store, [incident])))
+    print_lines(["files:", *in_columns([(name, in_bytes(count)) for name, count in files])])
+    print_lines(["items:", *in_columns([(name, f"{n} rows") for name, n in rows.items()])])
 
 
 def _release(rest: list[str], as_json: bool) -> None:

@@ -9,7 +9,7 @@ import sys
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import msgspec
 
@@ -22,6 +22,7 @@ from amberbox.cli._colour import painter
 from amberbox.cli._output import print_json, tell
 from amberbox.cli._server import add_where
 from amberbox.cli._statustable import View, detail, overview, waiting
+from amberbox.cli._text import print_lines
 from amberbox.client.address import is_url
 from amberbox.core.clock import NS
 from amberbox.core.config import did_you_mean
@@ -65,7 +66,7 @@ def run(args: argparse.Namespace) -> int:
     plan = _plan_of(args.where)
     reader = BoardReader(open_store(store_path(args.where)))
     if args.watch:
-        return _watch(reader, args, plan)
+        _watch(reader, args, plan)
     board = _read(reader, args, plan)
     _show(board, args, plan)
     return _verdict(board, args.component)
@@ -78,7 +79,7 @@ def _remote(args: argparse.Namespace) -> int:
     if args.wait is not None:
         return wait_remote(args, parse_duration_s(args.wait))
     if args.watch:
-        return _verdict(watch_remote(args), args.component)
+        watch_remote(args)
     board, tree = read_remote(args)
     if args.json:
         print_json(_as_json(board) | {"robot": tree.robot})
@@ -87,7 +88,7 @@ def _remote(args: argparse.Namespace) -> int:
     return _verdict(board, args.component)
 
 
-def _watch(reader: BoardReader, args: argparse.Namespace, plan: Plan | None) -> int:
+def _watch(reader: BoardReader, args: argparse.Namespace, plan: Plan | None) -> NoReturn:
     """Draw again and again until Ctrl-C."""
     while True:
         board = _read(reader, args, plan)
@@ -95,10 +96,7 @@ def _watch(reader: BoardReader, args: argparse.Namespace, plan: Plan | None) -> 
             print(f"{OWN}[H{OWN}[J", end="")
         _show(board, args, plan)
         sys.stdout.flush()
-        try:
-            time.sleep(_PERIOD_S)
-        except KeyboardInterrupt:
-            return _verdict(board, args.component)
+        time.sleep(_PERIOD_S)
 
 
 def _read(reader: BoardReader, args: argparse.Namespace, plan: Plan | None) -> Board:
@@ -140,10 +138,9 @@ def _show(board: Board, args: argparse.Namespace, plan: Plan | None) -> None:
         for message in FORMATS[args.format](board.statuses, Naming.of(plan)):
             print(msgspec.json.encode(message).decode())
     else:
-        print("\n".join(_lines(board, args, plan)))
+        print_lines(_lines(board, args, plan))
     if args.format == "table" and not args.json and not args.component:
-        for line in _link_lines(args.where):
-            print(line)
+        print_lines(_link_lines(args.where))
     if plan and {status.config_hash for status in board.statuses} - {plan.config_hash}:
         tell(["the robot folder is not as it was when the watcher began"])
     if board.silence:

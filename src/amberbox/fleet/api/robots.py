@@ -11,6 +11,7 @@ from sqlalchemy import Connection
 
 from amberbox.blackbox.journal import reserved
 from amberbox.core.clock import NS
+from amberbox.core.timetext import in_order
 from amberbox.fleet.accounts.robots import KnownRobot
 from amberbox.fleet.api.access import Fleet, OfRobot, Routes, Who
 from amberbox.fleet.api.forms import ID, AfterName, Limit, TimeText, time_of
@@ -145,7 +146,7 @@ def list_events(
     limit: Limit = 100,
 ) -> Sequence[Event]:
     """Return events of a robot in order of time: the newest of a range, or the first ones."""
-    span = time_of(from_, fleet.clock), time_of(to, fleet.clock)
+    span = in_order(time_of(from_, fleet.clock), time_of(to, fleet.clock))
     searched = _SEARCHED if kind else limit
     found = entries(fleet, robot.id, reserved.EVENT, span, searched, newest=newest, aside=aside)
     views = [view for entry in found if (view := _event(entry)) and kind in ("", view.kind)]
