@@ -57,7 +57,7 @@ def _find(fleet: Fleet, robot: str, name: str) -> AlarmLine:
     by_name |= {str(alarm.id): alarm for alarm in known}
     if name not in by_name:
         near = did_you_mean(name, by_name)
-        raise UsageError(f"there is no alarm '{name}'{near}", "amberbox alarm URL list shows them")
+        raise UsageError(f"there is no alarm '{name}'{near}", "amberbox alarm list URL shows them")
     return by_name[name]
 
 

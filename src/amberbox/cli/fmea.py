@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from amberbox.blackbox.folder.folder import inspect_folder
+from amberbox.cli._anyorder import accept_where_first
 from amberbox.cli._output import print_grid, print_json, tell, writable
 from amberbox.cli._server import add_where
 from amberbox.cli._text import print_lines
@@ -54,6 +55,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--exposure", type=float, metavar="HOURS", help="time in which failures come about"
     )
+    accept_where_first(parser, _ACTIONS)
 
 
 def run(args: argparse.Namespace) -> int:

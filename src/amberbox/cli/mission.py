@@ -11,6 +11,7 @@ from amberbox.blackbox.missions import Mission, choose
 from amberbox.blackbox.missions.ask import end, start
 from amberbox.blackbox.missions.detect import detect, find
 from amberbox.blackbox.where import store_path
+from amberbox.cli._anyorder import accept_where_first
 from amberbox.cli._output import add_range_only, opened, print_grid, print_json, span_of, tell
 from amberbox.cli._server import add_where
 from amberbox.client.address import is_url
@@ -27,6 +28,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     _start(verbs.add_parser("start", help="begin a mission now"))
     _end(verbs.add_parser("end", help="end a mission now"))
     _detect(verbs.add_parser("detect", help="find missions in what is recorded already"))
+    accept_where_first(parser, verbs.choices, "list")
 
 
 def _where(parser: argparse.ArgumentParser) -> None:
