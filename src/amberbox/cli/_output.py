@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import getpass
 import json
 import os
 import re
@@ -18,6 +19,7 @@ from amberbox.blackbox.query.tabletext import grid
 from amberbox.cli._server import remote_record
 from amberbox.client.address import is_url
 from amberbox.core.errors import UsageError
+from amberbox.core.files import open_to_all
 from amberbox.core.terminal import for_data
 from amberbox.core.timetext import in_order
 from amberbox.fleet.archive.where import archive_in
@@ -42,6 +44,20 @@ def room(file: IO[str], more: str) -> Room | None:
     ``more`` says how to get the columns that there is no room for.
     """
     return Room(shutil.get_terminal_size().columns, more) if file.isatty() else None
+
+
+def secret(question: str) -> str:
+    """Take a secret where no shell remembers it and nobody sees it."""
+    if sys.stdin.isatty():
+        return getpass.getpass(question)
+    return sys.stdin.readline().rstrip("\n")
+
+
+def warn_readable(folder: Path) -> None:
+    """Warn on stderr of a folder with data that everybody on this computer can read."""
+    what = open_to_all(folder)
+    if what:
+        print(f"warning: {what}\nhint: chmod -R o-rwx {folder}", file=sys.stderr, flush=True)
 
 
 def tell(notes: Iterable[str]) -> None:
