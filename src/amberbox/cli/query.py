@@ -59,7 +59,9 @@ def run(args: argparse.Namespace) -> int:
         table = record.query(
             args.item, args.variables or None, *span, args.by, args.points, missions=missions
         )
-        notes = [*table.notes, *([] if len(table) else [_nothing(record, table.item)])]
+        notes = [note.replace("fetch URL", f"fetch {args.where}") for note in table.notes]
+        if not len(table):
+            notes.append(_nothing(record, table.item))
     write(table, form, args.output)
     tell(notes)
     return 0
