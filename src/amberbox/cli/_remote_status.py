@@ -20,8 +20,8 @@ from amberbox.client.alarm_models import AlarmLine
 from amberbox.client.fleet import Fleet
 from amberbox.client.models import Component, Condition, StatusTree
 from amberbox.client.times import maybe_ns, time_ns
-from amberbox.core.config import did_you_mean
-from amberbox.core.errors import AmberboxError, UsageError
+from amberbox.core.errors import AmberboxError
+from amberbox.core.naming import component_named
 from amberbox.core.terminal import OWN
 from amberbox.core.types import Status
 from amberbox.monitoring.engine.findings import AlarmChange
@@ -35,13 +35,17 @@ _WAIT_S = 1.0
 _STANDING = ("open", "acknowledged", "shelved")
 
 
-def board_of(fleet: Fleet, robot: str, component: str | None) -> tuple[Board, StatusTree]:
-    """Ask the server; raises UsageError for a component that is not there."""
+def board_of(fleet: Fleet, robot: str, args: argparse.Namespace) -> tuple[Board, StatusTree]:
+    """Ask the server, and put the id of the component that is meant into ``args``.
+
+    Raises UsageError for one that is not there.
+    """
+    component = args.component
     tree = fleet.status(robot)
     known = [one.component for one in tree.components]
-    if component and known and component not in known:
-        near = did_you_mean(component, known)
-        raise UsageError(f"there is no component '{component}'{near}", f"known: {', '.join(known)}")
+    if component and known:
+        titles = {one.component: one.name for one in tree.components}
+        component = args.component = component_named(component, known, titles)
     statuses = [
         status for one in tree.components if component in (None, "", one.component)
         for status in _statuses(robot, one, tree.silence)
@@ -58,7 +62,7 @@ def read_remote(args: argparse.Namespace) -> tuple[Board, StatusTree]:
     """Ask about the robot that WHERE means."""
     fleet, robot = robot_at(args.where)
     with fleet:
-        return board_of(fleet, robot, args.component)
+        return board_of(fleet, robot, args)
 
 
 def show_remote(board: Board, tree: StatusTree, args: argparse.Namespace) -> None:
@@ -77,7 +81,7 @@ def wait_remote(args: argparse.Namespace, seconds: float) -> int:
     until_s = time.monotonic() + seconds
     with fleet:
         while True:
-            board, _ = board_of(fleet, robot, args.component)
+            board, _ = board_of(fleet, robot, args)
             wanted = [args.component] if args.component else _judged(board)
             missing = [name for name in wanted if board.silence or not _is_up(board, name)]
             if wanted and not missing:
@@ -93,7 +97,7 @@ def watch_remote(args: argparse.Namespace) -> NoReturn:
     fleet, robot = robot_at(args.where)
     with fleet:
         while True:
-            board, tree = board_of(fleet, robot, args.component)
+            board, tree = board_of(fleet, robot, args)
             if sys.stdout.isatty():
                 print(f"{OWN}[H{OWN}[J", end="")
             show_remote(board, tree, args)

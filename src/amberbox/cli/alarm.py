@@ -19,6 +19,7 @@ from amberbox.cli._server import PAGE, add_robot
 from amberbox.client.address import is_url
 from amberbox.core.config import did_you_mean
 from amberbox.core.errors import UsageError
+from amberbox.core.naming import component_named, endings
 from amberbox.core.timetext import NS, format_duration, format_time, parse_duration
 
 KIND = "alarm"
@@ -148,7 +149,9 @@ def _check(rows: Sequence[Row], name: str, action: str, where: str) -> str:
     """Return the id of the alarm that lasts and has this id, or is of this component."""
     lasting = {row["id"]: row for row in rows if row["state"] != "healed"}
     of = {row["component"]: row["id"] for row in lasting.values()}
-    alarm_id = name if name in lasting else of.get(name, name)
+    alarm_id = name
+    if name not in lasting and endings(name, of):
+        alarm_id = of[component_named(name, of)]
     hint = f"amberbox alarm list {where} shows them"
     if alarm_id not in lasting:
         healed = any(row["id"] == name for row in rows)

@@ -25,8 +25,8 @@ from amberbox.cli._statustable import View, detail, overview, waiting
 from amberbox.cli._text import print_lines
 from amberbox.client.address import is_url
 from amberbox.core.clock import NS
-from amberbox.core.config import did_you_mean
-from amberbox.core.errors import AmberboxError, UsageError
+from amberbox.core.errors import AmberboxError
+from amberbox.core.naming import component_named
 from amberbox.core.terminal import OWN
 from amberbox.core.timetext import format_time
 from amberbox.core.types import Output, Status
@@ -104,11 +104,8 @@ def _read(reader: BoardReader, args: argparse.Namespace, plan: Plan | None) -> B
     known = board.components
     if not args.component:
         return board
-    if known and args.component not in known:
-        near = did_you_mean(args.component, known)
-        raise UsageError(
-            f"there is no component '{args.component}'{near}", f"known: {', '.join(known)}"
-        )
+    if known:
+        args.component = component_named(args.component, known, _titles(plan))
     statuses = [status for status in board.statuses if status.component == args.component]
     return board if args.format == "table" and not args.json else _only(board, statuses)
 
@@ -166,7 +163,8 @@ def _lines(board: Board, args: argparse.Namespace, plan: Plan | None) -> Iterato
 def _wait(args: argparse.Namespace, seconds: float) -> int:
     """Wait for a component, or for all; say in the end what is still waited for."""
     plan = _plan_of(args.where)
-    _refuse_unknown(args.component, plan)
+    if args.component and (titles := _titles(plan)):
+        args.component = component_named(args.component, titles, titles)
     until_s = time.monotonic() + seconds
     reader: BoardReader | None = None
     while True:
@@ -185,11 +183,8 @@ def _wait(args: argparse.Namespace, seconds: float) -> int:
         time.sleep(min(_WAIT_S, max(until_s - time.monotonic(), 0)))
 
 
-def _refuse_unknown(component: str | None, plan: Plan | None) -> None:
-    known = [entry.id for entry in plan.components] if plan else []
-    if component and known and component not in known:
-        near = did_you_mean(component, known)
-        raise UsageError(f"there is no component '{component}'{near}", f"known: {', '.join(known)}")
+def _titles(plan: Plan | None) -> dict[str, str]:
+    return {entry.id: entry.name for entry in plan.components} if plan else {}
 
 
 def _reader_of(where: str) -> BoardReader | None:

@@ -11,6 +11,7 @@ from sqlalchemy import Connection
 
 from amberbox.blackbox.journal import reserved
 from amberbox.core.clock import NS
+from amberbox.core.naming import component_named, endings
 from amberbox.core.timetext import in_order
 from amberbox.fleet.accounts.robots import KnownRobot
 from amberbox.fleet.api.access import Fleet, OfRobot, Routes, Who
@@ -130,6 +131,9 @@ def read_timeline(
         raise HTTPException(400, "the window ends before it begins")
     with fleet.database.reading() as connection:
         standing = standings(connection, [robot.id]).get(robot.id, [])
+    known = {one.said.component for one in standing}
+    if component and endings(component, known):
+        component = component_named(component, known)
     span = (from_ns, to_ns)
     return timeline_of(timeline(fleet, robot.id, span, standing, component, points), span)
 

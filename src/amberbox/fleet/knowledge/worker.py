@@ -15,8 +15,8 @@ from amberbox.consult.declared import Declared
 from amberbox.consult.facts import known_facts, lookups
 from amberbox.consult.faulttrees import effect_json, effects_json
 from amberbox.consult.sheets import coverage_json, criticality_json, table_json
-from amberbox.core.config import did_you_mean, refuse
-from amberbox.core.errors import UsageError
+from amberbox.core.config import refuse
+from amberbox.core.naming import component_named
 from amberbox.core.timetext import format_time, in_order, parse_time
 from amberbox.diagnosis.explanation.names import Names
 from amberbox.diagnosis.faulttree import Analysis, analyse
@@ -198,10 +198,7 @@ def _effects(known: Any, effect: str) -> list[str]:
     names = effects(known)
     if not effect:
         return list(names)
-    if effect not in known.functions and effect not in known.components:
-        near = did_you_mean(effect, [*names, *known.components])
-        raise UsageError(f"there is no function '{effect}'{near}")
-    return [effect]
+    return [component_named(effect, [*known.functions, *known.components], kind="function")]
 
 
 def _standing(diagnoses: Any) -> Any:
