@@ -33,7 +33,8 @@ def component_named(
 ) -> str:
     """Return the id of a component by its id, its title, or its last words.
 
-    ``front`` is ``laser_front`` where no other id ends so. ``titles`` are those of ids. Raises UsageError when there is none, or several are meant.
+    ``front`` is ``laser_front`` where no other id ends so. ``titles`` are those of ids.
+    Raises UsageError when there is none, or several are meant.
     """
     if name in known:
         return name
