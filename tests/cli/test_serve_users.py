@@ -104,6 +104,8 @@ def test_a_robot_that_joins_too_early_hears_it_and_the_server_goes_on(
     data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """While it runs: a robot joins before there is an admin, then somebody is made one."""
+    data.mkdir()
+    data.chmod(0o755)
     server = started(data)
     try:
         status, body, _ = server.ask("/api/v1/robots")
@@ -124,7 +126,9 @@ def test_a_robot_that_joins_too_early_hears_it_and_the_server_goes_on(
         assert main(["join", str(robot), line]) == 0
         assert server.ask("/setup")[0] == 404
     finally:
-        server.stop()
+        _, said_by_server, _ = server.stop()
+    assert f"everybody on this computer can read {data} (mode 0755)" in said_by_server
+    assert f"hint: chmod -R o-rwx {data}" in said_by_server
 
 
 @pytest.mark.parametrize(
