@@ -309,6 +309,21 @@ def test_a_range_that_ends_before_it_begins_is_refused(
     assert "error: --to: not a time: 'yesterday'" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("line", "option"),
+    [
+        ("diagnose URL --at noon", "--at"), ("faulttree URL --closest --at noon", "--at"),
+        ("rules --where URL --ask broken(X) --from noon", "--from"),
+    ],
+)  # fmt: skip
+def test_a_time_for_a_server_names_its_option(
+    line: str, option: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It is read here first: nothing is asked of the server."""
+    assert main(line.replace("URL", "https://fleet.invalid/robots/r1").split()) == 2
+    assert f"error: {option}: not a time: 'noon'" in capsys.readouterr().err
+
+
 def test_a_range_from_python_that_ends_before_it_begins_is_refused(store: str) -> None:
     with amberbox.open(store) as record:
         for ask in (partial(record.query, "odom", None), record.gaps, record.events):

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import getpass
 import json
 import os
 import re
 import shutil
 import sys
+import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -21,7 +21,7 @@ from amberbox.client.address import is_url
 from amberbox.core.errors import UsageError
 from amberbox.core.files import open_to_all
 from amberbox.core.terminal import for_data
-from amberbox.core.timetext import in_order
+from amberbox.core.timetext import in_order, parse_time
 from amberbox.fleet.archive.where import archive_in
 
 if TYPE_CHECKING:
@@ -49,6 +49,8 @@ def room(file: IO[str], more: str) -> Room | None:
 def secret(question: str) -> str:
     """Take a secret where no shell remembers it and nobody sees it."""
     if sys.stdin.isatty():
+        import getpass  # few verbs ask
+
         return getpass.getpass(question)
     return sys.stdin.readline().rstrip("\n")
 
@@ -143,6 +145,12 @@ def time_of(option: str, text: str | None, read: Callable[[str | None], int | No
         return read(text)
     except UsageError as error:
         raise UsageError(f"{option}: {error.what}", error.hint) from error
+
+
+def check_time(option: str, text: str | None) -> None:
+    """Raise UsageError, naming the option, for a time that a server could not read either."""
+    if text:
+        time_of(option, text, lambda said: parse_time(said or "", time.time_ns, lambda: 0))
 
 
 def add_range(parser: argparse.ArgumentParser) -> None:

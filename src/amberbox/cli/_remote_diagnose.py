@@ -7,7 +7,7 @@ from typing import Any
 
 import msgspec
 
-from amberbox.cli._output import print_json, tell, text_output
+from amberbox.cli._output import check_time, print_json, tell, text_output
 from amberbox.cli._server import refuse_options, robot_at
 from amberbox.cli._text import print_lines
 from amberbox.client.times import time_ns
@@ -24,6 +24,7 @@ def run_remote(args: argparse.Namespace, lookback: str) -> int:
     given = {"follow": args.follow, "folder": args.folder, "lookback": args.lookback != lookback}
     refuse_options(args.where, given, "the server has the robot's folder, and looks itself; "
                    "amberbox status URL --watch shows what changes")  # fmt: skip
+    check_time("--at", args.at)
     fleet, robot = robot_at(args.where)
     with fleet:
         found = fleet.diagnose(
