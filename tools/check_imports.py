@@ -30,7 +30,7 @@ ALLOWED: Mapping[str, frozenset[str]] = {
     "demo": _UPPER | {"sim", "robot", "fleet"},
     "cli": _UPPER | {"sim", "testing", "robot", "fleet", "client", "demo"},
     "": frozenset({"core", "blackbox", "client"}),
-    "__main__": frozenset({"cli"}),
+    "__main__": frozenset({"cli", "core"}),
 }
 """Which of our packages each may import, besides itself; "" is the package's front door."""
 

@@ -259,6 +259,9 @@ def test_items_without_columns_are_listed_with_the_reason_and_can_be_had_raw(
     error = capsys.readouterr().err
     assert "hint: its messages are kept as they came" in error
     assert "--format mcap --item ros_unknown" in error
+    for item, why in (("ros_misfit", "no message fits its definition"),):
+        assert main(["query", store, item]) == 0
+        assert f"note: {item} has no rows: {why}" in capsys.readouterr().err
     assert main(["query", store, "ros_misfit"]) == 0
     assert "messages do not fit the definition of a/B" in capsys.readouterr().err
     assert main(["export", store, "--item", "ros_unknown", "-o", output]) == 0

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import sys
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 import amberbox
 from amberbox.blackbox.follow.read import journals
+from amberbox.cli.main import main
 from amberbox.core.errors import AmberboxError, UsageError
 from amberbox.testing.records import (
     BATTERY,
@@ -184,3 +190,28 @@ def test_items_may_have_the_names_of_our_schema(tmp_path: Path) -> None:
     record = amberbox.open(tmp_path)
     for name in ("journals", "main", "temp"):
         assert record.sql(f'select x from "{name}"').values("x") == [1]
+
+
+def test_ctrl_c_ends_a_long_statement(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    fill_store(tmp_path)
+    submit = ThreadPoolExecutor.submit
+
+    def submitted(pool: ThreadPoolExecutor, work: Callable[[], Any]) -> Future[Any]:
+        asked = submit(pool, work)
+        monkeypatch.setattr(asked, "result", lambda: os.kill(os.getpid(), signal.SIGINT))
+        return asked
+
+    endless = (
+        "select count(*) from range(10000000) a, range(10000000) b where a.range * b.range = 7"
+    )
+    monkeypatch.setattr(ThreadPoolExecutor, "submit", submitted)
+    with pytest.raises(KeyboardInterrupt):
+        amberbox.open(tmp_path).sql(endless)
+
+
+@pytest.mark.parametrize(
+    "statement", ["select nope", "selec", "select * from nope", "select cast('a' as int)", "drop x"]
+)
+def test_a_wrong_statement_is_wrong_usage(tmp_path: Path, statement: str) -> None:
+    fill_store(tmp_path)
+    assert main(["sql", str(tmp_path), statement]) == 2

@@ -103,6 +103,22 @@ def test_a_component_stands_for_its_alarm(store: Path) -> None:
     assert request.values["id"] == LASER
 
 
+def test_the_end_of_a_component_stands_for_its_alarm(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run, where = FakeRun(tmp_path / "store", "watch"), str(tmp_path / "store")
+    run.start(T0_NS)
+    ids = ["laser_front-1", "laser_rear-1", "wheel_rear-1"]
+    for number, alarm_id in enumerate(ids):
+        run.own(ALARM, T0_NS + (3 + number) * NS, alarm(alarm_id, number))
+    run.close()
+    assert main(["alarm", "ack", where, "front"]) == 0
+    (request,) = pending(open_store(tmp_path / "store"))
+    assert request.values["id"] == ids[0]
+    assert main(["alarm", "ack", where, "rear"]) == 2
+    assert "hint: name one of laser_rear, wheel_rear" in capsys.readouterr().err
+
+
 def test_the_user_says_it_and_programs_hear_so(
     store: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -199,7 +199,9 @@ def test_where_nothing_was_recorded_nothing_is_known(
 ) -> None:
     said = refused(capsys, recorded, "--at", "2023-11-14T23:13:20Z")
     assert "nothing was recorded in the 10 min before 2023-11-14T23:13:20" in said
-    assert "nothing was recorded in" in refused(capsys, recorded, "--at", "1970-01-01")
+    early = refused(capsys, recorded, "--at", "1970-01-01")
+    assert "nothing was recorded in" in early and "the record goes from 2023-11-14T22:13" in early
+    assert "error: --at: not a time: 'noon'" in refused(capsys, recorded, "--at", "noon")
     assert main(["diagnose", str(recorded), "--at", "2023-11-14T22:14Z"]) == 0
     assert "nothing was recorded after 2023-11-14T22:13:3" in capsys.readouterr().err
 

@@ -197,10 +197,10 @@ def test_following_prints_until_it_is_stopped(
         raise KeyboardInterrupt
 
     monkeypatch.setattr("amberbox.cli._diagnosis_follow.revisions", one)
-    assert main(["diagnose", str(watched), "--follow"]) == 1, "it is open when one stops"
+    assert main(["diagnose", str(watched), "--follow"]) == 130
     printed = capsys.readouterr()
     assert f"{standing.id}, revision 1" in printed.out
     assert "nobody watches" in printed.err and f"amberbox watch {watched}" in printed.err
-    assert main(["diagnose", str(watched), "--follow", "--json"]) == 1
+    assert main(["diagnose", str(watched), "--follow", "--json"]) == 130
     (line,) = capsys.readouterr().out.splitlines()
     assert json.loads(line)["id"] == standing.id

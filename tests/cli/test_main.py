@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -13,6 +14,7 @@ from amberbox import __version__
 from amberbox.cli import main as program
 from amberbox.cli.main import main
 from amberbox.core.errors import AmberboxError, ConfigurationError, Problem
+from amberbox.core.interrupt import Interrupt
 from amberbox.core.plugins import Plugin
 
 VERB = '''\
@@ -152,3 +154,69 @@ def test_closed_pipe_is_quiet(tmp_path: Path) -> None:
     os.close(write)
     assert done.stderr == ""
     assert done.returncode == 141
+
+
+INTERRUPTED = """
+import os, runpy, signal, sys
+
+class Ctrl_C:
+    # Sends SIGINT when the given number of modules has been looked for.
+    def __init__(self, after):
+        self.after = after
+
+    def find_spec(self, name, path=None, target=None):
+        self.after -= 1
+        if not self.after:
+            os.kill(os.getpid(), signal.SIGINT)
+        return None
+
+import amberbox.__main__ as start
+ended = {}
+for after in map(int, sys.argv[1:]):
+    child = os.fork()
+    if not child:
+        sys.argv = ["amberbox", "status", "/nowhere"]
+        sys.meta_path.insert(0, Ctrl_C(after))
+        sys.exit(start.main())
+    ended[after] = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+print(ended)
+"""
+"""Ends ``amberbox status`` by Ctrl-C at its so-manieth import, in a process for each."""
+
+
+def test_ctrl_c_while_modules_load_ends_quietly() -> None:
+    """Wherever it comes between the first import and the last: 130, and no traceback."""
+    places = [1, 2, 5, 20, 60, 120, 180, 240]
+    done = subprocess.run(
+        [sys.executable, "-c", INTERRUPTED, *map(str, places)], capture_output=True, text=True
+    )
+    assert done.stderr == ""
+    assert done.stdout == f"{dict.fromkeys(places, 130)}\n"
+
+
+def test_an_error_that_a_library_makes_of_ctrl_c_is_no_defect(
+    verb: Plugin, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    handler = Interrupt()
+    handler.loading = False
+    monkeypatch.setattr(signal, "getsignal", lambda _: handler)
+
+    def action(args: object) -> int:
+        with pytest.raises(KeyboardInterrupt):
+            handler(signal.SIGINT, None)
+        raise RuntimeError("the work was broken off")
+
+    monkeypatch.setattr(verb.load(), "action", action)
+    assert main(["work"]) == 130
+    assert capsys.readouterr().err == ""
+
+
+def test_ctrl_c_is_ignored_where_the_process_was_told_to() -> None:
+    """A job that a script starts in the background ignores SIGINT, and goes on doing so."""
+    code = (
+        "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN); import sys; "
+        "from amberbox.__main__ import main; sys.argv[1:] = ['--version']; main(); "
+        "print(signal.getsignal(signal.SIGINT) is signal.SIG_IGN)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.endswith("True\n")

@@ -8,13 +8,16 @@ import json
 import os
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+import amberbox
 from amberbox.cli.main import main
 from amberbox.testing.patience import PATIENCE_S
+from amberbox.core.errors import UsageError
 from amberbox.testing.records import T0_NS, FakeRun, build_segments_of, fill_store
 
 
@@ -287,3 +290,45 @@ def test_json_by_its_short_name(
     assert json.loads(capsys.readouterr().out) == expected and len(expected) == 300
     assert main([verb, store, what, "--json", "--format", "csv"]) == 2
     assert "not allowed with" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["query", "odom"], ["events"], ["gaps"], ["plot", "odom", "pose/x", "-o", "x.png"],
+        ["export", "-o", "x.csv"], ["mission list"], ["foxglove"],
+    ],
+)  # fmt: skip
+def test_a_range_that_ends_before_it_begins_is_refused(
+    store: str, capsys: pytest.CaptureFixture[str], words: list[str]
+) -> None:
+    verb, *rest = words
+    line = [*verb.split(), store, *rest]
+    assert main([*line, "--from", "-1s", "--to=-2s"]) == 2
+    error = capsys.readouterr().err
+    assert "the range ends before it begins: from 2026-09-21T14:13:21" in error
+    assert "hint: exchange from and to" in error
+    assert main([*line, "--to", "yesterday"]) == 2
+    assert "error: --to: not a time: 'yesterday'" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("line", "option"),
+    [
+        ("diagnose URL --at noon", "--at"), ("faulttree URL --closest --at noon", "--at"),
+        ("rules --where URL --ask broken(X) --from noon", "--from"),
+    ],
+)  # fmt: skip
+def test_a_time_for_a_server_names_its_option(
+    line: str, option: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It is read here first: nothing is asked of the server."""
+    assert main(line.replace("URL", "https://fleet.invalid/robots/r1").split()) == 2
+    assert f"error: {option}: not a time: 'noon'" in capsys.readouterr().err
+
+
+def test_a_range_from_python_that_ends_before_it_begins_is_refused(store: str) -> None:
+    with amberbox.open(store) as record:
+        for ask in (partial(record.query, "odom", None), record.gaps, record.events):
+            with pytest.raises(UsageError, match="ends before it begins"):
+                ask(from_=T0_NS + 1, to=T0_NS)

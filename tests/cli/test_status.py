@@ -420,7 +420,7 @@ def test_watch_draws_until_it_is_interrupted(
             raise KeyboardInterrupt
 
     monkeypatch.setattr("amberbox.cli.status.time.sleep", pause)
-    assert main(["status", str(store), "--watch"]) == 1
+    assert main(["status", str(store), "--watch"]) == 130
     assert capsys.readouterr().out.count("ropod_001: 2 ok") == 1
     assert pauses == [1.0, 1.0]
 

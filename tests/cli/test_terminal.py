@@ -5,12 +5,18 @@ from __future__ import annotations
 import io
 import sys
 from contextlib import redirect_stdout
+from pathlib import Path
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from amberbox.cli._output import print_grid, text_output
+from amberbox.cli._text import fold
 from amberbox.cli.main import main
 from amberbox.core.terminal import BACK, OWN, harmless
+from amberbox.testing.records import fill_store
+from tests.fuzzing import examples, fuzz
 
 
 class Terminal(io.StringIO):
@@ -45,6 +51,55 @@ def test_data_stay_as_they_are_in_a_pipe_and_are_harmless_in_a_terminal() -> Non
             file.write("\x1b[2J")
         assert stream.getvalue() == shown
     assert sys.stdout is not None
+
+
+@pytest.fixture(scope="module")
+def robot(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A robot folder of the simulator, with a record that has gaps, events and damage."""
+    folder = tmp_path_factory.mktemp("fit") / "a_robot_with_quite_a_long_name"
+    assert main(["new", str(folder)]) == 0
+    fill_store(folder / "store")
+    damaged = next((folder / "store").rglob("*.mcap"))
+    damaged.write_bytes(damaged.read_bytes()[:-200] + b"\0" * 200)
+    return folder
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "status", "doctor", "verify", "gaps", "items", "alarm list", "incident list",
+        "mission list", "check", "faulttree", "fmea criticality", "fmea coverage", "fmea check",
+    ],
+)  # fmt: skip
+def test_lines_fit_the_terminal(robot: Path, monkeypatch: pytest.MonkeyPatch, line: str) -> None:
+    """Texts are folded, tables cut; in a pipe lines are as long as they are."""
+    monkeypatch.setenv("COLUMNS", "60")
+    monkeypatch.setenv("NO_COLOR", "1")
+    terminal, pipe = Terminal(), io.StringIO()
+    for stream in (terminal, pipe):
+        with redirect_stdout(stream):
+            main([*line.split(), str(robot)])
+    lines = terminal.getvalue().splitlines()
+    assert lines and max(map(len, lines)) <= 60
+    if line in ("verify", "check"):
+        assert "".join(terminal.getvalue().split()) == "".join(pipe.getvalue().split())
+        assert max(map(len, pipe.getvalue().splitlines())) > 60
+
+
+@fuzz
+@settings(max_examples=examples(50))
+@given(text=st.text("ab " + OWN, max_size=80), width=st.integers(10, 40))
+def test_folding_loses_no_word(text: str, width: int) -> None:
+    folded = fold(text.replace(OWN, f"{OWN}[31m"), width)
+    plain = [line.replace(f"{OWN}[31m", "") for line in folded]
+    assert "".join(plain).replace(" ", "") == text.replace(OWN, "").replace(" ", "")
+
+
+def test_folded_lines_go_on_below_the_last_column() -> None:
+    assert fold("warn   disk  it is nearly full, look", 28) == [
+        "warn   disk  it is nearly",
+        "             full, look",
+    ]
 
 
 def test_pages_write_out_what_names_hide() -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from amberbox.core.files import write_private
+from amberbox.core.files import open_to_all, write_private
 
 
 def test_a_file_is_replaced_and_nothing_is_left_over(tmp_path: Path) -> None:
@@ -87,3 +87,12 @@ folder = Path(sys.argv[1])
         subprocess.run([sys.executable, "-c", code, folder], check=True)
         assert stat.S_IMODE((folder / "d").stat().st_mode) == 0o777 & ~after
         assert stat.S_IMODE((folder / "f").stat().st_mode) == 0o666 & ~after
+
+
+@pytest.mark.parametrize(("mode", "is_open"), [(0o700, False), (0o750, False), (0o755, True)])
+def test_folders_that_everybody_can_read_are_told(tmp_path: Path, mode: int, is_open: bool) -> None:
+    folder = tmp_path / "store"
+    assert open_to_all(folder) == "", "what is not there cannot be read"
+    folder.mkdir()
+    folder.chmod(mode)
+    assert bool(open_to_all(folder)) is is_open

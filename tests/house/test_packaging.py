@@ -119,7 +119,7 @@ def test_the_wheel_holds_licence_and_program(wheel: zipfile.ZipFile) -> None:
     licence = wheel.read(names["LICENSE"]).decode()
     assert licence == (ROOT / "LICENSE").read_text()
     assert "Apache License" in licence
-    assert b"amberbox = amberbox.cli.main:main" in wheel.read(names["entry_points.txt"])
+    assert b"amberbox = amberbox.__main__:main" in wheel.read(names["entry_points.txt"])
 
 
 def test_every_module_imports_with_none_of_the_optional_packages() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 
 from amberbox.cli._output import print_grid
+from amberbox.cli._text import print_lines
 from amberbox.consult.faulttrees import FACTORS, listed
 from amberbox.diagnosis.faulttree import Analysis, FaultTree
 from amberbox.diagnosis.faulttree.likelihood import Importance
@@ -14,7 +15,7 @@ def show(analysis: Analysis, args: argparse.Namespace) -> None:
     """Print it for people."""
     tree = analysis.tree
     size = f"{len(analysis.gates)} gates, {len(analysis.events)} basic events"
-    print(f"{called(tree, tree.top)}: {size}")
+    print_lines([f"{called(tree, tree.top)}: {size}"])
     if not analysis.coherent:
         print("not coherent: cut sets are the positive parts of the minimal solutions")
     _show_probability(analysis)
@@ -47,7 +48,7 @@ def _show_cut_sets(analysis: Analysis, count: int) -> None:
         if number:
             print(f"  order {order}: {number:,}")
     for entry in listed(analysis, count):
-        print("  {" + ", ".join(called(analysis.tree, event) for event in sorted(entry)) + "}")
+        print_lines(["  {" + ", ".join(called(analysis.tree, e) for e in sorted(entry)) + "}"])
 
 
 def limit_note(limit: int | None) -> str:

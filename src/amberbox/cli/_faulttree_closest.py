@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 
 from amberbox.cli._faulttree_answer import called, limit_note
 from amberbox.cli._faulttree_effects import analysed
-from amberbox.cli._output import opened, print_json
+from amberbox.cli._output import opened, print_json, time_of
+from amberbox.cli._text import print_lines
 from amberbox.consult.closest import Outlook, closest_json, outlooks
 from amberbox.core.errors import UsageError
 from amberbox.core.timetext import format_time
@@ -39,7 +40,7 @@ def show_closest(fmea: Fmea, args: argparse.Namespace, budget: Budget) -> None:
         return
     print(_heading(at_ns, diagnosis))
     for outlook in found:
-        print("\n".join(_lines(outlook)))
+        print_lines(_lines(outlook))
     if args.order is not None:
         print(f"\ncut sets{limit_note(args.order)}")
 
@@ -56,7 +57,7 @@ def _standing(args: argparse.Namespace) -> tuple[int | None, Diagnosis | None]:
         return None, None
     folder = load_folder(args.where)
     with opened(args.where) as record:
-        at_ns = record.time_ns(args.at)
+        at_ns = time_of("--at", args.at, record.time_ns)
         if at_ns is None:
             at_ns = record.last_ns()
     if at_ns is None:

@@ -8,7 +8,8 @@ import os
 import re
 import shutil
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
@@ -18,7 +19,9 @@ from amberbox.blackbox.query.tabletext import grid
 from amberbox.cli._server import remote_record
 from amberbox.client.address import is_url
 from amberbox.core.errors import UsageError
+from amberbox.core.files import open_to_all
 from amberbox.core.terminal import for_data
+from amberbox.core.timetext import in_order, parse_time
 from amberbox.fleet.archive.where import archive_in
 
 if TYPE_CHECKING:
@@ -41,6 +44,22 @@ def room(file: IO[str], more: str) -> Room | None:
     ``more`` says how to get the columns that there is no room for.
     """
     return Room(shutil.get_terminal_size().columns, more) if file.isatty() else None
+
+
+def secret(question: str) -> str:
+    """Take a secret where no shell remembers it and nobody sees it."""
+    if sys.stdin.isatty():
+        import getpass  # few verbs ask
+
+        return getpass.getpass(question)
+    return sys.stdin.readline().rstrip("\n")
+
+
+def warn_readable(folder: Path) -> None:
+    """Warn on stderr of a folder with data that everybody on this computer can read."""
+    what = open_to_all(folder)
+    if what:
+        print(f"warning: {what}\nhint: chmod -R o-rwx {folder}", file=sys.stderr, flush=True)
 
 
 def tell(notes: Iterable[str]) -> None:
@@ -111,6 +130,27 @@ def add_range_only(parser: argparse.ArgumentParser) -> None:
     times = "ISO (UTC), epoch, -10m before the last record, now or now-10m"
     parser.add_argument("--from", dest="from_", metavar="T", help=f"first time: {times}")
     parser.add_argument("--to", metavar="T", help="end of the range, not included")
+
+
+def span_of(args: argparse.Namespace, record: Record) -> tuple[int | None, int | None]:
+    """Return ``--from`` and ``--to``; raises UsageError if they cannot be, naming the option."""
+    return in_order(
+        time_of("--from", args.from_, record.time_ns), time_of("--to", args.to, record.time_ns)
+    )
+
+
+def time_of(option: str, text: str | None, read: Callable[[str | None], int | None]) -> int | None:
+    """Read the time that an option gives; raises UsageError that names the option."""
+    try:
+        return read(text)
+    except UsageError as error:
+        raise UsageError(f"{option}: {error.what}", error.hint) from error
+
+
+def check_time(option: str, text: str | None) -> None:
+    """Raise UsageError, naming the option, for a time that a server could not read either."""
+    if text:
+        time_of(option, text, lambda said: parse_time(said or "", time.time_ns, lambda: 0))
 
 
 def add_range(parser: argparse.ArgumentParser) -> None:

@@ -14,6 +14,7 @@ from amberbox.client.alarm_models import AlarmLine
 from amberbox.client.fleet import Fleet
 from amberbox.core.config import did_you_mean
 from amberbox.core.errors import UsageError
+from amberbox.core.naming import component_named, endings
 from amberbox.core.timetext import parse_duration
 
 _HEADER = ("id", "component", "state", "level", "severity", "opened (UTC)", "times", "who",
@@ -53,11 +54,13 @@ def _do(fleet: Fleet, alarm: AlarmLine, action: str, args: argparse.Namespace) -
 def _find(fleet: Fleet, robot: str, name: str) -> AlarmLine:
     """Return the alarm that has this id, or is of this component."""
     known = fleet.alarms(robot, state=_STANDING)
-    by_name = {alarm.origin: alarm for alarm in reversed(known)}
-    by_name |= {str(alarm.id): alarm for alarm in known}
+    of = {alarm.origin: alarm for alarm in reversed(known)}
+    by_name = of | {str(alarm.id): alarm for alarm in known}
+    if name not in by_name and endings(name, of):
+        name = component_named(name, of)
     if name not in by_name:
         near = did_you_mean(name, by_name)
-        raise UsageError(f"there is no alarm '{name}'{near}", "amberbox alarm URL list shows them")
+        raise UsageError(f"there is no alarm '{name}'{near}", "amberbox alarm list URL shows them")
     return by_name[name]
 
 

@@ -7,8 +7,9 @@ from typing import Any
 
 import msgspec
 
-from amberbox.cli._output import print_json, tell, text_output
+from amberbox.cli._output import check_time, print_json, tell, text_output
 from amberbox.cli._server import refuse_options, robot_at
+from amberbox.cli._text import print_lines
 from amberbox.client.times import time_ns
 from amberbox.core.errors import UsageError
 from amberbox.core.timetext import format_time
@@ -23,6 +24,7 @@ def run_remote(args: argparse.Namespace, lookback: str) -> int:
     given = {"follow": args.follow, "folder": args.folder, "lookback": args.lookback != lookback}
     refuse_options(args.where, given, "the server has the robot's folder, and looks itself; "
                    "amberbox status URL --watch shows what changes")  # fmt: skip
+    check_time("--at", args.at)
     fleet, robot = robot_at(args.where)
     with fleet:
         found = fleet.diagnose(
@@ -36,7 +38,7 @@ def run_remote(args: argparse.Namespace, lookback: str) -> int:
     if args.json:
         print_json(found)
     elif args.svg != "-":
-        print(_text(args.engine, found, explanation))
+        print_lines([_text(args.engine, found, explanation)])
     return int(found["state"] == "open")
 
 

@@ -11,7 +11,7 @@ import msgspec
 from amberbox.blackbox.journal.reserved import PREFIX
 from amberbox.cli._output import print_grid, print_json
 from amberbox.cli._server import remote_record
-from amberbox.cli._text import in_columns
+from amberbox.cli._text import in_columns, print_lines
 from amberbox.client.data_models import Incident
 from amberbox.client.remote import RemoteRecord
 from amberbox.client.times import time_ns
@@ -71,8 +71,8 @@ def _show(record: RemoteRecord, rest: list[str], as_json: bool) -> None:
         ("window", f"{_range(incident)} (UTC)"), ("who", incident.who or incident.trigger),
         ("reason", incident.reason),
     ]  # fmt: skip
-    print("\n".join(in_columns(facts, "")))
-    print("\n".join(["items:", *in_columns([(name, f"{n} rows") for name, n in rows.items()])]))
+    print_lines(in_columns(facts, ""))
+    print_lines(["items:", *in_columns([(name, f"{n} rows") for name, n in rows.items()])])
 
 
 def _release(record: RemoteRecord, rest: list[str], as_json: bool) -> None:

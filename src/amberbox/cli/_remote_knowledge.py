@@ -6,7 +6,7 @@ import argparse
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
-from amberbox.cli._output import print_grid, print_json, tell
+from amberbox.cli._output import check_time, print_grid, print_json, tell
 from amberbox.cli._server import refuse_options, robot_at
 from amberbox.core.errors import UsageError
 
@@ -80,6 +80,7 @@ def faulttree_remote(args: argparse.Namespace) -> int:
         raise UsageError("--at is for --closest", "amberbox faulttree URL --closest --at T")
     if args.importance and not args.effect:
         raise UsageError("a server tells of one function what matters", "--effect NAME")
+    check_time("--at", args.at)
     fleet, robot = robot_at(args.where)
     with fleet:
         found = fleet.faulttrees(
@@ -149,6 +150,8 @@ def rules_remote(args: argparse.Namespace) -> int:
     if args.ask is None:
         raise UsageError("a server is asked a goal", "--ask 'broken(X)'")
     want = "why_not" if args.why_not else "why" if args.why else ""
+    check_time("--from", args.from_)
+    check_time("--to", args.to)
     fleet, robot = robot_at(args.where)
     with fleet:
         found = fleet.rules(robot, args.ask, want, args.from_, args.to)

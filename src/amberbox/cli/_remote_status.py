@@ -7,6 +7,7 @@ import shutil
 import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
+from typing import NoReturn
 
 import msgspec
 
@@ -14,13 +15,13 @@ from amberbox.cli._colour import painter
 from amberbox.cli._output import tell
 from amberbox.cli._server import robot_at
 from amberbox.cli._statustable import View, alarms_of, overview, statuses_table, waiting
-from amberbox.cli._text import in_columns
+from amberbox.cli._text import in_columns, print_lines
 from amberbox.client.alarm_models import AlarmLine
 from amberbox.client.fleet import Fleet
 from amberbox.client.models import Component, Condition, StatusTree
 from amberbox.client.times import maybe_ns, time_ns
-from amberbox.core.config import did_you_mean
-from amberbox.core.errors import AmberboxError, UsageError
+from amberbox.core.errors import AmberboxError
+from amberbox.core.naming import component_named
 from amberbox.core.terminal import OWN
 from amberbox.core.types import Status
 from amberbox.monitoring.engine.findings import AlarmChange
@@ -34,13 +35,17 @@ _WAIT_S = 1.0
 _STANDING = ("open", "acknowledged", "shelved")
 
 
-def board_of(fleet: Fleet, robot: str, component: str | None) -> tuple[Board, StatusTree]:
-    """Ask the server; raises UsageError for a component that is not there."""
+def board_of(fleet: Fleet, robot: str, args: argparse.Namespace) -> tuple[Board, StatusTree]:
+    """Ask the server, and put the id of the component that is meant into ``args``.
+
+    Raises UsageError for one that is not there.
+    """
+    component = args.component
     tree = fleet.status(robot)
     known = [one.component for one in tree.components]
-    if component and known and component not in known:
-        near = did_you_mean(component, known)
-        raise UsageError(f"there is no component '{component}'{near}", f"known: {', '.join(known)}")
+    if component and known:
+        titles = {one.component: one.name for one in tree.components}
+        component = args.component = component_named(component, known, titles)
     statuses = [
         status for one in tree.components if component in (None, "", one.component)
         for status in _statuses(robot, one, tree.silence)
@@ -57,7 +62,7 @@ def read_remote(args: argparse.Namespace) -> tuple[Board, StatusTree]:
     """Ask about the robot that WHERE means."""
     fleet, robot = robot_at(args.where)
     with fleet:
-        return board_of(fleet, robot, args.component)
+        return board_of(fleet, robot, args)
 
 
 def show_remote(board: Board, tree: StatusTree, args: argparse.Namespace) -> None:
@@ -66,7 +71,7 @@ def show_remote(board: Board, tree: StatusTree, args: argparse.Namespace) -> Non
         for message in FORMATS[args.format](board.statuses, Naming.of(None)):
             print(msgspec.json.encode(message).decode())
         return
-    print("\n".join(_lines(board, tree, args)))
+    print_lines(_lines(board, tree, args))
     tell([tree.note] if tree.note else [])
 
 
@@ -76,7 +81,7 @@ def wait_remote(args: argparse.Namespace, seconds: float) -> int:
     until_s = time.monotonic() + seconds
     with fleet:
         while True:
-            board, _ = board_of(fleet, robot, args.component)
+            board, _ = board_of(fleet, robot, args)
             wanted = [args.component] if args.component else _judged(board)
             missing = [name for name in wanted if board.silence or not _is_up(board, name)]
             if wanted and not missing:
@@ -87,20 +92,17 @@ def wait_remote(args: argparse.Namespace, seconds: float) -> int:
             time.sleep(min(_WAIT_S, max(until_s - time.monotonic(), 0)))
 
 
-def watch_remote(args: argparse.Namespace) -> Board:
-    """Draw again every second until Ctrl-C; return what was drawn last."""
+def watch_remote(args: argparse.Namespace) -> NoReturn:
+    """Draw again every second until Ctrl-C."""
     fleet, robot = robot_at(args.where)
     with fleet:
         while True:
-            board, tree = board_of(fleet, robot, args.component)
+            board, tree = board_of(fleet, robot, args)
             if sys.stdout.isatty():
                 print(f"{OWN}[H{OWN}[J", end="")
             show_remote(board, tree, args)
             sys.stdout.flush()
-            try:
-                time.sleep(_WAIT_S)
-            except KeyboardInterrupt:
-                return board
+            time.sleep(_WAIT_S)
 
 
 def _judged(board: Board) -> list[str]:
@@ -163,7 +165,10 @@ def _lines(board: Board, tree: StatusTree, args: argparse.Namespace) -> Iterator
     if not args.component:
         yield from overview(board, view)
         return
-    component = next(one for one in tree.components if one.component == args.component)
+    component = next((one for one in tree.components if one.component == args.component), None)
+    if component is None:  # nothing has come of this robot yet
+        yield from overview(board, view)
+        return
     yield from statuses_table(board, args.component, view)
     yield from _outputs(component)
     yield from _needs(component)

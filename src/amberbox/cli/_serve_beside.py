@@ -57,7 +57,7 @@ def add_robot(folder: Path, robot: str, groups: Sequence[str], line_file: Path |
             secret = robotkeys.add_robot(connection, now_ns, robot, groups)
             line = line_of(connection, folder, robot, secret.text)
             details = {"groups": sorted(groups), "new_groups": new, "key_id": secret.id}
-            entry = Entry(_who(), "", "robots.add", robot, details=details)
+            entry = Entry(who(), "", "robots.add", robot, details=details)
             append(connection, now_ns, entry)
             if line_file is not None:  # before the robot is added for good
                 write_private(line_file, f"{line}\n")
@@ -121,7 +121,7 @@ def decide_signing_key(folder: Path, robot: str, *, confirm: bool) -> int:
                 raise UsageError(what, "amberbox serve signing-key shows all; or at /admin/robots")
             journals = decide(connection, now_ns, robot, keys[0], confirm=confirm)
             details = {"public_key": keys[0], "journals": journals}
-            entry = Entry(_who(), "", f"robots.signing_key.{word}", robot, details=details)
+            entry = Entry(who(), "", f"robots.signing_key.{word}", robot, details=details)
             append(connection, now_ns, entry)
     finally:
         database.close()
@@ -144,10 +144,10 @@ def judge_clock(folder: Path, *, confirm: bool) -> int:
         found = ages.read()
         if found.jump and confirm:
             with database.begin() as connection:
-                held = ages.confirm(connection, _who())
+                held = ages.confirm(connection, who())
                 details = {"jump": held.jump, "by_s": round(held.ahead_ns / NS)}
                 append(
-                    connection, held.wall_ns, Entry(_who(), "", "clock.confirm", "", "ok", details)
+                    connection, held.wall_ns, Entry(who(), "", "clock.confirm", "", "ok", details)
                 )
     finally:
         database.close()
@@ -180,7 +180,7 @@ def verify_audit(folder: Path, heads: Sequence[str]) -> int:
     return 0
 
 
-def _who() -> str:
+def who() -> str:
     """Name who types, for the audit log."""
     try:
         return f"shell:{getpass.getuser()}"

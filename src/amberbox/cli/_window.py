@@ -6,7 +6,7 @@ import argparse
 
 from amberbox.blackbox.query.record import Record
 from amberbox.cli._missions import add_mission, missions_of
-from amberbox.cli._output import tell
+from amberbox.cli._output import span_of, tell
 from amberbox.core.errors import UsageError
 
 Window = tuple[int | None, int | None]
@@ -23,7 +23,7 @@ def windows(args: argparse.Namespace, record: Record) -> list[Window]:
 
     Raises UsageError for an incident that is not there, and for two ways of saying a window.
     """
-    span = record.time_ns(args.from_), record.time_ns(args.to)
+    span = span_of(args, record)
     missions = missions_of(args, record)
     if missions is not None:
         return [(mission.from_ns, mission.to_ns) for mission in missions]

@@ -13,20 +13,21 @@ from amberbox.blackbox.journal.reserved import ALARM
 from amberbox.blackbox.requests import submit
 from amberbox.blackbox.store import is_locked, open_store
 from amberbox.blackbox.where import store_path
-from amberbox.cli._anyorder import accept_any_order
+from amberbox.cli._anyorder import add_actions
 from amberbox.cli._output import print_grid, print_json
-from amberbox.cli._server import add_where
+from amberbox.cli._server import PAGE, add_robot
 from amberbox.client.address import is_url
 from amberbox.core.config import did_you_mean
 from amberbox.core.errors import UsageError
+from amberbox.core.naming import component_named, endings
 from amberbox.core.timetext import NS, format_duration, format_time, parse_duration
 
 KIND = "alarm"
 """Kind of the requests that the watcher takes."""
 _WRITER = "watch"
 _USAGE = (
-    "amberbox alarm WHERE [list [--all]] | ack ID | shelve ID --for 2h | unshelve ID "
-    "[--who NAME] [--note TEXT] [--json]"
+    "amberbox alarm [list] WHERE [--all] | ack WHERE ID | shelve WHERE ID --for 2h | "
+    "unshelve WHERE ID [--who NAME] [--note TEXT] [--json]"
 )
 _HEADER = ("id", "state", "level", "severity", "opened (UTC)", "times", "who", "reason")
 
@@ -35,16 +36,11 @@ Row = dict[str, Any]
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
-    accept_any_order(parser)
     parser.usage = _USAGE
-    add_where(parser, "robot folder or store")
-    parser.add_argument(
-        "words",
-        nargs="*",
-        metavar="ACTION",
-        help="list, ack, shelve or unshelve; "
-        "the last three with the ID of an alarm, or with its component",
-    )
+    place = f"robot folder or store, or {PAGE}; then the ID of an alarm, or its component"
+    words = {name: () if name == "list" else ("ID",) for name in _ACTIONS}
+    add_actions(parser, words, "list", place, where_first=True)
+    add_robot(parser)
     parser.add_argument("--all", action="store_true", help="list those that have healed, too")
     parser.add_argument("--for", dest="for_", metavar="TIME", help="how long it is shelved: 2h")
     parser.add_argument("--who", default="", metavar="NAME", help="who says so; else the user")
@@ -54,9 +50,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """List the alarms, or leave a request that the watcher takes."""
-    action, *rest = args.words or ["list"]
-    if action not in _ACTIONS:
-        raise UsageError(f"there is no action '{action}'{did_you_mean(action, _ACTIONS)}", _USAGE)
+    action, rest = args.action, args.rest
     if args.for_ is not None and action != "shelve":
         raise UsageError("--for goes with shelve", _USAGE)
     if len(rest) != (action != "list"):
@@ -155,8 +149,10 @@ def _check(rows: Sequence[Row], name: str, action: str, where: str) -> str:
     """Return the id of the alarm that lasts and has this id, or is of this component."""
     lasting = {row["id"]: row for row in rows if row["state"] != "healed"}
     of = {row["component"]: row["id"] for row in lasting.values()}
-    alarm_id = name if name in lasting else of.get(name, name)
-    hint = f"amberbox alarm {where} list shows them"
+    alarm_id = name
+    if name not in lasting and endings(name, of):
+        alarm_id = of[component_named(name, of)]
+    hint = f"amberbox alarm list {where} shows them"
     if alarm_id not in lasting:
         healed = any(row["id"] == name for row in rows)
         what = f"the alarm '{name}' has healed" if healed else f"there is no alarm '{name}'"

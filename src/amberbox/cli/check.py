@@ -18,7 +18,7 @@ from amberbox.blackbox.folder.folder import (
 from amberbox.blackbox.folder.plan import PlannedItem, planned_items
 from amberbox.blackbox.folder.triggers import trigger_problems
 from amberbox.cli._plantext import in_full, in_short
-from amberbox.cli._text import in_columns
+from amberbox.cli._text import in_columns, print_lines
 from amberbox.consult.knowledge import knowledge_of, rule_problems
 from amberbox.consult.known import addresses_of
 from amberbox.core.config import load_yaml
@@ -56,7 +56,7 @@ def run(args: argparse.Namespace) -> int:
         monitoring = {} if plan is None else {"monitoring": summary.as_data(plan)}
         print(json.dumps(_report(folder, items, problems, ok) | monitoring, indent=2))
     else:
-        print("\n".join(_lines(args.folder, folder, items, problems, plan, args.modes)))
+        print_lines(_lines(args.folder, folder, items, problems, plan, args.modes))
     return 0 if ok else ConfigurationError.exit_code
 
 

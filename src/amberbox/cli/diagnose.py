@@ -6,14 +6,15 @@ import argparse
 import math
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from amberbox.cli._output import accept_relative_times, print_json, tell, text_output
+from amberbox.cli._output import accept_relative_times, print_json, tell, text_output, time_of
 from amberbox.cli._server import add_where
+from amberbox.cli._text import print_lines
 from amberbox.client.address import is_url
 from amberbox.core.clock import NS
 from amberbox.core.config import refuse
@@ -172,7 +173,7 @@ def _read(args: argparse.Namespace, subject: Subject, record: Record) -> Case:
     from amberbox.consult.reading import known_at
 
     store, knowledge = open_store(record.path), subject.knowledge
-    at_ns = end_ns(store) if args.at is None else record.time_ns(args.at)
+    at_ns = end_ns(store) if args.at is None else time_of("--at", args.at, record.time_ns)
     at_ns = record.last_ns() if at_ns is None else at_ns
     if at_ns is None:
         return Case(time.time_ns())  # a record without rows
@@ -195,12 +196,10 @@ def _follow(args: argparse.Namespace, subject: Subject, record: Record | None) -
     store = open_store(record.path)
     if not is_locked(store, WRITER):
         tell([f"nobody watches, so nothing new will come: amberbox watch {subject.folder.path}"])
-    show, is_open = line_of if args.json else revision_text, False
-    with suppress(KeyboardInterrupt):
-        for diagnosis, symptoms in revisions(store):
-            print(show(subject.knowledge, diagnosis, symptoms), flush=True)
-            is_open = diagnosis.state == "open"
-    return int(is_open)
+    show = line_of if args.json else revision_text
+    for diagnosis, symptoms in revisions(store):
+        print(show(subject.knowledge, diagnosis, symptoms), flush=True)
+    return 0
 
 
 def _diagnosed(
@@ -239,7 +238,7 @@ def _show(
         text = text_of(case, diagnosis, explanation)
         if diagnosis is None and args.engine == RULES:
             text = "nothing follows from them"
-        print(alone_text(args.engine, text))
+        print_lines([alone_text(args.engine, text)])
     return int(is_wrong(case, diagnosis))
 
 

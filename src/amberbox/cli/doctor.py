@@ -10,6 +10,7 @@ from dataclasses import asdict
 from amberbox.blackbox.doctor.checkup import checkup
 from amberbox.blackbox.doctor.finding import Finding
 from amberbox.cli._output import print_json
+from amberbox.cli._text import print_lines
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -24,7 +25,7 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         print_json([asdict(finding) for finding in findings])
     else:
-        print("\n".join(report(findings)))
+        print_lines(report(findings))
     return 1 if any(finding.level == "error" for finding in findings) else 0
 
 

@@ -8,6 +8,7 @@ from typing import Any
 
 from amberbox.cli._output import add_range_only, opened
 from amberbox.cli._server import add_where
+from amberbox.cli._text import print_lines
 from amberbox.cli._window import add_window, window_of
 from amberbox.core.terminal import for_data
 from amberbox.core.timetext import format_time
@@ -29,8 +30,7 @@ def run(args: argparse.Namespace) -> int:
         table.to_json(for_data(sys.stdout))
         print()
         return 0
-    for row in table.rows():
-        print(_line(row))
+    print_lines(_line(row) for row in table.rows())
     return 0
 
 

@@ -8,8 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from amberbox.blackbox.folder.folder import inspect_folder
+from amberbox.cli._anyorder import accept_where_first
 from amberbox.cli._output import print_grid, print_json, tell, writable
 from amberbox.cli._server import add_where
+from amberbox.cli._text import print_lines
 from amberbox.client.address import is_url
 from amberbox.consult.known import known_of
 from amberbox.consult.sheets import coverage_json, criticality_json
@@ -53,6 +55,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--exposure", type=float, metavar="HOURS", help="time in which failures come about"
     )
+    accept_where_first(parser, _ACTIONS)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -126,7 +129,8 @@ def _check(
     else:
         for problem in problems:
             print(problem)
-        print(f"{args.where}: {_in_words(fmea) if fmea and not wrong else _errors(problems)}")
+        said = _in_words(fmea) if fmea and not wrong else _errors(problems)
+        print_lines([f"{args.where}: {said}"])
     if fmea and known is None and not args.json:
         tell([f"no robot folder that can be read at {args.where}: {_NOT_COMPARED}"])
     return ConfigurationError.exit_code if wrong else 0
@@ -208,7 +212,7 @@ def _coverage(args: argparse.Namespace, fmea: Fmea, known: Known | None, rules: 
     if args.json:
         print_json(coverage_json(found))
     else:
-        print("\n".join(_coverage_lines(found)))
+        print_lines(_coverage_lines(found))
 
 
 def _coverage_lines(found: Coverage) -> Iterator[str]:

@@ -12,6 +12,7 @@ from amberbox.blackbox.foxglove.playback import Playback
 from amberbox.blackbox.foxglove.server import HOST, PORT, Listener, Server, is_loopback
 from amberbox.blackbox.where import store_path
 from amberbox.cli._output import add_range_only, opened, tell
+from amberbox.cli._output import span_of as asked_span
 from amberbox.core.errors import UsageError
 from amberbox.core.timetext import format_time
 
@@ -76,7 +77,7 @@ def _live(args: argparse.Namespace, stop: threading.Event) -> None:
 
 def _range(args: argparse.Namespace, stop: threading.Event) -> None:
     with opened(args.where) as record:
-        window = record.time_ns(args.from_), record.time_ns(args.to)
+        window = asked_span(args, record)
         frames = (ColumnFrames if args.columns else MessageFrames)(record, args.item, window)
         span = frames.looking.ask(lambda catalogue: span_of(catalogue, window))
         tell(frames.report.missing)

@@ -6,9 +6,8 @@ import argparse
 from typing import Any
 
 from amberbox.blackbox.segments.parquet import overlaps
-from amberbox.cli._output import add_range_only, opened, print_json
+from amberbox.cli._output import add_range_only, opened, print_grid, print_json
 from amberbox.cli._server import add_where
-from amberbox.cli._text import in_columns
 from amberbox.cli._window import Window, add_window, windows
 from amberbox.core.clock import NS
 from amberbox.core.timetext import format_time
@@ -36,7 +35,7 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         print_json([_as_json(gap) for gap in found])
     elif found:
-        print("\n".join(in_columns([_HEADER, *map(_row, found)], "")))
+        print_grid(_HEADER, map(_row, found))
     else:
         print("nothing is missing")
     return 0

@@ -14,26 +14,25 @@ from amberbox.blackbox.journal.reserved import PREFIX
 from amberbox.blackbox.query.record import Record
 from amberbox.blackbox.store import Store, open_store
 from amberbox.blackbox.where import store_path
+from amberbox.cli._anyorder import add_actions
 from amberbox.cli._output import print_grid, print_json, tell
-from amberbox.cli._server import add_robot, named
-from amberbox.cli._text import in_columns
+from amberbox.cli._server import PAGE, add_robot
+from amberbox.cli._text import in_columns, print_lines
 from amberbox.client.address import is_url
 from amberbox.core.clock import NS
 from amberbox.core.errors import UsageError
 from amberbox.core.timetext import format_time
 from amberbox.core.units import in_bytes, parse_duration_s
 
-_USAGE = "amberbox incident WHERE, list WHERE, show WHERE ID, release WHERE ID"
+_USAGE = "amberbox incident [mark] WHERE, list WHERE, show WHERE ID, release WHERE ID"
 _HEADER = ("id", "state", "from (UTC)", "seconds", "who", "reason")
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
     parser.usage = _USAGE + " [options]"
-    parser.add_argument(
-        "words", metavar="WHERE", nargs="+",
-        help="robot folder, store, or a robot's page on a server; before it list, show or release",
-    )  # fmt: skip
+    words = {"mark": (), **{name: ("ID",)[: count - 1] for name, (_, count) in _ACTIONS.items()}}
+    add_actions(parser, words, "mark", f"robot folder or store, or {PAGE}")
     add_robot(parser)
     parser.add_argument("--before", default="60s", metavar="TIME", help="kept from before: 60s")
     parser.add_argument("--after", default="20s", metavar="TIME", help="kept from now on: 20s")
@@ -43,11 +42,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Do what the first word says; without one of them, mark an incident."""
-    first, rest = args.words[0], args.words[1:]
-    if first not in _ACTIONS:
+    """Do what the action says; without one, mark an incident."""
+    if args.action == "mark":
         return _mark(args)
-    rest[:1] = [named(where, args.robot) for where in rest[:1]]
+    first, rest = args.action, [args.where, *args.rest]
     action, count = _ACTIONS[first]
     if len(rest) != count:
         needed = " ".join(("WHERE", "ID")[:count])
@@ -64,10 +62,10 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _mark(args: argparse.Namespace) -> int:
-    if len(args.words) > 1:
-        raise UsageError(f"what is '{args.words[1]}'?", _USAGE)
+    if args.rest:
+        raise UsageError(f"what is '{args.rest[0]}'?", _USAGE)
     before_s, after_s = parse_duration_s(args.before), parse_duration_s(args.after)
-    where = named(args.words[0], args.robot)
+    where = args.where
     if is_url(where):
         from amberbox.cli._remote_incident import mark_remote
 
@@ -104,9 +102,9 @@ def _show(rest: list[str], as_json: bool) -> None:
         print_json({**incident.to_json(), "bytes": held_bytes(store, [incident]),
                     "files": found, "items": rows})  # fmt: skip
         return
-    print("\n".join(_described(incident, held_bytes(store, [incident]))))
-    print("\n".join(["files:", *in_columns([(name, in_bytes(count)) for name, count in files])]))
-    print("\n".join(["items:", *in_columns([(name, f"{n} rows") for name, n in rows.items()])]))
+    print_lines(_described(incident, held_bytes(store, [incident])))
+    print_lines(["files:", *in_columns([(name, in_bytes(count)) for name, count in files])])
+    print_lines(["items:", *in_columns([(name, f"{n} rows") for name, n in rows.items()])])
 
 
 def _release(rest: list[str], as_json: bool) -> None:

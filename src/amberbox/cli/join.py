@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 from amberbox.cli._output import print_json, tell
+from amberbox.cli._text import print_lines
 from amberbox.core.errors import UsageError
 
 _EXIT = "exit status: 0 joined, 1 written down but the server cannot be reached now, 2 refused"
@@ -35,6 +36,6 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         print_json({"url": line.url, "reached": joined.reached, "said": list(joined.lines)})
     else:
-        print("\n".join(joined.lines))
+        print_lines(joined.lines)
         tell([f"amberbox run {args.folder} keeps it linked"])
     return 0 if joined.reached else 1

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import logging
 import os
+import signal
 import sys
 import traceback
 from collections.abc import Mapping, Sequence
@@ -14,6 +15,7 @@ from typing import NoReturn
 from amberbox import __version__
 from amberbox.core.config import did_you_mean
 from amberbox.core.errors import AmberboxError, ConfigurationError, UsageError
+from amberbox.core.interrupt import Interrupt
 from amberbox.core.plugins import Plugin, find
 from amberbox.core.terminal import harmless
 
@@ -21,7 +23,6 @@ EVERYDAY = (
     *("new", "check", "record", "watch", "run", "status"),
     *("query", "plot", "incident", "diagnose", "experiment", "serve"),
 )
-_INTERRUPTED = 130
 _BROKEN_PIPE = 141
 
 
@@ -40,21 +41,31 @@ def _main(arguments: Sequence[str] | None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return _BROKEN_PIPE
     except KeyboardInterrupt:
-        return _INTERRUPTED
-    except AmberboxError as error:
-        _show_trace()
+        return Interrupt.STATUS
+    except Exception as error:
+        return Interrupt.STATUS if _interrupted() else _failed(error)
+
+
+def _interrupted() -> bool:
+    """Tell whether Ctrl-C is what an error came of."""
+    handler = signal.getsignal(signal.SIGINT)
+    return isinstance(handler, Interrupt) and handler.came
+
+
+def _failed(error: Exception) -> int:
+    """Say what went wrong; return the exit status."""
+    _show_trace()
+    if isinstance(error, AmberboxError):
         _report(error)
         return error.exit_code
-    except OSError as error:
-        _show_trace()
+    if isinstance(error, OSError):
         place = f"{error.filename}: " if error.filename else ""
         _report(AmberboxError(f"{place}{error.strerror or error}"))
         return 1
-    except Exception as error:  # a defect of ours: never a bare traceback for the user
-        _show_trace()
-        hint = "this is a defect of amberbox; AMBERBOX_DEBUG=1 shows where it happened"
-        _report(AmberboxError(f"{type(error).__name__}: {error}", hint))
-        return 1
+    # a defect of ours: never a bare traceback for the user
+    hint = "this is a defect of amberbox; AMBERBOX_DEBUG=1 shows where it happened"
+    _report(AmberboxError(f"{type(error).__name__}: {error}", hint))
+    return 1
 
 
 def verbs() -> Mapping[str, Plugin]:
@@ -114,6 +125,9 @@ def _run_verb(name: str, arguments: Sequence[str], verbosity: int) -> int:
 
         name_robot(parsed)
     _set_up_logging(verbosity + parsed.verbose)
+    handler = signal.getsignal(signal.SIGINT)
+    if isinstance(handler, Interrupt):
+        handler.loading = False
     status: int = module.run(parsed)
     sys.stdout.flush()
     return status

@@ -11,7 +11,8 @@ from amberbox.blackbox.missions import Mission, choose
 from amberbox.blackbox.missions.ask import end, start
 from amberbox.blackbox.missions.detect import detect, find
 from amberbox.blackbox.where import store_path
-from amberbox.cli._output import add_range_only, opened, print_grid, print_json, tell
+from amberbox.cli._anyorder import accept_where_first
+from amberbox.cli._output import add_range_only, opened, print_grid, print_json, span_of, tell
 from amberbox.cli._server import add_where
 from amberbox.client.address import is_url
 from amberbox.core.errors import UsageError
@@ -27,6 +28,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     _start(verbs.add_parser("start", help="begin a mission now"))
     _end(verbs.add_parser("end", help="end a mission now"))
     _detect(verbs.add_parser("detect", help="find missions in what is recorded already"))
+    accept_where_first(parser, verbs.choices, "list")
 
 
 def _where(parser: argparse.ArgumentParser) -> None:
@@ -75,7 +77,7 @@ def _run_list(args: argparse.Namespace) -> int:
     if args.last is not None and args.last < 1:
         raise UsageError("--last must be 1 or more")
     with opened(args.where) as record:
-        span = record.time_ns(args.from_), record.time_ns(args.to)
+        span = span_of(args, record)
         known = record.missions()
     found = choose(known, args.name, failed=args.failed, last=args.last, span=span)
     _show(found, args.json, "no missions" if known == [] else "no such mission")

@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from amberbox.blackbox.folder.folder import SOURCES
-from amberbox.cli._text import in_columns
+from amberbox.cli._text import in_columns, print_lines
 from amberbox.core.config import did_you_mean
 from amberbox.core.describe import OptionRow, describe
 from amberbox.core.errors import UsageError
@@ -65,7 +65,7 @@ def _list(kinds: Sequence[str], as_json: bool) -> int:
         return 0
     for kind, some in found.items():
         print(f"{kind}s, {KINDS[kind].use}:")
-        print("\n".join(in_columns((row["name"], row["summary"]) for row in some)) + "\n")
+        print_lines([*in_columns((row["name"], row["summary"]) for row in some), ""])
     for row in rows:
         if row["missing"]:
             print(f"'{row['name']}' lacks {', '.join(row['missing'])}. {row['install']}".rstrip())
@@ -91,8 +91,8 @@ def _show(name: str, kinds: Sequence[str], as_json: bool) -> int:
     if as_json:
         print(json.dumps(_overview(kind, plugin) | details, indent=2))
         return 0
-    print(f"{plugin.name}: {plugin.summary}")
-    print("\n".join(_SHOWN[kind](details)))
+    print_lines([f"{plugin.name}: {plugin.summary}"])
+    print_lines(_SHOWN[kind](details))
     return 0
 
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 from amberbox.blackbox.folder.folder import load_folder
 from amberbox.cli._output import print_json, tell
-from amberbox.cli._text import in_columns
+from amberbox.cli._text import in_columns, print_lines
 from amberbox.core.errors import UsageError
 from amberbox.core.probe import ProbeOrder, in_order
 from amberbox.monitoring.probing.probe import Row, known_probes, load_probe
@@ -184,7 +184,7 @@ def _cells(order: ProbeOrder, row: Row) -> tuple[str, str, str, str]:
 
 def _print_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
     """Print whole cells: an error or a name that is cut helps nobody."""
-    print("\n".join(in_columns([header, *rows], indent="")))
+    print_lines(in_columns([header, *rows], indent=""))
 
 
 def _word(ok: bool | None) -> str:
@@ -220,8 +220,8 @@ def _list_kinds(as_json: bool) -> None:
         print_json([_described(name, module) for name, module in modules.items()])
         return
     for name, module in modules.items():
-        print(f"{name}: {(module.__doc__ or '').partition(chr(10))[0]}")
-        print("\n".join(in_columns(_explained(module))))
+        print_lines([f"{name}: {(module.__doc__ or '').partition(chr(10))[0]}"])
+        print_lines(in_columns(_explained(module)))
 
 
 def _described(name: str, module: ModuleType) -> Mapping[str, Any]:

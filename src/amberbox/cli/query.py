@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Callable
 from typing import IO
 
@@ -60,7 +59,9 @@ def run(args: argparse.Namespace) -> int:
         table = record.query(
             args.item, args.variables or None, *span, args.by, args.points, missions=missions
         )
-        notes = [*table.notes, *([] if len(table) else [_nothing(record, table.item)])]
+        notes = [note.replace("fetch URL", f"fetch {args.where}") for note in table.notes]
+        if not len(table):
+            notes.append(_nothing(record, table.item))
     write(table, form, args.output)
     tell(notes)
     return 0
@@ -68,7 +69,10 @@ def run(args: argparse.Namespace) -> int:
 
 def _nothing(record: Record, item: str) -> str:
     """Say where the rows are when the range has none."""
-    known = next(info for info in record.items() if info.name == item)
+    known = next((info for info in record.items() if info.name == item), None)
+    if known is None or known.no_columns:
+        why = "nothing of it can be read" if known is None else known.no_columns
+        return f"{item} has no rows: {why}"
     first, last = format_time(known.first_ns), format_time(known.last_ns)
     return f"no rows in this range; {item} has {known.rows} from {first} to {last}"
 
@@ -117,12 +121,9 @@ def _follow(record: Record, args: argparse.Namespace, form: str) -> int:
 
     with text_output(args.output) as file:
         first = True
-        try:
-            for table in follow_tables(record, args.item, args.variables or None, args.from_):
-                _stream(table, form, file, header=first)
-                first = False
-        except KeyboardInterrupt:
-            print(file=sys.stderr)
+        for table in follow_tables(record, args.item, args.variables or None, args.from_):
+            _stream(table, form, file, header=first)
+            first = False
     return 0
 
 

@@ -14,6 +14,7 @@ from dataclasses import asdict
 from amberbox.blackbox.folder.folder import load_folder
 from amberbox.blackbox.recorder.recorder import Recorder, RecorderState
 from amberbox.blackbox.service import is_service
+from amberbox.cli._output import warn_readable
 from amberbox.core.files import keep_to_group
 from amberbox.core.terminal import OWN
 from amberbox.core.units import in_bytes, in_unit
@@ -44,7 +45,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Record until stopped by a signal, by ``--for``, or by the end of all inputs."""
     keep_to_group()
-    recorder = Recorder(load_folder(args.folder))
+    folder = load_folder(args.folder)
+    warn_readable(folder.store_path)
+    recorder = Recorder(folder)
     recorder.pipeline.on_event = _tell
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: recorder.stop.set())

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from amberbox.blackbox.query.record import Record
-from amberbox.cli._output import add_range_only, opened, print_json, tell, writable
+from amberbox.cli._output import add_range_only, opened, print_json, span_of, tell, writable
 from amberbox.cli._server import add_robot
 from amberbox.client.address import is_url
 from amberbox.consult.facts import Place, facts_of, place_of
@@ -106,7 +106,7 @@ def _with_facts(
         return program
     span: tuple[int | None, int | None] = (None, None)
     if record is not None:
-        span = record.time_ns(args.from_), record.time_ns(args.to)
+        span = span_of(args, record)
     return facts_of(place, record, span).added_to(program)
 
 

@@ -18,6 +18,7 @@ _PORT = 8443
 _USAGE = """amberbox serve --data DIR [options]
        amberbox serve cert --data DIR --host NAME...
        amberbox serve add-robot ID --data DIR [--group GROUP]... [--line-file FILE]
+       amberbox serve add-user NAME --data DIR [--role ROLE] [--group GROUP]... [--one-time]
        amberbox serve signing-key [ID confirm|refuse] --data DIR
        amberbox serve clock --data DIR [--confirm]
        amberbox serve verify-audit --data DIR [--head "NUMBER HASH"]..."""
@@ -28,10 +29,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
     parser.usage = _USAGE
     parser.epilog = _EXIT
-    words = "cert | add-robot ID | signing-key | clock | verify-audit"
+    words = "cert | add-robot ID | add-user NAME | signing-key | clock | verify-audit"
     parser.add_argument("words", nargs="*", metavar=words,
-                        help="make a certificate, add a robot, decide on a robot's new signing "
-                        "key, judge the clock, verify the audit log")  # fmt: skip
+                        help="make a certificate, add a robot or a person, decide on a robot's new "
+                        "signing key, judge the clock, verify the audit log")  # fmt: skip
     parser.add_argument("--data", required=True, metavar="DIR", help="the server's data folder")
     parser.add_argument("--host", action="append", metavar="NAME",
                         help="address to listen at (127.0.0.1); cert: what the server is called, "
@@ -44,10 +45,17 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--new-code", action="store_true",
                         help="make a code that lets somebody become an admin")  # fmt: skip
     parser.add_argument("--group", action="append", default=[], metavar="GROUP",
-                        help="add-robot: a group that the robot is in")  # fmt: skip
+                        help="add-robot: a group that the robot is in; add-user: the person sees "
+                        "only robots of it")  # fmt: skip
     parser.add_argument("--line-file", metavar="FILE",
                         help="add-robot: write the line into a new file with mode 0600, "
                         "instead of printing it")  # fmt: skip
+    parser.add_argument("--role", metavar="ROLE",
+                        help="add-user: viewer, operator, technician or admin (the first person "
+                        "is an admin, others are viewers)")  # fmt: skip
+    parser.add_argument("--one-time", action="store_true",
+                        help="add-user: print a password that has to be changed at the first "
+                        "login, instead of asking for one")  # fmt: skip
     parser.add_argument("--confirm", action="store_true",
                         help="clock: it is right, recordings may grow old by it")  # fmt: skip
     parser.add_argument("--head", action="append", default=[], metavar="HEAD",
@@ -68,21 +76,23 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _serve(args: argparse.Namespace) -> int:
-    if args.group or args.line_file or args.head or args.confirm:
+    if args.group or args.line_file or args.head or args.confirm or args.role or args.one_time:
         what = (
-            "--group and --line-file are for add-robot, --head for verify-audit, "
-            "--confirm for clock"
+            "--group and --line-file are for add-robot, --role and --one-time for add-user, "
+            "--head for verify-audit, --confirm for clock"
         )
         raise UsageError(what, _USAGE)
     if args.host is not None and len(args.host) > 1:
         raise UsageError("a server listens at one address", "--host 0.0.0.0 for all of them")
     check_installed()
     gc.disable()  # until it answers: nothing that is loaded now goes away again
+    from amberbox.cli._output import warn_readable
     from amberbox.fleet.serving.binding import Wanted
     from amberbox.fleet.serving.starting import run as start
 
     host = args.host[0] if args.host else "127.0.0.1"
     wanted = Wanted(host, args.port, args.public_url, tuple(args.behind_proxy))
+    warn_readable(Path(args.data))
     told = _told(Path(args.data), quiet=args.quiet)
     start(Path(args.data).resolve(), wanted, new_code=args.new_code, begun=told)
     return 0
@@ -134,6 +144,15 @@ def _add_robot(args: argparse.Namespace) -> int:
     return add_robot(Path(args.data), args.words[1], args.group, file)
 
 
+def _add_user(args: argparse.Namespace) -> int:
+    from amberbox.cli._serve_users import add_user
+
+    if len(args.words) != 2:
+        raise UsageError("add-user takes one NAME", "amberbox serve add-user NAME --data DIR")
+    groups = args.group or None
+    return add_user(Path(args.data), args.words[1], args.role, groups, one_time=args.one_time)
+
+
 def _signing_key(args: argparse.Namespace) -> int:
     from amberbox.cli._serve_beside import decide_signing_key, list_signing_keys
 
@@ -160,6 +179,7 @@ def _verify_audit(args: argparse.Namespace) -> int:
 _BESIDE: Mapping[str, Callable[[argparse.Namespace], int]] = {
     "cert": _cert,
     "add-robot": _add_robot,
+    "add-user": _add_user,
     "signing-key": _signing_key,
     "clock": _clock,
     "verify-audit": _verify_audit,

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import getpass
 import socket
 import ssl
 import sys
 from pathlib import Path
 from urllib.parse import urlsplit
 
-from amberbox.cli._output import tell
+from amberbox.cli._output import secret, tell
 from amberbox.client import servers, trust
 from amberbox.client.address import Address, read_address
 from amberbox.client.errors import NotAllowedError, UnreachableError
@@ -104,7 +103,7 @@ def _confirm(address: Address, found: str) -> None:
 
 
 def _token(address: Address) -> str:
-    text = _secret(f"API token for {address.url}: ").strip()
+    text = secret(f"API token for {address.url}: ").strip()
     if not text:
         raise UsageError(
             "no token was given", f"amberbox sign-in {address.url} --user NAME makes one"
@@ -116,20 +115,13 @@ def _made(address: Address, name: str, pin: str, authority: str) -> str:
     """Make a token with a password; it lasts 90 days and is listed as this computer's."""
     from amberbox.fleet.accounts.actions import SCOPES
 
-    password = _secret(f"password of {name} at {address.url}: ")
+    password = secret(f"password of {name} at {address.url}: ")
     context = trust.context_of(address.url, pin, SignIn("", pin, authority))
     wire = Wire(address.url, context=context)
     try:
         return make_token(wire, name, password, f"amberbox on {socket.gethostname()}", SCOPES)
     finally:
         wire.close()
-
-
-def _secret(question: str) -> str:
-    """Take a secret where no shell remembers it and nobody sees it."""
-    if sys.stdin.isatty():
-        return getpass.getpass(question)
-    return sys.stdin.readline().rstrip("\n")
 
 
 def _try(address: Address, entry: SignIn) -> None:

@@ -10,7 +10,7 @@ import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import msgspec
 
@@ -24,10 +24,11 @@ from amberbox.cli._colour import painter
 from amberbox.cli._output import print_json, tell
 from amberbox.cli._server import add_where
 from amberbox.cli._statustable import View, detail, overview, waiting
+from amberbox.cli._text import print_lines
 from amberbox.client.address import is_url
 from amberbox.core.clock import NS
-from amberbox.core.config import did_you_mean
-from amberbox.core.errors import AmberboxError, UsageError
+from amberbox.core.errors import AmberboxError
+from amberbox.core.naming import component_named
 from amberbox.core.terminal import OWN
 from amberbox.core.timetext import format_time
 from amberbox.core.types import Output, Status
@@ -70,7 +71,7 @@ def run(args: argparse.Namespace) -> int:
     plan = _plan_of(args.where)
     reader = BoardReader(open_store(store_path(args.where)))
     if args.watch:
-        return _watch(reader, args, plan)
+        _watch(reader, args, plan)
     board = _read(reader, args, plan)
     _show(board, args, plan)
     return _verdict(board, args.component)
@@ -83,7 +84,7 @@ def _remote(args: argparse.Namespace) -> int:
     if args.wait is not None:
         return wait_remote(args, parse_duration_s(args.wait))
     if args.watch:
-        return _verdict(watch_remote(args), args.component)
+        watch_remote(args)
     board, tree = read_remote(args)
     if args.json:
         print_json(_as_json(board) | {"robot": tree.robot})
@@ -92,7 +93,7 @@ def _remote(args: argparse.Namespace) -> int:
     return _verdict(board, args.component)
 
 
-def _watch(reader: BoardReader, args: argparse.Namespace, plan: Plan | None) -> int:
+def _watch(reader: BoardReader, args: argparse.Namespace, plan: Plan | None) -> NoReturn:
     """Draw again and again until Ctrl-C."""
     while True:
         board = _read(reader, args, plan)
@@ -100,10 +101,7 @@ def _watch(reader: BoardReader, args: argparse.Namespace, plan: Plan | None) -> 
             print(f"{OWN}[H{OWN}[J", end="")
         _show(board, args, plan)
         sys.stdout.flush()
-        try:
-            time.sleep(_PERIOD_S)
-        except KeyboardInterrupt:
-            return _verdict(board, args.component)
+        time.sleep(_PERIOD_S)
 
 
 def _read(reader: BoardReader, args: argparse.Namespace, plan: Plan | None) -> Board:
@@ -111,11 +109,8 @@ def _read(reader: BoardReader, args: argparse.Namespace, plan: Plan | None) -> B
     known = board.components
     if not args.component:
         return board
-    if known and args.component not in known:
-        near = did_you_mean(args.component, known)
-        raise UsageError(
-            f"there is no component '{args.component}'{near}", f"known: {', '.join(known)}"
-        )
+    if known:
+        args.component = component_named(args.component, known, _titles(plan))
     statuses = [status for status in board.statuses if status.component == args.component]
     return board if args.format == "table" and not args.json else _only(board, statuses)
 
@@ -141,10 +136,9 @@ def _show(board: Board, args: argparse.Namespace, plan: Plan | None) -> None:
         for message in FORMATS[args.format](board.statuses, Naming.of(plan)):
             print(msgspec.json.encode(message).decode())
     else:
-        print("\n".join(_lines(board, args, plan)))
+        print_lines(_lines(board, args, plan))
     if args.format == "table" and not args.json and not args.component:
-        for line in _link_lines(args.where):
-            print(line)
+        print_lines(_link_lines(args.where))
     tell(_changes(args.where, board, plan))
     if board.silence:
         print(f"hint: {_UNKNOWN_HINT.format(where=args.where)}", file=sys.stderr)
@@ -190,7 +184,8 @@ def _lines(board: Board, args: argparse.Namespace, plan: Plan | None) -> Iterato
 def _wait(args: argparse.Namespace, seconds: float) -> int:
     """Wait for a component, or for all; say in the end what is still waited for."""
     plan = _plan_of(args.where)
-    _refuse_unknown(args.component, plan)
+    if args.component and (titles := _titles(plan)):
+        args.component = component_named(args.component, titles, titles)
     until_s = time.monotonic() + seconds
     reader: BoardReader | None = None
     while True:
@@ -209,11 +204,8 @@ def _wait(args: argparse.Namespace, seconds: float) -> int:
         time.sleep(min(_WAIT_S, max(until_s - time.monotonic(), 0)))
 
 
-def _refuse_unknown(component: str | None, plan: Plan | None) -> None:
-    known = [entry.id for entry in plan.components] if plan else []
-    if component and known and component not in known:
-        near = did_you_mean(component, known)
-        raise UsageError(f"there is no component '{component}'{near}", f"known: {', '.join(known)}")
+def _titles(plan: Plan | None) -> dict[str, str]:
+    return {entry.id: entry.name for entry in plan.components} if plan else {}
 
 
 def _reader_of(where: str) -> BoardReader | None:

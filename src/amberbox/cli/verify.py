@@ -12,7 +12,7 @@ from amberbox.blackbox.verify.findings import STATES, Finding, Report, as_text
 from amberbox.blackbox.verify.verify import verify
 from amberbox.blackbox.where import store_path
 from amberbox.cli._output import print_json, tell
-from amberbox.cli._text import in_columns
+from amberbox.cli._text import in_columns, print_lines
 from amberbox.core.units import in_bytes
 
 
@@ -40,7 +40,7 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         print_json(_as_json(report, good=good))
     else:
-        print("\n".join(_lines(report)))
+        print_lines(_lines(report))
         tell(report.notes)
     return 0 if good else 1
 

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from amberbox.cli._output import accept_relative_times, tell
+from amberbox.cli._output import accept_relative_times, span_of, tell
 from amberbox.core.errors import UsageError
 from amberbox.core.files import keep_to_group
 
@@ -186,7 +186,7 @@ def _part(args: argparse.Namespace, store: Store) -> Part:
     from amberbox.monitoring.watcher.replay import Part
 
     record = open_record(store.path)
-    return Part(record.time_ns(args.from_), record.time_ns(args.to), _speed(args.speed))
+    return Part(*span_of(args, record), _speed(args.speed))
 
 
 def _speed(text: str) -> float | None:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from typing import get_args
 
 from amberbox.core.config import did_you_mean
 from amberbox.core.errors import UsageError
+from amberbox.core.naming import named
 from amberbox.core.types import Symptom, SymptomState
 from amberbox.diagnosis.covering.next_test import CANNOT
 from amberbox.diagnosis.knowledge import Knowledge
@@ -18,7 +18,6 @@ SOURCE = "given"
 
 _STATES: Mapping[str, SymptomState] = {state: state for state in get_args(SymptomState)}
 _CANNOT = ("cannot", CANNOT)
-_SHOWN = 4
 
 
 def given_symptoms(texts: Iterable[str], knowledge: Knowledge, at_ns: int) -> list[Symptom]:
@@ -53,24 +52,6 @@ def given_answers(texts: Iterable[str], knowledge: Knowledge) -> dict[str, str]:
     return given
 
 
-def named(name: str, known: Collection[str], kind: str) -> str:
-    """Return the id that a name is, or is the end of.
-
-    Raises UsageError when there is none, or when it is the end of several.
-    """
-    if name in known:
-        return name
-    parts = _parts(name)
-    ends = [entry for entry in known if parts and _parts(entry)[-len(parts) :] == parts]
-    if len(ends) == 1:
-        return ends[0]
-    if not ends:
-        raise UsageError(f"there is no {kind} '{name}'{did_you_mean(name, known)}")
-    more = f" and {len(ends) - _SHOWN} more" if len(ends) > _SHOWN else ""
-    what = f"'{name}' is the end of {len(ends)} {kind}s"
-    raise UsageError(what, f"name one of {', '.join(ends[:_SHOWN])}{more}")
-
-
 def _state(word: str, text: str) -> SymptomState:
     if word not in _STATES:
         near = did_you_mean(word, _STATES)
@@ -92,7 +73,3 @@ def _value(test: str, value: str, knowledge: Knowledge) -> str:
     check = check_named(knowledge, test)
     check.level(value)
     return value
-
-
-def _parts(name: str) -> list[str]:
-    return [part for part in re.split(r"[/.#]", name) if part]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 
+from amberbox.blackbox.query.record import Record
 from amberbox.blackbox.store import Store
 from amberbox.consult.case import Case
 from amberbox.consult.journal import Said, said_until, was_watched
@@ -78,11 +79,20 @@ def evaluated(
     if evaluation.place is None:
         raise UsageError(
             f"nothing was recorded in the {duration(round(lookback_s * NS))} before "
-            f"{format_time(at_ns)[:19]}",
+            f"{format_time(at_ns)[:19]}; {_recorded(store)}",
             "amberbox gaps shows what is missing; give another --at or a longer --lookback",
         )
     reached_ns = evaluation.place.until_ns
     return replace(heard.case(reached_ns, tracker.situation()), origin="record")
+
+
+def _recorded(store: Store) -> str:
+    """Say from when to when a record has rows."""
+    items = Record(store.path).items()
+    if not items:
+        return "the record has no rows"
+    first_ns, last_ns = min(i.first_ns for i in items), max(i.last_ns for i in items)
+    return f"the record goes from {format_time(first_ns)[:19]} to {format_time(last_ns)[:19]}"
 
 
 def _between(

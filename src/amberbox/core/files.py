@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import stat
 from pathlib import Path
 
 from amberbox.core.errors import AmberboxError
@@ -37,6 +38,12 @@ def keep_to_group() -> None:
     """
     before = os.umask(0o077)
     os.umask(before | 0o027)
+
+
+def open_to_all(path: Path) -> str:
+    """Say that everybody on this computer can look into a folder; empty if that is not so."""
+    mode = stat.S_IMODE(path.stat().st_mode) if path.exists() else 0
+    return f"everybody on this computer can read {path} (mode {mode:04o})" if mode & 0o007 else ""
 
 
 def replace_file(path: Path, text: str) -> None:

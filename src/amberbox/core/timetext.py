@@ -59,6 +59,16 @@ def parse_time(text: str, now_ns: Callable[[], int], last_ns: Callable[[], int |
     return time_ns
 
 
+def in_order(from_ns: int | None, to_ns: int | None) -> tuple[int | None, int | None]:
+    """Return a range of time; raises UsageError if it ends before it begins."""
+    if from_ns is not None and to_ns is not None and from_ns > to_ns:
+        raise UsageError(
+            f"the range ends before it begins: from {format_time(from_ns)} to {format_time(to_ns)}",
+            "exchange from and to",
+        )
+    return from_ns, to_ns
+
+
 def ns_of(stamp: str) -> int:
     """Read a time as `format_time` writes it; raises UsageError for any other."""
     iso = _ISO.fullmatch(stamp)

@@ -7,8 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from sqlalchemy import delete, insert
 
 from amberbox.blackbox.query.gather import Request
+from amberbox.core.clock import NS
 from amberbox.core.errors import UsageError
 from amberbox.core.types import Schema, Topic
 from amberbox.fleet.archive.files import Layout
@@ -21,11 +23,17 @@ from amberbox.fleet.data.asked import Asked
 from amberbox.fleet.data.items import described_json, item_json, items_json
 from amberbox.fleet.data.look import Look, look
 from amberbox.fleet.data.rows import rows
+from amberbox.fleet.database.database import FILE, Database
+from amberbox.fleet.linkend.tables import STATUS
 from amberbox.testing.clock import ManualClock
 from amberbox.testing.records import POSE, T0_NS, FakeItem, FakeRun, pose
 from tests.fleet.archive.recordings import Robot
 
 _MS = 1_000_000
+LATE = (
+    "complete until 2026-09-21T14:13:21Z; the robot has data until 2026-09-21T14:14:21Z: "
+    "amberbox fetch URL odom 2026-09-21T14:13:21Z 2026-09-21T14:14:21Z --wait"
+)
 
 
 @pytest.fixture
@@ -55,6 +63,28 @@ def test_a_journal_that_is_committed_during_the_look_counts_once(archive: Folder
     archive.commit(0)
     reader = Reader(layout, catalogue, catalogue.sources(["r1"]))
     assert xs(Look(reader, catalogue, waiting)) == list(range(120))
+
+
+def test_what_is_still_on_the_robot_is_said_and_how_to_get_it(archive: FolderArchive) -> None:
+    """The newest status came over the link a minute after the end of what was copied."""
+    folder = archive.layout.folder
+    end_ns = T0_NS + 1_190 * _MS
+    status = {"robot": "r1", "component": "c", "mode": "", "level": "ok", "store_id": "s",
+              "run": 1, "seq": 1, "received_ns": 1, "data": b""}  # fmt: skip
+
+    def notes(to_ns: int | None = None) -> list[str]:
+        asked = Asked("r1", "odom", ["pose_x"], to_ns=to_ns)
+        return look(folder, "r1", lambda seen: rows(seen, asked).about.notes)
+
+    database = Database(folder / FILE)
+    assert notes() == []
+    for late_ns, said in ((NS, []), (60 * NS, [LATE])):
+        with database.begin() as connection:
+            connection.execute(delete(STATUS))
+            connection.execute(insert(STATUS), [{**status, "log_ns": end_ns + late_ns}])
+        assert notes() == said
+        assert notes(end_ns - NS) == [], "a range that was copied lacks nothing"
+    database.close()
 
 
 def test_what_is_too_much_to_read_is_said(

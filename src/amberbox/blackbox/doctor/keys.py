@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from amberbox.blackbox.doctor.finding import Finding, error, ok, warn
 from amberbox.blackbox.doctor.host import Host
 from amberbox.blackbox.doctor.subject import Subject
+from amberbox.core.files import open_to_all
 
 _BACKUP = "keep a copy of key.pub off the robot: amberbox verify needs it to prove anything"
 
@@ -18,9 +19,8 @@ def keys(subject: Subject, host: Host) -> Iterator[Finding]:
         yield ok("keys", "none yet: they are made at the first start of the recorder")
         return
     yield _judged(subject)
-    mode = stat.S_IMODE(subject.store_path.stat().st_mode)
-    if mode & 0o007:
-        what = f"everybody on this computer can read the store (mode {mode:04o})"
+    what = open_to_all(subject.store_path)
+    if what:
         yield warn("store", what, f"chmod -R o-rwx {subject.store_path}")
 
 

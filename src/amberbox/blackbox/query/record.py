@@ -29,7 +29,7 @@ from amberbox.blackbox.store import is_store
 from amberbox.blackbox.where import store_path
 from amberbox.core.errors import UsageError
 from amberbox.core.names import identifier
-from amberbox.core.timetext import parse_time
+from amberbox.core.timetext import in_order, parse_time
 from amberbox.core.types import Column, ColumnData, Gap, ItemSchema
 
 if TYPE_CHECKING:
@@ -101,7 +101,8 @@ class Record:
         pyarrow the journals are read instead of the segments: slower, with the same result.
         With ``missions`` the ranges are theirs; of several, a column ``mission`` tells which.
 
-        Raises UsageError for unknown or ambiguous names and for times that cannot be read.
+        Raises UsageError for unknown or ambiguous names, for times that cannot be read, and for a
+        range that ends before it begins.
         """
         if missions is not None:
             from amberbox.blackbox.missions.windows import query_missions
@@ -109,7 +110,7 @@ class Record:
             return query_missions(
                 missions, lambda start, end: self.query(item, variables, start, end, by, points)
             )
-        span = self.time_ns(from_), self.time_ns(to)
+        span = self.span_ns(from_, to)
         return self._ask(lambda c: query_tables(c, item, variables, span, by, points))
 
     def time_ns(self, moment: Time) -> int | None:
@@ -118,13 +119,17 @@ class Record:
             return moment
         return parse_time(moment, time.time_ns, self.last_ns)
 
+    def span_ns(self, from_: Time, to: Time) -> tuple[int | None, int | None]:
+        """Read both ends of a range; raises UsageError if it ends before it begins."""
+        return in_order(self.time_ns(from_), self.time_ns(to))
+
     def last_ns(self) -> int | None:
         """Return when the last record was received; None in an empty store."""
         return self._ask(gap_list.last_received_ns)
 
     def gaps(self, item: str | None = None, from_: Time = None, to: Time = None) -> list[Gap]:
         """Return what is missing in ``[from_, to)`` and why, of one item or of all."""
-        span = self.time_ns(from_), self.time_ns(to)
+        span = self.span_ns(from_, to)
         return self._ask(lambda catalogue: gap_list.gaps(catalogue, item, span))
 
     def missions(
@@ -164,11 +169,11 @@ class Record:
 
     def events(self, from_: Time = None, to: Time = None) -> Table:
         """Return what happened to the box: its event channel as a table."""
-        name = identifier(reserved.EVENT)
+        name, span = identifier(reserved.EVENT), self.span_ns(from_, to)
         if not self._ask(lambda catalogue: name in catalogue.schemas):
             return Table("events", (Column("timestamp", "timestamp", "time"),),
                          {"timestamp": np.empty(0, np.int64)})  # fmt: skip
-        return self.query(name, None, from_, to)
+        return self.query(name, None, *span)
 
     def _ask(self, question: Callable[[Catalogue], Answer]) -> Answer:
         return ask(self.path, question, with_segments=can_build())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -36,6 +37,7 @@ Pieces: TypeAlias = tuple[tuple[int, Piece], ...]
 _JOURNALS = "journals"
 """Schema of the rows that no segment serves."""
 
+_PERIOD_S = 0.05
 _UNREAD = "amberbox: not read yet"
 _FAILS = f"error('{_UNREAD}')"
 _EVERY = frozenset({"columns", "explain"})
@@ -69,8 +71,8 @@ def run_sql(catalogue: Catalogue, statement: str) -> Table:
     Rows of journals are read only of the tables, and only in the columns, that the statement
     names. What it gets at in other ways (``*``, ``query_table``) is read when it turns out.
 
-    Raises AmberboxError when DuckDB refuses the statement, UsageError without DuckDB or when the
-    statement is not a single SELECT, DESCRIBE, SHOW or EXPLAIN.
+    Raises UsageError without DuckDB, or when the statement is wrong or not a single SELECT,
+    DESCRIBE, SHOW or EXPLAIN; AmberboxError when DuckDB cannot carry it out.
     """
     named, names = _Named(statement), sorted(catalogue.schemas)
     for reading in (named, replace(named, all_columns=True), replace(named, all_tables=True)):
@@ -135,14 +137,31 @@ def run_views(
 ) -> Table:
     """Answer a SELECT over views that ``create`` makes; it returns the files that they read."""
     duckdb = _duckdb()
+    wrong = (duckdb.ProgrammingError, duckdb.DataError, duckdb.NotSupportedError,
+             duckdb.PermissionException)  # fmt: skip
     with duckdb.connect(":memory:") as connection:
         connection.execute("SET TimeZone = 'UTC'")
         _shut_off(connection, create(connection))
         try:
             _refuse_all_but_questions(connection, statement)
-            return _to_table(connection.sql(statement).to_arrow_table())
-        except duckdb.Error as error:
+            return _to_table(_answer(connection, statement))
+        except wrong as error:
+            raise UsageError(f"SQL: {error}", _hint(names)) from error
+        except duckdb.Error as error:  # memory, files: the statement is not at fault
             raise AmberboxError(f"SQL: {error}", _hint(names)) from error
+
+
+def _answer(connection: duckdb.DuckDBPyConnection, statement: str) -> Any:
+    """Run a statement on a thread of its own: DuckDB itself does not heed Ctrl-C."""
+    with ThreadPoolExecutor(1) as pool:
+        asked = pool.submit(lambda: connection.sql(statement).to_arrow_table())
+        try:
+            return asked.result()
+        except KeyboardInterrupt:
+            while not asked.done():  # an interrupt before it begins does nothing
+                connection.interrupt()
+                wait([asked], _PERIOD_S)
+            raise
 
 
 def _refuse_all_but_questions(connection: duckdb.DuckDBPyConnection, statement: str) -> None:

@@ -9,8 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 
-from amberbox.core.config import did_you_mean
-from amberbox.core.errors import UsageError
+from amberbox.core.naming import component_named
 from amberbox.core.needs import Needs
 from amberbox.diagnosis.faulttree.formula import (
     Constant,
@@ -40,10 +39,9 @@ def fault_tree_of(fmea: Fmea, effect: str, exposure_h: float | None = None) -> F
     Raises UsageError for an effect that there is not.
     """
     needs = fmea.needs()
-    if effect not in needs:
-        near = did_you_mean(effect, needs)
-        known = ", ".join(effects(fmea)) or "none; components can be named, too"
-        raise UsageError(f"there is no effect '{effect}'{near}", f"effects on the system: {known}")
+    known = ", ".join(effects(fmea)) or "none; components can be named, too"
+    hint = f"effects on the system: {known}"
+    effect = component_named(effect, needs, kind="effect", hint=hint)
     return tree_over(fmea, effect, {}, exposure_h)
 
 

@@ -148,9 +148,14 @@ def set_up_here(
         if not needs_setup(connection):
             raise WrongCodeError
         user = _admin(connection, clock.wall_ns(), name, hash_, caller, "loopback")
-        connection.execute(delete(SETUP_CODES))
+        forget_codes(connection)
     (folder / FILE).unlink(missing_ok=True)
     return user
+
+
+def forget_codes(connection: Connection) -> None:
+    """Let no code hold any more: the first admin is there."""
+    connection.execute(delete(SETUP_CODES))
 
 
 def _refuse_too_many(database: Database, clock: Clock, caller: Caller) -> None:

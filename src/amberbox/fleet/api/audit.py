@@ -12,7 +12,7 @@ from fastapi.responses import StreamingResponse
 from sqlalchemy import Select, select
 
 from amberbox.core.clock import Clock
-from amberbox.core.timetext import format_time
+from amberbox.core.timetext import format_time, in_order
 from amberbox.fleet.api.access import Fleet, Routes, Who
 from amberbox.fleet.api.forms import Limit, TimeText, download, time_of
 from amberbox.fleet.audit import export, log, verify
@@ -161,7 +161,7 @@ def _page(database: Database, chosen: Select[Any], after: int, last: int) -> lis
 
 
 def _chosen(wanted: Filter, clock: Clock) -> Select[Any]:
-    from_ns, to_ns = time_of(wanted.from_, clock), time_of(wanted.to, clock)
+    from_ns, to_ns = in_order(time_of(wanted.from_, clock), time_of(wanted.to, clock))
     chosen = select(AUDIT)
     chosen = chosen if from_ns is None else chosen.where(AUDIT.c.time_ns >= from_ns)
     chosen = chosen if to_ns is None else chosen.where(AUDIT.c.time_ns < to_ns)

@@ -13,7 +13,7 @@ from pydantic import Field, StringConstraints
 
 from amberbox.consult.plain import diagnosis_json, plain
 from amberbox.core.errors import UsageError
-from amberbox.core.timetext import format_time
+from amberbox.core.timetext import format_time, in_order
 from amberbox.core.types import Diagnosis
 from amberbox.fleet.accounts.robots import KnownRobot
 from amberbox.fleet.api.access import Caller, Fleet, OfRobot, Routes, Who
@@ -132,7 +132,7 @@ def list_diagnoses(
     to: TimeText = "", after: After = "", limit: Limit = 100,
 ) -> list[DiagnosisLine]:  # fmt: skip
     """List what a robot found to be broken, the newest first."""
-    span = time_of(from_, fleet.clock), time_of(to, fleet.clock)
+    span = in_order(time_of(from_, fleet.clock), time_of(to, fleet.clock))
     return [line_of(one) for one in page(diagnoses(fleet, robot.id, *span), after, limit)]
 
 

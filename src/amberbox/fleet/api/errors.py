@@ -16,6 +16,7 @@ from amberbox.fleet.accounts.passwords import TooManyError
 from amberbox.fleet.accounts.signin import MustWaitError, WrongLoginError
 from amberbox.fleet.asking.errors import BrokenError, BusyError
 from amberbox.fleet.database.database import DatabaseBusyError, DatabaseDamagedError
+from amberbox.link.refusals import BUSY, DAMAGED
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,6 +25,7 @@ class Problem:
 
     what: str
     hint: str
+    code: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,7 +43,7 @@ _SCHEMA: dict[str, Any] = {
         "error": {
             "type": "object",
             "required": ["what", "hint"],
-            "properties": {"what": _TEXT, "hint": _TEXT},
+            "properties": {"what": _TEXT, "hint": _TEXT, "code": _TEXT},
         }
     },
 }
@@ -60,7 +62,9 @@ PROBLEMS: dict[int | str, dict[str, Any]] = {
     413: _problem("too large"),
     422: _problem("not of the form that is described here"),
     429: _problem("too often: wait as long as Retry-After says"),
-    503: _problem("too busy at the moment: try again"),
+    503: _problem(
+        "not now, by its code: busy (try again), not_set_up (no admin yet), damaged (the database)"
+    ),
 }
 """What every route may answer; rooms declare only what they say beyond this."""
 
@@ -84,9 +88,11 @@ def add_handlers(app: FastAPI) -> None:
     app.add_exception_handler(RequestValidationError, say_invalid)
 
 
-def error(status: int, what: str, hint: str = "", headers: Any = None) -> JSONResponse:
-    """Return an error as a response."""
-    said = {"what": _sayable(what), "hint": _sayable(hint)}
+def error(
+    status: int, what: str, hint: str = "", headers: Any = None, code: str = ""
+) -> JSONResponse:
+    """Return an error as a response; ``code`` tells apart what has the same status."""
+    said = {"what": _sayable(what), "hint": _sayable(hint), **({"code": code} if code else {})}
     return JSONResponse({"error": said}, status, headers)
 
 
@@ -104,7 +110,9 @@ async def say_known(_: Request, found: Exception) -> JSONResponse:
     """Answer an error of ours."""
     assert isinstance(found, AmberboxError)
     wait = {"Retry-After": str(found.seconds)} if isinstance(found, MustWaitError) else None
-    return error(status_of(found), found.what, found.hint, wait)
+    status = status_of(found)
+    code = DAMAGED if isinstance(found, DatabaseDamagedError) else BUSY if status == 503 else ""
+    return error(status, found.what, found.hint, wait, code)
 
 
 async def say_http(_: Request, found: Exception) -> JSONResponse:

@@ -11,6 +11,8 @@ from sqlalchemy import Connection
 
 from amberbox.blackbox.journal import reserved
 from amberbox.core.clock import NS
+from amberbox.core.naming import component_named, endings
+from amberbox.core.timetext import in_order
 from amberbox.fleet.accounts.robots import KnownRobot
 from amberbox.fleet.api.access import Fleet, OfRobot, Routes, Who
 from amberbox.fleet.api.forms import ID, AfterName, Limit, TimeText, time_of
@@ -130,6 +132,9 @@ def read_timeline(
         raise HTTPException(400, "the window ends before it begins")
     with fleet.database.reading() as connection:
         standing = standings(connection, [robot.id]).get(robot.id, [])
+    known = {one.said.component for one in standing}
+    if component and endings(component, known):
+        component = component_named(component, known)
     span = (from_ns, to_ns)
     return timeline_of(timeline(fleet, robot.id, span, standing, component, points), span)
 
@@ -146,7 +151,7 @@ def list_events(
     limit: Limit = 100,
 ) -> Sequence[Event]:
     """Return events of a robot in order of time: the newest of a range, or the first ones."""
-    span = time_of(from_, fleet.clock), time_of(to, fleet.clock)
+    span = in_order(time_of(from_, fleet.clock), time_of(to, fleet.clock))
     searched = _SEARCHED if kind else limit
     found = entries(fleet, robot.id, reserved.EVENT, span, searched, newest=newest, aside=aside)
     views = [view for entry in found if (view := _event(entry)) and kind in ("", view.kind)]

@@ -72,7 +72,7 @@ class ArchiveRecord(Record):
         """Return rows as on the robot (see ``Record.query``), from the tables of the archive."""
         if missions is not None:
             raise UsageError("missions of an archive cannot be named yet", "give from and to")
-        span = self.time_ns(from_), self.time_ns(to)
+        span = self.span_ns(from_, to)
         return self._look(lambda r: _query(r, item, variables, span, by, points))
 
     def envelope(
@@ -89,7 +89,7 @@ class ArchiveRecord(Record):
         Reads the pyramid as far up as the steps allow; of a step that holds nothing there is no
         row. One robot at a time: with several there is a column ``robot``.
         """
-        span = self.time_ns(from_), self.time_ns(to)
+        span = self.span_ns(from_, to)
         return self._look(lambda reader: envelope(reader, item, variables, span, points))
 
     def last_ns(self) -> int | None:
@@ -98,7 +98,7 @@ class ArchiveRecord(Record):
 
     def gaps(self, item: str | None = None, from_: Time = None, to: Time = None) -> list[Gap]:
         """Return what is missing in ``[from_, to)`` and why, also what never came here."""
-        span = self.time_ns(from_), self.time_ns(to)
+        span = self.span_ns(from_, to)
         return self._look(lambda reader: gaps_of(reader, self.catalogue, item, span))
 
     def missions(
@@ -122,11 +122,11 @@ class ArchiveRecord(Record):
 
     def events(self, from_: Time = None, to: Time = None) -> Table:
         """Return what happened to the boxes."""
-        name = identifier(reserved.EVENT)
+        name, span = identifier(reserved.EVENT), self.span_ns(from_, to)
         if not self._look(lambda reader: name in reader.schemas):
             stamp = Column("timestamp", "timestamp", "time")
             return Table("events", (stamp,), {"timestamp": np.empty(0, np.int64)})
-        return self.query(name, None, from_, to)
+        return self.query(name, None, *span)
 
     def _sources(self) -> list[Source]:
         found = self.catalogue.sources(self.robots)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import msgspec
 import numpy as np
@@ -15,18 +15,23 @@ from amberbox.blackbox.query.table import Table
 from amberbox.blackbox.query.variables import Wanted
 from amberbox.blackbox.segments import columns as col
 from amberbox.blackbox.segments.flat import TableSchema
+from amberbox.core.clock import NS
 from amberbox.core.errors import UsageError
+from amberbox.core.timetext import format_time
 from amberbox.core.types import IntArray
 from amberbox.fleet.archive.envelope import envelope
 from amberbox.fleet.archive.pyramid import has_levels, is_plotted
 from amberbox.fleet.asking.errors import LimitError
 from amberbox.fleet.data.asked import MOST_ROWS, About, Asked
 from amberbox.fleet.data.look import Look, Span
+from amberbox.fleet.linkend.presence import said_until
 
 THINNED_ROWS = 1_000_000
 """Of more rows than this a thinned answer is made from the pyramid."""
 _LEAST_POINTS = 5
 """Of each variable least, greatest, first, last and a missing value; fewer would drop extremes."""
+_BEHIND_NS = 5 * NS
+"""So much less on the server than on the robot is worth a word."""
 _KEYS = frozenset({"timestamp", "received", "seq", "parent_seq"})
 
 
@@ -46,6 +51,29 @@ def rows(look: Look, asked: Asked) -> Answer:
         raise UsageError("the range ends before it begins", "exchange from and to")
     schema = look.schema(asked.item)
     wanted = wanted_columns(look, schema, asked.variables)
+    answer = _answer(look, schema, wanted, asked)
+    about = answer.about
+    notes = [] if about.next_ns is not None else not_copied(look, asked)
+    return replace(answer, about=msgspec.structs.replace(about, notes=[*about.notes, *notes]))
+
+
+def not_copied(look: Look, asked: Asked) -> list[str]:
+    """Say that the newest data of a range are still on the robot, and how to get them."""
+    complete_ns = look.complete_ns()
+    with look.catalogue.database.reading() as connection:
+        newest_ns = said_until(connection, asked.robot)
+    if complete_ns is None or newest_ns is None or newest_ns - complete_ns < _BEHIND_NS:
+        return []
+    if asked.to_ns is not None and asked.to_ns <= complete_ns:
+        return []
+    to_ns = newest_ns if asked.to_ns is None else min(newest_ns, asked.to_ns)
+    complete, newest, to = (f"{format_time(t)[:19]}Z" for t in (complete_ns, newest_ns, to_ns))
+    return [f"complete until {complete}; the robot has data until {newest}: "
+            f"amberbox fetch URL {asked.item} {complete} {to} --wait"]  # fmt: skip
+
+
+def _answer(look: Look, schema: TableSchema, wanted: Sequence[Wanted], asked: Asked) -> Answer:
+    span = asked.from_ns, asked.to_ns
     if asked.points is not None:
         if estimate(look, schema, span) > THINNED_ROWS and asked.by == "received":
             return _summed(look, schema, wanted, asked)

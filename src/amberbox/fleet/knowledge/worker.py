@@ -15,9 +15,9 @@ from amberbox.consult.declared import Declared
 from amberbox.consult.facts import known_facts, lookups
 from amberbox.consult.faulttrees import effect_json, effects_json
 from amberbox.consult.sheets import coverage_json, criticality_json, table_json
-from amberbox.core.config import did_you_mean, refuse
-from amberbox.core.errors import UsageError
-from amberbox.core.timetext import format_time, parse_time
+from amberbox.core.config import refuse
+from amberbox.core.naming import component_named
+from amberbox.core.timetext import format_time, in_order, parse_time
 from amberbox.diagnosis.explanation.names import Names
 from amberbox.diagnosis.faulttree import Analysis, analyse
 from amberbox.diagnosis.faulttree import Budget as TreeBudget
@@ -151,7 +151,7 @@ def rules(folder: Path, arguments: dict[str, Any]) -> Any:
     program = read_rules(subject.rules())
     refuse(program.problems())
     last_ns = moment(stores, asked.robot, "", asked.now_ns).at_ns
-    span = (_time(text, asked.now_ns, last_ns) for text in (asked.from_, asked.to))
+    span = in_order(*(_time(text, asked.now_ns, last_ns) for text in (asked.from_, asked.to)))
     window = past_of(stores, asked.robot, *span)
     facts = tuple(known_facts(asked.robot, subject.fmea, asked.exposure_h))
     program = Facts(facts, (), tuple(lookups(window))).added_to(program)
@@ -198,10 +198,7 @@ def _effects(known: Any, effect: str) -> list[str]:
     names = effects(known)
     if not effect:
         return list(names)
-    if effect not in known.functions and effect not in known.components:
-        near = did_you_mean(effect, [*names, *known.components])
-        raise UsageError(f"there is no function '{effect}'{near}")
-    return [effect]
+    return [component_named(effect, [*known.functions, *known.components], kind="function")]
 
 
 def _standing(diagnoses: Any) -> Any:

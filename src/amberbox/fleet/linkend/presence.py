@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from math import isfinite
 from typing import get_args
 
-from sqlalchemy import Connection, select, update
+from sqlalchemy import Connection, func, select, update
 
 from amberbox.fleet.database.upsert import upsert
-from amberbox.fleet.linkend.tables import BOOT, HEADS, ROBOT
+from amberbox.fleet.linkend.tables import BOOT, HEADS, ROBOT, ROW, STATUS
 from amberbox.link.frames import Beat
 from amberbox.monitoring.messages.pulse import Monitoring, State
 
@@ -41,6 +41,13 @@ def presences(connection: Connection) -> list[Presence]:
         )
         for row in rows
     ]  # fmt: skip
+
+
+def said_until(connection: Connection, robot: str) -> int | None:
+    """Return when the newest of what a robot said over the link was written; None of nothing."""
+    newest = (select(func.max(t.c.log_ns)).where(t.c.robot == robot) for t in (STATUS, ROW))
+    times = [connection.execute(chosen).scalar() for chosen in newest]
+    return max((time_ns for time_ns in times if time_ns is not None), default=None)
 
 
 def seen(connection: Connection, robot: str, epoch: int, beat: Beat, boot: str, at_ns: int) -> None:

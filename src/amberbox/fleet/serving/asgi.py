@@ -20,10 +20,20 @@ def headers_of(scope: Scope) -> Headers:
 
 
 async def refuse(
-    scope: Scope, send: Send, status: int, what: str, hint: str = "", more: Pairs = ()
+    scope: Scope,
+    send: Send,
+    status: int,
+    what: str,
+    hint: str = "",
+    more: Pairs = (),
+    code: str = "",
 ) -> None:
-    """Answer a request, or a socket that wants to open, with an error of the usual form."""
-    body = json.dumps({"error": {"what": what, "hint": hint}}).encode()
+    """Answer a request, or a socket that wants to open, with an error of the usual form.
+
+    ``code`` tells programs apart what has the same status.
+    """
+    said = {"what": what, "hint": hint, **({"code": code} if code else {})}
+    body = json.dumps({"error": said}).encode()
     prefix = "websocket." if scope["type"] == "websocket" else ""
     about = [(b"content-type", b"application/json"), (b"content-length", b"%d" % len(body)), *more]
     start = {"type": f"{prefix}http.response.start", "status": status, "headers": about}

@@ -9,6 +9,7 @@ from amberbox.fleet.api.access import PREFIX
 from amberbox.fleet.database.database import Database
 from amberbox.fleet.serving.asgi import ASGIApp, Receive, Scope, Send, headers_of, refuse
 from amberbox.link import limits
+from amberbox.link.refusals import NOT_SET_UP
 
 OPEN = ("/setup", f"{PREFIX}/health", f"{limits.PATH}/ca.pem")
 STATIC = "/static/"
@@ -47,5 +48,5 @@ async def _send_away(scope: Scope, send: Send) -> None:
         await send({"type": "http.response.start", "status": 303, "headers": headers})
         await send({"type": "http.response.body", "body": b""})
         return
-    hint = "open /setup on the server's machine, or with the code in its folder"
-    await refuse(scope, send, 503, "this server is not set up yet", hint)
+    hint = "amberbox serve add-user NAME --data DIR on the server, or open /setup there"
+    await refuse(scope, send, 503, "this server is not set up yet", hint, code=NOT_SET_UP)

@@ -195,7 +195,7 @@ class Alarms:
         if alarm_id not in lasting:
             raise UsageError(
                 f"there is no alarm '{alarm_id}' now{did_you_mean(alarm_id, lasting)}",
-                "amberbox alarm WHERE list shows them",
+                "amberbox alarm list WHERE shows them",
             )
         return lasting[alarm_id]
 

@@ -10,6 +10,7 @@ from urllib.parse import urlsplit, urlunsplit
 
 from amberbox.link import limits
 from amberbox.link.frames import Bye, Hello, Welcome, encode, from_server
+from amberbox.link.refusals import why_unavailable
 from amberbox.robot.link.options import LinkOptions
 
 _OPEN_S = 10.0
@@ -94,8 +95,8 @@ async def dial(options: LinkOptions, context: ssl.SSLContext | None) -> Line:
         status = error.response.status_code
         if status in (401, 403):
             raise RefusedError(f"the server refuses this robot's key ({status})") from error
-        busy = ": it is too busy, or not set up yet" if status == 503 else ""
-        raise LinkDownError(f"the server answers {status}{busy}") from error
+        why = f": {why_unavailable(bytes(error.response.body or b''))}" if status == 503 else ""
+        raise LinkDownError(f"the server answers {status}{why}") from error
     except (OSError, WebSocketException, TimeoutError) as error:
         raise LinkDownError(f"no connection: {error}") from error
 

@@ -1,0 +1,26 @@
+"""Ctrl-C: ends the program quietly at any moment, also while its modules load."""
+
+from __future__ import annotations
+
+import os
+from types import FrameType
+
+
+class Interrupt:
+    """Handles SIGINT: leaves at once while modules load, raises KeyboardInterrupt afterwards.
+
+    ``came`` tells that it was raised, also where a library made another error of it.
+    """
+
+    STATUS = 130
+
+    def __init__(self) -> None:
+        self.loading = True
+        self.came = False
+
+    def __call__(self, number: int, frame: FrameType | None) -> None:
+        """Handle the signal."""
+        if self.loading:
+            os._exit(self.STATUS)
+        self.came = True
+        raise KeyboardInterrupt
