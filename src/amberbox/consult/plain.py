@@ -29,6 +29,7 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
         "groups": [_group(entry, faults) for entry in diagnosis.groups],
         "next_tests": [_test(entry) for entry in diagnosis.next_tests],
         "findings": list(diagnosis.findings),
+        "make_safe": list(diagnosis.make_safe),
     }
 
 

@@ -334,6 +334,7 @@ class Diagnosis:
     failure mode. ``symptoms`` are those that were present, in order of onset; once all have
     healed its last revision says so in ``state`` and keeps the last answer. ``live_only`` marks
     a record that a replay does not have: said again in a new file, or ended by a restart.
+    ``make_safe`` is what has to be done before any of ``next_tests``, by the FMEA.
     """
 
     id: str
@@ -350,3 +351,4 @@ class Diagnosis:
     symptoms: tuple[str, ...] = ()
     state: Literal["open", "healed"] = "open"
     live_only: bool = False
+    make_safe: tuple[str, ...] = ()

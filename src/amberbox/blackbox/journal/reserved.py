@@ -187,6 +187,7 @@ _FIELDS: dict[str, dict[str, object]] = {
         ),
         "config_hash": _TEXT,
         "live_only": {"type": "boolean"},
+        "make_safe": _TEXTS,
     },
     CURSOR: {"cursor": _TEXT, "reader": _TEXT, "state": _TEXT},
 }

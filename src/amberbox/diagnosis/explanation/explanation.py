@@ -113,8 +113,26 @@ class Branch:
 
 
 @dataclass(frozen=True, slots=True)
+class Action:
+    """Something to do: make safe, test (``test`` is its id), watch or repair.
+
+    ``faults`` are the failure modes that it makes safe, ``severity`` that of the worst of them.
+    """
+
+    kind: Literal["make_safe", "test", "watch", "repair"]
+    text: str
+    test: str = ""
+    faults: tuple[str, ...] = ()
+    severity: Severity = ""
+
+
+@dataclass(frozen=True, slots=True)
 class Step:
-    """What to do next: a test with its answers, empty if there is none, and remedies."""
+    """What to do next: a test with its answers, empty if there is none, and remedies.
+
+    ``make_safe`` comes before all else; ``text`` begins with it, ``then`` is the rest. ``order``
+    has all actions in their order.
+    """
 
     text: str
     test: str = ""
@@ -124,6 +142,9 @@ class Step:
     answers: tuple[Branch, ...] = ()
     splits: bool = False
     remedies: tuple[str, ...] = ()
+    make_safe: tuple[Action, ...] = ()
+    then: str = ""
+    order: tuple[Action, ...] = ()
 
 
 State: TypeAlias = Literal["open", "healed", "none", "unknown"]

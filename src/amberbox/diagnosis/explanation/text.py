@@ -192,7 +192,9 @@ def _use(explanation: Explanation) -> Iterator[str]:
 
 
 def _next(step: Step) -> Iterator[str]:
-    yield from _paragraph(sentence(step.text))
+    for action in step.make_safe:
+        yield from _paragraph(f"First, make it safe: {sentence(action.text)}")
+    yield from _paragraph(sentence(f"Then: {step.then}" if step.make_safe else step.text))
     if step.test:
         yield _line(_effort(step), "  ")
         yield from _paragraph("What the answers would mean:")

@@ -83,5 +83,5 @@ _DIAGNOSIS = Forms(Diagnosis, {
     "id": SAME, "revision": WHOLE, "robot": SAME, "at_ns": WHOLE, "state": SAME,
     "symptoms": TEXTS, "hypotheses": _HYPOTHESIS.many, "groups": _GROUP.many,
     "mass_covered": NUMBER, "incomplete": SAME, "findings": TEXTS, "next_tests": _TEST.many,
-    "config_hash": SAME, "live_only": FLAG,
+    "config_hash": SAME, "live_only": FLAG, "make_safe": Form(read=tuple, default=()),
 })  # fmt: skip

@@ -82,7 +82,10 @@ class Choice:
 
 @dataclass(frozen=True, slots=True)
 class Next:
-    """What to do next; without ``test`` there is nothing to answer."""
+    """What to do next; without ``test`` there is nothing to answer.
+
+    ``make_safe`` comes before it, in the words of the robot's analysis.
+    """
 
     text: str
     test: str = ""
@@ -91,6 +94,7 @@ class Next:
     risk: str = ""
     choices: Sequence[Choice] = ()
     remedies: Sequence[str] = ()
+    make_safe: Sequence[str] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -176,7 +180,7 @@ def plain_card_of(revision: Answer) -> DiagnosisCard:
         tuple(Reason(check_fails(name), revision["at"],
                      moment_href(robot, (), revision["at_ns"]), name) for name in names[:REASONS]),
         max(0, len(names) - REASONS),
-        next=_plain_next(revision["next_tests"]), complete=False,
+        next=_plain_next(revision["next_tests"], revision.get("make_safe", ())), complete=False,
     )  # fmt: skip
 
 
@@ -241,20 +245,23 @@ def choices_of(test: Answer, step: Answer | None = None) -> tuple[Choice, ...]:
 
 def _told_next(step: Answer, tests: Sequence[Answer]) -> Next:
     test = next((test for test in tests if test["id"] == step["test"]), None)
+    safe = step.get("make_safe", ())
     return Next(
-        sentence(step["text"]), step["test"], step["by"],
+        sentence(step["then"] if safe else step["text"]), step["test"], step["by"],
         minutes(test["cost_s"]) if test else step["takes"], step["risk"],
         choices_of({}, step) if step["test"] else (),
         tuple(sentence(text) for text in step["remedies"]),
+        tuple(sentence(action["text"]) for action in safe),
     )  # fmt: skip
 
 
-def _plain_next(tests: Sequence[Answer]) -> Next | None:
+def _plain_next(tests: Sequence[Answer], safe: Sequence[str]) -> Next | None:
+    actions = tuple(sentence(text) for text in safe)
     if not tests:
-        return None
+        return Next("", make_safe=actions) if actions else None
     test = tests[0]
     return Next(sentence(test["text"]), test["id"], test["role"], minutes(test["cost_s"]),
-                choices=choices_of(test))  # fmt: skip
+                choices=choices_of(test), make_safe=actions)  # fmt: skip
 
 
 def _in_order(choices: Sequence[Choice]) -> tuple[Choice, ...]:
