@@ -259,6 +259,8 @@ class Symptom:
     ``detector.finding.item[.variable]``; ``source`` says who found it, ``strength`` is the share
     of it that counts (1: all). ``evidence`` names what was measured: address, from and to.
     ``blocked_by`` names what its component depends on and is not ok: then it is no evidence.
+    ``reason`` says the value that was measured and its limit, where that is known. ``gone_ns`` is
+    when it was seen to be gone, of one that is remembered: it goes on to count for a while.
     """
 
     id: str
@@ -270,6 +272,8 @@ class Symptom:
     source: str = "monitor"
     evidence: tuple[tuple[str, int, int], ...] = ()
     blocked_by: tuple[str, ...] = ()
+    reason: str = ""
+    gone_ns: int | None = None
 
 
 UNKNOWN_FAULT: Final = "unknown#other"

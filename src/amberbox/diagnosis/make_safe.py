@@ -65,15 +65,16 @@ def make_safe(
     """Return the actions against credible causes, the worst and most probable first.
 
     ``leading`` are the ids of the hypotheses that lead, ``cleared`` failure modes of which nothing
-    shows any more.
+    shows any more; what is fatal is made safe all the same, until it is ruled out.
     """
     first = {fault for h in hypotheses if h.id in leading for fault in h.faults}
     found: dict[str, list[tuple[int, float, str]]] = {}
     for name, share in presence(hypotheses).items():
         mode = fmea.modes.get(name)
-        is_credible = share >= CREDIBLE or name in first
-        action = safe_action(mode) if mode and is_credible and name not in cleared else ""
-        if mode and action:
+        if mode is None or (name in cleared and mode.severity != "fatal"):
+            continue
+        action = safe_action(mode) if share >= CREDIBLE or name in first else ""
+        if action:
             found.setdefault(action, []).append((SEVERITIES.index(mode.severity), share, name))
     made = [_against(action, sorted(of, reverse=True)) for action, of in found.items()]
     return tuple(sorted(made, key=lambda m: (-SEVERITIES.index(m.severity), -m.probability)))

@@ -152,6 +152,7 @@ _FIELDS: dict[str, dict[str, object]] = {
         "source": _TEXT,
         "evidence": _list_of(address=_TEXT, from_ns=_COUNT, to_ns=_COUNT),
         "blocked_by": _TEXTS,
+        "reason": _TEXT,
     },
     DIAGNOSIS: {
         "id": _TEXT,

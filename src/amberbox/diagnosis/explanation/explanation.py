@@ -11,18 +11,27 @@ Severity: TypeAlias = Literal["", "warning", "urgent", "critical", "fatal"]
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """A failure mode in words; ``cause`` is how it may come about, ``remedy`` what helps."""
+    """A failure mode in words; ``cause`` is how it may come about, ``remedy`` what helps.
+
+    ``gone_ns`` is since when nothing of it shows any more; what is ``intermittent`` comes and
+    goes by its nature, so that this says nothing.
+    """
 
     id: str
     text: str
     severity: Severity = ""
     cause: str = ""
     remedy: str = ""
+    gone_ns: int | None = None
+    intermittent: bool = False
 
 
 @dataclass(frozen=True, slots=True)
 class Possibility:
-    """One hypothesis in words, with its failure modes (none: a false alarm)."""
+    """One hypothesis in words, with its failure modes (none: a false alarm).
+
+    ``text`` names those that are active, where any is.
+    """
 
     id: str
     text: str
@@ -70,7 +79,9 @@ class Way:
 class Seen:
     """A symptom in words: where it is read, when it began, what it was measured from, and why.
 
-    ``after_s`` counts from the first symptom; times are None where nobody knows them.
+    ``after_s`` counts from the first symptom; times are None where nobody knows them. ``reason``
+    says the measured value and its limit, ``gone_ns`` is when it went. ``weight`` is how much it
+    matters: the severity of its worst cause times the probability of that.
     """
 
     id: str
@@ -80,6 +91,9 @@ class Seen:
     after_s: float | None = None
     measured_from: tuple[str, ...] = ()
     ways: tuple[Way, ...] = ()
+    reason: str = ""
+    gone_ns: int | None = None
+    weight: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,7 +130,8 @@ class Branch:
 class Action:
     """Something to do: make safe, test (``test`` is its id), watch or repair.
 
-    ``faults`` are the failure modes that it makes safe, ``severity`` that of the worst of them.
+    ``faults`` are the failure modes that it makes safe, ``severity`` that of the worst of them,
+    ``why`` names them with their probability.
     """
 
     kind: Literal["make_safe", "test", "watch", "repair"]
@@ -124,6 +139,7 @@ class Action:
     test: str = ""
     faults: tuple[str, ...] = ()
     severity: Severity = ""
+    why: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -217,7 +233,9 @@ class Explanation:
     nothing explains what is seen), ``others`` what follows it. ``unexplained`` was seen and does
     not follow from what leads, ``against`` should show and does not, ``unknown`` was seen and the
     FMEA does not know it, ``blocked`` was seen and does not count. ``members`` are the robots that
-    lead on, if it is the diagnosis of their team.
+    lead on, if it is the diagnosis of their team. ``cleared`` are failure modes beside active ones
+    of which nothing shows any more. What was seen is in order: what is there still first, and of
+    that what matters most.
     """
 
     diagnosis: str
@@ -239,3 +257,4 @@ class Explanation:
     details: tuple[str, ...]
     graph: Graph
     members: tuple[Member, ...] = ()
+    cleared: tuple[Fault, ...] = ()

@@ -31,12 +31,13 @@ def described(names: Names, group: AmbiguityGroup, members: Sequence[Hypothesis]
 
 
 def _text(names: Names, members: Sequence[Hypothesis]) -> str:
-    if len(members) == 1:
-        return names.faults(members[0].faults)
-    common = frozenset.intersection(*(hypothesis.faults for hypothesis in members))
-    rests = [hypothesis.faults - common for hypothesis in members]
+    sets = list(dict.fromkeys(frozenset(names.active(hypothesis.faults)) for hypothesis in members))
+    if len(sets) == 1:
+        return names.faults(sets[0])
+    common = frozenset.intersection(*sets)
+    rests = [faults - common for faults in sets]
     if not common or not all(rests):
-        return f"one of: {either([names.faults(h.faults) for h in members])}"
+        return f"one of: {either([names.faults(faults) for faults in sets])}"
     rest = either([names.faults(faults) for faults in rests])
     return (
         f"{both([names.mode(fault) for fault in in_order(common)])}, together with one of: {rest}"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from amberbox.core.errors import UsageError
@@ -36,16 +36,15 @@ def step_of(
     names: Names,
     diagnosis: Diagnosis,
     leading: Leading | None,
-    cleared: Collection[str] = (),
 ) -> Step:
     """Say what to do next, in the order in which it is safe.
 
     What makes credible dangerous causes safe comes first. Then, if one fault is almost certain,
     what mends it, else the test that tells more; nothing is mended first while a false alarm is
-    about as likely. ``cleared`` are failure modes of which nothing shows any more.
+    about as likely. ``leading`` has what is active of the hypotheses that lead.
     """
     ids = leading_ids(diagnosis.groups, diagnosis.hypotheses)
-    safe = make_safe(names.fmea, diagnosis.hypotheses, ids, cleared)
+    safe = make_safe(names.fmea, diagnosis.hypotheses, ids, names.cleared)
     group, members = leading or (AmbiguityGroup((), 0.0), ())
     remedies = _remedies(names, members, safe)
     asked = _worth_asking(knowledge, names, diagnosis, group, members)
@@ -53,8 +52,8 @@ def step_of(
     if asked is None:
         rest, order = _without_test(names, diagnosis, group, members, remedies)
         return Step(
-            _text(safe, rest), remedies=remedies, make_safe=_told(safe), then=rest,
-            order=(*_told(safe), *order),
+            _text(safe, rest), remedies=remedies, make_safe=_told(names, safe), then=rest,
+            order=(*_told(names, safe), *order),
         )  # fmt: skip
     check, first = asked.check, "; and ".join(remedies)
     test = Action("test", asked.text, check.id)
@@ -70,9 +69,9 @@ def step_of(
         asked.answers,
         check.id == group.split_by,
         remedies,
-        _told(safe),
+        _told(names, safe),
         rest,
-        (*_told(safe), *((*repairs, test) if mends_first else (test, *repairs))),
+        (*_told(names, safe), *((*repairs, test) if mends_first else (test, *repairs))),
     )
 
 
@@ -96,8 +95,16 @@ def _text(safe: Sequence[MakeSafe], rest: str) -> str:
     return f"First, make it safe: {'; '.join(action.text for action in safe)}. Then: {rest}"
 
 
-def _told(safe: Sequence[MakeSafe]) -> tuple[Action, ...]:
-    return tuple(Action("make_safe", a.text, "", a.faults, a.severity) for a in safe)
+def _told(names: Names, safe: Sequence[MakeSafe]) -> tuple[Action, ...]:
+    return tuple(
+        Action("make_safe", one.text, "", one.faults, one.severity, _danger(names, one))
+        for one in safe
+    )
+
+
+def _danger(names: Names, one: MakeSafe) -> str:
+    """Say against what an action is, the most probable first."""
+    return f"{either([names.mode(fault) for fault in one.faults], 2)}, {percent(one.probability)}"
 
 
 def _is_certain(group: AmbiguityGroup, members: Sequence[Hypothesis]) -> bool:
@@ -127,12 +134,22 @@ def _worth_asking(
     Where a false alarm is about as likely as what leads, it is one that tells these apart.
     """
     found = [_asked(knowledge, names, diagnosis, name) for name in _tests(diagnosis, group)]
-    asked = [test for test in found if test is not None]
+    asked = [test for test in found if test and not _is_past(names, diagnosis, members, test.check)]
     if _is_certain(group, members):
         asked = [test for test in asked if test.may_change_mind(names.faults(members[0].faults))]
     if _may_be_false_alarm(diagnosis, group, members):
         asked.sort(key=lambda test: not _tells_apart(knowledge, test.check, members))
     return asked[0] if asked else None
+
+
+def _is_past(
+    names: Names, diagnosis: Diagnosis, members: Sequence[Hypothesis], check: Check
+) -> bool:
+    """Tell whether a test is about causes alone that show no more, while others lead."""
+    listed = {fault for h in diagnosis.hypotheses for fault in h.faults}
+    seen = listed & {sight.cause for sight in check.sights}
+    led = {fault for h in members for fault in h.faults}
+    return bool(seen) and seen <= names.cleared.keys() and not led <= names.cleared.keys()
 
 
 def _tells_apart(knowledge: Knowledge, check: Check, members: Sequence[Hypothesis]) -> bool:

@@ -66,6 +66,7 @@ _SYMPTOM = Forms(Symptom, {
     "id": SAME, "state": SAME, "address": SAME, "onset_ns": TIME_IF_ANY,
     "confirmed_ns": TIME_IF_ANY, "strength": NUMBER, "source": SAME,
     "evidence": Form(_evidence_values, _evidence_of), "blocked_by": TEXTS,
+    "reason": Form(default=""),
 })  # fmt: skip
 _HYPOTHESIS = Forms(Hypothesis, {
     "id": SAME, "faults": Form(sorted, frozenset), "probability": NUMBER, "explains": TEXTS,
