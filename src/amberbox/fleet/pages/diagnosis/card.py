@@ -7,13 +7,16 @@ used, what to do next. Texts about the robot come from its own list of what can 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, TypeAlias
 
 from amberbox.core.clock import NS
 from amberbox.core.sureness import LIKELY, percent
 from amberbox.core.timetext import format_time
+from amberbox.diagnosis.explanation.activity import OWN_SHARE
+from amberbox.diagnosis.explanation.names import together
+from amberbox.diagnosis.explanation.words import both
 from amberbox.fleet.alarms.words import CauseKind, kind_of
 from amberbox.fleet.knowledge.holding import Hold
 from amberbox.fleet.pages.datalinks import moment_href
@@ -36,13 +39,26 @@ _FAILS = re.compile(r"\bfails(\.?)$")
 
 @dataclass(frozen=True, slots=True)
 class Cause:
-    """What may be broken; ``share`` is how probable it is, in words."""
+    """What may be broken; ``share`` is how probable it is, in words.
+
+    ``parts`` are its failure modes, each with what it is called.
+    """
 
     id: str
     text: str
     share: str
     kind: CauseKind = "fault"
     comes_from: str = ""
+    parts: Sequence[tuple[str, str]] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Cleared:
+    """A failure mode of which nothing shows any more, and since when."""
+
+    id: str
+    text: str
+    since: str | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +66,8 @@ class Reason:
     """What was seen, since when, and where the data of that moment are.
 
     ``until`` is when it was gone, after ``lasted``; without it is there, as far as anybody knows.
-    ``small`` is the id that it has.
+    ``small`` is the id that it has. ``owners`` are the failure modes that show it, ``weight`` is
+    how much it matters, ``beside`` tells that it does not follow from what leads.
     """
 
     text: str
@@ -59,11 +76,14 @@ class Reason:
     small: str = ""
     until: str | None = None
     lasted: str = ""
+    weight: float = 0.0
+    owners: frozenset[str] = frozenset()
+    beside: bool = False
 
     def over(self, hold: Hold) -> Reason:
-        """Return it with both ends, in the past, once it is over."""
+        """Return it with both ends, in the past, once it is over; else as it is there."""
         if hold.to_ns is None:
-            return self
+            return replace(self, until=None, lasted="")
         lasted = _lasted((hold.to_ns - hold.from_ns) / NS)
         text = _FAILS.sub(r"failed\1", self.text)
         return replace(self, text=text, at=format_time(hold.from_ns),
@@ -81,6 +101,16 @@ class Choice:
 
 
 @dataclass(frozen=True, slots=True)
+class Safety:
+    """What makes safe, against which failure modes (``why`` in words, ``faults`` by their ids)."""
+
+    text: str
+    why: str = ""
+    faults: frozenset[str] = frozenset()
+    is_fatal: bool = True
+
+
+@dataclass(frozen=True, slots=True)
 class Next:
     """What to do next; without ``test`` there is nothing to answer.
 
@@ -94,7 +124,7 @@ class Next:
     risk: str = ""
     choices: Sequence[Choice] = ()
     remedies: Sequence[str] = ()
-    make_safe: Sequence[str] = ()
+    make_safe: Sequence[Safety] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,8 +134,10 @@ class DiagnosisCard:
     ``state`` is ``none`` where nothing is known to be broken; then ``at`` is up to when that is
     known. It is ``gone`` where nothing of what was seen is there any more, since ``gone``, and
     ``past`` for what was known when an alarm ended. ``complete`` is false while only the robot's
-    own words are known, without explanation. ``more`` counts what was seen beyond ``why``.
-    ``number`` is empty where there is none. ``names`` are failure modes in words, by id.
+    own words are known, without explanation. ``seen`` is all that was seen, ``why`` the first of
+    it, ``more`` counts the others. ``cleared`` are causes beside those that lead of which nothing
+    shows any more, ``steady`` failure modes that do not come and go. ``number`` is empty where
+    there is none. ``names`` are failure modes in words, by id.
     """
 
     robot: str
@@ -116,8 +148,7 @@ class DiagnosisCard:
     causes: Sequence[Cause] = ()
     sure: Sure = ""
     number: str = ""
-    why: Sequence[Reason] = ()
-    more: int = 0
+    seen: Sequence[Reason] = ()
     severity: str = ""
     use: str = ""
     lost: Sequence[str] = ()
@@ -128,6 +159,62 @@ class DiagnosisCard:
     names: Mapping[str, str] = field(default_factory=dict)
     notes: Sequence[str] = ()
     gone: str | None = None
+    cleared: Sequence[Cleared] = ()
+    steady: frozenset[str] = frozenset()
+
+    @property
+    def why(self) -> Sequence[Reason]:
+        """What matters most of what was seen: what is there still comes first."""
+        return self.seen[:REASONS]
+
+    @property
+    def more(self) -> int:
+        """How much was seen beyond that."""
+        return max(0, len(self.seen) - REASONS)
+
+    def held(self, holds: Mapping[str, Hold]) -> DiagnosisCard:
+        """Return it with what is known of each symptom now: until when it was there."""
+        seen = [one.over(holds[one.small]) if one.small in holds else one for one in self.seen]
+        card = replace(self, seen=in_order(seen))
+        return card if self.state != "open" else card.without(cleared_in(card))
+
+    def without(self, over: Mapping[str, str]) -> DiagnosisCard:
+        """Return it with failure modes put apart that show no more, if others lead still."""
+        parts = {id_: text for cause in self.causes for id_, text in cause.parts}
+        if not (over.keys() & parts.keys() or self.cleared) or not parts.keys() - over.keys():
+            return self
+        causes = [_lasting(cause, over) for cause in self.causes]
+        cleared = [Cleared(id_, capital(parts[id_]), over[id_]) for id_ in parts if id_ in over]
+        safe = [one for one in (self.next.make_safe if self.next else ())
+                if one.is_fatal or not one.faults or one.faults - over.keys()]  # fmt: skip
+        step = replace(self.next, make_safe=safe) if self.next else None
+        kept = tuple({cause.text: cause for cause in causes}.values())
+        return replace(self, causes=kept, cleared=cleared, next=step)
+
+
+def in_order(seen: Iterable[Reason]) -> list[Reason]:
+    """Put what is there still first, and of that what matters most."""
+    return sorted(seen, key=lambda one: (one.until is not None, -one.weight))
+
+
+def cleared_in(card: DiagnosisCard) -> dict[str, str]:
+    """Return the failure modes of which all that they show is over, and since when."""
+    shown: dict[str, list[str | None]] = {}
+    for one in card.seen:
+        for fault in one.owners & card.steady:
+            shown.setdefault(fault, []).append(one.until)
+    ended = {fault: [end for end in ends if end] for fault, ends in shown.items()}
+    return {fault: max(ends) for fault, ends in ended.items() if len(ends) == len(shown[fault])}
+
+
+def _lasting(cause: Cause, over: Mapping[str, str]) -> Cause:
+    """Return a cause without what shows no more of it; as it is if all of it does not."""
+    left = [(id_, text) for id_, text in cause.parts if id_ not in over]
+    if not left:
+        return cause
+    text = f"{both([text for _, text in left])}{together(len(left))}"
+    kind = kind_of([id_ for id_, _ in left])
+    return replace(cause, text=capital(text), kind=kind)
 
 
 def _lasted(seconds: float) -> str:
@@ -150,16 +237,21 @@ def card_of(answer: Answer, until_ns: int | None = None) -> DiagnosisCard:
         return nothing_broken(robot, answer["at"], answer.get("notes", ()))
     causes = tuple(_told_causes(told["broken"]))
     probability = told["sure"]["probability"]
-    seen = told["because"] or told["unexplained"]
+    seen = [reason_of(robot, one, until_ns) for one in told["because"]]
+    beside = [reason_of(robot, one, until_ns) for one in told["unexplained"]]
+    seen += [replace(one, beside=bool(seen)) for one in beside]
+    cleared = [
+        Cleared(one["id"], capital(one["text"]), _at(one["gone_ns"]))
+        for one in told.get("cleared", ())
+    ]
     return DiagnosisCard(
         robot, answer["state"], answer["at"], answer["id"], answer["revision"], causes,
         _sure(causes, probability), percent(probability) if causes else "",
-        tuple(reason_of(robot, one, until_ns) for one in seen[:REASONS]),
-        max(0, len(seen) - REASONS),
-        told["use"]["severity"], sentence(told["use"]["text"]),
+        in_order(seen), told["use"]["severity"], sentence(told["use"]["text"]),
         tuple(lost["text"] for lost in told["use"]["lost"]), sentence(told["use"]["careful"]),
         _told_next(told["next"], answer["next_tests"]),
         answers=answer.get("answers"), names=names_in(told), notes=tuple(answer.get("notes", ())),
+        cleared=cleared, steady=frozenset(_steady(told["broken"])),
     )  # fmt: skip
 
 
@@ -178,8 +270,7 @@ def plain_card_of(revision: Answer) -> DiagnosisCard:
         robot, revision["state"], revision["at"], revision["id"], revision["revision"], causes,
         _sure(causes, probability), percent(probability) if causes else "",
         tuple(Reason(check_fails(name), revision["at"],
-                     moment_href(robot, (), revision["at_ns"]), name) for name in names[:REASONS]),
-        max(0, len(names) - REASONS),
+                     moment_href(robot, (), revision["at_ns"]), name) for name in names),
         next=_plain_next(revision["next_tests"], revision.get("make_safe", ())), complete=False,
     )  # fmt: skip
 
@@ -196,7 +287,24 @@ def _told_causes(broken: Answer | None) -> Iterator[Cause]:
         ids = [fault["id"] for fault in member["faults"]]
         comes_from = "; ".join(fault["cause"] for fault in member["faults"] if fault["cause"])
         yield Cause(member["id"], capital(member["text"]), percent(member["probability"]),
-                    kind_of(ids), comes_from)  # fmt: skip
+                    kind_of(ids), comes_from,
+                    tuple((fault["id"], fault["text"]) for fault in member["faults"]))  # fmt: skip
+
+
+def _steady(broken: Answer | None) -> Iterator[str]:
+    """Yield the failure modes that lead and do not come and go by their nature."""
+    for member in broken["members"] if broken else ():
+        yield from (f["id"] for f in member["faults"] if not f.get("intermittent", True))
+
+
+def _owners(seen: Answer) -> frozenset[str]:
+    """Return the failure modes that show what was seen, as surely as any of them or nearly so."""
+    best = max((way["detects"] for way in seen["ways"]), default=0.0)
+    return frozenset(w["fault"] for w in seen["ways"] if w["detects"] >= OWN_SHARE * best)
+
+
+def _at(at_ns: int | None) -> str | None:
+    return None if at_ns is None else format_time(at_ns)
 
 
 def _plain_cause(ids: Sequence[str], probability: float | None) -> Cause:
@@ -215,11 +323,13 @@ def _sure(causes: Sequence[Cause], probability: float) -> Sure:
 
 def reason_of(robot: str, seen: Answer, until_ns: int | None = None) -> Reason:
     """Return what was seen, with a link to the data of its beginning."""
-    onset_ns = seen["onset_ns"]
-    return Reason(
-        sentence(seen["text"]), None if onset_ns is None else format_time(onset_ns),
+    onset_ns, gone_ns = seen["onset_ns"], seen.get("gone_ns")
+    found = Reason(
+        sentence(seen["text"]), _at(onset_ns),
         moment_href(robot, seen["measured_from"], onset_ns, until_ns), str(seen.get("id", "")),
+        weight=seen.get("weight", 0.0), owners=_owners(seen),
     )  # fmt: skip
+    return found if gone_ns is None else found.over(Hold(onset_ns or gone_ns, gone_ns))
 
 
 def check_fails(symptom: str) -> str:
@@ -251,12 +361,19 @@ def _told_next(step: Answer, tests: Sequence[Answer]) -> Next:
         minutes(test["cost_s"]) if test else step["takes"], step["risk"],
         choices_of({}, step) if step["test"] else (),
         tuple(sentence(text) for text in step["remedies"]),
-        tuple(sentence(action["text"]) for action in safe),
+        tuple(_safety(action) for action in safe),
     )  # fmt: skip
 
 
+def _safety(action: Answer) -> Safety:
+    is_fatal = action["severity"] == "fatal"
+    return Safety(
+        sentence(action["text"]), capital(action["why"]), frozenset(action["faults"]), is_fatal
+    )
+
+
 def _plain_next(tests: Sequence[Answer], safe: Sequence[str]) -> Next | None:
-    actions = tuple(sentence(text) for text in safe)
+    actions = tuple(Safety(sentence(text)) for text in safe)
     if not tests:
         return Next("", make_safe=actions) if actions else None
     test = tests[0]
