@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from amberbox.core.clock import NS
-from amberbox.core.mode import FALSE, HOLD, TRUE, UNKNOWN, Input, shortest_window_s
+from amberbox.core.mode import FALSE, HOLD, TRUE, UNKNOWN, Given, Input, shortest_window_s
 from amberbox.core.types import IntArray, Output
 from amberbox.monitoring.engine import freshness
 from amberbox.monitoring.engine.findings import Found, What
@@ -114,6 +114,9 @@ class MappingRun:
         module: Any = mode.module
         self._evaluate: Callable[..., Mapping[str, Any]] = module.evaluate
         self._explain = getattr(module, "explain", None)
+        self._reason = getattr(module, "reason", None)
+        units = (output.plan.result.unit for output in outputs)
+        self._unit = next((unit for unit in units if unit), "")
         self._columns = getattr(module, "COLUMNS", False)
         timed = getattr(module, "timed", None)
         self._timed = timed(mode.config) if timed else getattr(module, "TIMED", False)
@@ -241,16 +244,20 @@ class MappingRun:
         self, output: OutputRun, now: int, code: int, kept: Any, results: Mapping[str, Any]
     ) -> Found:
         why = ""
-        if code == BAD and self._explain is not None:
-            why = self._explained(results)
+        if code == BAD:
+            why = self._why(now, results)
         elif code == NOT_KNOWN:
             why = f"{output.plan.name} is not known"
         return Found(now, output.number, _WHAT[code], output.judge.output(kept), why)
 
-    def _explained(self, results: Mapping[str, Any]) -> str:
-        assert self._explain is not None, "asked for where there is one"
-        plain = {n: _plain(value, n in self._bools) for n, value in results.items()}
+    def _why(self, now: int, results: Mapping[str, Any]) -> str:
+        """Say why an output is bad: by what was looked at, else by the results."""
         try:
+            given = Given(self.inputs, now, self._unit)
+            told = self._reason(self._config, given) if self._reason is not None else ""
+            if told or self._explain is None:
+                return readable(str(told))
+            plain = {n: _plain(value, n in self._bools) for n, value in results.items()}
             return readable(str(self._explain(self._config, plain)))
         except CRASHES as error:  # what was found stands, whatever its words
             return readable(f"no explanation: {type(error).__name__}: {error}")

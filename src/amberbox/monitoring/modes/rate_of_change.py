@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import inf
 from typing import Any
 
 import numpy as np
 
 from amberbox.core.clock import NS
-from amberbox.core.mode import Input, Result, where_known
+from amberbox.core.expression_reason import variable_text
+from amberbox.core.mode import Given, Input, Result, where_known
 from amberbox.core.options import option
 from amberbox.core.samples import Now
 from amberbox.core.standins import Finding
@@ -68,18 +69,34 @@ def history_s(config: Config) -> float:
 def evaluate(config: Config, inputs: Sequence[Input], now: Now) -> Mapping[str, Any]:
     """Compare the value with the one that was in force a window ago."""
     (variable,) = inputs
+    rate = _rate(config, variable, now)
+    in_limits = (rate >= config.min) & (rate <= config.max)
+    return {"in_limits": where_known(np.isfinite(rate), in_limits), "rate": rate}
+
+
+def _rate(config: Config, variable: Input, now: Now) -> Any:
+    """Return the change per second; NaN where it is not known."""
     before = now - round(config.window * NS)
     known = variable.samples.known(now) & variable.samples.known(before)
     change = _number(variable.at(now)) - _number(variable.at(before))
     if config.turn is not None:
         change = (change + config.turn / 2) % config.turn - config.turn / 2
-    rate = np.where(known, change / config.window, np.nan)
-    in_limits = (rate >= config.min) & (rate <= config.max)
-    return {"in_limits": where_known(np.isfinite(rate), in_limits), "rate": rate}
+    return np.where(known, change / config.window, np.nan)
 
 
 def _number(value: Any) -> Any:
     return np.asarray(value).astype(np.float64)
+
+
+def reason(config: Config, given: Given) -> str:
+    """Say how fast what changes, with the limit."""
+    unit = given.unit or "per second"
+    found = ((one.name, float(_rate(config, one, given.now_ns))) for one in given.inputs)
+    return "; ".join(
+        f"{variable_text(name)} changes by "
+        f"{replace(given, unit=unit).limited(rate, config.min, config.max)}"
+        for name, rate in found if rate < config.min or rate > config.max
+    )  # fmt: skip
 
 
 def explain(config: Config, results: Mapping[str, Any]) -> str:
