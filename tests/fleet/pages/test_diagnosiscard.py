@@ -217,3 +217,18 @@ def test_what_may_catch_fire_is_made_safe_also_when_it_shows_no_more(knowledge: 
     over = overheating(knowledge).held({HEATS: Hold(NOW, NOW + SECOND_NS)})
     assert [one.id for one in over.cleared] == ["battery#overheats"]
     assert over.next is not None and over.next.make_safe
+
+
+def test_which_instance_it_is_is_one_question_with_one_answer(knowledge: Knowledge) -> None:
+    found = card(knowledge, seen("localisation/match/scans_fit_map"))
+    assert found.next is not None and found.next.text.startswith("Which one is it? ")
+    *some, none = found.next.choices
+    assert {(one.test, one.value) for one in some} == {
+        ("laser_front.lamp", "no"), ("laser_rear.lamp", "no"),
+    }  # fmt: skip
+    all_sound = {none.test: none.value, **none.also}
+    assert all_sound == {"laser_front.lamp": "yes", "laser_rear.lamp": "yes"}
+    assert "Rear: no" in shown(found)
+    given = {test.replace(".", "__"): answer for test, answer in all_sound.items()}
+    after = card(knowledge, seen("localisation/match/scans_fit_map"), **given)
+    assert after.next is not None and after.next.test not in all_sound

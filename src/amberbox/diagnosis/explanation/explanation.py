@@ -14,7 +14,8 @@ class Fault:
     """A failure mode in words; ``cause`` is how it may come about, ``remedy`` what helps.
 
     ``gone_ns`` is since when nothing of it shows any more; what is ``intermittent`` comes and
-    goes by its nature, so that this says nothing.
+    goes by its nature, so that this says nothing. ``kind`` is what it has in common with those
+    of other instances of its type.
     """
 
     id: str
@@ -24,6 +25,7 @@ class Fault:
     remedy: str = ""
     gone_ns: int | None = None
     intermittent: bool = False
+    kind: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,11 +145,21 @@ class Action:
 
 
 @dataclass(frozen=True, slots=True)
+class Instance:
+    """One of several tests that are the same but for the instance, asked as one question."""
+
+    where: str
+    test: str
+    outcomes: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
 class Step:
     """What to do next: a test with its answers, empty if there is none, and remedies.
 
     ``make_safe`` comes before all else; ``text`` begins with it, ``then`` is the rest. ``order``
-    has all actions in their order.
+    has all actions in their order. ``instances`` are the tests that are asked as one, where which
+    instance it is has to be found; ``test`` is the first of them, to which ``answers`` belong.
     """
 
     text: str
@@ -161,6 +173,7 @@ class Step:
     make_safe: tuple[Action, ...] = ()
     then: str = ""
     order: tuple[Action, ...] = ()
+    instances: tuple[Instance, ...] = ()
 
 
 State: TypeAlias = Literal["open", "healed", "none", "unknown"]

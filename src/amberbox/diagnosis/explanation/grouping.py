@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 from amberbox.core.types import AmbiguityGroup, Diagnosis, Hypothesis
 from amberbox.diagnosis.explanation.explanation import Group
+from amberbox.diagnosis.explanation.instances import as_one, kinds_of
 from amberbox.diagnosis.explanation.names import Names, in_order
 from amberbox.diagnosis.explanation.words import both, either
 
@@ -37,8 +38,15 @@ def _text(names: Names, members: Sequence[Hypothesis]) -> str:
     common = frozenset.intersection(*sets)
     rests = [faults - common for faults in sets]
     if not common or not all(rests):
-        return f"one of: {either([names.faults(faults) for faults in sets])}"
-    rest = either([names.faults(faults) for faults in rests])
+        texts = _texts(names, sets)
+        return texts[0] if len(texts) == 1 else f"one of: {either(texts)}"
+    rest = either(_texts(names, rests))
     return (
         f"{both([names.mode(fault) for fault in in_order(common)])}, together with one of: {rest}"
     )
+
+
+def _texts(names: Names, sets: Sequence[Collection[str]]) -> list[str]:
+    """Describe sets of failure modes; those that differ by an instance alone are one."""
+    kinds = [kinds_of(names.fmea, faults) for faults in sets]
+    return as_one(kinds, [names.faults(faults) for faults in sets])

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from amberbox.core.types import Hypothesis
 from amberbox.diagnosis.covering.model import UNKNOWN
 from amberbox.diagnosis.explanation.explanation import Fault, Possibility
+from amberbox.diagnosis.explanation.instances import kind_of
 from amberbox.diagnosis.explanation.words import both, count, readable
 from amberbox.diagnosis.fmea.findings import text_of as finding_text
 from amberbox.diagnosis.fmea.model import Fmea
@@ -100,7 +101,7 @@ class Names:
             return Fault(mode_id, self.mode(mode_id), gone_ns=gone_ns)
         return Fault(
             mode_id, self.mode(mode_id), mode.severity, mode.cause, mode.remedy, gone_ns,
-            mode.intermittent,
+            mode.intermittent, kind_of(self.fmea, mode_id),
         )  # fmt: skip
 
     def possibility(self, hypothesis: Hypothesis) -> Possibility:

@@ -12,7 +12,8 @@ from amberbox.core.types import AmbiguityGroup, Diagnosis, Hypothesis
 from amberbox.diagnosis.covering.check import Check
 from amberbox.diagnosis.covering.model import UNKNOWN
 from amberbox.diagnosis.covering.prediction import outcomes, predict
-from amberbox.diagnosis.explanation.explanation import Action, Branch, Step
+from amberbox.diagnosis.explanation.explanation import Action, Branch, Instance, Step
+from amberbox.diagnosis.explanation.instances import instance_words, merged, siblings
 from amberbox.diagnosis.explanation.names import Names, in_order
 from amberbox.diagnosis.explanation.words import capital, duration, either
 from amberbox.diagnosis.knowledge import Knowledge
@@ -56,10 +57,13 @@ def step_of(
             order=(*_told(names, safe), *order),
         )  # fmt: skip
     check, first = asked.check, "; and ".join(remedies)
-    test = Action("test", asked.text, check.id)
+    alike = siblings(knowledge, diagnosis, check)
+    which = f"Which one is it? {merged([one.text for one in alike])}"
+    asks = which if len(alike) > 1 else asked.text
+    test = Action("test", asks, check.id)
     repairs = tuple(Action("repair", remedy) for remedy in remedies)
     mends_first = certain and bool(first)
-    rest = capital(f"{first}; or make sure before: {asked.text}" if mends_first else asked.text)
+    rest = capital(f"{first}; or make sure before: {asks}" if mends_first else asks)
     return Step(
         _text(safe, rest),
         check.id,
@@ -72,6 +76,7 @@ def step_of(
         _told(names, safe),
         rest,
         (*_told(names, safe), *((*repairs, test) if mends_first else (test, *repairs))),
+        _instances(names, alike),
     )
 
 
@@ -86,6 +91,17 @@ class Asked:
     def may_change_mind(self, leads: str) -> bool:
         """Tell whether an answer would make something else lead."""
         return any(branch.leads != leads for branch in self.answers)
+
+
+def _instances(names: Names, alike: Sequence[Check]) -> tuple[Instance, ...]:
+    """Say where tests are done that are asked as one; nothing for one alone."""
+    if len(alike) < 2:
+        return ()
+    components = [names.component(one.id.rpartition(".")[0]) for one in alike]
+    where = instance_words([one.text for one in alike]) or components
+    return tuple(
+        Instance(word, one.id, one.outcomes) for word, one in zip(where, alike, strict=True)
+    )
 
 
 def _text(safe: Sequence[MakeSafe], rest: str) -> str:

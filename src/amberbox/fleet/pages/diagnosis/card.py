@@ -15,6 +15,7 @@ from amberbox.core.clock import NS
 from amberbox.core.sureness import LIKELY, percent
 from amberbox.core.timetext import format_time
 from amberbox.diagnosis.explanation.activity import OWN_SHARE
+from amberbox.diagnosis.explanation.instances import merged
 from amberbox.diagnosis.explanation.names import together
 from amberbox.diagnosis.explanation.words import both
 from amberbox.fleet.alarms.words import CauseKind, kind_of
@@ -41,7 +42,8 @@ _FAILS = re.compile(r"\bfails(\.?)$")
 class Cause:
     """What may be broken; ``share`` is how probable it is, in words.
 
-    ``parts`` are its failure modes, each with what it is called.
+    ``parts`` are its failure modes, each with what it is called, ``of_kind`` what they have in
+    common with those of other instances of their types.
     """
 
     id: str
@@ -50,6 +52,8 @@ class Cause:
     kind: CauseKind = "fault"
     comes_from: str = ""
     parts: Sequence[tuple[str, str]] = ()
+    of_kind: tuple[str, ...] = ()
+    probability: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,12 +96,19 @@ class Reason:
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """An answer to a test: ``value`` is what is sent, ``leads`` what it would mean."""
+    """An answer to a test: ``value`` is what is sent, ``leads`` what it would mean.
+
+    Where several tests are asked as one, ``test`` is the one that it answers, ``also`` what it
+    says of the others, and ``text`` what people read.
+    """
 
     value: str
     chance: str = ""
     leads: str = ""
     then: str = ""
+    text: str = ""
+    test: str = ""
+    also: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -235,7 +246,7 @@ def card_of(answer: Answer, until_ns: int | None = None) -> DiagnosisCard:
     told, robot = answer["explanation"], str(answer["robot"])
     if told is None:
         return nothing_broken(robot, answer["at"], answer.get("notes", ()))
-    causes = tuple(_told_causes(told["broken"]))
+    causes = tuple(_as_one(_told_causes(told["broken"])))
     probability = told["sure"]["probability"]
     seen = [reason_of(robot, one, until_ns) for one in told["because"]]
     beside = [reason_of(robot, one, until_ns) for one in told["unexplained"]]
@@ -288,7 +299,20 @@ def _told_causes(broken: Answer | None) -> Iterator[Cause]:
         comes_from = "; ".join(fault["cause"] for fault in member["faults"] if fault["cause"])
         yield Cause(member["id"], capital(member["text"]), percent(member["probability"]),
                     kind_of(ids), comes_from,
-                    tuple((fault["id"], fault["text"]) for fault in member["faults"]))  # fmt: skip
+                    tuple((fault["id"], fault["text"]) for fault in member["faults"]),
+                    tuple(sorted(fault.get("kind", "") for fault in member["faults"])),
+                    member["probability"])  # fmt: skip
+
+
+def _as_one(causes: Iterable[Cause]) -> Iterator[Cause]:
+    """Join causes that differ by the instance of a type alone: which it is, is one question."""
+    found: dict[object, list[Cause]] = {}
+    for cause in causes:
+        found.setdefault(cause.of_kind or cause.id, []).append(cause)
+    for alike in found.values():
+        text = merged([cause.text for cause in alike])
+        whole = percent(min(1.0, sum(cause.probability for cause in alike)))
+        yield replace(alike[0], text=text, share=whole) if len(alike) > 1 else alike[0]
 
 
 def _steady(broken: Answer | None) -> Iterator[str]:
@@ -343,6 +367,8 @@ def check_fails(symptom: str) -> str:
 
 def choices_of(test: Answer, step: Answer | None = None) -> tuple[Choice, ...]:
     """Return the answers of a test; of a step also what they would mean."""
+    if step and step.get("instances"):
+        return _which(step["instances"])
     if step is None:
         plain = [Choice(value, percent(chance)) for value, chance in test["outcomes"].items()]
         return _in_order(plain)
@@ -351,6 +377,19 @@ def choices_of(test: Answer, step: Answer | None = None) -> tuple[Choice, ...]:
         for b in step["answers"]
     ]
     return _in_order(told)
+
+
+def _which(instances: Sequence[Answer]) -> tuple[Choice, ...]:
+    """Return the answers to tests that are asked as one: which of them gives what, or none."""
+    found = [
+        Choice(value, text=f"{capital(one['where'])}: {value}", test=one["test"])
+        for one in instances for value in one["outcomes"][1:]
+    ]  # fmt: skip
+    sound = {one["test"]: one["outcomes"][0] for one in instances}
+    first = next(iter(sound))
+    text = catalogue().text("diagnosis.card.none_of_them", value=sound[first])
+    none = Choice(sound.pop(first), text=text, test=first, also=sound)
+    return (*found, none)
 
 
 def _told_next(step: Answer, tests: Sequence[Answer]) -> Next:
