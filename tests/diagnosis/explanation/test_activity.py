@@ -71,3 +71,10 @@ def test_the_text_says_since_when() -> None:
 def test_all_gone_is_told_as_it_was() -> None:
     gone = told(*ENCODER, gone=ENCODER)
     assert gone.cleared == () and "encoder" in gone.headline
+
+
+def test_what_differs_by_a_cleared_cause_alone_is_one_possibility() -> None:
+    after = told(*ENCODER, *WINDOW, gone=ENCODER)
+    texts = [group.text for group in (after.broken, *after.others) if group]
+    assert len(texts) == len(set(texts))
+    assert sum(group.probability for group in (after.broken, *after.others) if group) < 1.01

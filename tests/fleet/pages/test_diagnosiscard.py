@@ -206,6 +206,9 @@ def test_a_repaired_cause_leaves_the_title_and_stands_apart(knowledge: Knowledge
     assert [cause.text for cause in over.causes] == ["The battery heats itself"]
     assert [one.id for one in over.cleared] == ["localisation#shift"]
     assert [reason.small for reason in over.why] == [HEATS, JUMPS]
+    assert found.next is not None and found.next.test == "place_on_map"
+    assert over.next is not None and over.next.text == "Replace the battery."
+    assert over.next.test == "" and float(over.number[:2]) > float(found.number[:2])
     html = shown(over)
     assert html.index("The battery heats itself") < html.index("shows no more")
     back = over.held({JUMPS: Hold(NOW, None)})

@@ -41,7 +41,7 @@ class Activity:
 
     def active(self, hypothesis: Hypothesis) -> Hypothesis:
         """Return a hypothesis with what is active of it; as it is if nothing of it is."""
-        left = hypothesis.faults - self.cleared.keys()
+        left = hypothesis.faults - frozenset(self.cleared)
         return replace(hypothesis, faults=left) if left else hypothesis
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Sequence
+from dataclasses import replace
 
 from amberbox.core.types import Diagnosis, Hypothesis, Symptom
 from amberbox.diagnosis.explanation.activity import Activity
@@ -14,7 +15,7 @@ from amberbox.diagnosis.explanation.grouping import described, groups_of
 from amberbox.diagnosis.explanation.headline import headline
 from amberbox.diagnosis.explanation.names import Names, in_order
 from amberbox.diagnosis.explanation.seen import Sights
-from amberbox.diagnosis.explanation.step import step_of
+from amberbox.diagnosis.explanation.step import Leading, step_of
 from amberbox.diagnosis.explanation.sureness import sureness
 from amberbox.diagnosis.explanation.use import use_of
 from amberbox.diagnosis.knowledge import Knowledge
@@ -34,7 +35,7 @@ def explain(diagnosis: Diagnosis, knowledge: Knowledge, symptoms: Iterable[Sympt
     activity = Activity.of(knowledge, diagnosis, symptoms)
     names = Names(knowledge.fmea, activity.cleared)
     sights = Sights.of(names, diagnosis, symptoms, activity.weights)
-    found = groups_of(diagnosis)
+    found = _alike(activity, groups_of(diagnosis))
     members = found[0][1] if found else ()
     active = [(group, tuple(map(activity.active, of))) for group, of in found]
     groups = [described(names, *group) for group in found[: 1 + OTHERS]]
@@ -64,6 +65,17 @@ def explain(diagnosis: Diagnosis, knowledge: Knowledge, symptoms: Iterable[Sympt
         graph_of(sights, found[: 1 + OTHERS]),
         cleared=_cleared(names, members),
     )
+
+
+def _alike(activity: Activity, found: Iterable[Leading]) -> list[Leading]:
+    """Join groups that differ by causes alone that show no more, the most probable first."""
+    joined: dict[frozenset[frozenset[str]], Leading] = {}
+    for group, members in found:
+        key = frozenset(activity.active(hypothesis).faults for hypothesis in members)
+        first, of = joined.get(key, (replace(group, probability=0.0), members))
+        whole = min(1.0, first.probability + group.probability)
+        joined[key] = replace(first, probability=whole), of
+    return sorted(joined.values(), key=lambda one: -one[0].probability)
 
 
 def _cleared(names: Names, members: Sequence[Hypothesis]) -> tuple[Fault, ...]:

@@ -160,6 +160,7 @@ class Step:
     ``make_safe`` comes before all else; ``text`` begins with it, ``then`` is the rest. ``order``
     has all actions in their order. ``instances`` are the tests that are asked as one, where which
     instance it is has to be found; ``test`` is the first of them, to which ``answers`` belong.
+    ``about`` are the failure modes that may be there and that the test sees.
     """
 
     text: str
@@ -174,6 +175,7 @@ class Step:
     then: str = ""
     order: tuple[Action, ...] = ()
     instances: tuple[Instance, ...] = ()
+    about: tuple[str, ...] = ()
 
 
 State: TypeAlias = Literal["open", "healed", "none", "unknown"]

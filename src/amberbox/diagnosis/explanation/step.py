@@ -77,6 +77,7 @@ def step_of(
         rest,
         (*_told(names, safe), *((*repairs, test) if mends_first else (test, *repairs))),
         _instances(names, alike),
+        tuple(sorted({fault for one in alike for fault in _seen_by(diagnosis, one)})),
     )
 
 
@@ -162,10 +163,15 @@ def _is_past(
     names: Names, diagnosis: Diagnosis, members: Sequence[Hypothesis], check: Check
 ) -> bool:
     """Tell whether a test is about causes alone that show no more, while others lead."""
-    listed = {fault for h in diagnosis.hypotheses for fault in h.faults}
-    seen = listed & {sight.cause for sight in check.sights}
+    seen = _seen_by(diagnosis, check)
     led = {fault for h in members for fault in h.faults}
     return bool(seen) and seen <= names.cleared.keys() and not led <= names.cleared.keys()
+
+
+def _seen_by(diagnosis: Diagnosis, check: Check) -> set[str]:
+    """Return the failure modes of any hypothesis that a test sees."""
+    listed = {fault for h in diagnosis.hypotheses for fault in h.faults}
+    return listed & {sight.cause for sight in check.sights}
 
 
 def _tells_apart(knowledge: Knowledge, check: Check, members: Sequence[Hypothesis]) -> bool:

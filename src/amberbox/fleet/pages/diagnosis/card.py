@@ -125,7 +125,8 @@ class Safety:
 class Next:
     """What to do next; without ``test`` there is nothing to answer.
 
-    ``make_safe`` comes before it, in the words of the robot's analysis.
+    ``make_safe`` comes before it, in the words of the robot's analysis. ``about`` are the failure
+    modes that the test is about.
     """
 
     text: str
@@ -136,6 +137,7 @@ class Next:
     choices: Sequence[Choice] = ()
     remedies: Sequence[str] = ()
     make_safe: Sequence[Safety] = ()
+    about: frozenset[str] = frozenset()
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,7 +150,8 @@ class DiagnosisCard:
     own words are known, without explanation. ``seen`` is all that was seen, ``why`` the first of
     it, ``more`` counts the others. ``cleared`` are causes beside those that lead of which nothing
     shows any more, ``steady`` failure modes that do not come and go. ``number`` is empty where
-    there is none. ``names`` are failure modes in words, by id.
+    there is none. ``names`` are failure modes in words, ``helps`` what mends them, by id;
+    ``shares`` are the hypotheses with their probabilities.
     """
 
     robot: str
@@ -172,6 +175,8 @@ class DiagnosisCard:
     gone: str | None = None
     cleared: Sequence[Cleared] = ()
     steady: frozenset[str] = frozenset()
+    helps: Mapping[str, str] = field(default_factory=dict)
+    shares: Sequence[tuple[frozenset[str], float]] = ()
 
     @property
     def why(self) -> Sequence[Reason]:
@@ -196,11 +201,22 @@ class DiagnosisCard:
             return self
         causes = [_lasting(cause, over) for cause in self.causes]
         cleared = [Cleared(id_, capital(parts[id_]), over[id_]) for id_ in parts if id_ in over]
-        safe = [one for one in (self.next.make_safe if self.next else ())
-                if one.is_fatal or not one.faults or one.faults - over.keys()]  # fmt: skip
-        step = replace(self.next, make_safe=safe) if self.next else None
         kept = tuple({cause.text: cause for cause in causes}.values())
-        return replace(self, causes=kept, cleared=cleared, next=step)
+        step = _next_without(self.next, over, self._help(parts.keys() - over.keys()))
+        return replace(self._sure_of(kept, over), causes=kept, cleared=cleared, next=step)
+
+    def _help(self, faults: Iterable[str]) -> str:
+        """Return what mends failure modes."""
+        texts = (self.helps[fault] for fault in sorted(faults) if self.helps.get(fault))
+        return sentence("; and ".join(dict.fromkeys(texts)))
+
+    def _sure_of(self, causes: Sequence[Cause], over: Mapping[str, str]) -> DiagnosisCard:
+        """Return it with how probable the one cause is that is left, alone or with others."""
+        if len(causes) != 1 or not self.shares:
+            return self
+        left = {id_ for id_, _ in causes[0].parts} - over.keys()
+        share = min(1.0, sum(share for faults, share in self.shares if left <= faults))
+        return replace(self, number=percent(share), sure=_sure(causes, share))
 
 
 def in_order(seen: Iterable[Reason]) -> list[Reason]:
@@ -216,6 +232,19 @@ def cleared_in(card: DiagnosisCard) -> dict[str, str]:
             shown.setdefault(fault, []).append(one.until)
     ended = {fault: [end for end in ends if end] for fault, ends in shown.items()}
     return {fault: max(ends) for fault, ends in ended.items() if len(ends) == len(shown[fault])}
+
+
+def _next_without(step: Next | None, over: Mapping[str, str], helps: str) -> Next | None:
+    """Return what to do without what shows no more; what helps in place of a test of that alone."""
+    if step is None:
+        return None
+    safe = [
+        one for one in step.make_safe
+        if one.is_fatal or not one.faults or one.faults - over.keys()
+    ]  # fmt: skip
+    if step.about and step.about <= over.keys():
+        return Next(helps, make_safe=safe) if helps or safe else None
+    return replace(step, make_safe=safe)
 
 
 def _lasting(cause: Cause, over: Mapping[str, str]) -> Cause:
@@ -263,6 +292,8 @@ def card_of(answer: Answer, until_ns: int | None = None) -> DiagnosisCard:
         _told_next(told["next"], answer["next_tests"]),
         answers=answer.get("answers"), names=names_in(told), notes=tuple(answer.get("notes", ())),
         cleared=cleared, steady=frozenset(_steady(told["broken"])),
+        helps={fault["id"]: fault["remedy"] for fault in _faults(told["broken"])},
+        shares=[(frozenset(h["faults"]), h["probability"]) for h in answer["hypotheses"]],
     )  # fmt: skip
 
 
@@ -288,9 +319,8 @@ def plain_card_of(revision: Answer) -> DiagnosisCard:
 
 def names_in(told: Answer) -> dict[str, str]:
     """Return what the failure modes are called that an explanation names."""
-    groups = [*([told["broken"]] if told["broken"] else ()), *told["others"]]
-    faults = (fault for group in groups for one in group["members"] for fault in one["faults"])
-    return {fault["id"]: fault["text"] for fault in faults}
+    groups = [told["broken"], *told["others"]]
+    return {fault["id"]: fault["text"] for group in groups for fault in _faults(group)}
 
 
 def _told_causes(broken: Answer | None) -> Iterator[Cause]:
@@ -317,8 +347,13 @@ def _as_one(causes: Iterable[Cause]) -> Iterator[Cause]:
 
 def _steady(broken: Answer | None) -> Iterator[str]:
     """Yield the failure modes that lead and do not come and go by their nature."""
-    for member in broken["members"] if broken else ():
-        yield from (f["id"] for f in member["faults"] if not f.get("intermittent", True))
+    return (one["id"] for one in _faults(broken) if not one.get("intermittent", True))
+
+
+def _faults(group: Answer | None) -> Iterator[Answer]:
+    """Yield the failure modes of a group."""
+    for member in group["members"] if group else ():
+        yield from member["faults"]
 
 
 def _owners(seen: Answer) -> frozenset[str]:
@@ -401,6 +436,7 @@ def _told_next(step: Answer, tests: Sequence[Answer]) -> Next:
         choices_of({}, step) if step["test"] else (),
         tuple(sentence(text) for text in step["remedies"]),
         tuple(_safety(action) for action in safe),
+        frozenset(step.get("about", ())),
     )  # fmt: skip
 
 
