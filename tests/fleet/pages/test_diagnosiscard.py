@@ -235,3 +235,19 @@ def test_which_instance_it_is_is_one_question_with_one_answer(knowledge: Knowled
     given = {test.replace(".", "__"): answer for test, answer in all_sound.items()}
     after = card(knowledge, seen("localisation/match/scans_fit_map"), **given)
     assert after.next is not None and after.next.test not in all_sound
+
+
+def test_an_answer_that_an_older_server_kept_is_shown(knowledge: Knowledge) -> None:
+    answer = answer_of(knowledge, seen(sim.NO_SCANS))
+    told = answer["explanation"]
+    for fault in (f for member in told["broken"]["members"] for f in member["faults"]):
+        for name in ("kind", "intermittent", "gone_ns"):
+            del fault[name]
+    for one in told["because"]:
+        for name in ("reason", "gone_ns", "weight"):
+            del one[name]
+    for name in ("make_safe", "then", "order", "instances", "about"):
+        del told["next"][name]
+    del told["cleared"]
+    found = card_of(answer).held({sim.NO_SCANS: Hold(NOW, None)})
+    assert len(found.causes) == 2 and shown(found)

@@ -42,8 +42,8 @@ _FAILS = re.compile(r"\bfails(\.?)$")
 class Cause:
     """What may be broken; ``share`` is how probable it is, in words.
 
-    ``parts`` are its failure modes, each with what it is called, ``of_kind`` what they have in
-    common with those of other instances of their types.
+    ``parts`` are its failure modes, each with what it is called, if it is one cause alone;
+    ``of_kind`` is what they have in common with those of other instances of their types.
     """
 
     id: str
@@ -212,7 +212,7 @@ class DiagnosisCard:
 
     def _sure_of(self, causes: Sequence[Cause], over: Mapping[str, str]) -> DiagnosisCard:
         """Return it with how probable the one cause is that is left, alone or with others."""
-        if len(causes) != 1 or not self.shares:
+        if len(causes) != 1 or not causes[0].parts:
             return self
         left = {id_ for id_, _ in causes[0].parts} - over.keys()
         share = min(1.0, sum(share for faults, share in self.shares if left <= faults))
@@ -330,8 +330,13 @@ def _told_causes(broken: Answer | None) -> Iterator[Cause]:
         yield Cause(member["id"], capital(member["text"]), percent(member["probability"]),
                     kind_of(ids), comes_from,
                     tuple((fault["id"], fault["text"]) for fault in member["faults"]),
-                    tuple(sorted(fault.get("kind", "") for fault in member["faults"])),
-                    member["probability"])  # fmt: skip
+                    _kinds(member["faults"]), member["probability"])  # fmt: skip
+
+
+def _kinds(faults: Sequence[Answer]) -> tuple[str, ...]:
+    """Return the kinds of failure modes; nothing where one has none, as of older servers."""
+    kinds = sorted(fault.get("kind", "") for fault in faults)
+    return tuple(kinds) if all(kinds) else ()
 
 
 def _as_one(causes: Iterable[Cause]) -> Iterator[Cause]:
@@ -342,7 +347,8 @@ def _as_one(causes: Iterable[Cause]) -> Iterator[Cause]:
     for alike in found.values():
         text = merged([cause.text for cause in alike])
         whole = percent(min(1.0, sum(cause.probability for cause in alike)))
-        yield replace(alike[0], text=text, share=whole) if len(alike) > 1 else alike[0]
+        joined = replace(alike[0], text=text, share=whole, parts=())
+        yield joined if len(alike) > 1 else alike[0]
 
 
 def _steady(broken: Answer | None) -> Iterator[str]:
