@@ -202,7 +202,7 @@ def _use(explanation: Explanation) -> Iterator[str]:
 
 def _next(step: Step) -> Iterator[str]:
     for action in step.make_safe:
-        yield from _paragraph(f"First, make it safe: {sentence(action.text)} ({action.why})")
+        yield from _paragraph(f"First, make it safe: {action.text} (it may be: {action.why}).")
     yield from _paragraph(sentence(f"Then: {step.then}" if step.make_safe else step.text))
     if step.test:
         yield _line(_effort(step), "  ")
