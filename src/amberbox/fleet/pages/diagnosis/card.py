@@ -162,7 +162,8 @@ class DiagnosisCard:
     causes: Sequence[Cause] = ()
     sure: Sure = ""
     number: str = ""
-    seen: Sequence[Reason] = ()
+    why: Sequence[Reason] = ()
+    more: int = 0
     severity: str = ""
     use: str = ""
     lost: Sequence[str] = ()
@@ -177,21 +178,17 @@ class DiagnosisCard:
     steady: frozenset[str] = frozenset()
     helps: Mapping[str, str] = field(default_factory=dict)
     shares: Sequence[tuple[frozenset[str], float]] = ()
+    seen: Sequence[Reason] = ()
 
-    @property
-    def why(self) -> Sequence[Reason]:
-        """What matters most of what was seen: what is there still comes first."""
-        return self.seen[:REASONS]
-
-    @property
-    def more(self) -> int:
-        """How much was seen beyond that."""
-        return max(0, len(self.seen) - REASONS)
+    def having(self, seen: Iterable[Reason]) -> DiagnosisCard:
+        """Return it with what was seen: what is there still first, of that what matters most."""
+        found = in_order(seen)
+        return replace(self, seen=found, why=found[:REASONS], more=max(0, len(found) - REASONS))
 
     def held(self, holds: Mapping[str, Hold]) -> DiagnosisCard:
         """Return it with what is known of each symptom now: until when it was there."""
         seen = [one.over(holds[one.small]) if one.small in holds else one for one in self.seen]
-        card = replace(self, seen=in_order(seen))
+        card = self.having(seen)
         return card if self.state != "open" else card.without(cleared_in(card))
 
     def without(self, over: Mapping[str, str]) -> DiagnosisCard:
@@ -287,14 +284,15 @@ def card_of(answer: Answer, until_ns: int | None = None) -> DiagnosisCard:
     return DiagnosisCard(
         robot, answer["state"], answer["at"], answer["id"], answer["revision"], causes,
         _sure(causes, probability), percent(probability) if causes else "",
-        in_order(seen), told["use"]["severity"], sentence(told["use"]["text"]),
-        tuple(lost["text"] for lost in told["use"]["lost"]), sentence(told["use"]["careful"]),
-        _told_next(told["next"], answer["next_tests"]),
+        severity=told["use"]["severity"], use=sentence(told["use"]["text"]),
+        lost=tuple(lost["text"] for lost in told["use"]["lost"]),
+        careful=sentence(told["use"]["careful"]),
+        next=_told_next(told["next"], answer["next_tests"]),
         answers=answer.get("answers"), names=names_in(told), notes=tuple(answer.get("notes", ())),
         cleared=cleared, steady=frozenset(_steady(told["broken"])),
         helps={fault["id"]: fault["remedy"] for fault in _faults(told["broken"])},
         shares=[(frozenset(h["faults"]), h["probability"]) for h in answer["hypotheses"]],
-    )  # fmt: skip
+    ).having(seen)  # fmt: skip
 
 
 def plain_card_of(revision: Answer) -> DiagnosisCard:
@@ -311,9 +309,10 @@ def plain_card_of(revision: Answer) -> DiagnosisCard:
     return DiagnosisCard(
         robot, revision["state"], revision["at"], revision["id"], revision["revision"], causes,
         _sure(causes, probability), percent(probability) if causes else "",
-        tuple(Reason(check_fails(name), revision["at"],
-                     moment_href(robot, (), revision["at_ns"]), name) for name in names),
         next=_plain_next(revision["next_tests"], revision.get("make_safe", ())), complete=False,
+    ).having(
+        Reason(check_fails(name), revision["at"], moment_href(robot, (), revision["at_ns"]), name)
+        for name in names
     )  # fmt: skip
 
 
