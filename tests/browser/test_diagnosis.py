@@ -44,6 +44,31 @@ def broken(site: Site, request: pytest.FixtureRequest) -> Iterator[str]:
     robot.say(gone, replace(found, revision=2, state="healed", at_ns=then_ns))
 
 
+HEATS, HOT, JUMPS = (
+    "battery.heats", "battery/temperature/in_range", "localisation/position/does_not_jump",
+)  # fmt: skip
+
+
+@pytest.fixture
+def hot(site: Site, request: pytest.FixtureRequest) -> Iterator[str]:
+    """Let a robot's battery overheat, an older fault being mended; give the page of it."""
+    robot, ns = site.robots[ROBOT], 1_000_000_000
+    at_ns = robot.clock.wall_ns()
+    lost = Symptom(JUMPS, "present", JUMPS, at_ns - 120 * ns, at_ns - 120 * ns)
+    rate = "the rate of temperature over 40 s is 0.034, at most 0.01"
+    heats = Symptom(HEATS, "present", HEATS, at_ns - 5 * ns, at_ns - 5 * ns, reason=rate)
+    warm = Symptom(HOT, "present", HOT, at_ns, at_ns, reason="temperature is 58.2 °C, at most 50")
+    knowledge = declared(FOLDER, ROBOT, HASH_2).knowledge()
+    heading = Heading(f"{ROBOT}-{request.node.name[:24]}", 1, at_ns)
+    found = answer(knowledge, Situation((lost, heats, warm), watched=True), heading)
+    gone = Symptom(JUMPS, "absent", JUMPS, None, at_ns - 30 * ns)
+    robot.say(lost, gone, heats, warm, found)
+    yield f"/robots/{ROBOT}/diagnosis"
+    then_ns = robot.clock.wall_ns()
+    over = [Symptom(name, "absent", name, None, then_ns) for name in (HEATS, HOT)]
+    robot.say(*over, replace(found, revision=2, state="healed", at_ns=then_ns))
+
+
 def opened(page: Page, path: str) -> Page:
     page.goto(path)
     page.locator("#dx-card [data-complete=yes]").wait_for()
@@ -59,6 +84,27 @@ def test_the_card(page_as: PageAs, width: int, theme: str) -> None:
     axe(page)
     no_sideways_scroll(page)
     shot(page, "diagnosis")
+
+
+@pytest.mark.parametrize("theme", ["light", "dark"])
+def test_what_is_dangerous_is_told_first_on_a_phone(page_as: PageAs, hot: str, theme: str) -> None:
+    page = opened(page_as("operator", 390, theme, height=844), hot)
+    card = page.locator("#dx-card")
+    safe = card.locator(".dx-safe")
+    expect(safe).to_contain_text("Switch off, let it cool outside.")
+    expect(card.locator(".dx > .dx-cause")).to_have_text("The battery heats itself")
+    expect(card.locator(".dx-cleared")).to_contain_text("Localisation has settled on a wrong place")
+    reason = card.locator(".dx-why li").first
+    expect(reason).to_contain_text("temperature over 40 s is 0.034, at most 0.01")
+    expect(card.locator(".dx-why")).to_contain_text("temperature is 58.2 °C, at most 50")
+    shot(page, "hot")
+    tops = [page.evaluate("e => e.getBoundingClientRect().top", one.element_handle())
+            for one in (card.locator(".dx > .dx-cause"), safe, reason)]  # fmt: skip
+    box = reason.bounding_box()
+    assert box is not None and tops == sorted(tops)
+    assert box["y"] + box["height"] <= 844, "the first screenful has all three"
+    axe(page)
+    no_sideways_scroll(page)
 
 
 def test_a_test_is_answered_and_the_cause_is_said(page_as: PageAs, broken: str) -> None:

@@ -17,6 +17,7 @@ from amberbox.diagnosis import faulttree_engine
 from amberbox.diagnosis.findings import rules as rules_engine
 from amberbox.diagnosis.findings.facts import Facts, seen_facts
 from amberbox.diagnosis.knowledge import Knowledge
+from amberbox.diagnosis.make_safe import with_make_safe
 from amberbox.diagnosis.rules import Program, read_rules
 
 
@@ -77,6 +78,11 @@ def diagnosis_by(engine: str, ground: Ground, case: Case) -> Diagnosis | None:
 
     Raises UsageError where there are no rules to ask.
     """
+    made = _made_by(engine, ground, case)
+    return None if made is None else with_make_safe(ground.knowledge.fmea, made)
+
+
+def _made_by(engine: str, ground: Ground, case: Case) -> Diagnosis | None:
     if engine == "rules":
         return _by_rules(ground, case)
     if engine == "faulttree":

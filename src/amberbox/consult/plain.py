@@ -29,6 +29,7 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
         "groups": [_group(entry, faults) for entry in diagnosis.groups],
         "next_tests": [_test(entry) for entry in diagnosis.next_tests],
         "findings": list(diagnosis.findings),
+        "make_safe": list(diagnosis.make_safe),
     }
 
 
@@ -40,6 +41,8 @@ def symptoms_json(symptoms: Sequence[Symptom], counted: Collection[str]) -> list
             "state": symptom.state,
             "onset": _time(symptom.onset_ns),
             "confirmed": _time(symptom.confirmed_ns),
+            "gone": _time(symptom.gone_ns),
+            "reason": symptom.reason,
             "source": symptom.source,
             "blocked_by": list(symptom.blocked_by),
             "counted": symptom.id in counted,

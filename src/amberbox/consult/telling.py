@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from typing import Any
 
 from amberbox.consult.case import Case
@@ -41,9 +42,15 @@ def json_of(
 def _seen(case: Case) -> Sequence[Symptom]:
     """Return what is known of symptoms; those of the diagnosis as they were when it was made."""
     present = {symptom.id for symptom in case.situation.present()}
-    before = [symptom for symptom in case.seen if symptom.id not in present]
+    before = [s for s in with_ends(case.seen, case.situation.symptoms) if s.id not in present]
     past = {symptom.id for symptom in before}
     return (*before, *(s for s in case.situation.symptoms if s.id not in past))
+
+
+def with_ends(seen: Iterable[Symptom], now: Iterable[Symptom]) -> list[Symptom]:
+    """Return symptoms as they were, with when they went by what is known of them now."""
+    ends = {s.id: s.confirmed_ns if s.state == "absent" else s.gone_ns for s in now}
+    return [replace(symptom, gone_ns=ends.get(symptom.id)) for symptom in seen]
 
 
 def _no_diagnosis(knowledge: Knowledge, case: Case) -> dict[str, Any]:

@@ -32,6 +32,8 @@ machine. It may also define
   recorded variable; without it ``PROBE`` is the kind and the text is the subject;
 - ``explain(config, results)``: one sentence on why the results are not as they should be; bools
   that are not known are None there, numbers NaN;
+- ``reason(config, given)``: the same by what was looked at (``Given``), with the values that were
+  measured and their limits; where it returns nothing, ``explain`` is asked;
 - ``explain_unknown(config, results)``: one sentence on what is missing where a result is not known.
 
 A verdict needs evidence: before a window is full, or where its rows are missing, a bool is UNKNOWN
@@ -43,11 +45,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
-from math import isfinite
+from math import isfinite, isnan
 from typing import Any, Literal, Protocol
 
 import numpy as np
 
+from amberbox.core.expression_reason import number_text
 from amberbox.core.flow import Flow
 from amberbox.core.samples import Now, Samples, Window
 
@@ -121,6 +124,29 @@ class Input:
     def rate_hz(self, now: Now, seconds: float) -> Any:
         """Return messages of its item per second over the last ``seconds``, before any filter."""
         return self.flow.rate_hz(now, seconds)
+
+
+@dataclass(frozen=True, slots=True)
+class Given:
+    """What a mode looked at when its results were bad, for people.
+
+    ``inputs`` are those it was called with, ``unit`` is that of its numbers, empty if nobody says.
+    """
+
+    inputs: Sequence[Input]
+    now_ns: int
+    unit: str = ""
+
+    def measured(self, value: float) -> str:
+        """Write a number with the unit."""
+        return f"{number_text(value)} {self.unit}".rstrip()
+
+    def limited(self, value: float, low: float, high: float) -> str:
+        """Write a number with the limit that it has crossed: ``48.1 °C, at most 45``."""
+        if isnan(value):
+            return "no number"
+        limit = f"at least {low:g}" if value < low else f"at most {high:g}"
+        return f"{self.measured(value)}, {limit}"
 
 
 def shortest_window_s(module: Any, config: Any) -> float:

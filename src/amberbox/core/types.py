@@ -266,6 +266,8 @@ class Symptom:
     ``detector.finding.item[.variable]``; ``source`` says who found it, ``strength`` is the share
     of it that counts (1: all). ``evidence`` names what was measured: address, from and to.
     ``blocked_by`` names what its component depends on and is not ok: then it is no evidence.
+    ``reason`` says the value that was measured and its limit, where that is known. ``gone_ns`` is
+    when it was seen to be gone, of one that is remembered: it goes on to count for a while.
     """
 
     id: str
@@ -277,6 +279,8 @@ class Symptom:
     source: str = "monitor"
     evidence: tuple[tuple[str, int, int], ...] = ()
     blocked_by: tuple[str, ...] = ()
+    reason: str = ""
+    gone_ns: int | None = None
 
 
 UNKNOWN_FAULT: Final = "unknown#other"
@@ -341,6 +345,7 @@ class Diagnosis:
     failure mode. ``symptoms`` are those that were present, in order of onset; once all have
     healed its last revision says so in ``state`` and keeps the last answer. ``live_only`` marks
     a record that a replay does not have: said again in a new file, or ended by a restart.
+    ``make_safe`` is what has to be done before any of ``next_tests``, by the FMEA.
     """
 
     id: str
@@ -357,3 +362,4 @@ class Diagnosis:
     symptoms: tuple[str, ...] = ()
     state: Literal["open", "healed"] = "open"
     live_only: bool = False
+    make_safe: tuple[str, ...] = ()

@@ -11,6 +11,7 @@ from amberbox.diagnosis.covering.budget import Budget
 from amberbox.diagnosis.covering.evidence import Evidence
 from amberbox.diagnosis.covering.next_test import next_tests, splitting_test
 from amberbox.diagnosis.knowledge import Knowledge
+from amberbox.diagnosis.make_safe import with_make_safe
 from amberbox.diagnosis.situation import Situation, evidence
 
 
@@ -47,7 +48,7 @@ def answer(
     )  # fmt: skip
     checks = tuple(knowledge.checks.values())
     tests = next_tests(knowledge.model, known, found.hypotheses, checks, most=effort.tests)
-    return Diagnosis(
+    made = Diagnosis(
         heading.id,
         heading.revision,
         knowledge.robot,
@@ -61,6 +62,7 @@ def answer(
         _groups(knowledge, known, found),
         tuple(symptom.id for symptom in situation.present()),
     )
+    return with_make_safe(knowledge.fmea, made)
 
 
 def _groups(knowledge: Knowledge, known: Evidence, found: Answer) -> tuple[AmbiguityGroup, ...]:

@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 
 from amberbox.core.clock import NS
-from amberbox.core.mode import HOLD, UNKNOWN, Input, Result
+from amberbox.core.mode import HOLD, UNKNOWN, Given, Input, Result
 from amberbox.core.samples import Samples
 from amberbox.testing._mode_files import ModeFile, mode_file, module_problems
 from amberbox.testing._mode_worlds import Feeding, World, sampled_worlds
@@ -160,6 +160,7 @@ class _Check:
         self._check_feeding(world, one_by_one)
         self._check_silence(world)
         self._check_explanations(one_by_one)
+        self._check_reasons(world)
         return {name for results in one_by_one for name in results}
 
     def evaluate(self, inputs: Sequence[Input], now: Any) -> Mapping[str, Any]:
@@ -227,6 +228,15 @@ class _Check:
             for results in found if explain is not None else ():
                 known = {name: self._known(name, value) for name, value in results.items()}
                 assert isinstance(explain(self.config, known), str)
+
+    def _check_reasons(self, world: World) -> None:
+        """Reasons are texts at any instant: of several inputs one alone may be known."""
+        reason = getattr(self.module, "reason", None)
+        if reason is None:
+            return
+        inputs = [given.whole() for given in world.inputs]
+        for now in world.instants.tolist():
+            assert isinstance(reason(self.config, Given(inputs, now)), str)
 
     def _known(self, name: str, value: Any) -> Any:
         if self.declared[name].type == "bool":

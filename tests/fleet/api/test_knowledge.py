@@ -225,6 +225,14 @@ def test_an_answer_ranks_anew_and_is_kept(home: House, operator: TestClient) -> 
     with home.services.database.reading() as connection:
         actions = [row.action for row in connection.execute(AUDIT.select())]
     assert actions.count("diagnoses.answer") == 2
+    both = {"test": "laser_front.window", "answer": "clean", "also": {"laser_rear.window": "clean"}}
+    third = operator.post(f"{path}/answers", json=both)
+    assert third.json()["answers"].items() >= {"laser_front.window": "clean",
+                                               "laser_rear.window": "clean"}.items()  # fmt: skip
+    kept = operator.get(path).json()
+    assert len(kept["answers"]) == 4 and len(kept["server_revisions"]) == 3
+    wrong = operator.post(f"{path}/answers", json={**both, "also": {"laser_rear.window": "blue"}})
+    assert wrong.status_code == 400
 
 
 def test_two_answers_at_the_same_time_both_count(

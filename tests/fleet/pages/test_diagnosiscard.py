@@ -1,5 +1,7 @@
 """The card of a diagnosis: what it makes of answers."""
 
+from dataclasses import replace
+from html import unescape
 from typing import Any
 
 import pytest
@@ -11,6 +13,7 @@ from amberbox.core.types import Symptom
 from amberbox.diagnosis.knowledge import Knowledge
 from amberbox.diagnosis.situation import Situation
 from amberbox.fleet.api.diagnoses import revision_json
+from amberbox.fleet.knowledge.holding import Hold
 from amberbox.fleet.pages.datalinks import moment_href
 from amberbox.fleet.pages.diagnosis.card import (
     REASONS,
@@ -46,6 +49,13 @@ def answer_of(knowledge: Knowledge, *symptoms: Symptom, **answers: str) -> dict[
 
 def card(knowledge: Knowledge, *symptoms: Symptom, **answers: str) -> DiagnosisCard:
     return card_of(answer_of(knowledge, *symptoms, **answers))
+
+
+def shown(found: DiagnosisCard, raw: bool = False) -> str:
+    """Return the card as a page has it; ``raw`` with its escapes."""
+    template = environment().get_template("diagnosis/part.html")
+    page = template.render(shown=found, seen=None, may=True, link=True)
+    return page if raw else unescape(page)
 
 
 def test_two_that_nothing_tells_apart_are_named_both(knowledge: Knowledge) -> None:
@@ -141,8 +151,7 @@ def test_whatever_stands_in_a_robots_folder_is_shown_as_text(knowledge: Knowledg
     told["next"].update(text=hostile, test=hostile, by=hostile)
     told["next"]["answers"][0]["answer"] = told["use"]["text"] = hostile
     answer["id"] = answer["robot"] = answer["notes"] = hostile
-    template = environment().get_template("diagnosis/part.html")
-    page = template.render(shown=card_of(answer), seen=None, may=True, link=True)
+    page = shown(card_of(answer), raw=True)
     assert "<img" not in page and "60481729" not in page
     assert page.count("&lt;img src=x onerror=alert(1)&gt;{{7777*7777}}") >= 6
 
@@ -158,3 +167,87 @@ def test_addresses_of_data_are_quoted_and_those_of_monitors_left_out() -> None:
     hostile = '"><script>'
     found = moment_href("a/b", [hostile, "laser/heartbeat/alive"], None)
     assert found == "/robots/a%2Fb/data?v=%22%3E%3Cscript%3E"
+
+
+HEATS, JUMPS = "battery.heats", "localisation/position/does_not_jump"
+
+
+def overheating(knowledge: Knowledge) -> DiagnosisCard:
+    """Return the card of a battery that heats itself, after the robot was lost on the map."""
+    lost = seen(JUMPS, at_ns=NOW - 30 * SECOND_NS)
+    return replace(card(knowledge, lost, seen(HEATS)), state="open")
+
+
+def test_a_dangerous_cause_is_made_safe_before_anything_is_asked(knowledge: Knowledge) -> None:
+    found = overheating(knowledge)
+    assert found.next is not None
+    (safe,) = found.next.make_safe
+    assert safe.text == "Switch off, let it cool outside."
+    assert safe.why.startswith("The battery heats itself, ")
+    assert found.why[0].small == HEATS
+    html = shown(found)
+    assert html.index(safe.text) < html.index("Why") < html.index(found.next.text)
+
+
+def test_in_the_robots_own_words_it_is_made_safe_first_as_well(knowledge: Knowledge) -> None:
+    case = Case(NOW, Situation((seen(JUMPS), seen(HEATS)), watched=True))
+    found = answered(knowledge, case)
+    assert found is not None
+    plain = plain_card_of(revision_json(found))
+    assert plain.next is not None and plain.next.make_safe
+    html = shown(plain)
+    assert html.index(plain.next.make_safe[0].text) < html.index(plain.next.text)
+
+
+def test_a_repaired_cause_leaves_the_title_and_stands_apart(knowledge: Knowledge) -> None:
+    found = overheating(knowledge)
+    assert len(found.causes[0].parts) == 2
+    over = found.held({JUMPS: Hold(NOW - 30 * SECOND_NS, NOW)})
+    assert [cause.text for cause in over.causes] == ["The battery heats itself"]
+    assert [one.id for one in over.cleared] == ["localisation#shift"]
+    assert [reason.small for reason in over.why] == [HEATS, JUMPS]
+    assert found.next is not None and found.next.test == "place_on_map"
+    assert over.next is not None and over.next.text == "Replace the battery."
+    assert over.next.test == "" and float(over.number[:2]) > float(found.number[:2])
+    html = shown(over)
+    assert html.index("The battery heats itself") < html.index("shows no more")
+    back = over.held({JUMPS: Hold(NOW, None)})
+    assert len(back.cleared) == 0 and "map" not in back.causes[0].text
+    assert " and " in back.causes[0].text
+
+
+def test_what_may_catch_fire_is_made_safe_also_when_it_shows_no_more(knowledge: Knowledge) -> None:
+    over = overheating(knowledge).held({HEATS: Hold(NOW, NOW + SECOND_NS)})
+    assert [one.id for one in over.cleared] == ["battery#overheats"]
+    assert over.next is not None and over.next.make_safe
+
+
+def test_which_instance_it_is_is_one_question_with_one_answer(knowledge: Knowledge) -> None:
+    found = card(knowledge, seen("localisation/match/scans_fit_map"))
+    assert found.next is not None and found.next.text.startswith("Which one is it? ")
+    *some, none = found.next.choices
+    assert {(one.test, one.value) for one in some} == {
+        ("laser_front.lamp", "no"), ("laser_rear.lamp", "no"),
+    }  # fmt: skip
+    all_sound = {none.test: none.value, **none.also}
+    assert all_sound == {"laser_front.lamp": "yes", "laser_rear.lamp": "yes"}
+    assert "Rear: no" in shown(found)
+    given = {test.replace(".", "__"): answer for test, answer in all_sound.items()}
+    after = card(knowledge, seen("localisation/match/scans_fit_map"), **given)
+    assert after.next is not None and after.next.test not in all_sound
+
+
+def test_an_answer_that_an_older_server_kept_is_shown(knowledge: Knowledge) -> None:
+    answer = answer_of(knowledge, seen(sim.NO_SCANS))
+    told = answer["explanation"]
+    for fault in (f for member in told["broken"]["members"] for f in member["faults"]):
+        for name in ("kind", "intermittent", "gone_ns"):
+            del fault[name]
+    for one in told["because"]:
+        for name in ("reason", "gone_ns", "weight"):
+            del one[name]
+    for name in ("make_safe", "then", "order", "instances", "about"):
+        del told["next"][name]
+    del told["cleared"]
+    found = card_of(answer).held({sim.NO_SCANS: Hold(NOW, None)})
+    assert len(found.causes) == 2 and shown(found)

@@ -6,6 +6,7 @@ import json
 from collections.abc import Iterable, Sequence
 from typing import Any
 
+from amberbox.core.mode import Result
 from amberbox.core.types import Symptom
 from amberbox.monitoring.engine.findings import NS, TICK_NS, Finding, Found
 from amberbox.monitoring.engine.states import States, outputs_of
@@ -281,3 +282,23 @@ def test_a_change_of_one_output_costs_nothing_for_the_others(monkeypatch: Any) -
     found = states.advance([Found(at_ns(1) + TICK_NS, 0, "bad", False)], T0_NS + 4 * NS, view)
     assert len(symptoms(found)) == 11
     assert sum(looked) == 11
+
+
+def test_a_symptom_says_what_was_measured_while_it_is_there() -> None:
+    stand = Stand(laser())
+    stand.bad(1, "laser", why="temperature is 58.2 °C, at most 50")
+    stand.ok(3, "laser")
+    assert [(s.state, s.reason) for s in symptoms(stand.until(4))] == [
+        ("present", "temperature is 58.2 °C, at most 50"), ("absent", ""),
+    ]  # fmt: skip
+
+
+def test_a_number_with_a_limit_of_its_own_says_both() -> None:
+    limited = OutputPlan(
+        "rate_hz", "float", Result("rate_hz", "float", "messages per second", "Hz"), place=0,
+        expectation=Expectation(8.0, ">="),
+    )  # fmt: skip
+    stand = Stand(component("laser", modes=[mode("device", limited)]))
+    stand.find(1, "laser", "bad", 3.25, "")
+    (told_of,) = symptoms(stand.until(2))
+    assert told_of.reason == "rate hz is 3.25 Hz, expected >= 8.0"

@@ -7,7 +7,8 @@ from math import inf, nan
 import numpy as np
 import pytest
 
-from amberbox.core.mode import FALSE, HOLD, TRUE, UNKNOWN
+from amberbox.core.expression_reason import variable_text
+from amberbox.core.mode import FALSE, HOLD, TRUE, UNKNOWN, Given
 from amberbox.monitoring.modes import range as mode
 from amberbox.monitoring.modes.range import Config
 from amberbox.testing.modes import assert_mode_contract, at_s, one_input
@@ -48,3 +49,13 @@ def test_a_limit_as_it_is_written_belongs_to_the_range_in_single_precision_too()
 )  # fmt: skip
 def test_limits_that_say_nothing_are_refused(config: Config) -> None:
     assert list(config.check())
+
+
+def test_the_reason_has_value_unit_and_the_limit_that_was_crossed() -> None:
+    config, entry = Config(min=5, max=50), one_input(times_s=[0, 1, 2], values=[58.2, 3.0, nan])
+    hot, cold, none = (Given([entry], int(now), "°C") for now in at_s(0, 1, 2))
+    name = variable_text(entry.name)
+    assert mode.reason(config, hot) == f"{name} is 58.2 °C, at most 50"
+    assert mode.reason(config, cold) == f"{name} is 3 °C, at least 5"
+    assert mode.reason(config, none) == f"{name} is no number"
+    assert mode.reason(Config(max=60), hot) == ""

@@ -7,7 +7,7 @@ from math import nan
 import numpy as np
 import pytest
 
-from amberbox.core.mode import FALSE, TRUE, UNKNOWN
+from amberbox.core.mode import FALSE, TRUE, UNKNOWN, Given
 from amberbox.monitoring.modes import rate_of_change as mode
 from amberbox.monitoring.modes.rate_of_change import Config
 from amberbox.testing.modes import assert_mode_contract, at_s, one_input
@@ -27,6 +27,9 @@ def test_a_ramp() -> None:
     assert found["in_limits"].tolist() == [UNKNOWN, TRUE, TRUE, FALSE, FALSE]
     assert found["rate"][-1] == pytest.approx(-0.5)
     assert "-0.5 per second" in mode.explain(LEAK, {"in_limits": False, "rate": -0.5})
+    told = mode.reason(LEAK, Given([entry], int(at_s(9)), "bar/s"))
+    assert told.endswith("changes by -0.5 bar/s, at least -0.2")
+    assert mode.reason(LEAK, Given([entry], int(at_s(5)))) == ""
 
 
 def test_a_value_that_was_filtered_since_it_did_not_change_has_rate_0() -> None:

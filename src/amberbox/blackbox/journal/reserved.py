@@ -155,6 +155,7 @@ _FIELDS: dict[str, dict[str, object]] = {
         "source": _TEXT,
         "evidence": _list_of(address=_TEXT, from_ns=_COUNT, to_ns=_COUNT),
         "blocked_by": _TEXTS,
+        "reason": _TEXT,
     },
     DIAGNOSIS: {
         "id": _TEXT,
@@ -190,6 +191,7 @@ _FIELDS: dict[str, dict[str, object]] = {
         ),
         "config_hash": _TEXT,
         "live_only": {"type": "boolean"},
+        "make_safe": _TEXTS,
     },
     CURSOR: {"cursor": _TEXT, "reader": _TEXT, "state": _TEXT},
 }

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Sequence
+from dataclasses import replace
 
 from amberbox.core.types import Diagnosis, Hypothesis, Symptom
+from amberbox.diagnosis.explanation.activity import Activity
 from amberbox.diagnosis.explanation.alike import alike
 from amberbox.diagnosis.explanation.details import details_of
-from amberbox.diagnosis.explanation.explanation import Explanation, Seen
+from amberbox.diagnosis.explanation.explanation import Explanation, Fault, Seen
 from amberbox.diagnosis.explanation.graph import graph_of
 from amberbox.diagnosis.explanation.grouping import described, groups_of
 from amberbox.diagnosis.explanation.headline import headline
-from amberbox.diagnosis.explanation.names import Names
+from amberbox.diagnosis.explanation.names import Names, in_order
 from amberbox.diagnosis.explanation.seen import Sights
-from amberbox.diagnosis.explanation.step import step_of
+from amberbox.diagnosis.explanation.step import Leading, step_of
 from amberbox.diagnosis.explanation.sureness import sureness
 from amberbox.diagnosis.explanation.use import use_of
 from amberbox.diagnosis.knowledge import Knowledge
@@ -29,15 +31,18 @@ def explain(diagnosis: Diagnosis, knowledge: Knowledge, symptoms: Iterable[Sympt
     what is not among them is told without. Failure modes and tests that the knowledge does not
     have are called by their ids.
     """
-    names, symptoms = Names(knowledge.fmea), tuple(symptoms)
-    sights = Sights.of(names, diagnosis, symptoms)
-    found = groups_of(diagnosis)
+    symptoms = tuple(symptoms)
+    activity = Activity.of(knowledge, diagnosis, symptoms)
+    names = Names(knowledge.fmea, activity.cleared)
+    sights = Sights.of(names, diagnosis, symptoms, activity.weights)
+    found = _alike(activity, groups_of(diagnosis))
     members = found[0][1] if found else ()
+    active = [(group, tuple(map(activity.active, of))) for group, of in found]
     groups = [described(names, *group) for group in found[: 1 + OTHERS]]
     broken, others = (groups[0] if groups else None), groups[1:]
-    others_with = list(zip(others, (group[1] for group in found[1:]), strict=False))
+    others_with = list(zip(others, (group[1] for group in active[1:]), strict=False))
     sure = sureness(diagnosis, broken, alike(names, diagnosis, members))
-    use = use_of(sights.ways, members, others_with)
+    use = use_of(sights.ways, active[0][1] if active else (), others_with)
     explained, missed = _explained(members), _missed(diagnosis, members)
     return Explanation(
         diagnosis.id,
@@ -48,17 +53,36 @@ def explain(diagnosis: Diagnosis, knowledge: Knowledge, symptoms: Iterable[Sympt
         headline(diagnosis, broken, sure, symptoms),
         broken,
         sure,
-        sights.in_time(explained, members),
-        sights.in_time(missed, ()),
+        sights.worst_first(explained, members),
+        sights.worst_first(missed, ()),
         sights.in_time((name for h in members for name in h.contradicted), members),
         diagnosis.findings,
         _blocked(sights, symptoms, {*explained, *missed}),
         tuple(others),
         use,
-        step_of(knowledge, names, diagnosis, found[0] if found else None),
+        step_of(knowledge, names, diagnosis, active[0] if active else None),
         details_of(diagnosis, found),
         graph_of(sights, found[: 1 + OTHERS]),
+        cleared=_cleared(names, members),
     )
+
+
+def _alike(activity: Activity, found: Iterable[Leading]) -> list[Leading]:
+    """Join groups that differ by causes alone that show no more, the most probable first."""
+    joined: dict[frozenset[frozenset[str]], Leading] = {}
+    for group, members in found:
+        key = frozenset(activity.active(hypothesis).faults for hypothesis in members)
+        first, of = joined.get(key, (replace(group, probability=0.0), members))
+        whole = min(1.0, first.probability + group.probability)
+        joined[key] = replace(first, probability=whole), of
+    return sorted(joined.values(), key=lambda one: -one[0].probability)
+
+
+def _cleared(names: Names, members: Sequence[Hypothesis]) -> tuple[Fault, ...]:
+    """Return what shows no more of what leads, beside what does."""
+    lasting = [h for h in members if h.faults - names.cleared.keys()]
+    faults = dict.fromkeys(fault for h in lasting for fault in in_order(h.faults))
+    return tuple(names.fault(fault) for fault in faults if fault in names.cleared)
 
 
 def _explained(members: Sequence[Hypothesis]) -> tuple[str, ...]:

@@ -11,18 +11,29 @@ Severity: TypeAlias = Literal["", "warning", "urgent", "critical", "fatal"]
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """A failure mode in words; ``cause`` is how it may come about, ``remedy`` what helps."""
+    """A failure mode in words; ``cause`` is how it may come about, ``remedy`` what helps.
+
+    ``gone_ns`` is since when nothing of it shows any more; what is ``intermittent`` comes and
+    goes by its nature, so that this says nothing. ``kind`` is what it has in common with those
+    of other instances of its type.
+    """
 
     id: str
     text: str
     severity: Severity = ""
     cause: str = ""
     remedy: str = ""
+    gone_ns: int | None = None
+    intermittent: bool = False
+    kind: str = ""
 
 
 @dataclass(frozen=True, slots=True)
 class Possibility:
-    """One hypothesis in words, with its failure modes (none: a false alarm)."""
+    """One hypothesis in words, with its failure modes (none: a false alarm).
+
+    ``text`` names those that are active, where any is.
+    """
 
     id: str
     text: str
@@ -70,7 +81,9 @@ class Way:
 class Seen:
     """A symptom in words: where it is read, when it began, what it was measured from, and why.
 
-    ``after_s`` counts from the first symptom; times are None where nobody knows them.
+    ``after_s`` counts from the first symptom; times are None where nobody knows them. ``reason``
+    says the measured value and its limit, ``gone_ns`` is when it went. ``weight`` is how much it
+    matters: the severity of its worst cause times the probability of that.
     """
 
     id: str
@@ -80,6 +93,9 @@ class Seen:
     after_s: float | None = None
     measured_from: tuple[str, ...] = ()
     ways: tuple[Way, ...] = ()
+    reason: str = ""
+    gone_ns: int | None = None
+    weight: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,8 +129,39 @@ class Branch:
 
 
 @dataclass(frozen=True, slots=True)
+class Action:
+    """Something to do: make safe, test (``test`` is its id), watch or repair.
+
+    ``faults`` are the failure modes that it makes safe, ``severity`` that of the worst of them,
+    ``why`` names them with their probability.
+    """
+
+    kind: Literal["make_safe", "test", "watch", "repair"]
+    text: str
+    test: str = ""
+    faults: tuple[str, ...] = ()
+    severity: Severity = ""
+    why: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Instance:
+    """One of several tests that are the same but for the instance, asked as one question."""
+
+    where: str
+    test: str
+    outcomes: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
 class Step:
-    """What to do next: a test with its answers, empty if there is none, and remedies."""
+    """What to do next: a test with its answers, empty if there is none, and remedies.
+
+    ``make_safe`` comes before all else; ``text`` begins with it, ``then`` is the rest. ``order``
+    has all actions in their order. ``instances`` are the tests that are asked as one, where which
+    instance it is has to be found; ``test`` is the first of them, to which ``answers`` belong.
+    ``about`` are the failure modes that may be there and that the test sees.
+    """
 
     text: str
     test: str = ""
@@ -124,6 +171,11 @@ class Step:
     answers: tuple[Branch, ...] = ()
     splits: bool = False
     remedies: tuple[str, ...] = ()
+    make_safe: tuple[Action, ...] = ()
+    then: str = ""
+    order: tuple[Action, ...] = ()
+    instances: tuple[Instance, ...] = ()
+    about: tuple[str, ...] = ()
 
 
 State: TypeAlias = Literal["open", "healed", "none", "unknown"]
@@ -196,7 +248,9 @@ class Explanation:
     nothing explains what is seen), ``others`` what follows it. ``unexplained`` was seen and does
     not follow from what leads, ``against`` should show and does not, ``unknown`` was seen and the
     FMEA does not know it, ``blocked`` was seen and does not count. ``members`` are the robots that
-    lead on, if it is the diagnosis of their team.
+    lead on, if it is the diagnosis of their team. ``cleared`` are failure modes beside active ones
+    of which nothing shows any more. What was seen is in order: what is there still first, and of
+    that what matters most.
     """
 
     diagnosis: str
@@ -218,3 +272,4 @@ class Explanation:
     details: tuple[str, ...]
     graph: Graph
     members: tuple[Member, ...] = ()
+    cleared: tuple[Fault, ...] = ()

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 from amberbox.core.types import AmbiguityGroup, Diagnosis, Hypothesis
 from amberbox.diagnosis.explanation.explanation import Group
+from amberbox.diagnosis.explanation.instances import as_one, kinds_of
 from amberbox.diagnosis.explanation.names import Names, in_order
 from amberbox.diagnosis.explanation.words import both, either
 
@@ -31,13 +32,21 @@ def described(names: Names, group: AmbiguityGroup, members: Sequence[Hypothesis]
 
 
 def _text(names: Names, members: Sequence[Hypothesis]) -> str:
-    if len(members) == 1:
-        return names.faults(members[0].faults)
-    common = frozenset.intersection(*(hypothesis.faults for hypothesis in members))
-    rests = [hypothesis.faults - common for hypothesis in members]
+    sets = list(dict.fromkeys(frozenset(names.active(hypothesis.faults)) for hypothesis in members))
+    if len(sets) == 1:
+        return names.faults(sets[0])
+    common = frozenset.intersection(*sets)
+    rests = [faults - common for faults in sets]
     if not common or not all(rests):
-        return f"one of: {either([names.faults(h.faults) for h in members])}"
-    rest = either([names.faults(faults) for faults in rests])
+        texts = _texts(names, sets)
+        return texts[0] if len(texts) == 1 else f"one of: {either(texts)}"
+    rest = either(_texts(names, rests))
     return (
         f"{both([names.mode(fault) for fault in in_order(common)])}, together with one of: {rest}"
     )
+
+
+def _texts(names: Names, sets: Sequence[Collection[str]]) -> list[str]:
+    """Describe sets of failure modes; those that differ by an instance alone are one."""
+    kinds = [kinds_of(names.fmea, faults) for faults in sets]
+    return as_one(kinds, [names.faults(faults) for faults in sets])

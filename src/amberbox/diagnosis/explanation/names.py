@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
 
 from amberbox.core.types import Hypothesis
 from amberbox.diagnosis.covering.model import UNKNOWN
 from amberbox.diagnosis.explanation.explanation import Fault, Possibility
+from amberbox.diagnosis.explanation.instances import kind_of
 from amberbox.diagnosis.explanation.words import both, count, readable
 from amberbox.diagnosis.fmea.findings import text_of as finding_text
 from amberbox.diagnosis.fmea.model import Fmea
@@ -18,9 +19,14 @@ FALSE_ALARM = "probably a false alarm"
 
 @dataclass(frozen=True, slots=True)
 class Names:
-    """Speaks of an FMEA's parts; what it does not have is called by its id."""
+    """Speaks of an FMEA's parts; what it does not have is called by its id.
+
+    ``cleared`` are failure modes of which nothing shows any more, and since when: beside others
+    that are active they are not named.
+    """
 
     fmea: Fmea
+    cleared: Mapping[str, int] = field(default_factory=dict)
 
     def mode(self, mode_id: str) -> str:
         """Describe a failure mode."""
@@ -48,15 +54,16 @@ class Names:
             return f"cannot: {self.function(name)}"
         return f"out of service: {self.component(name)}"
 
-    def symptom(self, symptom_id: str) -> str:
-        """Say what is seen when a symptom is there."""
+    def symptom(self, symptom_id: str, reason: str = "") -> str:
+        """Say what is seen when a symptom is there; ``reason`` is a value and its limit."""
         symptom = self.fmea.symptoms.get(symptom_id)
-        if symptom is not None and symptom.description:
-            return symptom.description
-        finding = finding_text(self.fmea, symptom_id)
-        if finding:
-            return finding
+        told = symptom.description if symptom is not None else ""
+        told = told or finding_text(self.fmea, symptom_id)
+        if told:
+            return f"{told} ({reason})" if reason else told
         parts = symptom_id.split("/")
+        if len(parts) == 3 and reason:
+            return f"{self.component(parts[0])}: {reason}"
         if len(parts) == 3:
             return f'{self.component(parts[0])}: the self-check "{_check(*parts[1:])}" fails'
         if symptom is not None and symptom.condition is not None and "#" in symptom_id:
@@ -80,15 +87,22 @@ class Names:
         """Describe failure modes that are there together; none is a false alarm."""
         if not faults:
             return FALSE_ALARM
-        texts = [self.mode(fault) for fault in in_order(faults)]
+        texts = [self.mode(fault) for fault in in_order(self.active(faults))]
         return f"{both(texts)}{together(len(texts))}"
+
+    def active(self, faults: Collection[str]) -> Collection[str]:
+        """Return those of some failure modes that show still; all if none does."""
+        return set(faults) - self.cleared.keys() or faults
 
     def fault(self, mode_id: str) -> Fault:
         """Describe a failure mode with what may be its cause and what helps."""
-        mode = self.fmea.modes.get(mode_id)
+        mode, gone_ns = self.fmea.modes.get(mode_id), self.cleared.get(mode_id)
         if mode is None:
-            return Fault(mode_id, self.mode(mode_id))
-        return Fault(mode_id, self.mode(mode_id), mode.severity, mode.cause, mode.remedy)
+            return Fault(mode_id, self.mode(mode_id), gone_ns=gone_ns)
+        return Fault(
+            mode_id, self.mode(mode_id), mode.severity, mode.cause, mode.remedy, gone_ns,
+            mode.intermittent, kind_of(self.fmea, mode_id),
+        )  # fmt: skip
 
     def possibility(self, hypothesis: Hypothesis) -> Possibility:
         """Describe a hypothesis."""

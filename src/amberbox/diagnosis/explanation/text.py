@@ -63,6 +63,8 @@ def _first_paragraph(explanation: Explanation) -> str:
 def _sections(explanation: Explanation) -> Iterator[tuple[str, list[str]]]:
     was = explanation.state == "healed"
     yield "What was broken" if was else "What is broken", list(_broken(explanation))
+    if explanation.cleared:
+        yield "What was broken and shows no more", list(_cleared(explanation))
     if explanation.members:
         yield "What the robots say themselves", list(_members(explanation.members))
     yield "How sure", list(_sure(explanation))
@@ -100,6 +102,12 @@ def _possibility(member: Possibility, number: str) -> Iterator[str]:
 
 def _cause(fault: Fault, title: str) -> list[str]:
     return [_line(f"{title} {fault.cause}", "    ")] if fault.cause else []
+
+
+def _cleared(explanation: Explanation) -> Iterator[str]:
+    for fault in explanation.cleared:
+        since = "" if fault.gone_ns is None else f", since {clock(fault.gone_ns)}"
+        yield from _item(f"{capital(fault.text)} ({fault.id}){since}")
 
 
 def _members(members: Sequence[Member]) -> Iterator[str]:
@@ -149,7 +157,8 @@ def _seen(seen: Seen) -> Iterator[str]:
     if seen.onset_ns is not None:
         after = "" if seen.after_s is None else f" ({later(seen.after_s)})"
         when = f"{clock(seen.onset_ns)}{after} "
-    yield from _item(f"{when}{seen.text}")
+    gone = "" if seen.gone_ns is None else f"; gone since {clock(seen.gone_ns)}"
+    yield from _item(f"{when}{seen.text}{gone}")
     yield _line(f"{seen.address}{_measured_from(seen)}", "    ")
 
 
@@ -192,7 +201,9 @@ def _use(explanation: Explanation) -> Iterator[str]:
 
 
 def _next(step: Step) -> Iterator[str]:
-    yield from _paragraph(sentence(step.text))
+    for action in step.make_safe:
+        yield from _paragraph(f"First, make it safe: {action.text} (it may be: {action.why}).")
+    yield from _paragraph(sentence(f"Then: {step.then}" if step.make_safe else step.text))
     if step.test:
         yield _line(_effort(step), "  ")
         yield from _paragraph("What the answers would mean:")

@@ -79,7 +79,7 @@ def mode_of(part: Part, name: str, scope: Scope) -> None:
         entry.severity, rate, probability, exposure_h, entry.beta, Ranks(),
         Effects(entry.effects.local, tuple(entry.effects.next), tuple(entry.effects.system)),
         links, entry.unobservable, tuple(results), entry.remedy, entry.takes_down,
-        entry.intermittent, node.line,
+        entry.intermittent, node.line, entry.make_safe,
     )  # fmt: skip
     scope.modes[mode_id] = with_ranks(mode, entry.ranks, scope.file.scales)
 

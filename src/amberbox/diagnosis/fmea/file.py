@@ -164,6 +164,7 @@ class ModeFile:
     unobservable: str = option("", "why nothing shows it, instead of symptoms")
     tests: Mapping[str, str | ResultFile] = option({}, "outcome of tests when it is there")
     remedy: str = option("", "what to do about it")
+    make_safe: str = option("", "what to do first, before anybody tests or repairs it")
     takes_down: bool = option(True, "whether the component stops serving")
     intermittent: bool = option(False, "whether it comes and goes")
 
@@ -266,6 +267,7 @@ class MemberFunctionFile:
     symptoms: Sequence[str | LinkFile] = option((), "how its loss shows to the team")
     unobservable: str = option("", "why nothing shows it")
     remedy: str = option("", "what to do about it")
+    make_safe: str = option("", "what to do first, before anybody tests or repairs it")
 
     def wrong(self) -> Iterator[tuple[str, str]]:
         """Yield each value out of its range, by key; the functions beside it are judged, too."""

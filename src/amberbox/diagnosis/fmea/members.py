@@ -86,6 +86,6 @@ def _lost(
         mode_id, component, LOST, text,
         severity=entry.severity, rate=entry.rate, probability=entry.probability,
         exposure_h=scope.file.exposure_h, symptoms=links, unobservable=entry.unobservable,
-        remedy=entry.remedy, line=node.line,
+        remedy=entry.remedy, line=node.line, make_safe=entry.make_safe,
     )  # fmt: skip
     scope.modes[mode_id] = with_ranks(mode, RanksFile(), scope.file.scales)

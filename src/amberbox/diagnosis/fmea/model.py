@@ -92,7 +92,8 @@ class FailureMode:
     ``rate`` is per hour of exposure (mode ratio times the component's rate, where the file says
     it so); else ``probability`` holds whatever the exposure. ``beta`` is the conditional
     probability that the effect on the system comes about. ``takes_down`` tells whether the
-    component stops serving those that need it. ``line`` is where the file has it.
+    component stops serving those that need it. ``make_safe`` is what has to be done before anybody
+    tests or repairs it, ``remedy`` what mends it. ``line`` is where the file has it.
     """
 
     id: str
@@ -115,6 +116,7 @@ class FailureMode:
     takes_down: bool = True
     intermittent: bool = False
     line: int = 0
+    make_safe: str = ""
 
     def chance(self, exposure_h: float | None = None) -> float:
         """Return how probable it is to be there: after an exposure, else its own."""

@@ -14,7 +14,7 @@ COLUMNS = (
     "Item", "Item description", "Function", "Failure mode", "Description", "Cause",
     "Local effect", "Next effect", "End effect", "Class", "Severity", "S", "O", "D", "RPN",
     "Priority", "Rate (1/h)", "Probability", "Exposure (h)", "Beta", "Cm", "Detection",
-    "Undetected because", "Action",
+    "Undetected because", "Make safe", "Action",
 )  # fmt: skip
 """What a sheet has, in this order."""
 
@@ -60,6 +60,7 @@ def row_of(fmea: Fmea, mode: FailureMode, rules: Sequence[Rule] = ()) -> dict[st
         "Cm": _number(mode_criticality(mode)),
         "Detection": _listed([link.symptom for link in mode.symptoms]),
         "Undetected because": mode.unobservable,
+        "Make safe": mode.make_safe,
         "Action": mode.remedy,
     }
 

@@ -126,7 +126,7 @@ class _Content:
         effects = {"local": row.get("Local effect", "")}
         yield from _given(effects=dict(_given(**effects)))
         yield from self._detection(row)
-        yield from _given(remedy=row.get("Action", ""))
+        yield from _given(make_safe=row.get("Make safe", ""), remedy=row.get("Action", ""))
 
     def _classes(self, row: Row, line: int) -> list[str]:
         found = []

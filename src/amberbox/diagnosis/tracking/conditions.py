@@ -9,6 +9,7 @@ import numpy as np
 
 from amberbox.core.clock import NS
 from amberbox.core.expression import Expression, ExpressionError
+from amberbox.core.expression_reason import reason
 from amberbox.core.expression_tree import Address, Age, Call, Held, Tree, Window, children
 from amberbox.core.samples import Samples
 from amberbox.core.types import Batch, IntArray, Status, Symptom, SymptomState
@@ -189,7 +190,10 @@ class Condition:
             return
         onset_ns = at_ns - self._delay_ns
         evidence = tuple((address, onset_ns, at_ns) for address in reads)
-        yield Symptom(self.id, state, first, onset_ns, at_ns, 1.0, "condition", evidence)
+        why = reason(self._expression, self._samples, at_ns, expected=False)
+        yield Symptom(
+            self.id, state, first, onset_ns, at_ns, 1.0, "condition", evidence, reason=why
+        )
 
 
 class Fresh:

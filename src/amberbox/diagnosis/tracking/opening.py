@@ -119,7 +119,8 @@ def _said(one: Diagnosis) -> tuple[object, ...]:
     leading = one.hypotheses[0] if one.hypotheses else None
     why = None if leading is None else (leading.id, leading.explains, leading.unexplained)
     proposed = one.next_tests[0].id if one.next_tests else ""
-    return why, frozenset(one.symptoms), proposed, one.findings, one.incomplete
+    about = one.findings, one.incomplete, one.make_safe
+    return why, frozenset(one.symptoms), proposed, *about
 
 
 def _moved(before: Diagnosis, after: Diagnosis) -> bool:

@@ -93,6 +93,11 @@ class Presence:
             self.until_ns = min(self.until_ns, at_ns)
 
     @property
+    def gone_ns(self) -> int | None:
+        """When it was seen to be gone; None while it is there, or nobody can tell."""
+        return self.told.confirmed_ns if self.is_absent and not self.is_there else None
+
+    @property
     def may_be_absent_ns(self) -> int:
         """From when on its absence can count: what takes long to come takes long to go."""
         return 0 if self.until_ns is None else self.until_ns + self.within_ns
@@ -106,10 +111,11 @@ class Presence:
     def shown(self, counts: Counts) -> Symptom:
         """Return it as evidence: what does not count is unknown, or blocked."""
         if counts == "present":
-            return replace(self.seen or self.told, state="present", blocked_by=())
+            seen = self.seen or self.told
+            return replace(seen, state="present", blocked_by=(), gone_ns=self.gone_ns)
         if counts == "absent" or self.told.blocked_by:
             return self.told
-        return replace(self.told, state="unknown")
+        return replace(self.told, state="unknown", gone_ns=self.gone_ns)
 
 
 class Presences:

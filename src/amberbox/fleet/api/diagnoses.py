@@ -54,10 +54,14 @@ class DiagnosisQuestion(Form):
 
 
 class NewAnswer(Form):
-    """What a test gave: one of its outcomes, or ``cannot``."""
+    """What a test gave: one of its outcomes, or ``cannot``.
+
+    ``also`` is what further tests gave, where several are asked as one question.
+    """
 
     test: _Address
     answer: _Word
+    also: dict[_Address, _Word] = Field(default_factory=dict, max_length=20)
 
 
 class NewCause(Form):
@@ -180,7 +184,7 @@ async def answer_test(
     for _ in range(_TRIES):
         before = await asyncio.to_thread(_given, fleet, robot.id, diagnosis)
         asked = AskDiagnosis(robot=robot.id, now_ns=fleet.clock.wall_ns(), diagnosis=diagnosis,
-                             answers={**before, body.test: body.answer})  # fmt: skip
+                             answers={**before, **_said(body)})  # fmt: skip
         answer = await _ask(fleet, who, asked)
         kept = await asyncio.to_thread(
             _keep_answer, fleet, who, robot.id, diagnosis, body, before, answer
@@ -205,6 +209,11 @@ async def say_cause(
     await asyncio.to_thread(_keep_cause, fleet, who, robot.id, diagnosis, cause)
     fleet.bus.publish(Change("diagnosis", robot.id, {"id": diagnosis}))
     return Cause(cause.failure_mode, cause.note, cause.who, format_time(cause.at_ns))
+
+
+def _said(body: NewAnswer) -> dict[str, str]:
+    """Return all that is answered at once."""
+    return {body.test: body.answer, **{t: a for t, a in body.also.items() if t != body.test}}
 
 
 async def _ask(fleet: Services, who: Caller, asked: AskDiagnosis) -> bytes:
@@ -251,12 +260,15 @@ def _keep_answer(
 ) -> bool:  # fmt: skip
     """Keep an answer and what follows; False if somebody else has answered since ``before``."""
     now_ns, person = fleet.clock.wall_ns(), who.principal.owner or who.principal.id
-    given = notebook.Given(body.test, body.answer, person, now_ns)
+    given, *also = [
+        notebook.Given(test, word, person, now_ns) for test, word in _said(body).items()
+    ]
     with fleet.database.begin() as connection:
         if notebook.counting(notebook.given(connection, robot, diagnosis)) != before:
             return False
-        notebook.keep_answer(connection, robot, diagnosis, given, answer)
-        details = {"diagnosis": diagnosis, "test": body.test, "answer": body.answer}
+        notebook.keep_answer(connection, robot, diagnosis, given, answer, also)
+        details: dict[str, Any] = {"diagnosis": diagnosis, "test": body.test, "answer": body.answer}
+        details |= {"also": dict(body.also)} if body.also else {}
         who.note(connection, now_ns, "diagnoses.answer", robot, details=details)
     return True
 

@@ -14,7 +14,7 @@ from amberbox.consult.given import given_answers, given_symptoms
 from amberbox.consult.journal import Said
 from amberbox.consult.reading import case_of
 from amberbox.consult.span import DAY_NS
-from amberbox.consult.telling import explained, json_of
+from amberbox.consult.telling import explained, json_of, with_ends
 from amberbox.core.errors import AmberboxError, UsageError
 from amberbox.core.timetext import format_time
 from amberbox.core.types import Symptom
@@ -86,10 +86,8 @@ def _as_revised(case: Case) -> Case:
     names = frozenset(case.open.symptoms)
     counting = case.situation.symptoms
     present = {s.id: s for s in (*case.seen, *counting) if s.state == "present"}
-    there = tuple(
-        replace(present.get(name, Symptom(name, "present", name)), blocked_by=())
-        for name in case.open.symptoms
-    )
+    shown = (present.get(name, Symptom(name, "present", name)) for name in case.open.symptoms)
+    there = tuple(replace(one, blocked_by=()) for one in with_ends(shown, counting))
     rest = (
         replace(symptom, state="unknown") if symptom.state == "present" else symptom
         for symptom in counting if symptom.id not in names

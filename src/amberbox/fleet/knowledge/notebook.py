@@ -80,11 +80,13 @@ def revisions(connection: Connection, robot: str, diagnosis: str) -> list[Revisi
 
 
 def keep_answer(
-    connection: Connection, robot: str, diagnosis: str, one: Given, body: bytes
-) -> None:
-    """Keep an answer, and what follows from it."""
+    connection: Connection, robot: str, diagnosis: str, one: Given, body: bytes,
+    also: Sequence[Given] = (),
+) -> None:  # fmt: skip
+    """Keep an answer, with others that were given at once, and what follows."""
     about = {"robot": robot, "diagnosis": diagnosis, "who": one.who, "at_ns": one.at_ns}
-    connection.execute(ANSWER.insert(), [{**about, "test": one.test, "answer": one.answer}])
+    rows = [{**about, "test": of.test, "answer": of.answer} for of in (one, *also)]
+    connection.execute(ANSWER.insert(), rows)
     connection.execute(REVISION.insert(), [{**about, "body": body.decode()}])
 
 

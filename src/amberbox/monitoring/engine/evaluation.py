@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from amberbox.core.clock import NS
-from amberbox.core.mode import FALSE, HOLD, TRUE, UNKNOWN, Input, shortest_window_s
+from amberbox.core.mode import FALSE, HOLD, TRUE, UNKNOWN, Given, Input, shortest_window_s
 from amberbox.core.stalls import Stalls
 from amberbox.core.types import IntArray, Output
 from amberbox.monitoring.engine import freshness
@@ -123,6 +123,9 @@ class MappingRun:
         self._evaluate: Callable[..., Mapping[str, Any]] = module.evaluate
         self._explain = getattr(module, "explain", None)
         self._explain_unknown = getattr(module, "explain_unknown", None)
+        self._reason = getattr(module, "reason", None)
+        units = (output.plan.result.unit for output in outputs)
+        self._unit = next((unit for unit in units if unit), "")
         self._columns = getattr(module, "COLUMNS", False)
         timed = getattr(module, "timed", None)
         self._timed = timed(mode.config) if timed else getattr(module, "TIMED", False)
@@ -256,20 +259,31 @@ class MappingRun:
     ) -> Found:
         why = ""
         if code == BAD:
-            why = self._explained(self._explain, results)
+            why = self._why(now, results)
         elif code == NOT_KNOWN:
             why = self._explained(self._explain_unknown, results)
             why = why or f"{output.plan.name} is not known"
         return Found(now, output.number, _WHAT[code], output.judge.output(kept), why)
 
+    def _why(self, now: int, results: Mapping[str, Any]) -> str:
+        """Say why an output is bad: by what was looked at, else by the results."""
+        told = ""
+        try:
+            if self._reason is not None:
+                told = str(self._reason(self._config, Given(self.inputs, now, self._unit)))
+        except CRASHES as error:  # what was found stands, whatever its words
+            return _not_explained(error)
+        return readable(told) if told else self._explained(self._explain, results)
+
     def _explained(self, explain: Any, results: Mapping[str, Any]) -> str:
+        """Ask a function of the mode to explain its results; empty where it has none."""
         if explain is None:
             return ""
         plain = {n: _plain(value, n in self._bools) for n, value in results.items()}
         try:
             return readable(str(explain(self._config, plain)))
         except CRASHES as error:  # what was found stands, whatever its words
-            return readable(f"no explanation: {type(error).__name__}: {error}")
+            return _not_explained(error)
 
     def _with_culprits(self, block: Block) -> Any:
         """Return the codes with the place of the first input that is as bad: it changes alone."""
@@ -360,6 +374,10 @@ class MappingRun:
         changed = [0, *rows] if key != output.key else rows
         output.key = (int(codes[-1]), kept[-1] if output.judge.is_discrete else None)
         return changed
+
+
+def _not_explained(error: BaseException) -> str:
+    return readable(f"no explanation: {type(error).__name__}: {error}")
 
 
 def _plain(value: Any, is_bool: bool) -> Any:

@@ -70,6 +70,17 @@ class OutputState:
         """What the robot can still do, by what is shown."""
         return self.plan.severity if self.shown == "bad" else "urgent"
 
+    @property
+    def measured(self) -> str:
+        """What was measured when it turned bad and what it should be; empty if nobody can say."""
+        if self._raw != "bad":
+            return ""
+        if self._why or self.plan.type == "bool" or self._value is None:
+            return self._why
+        value = f"{self._value} {self.plan.result.unit}".rstrip()
+        name = self.plan.name.replace("_", " ")
+        return f"{name} is {value}, expected {expected_text(self.plan)}"
+
     def take(self, found: Found) -> News:
         """Take what is found; a number that changes alone is no news."""
         at_ns, _, what, value, why = found

@@ -54,8 +54,8 @@ class _Watched:
         if onset_ns is not None:
             evidence = tuple((address, onset_ns, now_ns) for address in self.measured)
         return Symptom(
-            self.address, state, self.address, onset_ns, now_ns,
-            evidence=evidence, blocked_by=blocked_by,
+            self.address, state, self.address, onset_ns, now_ns, evidence=evidence,
+            blocked_by=blocked_by, reason=self.output.measured if state == "present" else "",
         )  # fmt: skip
 
 

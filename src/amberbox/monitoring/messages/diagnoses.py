@@ -66,6 +66,7 @@ _SYMPTOM = Forms(Symptom, {
     "id": SAME, "state": SAME, "address": SAME, "onset_ns": TIME_IF_ANY,
     "confirmed_ns": TIME_IF_ANY, "strength": NUMBER, "source": SAME,
     "evidence": Form(_evidence_values, _evidence_of), "blocked_by": TEXTS,
+    "reason": Form(default=""),
 })  # fmt: skip
 _HYPOTHESIS = Forms(Hypothesis, {
     "id": SAME, "faults": Form(sorted, frozenset), "probability": NUMBER, "explains": TEXTS,
@@ -83,5 +84,5 @@ _DIAGNOSIS = Forms(Diagnosis, {
     "id": SAME, "revision": WHOLE, "robot": SAME, "at_ns": WHOLE, "state": SAME,
     "symptoms": TEXTS, "hypotheses": _HYPOTHESIS.many, "groups": _GROUP.many,
     "mass_covered": NUMBER, "incomplete": SAME, "findings": TEXTS, "next_tests": _TEST.many,
-    "config_hash": SAME, "live_only": FLAG,
+    "config_hash": SAME, "live_only": FLAG, "make_safe": Form(read=tuple, default=()),
 })  # fmt: skip

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from amberbox.core.expression import Expression
-from amberbox.core.mode import Input, Result, where_known
+from amberbox.core.expression_reason import reason as condition_reason
+from amberbox.core.mode import Given, Input, Result, where_known
 from amberbox.core.options import option
 from amberbox.core.samples import Now
 from amberbox.core.standins import Finding
@@ -93,6 +94,15 @@ def evaluate(config: Config, inputs: Sequence[Input], now: Now) -> Mapping[str, 
     if config.number is not None:
         found["value"] = value_of(config.number, named, now)
     return found
+
+
+def reason(config: Config, given: Given) -> str:
+    """Say which terms make the condition fail, with their values."""
+    if config.condition is None:
+        return ""
+    named = by_name(given.inputs, reads(config))
+    samples = {name: named[name].samples for name in config.condition.addresses()}
+    return condition_reason(config.condition, samples, given.now_ns, expected=True)
 
 
 def explain(config: Config, results: Mapping[str, Any]) -> str:

@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from amberbox.core.mode import Input, Result, as_single, where_known, with_hysteresis
+from amberbox.core.expression_reason import variable_text
+from amberbox.core.mode import Given, Input, Result, as_single, where_known, with_hysteresis
 from amberbox.core.options import option
 from amberbox.core.samples import Now
 from amberbox.core.standins import Finding
@@ -65,3 +66,13 @@ def evaluate(config: Config, inputs: Sequence[Input], now: Now) -> Mapping[str, 
     well = (value >= low + config.hysteresis) & (value <= high - config.hysteresis)
     in_range = where_known(known, with_hysteresis(well, ~inside))
     return {"in_range": in_range, "value": np.where(known, value, np.nan)}
+
+
+def reason(config: Config, given: Given) -> str:
+    """Say which values are outside of which limit; none within the hysteresis alone."""
+    low, high = min(config.min, as_single(config.min)), max(config.max, as_single(config.max))
+    found = ((one.name, float(one.at(given.now_ns))) for one in given.inputs)
+    return "; ".join(
+        f"{variable_text(name)} is {given.limited(value, config.min, config.max)}"
+        for name, value in found if not low <= value <= high
+    )  # fmt: skip

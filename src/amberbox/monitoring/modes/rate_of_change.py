@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import inf
 from typing import Any
 
 import numpy as np
 
 from amberbox.core.clock import NS
-from amberbox.core.mode import Input, Result, where_known
+from amberbox.core.expression_reason import variable_text
+from amberbox.core.mode import Given, Input, Result, where_known
 from amberbox.core.options import option
 from amberbox.core.samples import Now
 from amberbox.core.standins import Finding
@@ -73,6 +74,15 @@ def evaluate(config: Config, inputs: Sequence[Input], now: Now) -> Mapping[str, 
     changed is no fault: what must change is not judged then.
     """
     (variable,) = inputs
+    rate = _rate(config, variable, now)
+    in_limits = (rate >= config.min) & (rate <= config.max)
+    has_news = variable.flow.last_received_ns(now) > now - round(config.window * NS)
+    judged = np.isfinite(rate) & (in_limits | (rate != 0) | has_news)
+    return {"in_limits": where_known(judged, in_limits), "rate": rate}
+
+
+def _rate(config: Config, variable: Input, now: Now) -> Any:
+    """Return the change per second; NaN where it is not known."""
     before = now - round(config.window * NS)
     known = variable.samples.known(now) & variable.samples.known(before)
     change = numbers(variable.at(now))[()] - numbers(variable.at(before))[()]
@@ -81,10 +91,18 @@ def evaluate(config: Config, inputs: Sequence[Input], now: Now) -> Mapping[str, 
     if config.turn is not None:
         known = known & (apart_s <= 2 * config.window)  # it may have turned more than once
         change = (change + config.turn / 2) % config.turn - config.turn / 2
-    rate = np.where(known, change / np.maximum(apart_s, config.window), np.nan)
-    in_limits = (rate >= config.min) & (rate <= config.max)
-    judged = np.isfinite(rate) & (in_limits | (change != 0) | (newest_ns > before))
-    return {"in_limits": where_known(judged, in_limits), "rate": rate}
+    return np.where(known, change / np.maximum(apart_s, config.window), np.nan)
+
+
+def reason(config: Config, given: Given) -> str:
+    """Say how fast what changes, with the limit."""
+    unit = given.unit or "per second"
+    found = ((one.name, float(_rate(config, one, given.now_ns))) for one in given.inputs)
+    return "; ".join(
+        f"{variable_text(name)} changes by "
+        f"{replace(given, unit=unit).limited(rate, config.min, config.max)}"
+        for name, rate in found if rate < config.min or rate > config.max
+    )  # fmt: skip
 
 
 def explain(config: Config, results: Mapping[str, Any]) -> str:

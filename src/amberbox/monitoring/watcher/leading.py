@@ -49,8 +49,10 @@ def in_words(diagnosis: Diagnosis) -> str:
     worth = [f"{either(m)} ({percent(p)})" for m, p in groups[:1]]
     worth += [f"{either(m)} ({percent(p)})" for m, p in groups[1:3] if p >= _ALSO]
     tests = diagnosis.next_tests
-    next_test = f"; next: {tests[0].text or tests[0].id}" if tests else ""
-    return (", or ".join(worth) or "no answer") + next_test
+    safe = "; ".join(diagnosis.make_safe)
+    first = f"; first, make it safe: {safe}" if safe else ""
+    next_test = f"; {'then' if safe else 'next'}: {tests[0].text or tests[0].id}" if tests else ""
+    return (", or ".join(worth) or "no answer") + first + next_test
 
 
 def either(hypotheses: Sequence[Hypothesis]) -> str:

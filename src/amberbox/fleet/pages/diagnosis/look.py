@@ -186,8 +186,7 @@ def _card(answer: Answer, seen: Look, known: Known) -> DiagnosisCard:
 
 def _timed(card: DiagnosisCard, seen: Look, known: Known, now_ns: int) -> DiagnosisCard:
     """Return a card that says of each reason until when it was there, and if all are gone."""
-    why = [one.over(seen.holds[one.small]) if one.small in seen.holds else one for one in card.why]
-    card = replace(card, why=why)
+    card = card.held(seen.holds)
     if seen.is_past:
         return replace(card, state="past")
     gone_ns = gone_since(known.last, seen.holds, now_ns) if card.state == "open" else None
