@@ -77,8 +77,8 @@ class Presence:
         """Tell whether it is known not to be there, whether that counts or not."""
         return self.told.state == "absent" and not self.told.blocked_by
 
-    def gone_ns(self, at_ns: int) -> int | None:
-        """Return since when it is seen to be gone; None while it is there, or hidden."""
+    def forgotten_since_ns(self, at_ns: int) -> int | None:
+        """Return since when it is being forgotten; None while it is there, or hidden."""
         if self.until_ns is None or (self.counts_present(at_ns) and not self._fades):
             return None
         return self.until_ns - self.hold_ns

@@ -37,8 +37,8 @@ class Repairs:
         """Tell whether an answer may replace another only since symptoms have gone.
 
         It may narrow the leading group, and leave out causes that show nothing any more. It
-        accuses none that was not accused
-        before, unless each leading hypothesis has such a cause, so that none holds any longer.
+        accuses none that was not accused before, unless each leading hypothesis has such a cause,
+        so that none holds any longer.
         """
         was, now = leading_faults(before), leading_faults(after)
         if set(now) < set(was) or all(
@@ -68,7 +68,7 @@ def leading_faults(diagnosis: Diagnosis) -> list[frozenset[str]]:
 
 def _over_ns(shown: Collection[Presence], at_ns: int) -> int:
     """Return when the cause of symptoms is over; NEVER_NS while one is there, or hidden."""
-    gone_ns = [one.gone_ns(at_ns) for one in shown]
+    gone_ns = [one.forgotten_since_ns(at_ns) for one in shown]
     if not shown or None in gone_ns:
         return NEVER_NS
     return max(gone or 0 for gone in gone_ns) + min(one.hold_ns for one in shown)
