@@ -36,7 +36,12 @@ def reduced(name: str, inside: Sequence[Row]) -> float | None:
         return (values[-1] - values[0]) / elapsed_s if elapsed_s else None
     if not values:
         return None
-    means = {"mean": statistics.fmean, "std": statistics.pstdev, "min": min, "max": max}
+    means: dict[str, Any] = {
+        "mean": statistics.fmean,
+        "std": statistics.pstdev,
+        "min": min,
+        "max": max,
+    }
     return float(means[name](values))
 
 

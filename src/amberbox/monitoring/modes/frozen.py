@@ -148,9 +148,10 @@ def _gaps_s(
     still = ~(spread > config.tolerance)
     if is_one(now):
         return _gap_s(config, entry, samples, named, int(now)) if still else nan
-    gaps_s = np.full(len(now), nan)
+    instants = np.asarray(now)
+    gaps_s = np.full(len(instants), nan)
     for place in np.flatnonzero(still).tolist():
-        gaps_s[place] = _gap_s(config, entry, samples, named, int(now[place]))
+        gaps_s[place] = _gap_s(config, entry, samples, named, int(instants[place]))
     return gaps_s
 
 
