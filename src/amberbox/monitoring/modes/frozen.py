@@ -164,6 +164,7 @@ def _gap_s(
     """
     start = now - round(config.window * NS)
     heard = joined_times([entry.flow.heard_ns(start, now), _near(samples.times_ns, start, now)])
+    heard = _near(heard, start, now)
     if not len(heard) or heard[0] > start:
         return nan
     good = samples.known(heard) & _is_valid(config, named, np.maximum(heard, start))
