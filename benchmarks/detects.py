@@ -52,7 +52,7 @@ class Job:
 
 
 def work(job: Job) -> Shown:
-    """Simulate a mission and note which symptoms were present and not blocked."""
+    """Simulate a mission and note which symptoms were present, blocked or not."""
     chance = random.Random(f"detects {job.kind} {job.number}")
     fault = chance.choice(kinds()[job.kind])
     mission = with_faults(FIRST_SEED + chance.randrange(10_000), [fault], chance)
@@ -65,7 +65,7 @@ def work(job: Job) -> Shown:
         for batch in batches.of(messages):
             watcher.feed(batch)
         for found in watcher.advance(START_NS + round(until_s * 1e9)):
-            if isinstance(found, Symptom) and found.state == "present" and not found.blocked_by:
+            if isinstance(found, Symptom) and found.state == "present":
                 after_s = seconds_of(found.confirmed_ns or found.onset_ns or 0) - mission.onset_s
                 if after_s >= 0:
                     symptoms.setdefault(found.id, after_s)

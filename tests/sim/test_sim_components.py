@@ -113,6 +113,11 @@ def test_a_frozen_gyroscope_of_a_unit_is_no_fault_of_others(plan: Plan) -> None:
     assert "bus" in blamed and "imu" not in blamed
 
 
+def test_a_robot_that_stops_hard_does_not_jump(plan: Plan) -> None:
+    findings = find(plan, with_fault("navigation_crash", 6.0), FAULT_S + 5.0)
+    assert {"position"}.isdisjoint(found.mode for found in failures(findings))
+
+
 def test_what_depends_on_a_fault_is_blocked_and_has_no_alarm(plan: Plan) -> None:
     findings = find(plan, with_fault("wheel_rear_right_bus_disconnected", 12), FAULT_S + 10)
     assert list(alarms(findings)) == ["bus"]

@@ -85,7 +85,8 @@ class Flow:
         last = heard.searchsorted(counts, "right") - 1
         row_ns = np.where(last >= 0, heard[last], -1) if len(heard) else np.full(len(counts), -1)
         left_out = (newest > row_ns) & (counts - newest <= COUNTED_NS)
-        return np.sort(np.concatenate([heard, counts[left_out]]))
+        joined = np.sort(np.concatenate([heard, counts[left_out]]))
+        return joined[max(int(joined.searchsorted(since_ns, "right")) - 1, 0) :]
 
     def longest_gap_s(self, now_ns: int, seconds: float, heard_ns: IntArray) -> float:
         """Return the longest time between messages of the last ``seconds``, and since the last.

@@ -223,9 +223,9 @@ class _Check:
             assert not well, f"{name} is {value} before there is any sample"
 
     def _check_explanations(self, found: Sequence[Mapping[str, Any]]) -> None:
-        for name in ("explain", "explain_unknown"):
-            explain = getattr(self.module, name, None)
-            for results in found if explain is not None else ():
+        explanations = [getattr(self.module, n, None) for n in ("explain", "explain_unknown")]
+        for explain in filter(None, explanations):
+            for results in found:
                 known = {name: self._known(name, value) for name, value in results.items()}
                 assert isinstance(explain(self.config, known), str)
 

@@ -148,9 +148,10 @@ def _gaps_s(
     still = ~(spread > config.tolerance)
     if is_one(now):
         return _gap_s(config, entry, samples, named, int(now)) if still else nan
-    gaps_s = np.full(len(now), nan)
+    instants = np.asarray(now)
+    gaps_s = np.full(len(instants), nan)
     for place in np.flatnonzero(still).tolist():
-        gaps_s[place] = _gap_s(config, entry, samples, named, int(now[place]))
+        gaps_s[place] = _gap_s(config, entry, samples, named, int(instants[place]))
     return gaps_s
 
 
@@ -163,6 +164,7 @@ def _gap_s(
     """
     start = now - round(config.window * NS)
     heard = joined_times([entry.flow.heard_ns(start, now), _near(samples.times_ns, start, now)])
+    heard = _near(heard, start, now)
     if not len(heard) or heard[0] > start:
         return nan
     good = samples.known(heard) & _is_valid(config, named, np.maximum(heard, start))

@@ -110,7 +110,8 @@ def _is_steady(config: Config, item: Input, now: Now, enough: Any) -> Any:
 
     if is_one(now):
         return not enough and at(int(now))
-    return np.array([not well and at(at_ns) for well, at_ns in zip(enough, now, strict=True)])
+    instants = np.asarray(now).tolist()
+    return np.array([not well and at(at_ns) for well, at_ns in zip(enough, instants, strict=True)])
 
 
 def explain(config: Config, results: Mapping[str, Any]) -> str:
