@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Literal, TypeAlias
 
 from amberbox.core.clock import NS
+from amberbox.core.robotstatus import RobotStatus
 from amberbox.core.sureness import LIKELY, percent
 from amberbox.core.timetext import format_time
 from amberbox.fleet.alarms.words import CauseKind, kind_of
@@ -102,6 +103,7 @@ class DiagnosisCard:
     ``past`` for what was known when an alarm ended. ``complete`` is false while only the robot's
     own words are known, without explanation. ``more`` counts what was seen beyond ``why``.
     ``number`` is empty where there is none. ``names`` are failure modes in words, by id.
+    ``status`` is that of the robot now, None on cards that are not about now.
     """
 
     robot: str
@@ -124,6 +126,7 @@ class DiagnosisCard:
     names: Mapping[str, str] = field(default_factory=dict)
     notes: Sequence[str] = ()
     gone: str | None = None
+    status: RobotStatus | None = None
 
 
 def _lasted(seconds: float) -> str:
