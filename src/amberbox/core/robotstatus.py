@@ -158,6 +158,8 @@ def _reason(seen: Observed, last: Level) -> str:
 
 
 def _text(seen: Observed, last: Level, severity: Severity | Literal[""]) -> str:
+    if seen.contact == "never":
+        return f"{NOTHING_KNOWN} {_capital(use_text(severity))}." if severity else NOTHING_KNOWN
     if not seen.is_current:
         return " ".join(filter(None, (_unheard(seen), _then(last, severity))))
     if severity:
