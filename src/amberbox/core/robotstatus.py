@@ -35,6 +35,8 @@ USE: Final[Mapping[Severity, str]] = {
 }
 """What each severity means."""
 
+NOT_MONITORED: Final = "not_monitored"
+"""The state of a component that has no monitor: how it is nobody asks."""
 NOTHING_WRONG: Final = "Nothing is known to be wrong."
 NOTHING_KNOWN: Final = "Nothing is known of it."
 _UNHEARD: Final[Mapping[Monitoring, str]] = {
@@ -121,6 +123,14 @@ def judge(seen: Observed) -> RobotStatus:
 def worst(levels: Iterable[Level]) -> Level:
     """Return the worst of some levels; ``unknown`` of none."""
     return max(levels, key=RANK.__getitem__, default="unknown")
+
+
+def components_level(components: Iterable[tuple[Level, str]]) -> Level:
+    """Return the worst level of components, each with its state; what has no monitor is left out.
+
+    It is ``unknown`` where nothing is monitored.
+    """
+    return worst(level for level, state in components if state != NOT_MONITORED)
 
 
 def highest(severities: Iterable[Severity | Literal[""]]) -> Severity | Literal[""]:

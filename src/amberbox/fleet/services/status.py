@@ -11,7 +11,15 @@ from dataclasses import dataclass, field
 
 from sqlalchemy import Connection
 
-from amberbox.core.robotstatus import Contact, Monitoring, Observed, RobotStatus, judge, worst
+from amberbox.core.robotstatus import (
+    NOT_MONITORED,
+    Contact,
+    Monitoring,
+    Observed,
+    RobotStatus,
+    components_level,
+    judge,
+)
 from amberbox.core.types import Level
 from amberbox.fleet.accounts.robots import KnownRobot
 from amberbox.fleet.linkend.presence import Presence, presences
@@ -110,13 +118,16 @@ class RobotStatuses:
 
 def level_of(statuses: Sequence[Standing]) -> Level:
     """Return the worst level of the components; a word that is no level is ``unknown``."""
-    known = (one.said.known_level for one in statuses if not one.said.mode)
-    return worst(known)
+    return components_level(
+        (one.said.known_level, one.said.state) for one in statuses if not one.said.mode
+    )
 
 
 def worst_of(statuses: Sequence[Standing]) -> SaidStatus | None:
     """Return what is worst; of those that are equally bad one that is not blocked by another."""
-    components = (one.said for one in statuses if not one.said.mode)
+    components = (
+        one.said for one in statuses if not one.said.mode and one.said.state != NOT_MONITORED
+    )
     return max(components, key=lambda said: (said.rank, not said.blocked_by), default=None)
 
 

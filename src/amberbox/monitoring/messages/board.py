@@ -14,6 +14,15 @@ from amberbox.blackbox.follow.records import OwnRecords
 from amberbox.blackbox.journal import reserved
 from amberbox.blackbox.store import Store, is_locked
 from amberbox.core.clock import NS
+from amberbox.core.robotstatus import (
+    Monitoring,
+    Observed,
+    RobotStatus,
+    components_level,
+    judge,
+    severity_rank,
+)
+from amberbox.core.timetext import format_time
 from amberbox.core.types import Status
 from amberbox.monitoring.engine.findings import AlarmChange
 from amberbox.monitoring.messages.records import alarm_of, status_of
@@ -34,6 +43,26 @@ class Board:
     alarms: Sequence[AlarmChange] = ()
     measured_ns: int = 0
     silence: str = ""
+
+    @property
+    def status(self) -> RobotStatus:
+        """The status of the robot as a whole, as the server makes it of the same."""
+        alarms = [alarm for alarm in self.alarms if alarm.state in ("open", "acknowledged")]
+        worst_alarm = max(alarms, key=lambda one: severity_rank(one.severity), default=None)
+        silent: Monitoring = "silent" if self.statuses else "absent"
+        return judge(
+            Observed(
+                monitoring=silent if self.silence or not self.statuses else "running",
+                level=components_level(
+                    (status.level, status.state) for status in self.components.values()
+                ),
+                alarm=worst_alarm.severity if worst_alarm else "",
+                alarm_reason=f"{worst_alarm.component}: {worst_alarm.reason}"
+                if worst_alarm
+                else "",
+                as_of=format_time(self.measured_ns) if self.measured_ns else None,
+            )
+        )
 
     @property
     def robot(self) -> str:
