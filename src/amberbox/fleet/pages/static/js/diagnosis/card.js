@@ -6,7 +6,7 @@ import { pieces, replace } from "../pieces.js";
 import { t } from "../strings.js";
 
 /** So long after trouble went one knows that nothing of it is seen any more. */
-const SETTLED_MS = 12000;
+export const SETTLED_MS = 12000;
 
 /**
  * Keep the card of a place up to date. Returns `renew()`, which asks for it anew.

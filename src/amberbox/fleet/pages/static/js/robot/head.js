@@ -2,6 +2,7 @@
 
 import { all, one } from "../dom.js";
 import { listen } from "../feed.js";
+import { SETTLED_MS } from "../diagnosis/card.js";
 import { keep } from "../pieces.js";
 import { nowMs, refresh, rfc3339 } from "../time.js";
 
@@ -29,7 +30,14 @@ feed.on("snapshot", ({ robots }) => {
   const card = robots.find((known) => known.robot === robot);
   if (card && isOther(card)) stale();
 });
-for (const kind of ["presence", "levels", "alarm", "diagnosis"]) feed.on(kind, () => stale());
+let settling = null;
+for (const kind of ["presence", "levels", "alarm", "diagnosis"]) {
+  feed.on(kind, () => {
+    stale();
+    clearTimeout(settling);
+    settling = setTimeout(stale, SETTLED_MS);
+  });
+}
 // what stands as of now does so as long as the robot says so
 feed.on("ages", ({ age_s: age }) => {
   for (const place of all("[data-as-of]")) {
