@@ -128,7 +128,7 @@ def _said(one: Robot) -> str:
     """Say in a line how a robot is: of one that is away, as of when."""
     status = one.status
     if status.is_current:
-        return " ".join(filter(None, (status.text, status.reason)))
+        return " ".join(f"{status.text} {status.reason}".split())
     away = {"offline": "Offline.", "silent": "Silent.", "never": "Never connected."}
     as_of = f"(as of {status.as_of[:19]}Z)" if status.as_of else ""
     return " ".join(filter(None, (away.get(status.contact), status.text, as_of)))

@@ -79,15 +79,15 @@ async def show_card(
     may = who.may("diagnoses.write", robot)
     then = partial(look_then, revision=revision) if diagnosis and revision else look
     seen = await asyncio.to_thread(then, fleet, robot.id, diagnosis)
+    now = await asyncio.to_thread(known_now, fleet, robot)
     try:
         if at:
             answer = await parts.Asked(fleet, who, robot.id, at=at).at_then()
             card, may = replace(card_of(answer), answers={}), False
         else:
-            now = await asyncio.to_thread(known_now, fleet, robot)
             card = await card_told(fleet, who, seen, now)
     except AmberboxError as error:
-        plain = None if at else await asyncio.to_thread(card_now, fleet, seen)
+        plain = None if at else await asyncio.to_thread(card_now, fleet, seen, now)
         return render(request, "diagnosis/trouble.html", error=error, plain=plain, may=may)
     return render(request, "diagnosis/part.html", shown=card, seen=seen, may=may, link=link)
 
