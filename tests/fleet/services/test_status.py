@@ -17,11 +17,12 @@ from starlette.testclient import TestClient
 
 from amberbox.cli import _remote_fleet
 from amberbox.client import models
-from amberbox.core.robotstatus import NOTHING_WRONG, WORDS
+from amberbox.core.robotstatus import NOTHING_WRONG, USE, WORDS, use_text
 from amberbox.core.types import AmbiguityGroup, Diagnosis, Hypothesis, Symptom
 from amberbox.fleet.alarms.tables import ALARM
 from amberbox.fleet.bus import Change
 from amberbox.fleet.linkend import presence
+from amberbox.fleet.pages.strings import catalogue
 from amberbox.link.frames import Row
 from amberbox.monitoring.messages.records import encoded
 from tests.fleet.house import ROBOTS, House, house
@@ -243,6 +244,14 @@ def is_current(status: Any) -> bool:
     return status["contact"] == "online" and status["monitoring"] in ("running", "overloaded")
 
 
+def test_pages_have_the_words_of_the_one_status() -> None:
+    text = catalogue().text
+    assert {level: text(f"common.level.{level}") for level in WORDS} == WORDS
+    for severity, use in USE.items():
+        assert text(f"words.severity_{severity}.name") == use_text(severity)
+        assert text(f"alarms.use.{severity}") == use
+
+
 @fuzz
 @given(st.lists(EVENTS, max_size=12))
 @example([("hello", NAMES[0]), ("broken", NAMES[0]), ("effect", NAMES[0], "critical")])
@@ -259,7 +268,7 @@ def is_current(status: Any) -> bool:
 )
 @example([("hello", NAMES[1]), ("says", NAMES[1], "error"), ("alarm", NAMES[1], "fatal"),
           ("acknowledged",), ("lost", NAMES[1]), ("time", 30)])  # fmt: skip
-@settings(max_examples=examples(4), deadline=None, phases=PHASES)
+@settings(max_examples=examples(2), deadline=None, phases=PHASES)
 def test_no_two_answers_contradict_each_other(events: Sequence[Event]) -> None:
     with TemporaryDirectory() as folder, house(Path(folder) / "house", shared=True) as home:
         world = World(home)
