@@ -147,7 +147,8 @@ def test_a_silent_robot_is_known_within_three_heartbeats(page_as: PageAs, robot:
     expect(page.locator("#silence")).to_contain_text("robot silent since")
     expect(page.locator("#robot-state")).to_contain_text("silent since")
     expect(page.locator("#robot")).to_have_class(re.compile("is-silent"))
-    expect(row(page, "base").locator(".age")).to_have_text(re.compile(r"[4-9] s"))
+    expect(row(page, "base").locator(".age")).to_have_text(re.compile(r"\d\d:\d\d:\d\d"))
+    expect(page.locator("#robot-state .level")).to_have_attribute("data-level", "unknown")
     robot.robots["ropod_001"].wake()
     expect(page.locator("#robot")).not_to_have_class(re.compile("is-silent"))
     expect(page.locator("#robot-state")).to_contain_text("online")
@@ -180,6 +181,49 @@ def test_what_was_missed_is_asked_for_behind_a_new_beginning(page_as: PageAs, si
     with page.expect_response(lambda answer: "/diagnosis/card" in answer.url):
         line.mend()
         expect(page.locator("#events")).to_contain_text("while nobody heard")
+
+
+def test_a_page_says_at_once_when_it_is_not_live(page_as: PageAs) -> None:
+    """No timer of the page runs: that the line has ended is enough."""
+    page = page_as("viewer")
+    page.clock.install()
+    line = Line(page)
+    page.goto("/")
+    is_live(page)
+    page.clock.pause_at(page.evaluate("Date.now()") + 1000)
+    line.cut()
+    expect(page.locator("html")).to_have_attribute("data-feed", "lost")
+    expect(page.locator(".when-lost")).to_have_text(re.compile(r"not live since \d\d:\d\d:\d\d"))
+    expect(page.locator(".when-live")).to_be_hidden()
+
+
+COUNTS = """() => {
+    const count = document.querySelector(".nav-count");
+    count.hidden = false;
+    return ["", "warning", "urgent", "critical", "fatal"].map((severity) => {
+        count.className = `nav-count${severity && ` severity-${severity}`}`;
+        const { color, backgroundColor } = getComputedStyle(count);
+        return [color, backgroundColor];
+    });
+}"""
+
+
+def _light(colour: str) -> float:
+    """Return the relative luminance of a colour as browsers write it (WCAG 2)."""
+    parts = [float(number) / 255 for number in re.findall(r"[\d.]+", colour)[:3]]
+    red, green, blue = (
+        part / 12.92 if part <= 0.04045 else ((part + 0.055) / 1.055) ** 2.4 for part in parts
+    )
+    return 0.2126 * red + 0.7152 * green + 0.0722 * blue
+
+
+@pytest.mark.parametrize("theme", ["light", "dark"])
+def test_the_number_of_open_alarms_can_be_read_at_any_severity(page_as: PageAs, theme: str) -> None:
+    page = page_as("viewer", theme=theme)
+    page.goto("/help")
+    for ink, ground in page.evaluate(COUNTS):
+        low, high = sorted((_light(ink), _light(ground)))
+        assert (high + 0.05) / (low + 0.05) >= 4.5, (theme, ink, ground)
 
 
 class Line:

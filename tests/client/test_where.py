@@ -130,6 +130,24 @@ def test_status_is_a_table_a_component_and_json(technician: Served, capsys: Capt
     assert "did you mean" in refused(capsys, "status", technician.where, "laser_fronk")
 
 
+def test_status_of_a_server_is_that_of_its_fleet_worst_first(
+    technician: Served, capsys: Capture
+) -> None:
+    server = technician.where.replace("/robots/ropod_001", "")
+    head, columns, *lines = said(capsys, "status", server, status=1).splitlines()
+    assert head == "3 robots: 3 unknown" and columns.split() == ["robot", "status", "alarms"]
+    first, *others = lines
+    assert first.startswith("ropod_001  unknown  1 open  Offline. When it was last heard of: ")
+    assert "(as of 20" in first
+    assert [line.split()[0] for line in others] == ["ropod_002", "ropod_003"]
+    assert all("Never connected." in line for line in others)
+    found = json.loads(said(capsys, "status", server, "--json", status=1))
+    assert found["server"] == technician.url
+    assert [one["robot"] for one in found["robots"]] == ["ropod_001", "ropod_002", "ropod_003"]
+    assert {one["level"] for one in found["robots"]} == {"unknown"}
+    assert "--robot" in refused(capsys, "status", server, "laser_front")
+
+
 def test_a_diagnosis_is_told_as_on_the_robot(
     technician: Served, capsys: Capture, tmp_path: Path
 ) -> None:

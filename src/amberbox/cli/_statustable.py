@@ -88,12 +88,12 @@ def waiting(board: Board, component: str) -> str:
 
 def _head(board: Board, statuses: Sequence[Status], view: View) -> Iterator[str]:
     levels: Counter[Level] = Counter(status.level for status in statuses)
-    worst: Level = max(levels, key=RANK.__getitem__) if levels else "unknown"
+    level = board.status.level
     counted = ", ".join(
         view.paint(f"{levels[level]} {level}", level)
         for level in sorted(levels, key=RANK.__getitem__, reverse=True)
     )
-    yield f"{view.paint(board.robot or 'robot', worst)}: {counted or 'nothing is known'}"
+    yield f"{view.paint(board.robot or 'robot', level)}: {counted or 'nothing is known'}"
     if board.silence:
         yield view.paint(board.silence, "unknown")
 

@@ -49,7 +49,7 @@ _UNKNOWN_HINT = "amberbox watch {where} judges what is recorded"
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
     accept_any_order(parser)
-    add_where(parser, "robot folder or store")
+    add_where(parser, "robot folder or store, a server for all its robots")
     parser.add_argument("component", nargs="?", metavar="COMPONENT", help="only this one, in full")
     parser.add_argument(
         "--wait", metavar="TIME", help="wait so long (30s) for it to be ok and initialised"
@@ -78,9 +78,12 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _remote(args: argparse.Namespace) -> int:
-    """Do the same of a robot on a server."""
+    """Do the same of a robot on a server, or of all that it has."""
     from amberbox.cli._remote_status import read_remote, show_remote, wait_remote, watch_remote
 
+    fleet = _of_fleet(args)
+    if fleet is not None:
+        return fleet
     if args.wait is not None:
         return wait_remote(args, parse_duration_s(args.wait))
     if args.watch:
@@ -91,6 +94,26 @@ def _remote(args: argparse.Namespace) -> int:
     else:
         show_remote(board, tree, args)
     return _verdict(board, args.component)
+
+
+def _of_fleet(args: argparse.Namespace) -> int | None:
+    """Print the status of each robot of a server; None where one robot of it is meant.
+
+    A server with a single robot means that one, in full.
+    """
+    from amberbox.cli import _remote_fleet
+    from amberbox.client.fleet import Fleet
+
+    if not _remote_fleet.is_fleet(args):
+        return None
+    with Fleet(args.where) as fleet:
+        robots = _remote_fleet.robots_of(fleet)
+        if len(robots) < 2:
+            return None
+        if args.watch:
+            _remote_fleet.watch(fleet, args)
+        _remote_fleet.show(robots, args)
+    return _remote_fleet.verdict(robots)
 
 
 def _watch(reader: BoardReader, args: argparse.Namespace, plan: Plan | None) -> NoReturn:

@@ -45,6 +45,25 @@ class Lead(Answer, frozen=True):
     at: str | None = None
 
 
+class RobotStatus(Answer, frozen=True):
+    """The one status of a robot, as the server makes it of everything that it knows.
+
+    ``level`` is ``unknown`` where nothing is known of now; then ``last_level`` is what it was at
+    ``as_of``. ``severity`` is what it can still do, ``text`` a sentence, ``reason`` what is worst.
+    The higher ``rank``, the worse.
+    """
+
+    level: str
+    last_level: str = "unknown"
+    severity: str = ""
+    text: str = ""
+    reason: str = ""
+    as_of: str | None = None
+    contact: str = ""
+    monitoring: str = ""
+    rank: int = 0
+
+
 class Card(Answer, frozen=True):
     """A robot at a glance; ``level`` is ``unknown`` where nobody can know."""
 
@@ -74,6 +93,7 @@ class Card(Answer, frozen=True):
     signing_key: str = ""
     monitoring: str = ""
     monitoring_delay_s: float = 0.0
+    status: RobotStatus | None = None
 
 
 class Output(Answer, frozen=True):
@@ -134,7 +154,10 @@ class Component(Answer, frozen=True):
 
 
 class StatusTree(Answer, frozen=True):
-    """All components of a robot; ``silence`` says why nothing counts, ``note`` what is missing."""
+    """All components of a robot, and its one status (None: an older server).
+
+    ``silence`` says why nothing counts, ``note`` what is missing.
+    """
 
     robot: str
     online: bool
@@ -142,6 +165,7 @@ class StatusTree(Answer, frozen=True):
     note: str = ""
     clock_offset_s: float | None = None
     components: tuple[Component, ...] = ()
+    status: RobotStatus | None = None
 
 
 class Stretch(Answer, frozen=True):

@@ -15,9 +15,7 @@ from amberbox.core.expression import Expression
 from amberbox.core.mode import Result
 from amberbox.core.needs import Needs
 from amberbox.core.probe import ProbeOrder
-
-Severity = Literal["warning", "urgent", "critical", "fatal"]
-"""What the robot can still do (VDA 5050); ``warning`` makes a status ``warn``, others ``error``."""
+from amberbox.core.robotstatus import Severity as Severity
 
 Policy = Literal["all", "any", "majority"]
 """How many of a component's modes must be ok for it to be ok."""

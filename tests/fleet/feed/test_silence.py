@@ -51,6 +51,15 @@ def test_of_a_silent_robot_whose_link_ends_nothing_more_is_told() -> None:
     assert list(silence.news({})) == []
 
 
+def test_a_watcher_that_falls_silent_is_told_of_once_and_again_when_it_is_heard() -> None:
+    silence, robots = Silence(), {"ropod_001": connected(0)}
+    quiet = frozenset({"ropod_001", "ropod_002"})  # the other one is away
+    assert list(silence.watchers(robots, frozenset())) == []
+    assert list(silence.watchers(robots, quiet)) == [("ropod_001", {"online": True})]
+    assert list(silence.watchers(robots, quiet)) == []
+    assert list(silence.watchers(robots, frozenset())) == [("ropod_001", {"online": True})]
+
+
 def standing(measured_s: float, log_s: float, received_s: float) -> Standing:
     said = SaidStatus("laser", measured_ns=int(measured_s * NS))
     return Standing(said, int(log_s * NS), int(received_s * NS))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,11 +13,16 @@ from amberbox.core.clock import NS
 from amberbox.core.types import Diagnosis, Output, Status, Symptom
 from amberbox.diagnosis.answering import Heading, answer
 from amberbox.diagnosis.situation import Situation
+from amberbox.fleet.linkend import board
+from amberbox.fleet.linkend.server import Connected
 from amberbox.fleet.linkend.tables import ROBOT, ROW
 from amberbox.link.folders import pack
+from amberbox.link.frames import Row
+from amberbox.link.serverend import ServerEnd
 from amberbox.monitoring.engine.findings import Finding
 from amberbox.monitoring.messages.records import encoded
 from tests.fleet.house import House
+from tests.fleet.linkend.test_server import FakeSocket
 
 FOLDER = Path(sim.__file__).parent / "folder"
 HASH = "5eed" * 16
@@ -72,6 +78,18 @@ def say(
         )  # fmt: skip
     with home.services.database.begin() as connection:
         connection.execute(ROW.insert(), rows)
+
+
+def is_here(home: House, robot: str = "ropod_001") -> None:
+    """Let a robot be connected, and all of it be well as its watcher says now."""
+    now_ns = home.clock.wall_ns()
+    link = Connected(robot, FakeSocket(), ServerEnd(robot), now_ns)
+    link.heard_s = math.inf
+    home.services.links.robots[robot] = link
+    channel, data = encoded(status("laser_front", now_ns))
+    with home.services.database.begin() as connection:
+        row = Row("watch", 1, 9_999, channel, now_ns, data)
+        board.show(connection, robot, STORE, [row], now_ns)
 
 
 def state(home: House, robot: str = "ropod_001", config_hash: str = HASH) -> None:

@@ -41,7 +41,7 @@ from amberbox.link.frames import (
 )
 from amberbox.link.positions import Place, Reach, RunEnd
 from amberbox.link.serverend import ServerEnd
-from amberbox.monitoring.messages.pulse import Monitoring
+from amberbox.monitoring.messages.pulse import Pulse
 from amberbox.testing.patience import PATIENCE_S
 
 REACH = Reach(Place(1, 0), Place(1, 9), Place(1, 5), (RunEnd(1, "b", 9, closed=False),))
@@ -281,15 +281,15 @@ def test_heartbeats_tell_backlog_and_clock_and_live_values_stay_in_memory(
 @pytest.mark.parametrize(
     ("said", "delay_s", "known"),
     [
-        ("overloaded", 12.5, Monitoring("overloaded", 12.5)),
-        ("running", float("nan"), Monitoring("running", 0.0)),
-        ("silent", -1.0, Monitoring("silent", 0.0)),
+        ("overloaded", 12.5, Pulse("overloaded", 12.5)),
+        ("running", float("nan"), Pulse("running", 0.0)),
+        ("silent", -1.0, Pulse("silent", 0.0)),
         ("", 0.0, None),
         ("a word of a later version", 1.0, None),
     ],
 )
 def test_a_heartbeat_says_how_the_watcher_is_doing(
-    database: Database, said: str, delay_s: float, known: Monitoring | None
+    database: Database, said: str, delay_s: float, known: Pulse | None
 ) -> None:
     async def scene() -> None:
         link, socket = LinkServer(database), FakeSocket()
@@ -310,7 +310,7 @@ def test_what_is_late_is_said_to_be_so_on_the_server() -> None:
     status = Standing(SaidStatus("laser", level="error", measured_ns=1), 1, 1)
     seen = Presence("r1", True, 1, 1, "s", "b", "", "1", 0, 0)
     when = Moment(26_000_000_000, None)
-    late = Monitoring("overloaded", 25.0)
+    late = Pulse("overloaded", 25.0)
     assert silence(seen, True, [status], when) == "its watcher has said nothing for 26 s"
     told = silence(seen, True, [status], when, late)
     assert told == "monitoring overloaded: the watcher is 25 s behind"

@@ -223,6 +223,8 @@ def test_what_is_over_is_said_to_be_over(tmp_path_factory: pytest.TempPathFactor
             (gone_ns, sim.status("laser_front", gone_ns)),
         ])  # fmt: skip
         viewer = home.client("viewer")
+        assert "Nothing is known of it now" in part(viewer, "")  # it is away
+        sim.is_here(home)
         shown = part(viewer, "")
         assert "Nothing is known to be broken" in shown
         assert "The last one: Laser front: driver crash; Laser front: silent" in shown
@@ -261,6 +263,9 @@ def test_what_is_not_seen_any_more_is_grey_and_in_the_past(
             (at_ns, revised(1, at_ns, sim.NO_SCANS)),
         ])  # fmt: skip
         operator = home.client("operator")
+        assert "What was broken As of" in part(operator, "/card")  # it is away
+        assert 'class="card dx dx-open dx-then"' in operator.get(f"{BASE}/card").text
+        sim.is_here(home)
         assert "What is broken" in part(operator, "/card")
         sim.say(home, told((90, sim.NO_SCANS, "absent")), start=50)
         for path in ("", "/card"):
@@ -303,6 +308,7 @@ def test_a_revision_of_then_is_shown_as_it_was(tmp_path_factory: pytest.TempPath
             (at_ns, revised(1, at_ns, sim.NO_SCANS)), *told((5, sim.NO_SCANS, "absent")),
             *told((20, IMU, "present")), (at_ns + 20 * NS, revised(2, at_ns + 20 * NS, IMU)),
         ])  # fmt: skip
+        sim.is_here(home)
         viewer = home.client("viewer")
         then = part(viewer, f"/card?diagnosis={sim.DIAGNOSIS}&revision=1")
         assert "The front laser has no power" in then and "What was broken" in then

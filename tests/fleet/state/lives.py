@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict
 from typing import Any
 
@@ -55,7 +56,7 @@ def connect(home: House, robot: str, *, ahead_ns: int = 0, config_hash: str = ""
         beat = Beat(admission.epoch, 0, 0, 7, ahead_ns, 2_000_000, 900)
         presence.seen(connection, robot, admission.epoch, beat, BOOT, now_ns)
     one = Connected(robot, FakeSocket(), ServerEnd(robot), now_ns)
-    one.backlog = 7
+    one.backlog, one.heard_s = 7, math.inf  # it is heard for as long as the test lasts
     home.services.links.robots[robot] = one
 
 

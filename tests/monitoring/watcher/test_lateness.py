@@ -15,7 +15,7 @@ from amberbox.core.clock import NS
 from amberbox.monitoring.messages.board import BoardReader
 from amberbox.monitoring.messages.pulse import (
     STATE_FILE,
-    Monitoring,
+    Pulse,
     monitoring_of,
     write_pulse,
 )
@@ -28,18 +28,18 @@ from tests.monitoring.watcher.stand import Stand, values_of, written
 
 def test_states_of_monitoring(tmp_path: Path) -> None:
     store, clock = create_store(tmp_path / "store"), ManualClock()
-    assert monitoring_of(store, clock) == Monitoring("absent")
+    assert monitoring_of(store, clock) == Pulse("absent")
     lock = WriterLock(store, "watch")
-    assert monitoring_of(store, clock) == Monitoring("running")  # it says nothing yet
+    assert monitoring_of(store, clock) == Pulse("running")  # it says nothing yet
     write_pulse(store, clock, 0.1)
-    assert monitoring_of(store, clock) == Monitoring("running", 0.1)
+    assert monitoring_of(store, clock) == Pulse("running", 0.1)
     write_pulse(store, clock, 12.5)
-    assert monitoring_of(store, clock) == Monitoring("overloaded", 12.5)
+    assert monitoring_of(store, clock) == Pulse("overloaded", 12.5)
     clock.advance(25.0)
     clock.step(-3600.0)
-    assert monitoring_of(store, clock) == Monitoring("silent", 25.0)
+    assert monitoring_of(store, clock) == Pulse("silent", 25.0)
     lock.release()
-    assert monitoring_of(store, clock) == Monitoring("absent")
+    assert monitoring_of(store, clock) == Pulse("absent")
 
 
 @pytest.mark.parametrize(
@@ -54,7 +54,7 @@ def test_sign_of_life_of_a_watcher_before_says_nothing(
     values = json.loads((store.path / STATE_FILE).read_text())
     assert values["pid"] == os.getpid()
     (store.path / STATE_FILE).write_text(json.dumps(values | change))
-    assert monitoring_of(store, clock) == Monitoring("running")
+    assert monitoring_of(store, clock) == Pulse("running")
     lock.release()
 
 
@@ -71,7 +71,7 @@ def test_sign_of_life_does_not_wait_for_the_evaluation(tmp_path: Path) -> None:
     written_to = threading.Event()
     while not (store.path / STATE_FILE).exists():
         written_to.wait(0.01)
-    assert monitoring_of(store, clock) == Monitoring("overloaded", 20.0)
+    assert monitoring_of(store, clock) == Pulse("overloaded", 20.0)
     board = BoardReader(store).read(clock.wall_ns())
     assert board.monitoring is not None and board.monitoring.state == "running"  # another boot
     assert lateness.ended() == 20.0

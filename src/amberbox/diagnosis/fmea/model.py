@@ -9,11 +9,8 @@ from typing import Literal, TypeAlias
 
 from amberbox.core.expression import Expression
 from amberbox.core.needs import NOTHING, Needs
-
-Severity: TypeAlias = Literal["warning", "urgent", "critical", "fatal"]
-"""What the robot can still do (VDA 5050): work, work and be seen to, not move on, nothing."""
-
-SEVERITIES: tuple[Severity, ...] = ("warning", "urgent", "critical", "fatal")
+from amberbox.core.robotstatus import SEVERITIES as SEVERITIES
+from amberbox.core.robotstatus import Severity as Severity
 
 Kind: TypeAlias = Literal["read", "question", "check"]
 

@@ -21,10 +21,11 @@ from amberbox.fleet.conclusions.entry import Entry
 from amberbox.fleet.conclusions.reading import entries
 from amberbox.fleet.linkend.presence import Presence, presences
 from amberbox.fleet.services import Services
+from amberbox.fleet.services.status import Known
 from amberbox.fleet.state import links
 from amberbox.fleet.state.facts import Facts
 from amberbox.fleet.state.said import SaidEvent, moment, taken
-from amberbox.fleet.state.standing import Moment, clock_offsets_ns, silence, standings
+from amberbox.fleet.state.standing import standings
 from amberbox.fleet.state.timeline import timeline
 from amberbox.fleet.state.tree import status_tree
 from amberbox.fleet.state.views import Card, StatusTree
@@ -101,18 +102,16 @@ def status_without_folder(fleet: Services, robot: KnownRobot) -> StatusTree:
     return _status(fleet, robot, lambda *_: Facts())
 
 
-def _status(fleet: Services, robot: KnownRobot, read: Callable[[str, str], Facts]) -> StatusTree:
-    now_ns = fleet.clock.wall_ns()
+def known_now(fleet: Services, robot: KnownRobot) -> Known:
+    """Return the one status of a robot with what it is made of."""
     with fleet.database.reading() as connection:
-        statuses = standings(connection, [robot.id]).get(robot.id, [])
-        seen = _presence(connection, robot.id)
-        offset_ns = clock_offsets_ns(connection, [robot.id]).get(robot.id)
-    online = robot.id in fleet.links.robots
-    facts = read(robot.id, seen.config_hash if seen else "")
-    when = Moment(now_ns, offset_ns)
-    link = fleet.links.robots.get(robot.id)
-    silent = silence(seen, online, statuses, when, link.monitoring if link else None)
-    return status_tree(robot.id, online, silent, statuses, facts, when)
+        statuses = fleet.feed.state.statuses
+        return statuses.of(connection, [robot], fleet.clock.wall_ns())[0]
+
+
+def _status(fleet: Services, robot: KnownRobot, read: Callable[[str, str], Facts]) -> StatusTree:
+    known = known_now(fleet, robot)
+    return status_tree(known, read(robot.id, known.presence.config_hash if known.presence else ""))
 
 
 @routes.get("/robots/{robot}/timeline", "status.read")

@@ -57,6 +57,7 @@ class StatusMemory:
 
     def __init__(self) -> None:
         self._known: dict[str, dict[tuple[str, str], _Known]] = {}
+        self._heard_ns: dict[str, int] = {}
 
     def load(self, connection: Connection) -> None:
         """Begin with what the board shows."""
@@ -65,6 +66,11 @@ class StatusMemory:
             if said is not None:
                 standing = Standing(said, row.log_ns, row.received_ns)
                 self._enter(row.robot, _Known(row.store_id, row.run, row.seq, standing))
+                self._heard_ns[row.robot] = max(self._heard_ns.get(row.robot, 0), row.received_ns)
+
+    def unheard(self, since_ns: int) -> frozenset[str]:
+        """Return the robots whose watchers have said something, and nothing since a time."""
+        return frozenset(name for name, at_ns in self._heard_ns.items() if at_ns < since_ns)
 
     def standing(self, robot: str) -> Mapping[tuple[str, str], Standing]:
         """Return what was said last of each component and mode of a robot."""
@@ -79,6 +85,7 @@ class StatusMemory:
             said = heard(row.data, SaidStatus) if row.channel == reserved.STATUS else None
             if said is None:
                 continue
+            self._heard_ns[robot] = now_ns
             key = said.component, said.mode
             before = self._known.get(robot, {}).get(key)
             if before is not None and _is_late(before, store_id, row):

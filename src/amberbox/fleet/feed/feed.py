@@ -27,7 +27,7 @@ from amberbox.fleet.feed.listener import Filter, Listener
 from amberbox.fleet.feed.live import EVERY_S, Live
 from amberbox.fleet.feed.silence import LOOK_S, Silence
 from amberbox.fleet.linkend.server import LinkServer
-from amberbox.fleet.state.standing import Moment, clock_offsets_ns
+from amberbox.fleet.state.standing import SILENT_NS, Moment, clock_offsets_ns
 from amberbox.fleet.state.state import Snapshot, State
 
 GATHER_S = 0.05
@@ -199,10 +199,14 @@ class Feed:
                         listener.wake.set()
 
     async def _silences(self) -> None:
-        """Tell of robots that miss their heartbeats while their link holds."""
+        """Tell of robots that miss heartbeats while their link holds, and of silent watchers."""
         while True:
             await asyncio.sleep(LOOK_S)
-            for robot, data in self._silence.news(self._links.robots):
+            unheard = self._memory.unheard(self._clock.wall_ns() - SILENT_NS)
+            for robot, data in (
+                *self._silence.news(self._links.robots),
+                *self._silence.watchers(self._links.robots, unheard),
+            ):
                 self.add("presence", robot, data)
 
     async def _ages(self) -> None:

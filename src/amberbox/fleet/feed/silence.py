@@ -16,6 +16,7 @@ class Silence:
 
     def __init__(self) -> None:
         self._silent: frozenset[str] = frozenset()
+        self._unheard: frozenset[str] = frozenset()
 
     def news(self, robots: Mapping[str, Connected]) -> Iterator[tuple[str, Mapping[str, Any]]]:
         """Yield robots that fell silent or are heard again, with what is told of their presence.
@@ -30,4 +31,16 @@ class Silence:
             yield name, {"online": True, "silent": True, "since": since}
         for name in sorted(before - self._silent):
             if name in robots:
+                yield name, {"online": True}
+
+    def watchers(
+        self, robots: Mapping[str, Connected], unheard: frozenset[str]
+    ) -> Iterator[tuple[str, Mapping[str, Any]]]:
+        """Yield connected robots whose watchers fell silent, or are heard again.
+
+        Their status is another one then, though nothing may have come from them.
+        """
+        changed, self._unheard = self._unheard ^ unheard, unheard
+        for name in sorted(changed & robots.keys()):
+            if not robots[name].is_silent:
                 yield name, {"online": True}

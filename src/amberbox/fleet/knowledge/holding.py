@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 from amberbox.blackbox.journal import reserved
 from amberbox.core.clock import NS
@@ -17,6 +18,22 @@ _MOST = 2_000
 """Words on symptoms that are looked through, the newest of them."""
 _SETTLED_NS = 10 * NS
 """What went so short ago may come and go."""
+
+
+class Told(Protocol):
+    """A word on a symptom, as a robot said it."""
+
+    @property
+    def state(self) -> str:
+        """Return whether it is there: ``present``, ``absent`` or ``unknown``."""
+
+    @property
+    def onset_ns(self) -> int | None:
+        """Return since when."""
+
+    @property
+    def confirmed_ns(self) -> int | None:
+        """Return when that was certain."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,21 +57,22 @@ def holds_of(stores: Stores, robot: str, revisions: Iterable[Diagnosis]) -> dict
     found: dict[str, Hold] = {}
     for symptom in findings(said, Symptom):
         if symptom.id in names:
-            hold = _after(found.get(symptom.id), symptom)
+            hold = held_after(found.get(symptom.id), symptom)
             found.update({symptom.id: hold} if hold is not None else {})
     return found
 
 
-def gone_since(last: Diagnosis, holds: Mapping[str, Hold], now_ns: int) -> int | None:
-    """Return when the last symptom of a revision went; None while one may be there."""
-    ends = [holds[name].to_ns if name in holds else None for name in last.symptoms]
+def gone_since(symptoms: Sequence[str], holds: Mapping[str, Hold], now_ns: int) -> int | None:
+    """Return when the last of some symptoms went; None while one may be there."""
+    ends = [holds[name].to_ns if name in holds else None for name in symptoms]
     known = [end_ns for end_ns in ends if end_ns is not None]
     if not ends or len(known) < len(ends) or now_ns - max(known) < _SETTLED_NS:
         return None
     return max(known)
 
 
-def _after(before: Hold | None, told: Symptom) -> Hold | None:
+def held_after(before: Hold | None, told: Told) -> Hold | None:
+    """Return since when a symptom is there, or was, after one more word on it."""
     at_ns = told.confirmed_ns or told.onset_ns or 0
     if told.state == "present" and (before is None or before.to_ns is not None):
         return Hold(told.onset_ns or at_ns)

@@ -9,10 +9,11 @@ from typing import get_args
 
 from sqlalchemy import Connection, func, select, update
 
+from amberbox.core.robotstatus import Monitoring
 from amberbox.fleet.database.upsert import upsert
 from amberbox.fleet.linkend.tables import BOOT, HEADS, ROBOT, ROW, STATUS
 from amberbox.link.frames import Beat
-from amberbox.monitoring.messages.pulse import Monitoring, State
+from amberbox.monitoring.messages.pulse import Pulse
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,12 +63,12 @@ def seen(connection: Connection, robot: str, epoch: int, beat: Beat, boot: str, 
         connection.execute(upsert(connection.dialect, BOOT, ("robot", "boot_id"), change), [row])
 
 
-def monitoring_said(beat: Beat) -> Monitoring | None:
+def monitoring_said(beat: Beat) -> Pulse | None:
     """Return what a heartbeat says of the robot's watcher; None where it says nothing we know."""
-    state = next((state for state in get_args(State) if state == beat.monitoring), None)
+    state = next((state for state in get_args(Monitoring) if state == beat.monitoring), None)
     if state is None:
         return None
-    return Monitoring(state, max(beat.delay_s, 0.0) if isfinite(beat.delay_s) else 0.0)
+    return Pulse(state, max(beat.delay_s, 0.0) if isfinite(beat.delay_s) else 0.0)
 
 
 def gone(connection: Connection, robot: str, epoch: int, last_seen_ns: int) -> None:

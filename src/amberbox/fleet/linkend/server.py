@@ -38,7 +38,7 @@ from amberbox.link.frames import (
 )
 from amberbox.link.ledger import Admission, StaleEpochError, Stored
 from amberbox.link.serverend import Admit, Deed, Keep, Say, ServerEnd
-from amberbox.monitoring.messages.pulse import Monitoring
+from amberbox.monitoring.messages.pulse import Pulse
 
 Value = tuple[int, float | str | None]
 _SEEN_EVERY_NS = 10 * 1_000_000_000
@@ -86,7 +86,7 @@ class Connected:
     last_seen_ns: int
     written_ns: int = 0
     backlog: int = 0
-    monitoring: Monitoring | None = None
+    monitoring: Pulse | None = None
     """How its watcher is doing; None where it has not said."""
     answers: asyncio.Queue[Answer | None] = field(default_factory=lambda: asyncio.Queue(_WAITING))
     heard_s: float = field(default_factory=time.monotonic)

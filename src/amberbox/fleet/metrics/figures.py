@@ -10,6 +10,7 @@ from pathlib import Path
 
 from sqlalchemy import func, select
 
+from amberbox.fleet.accounts.robots import list_robots
 from amberbox.fleet.accounts.tables import ROBOTS
 from amberbox.fleet.archive.catalogue import COMMITTED, PUT
 from amberbox.fleet.archive.tables import JOURNALS
@@ -18,6 +19,7 @@ from amberbox.fleet.database.database import FILE
 from amberbox.fleet.linkend.tables import ASIDE, ROBOT
 from amberbox.fleet.metrics.text import Family, Sample, counter, gauge
 from amberbox.fleet.services import Services
+from amberbox.fleet.services.status import counts
 from amberbox.fleet.state.damaged import damaged_files
 
 _PAGE = os.sysconf("SC_PAGE_SIZE")
@@ -42,6 +44,7 @@ class Received:
 def families(services: Services, received: Received) -> Iterator[Family]:
     """Give all figures but those of requests."""
     yield from _robots(services)
+    yield from _levels(services)
     yield from _arrivals(received)
     yield from _archive(services)
     yield from _damaged(services)
@@ -66,6 +69,15 @@ def _robots(services: Services) -> Iterator[Family]:
     yield gauge("amberbox_rows_aside", "Rows that robots have no more.", aside)
     waiting = sum(one.answers.qsize() for one in online)
     yield gauge("amberbox_link_queue", "Frames of robots that are not answered yet.", waiting)
+
+
+def _levels(services: Services) -> Iterator[Family]:
+    with services.database.reading() as connection:
+        statuses = services.feed.state.statuses
+        known = statuses.of(connection, list_robots(connection), services.clock.wall_ns())
+    about = "Robots by the level of their status; unknown: nothing is known of now."
+    levels = [Sample(count, {"level": level}) for level, count in sorted(counts(known).items())]
+    yield Family("amberbox_robots_by_level", "gauge", about, levels)
 
 
 def _arrivals(received: Received) -> Iterator[Family]:

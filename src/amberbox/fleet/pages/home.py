@@ -8,6 +8,8 @@ from typing import Annotated, Any, Literal
 
 from fastapi import Query, Request, Response
 
+from amberbox.core.robotstatus import worst
+from amberbox.core.types import Level
 from amberbox.fleet.api.access import Fleet, OfRobot, Who
 from amberbox.fleet.api.health import read_health
 from amberbox.fleet.api.robots import list_cards, read_card
@@ -16,14 +18,11 @@ from amberbox.fleet.api.system import read_status as read_system
 from amberbox.fleet.pages.page import Pages, render
 from amberbox.fleet.services import Services
 from amberbox.fleet.state.views import Card
-from amberbox.monitoring.engine.outputs import SEVERITIES
 
 routes = Pages()
 
 Show = Literal["all", "trouble", "alarms", "offline"]
 Sort = Literal["worst", "name", "battery", "seen"]
-_LEVELS = ("error", "warn", "stale", "unknown", "ok")
-_SEVERITIES = (*reversed(SEVERITIES), "")
 _MOST = 10_000
 BEHIND_ROWS = 5000
 """More than that a robot records in some seconds: one that has so many to send was away."""
@@ -96,7 +95,7 @@ def _fits(card: Card, look: Look) -> bool:
         all(word in words for word in look.q.casefold().split())
         and {
             "all": True,
-            "trouble": card.level in ("error", "warn") or card.severity != "" or card.alarms > 0,
+            "trouble": card.status.is_trouble or card.alarms > 0,
             "alarms": card.alarms > 0,
             "offline": not card.online,
         }[look.show]
@@ -105,7 +104,7 @@ def _fits(card: Card, look: Look) -> bool:
 
 def _order(sort: Sort) -> Callable[[Card], tuple[Any, ...]]:
     keys: Mapping[Sort, Callable[[Card], tuple[Any, ...]]] = {
-        "worst": lambda c: (_SEVERITIES.index(c.severity), _LEVELS.index(c.level), c.robot),
+        "worst": lambda c: (-c.status.rank, c.robot),
         "name": lambda c: (c.robot,),
         "battery": lambda c: (c.battery is None, c.battery.percent if c.battery else 0.0, c.robot),
         "seen": lambda c: (c.online, c.last_seen or "", c.robot),
@@ -130,12 +129,11 @@ class System:
 
     health: str
     folders: Sequence[SystemFolder]
-    level: str
+    level: Level
 
 
 def _system(fleet: Services, who: Who) -> System:
     health = read_health(fleet, Response()).status
     folders = read_system(fleet) if who.may("status.read") else []
     levels = {one.level for folder in folders for one in folder.statuses if not one.mode}
-    level = next((one for one in _LEVELS if one in levels), "ok")
-    return System(health, folders, level)
+    return System(health, folders, worst(levels))

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any, Literal
 
-from sqlalchemy import ColumnElement, Connection, and_, select
+from sqlalchemy import ColumnElement, Connection, Row, and_, select
 
-from amberbox.fleet.alarms.alarm import rank_of
+from amberbox.core.robotstatus import Severity, highest, severity_rank
 from amberbox.fleet.alarms.tables import ALARM, ALARM_ROBOT
 
 
@@ -23,29 +24,40 @@ class OpenAlarms:
     """Alarms of a robot that nobody has said anything about; ``over`` of them have stopped.
 
     ``severity`` is the highest of what lasts, acknowledged or not; empty where nothing does.
+    ``lasting`` is the same of what its monitors found, ``reason`` what that alarm is about: an
+    alarm that tells of its absence says nothing of how it is.
     """
 
     count: int = 0
     over: int = 0
-    severity: str = ""
+    severity: Severity | Literal[""] = ""
+    lasting: Severity | Literal[""] = ""
+    reason: str = ""
 
 
 def open_alarms(connection: Connection) -> dict[str, OpenAlarms]:
     """Return the alarms by robot; an alarm about several robots counts for each."""
     lasts = and_(ALARM.c.active, ALARM_ROBOT.c.to_ns.is_(None)).label("lasts")
     wanted = (
-        select(ALARM_ROBOT.c.robot, ALARM.c.severity, ALARM.c.state, lasts)
+        select(ALARM_ROBOT.c.robot, ALARM.c.severity, ALARM.c.state, ALARM.c.kind,
+               ALARM.c.origin, ALARM.c.reason, lasts)
         .join(ALARM, ALARM.c.number == ALARM_ROBOT.c.alarm)
         .where(is_open() | and_(ALARM.c.state == "acknowledged", ALARM.c.merged_into.is_(None)))
-    )
+        .order_by(ALARM.c.number)
+    )  # fmt: skip
     found: dict[str, OpenAlarms] = {}
-    for robot, severity, state, is_there in connection.execute(wanted):
-        known = found.get(robot, OpenAlarms())
-        found[robot] = _with(known, severity, is_open=state == "open", lasts=bool(is_there))
+    for row in connection.execute(wanted):
+        found[row.robot] = _with(found.get(row.robot, OpenAlarms()), row)
     return found
 
 
-def _with(known: OpenAlarms, severity: str, *, is_open: bool, lasts: bool) -> OpenAlarms:
-    worst = max(known.severity, severity, key=rank_of) if lasts else known.severity
-    over = known.over + (is_open and not lasts)
-    return OpenAlarms(known.count + is_open, over, worst)
+def _with(known: OpenAlarms, row: Row[Any]) -> OpenAlarms:
+    """Add an alarm to those of a robot."""
+    is_new = row.state == "open"
+    if not row.lasts:
+        return replace(known, count=known.count + is_new, over=known.over + is_new)
+    worst = highest((known.severity, row.severity))
+    known = replace(known, count=known.count + is_new, severity=worst)
+    if row.kind != "robot" or severity_rank(row.severity) <= severity_rank(known.lasting):
+        return known
+    return replace(known, lasting=row.severity, reason=f"{row.origin}: {row.reason}")

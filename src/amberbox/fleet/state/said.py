@@ -12,8 +12,9 @@ from typing import Any, TypeVar
 import msgspec
 
 from amberbox.core.clock import NS
+from amberbox.core.robotstatus import RANK
 from amberbox.core.timetext import format_time
-from amberbox.monitoring.engine.outputs import RANK
+from amberbox.core.types import Level
 
 _RANKS: Mapping[str, int] = dict(RANK.items())
 _FIRST_NS, _BEYOND_NS = 1, 2**63
@@ -58,6 +59,11 @@ class SaidStatus(msgspec.Struct, frozen=True):
         """Return how bad it is."""
         return rank_of(self.level)
 
+    @property
+    def known_level(self) -> Level:
+        """Return the level; ``unknown`` for a word that is none."""
+        return self.level if self.level in RANK else "unknown"  # type: ignore[return-value]  # it is one of them
+
 
 class SaidMission(msgspec.Struct, frozen=True):
     """The beginning or the end of a mission."""
@@ -85,6 +91,16 @@ class SaidDiagnosis(msgspec.Struct, frozen=True):
     at_ns: int = 0
     state: str = ""
     hypotheses: list[SaidHypothesis] = []
+    symptoms: list[str] = []
+
+
+class SaidSymptom(msgspec.Struct, frozen=True):
+    """A symptom, as far as it tells whether it is there."""
+
+    id: str
+    state: str = ""
+    onset_ns: int | None = None
+    confirmed_ns: int | None = None
 
 
 class SaidEvent(msgspec.Struct, frozen=True):

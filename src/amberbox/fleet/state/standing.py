@@ -8,11 +8,12 @@ from dataclasses import dataclass
 from sqlalchemy import Connection, and_, select
 
 from amberbox.core.clock import NS
+from amberbox.core.robotstatus import Contact, Monitoring
 from amberbox.fleet.linkend.presence import Presence
 from amberbox.fleet.linkend.tables import BOOT, ROBOT, STATUS
 from amberbox.fleet.state.said import SaidStatus, heard, moment
 from amberbox.monitoring.messages.board import duration, overloaded
-from amberbox.monitoring.messages.pulse import Monitoring
+from amberbox.monitoring.messages.pulse import Pulse
 
 SILENT_NS = 10 * NS
 """The watcher says everything each second; over a bad network that may come a little later."""
@@ -84,28 +85,50 @@ def clock_offsets_ns(connection: Connection, robots: Sequence[str] | None = None
     return {row.robot: row.offset_ns for row in connection.execute(wanted)}
 
 
+def monitoring_of(
+    statuses: Sequence[Standing], when: Moment, pulse: Pulse | None = None
+) -> Monitoring:
+    """Tell whether a robot's watcher says anything that is about now.
+
+    ``pulse`` is what the link says of it, apart from the statuses: one that is late is not silent.
+    """
+    if not statuses:
+        return "absent"
+    if pulse is not None and pulse.state == "overloaded":
+        return "overloaded"
+    return "running" if _newest_ns(statuses, when) <= SILENT_NS else "silent"
+
+
 def silence(
+    contact: Contact,
     presence: Presence | None,
-    online: bool,
+    monitoring: Monitoring,
     statuses: Sequence[Standing],
     when: Moment,
-    monitoring: Monitoring | None = None,
+    delay_s: float = 0.0,
 ) -> str:
     """Say why nothing is known of a robot now; empty where something is.
 
-    ``monitoring`` is what its link says of its watcher, apart from the statuses.
+    ``delay_s`` is how late overloaded monitoring evaluates.
     """
-    now_ns = when.now_ns
-    if presence is None:
+    if contact == "never" or presence is None:
         return "it has never connected"
-    if not online:
-        return f"offline, last seen {duration(now_ns - presence.last_seen_ns)} ago"
-    if not statuses:
+    if contact != "online":
+        seen = duration(when.now_ns - presence.last_seen_ns)
+        return f"{'offline' if contact == 'offline' else 'silent'}, last seen {seen} ago"
+    if monitoring == "absent":
         return "it has said nothing of its components yet"
-    if monitoring is not None and monitoring.state == "overloaded":
-        return overloaded(monitoring.delay_s)
-    newest_ns = max(status.received_ns for status in statuses)
-    if now_ns - newest_ns > SILENT_NS:
-        return f"its watcher has said nothing for {duration(now_ns - newest_ns)}"
-    age_ns = min(when.age_ns(status) for status in statuses)
-    return f"what it says is {duration(age_ns)} old" if age_ns > SILENT_NS else ""
+    if monitoring == "overloaded":
+        return overloaded(delay_s)
+    if monitoring != "silent":
+        return ""
+    unheard_ns = when.now_ns - max(status.received_ns for status in statuses)
+    if unheard_ns > SILENT_NS:
+        return f"its watcher has said nothing for {duration(unheard_ns)}"
+    return f"what it says is {duration(_newest_ns(statuses, when))} old"
+
+
+def _newest_ns(statuses: Sequence[Standing], when: Moment) -> int:
+    """Return how long ago anything was said, or how old it was then if that is more."""
+    unheard_ns = when.now_ns - max(status.received_ns for status in statuses)
+    return max(unheard_ns, min(when.age_ns(status) for status in statuses))

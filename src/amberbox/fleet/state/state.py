@@ -10,6 +10,7 @@ from typing import Any
 
 from sqlalchemy import select
 
+from amberbox.core.clock import NS
 from amberbox.core.errors import AmberboxError
 from amberbox.fleet.accounts.robots import list_robots
 from amberbox.fleet.accounts.tables import ROBOTS
@@ -19,11 +20,12 @@ from amberbox.fleet.bus import Bus, Change
 from amberbox.fleet.database.database import Database
 from amberbox.fleet.folders.folders import Folders
 from amberbox.fleet.linkend.server import LinkServer
-from amberbox.fleet.state.cards import FEW, Cards
+from amberbox.fleet.services.status import FEW, RobotStatuses
+from amberbox.fleet.state.cards import Cards
 from amberbox.fleet.state.facts import FactsBook
 from amberbox.fleet.state.latest import Latest
 from amberbox.fleet.state.said import status_data
-from amberbox.fleet.state.standing import standings
+from amberbox.fleet.state.standing import Moment, clock_offsets_ns, standings
 from amberbox.fleet.state.views import Card
 
 
@@ -51,8 +53,10 @@ class State:
         self.archive = archive
         self.latest = Latest()
         self.facts = FactsBook(folders, asking)
-        self.cards = Cards(links, self.latest, self.facts)
+        self.statuses = RobotStatuses(links, self.latest)
+        self.cards = Cards(self.statuses, self.facts)
         self._bus = bus
+        bus.on("explained", self._explained)
         self._folders = folders
         self._wanted: asyncio.Queue[str] = asyncio.Queue()
 
@@ -80,8 +84,13 @@ class State:
             few = sorted(robots) if len(robots) <= FEW else None
             found = standings(connection, few)
             cards = self.cards.of(connection, known, now_ns, found)
+            offsets = clock_offsets_ns(connection, few)
+        when = {robot: Moment(now_ns, offsets.get(robot)) for robot in robots}
         statuses = {
-            robot: [status_data(one.said) for one in found[robot]]
+            robot: [
+                {**status_data(one.said), "age_s": round(when[robot].age_ns(one) / NS, 2)}
+                for one in found[robot]
+            ]
             for robot in sorted(robots if with_statuses else ())
             if robot in found
         }
@@ -89,6 +98,14 @@ class State:
 
     def _rows(self, change: Change) -> None:
         self.latest.take(change.robot, change.data["rows"])
+
+    def _explained(self, change: Change) -> None:
+        """Note what a diagnosis that was put into words leaves of its robot."""
+        answer = change.data["answer"]
+        told = answer.get("explanation")
+        if told and answer.get("id"):
+            severity = told["use"]["severity"]
+            self.latest.explain(change.robot, answer["id"], answer["revision"], severity)
 
     def _robot(self, change: Change) -> None:
         if change.robot:

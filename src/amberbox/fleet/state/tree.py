@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from amberbox.core.clock import NS
+from amberbox.fleet.services.status import Known
 from amberbox.fleet.state.facts import ComponentFacts, Facts, OutputFacts
 from amberbox.fleet.state.said import SaidOutput
 from amberbox.fleet.state.standing import Moment, Standing
@@ -20,27 +21,24 @@ from amberbox.fleet.state.views import (
 _NOTHING = OutputFacts("")
 
 
-def status_tree(
-    robot: str,
-    online: bool,
-    silence: str,
-    statuses: Sequence[Standing],
-    facts: Facts,
-    when: Moment,
-) -> StatusTree:
+def status_tree(known: Known, facts: Facts) -> StatusTree:
     """Put statuses and what the folder says into a tree; what is in no folder stands at the end."""
     by_name: dict[str, list[Standing]] = {}
-    for status in statuses:
+    for status in known.statuses:
         by_name.setdefault(status.said.component, []).append(status)
-    known = {component.id for component in facts.components}
-    extra = [ComponentFacts(name, name) for name in by_name if name not in known]
-    levels = {(s.said.component, s.said.mode): s.said.level for s in statuses}
+    planned = {component.id for component in facts.components}
+    extra = [ComponentFacts(name, name) for name in by_name if name not in planned]
+    levels = {(s.said.component, s.said.mode): s.said.level for s in known.statuses}
     components = [
-        _component(one, by_name.get(one.id, ()), levels, when)
+        _component(one, by_name.get(one.id, ()), levels, known.when)
         for one in (*facts.components, *extra)
     ]
-    offset_s = None if when.offset_ns is None else round(when.offset_ns / NS, 6)
-    return StatusTree(robot, online, silence, facts.note, offset_s, components)
+    offset_ns = known.when.offset_ns
+    offset_s = None if offset_ns is None else round(offset_ns / NS, 6)
+    return StatusTree(
+        known.robot.id, known.link is not None, known.silence, facts.note, offset_s, components,
+        known.status,
+    )  # fmt: skip
 
 
 def _component(

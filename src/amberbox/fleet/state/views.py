@@ -6,6 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
+from amberbox.core.robotstatus import RobotStatus
+
 Value = bool | int | float | str | None
 
 
@@ -46,13 +48,13 @@ class Lead:
 class Card:
     """A robot at a glance.
 
-    ``level`` is ``unknown`` where nobody can know; ``last_level`` is what it was then. ``cause``
-    says in words what is worst. ``alarms`` are those that nobody has said anything about yet, of
-    which ``alarms_over`` have stopped; ``severity`` is the highest of those that last, also of
-    acknowledged ones. Of its files ``damaged_files`` are set aside as damaged, ``damaged_new``
-    of these in the last 24 hours. ``silent``: its link holds, and three heartbeats are missing.
-    ``signing_key`` is ``pending`` or ``refused`` where it signs with another key than before that
-    no admin has confirmed: what it says of itself may come from somebody else.
+    ``status`` is the one status of the robot; ``level`` and ``last_level`` are its own. ``cause``
+    says in words what is worst, or why nothing is known. ``alarms`` are those that nobody has said
+    anything about yet, of which ``alarms_over`` have stopped; ``severity`` is the highest of those
+    that last, also of acknowledged ones. Of its files ``damaged_files`` are set aside as damaged,
+    ``damaged_new`` of these in the last 24 hours. ``silent``: its link holds, and three heartbeats
+    are missing. ``signing_key`` is ``pending`` or ``refused`` where it signs with another key than
+    before that no admin has confirmed: what it says of itself may come from somebody else.
     ``monitoring`` is how its watcher is doing by its link (``running``, ``overloaded``, ``silent``,
     ``absent``; empty where that is not known), ``monitoring_delay_s`` how late that evaluates.
     """
@@ -77,6 +79,7 @@ class Card:
     battery: Battery | None
     mission: OnMission | None
     diagnosis: Lead | None
+    status: RobotStatus
     silent: bool = False
     alarms_over: int = 0
     damaged_files: int = 0
@@ -153,7 +156,10 @@ class Component:
 
 @dataclass(frozen=True, slots=True)
 class StatusTree:
-    """All components of a robot. ``silence`` says why nothing counts, ``note`` what is missing."""
+    """All components of a robot, and the status of the robot that they are part of.
+
+    ``silence`` says why nothing counts now, ``note`` what is missing.
+    """
 
     robot: str
     online: bool
@@ -161,3 +167,4 @@ class StatusTree:
     note: str
     clock_offset_s: float | None
     components: Sequence[Component]
+    status: RobotStatus | None = None

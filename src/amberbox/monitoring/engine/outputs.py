@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, Final, Literal, TypeAlias
 
 from amberbox.core.clock import NS
+from amberbox.core.robotstatus import RANK as RANK
+from amberbox.core.robotstatus import SEVERITIES as SEVERITIES
+from amberbox.core.robotstatus import worst as worst
 from amberbox.core.types import Level, Output
 from amberbox.monitoring.engine.findings import TICK_NS, Found, What
 from amberbox.monitoring.plan import Expectation, OutputPlan, Severity
 
-RANK: Final[Mapping[Level, int]] = {"ok": 0, "warn": 1, "unknown": 2, "stale": 3, "error": 4}
-"""How bad a level is."""
-SEVERITIES: Final[tuple[Severity, ...]] = ("warning", "urgent", "critical", "fatal")
-"""From low to high, the words of VDA 5050 and of the mode files."""
 FUNCTIONAL: Final[frozenset[Level]] = frozenset(("ok", "warn"))
 """Levels of what others can build on."""
 NOT_MEASURED: Final = "not measured yet"
@@ -183,11 +182,6 @@ class OutputState:
         self._why = NOT_MEASURED if why is None else why
         self._flips = list(flips)
         self.settle(now_ns)
-
-
-def worst(levels: Iterable[Level]) -> Level:
-    """Return the worst of some levels; ``unknown`` of none."""
-    return max(levels, key=RANK.__getitem__, default="unknown")
 
 
 def highest(severities: Iterable[Severity]) -> Severity:

@@ -14,9 +14,18 @@ from amberbox.blackbox.follow.records import OwnRecords
 from amberbox.blackbox.journal import reserved
 from amberbox.blackbox.store import Store, is_locked
 from amberbox.core.clock import NS
+from amberbox.core.robotstatus import (
+    Monitoring,
+    Observed,
+    RobotStatus,
+    components_level,
+    judge,
+    severity_rank,
+)
+from amberbox.core.timetext import format_time
 from amberbox.core.types import Status
 from amberbox.monitoring.engine.findings import AlarmChange
-from amberbox.monitoring.messages.pulse import Monitoring, monitoring_of
+from amberbox.monitoring.messages.pulse import Pulse, monitoring_of
 from amberbox.monitoring.messages.records import alarm_of, status_of
 
 WRITER = "watch"
@@ -38,7 +47,35 @@ class Board:
     alarms: Sequence[AlarmChange] = ()
     measured_ns: int = 0
     silence: str = ""
-    monitoring: Monitoring | None = None
+    monitoring: Pulse | None = None
+
+    @property
+    def status(self) -> RobotStatus:
+        """The status of the robot as a whole, as the server makes it of the same."""
+        alarms = [alarm for alarm in self.alarms if alarm.state in ("open", "acknowledged")]
+        worst_alarm = max(alarms, key=lambda one: severity_rank(one.severity), default=None)
+        return judge(
+            Observed(
+                monitoring=self._monitoring,
+                level=components_level(
+                    (status.level, status.state) for status in self.components.values()
+                ),
+                alarm=worst_alarm.severity if worst_alarm else "",
+                alarm_reason=f"{worst_alarm.component}: {worst_alarm.reason}"
+                if worst_alarm
+                else "",
+                as_of=format_time(self.measured_ns) if self.measured_ns else None,
+                delay_s=self.monitoring.delay_s if self.monitoring else 0.0,
+            )
+        )
+
+    @property
+    def _monitoring(self) -> Monitoring:
+        if not self.statuses:
+            return "absent"
+        if self.monitoring is not None and self.monitoring.state == "overloaded":
+            return "overloaded"
+        return "silent" if self.silence else "running"
 
     @property
     def robot(self) -> str:
@@ -83,7 +120,7 @@ class BoardReader:
         known = [_unknown(status, silence) for status in newest] if silence else newest
         return Board(known, alarms, statuses[-1].measured_ns, silence, monitoring)
 
-    def _judge(self, last: Status, written_ns: int, now_ns: int, monitoring: Monitoring) -> str:
+    def _judge(self, last: Status, written_ns: int, now_ns: int, monitoring: Pulse) -> str:
         if written_ns > now_ns + SILENT_NS:
             return "the watcher's last word is from the future: was a clock set?"
         if monitoring.state == "overloaded":

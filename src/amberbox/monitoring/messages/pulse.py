@@ -9,10 +9,11 @@ from __future__ import annotations
 import json
 import os
 from contextlib import suppress
-from typing import Literal, NamedTuple, TypeAlias
+from typing import NamedTuple
 
 from amberbox.blackbox.store import Store, is_locked
 from amberbox.core.clock import NS, Clock, SystemClock
+from amberbox.core.robotstatus import Monitoring
 
 WATCH = "watch"
 """The lock that a watcher holds."""
@@ -22,16 +23,14 @@ OVERLOADED_S = 3.0
 SILENT_S = 5.0
 """A watcher gives a sign of life each second; one that is older than this says nothing."""
 
-State: TypeAlias = Literal["running", "overloaded", "silent", "absent"]
 
-
-class Monitoring(NamedTuple):
+class Pulse(NamedTuple):
     """How the monitoring of a robot is doing.
 
     ``delay_s`` is how late rows are evaluated; of a silent watcher, the age of its sign of life.
     """
 
-    state: State = "absent"
+    state: Monitoring = "absent"
     delay_s: float = 0.0
 
 
@@ -47,13 +46,13 @@ def write_pulse(store: Store, clock: Clock, delay_s: float) -> None:
         part.replace(store.path / STATE_FILE)
 
 
-def monitoring_of(store: Store, clock: Clock | None = None) -> Monitoring:
+def monitoring_of(store: Store, clock: Clock | None = None) -> Pulse:
     """Return how a store's watcher is doing.
 
     One that writes no sign of life (an older version, or one that has just begun) is running.
     """
     if not is_locked(store, WATCH):
-        return Monitoring()
+        return Pulse()
     clock = clock or SystemClock()
     try:
         values = json.loads((store.path / STATE_FILE).read_text())
@@ -61,12 +60,12 @@ def monitoring_of(store: Store, clock: Clock | None = None) -> Monitoring:
         age_s = (clock.boot_ns() - int(values["boot_ns"])) / NS
         delay_s = float(values["delay_s"])
     except (OSError, ValueError, KeyError, TypeError):
-        return Monitoring("running")
+        return Pulse("running")
     if not is_of_now:
-        return Monitoring("running")
+        return Pulse("running")
     if age_s > SILENT_S:
-        return Monitoring("silent", age_s)
-    return Monitoring("overloaded" if delay_s > OVERLOADED_S else "running", delay_s)
+        return Pulse("silent", age_s)
+    return Pulse("overloaded" if delay_s > OVERLOADED_S else "running", delay_s)
 
 
 def _is_alive(pid: int) -> bool:

@@ -22,6 +22,7 @@ from amberbox.fleet.api.alarmlines import AlarmLine, line_of
 from amberbox.fleet.api.alarms import show_alarm
 from amberbox.fleet.api.forms import shown
 from amberbox.fleet.api.notifications import Notification, list_notifications
+from amberbox.fleet.api.robots import known_now
 from amberbox.fleet.notifying.tables import OUTBOX
 from amberbox.fleet.pages.alarms.wording import Event, Words, events, lasted_ns, words_of
 from amberbox.fleet.pages.datalinks import data_href
@@ -169,7 +170,7 @@ def diagnosis_of(fleet: Services, who: Caller, line: AlarmLine) -> Explained:
         return Explained()
     try:
         if line.active:
-            card = card_now(fleet, look(fleet, robot.id, line.diagnosis), None)
+            card = card_now(fleet, look(fleet, robot.id, line.diagnosis), known_now(fleet, robot))
             return Explained(card, who.may("diagnoses.write", robot))
         return _explained_then(fleet, robot.id, line)
     except HTTPException:  # what the robot found may come after its alarm
@@ -180,12 +181,12 @@ def _explained_then(fleet: Services, robot: str, line: AlarmLine) -> Explained:
     end_ns = ns_of(line.cleared or line.changed)
     then = look_then(fleet, robot, line.diagnosis, line.diagnosis_revision, end_ns)
     assert then.known is not None
-    card, last = card_now(fleet, then, None), then.known.last
+    card, last = card_now(fleet, then), then.known.last
     now = look(fleet, robot, line.diagnosis)
     since_ns = now.known.differs_since(last) if now.known else None
     if since_ns is None:
         return Explained(card, revision=last.revision)
-    later = card_now(fleet, now, None)
+    later = card_now(fleet, now)
     return Explained(card, False, last.revision, later if later.state == "open" else None,
                      format_time(since_ns))  # fmt: skip
 

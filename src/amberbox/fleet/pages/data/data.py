@@ -61,6 +61,6 @@ def show_coverage(robot: OfRobot, fleet: Fleet, who: Who) -> Response:
 
 def _named(fleet: Services, robot: KnownRobot) -> Sequence[str]:
     """Return the variables to which the reasons of the robot's diagnosis lead."""
-    card = current_card(fleet, robot.id, None)
+    card = current_card(fleet, robot.id)
     queries = (parse_qs(urlsplit(reason.href).query) for reason in card.why)
     return list(dict.fromkeys(name for query in queries for name in query.get("v", ())))

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Literal, TypeAlias
 
 from amberbox.core.clock import NS
+from amberbox.core.robotstatus import RobotStatus
 from amberbox.core.sureness import LIKELY, percent
 from amberbox.core.timetext import format_time
 from amberbox.diagnosis.explanation.activity import OWN_SHARE
@@ -151,7 +152,8 @@ class DiagnosisCard:
     it, ``more`` counts the others. ``cleared`` are causes beside those that lead of which nothing
     shows any more, ``steady`` failure modes that do not come and go. ``number`` is empty where
     there is none. ``names`` are failure modes in words, ``helps`` what mends them, by id;
-    ``shares`` are the hypotheses with their probabilities.
+    ``shares`` are the hypotheses with their probabilities. ``status`` is that of the robot now,
+    None on cards that are not about now.
     """
 
     robot: str
@@ -179,6 +181,7 @@ class DiagnosisCard:
     helps: Mapping[str, str] = field(default_factory=dict)
     shares: Sequence[tuple[frozenset[str], float]] = ()
     seen: Sequence[Reason] = ()
+    status: RobotStatus | None = None
 
     def having(self, seen: Iterable[Reason]) -> DiagnosisCard:
         """Return it with what was seen: what is there still first, of that what matters most."""

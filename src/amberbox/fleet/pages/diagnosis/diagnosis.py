@@ -17,6 +17,7 @@ from fastapi import Query, Request, Response
 from amberbox.core.errors import AmberboxError
 from amberbox.fleet.accounts.robots import KnownRobot
 from amberbox.fleet.api.access import Fleet, OfRobot, Who
+from amberbox.fleet.api.robots import known_now, read_card
 from amberbox.fleet.knowledge.asked import SymptomWord
 from amberbox.fleet.pages.diagnosis import asking, parts
 from amberbox.fleet.pages.diagnosis import tree as trees
@@ -31,7 +32,6 @@ from amberbox.fleet.pages.diagnosis.look import (
 )
 from amberbox.fleet.pages.page import Pages, render
 from amberbox.fleet.services import Services
-from amberbox.fleet.state.views import Card
 
 routes = Pages()
 
@@ -54,8 +54,8 @@ def show(
     tab: Word = "",
 ) -> Response:  # fmt: skip
     """Show what is known to be broken; nothing here waits for a worker."""
-    card, seen = _robot(fleet, robot), look(fleet, robot.id, diagnosis)
-    shown = card_now(fleet, seen, card.last_seen)
+    now, seen = known_now(fleet, robot), look(fleet, robot.id, diagnosis)
+    card, shown = read_card(fleet, robot), card_now(fleet, seen, now)
     may = who.may("diagnoses.write", robot)
     tabs = [name for name in TABS if may or name not in ASKING]
     lacks = missing(fleet, robot.id, card.last_seen is not None) if not seen.stands else ""
@@ -79,14 +79,15 @@ async def show_card(
     may = who.may("diagnoses.write", robot)
     then = partial(look_then, revision=revision) if diagnosis and revision else look
     seen = await asyncio.to_thread(then, fleet, robot.id, diagnosis)
+    now = await asyncio.to_thread(known_now, fleet, robot)
     try:
         if at:
             answer = await parts.Asked(fleet, who, robot.id, at=at).at_then()
             card, may = replace(card_of(answer), answers={}), False
         else:
-            card = await card_told(fleet, who, seen, await asyncio.to_thread(_seen, fleet, robot))
+            card = await card_told(fleet, who, seen, now)
     except AmberboxError as error:
-        plain = None if at else await asyncio.to_thread(card_now, fleet, seen, None)
+        plain = None if at else await asyncio.to_thread(card_now, fleet, seen, now)
         return render(request, "diagnosis/trouble.html", error=error, plain=plain, may=may)
     return render(request, "diagnosis/part.html", shown=card, seen=seen, may=may, link=link)
 
@@ -192,13 +193,4 @@ def _before(fleet: Services, seen: Look) -> DiagnosisCard | None:
     """Return the card of what was found last, where nothing is known to be broken any more."""
     if seen.known is None or seen.stands:
         return None
-    return card_now(fleet, replace(seen, is_newest=False), None)
-
-
-def _robot(fleet: Services, robot: KnownRobot) -> Card:
-    with fleet.database.reading() as connection:
-        return fleet.feed.state.cards.of(connection, [robot], fleet.clock.wall_ns())[0]
-
-
-def _seen(fleet: Services, robot: KnownRobot) -> str | None:
-    return _robot(fleet, robot).last_seen
+    return card_now(fleet, replace(seen, is_newest=False))

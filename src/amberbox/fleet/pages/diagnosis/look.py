@@ -28,6 +28,7 @@ from amberbox.fleet.pages.diagnosis.card import (
     plain_card_of,
 )
 from amberbox.fleet.services import Services
+from amberbox.fleet.services.status import Known as Now
 
 Missing: TypeAlias = Literal["", "never", "folder", "fmea"]
 """What a diagnosis needs and is not there: a connection, the robot's folder, its failure modes."""
@@ -87,22 +88,22 @@ def look_then(
     return _with_remarks(fleet, Look(robot, known, is_newest=False, is_past=True), later)
 
 
-def card_now(fleet: Services, seen: Look, as_of: str | None) -> DiagnosisCard:
-    """Return the card of what is looked at without waiting; ``as_of`` is how far is known."""
+def card_now(fleet: Services, seen: Look, now: Now | None = None) -> DiagnosisCard:
+    """Return the card of what is looked at without waiting; ``now`` is how the robot is now."""
     if seen.known is None or not seen.stands:
-        return nothing_broken(seen.robot, as_of)
+        return _nothing(seen, now)
     answer = _at_hand(fleet, seen)
     known = seen.known
     card = _plain(seen, known) if answer is None else _card(answer, seen, known)
-    return _timed(card, seen, known, fleet.clock.wall_ns())
+    return _timed(card, seen, known, now, fleet.clock.wall_ns())
 
 
-async def card_told(fleet: Services, who: Caller, seen: Look, as_of: str | None) -> DiagnosisCard:
+async def card_told(fleet: Services, who: Caller, seen: Look, now: Now | None) -> DiagnosisCard:
     """Return the card with its explanation; raises AmberboxError where there can be none."""
     if seen.known is None or not seen.stands:
-        return nothing_broken(seen.robot, as_of)
+        return _nothing(seen, now)
     card = _card(await answer_told(fleet, who, seen), seen, seen.known)
-    return _timed(card, seen, seen.known, fleet.clock.wall_ns())
+    return _timed(card, seen, seen.known, now, fleet.clock.wall_ns())
 
 
 async def answer_told(fleet: Services, who: Caller, seen: Look) -> Answer:
@@ -119,9 +120,9 @@ def asked_of(fleet: Services, robot: str, at: str = "", **more: Any) -> AskDiagn
     return AskDiagnosis(robot=robot, now_ns=fleet.clock.wall_ns(), at=at, **more)
 
 
-def current_card(fleet: Services, robot: str, as_of: str | None) -> DiagnosisCard:
+def current_card(fleet: Services, robot: str, now: Now | None = None) -> DiagnosisCard:
     """Return the card of what a robot has now, without waiting: for other pages."""
-    return card_now(fleet, look(fleet, robot), as_of)
+    return card_now(fleet, look(fleet, robot), now)
 
 
 def missing(fleet: Services, robot: str, ever_seen: bool) -> Missing:
@@ -184,10 +185,29 @@ def _card(answer: Answer, seen: Look, known: Known) -> DiagnosisCard:
     return replace(card, state=known.last.state, answers=seen.answers)
 
 
-def _timed(card: DiagnosisCard, seen: Look, known: Known, now_ns: int) -> DiagnosisCard:
-    """Return a card that says of each reason until when it was there, and if all are gone."""
+def _nothing(seen: Look, now: Now | None) -> DiagnosisCard:
+    if now is None:
+        return nothing_broken(seen.robot, None)
+    return replace(nothing_broken(seen.robot, now.status.as_of), status=now.status)
+
+
+def _timed(
+    card: DiagnosisCard, seen: Look, known: Known, now: Now | None, now_ns: int
+) -> DiagnosisCard:
+    """Return a card that says of each reason until when it was there, and if all are gone.
+
+    Of the diagnosis that the robot made last, its one status says whether anything is seen still.
+    """
     card = card.held(seen.holds)
     if seen.is_past:
         return replace(card, state="past")
-    gone_ns = gone_since(known.last, seen.holds, now_ns) if card.state == "open" else None
+    if now is not None and seen.is_newest:
+        card = replace(card, status=now.status)
+    if card.state != "open":
+        return card
+    standing = now.recent.diagnosis if now is not None else None
+    if now is not None and standing is not None and standing.id == known.id:
+        gone_ns = now.gone_ns
+    else:
+        gone_ns = gone_since(known.last.symptoms, seen.holds, now_ns)
     return card if gone_ns is None else replace(card, state="gone", gone=format_time(gone_ns))

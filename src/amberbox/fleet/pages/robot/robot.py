@@ -15,6 +15,7 @@ from amberbox.fleet.api.access import Fleet, OfRobot, Who
 from amberbox.fleet.api.forms import time_of
 from amberbox.fleet.api.robots import (
     Event,
+    known_now,
     list_events,
     read_card,
     read_link,
@@ -25,6 +26,7 @@ from amberbox.fleet.api.robots import (
 )
 from amberbox.fleet.data import remarks
 from amberbox.fleet.pages.datalinks import moment_href
+from amberbox.fleet.pages.diagnosis.card import DiagnosisCard
 from amberbox.fleet.pages.diagnosis.look import current_card
 from amberbox.fleet.pages.page import Pages, render
 from amberbox.fleet.pages.robot import expected, values
@@ -84,7 +86,7 @@ def show(
         fill=_fills(request, robot) if known is None else {},
         has_files=_has_files(fleet, who, robot, card), robot=robot,
         seen=_times(fleet, robot, look, tree), **_events(fleet, robot, kind, may["items.read"]),
-        diagnosis=current_card(fleet, robot.id, card.last_seen) if may["diagnoses.read"] else None,
+        diagnosis=_diagnosis(fleet, robot) if may["diagnoses.read"] else None,
         strings=("diagnosis",),
     )  # fmt: skip
 
@@ -204,6 +206,10 @@ def _href(fleet: Services, robot: str, event: Event) -> str:
     """Return where the data around an event are shown."""
     at_ns = time_of(event.at or "", fleet.clock)
     return "" if at_ns is None else moment_href(robot, (), at_ns)
+
+
+def _diagnosis(fleet: Services, robot: KnownRobot) -> DiagnosisCard:
+    return current_card(fleet, robot.id, known_now(fleet, robot))
 
 
 def _now(fleet: Services, who: Who, robot: KnownRobot) -> Mapping[str, Any]:

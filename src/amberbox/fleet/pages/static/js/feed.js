@@ -1,7 +1,8 @@
 // What changes on the server, as it changes: one socket per page, which comes back by itself.
 //
-// `data-feed` of the document is `live` or `lost`: lost when nothing was heard for 3 s, whatever
-// the network says. Pages grey out what is marked with the class `live` then.
+// `data-feed` of the document is `live` or `lost`: lost as soon as the socket closes, and when no
+// heartbeat was heard for 3 s (the server sends one each second), whatever the network says. Pages
+// grey out what is marked with the class `live` then, and say since when.
 
 import { signIn } from "./ask.js";
 import { all, one } from "./dom.js";
@@ -9,6 +10,7 @@ import { nowMs, refresh, rfc3339 } from "./time.js";
 
 const LOST_MS = 3000;
 const HANGS_MS = 10000;
+const BANNER_MS = 1000;
 const PATIENCE_MS = [250, 500, 1000, 2000, 4000, 8000];
 const ENDED = 4401;
 const FORBIDDEN = 4403;
@@ -43,6 +45,9 @@ export function listen({ robots = null, kinds = null, live = {} } = {}) {
 function start() {
   open();
   setInterval(watch, 500);
+  // a page that was out of sight, or a phone that slept, looks at once: its timers stood still
+  for (const woken of ["pageshow", "online", "offline"]) addEventListener(woken, watch);
+  document.addEventListener("visibilitychange", watch);
 }
 
 /** Ask for what all parts want together. */
@@ -97,6 +102,7 @@ function closed(code) {
     location.reload(); // the page itself says what is not allowed any more
     return;
   }
+  state("lost");
   const wait = PATIENCE_MS[Math.min(line.tries, PATIENCE_MS.length - 1)];
   line.tries += 1;
   line.isBack = true; // what was missed meanwhile comes with a snapshot
@@ -114,9 +120,17 @@ function state(now) {
   const root = document.documentElement;
   if (root.dataset.feed === now) return;
   root.dataset.feed = now;
+  const since = rfc3339(nowMs() - (performance.now() - line.heardMs));
+  for (const shown of all("[data-feed-since]")) {
+    shown.dateTime = since;
+    refresh(shown.parentElement);
+  }
+  if (now === "lost") setTimeout(warn, BANNER_MS);
+  else warn();
+}
+
+/** Show the banner for as long as nothing is heard; not where the line is back within a second. */
+function warn() {
   const banner = one(".lost-banner");
-  if (!banner) return;
-  banner.hidden = now !== "lost";
-  for (const since of all("[data-feed-since]", banner)) since.dateTime = rfc3339(nowMs() - LOST_MS);
-  refresh(banner);
+  if (banner) banner.hidden = document.documentElement.dataset.feed !== "lost";
 }

@@ -6,7 +6,7 @@ import { pieces, replace } from "../pieces.js";
 import { t } from "../strings.js";
 
 /** So long after trouble went one knows that nothing of it is seen any more. */
-const SETTLED_MS = 12000;
+export const SETTLED_MS = 12000;
 
 /**
  * Keep the card of a place up to date. Returns `renew()`, which asks for it anew.
@@ -71,7 +71,14 @@ function follow(feed, place, robot, renew) {
     feed.on("diagnosis", (_, of) => hear(of === robot)),
     feed.on("alarm", (_, of) => settle(of === robot)),
     feed.on("snapshot", () => hear((snapshots += 1) > 1)),
+    () => removeEventListener("statuschange", restate),
   ];
+  addEventListener("statuschange", restate);
+
+  /** The robot's status is another one: the card says what follows from it. */
+  function restate() {
+    hear(true);
+  }
 
   /** What an alarm is about may have gone: nothing else tells that nothing of it is seen. */
   function settle(isNews) {

@@ -4,7 +4,7 @@
 import { all, el, level as levelOf, one, setText, setWords } from "../dom.js";
 import { isMet } from "./expected.js";
 import { t } from "../strings.js";
-import { nowMs, span, when } from "../time.js";
+import { local, nowMs, span, when } from "../time.js";
 
 const DIGITS = 4;
 const [LONG_S, FOREVER_S] = [120, 1e9];
@@ -80,7 +80,7 @@ export function robotLive(page) {
     const k = key(said.component, said.mode);
     const known = rows.get(k);
     if (!known) return false;
-    measured.set(k, nowMs());
+    measured.set(k, nowMs() - 1000 * (said.age_s ?? 0));
     setLevel(known.level, said.level);
     const why = said.level === "ok" ? "" : said.reason || said.state.replaceAll("_", " ");
     setText(known.why, why);
@@ -120,11 +120,15 @@ export function robotLive(page) {
     for (const k of measured.keys()) measured.set(k, now - 1000 * (old.get(k) ?? newest));
   }
 
-  /** Write all ages: they count on, whether something comes or not. */
-  function tick() {
+  /**
+   * Write all ages: they count on, whether something comes or not. Of a robot that is away or
+   * silent it is written as of when each was measured.
+   */
+  function tick(isSilent = false) {
     const now = nowMs();
     for (const [k, { age }] of rows) {
-      if (measured.has(k)) setText(age, span(Math.max(1, (now - measured.get(k)) / 1000)));
+      const at = measured.get(k);
+      if (at !== undefined) setText(age, isSilent ? local(at, "time") : span(Math.max(1, (now - at) / 1000)));
     }
   }
 

@@ -127,8 +127,8 @@ function start() {
   page.addEventListener("click", follow);
   for (const place of [section, one(".robot-side")]) new MutationObserver(indexAnew).observe(place, { childList: true });
   setInterval(() => {
-    live.tick();
     presence.say();
+    live.tick(page.classList.contains("is-silent"));
   }, 1000);
   setInterval(stale.now, NOW_MS);
   setInterval(stale.trend, TREND_MS);
