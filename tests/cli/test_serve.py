@@ -84,7 +84,7 @@ class Server:
 
     def await_answer(self) -> None:
         """Wait until it answers."""
-        for _ in range(3000):
+        for _ in range(6000):
             assert self.process.poll() is None, self.process.communicate()
             try:
                 self.ask("/setup")

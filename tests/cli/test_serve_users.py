@@ -126,7 +126,7 @@ def test_a_robot_that_joins_too_early_hears_it_and_the_server_goes_on(
         assert main(["join", str(robot), line]) == 0
         assert server.ask("/setup")[0] == 404
     finally:
-        _, said_by_server, _ = server.stop()
+        _, said_by_server = server.stop()
     assert f"everybody on this computer can read {data} (mode 0755)" in said_by_server
     assert f"hint: chmod -R o-rwx {data}" in said_by_server
 

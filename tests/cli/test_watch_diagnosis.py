@@ -20,9 +20,16 @@ from amberbox.monitoring.configuration import load_plan
 from amberbox.monitoring.watcher.replay import replay
 from tests.cli.test_watch import folder as folder  # a fixture
 from tests.cli.test_watch import record
-from tests.monitoring.watcher.stand import Stand, component, kill, plan_of, positive, variable
+from tests.monitoring.watcher.stand import (
+    Stand,
+    component,
+    kill,
+    plan_of,
+    positive,
+    values_of,
+    variable,
+)
 from tests.monitoring.watcher.stand import written as written_in
-from tests.monitoring.watcher.test_trouble import values
 
 FMEA = """\
 instances: {motor: [motor], room: [room]}
@@ -156,6 +163,6 @@ def test_killed_at_any_moment_no_diagnosis_is_lost_or_doubled(tmp_path: Path, se
     watcher.step()
     watcher.close()
     live, replayed = written_in(stand.path), stand.replayed(plan)
-    assert len(values(live, "amberbox/diagnosis")) > 3
-    assert any(s["source"] == "condition" for s in values(live, "amberbox/symptom"))
+    assert len(values_of(live, "amberbox/diagnosis")) > 3
+    assert any(s["source"] == "condition" for s in values_of(live, "amberbox/symptom"))
     assert live == replayed

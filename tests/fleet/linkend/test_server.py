@@ -11,6 +11,7 @@ import pytest
 from sqlalchemy import select, text
 
 from amberbox.blackbox.journal import reserved
+from amberbox.core.robotstatus import Contact
 from amberbox.fleet.database.database import Database
 from amberbox.fleet.linkend import ledger
 from amberbox.fleet.linkend.board import board
@@ -21,7 +22,7 @@ from amberbox.fleet.linkend.server import Hooks, LinkServer
 from amberbox.fleet.linkend.sockets import SocketClosedError
 from amberbox.fleet.linkend.tables import BOOT, EVENT, HEADS, ROW
 from amberbox.fleet.state.said import SaidStatus
-from amberbox.fleet.state.standing import Moment, Standing, silence
+from amberbox.fleet.state.standing import Moment, Standing, monitoring_of, silence
 from amberbox.link.frames import (
     Ack,
     Beat,
@@ -311,10 +312,14 @@ def test_what_is_late_is_said_to_be_so_on_the_server() -> None:
     seen = Presence("r1", True, 1, 1, "s", "b", "", "1", 0, 0)
     when = Moment(26_000_000_000, None)
     late = Pulse("overloaded", 25.0)
-    assert silence(seen, True, [status], when) == "its watcher has said nothing for 26 s"
-    told = silence(seen, True, [status], when, late)
-    assert told == "monitoring overloaded: the watcher is 25 s behind"
-    assert silence(seen, False, [status], when, late) == "offline, last seen 26 s ago"
+
+    def said(contact: Contact, pulse: Pulse | None = None) -> str:
+        monitoring = monitoring_of([status], when, pulse)
+        return silence(contact, seen, monitoring, [status], when, pulse.delay_s if pulse else 0.0)
+
+    assert said("online") == "its watcher has said nothing for 26 s"
+    assert said("online", late) == "monitoring overloaded: the watcher is 25 s behind"
+    assert said("offline", late) == "offline, last seen 26 s ago"
 
 
 def test_the_board_goes_by_position_not_by_clock_or_arrival(database: Database) -> None:

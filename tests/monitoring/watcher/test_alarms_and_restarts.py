@@ -27,10 +27,10 @@ from tests.monitoring.watcher.stand import (
     kill,
     positive,
     run_for,
+    values_of,
     variable,
     written,
 )
-from tests.monitoring.watcher.test_trouble import values
 
 
 def only(*parts: ComponentPlan, config_hash: str = "hash") -> Plan:
@@ -64,8 +64,8 @@ def begun(stand: Stand, plan: Plan, value: float = -1.0) -> Watcher:
 
 def states(stand: Stand) -> dict[str, str]:
     """Return how each alarm stands by its newest record, live only or not, by component."""
-    alarms = [*values(written(stand.path), "amberbox/alarm")]
-    alarms += values(written(stand.path, live_only=True), "amberbox/alarm")
+    alarms = [*values_of(written(stand.path), "amberbox/alarm")]
+    alarms += values_of(written(stand.path, live_only=True), "amberbox/alarm")
     newest = {str(a["component"]): a for a in sorted(alarms, key=lambda a: str(a["changed_ns"]))}
     lasting = {a.component: a.state for a in standing_in(open_store(stand.path)).alarms.values()}
     return {name: lasting.get(name, "healed") for name in newest}
@@ -79,7 +79,7 @@ def test_an_alarm_of_a_component_that_is_gone_heals(tmp_path: Path) -> None:
     live(stand, watcher, 20, -1.0)
     watcher.close()
     assert states(stand) == {"base": "open", "arm": "healed"}
-    alarms = values(written(stand.path, live_only=True), "amberbox/alarm")
+    alarms = values_of(written(stand.path, live_only=True), "amberbox/alarm")
     (healed,) = [alarm for alarm in alarms if alarm["state"] == "healed"]
     assert (healed["component"], healed["reason"]) == ("arm", CHANGED)
 
@@ -88,7 +88,7 @@ def test_an_alarm_that_stands_heals_under_other_monitors(tmp_path: Path) -> None
     """It keeps its id, what was said of it, and its end is written down."""
     stand = Stand(tmp_path / "store")
     watcher = begun(stand, only(base()))
-    (opened,) = values(written(stand.path), "amberbox/alarm")
+    (opened,) = values_of(written(stand.path), "amberbox/alarm")
     submit(watcher._watch.store, "alarm", _said("acknowledge", opened["id"]))
     live(stand, watcher, 5, -1.0)
     watcher.close()
@@ -98,7 +98,7 @@ def test_an_alarm_that_stands_heals_under_other_monitors(tmp_path: Path) -> None
     assert (alarm.id, alarm.state, alarm.who) == (opened["id"], "acknowledged", "anna")
     live(stand, watcher, 30, 1.0)
     watcher.close()
-    healed = values(written(stand.path), "amberbox/alarm")[-1]
+    healed = values_of(written(stand.path), "amberbox/alarm")[-1]
     assert (healed["id"], healed["state"]) == (opened["id"], "healed")
 
 
@@ -211,6 +211,6 @@ def test_an_explanation_that_hangs_is_done_without(
         stand.box.write(0.1)
     watcher = stand.watcher(only(component("base", positive, variable("ros_main"), explain=stuck)))
     run_for(watcher, threading.Event(), 2.0)
-    (*_, status) = values(written(stand.path), "amberbox/status")
+    (*_, status) = values_of(written(stand.path), "amberbox/status")
     assert status["level"] == "error"
     assert "no explanation: HangError" in str(status["reason"])

@@ -36,10 +36,10 @@ from tests.monitoring.watcher.stand import (
     line_of,
     plan_of,
     positive,
+    values_of,
     variable,
     written,
 )
-from tests.monitoring.watcher.test_trouble import values
 
 
 def stand_of(path: Path, seed: int) -> Stand:
@@ -64,7 +64,7 @@ def live(stand: Stand, watcher: Watcher, ticks: int, main: float) -> None:
 
 
 def channel(stand: Stand, name: str, *, live_only: bool = False) -> Sequence[Mapping[str, Any]]:
-    return values(written(stand.path, live_only=live_only), f"amberbox/{name}")
+    return values_of(written(stand.path, live_only=live_only), f"amberbox/{name}")
 
 
 @pytest.mark.parametrize("seed", range(3))
