@@ -35,7 +35,7 @@ def broken(site: Site, request: pytest.FixtureRequest) -> Iterator[str]:
     silent = Symptom(NO_SCANS, "present", NO_SCANS, at_ns, at_ns,
                      evidence=(("sim_scan_front", at_ns, at_ns),))  # fmt: skip
     knowledge = declared(FOLDER, ROBOT, HASH_2).knowledge()
-    heading = Heading(f"{ROBOT}-{request.node.name[:24]}", 1, at_ns)
+    heading = Heading(f"{ROBOT}-hot-{request.node.callspec.params['theme']}", 1, at_ns)
     found = answer(knowledge, Situation((silent,), watched=True), heading)
     robot.say(silent, found)
     yield f"/robots/{ROBOT}/diagnosis"
@@ -59,7 +59,7 @@ def hot(site: Site, request: pytest.FixtureRequest) -> Iterator[str]:
     heats = Symptom(HEATS, "present", HEATS, at_ns - 5 * ns, at_ns - 5 * ns, reason=rate)
     warm = Symptom(HOT, "present", HOT, at_ns, at_ns, reason="temperature is 58.2 °C, at most 50")
     knowledge = declared(FOLDER, ROBOT, HASH_2).knowledge()
-    heading = Heading(f"{ROBOT}-{request.node.name[:24]}", 1, at_ns)
+    heading = Heading(f"{ROBOT}-hot-{request.node.callspec.params['theme']}", 1, at_ns)
     found = answer(knowledge, Situation((lost, heats, warm), watched=True), heading)
     gone = Symptom(JUMPS, "absent", JUMPS, None, at_ns - 30 * ns)
     robot.say(lost, gone, heats, warm, found)

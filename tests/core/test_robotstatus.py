@@ -45,7 +45,9 @@ SEEN = st.builds(
         (replace(FINE, diagnosed=True), "warn", "Something is not as expected."),
         (replace(FINE, diagnosed=True, effect="fatal"), "error",
          "Fatal: it must stop and stay stopped."),
-        (replace(FINE, monitoring="overloaded"), "warn", "Something is not as expected."),
+        (replace(FINE, monitoring="overloaded", delay_s=25.3), "unknown",
+         "Its monitoring is overloaded: what it says comes 25 s late. "
+         "When it was last heard of: fine."),
         (replace(FINE, contact="offline"), "unknown", "When it was last heard of: fine."),
         (replace(FINE, contact="offline", level="error", alarm="urgent"), "unknown",
          "When it was last heard of: error; urgent: it works, see to it soon."),
@@ -77,7 +79,6 @@ def test_the_reason_is_of_what_makes_it_as_it_is() -> None:
     busy = replace(FINE, level="warn", reason="host: busy", alarm_reason="laser: dead")
     assert judge(busy).reason == "host: busy"
     assert judge(replace(busy, alarm="critical")).reason == "laser: dead"
-    assert "overloaded" in judge(replace(FINE, monitoring="overloaded")).reason
 
 
 @fuzz
