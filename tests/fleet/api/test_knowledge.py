@@ -253,7 +253,8 @@ def test_two_answers_at_the_same_time_both_count(
     monkeypatch.setattr(home.services.asking, "ask", slowly)
     first = operator.post(path, json={"test": "laser_front.lamp", "answer": "yes"})
     assert len(asked) == 3  # the first one again, with the answer of the other
-    assert first.json()["answers"] == {"laser_front.lamp": "yes", "laser_front.sound": "yes"}
+    both = {"laser_front.lamp": "yes", "laser_front.sound": "yes"}
+    assert both.items() <= first.json()["answers"].items()
     kept = operator.get(f"{PATH}/diagnoses/{sim.DIAGNOSIS}").json()["server_revisions"][-1]
     assert kept["diagnosis"]["answers"] == first.json()["answers"]
 

@@ -14,6 +14,7 @@ from amberbox.core.clock import NS
 from amberbox.core.types import Status
 from amberbox.monitoring.engine.findings import AlarmChange, Finding
 from amberbox.monitoring.messages.board import Board, BoardReader, duration
+from amberbox.monitoring.messages.pulse import Pulse
 from amberbox.monitoring.messages.records import record_of
 from amberbox.testing.records import T0_NS, FakeRun
 from tests.monitoring.messages.laser import COMPONENT, OF_DEVICE, OF_HEARTBEAT
@@ -95,7 +96,7 @@ def test_silence_says_for_how_long_and_whether_the_watcher_runs(
 
 
 def test_board_without_any_status(store: Store) -> None:
-    assert read(store, 0) == Board((), [], 0, "the watcher has said nothing yet")
+    assert read(store, 0) == Board((), [], 0, "the watcher has said nothing yet", Pulse("absent"))
 
 
 def test_watcher_that_catches_up_is_not_believed(store: Store, watcher: FakeRun) -> None:

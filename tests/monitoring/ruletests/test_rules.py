@@ -40,7 +40,8 @@ def test_bad_rules_say_where_and_what(path: Path) -> None:
 
 def test_what_came_instead_is_told() -> None:
     told = "\n".join(problem.what for problem in _problems(FIXTURES / "differs.bad.yaml"))
-    assert "(at 5 s came tested/cooler: nominal -> cool: cool is false, expected true)" in told
+    why = "cool is false, expected true: t is 90, at most 80"
+    assert f"(at 5 s came tested/cooler: nominal -> cool: {why})" in told
     assert "(at 5 s came alarm of tested (urgent) open: cool is false" in told
 
 
