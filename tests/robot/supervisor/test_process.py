@@ -146,7 +146,7 @@ sys.path[:0] = {path!r}
 from amberbox.robot.supervisor.child import Child
 from amberbox.robot.supervisor.output import Voice
 from amberbox.robot.supervisor.process import RealProcess
-command = [sys.executable, "-S", "-c", "import time; print('up', flush=True); time.sleep(60)"]
+command = [sys.executable, "-S", "-c", "import os, time; os.write(1, b'up'); time.sleep(60)"]
 def say(text): pass
 made = []
 for outlives in (False, True):
