@@ -156,6 +156,7 @@ def blamable(site: Site, faults: Sequence[Fault]) -> set[str]:
     of = catalogue()
     found = {of[fault.name].component for fault in faults}
     found |= {name for fault in faults for name in (*of[fault.name].affects, *fault.shows)}
+    found.add("log")  # it tells of each task that is given up, whatever the reason
     needs = {
         one["component"]: {need["component"] for need in one["needs"]} | {one["part_of"]}
         for one in site.ask(f"/robots/{ROBOT}/status")["components"]
