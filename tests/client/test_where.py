@@ -13,6 +13,8 @@ import pytest
 
 from amberbox.cli.main import main
 from amberbox.client import servers
+from amberbox.client.fleet import Fleet
+from amberbox.client.models import Card
 from amberbox.client.remote import NOT_YET, RemoteRecord
 from amberbox.core.types import Gap
 from amberbox.testing.records import T0_NS
@@ -146,6 +148,20 @@ def test_status_of_a_server_is_that_of_its_fleet_worst_first(
     assert [one["robot"] for one in found["robots"]] == ["ropod_001", "ropod_002", "ropod_003"]
     assert {one["level"] for one in found["robots"]} == {"unknown"}
     assert "--robot" in refused(capsys, "status", server, "laser_front")
+
+
+def test_robots_that_are_switched_off_are_last_and_do_not_count(
+    monkeypatch: pytest.MonkeyPatch, capsys: Capture
+) -> None:
+    cards = [
+        Card("a", disabled=True, level="unknown"),
+        Card("b", online=True, level="ok", last_level="ok"),
+        Card("c", online=True, level="warn", last_level="warn"),
+    ]
+    monkeypatch.setattr(Fleet, "robots", lambda _: cards)
+    lines = said(capsys, "status", "https://server.example").splitlines()
+    assert [line.split()[0] for line in lines[2:]] == ["c", "b", "a"]
+    assert lines[-1].endswith("Switched off by an admin.")
 
 
 def test_a_diagnosis_is_told_as_on_the_robot(

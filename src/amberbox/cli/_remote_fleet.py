@@ -43,9 +43,9 @@ def is_fleet(args: argparse.Namespace) -> bool:
 
 
 def robots_of(fleet: Fleet) -> list[Robot]:
-    """Return the robots that one may see, the worst first."""
+    """Return the robots that one may see, the worst first; at the end those switched off."""
     found = [Robot(card, _status(card)) for card in fleet.robots()]
-    return sorted(found, key=lambda one: (-one.status.rank, one.card.robot))
+    return sorted(found, key=lambda one: (one.card.disabled, -one.status.rank, one.card.robot))
 
 
 def show(robots: Sequence[Robot], args: argparse.Namespace) -> None:
@@ -69,8 +69,9 @@ def watch(fleet: Fleet, args: argparse.Namespace) -> NoReturn:
 
 
 def verdict(robots: Sequence[Robot]) -> int:
-    """Return 0 if every robot is known to work, as ``status`` of one robot does."""
-    return int(any(one.status.level not in ("ok", "warn") for one in robots))
+    """Return 0 if every robot that is not switched off is known to work, as of one robot."""
+    meant = (one for one in robots if not one.card.disabled)
+    return int(any(one.status.level not in ("ok", "warn") for one in meant))
 
 
 def _status(card: Card) -> RobotStatus:
@@ -125,6 +126,8 @@ def _alarms(card: Card) -> str:
 def _said(one: Robot) -> str:
     """Say in a line how a robot is: of one that is away, as of when."""
     status = one.status
+    if one.card.disabled:
+        return "Switched off by an admin."
     if status.is_current:
         return " ".join(f"{status.text} {status.reason}".split())
     away = {"offline": "Offline.", "silent": "Silent.", "never": "Never connected."}

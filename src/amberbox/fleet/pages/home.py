@@ -104,7 +104,7 @@ def _fits(card: Card, look: Look) -> bool:
 
 def _order(sort: Sort) -> Callable[[Card], tuple[Any, ...]]:
     keys: Mapping[Sort, Callable[[Card], tuple[Any, ...]]] = {
-        "worst": lambda c: (-c.status.rank, c.robot),
+        "worst": lambda c: (c.disabled, -c.status.rank, c.robot),
         "name": lambda c: (c.robot,),
         "battery": lambda c: (c.battery is None, c.battery.percent if c.battery else 0.0, c.robot),
         "seen": lambda c: (c.online, c.last_seen or "", c.robot),
