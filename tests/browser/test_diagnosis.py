@@ -24,7 +24,6 @@ if TYPE_CHECKING:
 BASE = "/robots/ropod_001/diagnosis"
 ROBOT = "ropod_002"
 NO_SCANS = "laser_front/heartbeat/alive"
-"""The first question of all takes a worker long on a busy machine."""
 
 
 @pytest.fixture
@@ -35,7 +34,7 @@ def broken(site: Site, request: pytest.FixtureRequest) -> Iterator[str]:
     silent = Symptom(NO_SCANS, "present", NO_SCANS, at_ns, at_ns,
                      evidence=(("sim_scan_front", at_ns, at_ns),))  # fmt: skip
     knowledge = declared(FOLDER, ROBOT, HASH_2).knowledge()
-    heading = Heading(f"{ROBOT}-hot-{request.node.callspec.params['theme']}", 1, at_ns)
+    heading = Heading(f"{ROBOT}-{request.node.name[:24]}", 1, at_ns)
     found = answer(knowledge, Situation((silent,), watched=True), heading)
     robot.say(silent, found)
     yield f"/robots/{ROBOT}/diagnosis"
