@@ -59,3 +59,8 @@ def test_the_reason_has_value_unit_and_the_limit_that_was_crossed() -> None:
     assert mode.reason(config, cold) == f"{name} is 3 °C, at least 5"
     assert mode.reason(config, none) == f"{name} is no number"
     assert mode.reason(Config(max=60), hot) == ""
+
+
+def test_a_text_is_no_number_in_the_reason_either() -> None:
+    entry = one_input(times_s=[0], values=["E-STOP"])
+    assert mode.reason(Config(max=1), Given([entry], int(at_s(0)))).endswith("is no number")

@@ -71,7 +71,7 @@ def evaluate(config: Config, inputs: Sequence[Input], now: Now) -> Mapping[str, 
 def reason(config: Config, given: Given) -> str:
     """Say which values are outside of which limit; none within the hysteresis alone."""
     low, high = min(config.min, as_single(config.min)), max(config.max, as_single(config.max))
-    found = ((one.name, float(one.at(given.now_ns))) for one in given.inputs)
+    found = ((one.name, float(numbers(one.at(given.now_ns))[()])) for one in given.inputs)
     return "; ".join(
         f"{variable_text(name)} is {given.limited(value, config.min, config.max)}"
         for name, value in found if not low <= value <= high
