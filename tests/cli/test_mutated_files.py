@@ -51,7 +51,7 @@ missions:
   - {name: carry, start: sim_state.state == 1, end: sim_state.state == 2, parameters: {a: sim_state.id}, max: 1 h}
 incidents: {share: 30 %, per_hour: 5}
 monitoring: {stale_after: 3 s}
-"""  # noqa: E501
+"""  # noqa: E501 - lines of YAML as people write them
 
 
 class Shipped(NamedTuple):

@@ -44,7 +44,7 @@ class Stalls:
 
     def snapshot(self) -> list[list[int]]:
         """Return what ``add`` takes again."""
-        return np.stack([self._starts, self._ends], axis=1).tolist()  # type: ignore[no-any-return]
+        return np.stack([self._starts, self._ends], axis=1).tolist()  # type: ignore[no-any-return]  # numpy says Any
 
     def next_after(self, time_ns: int) -> tuple[int, int] | None:
         """Return the first stall whose effects reach beyond a time, and when these are over."""

@@ -101,7 +101,7 @@ def test_slow_evaluation_is_overload_and_not_a_silent_recorder(
     take = Evaluation.take
 
     def slowly(self: Evaluation, block: object) -> object:
-        yield from take(self, block)  # type: ignore[arg-type]
+        yield from take(self, block)  # type: ignore[arg-type]  # the function that it stands for
         for _ in range(200):
             stand.tick()
 
