@@ -1,0 +1,1 @@
+"""Show that two versions of Amberbox behave byte for byte alike, seen from outside."""
