@@ -17,24 +17,21 @@ from pathlib import Path
 
 from sqlalchemy import select
 
-from amberbox.blackbox.journal import reserved
+from amberbox.blackbox.journal import channels
 from amberbox.core.clock import NS
-from amberbox.fleet.accounts.robotkeys import add_robot
-from amberbox.fleet.alarms.alarm import Alarm
-from amberbox.fleet.alarms.alarms import Alarms
-from amberbox.fleet.alarms.register import Register
-from amberbox.fleet.alarms.tables import ALARM
-from amberbox.fleet.bus import Bus, Change
-from amberbox.fleet.database.database import FILE, Database
-from amberbox.fleet.linkend import ledger
-from amberbox.fleet.notifying.settings import NAME, Notifications, Webhook
-from amberbox.fleet.notifying.tables import OUTBOX
-from amberbox.fleet.options.options import write
 from amberbox.link.frames import Hello
-from amberbox.link.frames import Row as LinkRow
-from amberbox.monitoring.engine.findings import AlarmChange
-from amberbox.monitoring.messages.records import encoded
-from amberbox.monitoring.watcher.instants import instant_of
+from amberbox.link.frames import LinkRow as LinkRow
+from amberbox.monitoring.findings import AlarmChange, encoded, instant_of
+from amberbox.server.accounts.robots import add_robot
+from amberbox.server.alarms.alarm import Alarm
+from amberbox.server.alarms.manager import Alarms
+from amberbox.server.alarms.recipients import NAME, Notifications, Webhook
+from amberbox.server.alarms.store import AlarmRegister
+from amberbox.server.bus import EventBus, ServerChange
+from amberbox.server.database import FILE, ServerDatabase
+from amberbox.server.ingest import ledger
+from amberbox.server.schema import ALARM, OUTBOX
+from amberbox.server.settings import write
 from amberbox.sim.robot import START_NS
 from amberbox.testing.clock import ManualClock
 from benchmarks.common import Row
@@ -45,7 +42,7 @@ HOURS = float(os.environ.get("BENCH_ALARM_HOURS", "0.5"))
 CHUNK_H = 0.25
 STORM = 200
 _STORE = "12345678-1234-1234-1234-123456789012"
-_CHANNELS = (reserved.ALARM, reserved.DIAGNOSIS, reserved.EVENT)
+_CHANNELS = (channels.ALARM, channels.DIAGNOSIS, channels.EVENT)
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,15 +104,15 @@ def played(told: Sequence[Sequence[Heard]]) -> Outcome:
     """Let a server hear what the watchers of robots wrote, each at its time, and 10 min more."""
     with tempfile.TemporaryDirectory() as place:
         clock = ManualClock(START_NS)
-        database = Database(Path(place) / FILE, clock)
-        bus = Bus()
+        database = ServerDatabase(Path(place) / FILE, clock)
+        bus = EventBus()
         alarms = Alarms(database, bus, clock)
         try:
             _settle(database, clock, bus, len(told))
             alarms.step()
             seconds = _play(alarms, bus, clock, told)
             with database.reading() as connection:
-                found = Register(connection).alarms(ALARM.c.merged_into.is_(None))
+                found = AlarmRegister(connection).alarms(ALARM.c.merged_into.is_(None))
                 messages = len(connection.execute(select(OUTBOX.c.number)).all())
         finally:
             alarms.close()
@@ -123,7 +120,7 @@ def played(told: Sequence[Sequence[Heard]]) -> Outcome:
     return Outcome(found, messages, seconds)
 
 
-def _settle(database: Database, clock: ManualClock, bus: Bus, robots: int) -> None:
+def _settle(database: ServerDatabase, clock: ManualClock, bus: EventBus, robots: int) -> None:
     """Make robots known and let them connect; somebody wants to hear of everything."""
     hook = Webhook("hook", "https://hook.example/", "0123456789abcdef")
     with database.begin() as connection:
@@ -134,10 +131,14 @@ def _settle(database: Database, clock: ManualClock, bus: Bus, robots: int) -> No
         hello = Hello(f"robot_{number}", _STORE, "b1", {}, "h", clock.wall_ns(), 0, "1")
         with database.begin() as connection:
             admission = ledger.admit(connection, hello, clock.wall_ns())
-        bus.publish(Change("connected", hello.robot, {"hello": hello, "admission": admission}))
+        bus.publish(
+            ServerChange("connected", hello.robot, {"hello": hello, "admission": admission})
+        )
 
 
-def _play(alarms: Alarms, bus: Bus, clock: ManualClock, told: Sequence[Sequence[Heard]]) -> float:
+def _play(
+    alarms: Alarms, bus: EventBus, clock: ManualClock, told: Sequence[Sequence[Heard]]
+) -> float:
     """Return for how long the server was at it."""
     entries = sorted(
         ((one.at_ns, robot, seq, one) for robot, some in enumerate(told)
@@ -156,5 +157,5 @@ def _play(alarms: Alarms, bus: Bus, clock: ManualClock, told: Sequence[Sequence[
     return time.perf_counter() - start_s
 
 
-def _publish(bus: Bus, robot: str, row: LinkRow) -> None:
-    bus.publish(Change("rows", robot, {"store_id": _STORE, "rows": [row]}))
+def _publish(bus: EventBus, robot: str, row: LinkRow) -> None:
+    bus.publish(ServerChange("rows", robot, {"store_id": _STORE, "rows": [row]}))

@@ -7,25 +7,30 @@ import shutil
 import tempfile
 import time
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from amberbox.blackbox.columns.flat_tables import FlatTable, TableSchema
 from amberbox.blackbox.journal.writer import JournalOptions, JournalWriter
-from amberbox.blackbox.segments.flat import Flat, TableSchema
-from amberbox.blackbox.store import create_store
+from amberbox.blackbox.store.store import create_store
 from amberbox.core.clock import NS
 from amberbox.core.types import Column, Schema, Topic
-from amberbox.fleet.archive.catalogue import Source
-from amberbox.fleet.archive.files import table_of, tables_of
-from amberbox.fleet.archive.folder import FolderArchive
-from amberbox.fleet.archive.journal import Facts, encode
-from amberbox.fleet.archive.log import LiveFile
-from amberbox.fleet.archive.pyramid import Climb
-from amberbox.fleet.archive.store import JournalKey
-from amberbox.fleet.archive.worker import Worker
-from amberbox.fleet.archive.writing import FileBuilder, Origin, Place
+from amberbox.server.archive.catalogue import RobotStore
+from amberbox.server.archive.delta_files import (
+    FileBuilder,
+    JournalOrigin,
+    LiveFile,
+    TableFilePath,
+    table_of,
+    tables_of,
+)
+from amberbox.server.archive.folder import FolderArchive
+from amberbox.server.archive.rollups import RollupBuilder
+from amberbox.server.archive.worker import ArchiveWorker
+from amberbox.server.journals import JournalFacts, JournalKey, encode
 from benchmarks.common import Row, percentile, wall_s
 from benchmarks.query import definition, fifty_columns
 
@@ -37,7 +42,7 @@ RATE_HZ = 10
 FILE_S = 600
 _FILES_A_DAY = 24 * 3600 // FILE_S
 _ROWS = FILE_S * RATE_HZ
-_SOURCE = Source("r1", "00000000-0000-4000-8000-000000000001")
+_SOURCE = RobotStore("r1", "00000000-0000-4000-8000-000000000001")
 _COLUMNS = tuple(Column(name, name, "float64") for name in ("x", "y", "volts", "amps"))
 _SCHEMA = TableSchema("drive", "bench/Drive", _COLUMNS, topic="/drive", source="bench")
 
@@ -56,7 +61,7 @@ def measure() -> list[Row]:
 
 def make_month(archive: FolderArchive) -> None:
     """Write a month of one item as the worker leaves it: a file a day, its levels above it."""
-    from amberbox.fleet.archive import delta
+    from amberbox.server.archive import delta_files
 
     random = np.random.default_rng(1)
     walks = np.cumsum(random.normal(0, 0.01, (4, _FILES_A_DAY * _ROWS)), axis=1).round(3)
@@ -68,7 +73,7 @@ def make_month(archive: FolderArchive) -> None:
         for table, builder in builders.items():
             files: list[LiveFile] = [builder.finish()]
             folder = archive.layout.tables / table
-            delta.change(folder, builder.schema, files, batch=day + 1, about="bench")
+            delta_files.change_table(folder, builder.schema, files, batch=day + 1, about="bench")
     archive.catalogue.plan(archive.catalogue.waiting(), 0)
     batch = archive.catalogue.open_batch()
     assert batch is not None
@@ -83,25 +88,25 @@ def _add_journal(
     times = START_NS + seq * (NS // RATE_HZ)
     part = walks[:, number * _ROWS : (number + 1) * _ROWS]
     columns = {column.name: line for column, line in zip(_COLUMNS, part, strict=True)}
-    flat = Flat(_SCHEMA, "main", 1, seq, times, times, times, columns)
-    climb = Climb(_SCHEMA)
+    flat = FlatTable(_SCHEMA, "main", 1, seq, times, times, times, columns)
+    climb = RollupBuilder(_SCHEMA)
     climb.add(flat)
     name = f"journal/000001-bench000-{file:04}.mcap"
-    origin = Origin(name, "", ((int(times[0]), 0),))
+    origin = JournalOrigin(name, "", ((int(times[0]), 0),))
     for level, rows in (("", flat), *climb.levels()):
         table = table_of(_SCHEMA, level)
         if table not in builders:
             date = str(np.datetime64(int(times[0]) // NS, "s"))[:10]
-            place = Place(table, _SOURCE, date, f"{day:08}")
+            place = TableFilePath(table, _SOURCE, date, f"{day:08}")
             builders[table] = FileBuilder(archive.layout.tables, place, rows.schema)
         builders[table].add(rows)
         builders[table].end_part(origin, "main", 1)
     archive.catalogue.add(_journal_row(name, flat))
 
 
-def _journal_row(name: str, flat: Flat) -> dict[str, Any]:
+def _journal_row(name: str, flat: FlatTable) -> dict[str, Any]:
     first_ns, last_ns = int(flat.log_time_ns[0]), int(flat.log_time_ns[-1])
-    facts = Facts(
+    facts = JournalFacts(
         [(first_ns, 0, True, first_ns - START_NS), (last_ns, 0, True, last_ns - START_NS)]
     )
     return {
@@ -148,7 +153,7 @@ def _commits(folder: Path) -> Iterator[Row]:
         copy = folder / "upload"
         shutil.copyfile(path, copy)
         archive.put(key, copy)
-    with Worker(folder / "server") as worker:
+    with closing(ArchiveWorker(folder / "server")) as worker:
         worker.sweep()  # it is up
         began = time.perf_counter()
         done = worker.commit(0.0)

@@ -18,17 +18,17 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from amberbox.blackbox.follow.read import journals
 from amberbox.blackbox.recorder.pipeline import PipelineOptions
-from amberbox.blackbox.segments.build import build_segments
-from amberbox.blackbox.signing.sealing import seal_journals
-from amberbox.blackbox.store import open_store
+from amberbox.blackbox.signing.signatures import seal_journals
+from amberbox.blackbox.store.journal_reader import journals
+from amberbox.blackbox.store.segment_builder import build_segments
+from amberbox.blackbox.store.store import open_store
 from amberbox.core.clock import NS
-from amberbox.core.timetext import format_time
-from amberbox.testing.box import WRITE_S, ManualBox
+from amberbox.core.timestamps import format_time
 from amberbox.testing.clock import ManualClock
 from benchmarks import mix
 from benchmarks.common import Row, meanwhile
+from tests.support.manual_recorder import WRITE_S, ManualBox
 
 REPEATS = 7
 HOUR_S = 3600

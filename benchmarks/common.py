@@ -1,8 +1,9 @@
-"""One measured number as a row, and how CPU time and rates are measured."""
+"""One measured number as a row; how CPU time and rates are measured; a free port."""
 
 from __future__ import annotations
 
 import gc
+import socket
 import statistics
 import threading
 import time
@@ -58,6 +59,12 @@ def wall_s(work: Callable[[], object], repeats: int = 5) -> float:
 def rate(count: int, work: Callable[[], object], repeats: int = 5) -> float:
     """How many of ``count`` pieces ``work`` does per CPU second: the median of ``repeats`` runs."""
     return count / max(cpu_s(work, repeats), 1e-9)
+
+
+def free_port() -> int:
+    """Return a TCP port of this computer that nobody listens at."""
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        return int(probe.getsockname()[1])
 
 
 def percentile(values: list[float], percent: float) -> float:

@@ -19,8 +19,7 @@ from functools import partial
 from typing import Any
 
 from amberbox.core.needs import Needs, all_of, any_of
-from amberbox.diagnosis.covering.answer import Answer, diagnose
-from amberbox.diagnosis.covering.evidence import Evidence, Observation
+from amberbox.diagnosis.covering.hypotheses import RankedHypotheses, diagnose
 from amberbox.diagnosis.covering.model import (
     UNKNOWN,
     Function,
@@ -31,7 +30,7 @@ from amberbox.diagnosis.covering.model import (
     Unknown,
 )
 from amberbox.diagnosis.covering.next_test import next_tests, with_answer
-from amberbox.diagnosis.covering.prediction import predict
+from amberbox.diagnosis.covering.observations import Evidence, Observation, predict
 from benchmarks.common import Row, percentile
 
 SIZES = ((200, 500, 300), (500, 2000, 750), (1000, 5000, 1500))
@@ -56,7 +55,7 @@ class Outcome:
     """What the engine made of a case."""
 
     case: Case
-    answer: Answer
+    answer: RankedHypotheses
     rank_ms: float
     test_ms: float
 
@@ -197,7 +196,7 @@ def _visible(model: Model, case: Case) -> bool:
     return all(present & predict(model, {fault}).misses.keys() for fault in case.faults)
 
 
-def _in_groups(answer: Answer, faults: frozenset[str], groups: int) -> bool:
+def _in_groups(answer: RankedHypotheses, faults: frozenset[str], groups: int) -> bool:
     names = {hypothesis.id: hypothesis.faults for hypothesis in answer.hypotheses}
     return any(
         names[member] == faults
@@ -206,7 +205,7 @@ def _in_groups(answer: Answer, faults: frozenset[str], groups: int) -> bool:
     )
 
 
-def _with_tests(model: Model, outcome: Outcome) -> tuple[Answer, int]:
+def _with_tests(model: Model, outcome: Outcome) -> tuple[RankedHypotheses, int]:
     """Read what is proposed until nothing more is, at most ``TESTS`` times."""
     answer, evidence = outcome.answer, outcome.case.evidence
     for number in range(TESTS):

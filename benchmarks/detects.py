@@ -19,11 +19,10 @@ from multiprocessing import get_context
 from pathlib import Path
 
 from amberbox.core.types import Symptom
-from amberbox.diagnosis.tracking.tracker import Tracker
-from amberbox.monitoring.engine.engine import Engine
-from amberbox.monitoring.watcher.diagnosing import Diagnosing
-from amberbox.sim import catalogue
-from amberbox.sim.catalogue import Fault
+from amberbox.diagnosis.tracker import FaultTracker
+from amberbox.monitoring.engine import Engine
+from amberbox.monitoring.record_evaluation import DiagnosedEngine
+from amberbox.sim.faults import SimulatedFault, catalogue
 from amberbox.sim.robot import START_NS
 from benchmarks.diagnosis import interval, polite, world
 from benchmarks.missions import Batches, live, mode_of, seconds_of, with_faults
@@ -57,7 +56,7 @@ def work(job: Job) -> Shown:
     fault = chance.choice(kinds()[job.kind])
     mission = with_faults(FIRST_SEED + chance.randrange(10_000), [fault], chance)
     at = world()
-    watcher = Diagnosing(Engine(at.plan), Tracker(at.knowledge))
+    watcher = DiagnosedEngine(Engine(at.plan), FaultTracker(at.knowledge))
     watcher.begin(START_NS)
     batches = Batches(at.wanted)
     symptoms: dict[str, float] = {}
@@ -73,9 +72,9 @@ def work(job: Job) -> Shown:
     return Shown(fault.id, mode, mission.faults[0].magnitude, symptoms)
 
 
-def kinds() -> dict[str, list[Fault]]:
+def kinds() -> dict[str, list[SimulatedFault]]:
     """Return the faults of the catalogue by kind: one that several units can have is one kind."""
-    found: dict[str, list[Fault]] = {}
+    found: dict[str, list[SimulatedFault]] = {}
     for fault in catalogue().values():
         found.setdefault(_pooled(fault.id, _place_of(fault.id)), []).append(fault)
     return found

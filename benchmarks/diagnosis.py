@@ -24,20 +24,20 @@ from itertools import pairwise
 from multiprocessing import get_context
 from pathlib import Path
 
-from amberbox.blackbox.folder.folder import load_folder
+from amberbox.blackbox.robot_folder.folder import load_folder
 from amberbox.cli.main import main as amberbox
-from amberbox.consult.knowledge import knowledge_of
+from amberbox.consult.folder_knowledge import load_knowledge
 from amberbox.core.clock import NS
 from amberbox.core.types import Diagnosis
 from amberbox.diagnosis.covering.model import UNKNOWN
 from amberbox.diagnosis.knowledge import Knowledge
-from amberbox.diagnosis.tracking.tracker import Tracker
-from amberbox.monitoring.configuration import load_plan
-from amberbox.monitoring.engine.engine import Engine
-from amberbox.monitoring.engine.findings import Finding
-from amberbox.monitoring.plan import Plan
-from amberbox.monitoring.watcher.diagnosing import Diagnosing
-from amberbox.sim.catalogue import load_faults
+from amberbox.diagnosis.tracker import FaultTracker
+from amberbox.monitoring.engine import Engine
+from amberbox.monitoring.findings import Finding
+from amberbox.monitoring.plan import MonitoringPlan
+from amberbox.monitoring.plan_loader import load_plan
+from amberbox.monitoring.record_evaluation import DiagnosedEngine
+from amberbox.sim.faults import load_faults
 from amberbox.sim.robot import START_NS
 from benchmarks.common import Row
 from benchmarks.missions import (
@@ -100,7 +100,7 @@ class Outcome:
 class World:
     """The robot folder that is watched: made once in each process."""
 
-    plan: Plan
+    plan: MonitoringPlan
     knowledge: Knowledge
     wanted: dict[str, set[str]]
 
@@ -113,7 +113,7 @@ def world() -> World:
         amberbox(["new", str(path), "--from", "sim"])
         folder = load_folder(path)
         plan, _ = load_plan(folder)
-        knowledge, _ = knowledge_of(folder, plan)
+        knowledge, _ = load_knowledge(folder, plan)
     assert knowledge is not None, "the simulated robot has an FMEA"
     wanted: dict[str, set[str]] = {}
     for entry in plan.inputs():
@@ -128,7 +128,7 @@ def world() -> World:
 def findings(mission: Mission) -> Iterator[Finding]:
     """Yield what the watcher of a robot finds in a mission."""
     at = world()
-    watcher = Diagnosing(Engine(at.plan), Tracker(at.knowledge))
+    watcher = DiagnosedEngine(Engine(at.plan), FaultTracker(at.knowledge))
     watcher.begin(START_NS)
     batches = Batches(at.wanted)
     for until_s, messages in live(mission):

@@ -5,9 +5,9 @@ from __future__ import annotations
 import random
 from collections.abc import Sequence
 
-from amberbox.fleet.drawing.graph import Component, Edge, dependency_graph
-from amberbox.fleet.drawing.layers import Box, layered
-from amberbox.fleet.pages.drawingwords import drawing_words
+from amberbox.core.layered_layout import LayoutBox, layered
+from amberbox.server.drawing.graph import ComponentBox, DependencyEdge, dependency_graph
+from amberbox.server.web.text import drawing_words
 from benchmarks.common import Row, cpu_s
 
 NODES = 500
@@ -17,18 +17,18 @@ TARGET_MS = 100
 
 def measure() -> list[Row]:
     """Lay out graphs of 500 boxes of three shapes, and draw one."""
-    boxes = [Box(str(number), 180, 46) for number in range(NODES)]
+    boxes = [LayoutBox(str(number), 180, 46) for number in range(NODES)]
     graphs = {"far links": _far(), "deep": _deep(), "wide": _wide()}
     rows = [_row(f"layout, {kind}", boxes, links) for kind, links in graphs.items()]
-    components = [Component(box.id, f"component {box.id}", "error") for box in boxes]
-    edges = [Edge(start, end) for start, end in _wide()]
+    components = [ComponentBox(box.id, f"component {box.id}", "error") for box in boxes]
+    edges = [DependencyEdge(start, end) for start, end in _wide()]
     seconds = cpu_s(
         lambda: str(dependency_graph(components, edges, label="all", words=drawing_words()))
     )
     return [*rows, Row("layout and SVG, wide", seconds * 1e3, "ms")]
 
 
-def _row(name: str, boxes: Sequence[Box], links: Sequence[tuple[str, str]]) -> Row:
+def _row(name: str, boxes: Sequence[LayoutBox], links: Sequence[tuple[str, str]]) -> Row:
     seconds = cpu_s(lambda: layered(boxes, links))
     note = f"{NODES} boxes, {len(links)} links, target: {TARGET_MS} ms"
     return Row(name, seconds * 1e3, "ms", note=note)

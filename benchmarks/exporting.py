@@ -11,12 +11,13 @@ from pathlib import Path
 
 import numpy as np
 
-from amberbox.blackbox.exporting import ExportReport, View, export
-from amberbox.blackbox.follow.read import journals
 from amberbox.blackbox.journal.writer import JournalOptions, JournalWriter
-from amberbox.blackbox.query.record import Record
-from amberbox.blackbox.segments.build import build_segments
-from amberbox.blackbox.store import create_store
+from amberbox.blackbox.query.export import export
+from amberbox.blackbox.query.export_job import ExportReport, View
+from amberbox.blackbox.query.record import LocalRecord
+from amberbox.blackbox.store.journal_reader import journals
+from amberbox.blackbox.store.segment_builder import build_segments
+from amberbox.blackbox.store.store import create_store
 from benchmarks import mix
 from benchmarks.common import Row, cpu_s
 
@@ -61,7 +62,7 @@ def _form(folder: Path, form: str, peer: tuple[str, float] | None) -> Iterator[R
     reports: list[ExportReport] = []
 
     def work() -> None:
-        reports.append(export(Record(folder / "store"), View(), next(targets), form))
+        reports.append(export(LocalRecord(folder / "store"), View(), next(targets), form))
 
     seconds = cpu_s(work, 3)
     unit = "messages" if form in ("mcap", "bag") else "rows"
@@ -116,10 +117,11 @@ def _with_rosbags(path: Path, made: mix.Mix) -> None:
 _CHILD = """
 import sys
 from pathlib import Path
-from amberbox.blackbox.exporting import View, export
-from amberbox.blackbox.query.record import Record
+from amberbox.blackbox.query.export import export
+from amberbox.blackbox.query.export_job import View
+from amberbox.blackbox.query.record import LocalRecord
 start = (1_700_000_000 * 10**9, 1_700_000_000 * 10**9 + int(sys.argv[4]) * 10**9)
-export(Record(Path(sys.argv[1])), View(windows=[start]), Path(sys.argv[2]), sys.argv[3])
+export(LocalRecord(Path(sys.argv[1])), View(windows=[start]), Path(sys.argv[2]), sys.argv[3])
 peak = next(l for l in Path("/proc/self/status").read_text().splitlines() if "VmHWM" in l)
 print(int(peak.split()[1]) / 1000)
 """

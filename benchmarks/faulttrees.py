@@ -14,25 +14,27 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
-import amberbox.sim
+from amberbox import sim
 from amberbox.core.needs import Needs
-from amberbox.diagnosis.faulttree import (
+from amberbox.diagnosis.faulttree.analysis import analyse, closest
+from amberbox.diagnosis.faulttree.open_psa import read_mef, write_mef
+from amberbox.diagnosis.faulttree.tree import (
     FaultTree,
-    analyse,
-    closest,
+    Formula,
+    all_of,
+    any_of,
+    at_least,
     fault_tree,
-    read_mef,
-    write_mef,
+    names,
 )
-from amberbox.diagnosis.faulttree.formula import Formula, all_of, any_of, at_least, names
-from amberbox.diagnosis.fmea import load_fmea
-from amberbox.diagnosis.fmea.model import Component, FailureMode, Fmea, Function
-from amberbox.diagnosis.fmea.trees import effects, fault_tree_of
+from amberbox.diagnosis.fmea.fault_trees import effects, fault_tree_of
+from amberbox.diagnosis.fmea.loader import load_fmea
+from amberbox.diagnosis.fmea.model import FailureMode, Fmea, FmeaComponent, FmeaFunction
 from benchmarks.common import Row, wall_s
 from benchmarks.covering import random_robot
 
 ARALIA = Path(__file__).resolve().parents[2] / "shared" / "data" / "diagnosis" / "fault_trees"
-SIMULATED = Path(amberbox.sim.__file__).parent / "folder" / "fmea.yaml"
+SIMULATED = Path(sim.__file__).parent / "folder" / "fmea.yaml"
 TARGETS = {"baobab1": "to be <= 1 s"}
 
 
@@ -72,7 +74,7 @@ def random_fmea(components: int, modes: int) -> Fmea:
         for mode in model.modes
     }  # fmt: skip
     parts = {
-        part.id: Component(part.id, "part", needs=part.needs,
+        part.id: FmeaComponent(part.id, "part", needs=part.needs,
                            modes=tuple(m for m in failures if failures[m].component == part.id))
         for part in model.functions
     }  # fmt: skip
@@ -80,7 +82,7 @@ def random_fmea(components: int, modes: int) -> Fmea:
     functions = {}
     for number in range(10):
         spares = tuple(rng.sample(list(parts), 5))
-        functions[f"f{number}"] = Function(f"f{number}", Needs(rng.choice((1, 2, 3)), spares))
+        functions[f"f{number}"] = FmeaFunction(f"f{number}", Needs(rng.choice((1, 2, 3)), spares))
     return Fmea("random", failures, parts, functions, {})
 
 

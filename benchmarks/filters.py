@@ -58,7 +58,7 @@ def _kept_shares() -> Iterator[Row]:
 
 
 def _tolerances() -> Iterator[Row]:
-    """Why ``TOLERANCE_PERIODS`` is what it is: the table of docs/filters.md."""
+    """Why ``TOLERANCE_PERIODS`` is what it is: the table of docs/robot/filters.md."""
     for jitter, arrive in ARRIVALS.items():
         for rate_hz in RATES_HZ:
             streams = [arrive(rate_hz, np.random.default_rng(seed), LONG) for seed in range(4)]

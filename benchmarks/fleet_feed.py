@@ -18,10 +18,10 @@ from pathlib import Path
 
 import msgspec
 
-from benchmarks.common import Row, percentile
+from benchmarks.common import Row, free_port, percentile
 from benchmarks.feedload import viewers
 from benchmarks.feedload.fleet import CHANGE_S, LOAD, fill, speak
-from benchmarks.feedload.serving import assembled, free_port, served
+from benchmarks.feedload.serving import assembled, served
 
 VIEWERS = 20
 WITH_S, WITHOUT_S = 2 * CHANGE_S, CHANGE_S

@@ -17,8 +17,8 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from amberbox.core.clock import NS
-from amberbox.fleet.serving.process import raise_file_limit
-from amberbox.robot.link.client import LinkClient
+from amberbox.link.client import LinkClient
+from amberbox.server.process import raise_file_limit
 from benchmarks.common import Row, percentile
 from benchmarks.fleetload import making, robots
 from benchmarks.fleetload.servers import Server

@@ -15,16 +15,16 @@ import numpy as np
 import uvicorn
 
 from amberbox.core.clock import NS
-from amberbox.core.timetext import format_time
-from amberbox.fleet.accounts.actions import Role
-from amberbox.fleet.accounts.passwords import Cost, Passwords
-from amberbox.fleet.accounts.robotkeys import add_robot
-from amberbox.fleet.accounts.tokens import add_token
-from amberbox.fleet.accounts.users import add_user, find_user
-from amberbox.fleet.services import Services
-from amberbox.fleet.serving import assembly
-from amberbox.fleet.serving.app import make_app
-from amberbox.fleet.serving.settings import Settings
+from amberbox.core.timestamps import format_time
+from amberbox.server import process
+from amberbox.server.accounts.passwords import HashCost, Passwords
+from amberbox.server.accounts.permissions import Role
+from amberbox.server.accounts.robots import add_robot
+from amberbox.server.accounts.tokens import add_token
+from amberbox.server.accounts.users import add_user, find_user
+from amberbox.server.app import make_app
+from amberbox.server.config import ServerSettings
+from amberbox.server.services.context import Services
 from benchmarks.archive import DAYS, RATE_HZ, START_NS, make_month
 from benchmarks.common import Row, percentile
 
@@ -81,7 +81,9 @@ def _served(folder: Path) -> Iterator[httpx.Client]:
     """Serve a month of a robot on loopback; the client is a program with a token."""
     with socket.create_server(("127.0.0.1", 0)) as listening:
         url = f"http://127.0.0.1:{listening.getsockname()[1]}"
-        services = assembly.assemble(folder, Settings(url), passwords=Passwords(Cost(1, 8, 1)))
+        services = process.make_services(
+            folder, ServerSettings(url), passwords=Passwords(HashCost(1, 8, 1))
+        )
         make_month(services.archive)
         config = uvicorn.Config(make_app(services), log_level="warning", lifespan="off")
         server = uvicorn.Server(config)
@@ -94,7 +96,7 @@ def _served(folder: Path) -> Iterator[httpx.Client]:
         finally:
             server.should_exit = True
             thread.join()
-            assembly.close(services)
+            process.close(services)
 
 
 def _token(services: Services) -> str:

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from amberbox.blackbox.formats.options import ReadOptions
-from amberbox.blackbox.importing import import_recordings
+from amberbox.blackbox.formats._recording import ReadOptions
+from amberbox.blackbox.query.importing import import_recordings
 from amberbox.core.clock import NS
 from benchmarks.common import Row, cpu_s
 

@@ -11,15 +11,16 @@ import tempfile
 import time
 from pathlib import Path
 
-from amberbox.blackbox.incidents import Incident, Wish, advance, load_all, pin, release
-from amberbox.blackbox.keeper.options import KeeperOptions
 from amberbox.blackbox.recorder.pipeline import PipelineOptions
-from amberbox.blackbox.store import Store, open_store
+from amberbox.blackbox.retention.pins import PinRequest, advance, pin, release
+from amberbox.blackbox.robot_folder.robot_yaml import RetentionOptions
+from amberbox.blackbox.store.incident import StoredIncident, load_all
+from amberbox.blackbox.store.store import Store, open_store
 from amberbox.core.clock import NS
 from amberbox.core.source import TopicOptions
 from amberbox.core.types import Topic
-from amberbox.testing.box import COUNT, ManualBox, number
 from benchmarks.common import Row
+from tests.support.manual_recorder import COUNT, ManualBox, number
 
 MINUTES = 12
 REPEATS = 9
@@ -32,7 +33,7 @@ def measure() -> list[Row]:
     with tempfile.TemporaryDirectory() as place:
         box = _recorded(Path(place) / "store")
         store = open_store(box.store)
-        warm = [_pinned_ms(store, Wish(600, 20, "bench")) for _ in range(REPEATS)]
+        warm = [_pinned_ms(store, PinRequest(600, 20, "bench")) for _ in range(REPEATS)]
         copied_ms = _copied_ms(store, Path(place))
         box.close()
     note = "target: 50; ten minutes, 6,000 writes, the recorder at work"
@@ -55,11 +56,11 @@ def _recorded(store: Path) -> ManualBox:
     return box
 
 
-def _pinned_ms(store: Store, wish: Wish) -> float:
+def _pinned_ms(store: Store, wish: PinRequest) -> float:
     began = time.perf_counter()
-    made = pin(store, wish, KeeperOptions())
+    made = pin(store, wish, RetentionOptions())
     took_ms = 1000 * (time.perf_counter() - began)
-    assert isinstance(made, Incident)
+    assert isinstance(made, StoredIncident)
     release(store, advance(store, made))
     return took_ms
 

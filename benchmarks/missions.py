@@ -14,9 +14,8 @@ import numpy as np
 
 from amberbox.core.clock import NS
 from amberbox.core.types import Batch, Column, ItemSchema, Ragged
-from amberbox.sim import Robot, catalogue
-from amberbox.sim.catalogue import Fault
-from amberbox.sim.robot import START_NS, Message
+from amberbox.sim.faults import SimulatedFault, catalogue
+from amberbox.sim.robot import START_NS, Message, Robot
 
 ONSET_S = (25.0, 60.0)
 """When the first fault begins; before, the robot drives and the windows of monitors fill."""
@@ -37,7 +36,7 @@ NAMES = {
 class Planted:
     """A fault that is to begin ``at_s``, and how strong; at ``until_s`` it is repaired."""
 
-    fault: Fault
+    fault: SimulatedFault
     magnitude: float
     at_s: float
     until_s: float = math.inf
@@ -73,7 +72,7 @@ def draw(seed: int, count: int) -> Mission:
     return with_faults(seed, faults, chance)
 
 
-def with_faults(seed: int, faults: Sequence[Fault], chance: random.Random) -> Mission:
+def with_faults(seed: int, faults: Sequence[SimulatedFault], chance: random.Random) -> Mission:
     """Draw magnitudes, times and load for a mission with given faults."""
     at_s = chance.uniform(*ONSET_S)
     planted = []
@@ -91,7 +90,7 @@ def nominal(seed: int, seconds: float) -> Mission:
     return Mission(seed, scenario, scenario == "transport" and seed % 2 == 0, (), seconds)
 
 
-def magnitude(fault: Fault, chance: random.Random) -> float:
+def magnitude(fault: SimulatedFault, chance: random.Random) -> float:
     """Draw how strong a fault is: evenly on a scale of factors, over all of its range."""
     low, high = fault.magnitude.low, fault.magnitude.high
     if low == high:
@@ -102,7 +101,7 @@ def magnitude(fault: Fault, chance: random.Random) -> float:
     return size if chance.random() < 0.5 else -size
 
 
-def mode_of(fault: Fault, modes: Collection[str]) -> str:
+def mode_of(fault: SimulatedFault, modes: Collection[str]) -> str:
     """Return the failure mode that a fault of the catalogue means, empty if there is none."""
     if fault.id in NAMES:
         return NAMES[fault.id]

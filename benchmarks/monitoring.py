@@ -16,10 +16,10 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from amberbox.blackbox.follow.follow import follow
-from amberbox.blackbox.journal import reserved
+from amberbox.blackbox.journal import channels as journal_channels
 from amberbox.blackbox.journal.writer import JournalOptions, JournalWriter
-from amberbox.blackbox.store import create_store
+from amberbox.blackbox.store.store import create_store
+from amberbox.blackbox.store.tail import follow
 from amberbox.core.clock import NS
 from amberbox.core.types import Batch, Schema, Topic
 from benchmarks.common import Row, percentile
@@ -138,8 +138,8 @@ def _write_record(store: Path, hours: float) -> int:
         writer.channel(Topic(f"t{n}", "ros1", schema), {"item": f"zmq_t{n}", "source": "zmq"})
         for n in range(ITEMS)
     ]
-    own = {"item": "amberbox_counters", "source": reserved.SOURCE}
-    channels.append(writer.channel(reserved.topic_of(reserved.COUNTERS), own))
+    own = {"item": "amberbox_counters", "source": journal_channels.SOURCE}
+    channels.append(writer.channel(journal_channels.topic_of(journal_channels.COUNTERS), own))
     values = np.random.default_rng(1).normal(size=(1000, ITEMS, COLUMNS))
     writes = round(hours * 36_000)
     for number in range(writes):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-import socket
 import subprocess
 import sys
 import tempfile
@@ -15,16 +14,16 @@ from typing import TYPE_CHECKING
 
 import httpx
 
-from amberbox.fleet.accounts.actions import Role
-from amberbox.fleet.accounts.passwords import Cost, Passwords
-from amberbox.fleet.accounts.robotkeys import add_robot
-from amberbox.fleet.accounts.sessions import begin_session
-from amberbox.fleet.accounts.users import add_user, find_user
-from amberbox.fleet.api.who import COOKIE
-from amberbox.fleet.serving import assembly
-from amberbox.fleet.serving.settings import Settings
+from amberbox.server import process
+from amberbox.server.accounts.passwords import HashCost, Passwords
+from amberbox.server.accounts.permissions import Role
+from amberbox.server.accounts.robots import add_robot
+from amberbox.server.accounts.sessions import begin_session
+from amberbox.server.accounts.users import add_user, find_user
+from amberbox.server.config import ServerSettings
+from amberbox.server.http.auth import COOKIE
 from benchmarks.archive import RATE_HZ, START_NS, make_month
-from benchmarks.common import Row, percentile
+from benchmarks.common import Row, free_port, percentile
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page
@@ -133,9 +132,7 @@ def _open(browser: Browser, url: str, secret: str, path: str) -> Page:
 @contextmanager
 def served(folder: Path) -> Iterator[tuple[str, str]]:
     """Serve a month of a robot; yield the address and the session of an admin."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
+    port = free_port()
     url = f"http://localhost:{port}"
     secret = _filled(folder, url)
     words = ("--data", str(folder), "--port", str(port), "--quiet")
@@ -150,7 +147,9 @@ def served(folder: Path) -> Iterator[tuple[str, str]]:
 
 
 def _filled(folder: Path, url: str) -> str:
-    services = assembly.assemble(folder, Settings(url), passwords=Passwords(Cost(1, 8, 1)))
+    services = process.make_services(
+        folder, ServerSettings(url), passwords=Passwords(HashCost(1, 8, 1))
+    )
     make_month(services.archive)
     now_ns = time.time_ns()
     with services.database.begin() as connection:
@@ -159,7 +158,7 @@ def _filled(folder: Path, url: str) -> str:
         add_user(connection, now_ns, "admin", Role.ADMIN, hashed)
         owner = find_user(connection, "admin")
         began = begin_session(connection, now_ns, owner.user_id, "127.0.0.1", "benchmark")
-    assembly.close(services)
+    process.close(services)
     return began.secret
 
 

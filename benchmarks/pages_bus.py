@@ -24,20 +24,19 @@ import httpx
 import zmq
 import zmq.asyncio
 
-from amberbox.demo.processes import start_tied
-from amberbox.fleet.accounts.actions import Role
-from amberbox.fleet.accounts.robotkeys import add_robot
-from amberbox.fleet.accounts.sessions import begin_session
-from amberbox.fleet.accounts.users import add_user
-from amberbox.fleet.api.who import COOKIE
-from amberbox.fleet.database.database import FILE, Database
-from amberbox.fleet.serving.starting import make_folder
-from amberbox.link.joining import join_line
-from amberbox.robot.joining.writing import with_server, write_key, write_robot_file
-from benchmarks.common import Row, percentile
+from amberbox.agent.join import with_server, write_key, write_robot_file
+from amberbox.demo.fleet import start_tied
+from amberbox.link.join_line import join_line
+from amberbox.server.accounts.permissions import Role
+from amberbox.server.accounts.robots import add_robot
+from amberbox.server.accounts.sessions import begin_session
+from amberbox.server.accounts.users import add_user
+from amberbox.server.database import FILE, ServerDatabase
+from amberbox.server.http.auth import COOKIE
+from amberbox.server.start import make_folder
+from benchmarks.common import Row, free_port, percentile
 from benchmarks.feedload.browser import opened
 from benchmarks.feedload.fleet import COMPONENTS, RATE_HZ
-from benchmarks.feedload.serving import free_port
 
 Shown: TypeAlias = tuple[str, int, float]
 """Component, number, and when the page showed it."""
@@ -138,7 +137,7 @@ def _prepare(folder: Path, url: str, endpoint: str) -> str:
     """Write the folders of a server and of a robot that has joined it; return a session."""
     data, robot = folder / "server", folder / ROBOT
     make_folder(data)
-    database, now_ns = Database(data / FILE), time.time_ns()
+    database, now_ns = ServerDatabase(data / FILE), time.time_ns()
     with database.begin() as connection:
         key = add_robot(connection, now_ns, ROBOT, ())
         person = add_user(connection, now_ns, "admin", Role.ADMIN, "-")

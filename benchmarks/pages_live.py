@@ -11,10 +11,10 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from benchmarks.common import Row, percentile
+from benchmarks.common import Row, free_port, percentile
 from benchmarks.feedload.browser import WATCH, opened
 from benchmarks.feedload.fleet import COMPONENTS, LOAD, SENT, fill, speak
-from benchmarks.feedload.serving import assembled, free_port, served
+from benchmarks.feedload.serving import assembled, served
 
 RUN_S, WARM_S = 10.0, 2.0
 _MOST_MS, _MOST_CORE = 100.0, 10.0

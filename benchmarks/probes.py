@@ -9,10 +9,8 @@ import resource
 import time
 
 from amberbox.core.probe import ProbeOrder
-from amberbox.monitoring.probing.probe import Row as ProbeRow
-from amberbox.monitoring.probing.probe import load_probe
-from amberbox.monitoring.probing.publisher import encode
-from amberbox.monitoring.probing.runner import ProbeRunner
+from amberbox.monitoring.probe_runner import ProbeRunner, encode, load_probe
+from amberbox.monitoring.probe_runner import Row as ProbeRow
 from benchmarks.common import Row
 
 PROBES = 200
@@ -55,10 +53,10 @@ def _many() -> Row:
 
 def _look(kind: str, subject: str, count: int) -> Row:
     probe = load_probe(kind)
-    probe.look(subject)
+    probe.measure_once(subject)
     begin_s = _cpu_s()
     for _ in range(count):
-        row = probe.look(subject)
+        row = probe.measure_once(subject)
     return Row(f"{kind}: one look", 1e3 * (_cpu_s() - begin_s) / count, "ms", note=row["error"])
 
 

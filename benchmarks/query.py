@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from amberbox.blackbox.follow.read import JournalFile, journals
 from amberbox.blackbox.journal.writer import JournalOptions, JournalWriter
-from amberbox.blackbox.query.record import Record
-from amberbox.blackbox.segments.build import build_segments
-from amberbox.blackbox.store import WriterLock, create_store, open_store
+from amberbox.blackbox.query.record import LocalRecord
+from amberbox.blackbox.store.journal_reader import JournalFile, journals
+from amberbox.blackbox.store.segment_builder import build_segments
+from amberbox.blackbox.store.store import WriterLock, create_store, open_store
 from amberbox.core.clock import NS
 from amberbox.core.types import Schema, Topic
 from benchmarks import mix
@@ -152,7 +152,7 @@ def _recording(store: Path, messages: NDArray[Any]) -> Iterator[None]:
 
 
 def _query_times(store: Path) -> Iterator[Row]:
-    record = Record(store)
+    record = LocalRecord(store)
     from_ns = START_NS + 13_000 * NS + 777
 
     def ask() -> None:
@@ -224,7 +224,7 @@ def _record_and_build(made: mix.Mix, tick_ns: int, stores: Iterator[Path]) -> No
 
 
 def _real_recordings() -> Iterator[Row]:
-    from amberbox.blackbox.importing import import_recordings
+    from amberbox.blackbox.query.importing import import_recordings
 
     shares = []
     for name in REAL if RECORDINGS.is_dir() else ():

@@ -15,9 +15,9 @@ from pathlib import Path
 
 import numpy as np
 
-from amberbox.blackbox.follow import read
-from amberbox.blackbox.follow.follow import follow
-from amberbox.blackbox.store import is_store
+from amberbox.blackbox.store import journal_reader
+from amberbox.blackbox.store.store import is_store
+from amberbox.blackbox.store.tail import follow
 from amberbox.core.types import Batch
 from benchmarks.common import Row, percentile
 from benchmarks.ros_sockets import ODOMETRY_BYTES, publishing, topics
@@ -136,7 +136,7 @@ def totals(store: Path) -> tuple[int, int]:
     """Count what was kept and what was dropped, by the last counters of each item."""
     kept: dict[str, int] = {}
     dropped: dict[str, int] = {}
-    for batch in read.batches(store, ["amberbox_counters"]):
+    for batch in journal_reader.batches(store, ["amberbox_counters"]):
         rows = batch.children["items"].columns
         names = np.asarray(rows["item"]).tolist()
         kept.update(zip(names, np.asarray(rows["kept"]).tolist(), strict=True))

@@ -17,11 +17,9 @@ from dataclasses import dataclass
 from multiprocessing import get_context
 
 from amberbox.core.types import Diagnosis
-from amberbox.monitoring.engine.alarms import FOLLOWS
-from amberbox.monitoring.engine.findings import AlarmChange
-from amberbox.monitoring.watcher.leading import leading
-from amberbox.sim import catalogue
-from amberbox.sim.catalogue import Fault
+from amberbox.monitoring.alarms import FOLLOWS
+from amberbox.monitoring.findings import AlarmChange
+from amberbox.sim.faults import SimulatedFault, catalogue
 from benchmarks.common import Row
 from benchmarks.diagnosis import findings, world
 from benchmarks.missions import Mission, Planted, mode_of, nominal, seconds_of
@@ -109,12 +107,12 @@ def _spans(mode: str, answers: Sequence[Diagnosis], end_s: float) -> Iterator[tu
     """Yield from when to when a failure mode is in the leading answer."""
     ends = [*(seconds_of(one.at_ns) for one in answers[1:]), end_s]
     for one, to_s in zip(answers, ends, strict=True):
-        if one.state == "open" and any(mode in hypothesis.faults for hypothesis in leading(one)):
+        if one.state == "open" and any(mode in hypothesis.faults for hypothesis in one.leading()):
             yield seconds_of(one.at_ns), to_s
 
 
 def _is_unalarmed(
-    fault: Fault,
+    fault: SimulatedFault,
     mode: str,
     spans: Iterable[tuple[float, float]],
     alarms: Sequence[AlarmChange],

@@ -1,6 +1,6 @@
 """ROS 1 sockets: publishers in another process speak TCPROS to the box over several connections.
 
-No ROS is needed: ``amberbox.testing.rosnet`` has a master and publishers. Recording to disk is
+No ROS is needed: ``tests.support.ros_network`` has a master and publishers. Recording to disk is
 not part of it; the sink only counts.
 """
 
@@ -16,13 +16,13 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
-from amberbox.blackbox.ros1.client import Client
-from amberbox.blackbox.ros1.framing import Framer
-from amberbox.blackbox.ros1.settings import Settings
+from amberbox.blackbox.sources.ros1.client import RosSubscriber
+from amberbox.blackbox.sources.ros1.master import SubscriberSettings
+from amberbox.blackbox.sources.ros1.tcpros import Framer
 from amberbox.core.source import Power
 from amberbox.core.types import Topic
-from amberbox.testing.rosnet import RosMaster, RosPublisher, RosTopic
 from benchmarks.common import Row, cpu_s
+from tests.support.ros_network import RosMaster, RosPublisher, RosTopic
 
 ODOMETRY_BYTES = 704
 IMAGE_BYTES = 920_000
@@ -132,7 +132,7 @@ def _sockets(name: str, sockets: int, rate_hz: float, size: int, burst: int = 1)
     with publishing(sockets, rate_hz, size, burst) as uri:
         sink, stop = CountingSink(), threading.Event()
         wanted = dict.fromkeys(topics(sockets), "")
-        client = Client(Settings(master_uri=uri), wanted, sink)
+        client = RosSubscriber(SubscriberSettings(master_uri=uri), wanted, sink)
         thread = threading.Thread(target=client.run, args=(stop,))
         thread.start()
         while len([count for count in sink.counts.values() if count]) < sockets:

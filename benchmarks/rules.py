@@ -11,7 +11,8 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from amberbox.diagnosis.rules import ask, read_text
+from amberbox.diagnosis.prolog.program import read_text
+from amberbox.diagnosis.prolog.query import ask
 from benchmarks.common import Row
 
 FACTS, RULES, KINDS, SIGNS = 10_000, 1_000, 100, 300

@@ -25,7 +25,7 @@ from benchmarks.common import Row
 
 FOLDER = Path(__file__).parent
 RESULTS = FOLDER / "results"
-PAGE = FOLDER.parent / "docs" / "benchmarks.md"
+PAGE = FOLDER.parent / "docs" / "reference" / "benchmarks.md"
 PACKAGES = ("amberbox", "numpy", "zstandard", "msgspec", "rosbags", "mcap", "foxglove-sdk",
             "pyarrow", "duckdb")  # fmt: skip
 INTRODUCTION = """# Benchmarks

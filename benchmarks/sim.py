@@ -9,7 +9,7 @@ from functools import partial
 
 import msgspec
 
-from amberbox.sim import Robot
+from amberbox.sim.robot import Robot
 from benchmarks.common import Row, cpu_s
 
 ROBOT_S = 60.0

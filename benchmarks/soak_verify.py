@@ -11,8 +11,8 @@ from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
-from amberbox.blackbox.verify.verify import verify
-from amberbox.testing.history import History
+from amberbox.blackbox.signing.verify import verify
+from tests.support.manual_recorder import History
 
 STORES = 1_000
 

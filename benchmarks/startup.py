@@ -17,7 +17,7 @@ from contextlib import contextmanager
 from os import environ
 from pathlib import Path
 
-from amberbox.blackbox.store import is_locked, open_store
+from amberbox.blackbox.store.store import is_locked, open_store
 from benchmarks.common import Row
 from benchmarks.recorder import robot_folder
 

@@ -17,19 +17,17 @@ from typing import Any
 
 import numpy as np
 
-from amberbox.blackbox.folder.folder import load_folder
+from amberbox.blackbox.robot_folder.folder import load_folder
 from amberbox.cli.main import main
-from amberbox.consult.known import known_of
+from amberbox.consult.folder_knowledge import fmea_references
 from amberbox.core.clock import NS
 from amberbox.core.types import Batch, Column, ItemSchema, Symptom
-from amberbox.diagnosis.answering import Heading, answer
-from amberbox.diagnosis.fmea.load import load_fmea
-from amberbox.diagnosis.fmea.propagation import links_by_mode
+from amberbox.diagnosis.diagnose import DiagnosisId, ObservedSituation, answer
+from amberbox.diagnosis.fmea.loader import load_fmea
+from amberbox.diagnosis.fmea.model import links_by_mode
 from amberbox.diagnosis.knowledge import Knowledge
-from amberbox.diagnosis.situation import Situation
-from amberbox.diagnosis.tracking.tracker import EFFORT, Tracker
-from amberbox.sim import Robot
-from amberbox.sim.robot import START_NS
+from amberbox.diagnosis.tracker import EFFORT, FaultTracker
+from amberbox.sim.robot import START_NS, Robot
 from benchmarks.common import Row, percentile
 
 SECONDS = 60
@@ -49,7 +47,7 @@ def _simulated() -> Knowledge:
         folder = Path(place) / "robot"
         with contextlib.redirect_stdout(io.StringIO()):
             assert main(["new", str(folder), "--from", "sim"]) == 0
-        fmea, problems = load_fmea(folder / "fmea.yaml", known_of(load_folder(folder)))
+        fmea, problems = load_fmea(folder / "fmea.yaml", fmea_references(load_folder(folder)))
     assert fmea is not None, problems
     return Knowledge("bench", fmea)
 
@@ -97,7 +95,7 @@ def _parts(whole: Batch, step_ns: int) -> Iterator[tuple[int, Batch]]:
 
 def _tracked_s(knowledge: Knowledge, parts: list[tuple[int, Batch]]) -> float:
     """Return the CPU seconds that tracking takes."""
-    tracker = Tracker(knowledge)
+    tracker = FaultTracker(knowledge)
     tracker.begin(START_NS)
     start_s = time.process_time()
     for until_ns, batch in parts:
@@ -114,17 +112,17 @@ def _answers(knowledge: Knowledge, faults: int) -> Row:
     return Row(what, percentile(times_ms, 50), "ms", note=note)
 
 
-def _situation(knowledge: Knowledge, faults: int, rng: random.Random) -> Situation:
+def _situation(knowledge: Knowledge, faults: int, rng: random.Random) -> ObservedSituation:
     """Return what monitors say of random faults; some outputs cannot be read."""
     links = links_by_mode(knowledge.fmea)
     chosen = rng.sample(list(knowledge.fmea.modes), faults)
     shown = {link.symptom for m in chosen for link in links[m] if rng.random() < link.detects}
     read = [name for name in knowledge.fmea.symptoms if name in shown or rng.random() < READABLE]
     symptoms = (Symptom(name, "present" if name in shown else "absent", name) for name in read)
-    return Situation(tuple(symptoms), watched=True)
+    return ObservedSituation(tuple(symptoms), watched=True)
 
 
-def _answer_ms(knowledge: Knowledge, situation: Situation) -> float:
+def _answer_ms(knowledge: Knowledge, situation: ObservedSituation) -> float:
     start_s = time.process_time()
-    answer(knowledge, situation, Heading("bench", 1, 0), EFFORT)
+    answer(knowledge, situation, DiagnosisId("bench", 1, 0), EFFORT)
     return 1e3 * (time.process_time() - start_s)

@@ -8,9 +8,10 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from amberbox.blackbox.unroll import Unroller, unroller
-from amberbox.blackbox.unroll.infer import widen
-from amberbox.blackbox.unroll.ros import RosUnroller
+from amberbox.blackbox.columns import Unroller
+from amberbox.blackbox.columns.json_messages import widen_schema
+from amberbox.blackbox.columns.ros_messages import RosUnroller
+from amberbox.blackbox.columns.unroll import unroller
 from amberbox.core.types import Schema, Topic
 from benchmarks.common import Row, rate
 from benchmarks.mix import START_NS, make_message, store
@@ -101,9 +102,9 @@ def _of_json() -> Iterator[Row]:
         )
         for k in range(BATCH * BATCHES)
     ]
-    schema, _ = widen(None, messages[:1], "json", "wheel")
+    schema, _ = widen_schema(None, messages[:1], "json", "wheel")
     what = "JSON with a child table of 4"
-    checked = rate(len(messages), lambda: widen(schema, messages, "json", "wheel"))
+    checked = rate(len(messages), lambda: widen_schema(schema, messages, "json", "wheel"))
     yield Row(f"{what}, schema unchanged", checked, "messages/s")
     task = unroller(Topic("/wheel", "json", schema))
     yield Row(f"{what}, rows", rate(len(messages), _in_batches(task, messages)), "rows/s")

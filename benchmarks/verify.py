@@ -13,11 +13,11 @@ from pathlib import Path
 import numpy as np
 
 from amberbox.blackbox.journal.writer import JournalOptions, JournalWriter
-from amberbox.blackbox.segments import manifest as mf
 from amberbox.blackbox.signing.keys import open_keys
-from amberbox.blackbox.signing.sealing import seal_journals
-from amberbox.blackbox.store import Store, create_store
-from amberbox.blackbox.verify.verify import verify
+from amberbox.blackbox.signing.signatures import seal_journals
+from amberbox.blackbox.signing.verify import verify
+from amberbox.blackbox.store import manifest as mf
+from amberbox.blackbox.store.store import Store, create_store
 from benchmarks.common import Row, percentile, wall_s
 from benchmarks.journal import FULL_SPEED_WRITE, WRITES_PER_SYNC
 from benchmarks.mix import Mix, make
@@ -89,8 +89,8 @@ def _seal_again(store: Store, work: Callable[[], object]) -> None:
 _SEALING = """
 import os, sys
 from pathlib import Path
-from amberbox.blackbox.signing.sealing import seal_journals
-from amberbox.blackbox.store import open_store
+from amberbox.blackbox.signing.signatures import seal_journals
+from amberbox.blackbox.store.store import open_store
 os.nice(10)
 store = open_store(Path(sys.argv[1]))
 print("ready", flush=True)

@@ -18,12 +18,12 @@ from amberbox.core.plugins import Plugin, find
 from tools.findings import ROOT, Finding, report
 from tools.markdown import anchors, links, pages
 
-INTERNAL = ("docs/design.md", "docs/notes/", "CHANGELOG.md")
+INTERNAL = ("docs/develop/", "CONTRIBUTING.md", "CHANGELOG.md")
 """Pages for those who build Amberbox: what is only mentioned there is not documented."""
 
 MODES = ("amberbox.monitoring.modes", ("Config", "evaluate"))
 PROBES = ("amberbox.monitoring.probes", ("MEASURES", "SUBJECT", "measure"))
-MODES_PAGE = "docs/modes.md"
+MODES_PAGE = "docs/robot/modes.md"
 
 
 def check(root: Path) -> list[Finding]:

@@ -1,13 +1,16 @@
-"""Check the import directions of docs/design.md 2: who may know of whom, and what loads late."""
+"""Check the imports of docs/develop/design.md 2: directions, cycles, and what loads late."""
 
 from __future__ import annotations
 
+import ast
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
+from typing import NamedTuple
 
 from tools.findings import ROOT, Finding, report
-from tools.import_graph import Import, imports, modules
 
 OURS = "amberbox"
 _UPPER = frozenset(
@@ -25,34 +28,47 @@ ALLOWED: Mapping[str, frozenset[str]] = {
     "experiments": frozenset({"core", "blackbox"}),
     "link": frozenset({"core", "blackbox"}),
     "client": frozenset({"core", "blackbox"}),
-    "robot": _UPPER,
-    "fleet": _UPPER,
-    "demo": _UPPER | {"sim", "robot", "fleet"},
-    "cli": _UPPER | {"sim", "testing", "robot", "fleet", "client", "demo"},
+    "agent": _UPPER,
+    "server": _UPPER,
+    "demo": _UPPER | {"sim", "agent", "server"},
+    "cli": _UPPER | {"sim", "testing", "agent", "server", "client", "demo"},
     "": frozenset({"core", "blackbox", "client"}),
     "__main__": frozenset({"cli", "core"}),
 }
 """Which of our packages each may import, besides itself; "" is the package's front door."""
 
 SOURCES = f"{OURS}.blackbox.sources"
-PROTOCOLS = (f"{OURS}.blackbox.ros1", f"{OURS}.blackbox.formats", f"{OURS}.sim")
+PROTOCOLS = (f"{OURS}.blackbox.sources.ros1", f"{OURS}.blackbox.formats", f"{OURS}.sim")
 """Protocol libraries of our own: what a source may import besides ``core``."""
 
 MODES = f"{OURS}.monitoring.modes"
 PROBES = f"{OURS}.monitoring.probes"
-ROS1 = f"{OURS}.blackbox.ros1"
+ROS1 = f"{OURS}.blackbox.sources.ros1"
+EVIDENCE = f"{OURS}.diagnosis.evidence"
+REASONING = tuple(
+    f"{OURS}.diagnosis.{name}"
+    for name in (
+        "condition_symptoms",
+        "covering",
+        "diagnose",
+        "faulttree",
+        "fmea",
+        "knowledge",
+        "prolog",
+    )
+)
+"""What a provider of evidence may import: the model, and libraries of its method."""
 
 PLUGINS: Mapping[str, tuple[str, Sequence[str]]] = {
     SOURCES: ("source", PROTOCOLS),
     MODES: ("mode", ()),
     PROBES: ("probe", (ROS1,)),
+    EVIDENCE: ("provider of evidence", REASONING),
 }
 """Packages of plugins: what one is called, and what it may import besides ``core``."""
 
 READERS: Mapping[str, Sequence[str]] = {
-    f"{SOURCES}.status": tuple(
-        f"{OURS}.blackbox.{name}" for name in ("follow", "journal.reserved", "store", "where")
-    ),
+    f"{SOURCES}.status": tuple(f"{OURS}.blackbox.{name}" for name in ("journal.channels", "store")),
 }
 """Plugins whose protocol is our own record: what a robot's watcher writes is read by its team."""
 
@@ -64,8 +80,7 @@ RECORDING = tuple(
         "sim",
         "blackbox.sources",
         "blackbox.filters",
-        "blackbox.unroll",
-        "blackbox.ros1",
+        "blackbox.columns.unroll",
         "blackbox.recorder",
         "blackbox.journal",
     )
@@ -74,7 +89,7 @@ RECORDING = tuple(
 
 
 def check(source: Path) -> list[Finding]:
-    """Return every import below ``source`` that the directions forbid."""
+    """Return every import below ``source`` that the directions forbid, and cycles of imports."""
     known = modules(source)
     graph = {module: imports(module, path, known) for module, path in known.items()}
     return [
@@ -82,7 +97,41 @@ def check(source: Path) -> list[Finding]:
         for module, entries in graph.items()
         for entry in entries
         for what in _complaints(module, entry)
-    ] + list(_pyarrow_in_record(graph, known, source))
+    ] + [*_pyarrow_in_record(graph, known, source), *_cycles(known, source)]
+
+
+def _cycles(known: Mapping[str, Path], source: Path) -> Iterator[Finding]:
+    """Find a cycle among all files, then among what lies in each folder; every import counts.
+
+    Imports in functions and for type checkers count too: a reader follows them as well.
+    """
+    files: dict[str, set[str]] = {}
+    folders: dict[str, dict[str, set[str]]] = defaultdict(lambda: defaultdict(set))
+    for module, path in known.items():
+        entries = imports(module, path, known, typing=True)
+        files[module] = {e.target for e in entries if e.target in known} - {module}
+        for target in files[module]:
+            folder, ours, theirs = _fork(_file(module, known), _file(target, known))
+            folders[folder][ours].add(theirs)
+    for folder, graph in (("files", files), *sorted(folders.items())):
+        try:
+            TopologicalSorter(graph).prepare()
+        except CycleError as error:
+            cycle = " <- ".join(error.args[1])
+            where = "src" if folder == "files" else str(source.joinpath(*folder.split(".")))
+            yield Finding(where, 0, f"a cycle of imports: {cycle}")
+
+
+def _file(module: str, known: Mapping[str, Path]) -> Sequence[str]:
+    """Return the parts of a module's name; those of a package end with ``__init__``."""
+    is_package = known[module].name == "__init__.py"
+    return [*module.split("."), *(["__init__"] if is_package else [])]
+
+
+def _fork(ours: Sequence[str], theirs: Sequence[str]) -> tuple[str, str, str]:
+    """Return the folder that two files share, and in which of its entries each of them lies."""
+    depth = next(i for i, (a, b) in enumerate(zip(ours, theirs, strict=False)) if a != b)
+    return ".".join(ours[:depth]), ours[depth], theirs[depth]
 
 
 def _complaints(module: str, entry: Import) -> Iterator[str]:
@@ -152,6 +201,78 @@ def _within(module: str, packages: Sequence[str]) -> bool:
 
 def _shown(path: Path, source: Path) -> str:
     return str(path.relative_to(source.parent))
+
+
+class Import(NamedTuple):
+    """One import of a module; ``lazy`` when it happens inside a function."""
+
+    line: int
+    target: str
+    lazy: bool
+
+
+def modules(source: Path) -> Mapping[str, Path]:
+    """Return the modules below a source folder by their dotted name."""
+    return {_dotted(path.relative_to(source)): path for path in sorted(source.rglob("*.py"))}
+
+
+def imports(
+    module: str, path: Path, known: Collection[str], *, typing: bool = False
+) -> list[Import]:
+    """Return what a module imports at run time; with ``typing`` also what type checkers import."""
+    package = module if path.name == "__init__.py" else module.rpartition(".")[0]
+    tree = ast.parse(path.read_text(encoding="utf-8"), str(path))
+    return [
+        Import(node.lineno, target, lazy)
+        for node, lazy in _statements(tree, lazy=False, typing=typing)
+        for target in _targets(node, package, known)
+    ]
+
+
+def _dotted(relative: Path) -> str:
+    parts = relative.with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def _statements(
+    node: ast.AST, lazy: bool, typing: bool
+) -> Iterator[tuple[ast.Import | ast.ImportFrom, bool]]:
+    for child in ast.iter_child_nodes(node):
+        if isinstance(child, ast.Import | ast.ImportFrom):
+            yield child, lazy
+        elif isinstance(child, ast.If) and _is_type_checking(child.test) and not typing:
+            for other in child.orelse:
+                yield from _statements(ast.Module([other], []), lazy, typing)
+        else:
+            inside = isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda)
+            yield from _statements(child, lazy or inside, typing)
+
+
+def _is_type_checking(test: ast.expr) -> bool:
+    name = test.attr if isinstance(test, ast.Attribute) else getattr(test, "id", "")
+    return name == "TYPE_CHECKING"
+
+
+def _targets(
+    node: ast.Import | ast.ImportFrom, package: str, known: Collection[str]
+) -> Iterator[str]:
+    if isinstance(node, ast.Import):
+        yield from (alias.name for alias in node.names)
+        return
+    base = _base(node, package)
+    names = {f"{base}.{alias.name}" for alias in node.names}
+    submodules = names & set(known)
+    yield from sorted(submodules)
+    if names - submodules:
+        yield base
+
+
+def _base(node: ast.ImportFrom, package: str) -> str:
+    if not node.level:
+        return node.module or ""
+    parts = package.split(".")
+    parents = parts[: len(parts) - node.level + 1]
+    return ".".join([*parents, *([node.module] if node.module else [])])
 
 
 if __name__ == "__main__":

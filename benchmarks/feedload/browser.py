@@ -8,7 +8,7 @@ from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING
 from urllib.parse import urlencode
 
-from amberbox.fleet.api.who import COOKIE
+from amberbox.server.http.auth import COOKIE
 
 if TYPE_CHECKING:
     from playwright.async_api import Page

@@ -10,15 +10,15 @@ from typing import Any
 import msgspec
 from sqlalchemy import Connection
 
-from amberbox.blackbox.journal import reserved
-from amberbox.fleet.accounts.actions import Role
-from amberbox.fleet.accounts.robotkeys import add_robot
-from amberbox.fleet.accounts.sessions import begin_session
-from amberbox.fleet.accounts.users import add_user
-from amberbox.fleet.bus import Change
-from amberbox.fleet.linkend.tables import ROBOT, STATUS
-from amberbox.fleet.services import Services
-from amberbox.link.frames import Row
+from amberbox.blackbox.journal import channels
+from amberbox.link.frames import LinkRow
+from amberbox.server.accounts.permissions import Role
+from amberbox.server.accounts.robots import add_robot
+from amberbox.server.accounts.sessions import begin_session
+from amberbox.server.accounts.users import add_user
+from amberbox.server.bus import ServerChange
+from amberbox.server.schema import ROBOT, STATUS
+from amberbox.server.services.context import Services
 
 ROBOTS, COMPONENTS, RATE_HZ = 10, 40, 5
 LOAD = f"{ROBOTS} x {COMPONENTS} components at {RATE_HZ} Hz"
@@ -49,7 +49,7 @@ async def speak(services: Services) -> None:
         await asyncio.sleep(max(wait_s, 0.0))
         step += 1
         robot, round_ = step % ROBOTS, step // ROBOTS
-        services.bus.publish(Change("rows", f"r{robot}", _told(robot, round_)))
+        services.bus.publish(ServerChange("rows", f"r{robot}", _told(robot, round_)))
 
 
 def _told(robot: int, round_: int) -> dict[str, Any]:
@@ -58,7 +58,7 @@ def _told(robot: int, round_: int) -> dict[str, Any]:
     rows = [status_row(n, round_, wrong=wrong and n == 0) for n in range(COMPONENTS)]
     if wrong != before:
         said = {"kind": "component_state", "text": "c0 has changed", "source": "watch"}
-        rows.append(_row(reserved.EVENT, round_ * 1000 + 999, said))
+        rows.append(_row(channels.EVENT, round_ * 1000 + 999, said))
     return {"store_id": "s", "rows": rows}
 
 
@@ -67,7 +67,7 @@ def _is_wrong(robot: int, round_: int) -> bool:
     return turn % 2 == 0 and turn // 2 % ROBOTS == robot
 
 
-def status_row(component: int, round_: int, *, wrong: bool = False) -> Row:
+def status_row(component: int, round_: int, *, wrong: bool = False) -> LinkRow:
     """Return a status with values that differ from round to round."""
     now_ns = time.time_ns()
     outputs = [{"name": "volts", "type": "float", "value": 20 + round_ % 80 / 8, "text": None},
@@ -78,11 +78,11 @@ def status_row(component: int, round_: int, *, wrong: bool = False) -> Row:
             "state": state, "outputs": outputs, "blocked_by": [], "measured_ns": now_ns,
             "since_ns": now_ns, "reason": "volts are low" if wrong else "", "config_hash": "",
             "live_only": False}  # fmt: skip
-    return _row(reserved.STATUS, round_ * 1000 + component, said)
+    return _row(channels.STATUS, round_ * 1000 + component, said)
 
 
-def _row(channel: str, seq: int, said: dict[str, Any]) -> Row:
-    return Row("watch", 1, seq, channel, time.time_ns(), msgspec.json.encode(said))
+def _row(channel: str, seq: int, said: dict[str, Any]) -> LinkRow:
+    return LinkRow("watch", 1, seq, channel, time.time_ns(), msgspec.json.encode(said))
 
 
 def _people(connection: Connection, now_ns: int, hashed: str) -> list[str]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import math
-import socket
 import time
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager, contextmanager
@@ -12,28 +11,30 @@ from pathlib import Path
 
 import uvicorn
 
-from amberbox.fleet.accounts.passwords import Cost, Passwords
-from amberbox.fleet.linkend.server import Connected
-from amberbox.fleet.services import Services
-from amberbox.fleet.serving import assembly
-from amberbox.fleet.serving.app import make_app
-from amberbox.fleet.serving.settings import Settings
-from amberbox.link.serverend import ServerEnd
+from amberbox.link.server_end import ServerEnd
+from amberbox.server import process
+from amberbox.server.accounts.passwords import HashCost, Passwords
+from amberbox.server.app import make_app
+from amberbox.server.config import ServerSettings
+from amberbox.server.ingest.link_server import RobotConnection
+from amberbox.server.services.context import Services
 from benchmarks.feedload.fleet import ROBOTS
 
 
 @contextmanager
 def assembled(folder: Path, port: int) -> Iterator[Services]:
     """Put a server together whose robots are taken to be here."""
-    settings = Settings(f"http://localhost:{port}")
-    services = assembly.assemble(folder, settings, None, Passwords(Cost(1, 8, 1)))
+    settings = ServerSettings(f"http://localhost:{port}")
+    services = process.make_services(folder, settings, None, Passwords(HashCost(1, 8, 1)))
     for name in (f"r{robot}" for robot in range(ROBOTS)):
-        here = Connected(name, _Nobody(), ServerEnd(name), time.time_ns(), heard_s=math.inf)
+        here = RobotConnection(
+            name, _Nobody(), ServerEnd(name), time.time_ns(), last_received_s=math.inf
+        )
         services.links.robots[name] = here
     try:
         yield services
     finally:
-        assembly.close(services)
+        process.close(services)
 
 
 @asynccontextmanager
@@ -53,13 +54,6 @@ async def served(services: Services, port: int) -> AsyncIterator[None]:
         tasks[0].cancel()
         server.should_exit = server.force_exit = True
         await asyncio.gather(*tasks, return_exceptions=True)
-
-
-def free_port() -> int:
-    """Return a port that nobody has."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 class _Nobody:

@@ -19,7 +19,7 @@ import httpx
 import msgspec
 from websockets.asyncio.client import ClientConnection, connect
 
-from amberbox.fleet.api.who import COOKIE
+from amberbox.server.http.auth import COOKIE
 from benchmarks.feedload.fleet import SENT
 from benchmarks.feedload.viewing import Page, Piece, pages
 

@@ -1,7 +1,7 @@
 """What open pages ask of a server: their feed, and the pieces that they fetch anew.
 
 What pages listen to is read from their modules; when they fetch pieces stands here as it stands
-there (``home.js``, ``robot/robot.js``, ``robot/head.js``, ``alarms/count.js``).
+there (``home.js``, ``robot.js``, ``robot_head.js``, ``page.js``).
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import amberbox.fleet.pages
+from amberbox.server import web
 from benchmarks.feedload.fleet import ROBOTS
 
-_MODULES = Path(amberbox.fleet.pages.__file__).parent / "static/js"
-_LISTENS = re.compile(r"\blisten\(\{[^}]*?kinds: (\[[^\]]*\])")
+_MODULES = Path(web.__file__).parent / "static/js"
+_LISTENS = re.compile(r"\bsubscribe\(\{[^}]*?kinds: (\[[^\]]*\])")
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +62,7 @@ def _robot(robot: str) -> Page:
     path = f"/pieces/robots/{robot}"
     now = Piece(f"{path}/now", 20)
     return Page(
-        [robot], _kinds("robot/robot.js", "robot/head.js"),
+        [robot], _kinds("robot.js", "robot_head.js"),
         (now, Piece("/pieces/alarm-count", 60)),
         news=(Piece(f"{path}/graph", 2), Piece(f"{path}/timeline?window=1h&lanes=", 5),
               Piece(f"{path}/head", 1)),

@@ -14,20 +14,19 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from amberbox.blackbox.follow.read import JournalFile, journals, sound_chunks
-from amberbox.blackbox.journal import reserved
+from amberbox.blackbox.journal import channels
 from amberbox.blackbox.journal.chunk import sequences
 from amberbox.blackbox.journal.writer import JournalOptions, JournalWriter
-from amberbox.blackbox.keeper.keeper import Keeper
-from amberbox.blackbox.keeper.options import KeeperOptions
-from amberbox.blackbox.keeper.ownstreams import Own, Streams
+from amberbox.blackbox.retention.maintenance import RetentionService
+from amberbox.blackbox.robot_folder.robot_yaml import RetentionOptions
 from amberbox.blackbox.signing.keys import public_key
-from amberbox.blackbox.store import Store, create_store
+from amberbox.blackbox.store.derived_journal import DerivedStreams, EncodedRecord
+from amberbox.blackbox.store.journal_reader import JournalFile, journals, sound_chunks
+from amberbox.blackbox.store.store import Store, create_store
 from amberbox.core.clock import NS
 from amberbox.core.types import Schema, Topic
-from amberbox.link.frames import Row
-from amberbox.link.proof import proofs_of
-from amberbox.link.uploads import Proof
+from amberbox.link.frames import LinkRow
+from amberbox.link.uploads import Proof, proofs_of
 from benchmarks.query import definition, fifty_columns
 
 BOOT = "10adbe9c-0000-4000-8000-000000000001"
@@ -56,7 +55,7 @@ class Recording:
 
     store: Store
     public_key: str
-    rows: Sequence[Row]
+    rows: Sequence[LinkRow]
     sealed: Sequence[Sealed]
     end_seq: int
     start_ns: int
@@ -84,7 +83,7 @@ def make_recording(
 
 def seal(store: Store) -> None:
     """Have the keeper seal and sign what was written."""
-    keeper = Keeper(store, KeeperOptions(robot="r0", quota_percent=100.0, min_free=0))
+    keeper = RetentionService(store, RetentionOptions(robot="r0", quota_percent=100.0, min_free=0))
     keeper._with_segments = False  # columns are made by the server here, not by the robot
     keeper.step(threading.Event())
     keeper.close()
@@ -115,12 +114,12 @@ def _writer(store: Store, writer: str, **more: Any) -> JournalWriter:
 
 
 def _write_statuses(store: Store, files: int, file_s: float, start_ns: int) -> None:
-    writer, streams, turns = _writer(store, "watch"), Streams(), round(file_s * 4)
+    writer, streams, turns = _writer(store, "watch"), DerivedStreams(), round(file_s * 4)
     for turn in range(files * turns):
         at_ns = start_ns + turn * NS // 4
         if turn % turns == 0:
             writer.rotate()
-        messages = [Own(reserved.CLOCK, _clock(at_ns, start_ns))]
+        messages = [EncodedRecord(channels.CLOCK, _clock(at_ns, start_ns))]
         messages += [_status(turn * _TURN + n, at_ns) for n in range(_TURN)]
         placed = [streams.placed(writer, message) for message in messages]
         times = [at_ns] * len(placed)
@@ -135,7 +134,7 @@ def _clock(at_ns: int, start_ns: int) -> bytes:
     return msgspec.json.encode(values)
 
 
-def _status(number: int, at_ns: int) -> Own:
+def _status(number: int, at_ns: int) -> EncodedRecord:
     """Compose the status of a component; its ``number`` is known by the sender."""
     component = number % COMPONENTS
     value = number if component < CHANGING else component
@@ -146,7 +145,7 @@ def _status(number: int, at_ns: int) -> Own:
               "level": "ok", "state": "nominal", "outputs": outputs, "blocked_by": [],
               "measured_ns": at_ns, "since_ns": at_ns - at_ns % (600 * NS), "reason": "",
               "config_hash": "", "live_only": False}  # fmt: skip
-    return Own(reserved.STATUS, msgspec.json.encode(values))
+    return EncodedRecord(channels.STATUS, msgspec.json.encode(values))
 
 
 def _write_data(store: Store, files: int, file_s: float, start_ns: int, hz: int) -> None:
@@ -183,13 +182,13 @@ def make_large(path: Path, files: int, megabytes: int, start_ns: int) -> Recordi
     return Recording(store, public_key(path) or "", [], sealed(store, 1.0), 0, start_ns)
 
 
-def _rows(journal: JournalFile) -> Iterator[Row]:
+def _rows(journal: JournalFile) -> Iterator[LinkRow]:
     """Give the statuses of a journal as they go over the link."""
     for chunk in sound_chunks(journal):
         numbers = sequences(chunk, journal.first_seq).tolist()
         messages = chunk.messages(np.arange(len(chunk)))
         for row, seq in enumerate(numbers):
             topic = journal.streams[int(chunk.channel[row])].topic.name
-            if topic == reserved.STATUS:
+            if topic == channels.STATUS:
                 at_ns = int(chunk.log_ns[row])
-                yield Row(journal.writer, journal.run, seq, topic, at_ns, messages[row])
+                yield LinkRow(journal.writer, journal.run, seq, topic, at_ns, messages[row])

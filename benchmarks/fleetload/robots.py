@@ -19,11 +19,22 @@ from websockets.exceptions import ConnectionClosed
 
 from amberbox.core.clock import NS
 from amberbox.link import limits, uploads
-from amberbox.link.frames import Ack, Beat, Durable, Hello, Rows, Welcome, encode, from_server
-from amberbox.link.positions import START, Place, Reach, RunEnd
-from amberbox.robot.link.copying import HttpSending, _about
-from amberbox.robot.link.dialing import authorization, socket_url
-from amberbox.robot.link.options import LinkOptions
+from amberbox.link.connection import LinkOptions, authorization, socket_url
+from amberbox.link.frames import (
+    START,
+    Ack,
+    BeatFrame,
+    DurableFrame,
+    Hello,
+    JournalPosition,
+    RowsFrame,
+    RunEnd,
+    Welcome,
+    WriterReach,
+    encode,
+    from_server,
+)
+from amberbox.link.uploader import HttpTransport, _about
 from benchmarks.fleetload.making import BOOT, CHANGING, COMPONENTS, Recording, Sealed
 from benchmarks.fleetload.servers import Server
 
@@ -134,15 +145,15 @@ class Robot:
                 if n % COMPONENTS < CHANGING:
                     self.heard.sent_s[self.name, n] = now_s
             self.at += len(rows)
-            upto = {"watch": Place(1, rows[-1].seq + 1)}
-            await self._socket.send(encode(Rows(self.epoch, self.number, list(rows), upto)))
+            upto = {"watch": JournalPosition(1, rows[-1].seq + 1)}
+            await self._socket.send(encode(RowsFrame(self.epoch, self.number, list(rows), upto)))
         if turn % 4 == 3:
             end = self.recording.rows[self.at - 1].seq + 1
-            await self._socket.send(encode(Durable(self.epoch, {"watch": _reach(end)})))
+            await self._socket.send(encode(DurableFrame(self.epoch, {"watch": _reach(end)})))
             await self._socket.send(encode(self._beat()))
 
-    def _beat(self) -> Beat:
-        return Beat(self.epoch, time.time_ns(), time.monotonic_ns(), 0, 0, NS // 1000)
+    def _beat(self) -> BeatFrame:
+        return BeatFrame(self.epoch, time.time_ns(), time.monotonic_ns(), 0, 0, NS // 1000)
 
     async def _listen(self) -> None:
         while True:
@@ -165,7 +176,7 @@ class Robot:
 
     def copy(self, one: Sealed) -> uploads.Verdict:
         """Copy a journal with the robot's own code for requests; blocks."""
-        sending = HttpSending(self.options, lambda: self.context)
+        sending = HttpTransport(self.options, lambda: self.context)
         address, about = uploads.address(self.recording.store.id, one.name), _about(one.path)
         try:
             at, content = sending("HEAD", address, about, b"").offset, one.path.read_bytes()
@@ -201,6 +212,6 @@ def _note(heard: Heard, robot: str, statuses: Sequence[Any], now_s: float) -> No
             heard.ages_s.append(now_s - sent_s)
 
 
-def _reach(end: int) -> Reach:
-    at = Place(1, end)
-    return Reach(START, at, at, (RunEnd(1, BOOT, end, closed=False),))
+def _reach(end: int) -> WriterReach:
+    at = JournalPosition(1, end)
+    return WriterReach(START, at, at, (RunEnd(1, BOOT, end, closed=False),))

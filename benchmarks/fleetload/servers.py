@@ -17,15 +17,15 @@ from types import TracebackType
 
 from sqlalchemy import func, select
 
-from amberbox.fleet.accounts.actions import Role
-from amberbox.fleet.accounts.passwords import Cost, Passwords
-from amberbox.fleet.accounts.robotkeys import add_robot
-from amberbox.fleet.accounts.tokens import add_token
-from amberbox.fleet.accounts.users import add_user
-from amberbox.fleet.archive.catalogue import COMMITTED
-from amberbox.fleet.archive.tables import JOURNALS
-from amberbox.fleet.database.database import FILE, Database
-from amberbox.fleet.linkend.tables import ROW
+from amberbox.server.accounts.passwords import HashCost, Passwords
+from amberbox.server.accounts.permissions import Role
+from amberbox.server.accounts.robots import add_robot
+from amberbox.server.accounts.tokens import add_token
+from amberbox.server.accounts.users import add_user
+from amberbox.server.archive.catalogue import COMMITTED
+from amberbox.server.database import FILE, ServerDatabase
+from amberbox.server.schema import JOURNALS, ROW
+from benchmarks.common import free_port
 
 _TICK = os.sysconf("SC_CLK_TCK")
 _PAGE = os.sysconf("SC_PAGE_SIZE")
@@ -61,7 +61,7 @@ class Server:
 
     def __enter__(self) -> Server:
         self.folder.mkdir(parents=True)
-        self.port = _free_port()
+        self.port = free_port()
         self._enrol()
         words = ["serve", "--data", str(self.folder)]
         if self.tls:
@@ -118,7 +118,7 @@ class Server:
 
     def waiting(self) -> tuple[int, int]:
         """Count the journals that have come, and those of them that are not in columns yet."""
-        database = Database(self.folder / FILE, read_only=True)
+        database = ServerDatabase(self.folder / FILE, read_only=True)
         with database.reading() as connection:
             states = select(JOURNALS.c.state, func.count()).group_by(JOURNALS.c.state)
             found = {state: int(count) for state, count in connection.execute(states)}
@@ -132,9 +132,9 @@ class Server:
             _note(self.usage, pid, role)
 
     def _enrol(self) -> None:
-        now_ns, database = time.time_ns(), Database(self.folder / FILE)
+        now_ns, database = time.time_ns(), ServerDatabase(self.folder / FILE)
         with database.begin() as connection:
-            hashed = Passwords(Cost(1, 8, 1)).hash("a long enough passphrase")
+            hashed = Passwords(HashCost(1, 8, 1)).hash("a long enough passphrase")
             admin = add_user(connection, now_ns, "admin", Role.ADMIN, hashed)
             scopes = ["read:status", "read:data"]
             self.token = add_token(connection, now_ns, admin, "bench", scopes).text
@@ -162,7 +162,7 @@ class Server:
 
     def _look(self) -> None:
         """Look at the processes each second, at the rows of the link every ten."""
-        database, seconds = Database(self.folder / FILE, read_only=True), 0
+        database, seconds = ServerDatabase(self.folder / FILE, read_only=True), 0
         while not self._stop.wait(1.0):
             self.measure_now()
             seconds += 1
@@ -172,11 +172,6 @@ class Server:
                 self.rows.append(int(count or 0))
                 self.sizes_mb.append(self.database_mb())
         database.close()
-
-
-def _free_port() -> int:
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        return int(free.getsockname()[1])
 
 
 def _family(pid: int) -> dict[int, str]:

@@ -1,13 +1,17 @@
 """Amberbox: a flight recorder and a doctor for robots."""
 
+import sys
 from typing import TYPE_CHECKING, Any
 
+from amberbox.core.moved import Moved
+from amberbox.core.version import __version__ as __version__
+
 if TYPE_CHECKING:
-    from amberbox.blackbox.follow.follow import follow as follow
-    from amberbox.blackbox.incidents.marking import mark as mark
+    from amberbox.blackbox.retention.pins import mark as mark
+    from amberbox.blackbox.store.tail import follow as follow
     from amberbox.client.opening import open as open
 
-__version__ = "0.1.0"
+sys.meta_path.append(Moved())
 
 
 def __getattr__(name: str) -> Any:
@@ -17,11 +21,11 @@ def __getattr__(name: str) -> Any:
 
         return open_record
     if name == "follow":
-        from amberbox.blackbox.follow.follow import follow as follow_record
+        from amberbox.blackbox.store.tail import follow as follow_record
 
         return follow_record
     if name == "mark":
-        from amberbox.blackbox.incidents.marking import mark as mark_incident
+        from amberbox.blackbox.retention.pins import mark as mark_incident
 
         return mark_incident
     raise AttributeError(f"module 'amberbox' has no attribute {name!r}")

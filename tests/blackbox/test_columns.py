@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from amberbox.blackbox.query.tabletext import plain
-from amberbox.blackbox.segments import columns as col
+from amberbox.blackbox.columns import arrays as col
+from amberbox.blackbox.columns.table_text import plain
 from amberbox.core.types import ColumnData, Ragged
 
 

@@ -8,9 +8,13 @@ from textwrap import dedent
 
 import pytest
 
-from amberbox.blackbox.folder.folder import RobotFolder, inspect_folder, load_folder
-from amberbox.blackbox.folder.plan import planned_items
-from amberbox.blackbox.folder.robot import RobotConfig
+from amberbox.blackbox.robot_folder.folder import (
+    RobotFolder,
+    inspect_folder,
+    load_folder,
+    planned_items,
+)
+from amberbox.blackbox.robot_folder.robot_yaml import RobotConfig
 from amberbox.core.errors import ConfigurationError, Problem, UsageError
 
 CONFIGS = Path(__file__).parent / "configs"

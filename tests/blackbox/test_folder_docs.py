@@ -1,18 +1,17 @@
-"""docs/configuration.md names every key, and its examples load."""
+"""docs/robot/configuration.md names every key, and its examples load."""
 
 from __future__ import annotations
 
 import re
 from pathlib import Path
 
-from amberbox.blackbox.folder.blocks import DefaultParameters
-from amberbox.blackbox.folder.folder import load_folder
-from amberbox.blackbox.folder.legacy import LEGACY_KEYS
-from amberbox.blackbox.folder.robot import RobotConfig
-from amberbox.core.describe import describe
+from amberbox.blackbox.robot_folder.black_box_yaml import LEGACY_KEYS, DefaultParameters
+from amberbox.blackbox.robot_folder.folder import load_folder
+from amberbox.blackbox.robot_folder.robot_yaml import RobotConfig
+from amberbox.core.options import describe
 from amberbox.core.source import TopicOptions
 
-PAGE = Path(__file__).resolve().parents[2] / "docs" / "configuration.md"
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "robot" / "configuration.md"
 
 
 def test_every_key_is_documented() -> None:

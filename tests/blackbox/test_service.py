@@ -11,10 +11,10 @@ from pathlib import Path
 
 import pytest
 
-from amberbox.blackbox.folder.folder import load_folder
 from amberbox.blackbox.recorder.recorder import Recorder
-from amberbox.blackbox.service import Notifier, notify, watchdog_s
-from amberbox.testing.patience import PATIENCE_S
+from amberbox.blackbox.robot_folder.folder import load_folder
+from amberbox.core.systemd import Notifier, notify, watchdog_s
+from amberbox.testing.clock import PATIENCE_S
 
 SIM = "- sim:\n    seed: 1\n    topics: [{name: odom}]\n"
 
@@ -135,7 +135,7 @@ def test_the_recorder_is_ready_once_bytes_are_there_and_says_when_it_stops(
     monkeypatch.setenv("NOTIFY_SOCKET", manager.address)
     (tmp_path / "robot.yaml").write_text("id: r\n")
     (tmp_path / "black_box.yaml").write_text(SIM)
-    recorder = Recorder(load_folder(tmp_path), keeper=False)
+    recorder = Recorder(load_folder(tmp_path), retention=False)
     thread = threading.Thread(target=recorder.run)
     assert journal_bytes(tmp_path) == 0
     thread.start()
@@ -162,7 +162,7 @@ def test_a_recorder_that_hangs_gives_no_sign_of_life(
     monkeypatch.setenv("WATCHDOG_USEC", "100000")
     (tmp_path / "robot.yaml").write_text("id: r\n")
     (tmp_path / "black_box.yaml").write_text(SIM)
-    recorder = Recorder(load_folder(tmp_path), keeper=False)
+    recorder = Recorder(load_folder(tmp_path), retention=False)
     hangs, goes_on, tick = threading.Event(), threading.Event(), recorder.pipeline.tick
     signs = 0
 

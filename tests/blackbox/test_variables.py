@@ -4,7 +4,12 @@ from __future__ import annotations
 
 import pytest
 
-from amberbox.blackbox.query.variables import closest, find, resolve, select
+from amberbox.blackbox.columns.variables import (
+    configured_columns,
+    find_columns,
+    resolve_columns,
+    suggest_names,
+)
 from amberbox.core.errors import UsageError
 from amberbox.core.types import Column
 
@@ -44,16 +49,16 @@ def paths(columns: list[Column]) -> list[str]:
     ],
 )
 def test_find(name: str, expected: list[str]) -> None:
-    assert paths(find(COLUMNS, name)) == expected
+    assert paths(find_columns(COLUMNS, name)) == expected
 
 
 def test_a_name_that_fits_twice_is_ambiguous() -> None:
     with pytest.raises(UsageError, match="ambiguous: pose/pose/position/x or twist/twist/linear/x"):
-        find(COLUMNS[:-2], "x")
+        find_columns(COLUMNS[:-2], "x")
 
 
 def test_an_element_of_a_list_has_a_name_of_its_own() -> None:
-    wanted = resolve(COLUMNS, ["ranges[17]", "ranges", "ranges[-1]"], "scan")
+    wanted = resolve_columns(COLUMNS, ["ranges[17]", "ranges", "ranges[-1]"], "scan")
     assert [(w.name, w.element) for w in wanted] == [
         ("ranges[17]", 17),
         ("ranges", None),
@@ -62,7 +67,7 @@ def test_an_element_of_a_list_has_a_name_of_its_own() -> None:
 
 
 def test_each_column_comes_once_in_the_order_asked_for() -> None:
-    wanted = resolve(COLUMNS, ["position/y", "position"], "odom")
+    wanted = resolve_columns(COLUMNS, ["position/y", "position"], "odom")
     assert [w.column.path for w in wanted] == ["pose/pose/position/y", "pose/pose/position/x"]
 
 
@@ -71,7 +76,7 @@ def test_each_column_comes_once_in_the_order_asked_for() -> None:
 )
 def test_an_unknown_name_is_answered_with_the_closest(name: str, hint: str) -> None:
     with pytest.raises(UsageError, match="odom has no variable") as caught:
-        resolve(COLUMNS, [name], "odom")
+        resolve_columns(COLUMNS, [name], "odom")
     assert hint in caught.value.hint
 
 
@@ -88,15 +93,18 @@ def test_an_unknown_name_is_answered_with_the_closest(name: str, hint: str) -> N
     ],
 )
 def test_select_as_configured(names: list[str], expected: list[str]) -> None:
-    assert paths(select(COLUMNS, names)) == expected
+    assert paths(configured_columns(COLUMNS, names)) == expected
 
 
 def test_select_takes_every_path_that_ends_in_a_name() -> None:
-    assert paths(select(COLUMNS[:-2], ["x"])) == ["pose/pose/position/x", "twist/twist/linear/x"]
+    assert paths(configured_columns(COLUMNS[:-2], ["x"])) == [
+        "pose/pose/position/x",
+        "twist/twist/linear/x",
+    ]
 
 
 def test_closest_items() -> None:
-    hint = closest("ros_odmo", ["ros_odom", "ros_scan"])
+    hint = suggest_names("ros_odmo", ["ros_odom", "ros_scan"])
     assert hint == "did you mean ros_odom? there are: ros_odom, ros_scan"
-    assert closest("zzz", ["a", "b"]) == "there are: a, b"
-    assert closest("zzz", []) == "nothing has been recorded yet"
+    assert suggest_names("zzz", ["a", "b"]) == "there are: a, b"
+    assert suggest_names("zzz", []) == "nothing has been recorded yet"

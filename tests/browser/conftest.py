@@ -4,7 +4,7 @@ A test of a page::
 
     import pytest
     from tests.browser.conftest import PageAs
-    from tests.browser.looks import axe, no_sideways_scroll, shot
+    from tests.browser.page_checks import axe, no_sideways_scroll, shot
     from tests.browser.site import Site
 
     @pytest.mark.parametrize("theme", ["light", "dark"])
@@ -19,7 +19,7 @@ A test of a page::
 At the end of a test each of its pages is closed, and the test fails when one had an error on its
 console, an error in a script, an answer of 400 or more, or asked anybody but the site. What is
 meant to happen is named by a word of its line: ``page_as("viewer", expects=["404 GET"])``; while
-the server is restarted ``expects=RESTART`` (``tests/browser/watching.py``).
+the server is restarted ``expects=RESTART`` (``tests/browser/page_checks.py``).
 
 - ``site`` (site.py): ``url``, ``restart()``, ``ask("/robots")``, ``session(name)``; ``site.robots``
   are the robots (robot.py) that one lets find something: ``change``, ``status``, ``say``,
@@ -27,7 +27,7 @@ the server is restarted ``expects=RESTART`` (``tests/browser/watching.py``).
   and ``come()``. What a test changes it puts right again: all tests share one site.
   What was recorded and said stands in record.py and story.py, hostile names in hostile.py.
 - People: viewer, operator, technician, admin, and nurse, a technician for the ward only.
-- ``expect`` of Playwright, in a module: ``from tests.browser.expecting import expect``.
+- ``expect`` of Playwright waits as long as everything else does: ``browser`` sets that.
 - Screenshots go to the folder $AMBERBOX_SHOTS.
 """
 
@@ -40,10 +40,10 @@ from typing import TYPE_CHECKING, Protocol
 
 import pytest
 
-from amberbox.fleet.api.who import COOKIE
+from amberbox.server.http.auth import COOKIE
 from tests.browser.chromium import chromium, only
+from tests.browser.page_checks import Watched
 from tests.browser.site import Site, made
-from tests.browser.watching import Watched
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, BrowserContext, Page
@@ -90,6 +90,9 @@ def site(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactor
 @pytest.fixture(scope="session")
 def browser(request: pytest.FixtureRequest) -> Browser:
     """The browser."""
+    from playwright.sync_api import expect  # only where it is there
+
+    expect.set_options(timeout=_WAIT_MS)
     opened = request.config.stash.setdefault(_OPEN, ExitStack())
     return opened.enter_context(chromium())
 

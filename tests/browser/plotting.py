@@ -6,8 +6,8 @@ import json
 import time
 from typing import TYPE_CHECKING, Any
 
-from amberbox.fleet.pages.assets import address
-from amberbox.fleet.pages.strings import for_browser
+from amberbox.server.web.assets import address
+from amberbox.server.web.text import for_browser
 
 if TYPE_CHECKING:
     from playwright.sync_api import Page, Route

@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from amberbox.blackbox.journal import reserved
+from amberbox.blackbox.journal import channels
 from amberbox.core.clock import NS
 from amberbox.core.types import Schema, Topic
 from amberbox.testing.records import FakeItem, FakeRun
@@ -88,16 +88,16 @@ def write_kept(store: Path, now_ns: int, boot: str) -> None:
     """Write the journal of ``keep``: missions, an incident, why something is missing."""
     run = FakeRun(store, "keep", boot=boot)
     for values in _missions(now_ns):
-        run.own(reserved.MISSION, values["to_ns"] or values["from_ns"], values)
+        run.own(channels.MISSION, values["to_ns"] or values["from_ns"], values)
     for state in ("open", "complete"):
         incident = {"id": "incident-1", "state": state, "reason": "bumper pressed", "who": "",
                     "trigger": "bump", "from_ns": now_ns - 36 * MINUTE_NS,
                     "to_ns": now_ns - 34 * MINUTE_NS}  # fmt: skip
-        run.own(reserved.INCIDENT, now_ns - 34 * MINUTE_NS, incident)
+        run.own(channels.INCIDENT, now_ns - 34 * MINUTE_NS, incident)
     from_ns, to_ns = (now_ns + at_ns for at_ns in GAP_NS)
     gap = {"item": ODOM, "peer": "", "from_ns": from_ns, "to_ns": to_ns, "reason": LOST,
            "count": (to_ns - from_ns) // NS * ODOM_HZ}  # fmt: skip
-    run.own(reserved.GAP, to_ns, gap)
+    run.own(channels.GAP, to_ns, gap)
     run.close()
 
 

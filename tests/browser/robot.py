@@ -6,24 +6,23 @@ import asyncio
 import threading
 import time
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
-from amberbox.blackbox.keeper.ownjournal import OwnJournal, event
-from amberbox.blackbox.keeper.ownstreams import Own
-from amberbox.blackbox.store import WriterLock, create_store
+from amberbox.blackbox.store.derived_journal import DerivedJournal, EncodedRecord, event
+from amberbox.blackbox.store.store import WriterLock, create_store
+from amberbox.core.clock import NS
+from amberbox.core.pacing import Backoff
 from amberbox.core.types import Level, Output, Status
-from amberbox.link.backoff import Backoff
-from amberbox.monitoring.engine.findings import Condition, Finding, Transition
-from amberbox.monitoring.messages.records import encoded, record_of
-from amberbox.robot.link.client import LinkClient
-from amberbox.robot.link.network import Network
-from amberbox.robot.link.options import LinkOptions
+from amberbox.link.client import LinkClient
+from amberbox.link.connection import LinkOptions
+from amberbox.link.policy import Network
+from amberbox.monitoring.current_state import read_heartbeat
+from amberbox.monitoring.findings import Finding, HealthState, Transition, encoded, record_of
 from amberbox.testing.records import FakeItem, FakeRun
-from tests.browser.robotclock import RobotClock
 
 _REPEAT_S = 1.0
 _END_S = 10.0
@@ -46,7 +45,7 @@ class Robot:
         self._options = options
         self._store = create_store(store)
         self._lock = WriterLock(self._store, "watch")
-        self._journal = OwnJournal(
+        self._journal = DerivedJournal(
             self._store, "watch", robot=self.name, config_hash=options.config_hash, clock=clock
         )
         self._saying = threading.Lock()
@@ -77,10 +76,10 @@ class Robot:
     ) -> None:  # fmt: skip
         """Let a component go into another condition: the status, and the event of it."""
         old = self.statuses.get((component, ""))
-        before = Condition(old.level, old.state) if old else Condition("ok", "nominal")
+        before = HealthState(old.level, old.state) if old else HealthState("ok", "nominal")
         new = self.status(component, level, state, reason=reason, blocked_by=blocked_by)
         self.say(Transition(
-            self.name, component, "", before, Condition(new.level, new.state), new.measured_ns,
+            self.name, component, "", before, HealthState(new.level, new.state), new.measured_ns,
             reason, blocked_by, hint, self._options.config_hash,
         ))  # fmt: skip
 
@@ -105,7 +104,7 @@ class Robot:
         with self._saying:
             now_ns = self.clock.wall_ns()
             rows = [encoded(replace(s, measured_ns=now_ns)) for s in self.statuses.values()]
-            self._journal.append([Own(channel, data) for channel, data in rows])
+            self._journal.append([EncodedRecord(channel, data) for channel, data in rows])
 
     def measure(self, item: FakeItem, **values: Any) -> None:
         """Record a message now: who looks at its variables live sees them."""
@@ -161,7 +160,7 @@ class Robot:
         started.set()
         client = LinkClient(
             self._store, self._options, clock=self.clock, network=lambda: Network("eth0"),
-            backoff=Backoff(least_s=0.05, most_s=0.3),
+            monitoring=read_heartbeat, backoff=Backoff(least_s=0.05, most_s=0.3),
         )  # fmt: skip
         repeating = asyncio.create_task(self._repeat())
         await client.run(self._stop)
@@ -173,3 +172,27 @@ class Robot:
             if self.repeats and self.statuses:
                 await asyncio.to_thread(self.repeat)
             await asyncio.sleep(max(0.1, began_s + _REPEAT_S - time.monotonic()))
+
+
+_UP_NS = 6 * 3600 * NS
+"""How long the robot had been on when the tests began."""
+
+
+@dataclass
+class RobotClock:
+    """Goes as real time does; ``ago_ns`` is how far in the past it stands."""
+
+    boot: str
+    ago_ns: int = 0
+
+    def wall_ns(self) -> int:
+        return time.time_ns() - self.ago_ns
+
+    def boot_ns(self) -> int:
+        return time.monotonic_ns() + _UP_NS - self.ago_ns
+
+    def boot_id(self) -> str:
+        return self.boot
+
+    def synchronised(self) -> bool | None:
+        return True

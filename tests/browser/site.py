@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import json
 import subprocess
-import sys
 import time
 import urllib.request
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -16,24 +15,22 @@ from typing import Any
 from fastapi import FastAPI
 
 from amberbox.core.clock import NS
-from amberbox.fleet.accounts.sessions import begin_session
-from amberbox.fleet.accounts.tokens import add_token
-from amberbox.fleet.accounts.users import find_user
-from amberbox.fleet.alarms.alarm import Alarm
-from amberbox.fleet.alarms.tables import ALARM, ALARM_ROBOT, HISTORY
-from amberbox.fleet.api.who import COOKIE
-from amberbox.fleet.database.database import FILE, Database
-from amberbox.fleet.linkend.tables import ROBOT
+from amberbox.link.connection import LinkOptions
 from amberbox.link.folders import pack
-from amberbox.robot.link.options import LinkOptions
-from amberbox.testing.patience import PATIENCE_S
+from amberbox.server.accounts.sessions import begin_session
+from amberbox.server.accounts.tokens import add_token
+from amberbox.server.accounts.users import find_user
+from amberbox.server.alarms.alarm import Alarm
+from amberbox.server.database import FILE, ServerDatabase
+from amberbox.server.http.auth import COOKIE
+from amberbox.server.schema import ALARM, ALARM_ROBOT, HISTORY, ROBOT
+from amberbox.testing.clock import PATIENCE_S, wait_until
 from tests.browser import hostile, record, story
-from tests.browser.robot import Robot
-from tests.browser.robotclock import RobotClock
-from tests.client.served import free_port
-from tests.fleet.archive.recordings import Robot as Recorded
-from tests.fleet.house import House
-from tests.fleet.knowledge import robot as sim
+from tests.browser.robot import Robot, RobotClock
+from tests.server.archive.recordings import Robot as Recorded
+from tests.server.house import House
+from tests.server.knowledge import robot as sim
+from tests.support.processes import command, free_port
 
 MINUTE_NS = 60 * NS
 HASH_2 = "bead" * 16
@@ -52,7 +49,7 @@ class Site:
     keys: dict[str, str]
     robots: dict[str, Robot] = field(default_factory=dict)
     process: subprocess.Popen[bytes] | None = None
-    _database: Database | None = None
+    _database: ServerDatabase | None = None
 
     @property
     def url(self) -> str:
@@ -88,22 +85,22 @@ class Site:
             return json.load(answer)
 
     @property
-    def database(self) -> Database:
+    def database(self) -> ServerDatabase:
         """The server's own database, which other processes may write, too."""
-        self._database = self._database or Database(self.data / FILE)
+        self._database = self._database or ServerDatabase(self.data / FILE)
         return self._database
 
     def start(self) -> None:
         """Start the server on its port and wait until it answers."""
         self.launch()
-        until(self.answers, "the server answers")
+        wait_until(self.answers, "the server answers")
 
     def launch(self) -> None:
         """Start the server without waiting for it."""
         words = ("--data", str(self.data), "--port", str(self.port), "--quiet")
         with (self.folder / "server.log").open("ab") as log:
             self.process = subprocess.Popen(
-                [sys.executable, "-m", "amberbox", "serve", *words], stdin=subprocess.DEVNULL,
+                command("serve", *words), stdin=subprocess.DEVNULL,
                 stdout=log, stderr=log,
             )  # fmt: skip
 
@@ -142,14 +139,6 @@ class Site:
             return False
 
 
-def until(what: Callable[[], object], words: str) -> None:
-    """Wait until something is so; fail after a time, saying what never came to be."""
-    end_s = time.monotonic() + PATIENCE_S
-    while not what():
-        assert time.monotonic() < end_s, f"it never came to be that {words}"
-        time.sleep(0.05)
-
-
 @contextmanager
 def made(folder: Path) -> Iterator[Site]:
     """Fill a server's folder, start it, let the robots come; end all of it afterwards."""
@@ -165,7 +154,7 @@ def made(folder: Path) -> Iterator[Site]:
     try:
         site.launch()
         _let_happen(site, boot)
-        until(site.answers, "the server answers")
+        wait_until(site.answers, "the server answers")
         _let_come(site)
         yield site
     finally:
@@ -268,8 +257,8 @@ def _let_come(site: Site) -> None:
     """Let the robots connect, and wait until the server knows what they have to say."""
     for robot in site.robots.values():
         robot.come()
-    until(lambda: site.is_online(*site.robots), "the robots are here")
-    until(lambda: _has_alarm(site), "the alarm of the laser is there")
+    wait_until(lambda: site.is_online(*site.robots), "the robots are here")
+    wait_until(lambda: _has_alarm(site), "the alarm of the laser is there")
 
 
 def _has_alarm(site: Site) -> bool:

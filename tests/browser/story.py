@@ -5,15 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from amberbox.consult.declared import declared
+from amberbox.consult.folder_knowledge import read_declared_robot
 from amberbox.core.clock import NS
 from amberbox.core.types import Diagnosis, Symptom
-from amberbox.diagnosis.answering import Heading, answer
-from amberbox.diagnosis.situation import Situation
-from amberbox.monitoring.engine.findings import AlarmChange
+from amberbox.diagnosis.diagnose import DiagnosisId, ObservedSituation, answer
+from amberbox.monitoring.findings import AlarmChange
 from tests.browser import hostile
 from tests.browser.robot import Robot
-from tests.fleet.knowledge.robot import FOLDER, HASH
+from tests.server.knowledge.robot import FOLDER, HASH
 
 MINUTE_NS = 60 * NS
 FAULT_NS = -15 * NS
@@ -70,7 +69,7 @@ def all_well(robot: Robot) -> None:
 
 def laser_dies(robot: Robot) -> None:
     """Let the front laser fall silent: status, consequences, symptom, diagnosis, alarm."""
-    known = declared(FOLDER, robot.name, HASH).knowledge()
+    known = read_declared_robot(FOLDER, robot.name, HASH).knowledge()
     robot.clock.ago_ns = -FAULT_NS
     at_ns = robot.clock.wall_ns()
     robot.status("laser_front", "error", "alive", mode="heartbeat", reason=REASON, alive=False,
@@ -81,7 +80,9 @@ def laser_dies(robot: Robot) -> None:
         robot.change(component, "error", "blocked", reason=f"needs {by[0]}", blocked_by=by)
     silent = Symptom(NO_SCANS, "present", NO_SCANS, at_ns, at_ns)
     runs = Symptom(RUNS, "absent", RUNS, None, at_ns)
-    found = answer(known, Situation((silent, runs), watched=True), Heading(DIAGNOSIS, 1, at_ns))
+    found = answer(
+        known, ObservedSituation((silent, runs), watched=True), DiagnosisId(DIAGNOSIS, 1, at_ns)
+    )
     robot.say(silent, runs, found, alarm(robot.name, at_ns, found))
     robot.clock.ago_ns = 0
 

@@ -1,10 +1,11 @@
 """Accounts, people, teams and robots, in a browser."""
 
+from playwright.sync_api import expect
+
 from tests.browser.conftest import PageAs
-from tests.browser.expecting import expect
-from tests.browser.looks import axe, shot
+from tests.browser.page_checks import axe, shot
 from tests.browser.site import Site
-from tests.fleet.notifying.receivers import hook_server
+from tests.server.alarms.receivers import hook_server
 
 
 def test_somebody_is_invited_and_chooses_a_password(page_as: PageAs) -> None:

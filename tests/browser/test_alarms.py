@@ -11,18 +11,18 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from playwright.sync_api import expect
 from sqlalchemy import delete
 
 from amberbox.core.clock import NS
-from amberbox.fleet.accounts.sessions import csrf_token
-from amberbox.fleet.alarms.alarm import Alarm
-from amberbox.fleet.alarms.tables import ALARM, ALARM_ROBOT, HISTORY
-from amberbox.fleet.api.who import COOKIE, CSRF_HEADER
-from amberbox.testing.patience import PATIENCE_S
+from amberbox.server.accounts.sessions import csrf_token
+from amberbox.server.alarms.alarm import Alarm
+from amberbox.server.http.auth import COOKIE, CSRF_HEADER
+from amberbox.server.schema import ALARM, ALARM_ROBOT, HISTORY
+from amberbox.testing.clock import PATIENCE_S
 from tests.browser import hostile
 from tests.browser.conftest import PageAs
-from tests.browser.expecting import expect
-from tests.browser.looks import axe, no_sideways_scroll, shot
+from tests.browser.page_checks import axe, no_sideways_scroll, shot
 from tests.browser.site import Site
 
 if TYPE_CHECKING:

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 from urllib.parse import parse_qs, urlsplit
 
 import pytest
+from playwright.sync_api import expect
 
 from tests.browser import hostile, record
 from tests.browser.conftest import PageAs
-from tests.browser.expecting import expect
+from tests.browser.page_checks import RESTART
 from tests.browser.site import Site
-from tests.browser.watching import RESTART
 
 if TYPE_CHECKING:
     from playwright.sync_api import Page, Route

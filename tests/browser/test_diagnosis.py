@@ -7,16 +7,15 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import pytest
+from playwright.sync_api import expect
 
-from amberbox.consult.declared import declared
+from amberbox.consult.folder_knowledge import read_declared_robot
 from amberbox.core.types import Symptom
-from amberbox.diagnosis.answering import Heading, answer
-from amberbox.diagnosis.situation import Situation
+from amberbox.diagnosis.diagnose import DiagnosisId, ObservedSituation, answer
 from tests.browser.conftest import PageAs
-from tests.browser.expecting import expect
-from tests.browser.looks import axe, no_sideways_scroll, shot
+from tests.browser.page_checks import axe, no_sideways_scroll, shot
 from tests.browser.site import HASH_2, Site
-from tests.fleet.knowledge.robot import FOLDER
+from tests.server.knowledge.robot import FOLDER
 
 if TYPE_CHECKING:
     from playwright.sync_api import Page
@@ -33,9 +32,9 @@ def broken(site: Site, request: pytest.FixtureRequest) -> Iterator[str]:
     at_ns = robot.clock.wall_ns()
     silent = Symptom(NO_SCANS, "present", NO_SCANS, at_ns, at_ns,
                      evidence=(("sim_scan_front", at_ns, at_ns),))  # fmt: skip
-    knowledge = declared(FOLDER, ROBOT, HASH_2).knowledge()
-    heading = Heading(f"{ROBOT}-{request.node.name[:24]}", 1, at_ns)
-    found = answer(knowledge, Situation((silent,), watched=True), heading)
+    knowledge = read_declared_robot(FOLDER, ROBOT, HASH_2).knowledge()
+    heading = DiagnosisId(f"{ROBOT}-{request.node.name[:24]}", 1, at_ns)
+    found = answer(knowledge, ObservedSituation((silent,), watched=True), heading)
     robot.say(silent, found)
     yield f"/robots/{ROBOT}/diagnosis"
     then_ns = robot.clock.wall_ns()
@@ -57,9 +56,9 @@ def hot(site: Site, request: pytest.FixtureRequest) -> Iterator[str]:
     rate = "the rate of temperature over 40 s is 0.034, at most 0.01"
     heats = Symptom(HEATS, "present", HEATS, at_ns - 5 * ns, at_ns - 5 * ns, reason=rate)
     warm = Symptom(HOT, "present", HOT, at_ns, at_ns, reason="temperature is 58.2 °C, at most 50")
-    knowledge = declared(FOLDER, ROBOT, HASH_2).knowledge()
-    heading = Heading(f"{ROBOT}-hot-{request.node.callspec.params['theme']}", 1, at_ns)
-    found = answer(knowledge, Situation((lost, heats, warm), watched=True), heading)
+    knowledge = read_declared_robot(FOLDER, ROBOT, HASH_2).knowledge()
+    heading = DiagnosisId(f"{ROBOT}-hot-{request.node.callspec.params['theme']}", 1, at_ns)
+    found = answer(knowledge, ObservedSituation((lost, heats, warm), watched=True), heading)
     gone = Symptom(JUMPS, "absent", JUMPS, None, at_ns - 30 * ns)
     robot.say(lost, gone, heats, warm, found)
     yield f"/robots/{ROBOT}/diagnosis"

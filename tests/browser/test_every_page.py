@@ -9,13 +9,13 @@ from collections.abc import Iterable, Mapping
 from html import unescape
 
 import pytest
+from playwright.sync_api import expect
 
-from amberbox.fleet.api.who import COOKIE
-from amberbox.fleet.serving.app import rooms
-from amberbox.testing.patience import PATIENCE_S
+from amberbox.server.http.auth import COOKIE
+from amberbox.server.routes import PAGES as PAGE_ROUTES
+from amberbox.testing.clock import PATIENCE_S
 from tests.browser.conftest import PageAs
-from tests.browser.expecting import expect
-from tests.browser.looks import axe, no_sideways_scroll, no_squeezed_values, shot
+from tests.browser.page_checks import axe, no_sideways_scroll, no_squeezed_values, shot
 from tests.browser.site import Site
 
 PAGES: Mapping[str, str] = {
@@ -56,8 +56,7 @@ def is_page(path: str) -> bool:
 
 
 def test_no_page_is_left_out() -> None:
-    routes = [routes for name, routes in rooms().items() if name.startswith("pages.")]
-    paths = {path for one in routes for method, path in one.rules if method == "GET"}
+    paths = {path for one in PAGE_ROUTES for method, path in one.rules if method == "GET"}
     assert {path for path in paths if is_page(path)} == set(PAGES) | ELSEWHERE
 
 

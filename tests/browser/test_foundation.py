@@ -10,13 +10,13 @@ from threading import Thread
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from playwright.sync_api import expect
 
+from amberbox.testing.clock import wait_until
 from tests.browser import hostile
 from tests.browser.conftest import PageAs
-from tests.browser.expecting import expect
-from tests.browser.looks import axe, no_sideways_scroll, shot
-from tests.browser.site import Site, fresh, until
-from tests.browser.watching import Watched
+from tests.browser.page_checks import Watched, axe, no_sideways_scroll, shot
+from tests.browser.site import Site, fresh
 
 if TYPE_CHECKING:
     from playwright.sync_api import Page
@@ -82,7 +82,7 @@ def test_what_goes_wrong_in_a_page_is_noticed(page_as: PageAs, site: Site) -> No
     page.evaluate("() => { setTimeout(() => { throw new Error('boom') }) }")
     page.wait_for_function("() => true")
     (watched,) = page_as.watched
-    until(lambda: heard(page, watched) >= 4, "all is heard")
+    wait_until(lambda: heard(page, watched) >= 4, "all is heard")
     assert watched.heard[0] == f"404 GET {site.url}/api/v1/nothing"
     assert any("boom" in one for one in watched.heard)
     assert not watched.troubles
@@ -135,7 +135,7 @@ def test_the_robots_are_as_they_say(site: Site) -> None:
     assert cards["ropod_001"]["level"] == "error" and cards["ropod_001"]["alarms"] == 1
     assert cards["ropod_001"]["diagnosis"]["faults"] == ["laser_front#silent"]
     assert cards["ropod_002"]["level"] == "warn"
-    until(lambda: card(site, "ropod_002")["model"] == hostile.MODEL, "its folder is read")
+    wait_until(lambda: card(site, "ropod_002")["model"] == hostile.MODEL, "its folder is read")
     assert not cards["ropod_003"]["online"] and cards["ropod_003"]["backlog_rows"] == 1234
 
 
@@ -146,18 +146,18 @@ def test_a_robot_says_something_leaves_and_comes(site: Site) -> None:
         return found[component]
 
     site.say("ropod_001", "imu", "warn", reason="it shakes")
-    until(lambda: level() == "warn", "the server hears of it")
+    wait_until(lambda: level() == "warn", "the server hears of it")
     site.robots["ropod_001"].leave()
-    until(lambda: not site.is_online("ropod_001"), "the robot is gone")
+    wait_until(lambda: not site.is_online("ropod_001"), "the robot is gone")
     site.say("ropod_001", "imu", "ok")
     site.robots["ropod_001"].come()
-    until(lambda: site.is_online("ropod_001") and level() == "ok", "it is back")
+    wait_until(lambda: site.is_online("ropod_001") and level() == "ok", "it is back")
 
 
 def test_the_server_is_restarted(site: Site) -> None:
     before = site.url
     site.restart()
-    until(lambda: site.is_online(*site.robots), "the robots came back by themselves")
+    wait_until(lambda: site.is_online(*site.robots), "the robots came back by themselves")
     assert site.url == before
 
 

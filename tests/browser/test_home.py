@@ -3,10 +3,10 @@
 import re
 
 import pytest
+from playwright.sync_api import expect
 
 from tests.browser.conftest import PageAs
-from tests.browser.expecting import expect
-from tests.browser.looks import axe, no_sideways_scroll, shot
+from tests.browser.page_checks import axe, no_sideways_scroll, shot
 from tests.browser.site import Site
 
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from amberbox.core.showing import visible
+from playwright.sync_api import expect
+
+from amberbox.core.safe_text import escape_hidden
 from tests.browser import hostile
 from tests.browser.conftest import PageAs
-from tests.browser.expecting import expect
-from tests.browser.looks import axe, shot
+from tests.browser.page_checks import axe, shot
 from tests.browser.site import Site
 from tests.browser.test_data import VOLTS, open_data, stamp
 
@@ -23,7 +24,9 @@ def test_a_moment_is_annotated_where_no_mission_was_under_way(page_as: PageAs, s
     shot(page, "note-dialog")
     dialog.get_by_role("button", name="Add", exact=True).click()
     expect(page.get_by_text("The note is added.")).to_be_visible()
-    expect(page.locator(".plot-list li").filter(has_text=visible(hostile.NOTE))).to_be_attached()
+    expect(
+        page.locator(".plot-list li").filter(has_text=escape_hidden(hostile.NOTE))
+    ).to_be_attached()
     (found,) = site.ask("/robots/ropod_001/notes")[:1]
     assert (found["text"], found["mission"]) == (hostile.NOTE, "")
     shot(page, "note-marker")

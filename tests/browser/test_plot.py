@@ -9,13 +9,13 @@ from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from playwright.sync_api import expect
 
-from amberbox.fleet.pages.assets import address
-from amberbox.testing.patience import PATIENCE_S
+from amberbox.server.web.assets import address
+from amberbox.testing.clock import PATIENCE_S
 from tests.browser import hostile, record
 from tests.browser.conftest import PageAs
-from tests.browser.expecting import expect
-from tests.browser.looks import axe, no_sideways_scroll, shot
+from tests.browser.page_checks import axe, no_sideways_scroll, shot
 from tests.browser.plotting import (
     CHARGE,
     ENABLED,
@@ -197,7 +197,8 @@ def test_gaps_that_cannot_be_had_are_asked_for_again(page_as: PageAs, site: Site
     page.unroute("**/data/around?*")
     from_s, to_s = hour(site)
     page.evaluate("([from, to]) => stack.window(from, to)", [from_s - 60, to_s])
-    assert page.evaluate("() => stack.now().traces[0].sums") is None  # those were of another window
+    # those were of another window
+    assert page.evaluate("() => stack.now().traces[0].statistics") is None
     settle(page)
     expect(legend).to_contain_text("lost or damaged")
     expect(legend).not_to_contain_text("cannot tell")
@@ -366,10 +367,10 @@ def test_one_against_the_other_and_how_often(page_as: PageAs, site: Site) -> Non
     whole = address("all.js")
     span = {"from": at(site, -50 * 60 * 10**9), "to": at(site, -40 * 60 * 10**9)}
     pose = [SPEED | {"variable": f"pose_{axis}", "label": axis, "unit": "m"} for axis in "xy"]
-    page.evaluate(made, [whole, "plot/xy.js", "xyView", {"x": pose[0], "y": pose[1], **span}])
+    page.evaluate(made, [whole, "plot/figures.js", "xyView", {"x": pose[0], "y": pose[1], **span}])
     expect(page.get_by_role("img", name="y [m] against x [m]")).to_be_visible()
     expect(page.get_by_text(re.compile(r"points out of 30,000"))).to_be_visible()
-    page.evaluate(made, [whole, "plot/histogram.js", "histogram", {"trace": STATE, **span}])
+    page.evaluate(made, [whole, "plot/figures.js", "histogram", {"trace": STATE, **span}])
     expect(page.get_by_text("300 values")).to_be_visible()
     table = page.get_by_role("table", name="How often State had which value")
     counts = {name: int(table.get_by_role("row", name=name).get_by_role("cell").inner_text())

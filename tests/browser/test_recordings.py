@@ -4,12 +4,12 @@ import re
 from pathlib import Path
 
 import pytest
+from playwright.sync_api import expect
 
-from amberbox.core.showing import visible
+from amberbox.core.safe_text import escape_hidden
 from tests.browser import hostile
 from tests.browser.conftest import PageAs
-from tests.browser.expecting import expect
-from tests.browser.looks import axe, no_sideways_scroll, shot
+from tests.browser.page_checks import axe, no_sideways_scroll, shot
 from tests.browser.site import Site
 
 ROBOT = "/recordings/ropod_001"
@@ -90,7 +90,7 @@ def test_a_note_is_kept_and_what_is_chosen_stays(page_as: PageAs) -> None:
     row.get_by_text("Add one").or_(row.get_by_text(re.compile("notes?$"))).first.click()
     row.get_by_role("textbox").fill(hostile.NOTE)
     row.get_by_role("button", name="Keep the note").click()
-    expect(row.locator(".recordings-notes p").first).to_have_text(visible(hostile.NOTE))
+    expect(row.locator(".recordings-notes p").first).to_have_text(escape_hidden(hostile.NOTE))
     expect(box).to_be_checked()
     expect(row.get_by_role("textbox")).to_have_value("")
 

@@ -9,17 +9,16 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import pytest
+from playwright.sync_api import expect
 
-from amberbox.fleet.pages import assets
-from amberbox.fleet.pages.robot import expected, values
-from amberbox.fleet.pages.robot.tree import key
-from amberbox.fleet.state.views import Output
+from amberbox.core.api import Output
+from amberbox.server.web import assets, components
+from amberbox.server.web.components import key
+from amberbox.testing.clock import wait_until
 from tests.browser import hostile
 from tests.browser.conftest import PageAs
-from tests.browser.expecting import expect
-from tests.browser.looks import axe, no_sideways_scroll, shot
-from tests.browser.site import Site, until
-from tests.browser.watching import RESTART
+from tests.browser.page_checks import RESTART, axe, no_sideways_scroll, shot
+from tests.browser.site import Site
 
 if TYPE_CHECKING:
     from playwright.sync_api import Locator, Page, Route, WebSocketRoute
@@ -177,7 +176,9 @@ def test_what_was_missed_is_asked_for_behind_a_new_beginning(page_as: PageAs, si
     line.cut()
     expect(page.locator("html")).to_have_attribute("data-feed", "lost")
     site.robots["ropod_001"].tell("note", "it came while nobody heard")
-    until(lambda: "while nobody heard" in str(site.ask("/robots/ropod_001/events")), "it is there")
+    wait_until(
+        lambda: "while nobody heard" in str(site.ask("/robots/ropod_001/events")), "it is there"
+    )
     with page.expect_response(lambda answer: "/diagnosis/card" in answer.url):
         line.mend()
         expect(page.locator("#events")).to_contain_text("while nobody heard")
@@ -306,10 +307,12 @@ def test_browser_and_server_write_numbers_alike(page_as: PageAs) -> None:
     page = page_as("viewer")
     page.goto(PAGE)
     told = page.evaluate(
-        "async ([path, values]) => values.map((await import(path)).$need('robot/live.js').number)",
+        "async ([path, values]) => {"
+        " const { numberText } = (await import(path)).$need('robot_values.js');"
+        " return values.map(numberText) }",
         [assets.address("all.js"), list(NUMBERS)],
     )
-    assert told == [values.number(value) for value in NUMBERS]
+    assert told == [components.number(value) for value in NUMBERS]
 
 
 def test_browser_and_server_judge_values_alike(page_as: PageAs) -> None:
@@ -317,12 +320,12 @@ def test_browser_and_server_judge_values_alike(page_as: PageAs) -> None:
     page.goto(PAGE)
     told = page.evaluate(
         "async ([path, all]) => {"
-        " const { isMet } = (await import(path)).$need('robot/expected.js');"
-        " return all.map(([expected, value]) => isMet(expected, value)) }",
+        " const { isAsExpected } = (await import(path)).$need('robot_values.js');"
+        " return all.map(([expected, value]) => isAsExpected(expected, value)) }",
         [assets.address("all.js"), [[expected, value] for expected, _, value in EXPECTED]],
     )
     outputs = [Output("x", type, value, said, "", "") for said, type, value in EXPECTED]
-    assert told == [expected.is_met(one) for one in outputs]
+    assert told == [components.is_met(one) for one in outputs]
     assert any(told) and not all(told)
 
 

@@ -24,16 +24,17 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from fastapi import FastAPI
 
-from amberbox.demo.robots import DemoRobot, place_of, write_folder
-from amberbox.fleet.api.who import COOKIE
-from amberbox.link.joining import join_line, read_join_line
-from amberbox.sim.catalogue import catalogue
-from amberbox.testing import patience
+from amberbox.demo.fleet import SimulatedRobot, robot_paths, write_folder
+from amberbox.link.join_line import join_line, read_join_line
+from amberbox.server.http.auth import COOKIE
+from amberbox.sim.faults import catalogue
+from amberbox.testing import clock
+from amberbox.testing.clock import wait_until
 from tests.browser.conftest import PageAs
-from tests.browser.looks import no_sideways_scroll
-from tests.browser.site import Site, until
-from tests.client.served import free_port
-from tests.fleet.house import House
+from tests.browser.page_checks import no_sideways_scroll
+from tests.browser.site import Site
+from tests.server.house import House
+from tests.support.processes import free_port
 
 if TYPE_CHECKING:
     from playwright.sync_api import Page
@@ -41,7 +42,7 @@ if TYPE_CHECKING:
 ROBOT = "ropod_001"
 PHONE = 390
 FEW = 3
-PATIENCE_S = 5 * patience.PATIENCE_S
+PATIENCE_S = 5 * clock.PATIENCE_S
 """A box with its watcher and a server start and judge while other tests run beside them."""
 _BURN = "while True: pass"
 
@@ -118,7 +119,7 @@ def said(site: Site) -> Said:
 
 
 @contextmanager
-def served(folder: Path) -> Iterator[tuple[Site, DemoRobot]]:
+def served(folder: Path) -> Iterator[tuple[Site, SimulatedRobot]]:
     """Start a server, and the box of a simulated robot that is joined to it; end both."""
     (folder / "server").mkdir(parents=True)
     home = House(folder / "server", FastAPI(), time.time_ns())
@@ -127,10 +128,10 @@ def served(folder: Path) -> Iterator[tuple[Site, DemoRobot]]:
     robot = None
     try:
         site.launch()
-        place = place_of(ROBOT, folder / "robots")
+        place = robot_paths(ROBOT, folder / "robots")
         write_folder(place, read_join_line(str(join_line(site.url, ROBOT, site.keys[ROBOT]))))
-        robot = DemoRobot(place)
-        until(site.answers, "the server answers")
+        robot = SimulatedRobot(place)
+        wait_until(site.answers, "the server answers")
         yield site, robot
     finally:
         if robot is not None:
@@ -200,7 +201,7 @@ def _disagreements(shown: Mapping[str, Any], api: Said) -> Iterator[str]:
 class Day:
     """The robot page and the page of its diagnosis, and what is broken by now."""
 
-    def __init__(self, site: Site, robot: DemoRobot, pages: Sequence[Page]) -> None:
+    def __init__(self, site: Site, robot: SimulatedRobot, pages: Sequence[Page]) -> None:
         self.site, self.robot, self.pages = site, robot, pages
         self.broken: list[Fault] = []
         self.ever: list[Fault] = []

@@ -8,15 +8,15 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from amberbox.blackbox.folder.folder import load_folder
-from amberbox.blackbox.store import open_store
-from amberbox.consult.knowledge import diagnoser_of
+from amberbox.blackbox.robot_folder.folder import load_folder
+from amberbox.blackbox.store.store import open_store
+from amberbox.consult.folder_knowledge import load_diagnoser
 from amberbox.core.clock import NS
 from amberbox.core.types import Schema, Topic
-from amberbox.monitoring.configuration import load_plan
-from amberbox.monitoring.watcher.watcher import Watch, Watcher
-from amberbox.testing.box import ManualBox
+from amberbox.monitoring.plan_loader import load_plan
+from amberbox.monitoring.watcher import RecordWatcher, WatcherSetup
 from amberbox.testing.clock import ManualClock
+from tests.support.manual_recorder import ManualBox
 
 VALUE = Schema("t/T", "ros1msg", b"float64 data\n")
 TEMPERATURE, SPEED = Topic("/temperature", "ros1", VALUE), Topic("/speed", "ros1", VALUE)
@@ -89,7 +89,7 @@ class Bench:
 
     folder: Path
     clock: ManualClock = field(default_factory=ManualClock)
-    watcher: Watcher | None = None
+    watcher: RecordWatcher | None = None
 
     def __post_init__(self) -> None:
         self.box = ManualBox(load_folder(self.folder).store_path, clock=self.clock)
@@ -99,11 +99,11 @@ class Bench:
         """Watch while the block runs."""
         folder = load_folder(self.folder)
         plan, _ = load_plan(folder)
-        make, _ = diagnoser_of(folder, plan)
+        make, _ = load_diagnoser(folder, plan)
         store = open_store(folder.store_path)
         clock_s = lambda: self.clock.boot / NS  # noqa: E731 - no name would say more
-        watch = Watch(plan, store, folder, clock=self.clock, clock_s=clock_s, diagnoser=make)
-        self.watcher = Watcher(watch)
+        watch = WatcherSetup(plan, store, folder, clock=self.clock, clock_s=clock_s, diagnoser=make)
+        self.watcher = RecordWatcher(watch)
         try:
             yield
         finally:

@@ -8,9 +8,8 @@ from typing import Any
 
 import pytest
 
-from amberbox.blackbox.journal.reserved import ALARM
-from amberbox.blackbox.requests import pending
-from amberbox.blackbox.store import WriterLock, open_store
+from amberbox.blackbox.journal.channels import ALARM
+from amberbox.blackbox.store.store import WriterLock, open_store, pending
 from amberbox.cli.main import main
 from amberbox.core.clock import NS
 from amberbox.testing.records import T0_NS, FakeRun

@@ -5,8 +5,6 @@ from __future__ import annotations
 import os
 import re
 import subprocess
-import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -14,7 +12,8 @@ import pytest
 from amberbox.cli.main import main
 from amberbox.demo.recorder import FAULT, SLOW, SLOWED
 from amberbox.demo.story import CAUSE
-from amberbox.testing.patience import PATIENCE_S
+from amberbox.testing.clock import wait_until
+from tests.support.processes import command
 
 STORY = [
     "4 people signed in by their links; none works a second time",
@@ -53,11 +52,10 @@ RECORDER = [
 
 
 def demo(home: Path, *words: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "amberbox", "demo", *words]
     environment = {"PATH": "/usr/bin:/bin", "HOME": str(home), "TMPDIR": str(home)}
     return subprocess.run(
-        command, env=environment, stdin=subprocess.DEVNULL, capture_output=True, text=True,
-        timeout=290, check=False,
+        command("demo", *words), env=environment, stdin=subprocess.DEVNULL,
+        capture_output=True, text=True, timeout=290, check=False,
     )  # fmt: skip
 
 
@@ -69,10 +67,8 @@ def test_the_story_goes_through_by_itself_and_leaves_nothing_behind(tmp_path: Pa
     assert re.search(".*".join(STORY), done.stdout, re.DOTALL), done.stdout
     assert "Traceback" not in done.stderr
     assert list(tmp_path.glob("amberbox-demo-*")) == []
-    end_s = time.monotonic() + PATIENCE_S
-    while still_running(tmp_path) and time.monotonic() < end_s:
-        time.sleep(0.2)  # what a recorder had started notices its end by itself
-    assert still_running(tmp_path) == []
+    # what a recorder had started notices its end by itself
+    wait_until(lambda: not still_running(tmp_path), "no process is left")
 
 
 @pytest.mark.alone

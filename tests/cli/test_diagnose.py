@@ -74,7 +74,7 @@ def test_given_symptoms_are_all_there_is_without_a_record(
 def test_every_key_is_documented_and_every_number_finite(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    page = (Path(__file__).parents[2] / "docs" / "diagnosing.md").read_text()
+    page = (Path(__file__).parents[2] / "docs" / "robot" / "diagnosing.md").read_text()
     made = found(capsys, folder, "--symptom", TURNS, "--symptom", HOT)
     parts = (made, made["hypotheses"][0], made["groups"][0], made["next_tests"][0])
     keys = {key for part in (*parts, made["symptoms"][0], made["explanation"]) for key in part}
@@ -110,7 +110,7 @@ def test_what_is_wrong_is_said(folder: Path, capsys: pytest.CaptureFixture[str])
     (folder / "fmea.yaml").write_text(FMEA.replace("rate: 2.0e-4", "rate: much"))
     assert f"{folder / 'fmea.yaml'}:8: " in refused(capsys, *given)
     (folder / "fmea.yaml").unlink()
-    assert "docs/fmea.md" in refused(capsys, *given)
+    assert "docs/robot/fmea.md" in refused(capsys, *given)
 
 
 def test_answers_rank_anew(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

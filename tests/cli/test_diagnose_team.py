@@ -8,18 +8,17 @@ from pathlib import Path
 
 import pytest
 
-from amberbox.blackbox.folder.folder import load_folder
-from amberbox.blackbox.store import open_store
-from amberbox.cli._diagnosis_members import with_members
-from amberbox.consult.case import Case, answered
-from amberbox.consult.journal import said_until
-from amberbox.consult.telling import explained
+from amberbox.blackbox.robot_folder.folder import load_folder
+from amberbox.blackbox.store.store import open_store
+from amberbox.cli.diagnose import with_members
 from amberbox.core.clock import NS
 from amberbox.core.types import Symptom
-from amberbox.diagnosis.explanation.explanation import Member
-from amberbox.diagnosis.fmea.load import load_fmea
+from amberbox.diagnosis.diagnose import DiagnosisContext, ObservedSituation, diagnose_context
+from amberbox.diagnosis.fmea.loader import load_fmea
 from amberbox.diagnosis.knowledge import Knowledge
-from amberbox.diagnosis.situation import Situation
+from amberbox.diagnosis.report.explanation import MemberDiagnosis
+from amberbox.diagnosis.report.serialiser import explain_context
+from amberbox.monitoring.current_state import findings_until
 from tests.cli.diagnosed import Bench, write_folder
 
 TEAM = """\
@@ -58,10 +57,12 @@ def robot(hot: Bench, tmp_path: Path) -> Path:
 def opened_ns(robot: Path) -> int:
     """Return when the robot's own diagnosis was made."""
     store = open_store(load_folder(robot).store_path)
-    return said_until(store, 1 << 62).diagnoses[0].at_ns
+    return findings_until(store, 1 << 62).diagnoses[0].at_ns
 
 
-def said(robot: Path, at_ns: int, symptom: str = "first/works/works") -> tuple[Member, ...]:
+def said(
+    robot: Path, at_ns: int, symptom: str = "first/works/works"
+) -> tuple[MemberDiagnosis, ...]:
     """Return what the robots say in a team's diagnosis of an instant."""
     team = robot.parent / "team"
     team.mkdir(exist_ok=True)
@@ -69,8 +70,10 @@ def said(robot: Path, at_ns: int, symptom: str = "first/works/works") -> tuple[M
     fmea, problems = load_fmea(team / "fmea.yaml")
     assert fmea is not None, problems
     knowledge = Knowledge("team", fmea)
-    case = Case(at_ns, Situation((Symptom(symptom, "present"),)))
-    told = with_members(knowledge, case, explained(knowledge, case, answered(knowledge, case)))
+    case = DiagnosisContext(at_ns, ObservedSituation((Symptom(symptom, "present"),)))
+    told = with_members(
+        knowledge, case, explain_context(knowledge, case, diagnose_context(knowledge, case))
+    )
     assert told is not None
     return told.members
 

@@ -9,18 +9,18 @@ from typing import Any
 
 import pytest
 
-from amberbox.blackbox.folder.folder import load_folder
-from amberbox.blackbox.store import Store, open_store
-from amberbox.cli._diagnosis_follow import revisions
+from amberbox.blackbox.robot_folder.folder import load_folder
+from amberbox.blackbox.store.store import Store, open_store
+from amberbox.cli.diagnose import revisions
 from amberbox.cli.main import main
-from amberbox.consult import reading
-from amberbox.consult.journal import Said, said_until
-from amberbox.consult.knowledge import knowledge_of
-from amberbox.consult.reading import counting
+from amberbox.consult import context
+from amberbox.consult.context import situation_at
+from amberbox.consult.folder_knowledge import load_knowledge
 from amberbox.core.clock import NS
 from amberbox.core.types import Diagnosis
-from amberbox.diagnosis.tracking.tracker import Tracker
-from amberbox.monitoring.configuration import load_plan
+from amberbox.diagnosis.tracker import FaultTracker
+from amberbox.monitoring.current_state import RecordedFindings, findings_until
+from amberbox.monitoring.plan_loader import load_plan
 from tests.cli.diagnosed import Bench, write_folder
 from tests.cli.test_diagnose import HOT, TURNS, found, leading
 
@@ -46,7 +46,7 @@ def no_evaluation(monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*arguments: Any) -> None:
         raise AssertionError("the record was evaluated")
 
-    monkeypatch.setattr(reading, "evaluated", refuse)
+    monkeypatch.setattr(context, "context_by_evaluation", refuse)
 
 
 def store_of(folder: Path) -> Store:
@@ -59,7 +59,7 @@ def test_the_diagnosis_that_stood_is_told(
 ) -> None:
     made = found(capsys, watched, "--at", DURING)
     assert made["origin"] == "watcher" and made["state"] == "open"
-    written = [d for d in said_until(store_of(watched), 1 << 62).diagnoses if d.state == "open"]
+    written = [d for d in findings_until(store_of(watched), 1 << 62).diagnoses if d.state == "open"]
     assert (made["id"], made["revision"]) in {(d.id, d.revision) for d in written}
     assert leading(made) == ["motor#worn"]
     healed = found(capsys, watched, status=0)
@@ -87,7 +87,7 @@ def test_the_record_evaluated_says_the_same(
         status = 1 if options else 0
         journal = found(capsys, watched, *options, status=status)
         with monkeypatch.context() as patch:
-            patch.setattr("amberbox.consult.reading.was_watched", lambda *_: False)
+            patch.setattr("amberbox.consult.context.was_watched", lambda *_: False)
             record = found(capsys, watched, *options, status=status)
         assert record["origin"] == "record" and journal["origin"] == "watcher"
         assert record["hypotheses"] == journal["hypotheses"]
@@ -97,18 +97,18 @@ def test_the_record_evaluated_says_the_same(
 
 def test_what_counts_is_what_the_tracker_counts(watched: Path) -> None:
     folder = load_folder(watched)
-    knowledge, _ = knowledge_of(folder, load_plan(folder)[0])
+    knowledge, _ = load_knowledge(folder, load_plan(folder)[0])
     assert knowledge is not None
-    symptoms = said_until(store_of(watched), 1 << 62).symptoms
+    symptoms = findings_until(store_of(watched), 1 << 62).symptoms
     first = min(s.confirmed_ns or 0 for s in symptoms)
     for tenth in range(1, 150, 7):
         at_ns = first + tenth * NS // 10
         told = [s for s in symptoms if (s.confirmed_ns or 0) <= at_ns]
-        tracker = Tracker(knowledge)
+        tracker = FaultTracker(knowledge)
         tracker.begin(first - 1)
         tracker.advance(told, at_ns)
         expected = {s.id: s.state for s in tracker.situation().symptoms}
-        assert {s.id: s.state for s in counting(knowledge, told, at_ns).symptoms} == expected
+        assert {s.id: s.state for s in situation_at(knowledge, told, at_ns).symptoms} == expected
 
 
 def test_symptoms_of_deleted_files_are_there_still(
@@ -118,11 +118,11 @@ def test_symptoms_of_deleted_files_are_there_still(
     asked = (*during, "--answer", "sound=smooth")
     before = found(capsys, *asked)
 
-    def left(store: Store, at_ns: int) -> Said:
-        said = said_until(store, at_ns)
+    def left(store: Store, at_ns: int) -> RecordedFindings:
+        said = findings_until(store, at_ns)
         return replace(said, symptoms=[s for s in said.symptoms if s.id not in gone])
 
-    monkeypatch.setattr(reading, "said_until", left)
+    monkeypatch.setattr(context, "findings_until", left)
     gone = {HOT}
     after = found(capsys, *asked)
     assert after["origin"] == "watcher" and after["hypotheses"] == before["hypotheses"]
@@ -183,20 +183,22 @@ def test_what_stands_is_given_first_and_once(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         for diagnosis, _ in revisions(store_of(bench.folder), wait):
             given.append(replace(diagnosis, live_only=False))
-    newest = said_until(store_of(bench.folder), 1 << 62).diagnoses[-1]
+    newest = findings_until(store_of(bench.folder), 1 << 62).diagnoses[-1]
     assert given == [replace(newest, live_only=False)]
 
 
 def test_following_prints_until_it_is_stopped(
     watched: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (standing,) = (d for d in said_until(store_of(watched), 1 << 62).diagnoses if d.revision == 1)
+    (standing,) = (
+        d for d in findings_until(store_of(watched), 1 << 62).diagnoses if d.revision == 1
+    )
 
     def one(store: Store) -> Any:
         yield standing, {}
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("amberbox.cli._diagnosis_follow.revisions", one)
+    monkeypatch.setattr("amberbox.cli.diagnose.revisions", one)
     assert main(["diagnose", str(watched), "--follow"]) == 130
     printed = capsys.readouterr()
     assert f"{standing.id}, revision 1" in printed.out

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from amberbox.blackbox.doctor.finding import Finding, error, ok, warn
-from amberbox.cli.doctor import report
+from amberbox.agent.doctor.subject import DoctorFinding, error, ok, warn
+from amberbox.cli.box import report
 from amberbox.cli.main import main
-from amberbox.testing.box import recording
+from tests.support.manual_recorder import recording
 
 
 @pytest.fixture
@@ -39,7 +39,7 @@ def test_it_works_while_recording(folder: Path, capsys: pytest.CaptureFixture[st
         while not recorder.pipeline.bytes_written:
             recorder.stop.wait(0.01)
         assert main(["doctor", str(folder), "--json"]) == 0
-    findings = [Finding(**finding) for finding in json.loads(capsys.readouterr().out)]
+    findings = [DoctorFinding(**finding) for finding in json.loads(capsys.readouterr().out)]
     levels = {finding.check: finding.level for finding in findings}
     assert levels["configuration"] == levels["source sim"] == levels["recorder"] == "ok"
     assert all(finding.hint for finding in findings if finding.level != "ok")

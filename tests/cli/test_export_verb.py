@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import amberbox
-from amberbox.blackbox.follow.read import journals
+from amberbox.blackbox.store.journal_reader import journals
 from amberbox.cli.main import main
 from amberbox.testing.records import build_segments_of, fill_store
 

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from amberbox.cli.main import main
-from amberbox.diagnosis.faulttree import fault_tree, read_mef, write_mef
-from amberbox.diagnosis.faulttree.formula import all_of, any_of, at_least, none_of
+from amberbox.diagnosis.faulttree.open_psa import read_mef, write_mef
+from amberbox.diagnosis.faulttree.tree import all_of, any_of, at_least, fault_tree, none_of
 
 GATES = {
     "stranded": any_of("no_drive", "power"),

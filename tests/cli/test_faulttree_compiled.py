@@ -9,11 +9,12 @@ from typing import Any
 import pytest
 
 from amberbox.cli.main import main
-from amberbox.diagnosis.faulttree import analyse, read_mef
+from amberbox.diagnosis.faulttree.analysis import analyse
+from amberbox.diagnosis.faulttree.open_psa import read_mef
 from tests.cli.diagnosed import FMEA, Bench, write_folder
 from tests.diagnosis.fmea.small import TEXT
 
-PAGE = Path(__file__).resolve().parents[2] / "docs" / "faulttrees.md"
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "robot" / "faulttrees.md"
 
 
 @pytest.fixture
@@ -193,7 +194,7 @@ def test_a_diagnosis_brings_cut_sets_close(
     assert "\ndrive\n" in text and "happened: fan#stuck (0.9" in text
     assert "; missing: motor#worn (0.00" in text
     with monkeypatch.context() as patch:
-        patch.setattr("amberbox.consult.reading.watched", lambda *_: None)
+        patch.setattr("amberbox.consult.context.context_from_journal", lambda *_: None)
         assert printed(capsys, bench.folder, "--closest")["diagnosis"] == found["diagnosis"]
     before = printed(capsys, bench.folder, "--closest", "--at", "-6s")
     assert before["diagnosis"] is None and before["effects"][0]["closest"][0]["happened"] == []

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from amberbox.cli.main import main
-from amberbox.testing.box import COUNT, ManualBox, number
+from tests.support.manual_recorder import COUNT, ManualBox, number
 
 
 @pytest.fixture

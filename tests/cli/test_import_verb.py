@@ -11,9 +11,9 @@ from rosbags.rosbag1 import Writer
 from rosbags.typesys import Stores, get_typestore
 
 from amberbox.cli.main import main
-from amberbox.testing.box import COUNT, ManualBox, number
 from tests.blackbox.formats.test_mongodump import write_dump
 from tests.blackbox.formats.ulog_file import flight
+from tests.support.manual_recorder import COUNT, ManualBox, number
 
 TYPES = get_typestore(Stores.ROS1_NOETIC)
 Capture = pytest.CaptureFixture[str]

@@ -7,7 +7,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,14 +15,15 @@ from typing import Any
 import pytest
 
 import amberbox
-from amberbox.blackbox.incidents import load_all
 from amberbox.blackbox.recorder.pipeline import PipelineOptions
-from amberbox.blackbox.store import open_store
+from amberbox.blackbox.store.incident import load_all
+from amberbox.blackbox.store.store import open_store
 from amberbox.cli.main import main
 from amberbox.core.clock import NS
 from amberbox.core.source import TopicOptions
-from amberbox.testing.box import COUNT, ManualBox, number
-from amberbox.testing.patience import PATIENCE_S
+from amberbox.testing.clock import PATIENCE_S, wait_until
+from tests.support.manual_recorder import COUNT, ManualBox, number
+from tests.support.processes import command, wait_for
 
 
 @pytest.fixture
@@ -166,8 +166,7 @@ def test_triggers_that_make_no_sense_are_refused(
 
 @contextmanager
 def recorder(folder: Path) -> Iterator[subprocess.Popen[bytes]]:
-    command = [sys.executable, "-m", "amberbox", "record", str(folder), "--quiet"]
-    process = subprocess.Popen(command, stderr=subprocess.DEVNULL)
+    process = subprocess.Popen(command("record", folder, "--quiet"), stderr=subprocess.DEVNULL)
     try:
         yield process
     finally:
@@ -187,14 +186,9 @@ def keeper_of(parent: int) -> int | None:
     return None
 
 
-def wait_for(what: Any) -> Any:
-    end = time.monotonic() + PATIENCE_S
-    while time.monotonic() < end:
-        found = what()
-        if found:
-            return found
-        time.sleep(0.05)
-    raise AssertionError("it did not come")
+def battery_rows(store: Path) -> int:
+    with amberbox.open(store) as record:
+        return sum(item.rows for item in record.items() if item.name == "sim_battery")
 
 
 def test_a_real_recorder_pins_what_its_trigger_says(tmp_path: Path) -> None:
@@ -207,11 +201,13 @@ def test_a_real_recorder_pins_what_its_trigger_says(tmp_path: Path) -> None:
     )
     store = tmp_path / "store"
     with recorder(tmp_path) as process:
-        keeper = wait_for(lambda: keeper_of(process.pid))
-        wait_for(lambda: list(store.glob("ring/*.mcap")))
+        keeper = wait_for(lambda: keeper_of(process.pid), "the recorder has a keeper")
+        wait_until(lambda: list(store.glob("ring/*.mcap")), "the ring has a file")
         os.kill(keeper, signal.SIGKILL)
         made = amberbox.mark(tmp_path, before_s=1, after_s=0, reason="by hand")
         assert (store / "incidents" / made.id / "incident.json").exists()
+        # the trigger is about the battery, which may come after the ring has its first file
+        wait_until(lambda: battery_rows(store) > 1, "the battery is recorded")
     (by_hand,) = [i for i in load_all(open_store(store)) if i.id == made.id]
     assert by_hand.state in ("open", "complete")
     once = [sys.executable, "-m", "amberbox.blackbox.keeper", str(store), "--once"]

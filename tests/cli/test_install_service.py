@@ -16,12 +16,12 @@ from pathlib import Path
 
 import pytest
 
-from amberbox.blackbox.folder.folder import load_folder
-from amberbox.blackbox.unitfile import MARK, Service, argument, command_line, service_of, unit_text
-from amberbox.cli.install_service import apply, installation, owner, removal
+from amberbox.agent.systemd_unit import MARK, Service, argument, command_line, service_of, unit_text
+from amberbox.blackbox.robot_folder.folder import load_folder
+from amberbox.cli.box import apply, installation, owner, removal
 from amberbox.cli.main import main, verbs
 from amberbox.core.errors import AmberboxError, UsageError
-from amberbox.testing.patience import PATIENCE_S
+from amberbox.testing.clock import PATIENCE_S
 
 SIM = "- sim:\n    seed: 1\n    topics: [{name: odom}]\n"
 ME = getpass.getuser()

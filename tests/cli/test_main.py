@@ -10,12 +10,13 @@ from pathlib import Path
 
 import pytest
 
-from amberbox import __version__
 from amberbox.cli import main as program
 from amberbox.cli.main import main
 from amberbox.core.errors import AmberboxError, ConfigurationError, Problem
 from amberbox.core.interrupt import Interrupt
 from amberbox.core.plugins import Plugin
+from amberbox.core.version import __version__
+from tests.support.processes import command
 
 VERB = '''\
 """Does what the test wants."""
@@ -149,8 +150,9 @@ def test_debug_shows_the_trace(
 def test_closed_pipe_is_quiet(tmp_path: Path) -> None:
     read, write = os.pipe()
     os.close(read)
-    command = [sys.executable, "-m", "amberbox", "--help"]
-    done = subprocess.run(command, stdout=write, stderr=subprocess.PIPE, text=True, check=False)
+    done = subprocess.run(
+        command("--help"), stdout=write, stderr=subprocess.PIPE, text=True, check=False
+    )
     os.close(write)
     assert done.stderr == ""
     assert done.returncode == 141

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from amberbox.blackbox.missions import load
+from amberbox.blackbox.retention.missions import load
 from amberbox.cli.main import main
 from amberbox.core.clock import NS
 from amberbox.testing.records import T0_NS, FakeItem, FakeRun

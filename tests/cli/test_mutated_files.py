@@ -12,21 +12,24 @@ import yaml
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from amberbox.blackbox.folder.blocks import read_blocks
-from amberbox.blackbox.folder.folder import SOURCES, load_folder
-from amberbox.blackbox.folder.robot import RobotConfig
-from amberbox.core.config import build, parse_yaml
+from amberbox.blackbox.robot_folder.black_box_yaml import read_blocks
+from amberbox.blackbox.robot_folder.folder import SOURCES, load_folder
+from amberbox.blackbox.robot_folder.robot_yaml import RobotConfig
+from amberbox.core.config import build
 from amberbox.core.errors import Problem
-from amberbox.core.nodes import Node
-from amberbox.diagnosis.fmea.load import read_fmea
-from amberbox.monitoring.configuration.dependencies import read_dependencies
-from amberbox.monitoring.configuration.files import ComponentFile, legacy_note
-from amberbox.monitoring.configuration.functions import find_functions
-from amberbox.monitoring.configuration.inputs import Inputs
-from amberbox.monitoring.configuration.modes import Bench, plan_mode
-from amberbox.monitoring.configuration.recorded import Recorded
-from amberbox.monitoring.configuration.tree import ModeSource
-from amberbox.monitoring.ruletests.files import RuleFile
+from amberbox.core.yaml_nodes import Node, parse_yaml
+from amberbox.diagnosis.fmea.loader import read_fmea
+from amberbox.monitoring.component_files import (
+    ComponentFileOptions,
+    ModeSource,
+    find_functions,
+    legacy_note,
+)
+from amberbox.monitoring.dependencies import read_dependencies
+from amberbox.monitoring.mode_bindings import InputBinder
+from amberbox.monitoring.plan_loader import PlanContext, plan_mode
+from amberbox.monitoring.recorded_items import RecordedItems
+from amberbox.monitoring.rule_tests import RuleTestFile
 from tests.diagnosis.fmea.small import TEXT as SMALL
 from tests.fuzzing import SOAKING, examples, fuzz
 
@@ -83,14 +86,14 @@ def shipped(tmp_path_factory: pytest.TempPathFactory) -> Mapping[str, list[Shipp
     (place / "black_box.yaml").write_text((SIM / "black_box.yaml").read_text())
     folder = load_folder(place)
     functions = find_functions(place)
-    inputs = Inputs(Recorded(folder), functions)
+    inputs = InputBinder(RecordedItems(folder), functions)
 
     def component(node: Node, problems: list[Problem]) -> None:
-        build(ComponentFile, node, problems, "", legacy_note)
+        build(ComponentFileOptions, node, problems, "", legacy_note)
         read_dependencies(node, problems)
 
     def mode(node: Node, problems: list[Problem]) -> None:
-        bench = Bench(functions, inputs, folder.robot, problems)
+        bench = PlanContext(functions, inputs, folder.robot, problems)
         plan_mode(ModeSource(Path(node.file), node), bench)
 
     example = ROOT / "examples/laser"
@@ -106,7 +109,7 @@ def shipped(tmp_path_factory: pytest.TempPathFactory) -> Mapping[str, list[Shipp
         "black box": _files(boxes, lambda node, found: read_blocks(node, SOURCES, found)),
         "component": _files([*parts, example / "components/laser.yaml"], component),
         "mode": _files([*modes, *sorted((example / "components/laser").glob("*.yaml"))], mode),
-        "rule tests": _files(rules, lambda node, found: build(RuleFile, node, found)),
+        "rule tests": _files(rules, lambda node, found: build(RuleTestFile, node, found)),
         "fmea": [
             Shipped("fmea.yaml", t, lambda text: read_fmea(text, None, FILE)[1]) for t in texts
         ],

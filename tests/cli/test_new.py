@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from amberbox.blackbox.folder.folder import SOURCES, load_folder
+from amberbox.blackbox.robot_folder.folder import SOURCES, load_folder
 from amberbox.cli.main import main
 from amberbox.core.plugins import find
 

@@ -6,13 +6,14 @@ import json
 
 import pytest
 
-from amberbox.blackbox.folder.folder import SOURCES
+from amberbox.blackbox.robot_folder.folder import SOURCES
 from amberbox.cli import plugins as verb
 from amberbox.cli.main import main
-from amberbox.core.config import build, parse_yaml
-from amberbox.core.describe import describe
+from amberbox.core.config import build
+from amberbox.core.options import describe
 from amberbox.core.plugins import find, get
 from amberbox.core.source import TopicOptions
+from amberbox.core.yaml_nodes import parse_yaml
 
 ALL = sorted(find(SOURCES, defines=("Config", "Source")))
 MODES = sorted(verb.KINDS["mode"].plugins())

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import signal
 import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -14,9 +13,9 @@ import pytest
 import amberbox
 from amberbox.cli.main import main
 from amberbox.core.probe import ProbeOrder
-from amberbox.testing.box import recording
-from amberbox.testing.patience import PATIENCE_S, wait_until
-from amberbox.testing.realros import free_port
+from amberbox.testing.clock import PATIENCE_S, wait_until
+from tests.support.manual_recorder import recording
+from tests.support.processes import command, free_port
 
 COMPONENT = "component_name: laser\nmodes: [laser_device.yaml]\n"
 MODE = """\
@@ -44,7 +43,7 @@ def folder(tmp_path: Path) -> Path:
 
 def start(*arguments: str) -> subprocess.Popen[str]:
     return subprocess.Popen(
-        [sys.executable, "-m", "amberbox", "probe", *arguments],
+        command("probe", *arguments),
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
     )  # fmt: skip
 

@@ -17,7 +17,7 @@ import pytest
 import amberbox
 from amberbox.cli.main import main
 from amberbox.core.errors import UsageError
-from amberbox.testing.patience import PATIENCE_S
+from amberbox.testing.clock import PATIENCE_S
 from amberbox.testing.records import T0_NS, FakeRun, build_segments_of, fill_store
 
 

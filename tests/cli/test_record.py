@@ -6,21 +6,21 @@ import json
 import os
 import signal
 import subprocess
-import sys
 import time
 from pathlib import Path
 
 import pytest
 
 import amberbox
-from amberbox.blackbox.follow import read
 from amberbox.blackbox.recorder.recorder import ItemState, RecorderState
-from amberbox.blackbox.store import Store
+from amberbox.blackbox.store import journal_reader
+from amberbox.blackbox.store.store import Store
 from amberbox.cli.main import main
 from amberbox.cli.record import summary, table
 from amberbox.core.errors import UsageError
-from amberbox.testing.box import events
-from amberbox.testing.patience import PATIENCE_S, wait_until
+from amberbox.testing.clock import PATIENCE_S, wait_until
+from tests.support.manual_recorder import events
+from tests.support.processes import command
 
 SIM = "- sim:\n    seed: 1\n    topics: [{name: odom}, {name: wifi}]\n"
 STATE = RecorderState(
@@ -46,7 +46,7 @@ def folder(tmp_path: Path) -> Path:
 
 def record(folder: Path, *options: str) -> subprocess.Popen[str]:
     return subprocess.Popen(
-        [sys.executable, "-m", "amberbox", "record", str(folder), *options],
+        command("record", folder, *options),
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
     )  # fmt: skip
 
@@ -85,7 +85,7 @@ def test_it_ends_by_itself_and_prints_json_meanwhile(folder: Path) -> None:
     assert odom["rate_hz"] == pytest.approx(50, abs=15)
     assert states[1]["disk_free_bytes"] > 0
     assert errors.startswith("recorded ")
-    assert all(journal.finished for journal in read.journals(folder / "store"))
+    assert all(journal.finished for journal in journal_reader.journals(folder / "store"))
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
@@ -96,7 +96,7 @@ def test_a_signal_ends_it_cleanly(folder: Path, number: int) -> None:
     output, errors = process.communicate(timeout=PATIENCE_S)
     assert (process.returncode, output, errors) == (0, "", "")
     assert [event["kind"] for event in events(folder / "store", "stopped")] == ["stopped"]
-    files = read.journals(folder / "store")
+    files = journal_reader.journals(folder / "store")
     assert files and all(journal.finished for journal in files)
     (gap,) = (gap for gap in amberbox.open(folder).gaps("sim_odom") if gap.reason == "stopped")
     assert gap.to_ns >= gap.from_ns
@@ -104,7 +104,10 @@ def test_a_signal_ends_it_cleanly(folder: Path, number: int) -> None:
 
 def rows(folder: Path) -> int:
     try:
-        return sum(journal.items.get("sim_odom", 0) for journal in read.journals(folder / "store"))
+        return sum(
+            journal.items.get("sim_odom", 0)
+            for journal in journal_reader.journals(folder / "store")
+        )
     except UsageError:  # the store is about to be made
         return 0
 

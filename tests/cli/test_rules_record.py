@@ -9,18 +9,15 @@ from typing import Any
 
 import pytest
 
-from amberbox.blackbox.missions import Mission
-from amberbox.blackbox.missions.ask import write
-from amberbox.blackbox.missions.mission import Moment
-from amberbox.blackbox.store import open_store
+from amberbox.blackbox.retention.missions import MissionInstant, RecordedMission, write
+from amberbox.blackbox.store.store import open_store
 from amberbox.cli.main import main
 from amberbox.core.clock import NS
 from amberbox.core.types import Status
-from amberbox.diagnosis.rules import read_rules
-from amberbox.monitoring.engine.findings import Condition, Transition
-from amberbox.monitoring.messages.records import record_of
+from amberbox.diagnosis.prolog.program import read_rules
+from amberbox.monitoring.findings import HealthState, Transition, record_of
 from amberbox.testing.records import T0_NS, FakeItem, FakeRun
-from tests.diagnosis.rules.swi import ask_swi, ask_us
+from tests.diagnosis.prolog.swi import ask_swi, ask_us
 
 BATTERY = FakeItem("battery", [{"charge": 1.0, "mode": "idle"}])
 FMEA = """\
@@ -35,12 +32,12 @@ failed_on_low_battery(M) :- mission(M, failed, From, To), holds('battery.charge 
 """
 
 
-def mission(name: str, first: int, last: int, outcome: str) -> Mission:
+def mission(name: str, first: int, last: int, outcome: str) -> RecordedMission:
     """Return a mission; times are seconds of the record."""
-    ended = Moment(T0_NS + last * NS)
-    return Mission(name, "transport", Moment(T0_NS + first * NS), parameters={"load": 5}).ended(
-        ended, outcome, failed=outcome != "done"
-    )
+    ended = MissionInstant(T0_NS + last * NS)
+    return RecordedMission(
+        name, "transport", MissionInstant(T0_NS + first * NS), parameters={"load": 5}
+    ).ended(ended, outcome, failed=outcome != "done")
 
 
 MISSIONS = [
@@ -58,7 +55,7 @@ def status(level: Any, state: str, at_s: float) -> Status:
 def change(before: tuple[Any, str], after: tuple[Any, str], at_s: float) -> Transition:
     at_ns = T0_NS + round(at_s * NS)
     return Transition(
-        "rex", "laser", "", Condition(*before), Condition(*after), at_ns, "", (), "", "abc"
+        "rex", "laser", "", HealthState(*before), HealthState(*after), at_ns, "", (), "", "abc"
     )
 
 

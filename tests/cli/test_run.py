@@ -6,20 +6,19 @@ import json
 import os
 import signal
 import subprocess
-import sys
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 import amberbox
-from amberbox.blackbox.doctor.supervised import STATE_FILE
-from amberbox.blackbox.journal.head import read_head
-from amberbox.blackbox.store import is_locked, open_store
+from amberbox.agent.doctor.processes import SUPERVISOR_STATE_FILE
+from amberbox.blackbox.journal.tail import read_head
+from amberbox.blackbox.store.store import is_locked, open_store
 from amberbox.cli.main import main
-from amberbox.testing.patience import PATIENCE_S
+from amberbox.testing.clock import PATIENCE_S, wait_until
+from tests.support.processes import command
 
 SIM = "- sim:\n    seed: 1\n    topics: [{name: odom}]\n"
 BASE = "component_name: base\nmodes: [base/driving.yaml]\n"
@@ -51,13 +50,13 @@ class Box:
 
     def __init__(self, folder: Path) -> None:
         self.folder, self.log = folder, folder.parent / "log"
-        command = [sys.executable, "-m", "amberbox", "run", "--quiet", str(folder)]
+        words = command("run", "--quiet", folder)
         with self.log.open("ab") as log:
-            self.process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stderr=log)
+            self.process = subprocess.Popen(words, stdin=subprocess.DEVNULL, stderr=log)
 
     def child(self, name: str) -> dict[str, Any]:
         try:
-            state = json.loads((self.folder / "store" / STATE_FILE).read_text())
+            state = json.loads((self.folder / "store" / SUPERVISOR_STATE_FILE).read_text())
         except FileNotFoundError:
             return {}
         own = state["pid"] == self.process.pid
@@ -70,15 +69,8 @@ class Box:
             child = self.child(name)
             return child.get("state") == state and child["pid"] != other_than
 
-        wait_until(is_there, self.log)
+        wait_until(is_there, f"{name} is {state}")
         return int(self.child(name)["pid"])
-
-
-def wait_until(is_so: Callable[[], bool], log: Path) -> None:
-    end_s = time.monotonic() + PATIENCE_S
-    while not is_so():
-        assert time.monotonic() < end_s, log.read_text()
-        time.sleep(0.02)
 
 
 @pytest.fixture
@@ -114,12 +106,12 @@ def test_whatever_is_killed_recording_goes_on(folder: Path, boxes: list[Box]) ->
         head = read_head(store.folder("main"))
         return bool(head and before and head.watermark_ns > before.watermark_ns)
 
-    wait_until(goes_on, box.log)
+    wait_until(goes_on, "the recorder goes on")
     again = Box(folder)
     boxes.append(again)
     assert again.wait_for("record") != recorder
     again.wait_for("watch", "starting")
-    wait_until(lambda: bool(events(folder, "process_taken_over")), box.log)
+    wait_until(lambda: events(folder, "process_taken_over"), "the recorder is taken over")
 
     again.process.send_signal(signal.SIGTERM)
     assert again.process.wait(PATIENCE_S) == 0
@@ -134,8 +126,8 @@ def test_whatever_is_killed_recording_goes_on(folder: Path, boxes: list[Box]) ->
 
 def test_it_ends_with_inputs_that_end(folder: Path) -> None:
     (folder / "black_box.yaml").write_text(f"{SIM}    speed: max\n    duration_s: 5\n")
-    command = [sys.executable, "-m", "amberbox", "run", "--quiet", str(folder)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    words = command("run", "--quiet", folder)
+    done = subprocess.run(words, capture_output=True, text=True, timeout=60)
     assert done.returncode == 0, done.stderr
     assert done.stderr.splitlines()[-1] == "all inputs have ended"
     assert len(events(folder, "started")) == 1

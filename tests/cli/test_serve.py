@@ -11,7 +11,6 @@ import socket
 import ssl
 import stat
 import subprocess
-import sys
 import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -22,37 +21,25 @@ from urllib.parse import urlencode
 import pytest
 from sqlalchemy import select
 
-from amberbox.blackbox.keeper.keeper import seal
+from amberbox.blackbox.retention.maintenance import seal
 from amberbox.blackbox.signing.keys import open_keys
-from amberbox.blackbox.store import open_store
+from amberbox.blackbox.store.store import open_store
 from amberbox.cli.main import main
-from amberbox.fleet.accounts.robotkeys import revoke_keys
-from amberbox.fleet.archive.ageclock import OPTION, Mark
-from amberbox.fleet.archive.tables import JOURNALS
-from amberbox.fleet.audit.tables import AUDIT
-from amberbox.fleet.database.database import Database
-from amberbox.fleet.linkend.tables import COMMITTED, ROW
-from amberbox.fleet.options import options
+from amberbox.core.tls import PinError, fingerprint
+from amberbox.link.connection import LinkOptions, LinkRefusedError, dial, tls_context
 from amberbox.link.frames import Bye, Hello, encode, from_server
-from amberbox.link.joining import JoinLine, read_join_line
-from amberbox.robot.link.copying import Copier, HttpSending
-from amberbox.robot.link.dialing import RefusedError, dial
-from amberbox.robot.link.options import LinkOptions
-from amberbox.robot.link.tls import PinError, context_for, fingerprint
-from amberbox.testing.patience import PATIENCE_S
-from tests.robot.link.rig import Watcher, client_of, held, linked, recorded, until
+from amberbox.link.join_line import JoinLine, read_join_line
+from amberbox.link.uploader import HttpTransport, JournalCopier
+from amberbox.server import settings
+from amberbox.server.accounts.robots import revoke_keys
+from amberbox.server.archive.retention import OPTION, ConfirmedTime
+from amberbox.server.database import ServerDatabase
+from amberbox.server.schema import AUDIT, COMMITTED, JOURNALS, ROW
+from amberbox.testing.clock import PATIENCE_S
+from tests.link.robot.rig import Watcher, client_of, held, linked, recorded, until
+from tests.support.processes import command, free_port
 
 PASSWORD = "four words without meaning"
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
-def command(*words: object) -> list[str]:
-    return [sys.executable, "-m", "amberbox", "serve", *map(str, words)]
 
 
 @dataclass
@@ -103,7 +90,7 @@ class Server:
 def started(data: Path, *words: object, context: ssl.SSLContext | None = None) -> Server:
     port = free_port()
     process = subprocess.Popen(
-        command("--data", data, "--port", port, *words), stdin=subprocess.DEVNULL,
+        command("serve", "--data", data, "--port", port, *words), stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
     )  # fmt: skip
     server = Server(data, port, process, context)
@@ -130,7 +117,7 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
 def line(server: Server) -> JoinLine:
     """What a robot is given, while the server runs."""
     done = subprocess.run(
-        command("add-robot", "r1", "--data", server.data), capture_output=True, text=True
+        command("serve", "add-robot", "r1", "--data", server.data), capture_output=True, text=True
     )
     assert done.returncode == 0, done.stderr
     return read_join_line(done.stdout)
@@ -142,7 +129,9 @@ def options_of(line: JoinLine) -> LinkOptions:
 
 def test_a_second_process_on_the_folder_is_told_who_is_there(server: Server) -> None:
     second = subprocess.run(
-        command("--data", server.data, "--port", free_port()), capture_output=True, text=True
+        command("serve", "--data", server.data, "--port", free_port()),
+        capture_output=True,
+        text=True,
     )
     assert second.returncode == 2
     assert f"process {server.process.pid}" in second.stderr
@@ -163,9 +152,9 @@ def test_who_was_made_admin_signs_in(server: Server) -> None:
 def test_a_robot_pins_the_authority(server: Server, line: JoinLine, tmp_path: Path) -> None:
     assert line.url == f"https://localhost:{server.port}"
     assert fingerprint(server.ask("/link/v1/ca.pem")[1]) == line.ca
-    assert context_for(line.url, line.ca, tmp_path) is not None
+    assert tls_context(line.url, line.ca, tmp_path) is not None
     with pytest.raises(PinError):
-        context_for(line.url, "0" * 64, tmp_path)
+        tls_context(line.url, "0" * 64, tmp_path)
 
 
 def test_what_a_robot_says_arrives_and_its_journals_become_columns(
@@ -177,7 +166,7 @@ def test_what_a_robot_says_arrives_and_its_journals_become_columns(
     watcher.write(50, 3)
     client = client_of(watcher.store, 0)
     client.options = options_of(line)
-    with_database = Database(server.data / "server.db", read_only=True)
+    with_database = ServerDatabase(server.data / "server.db", read_only=True)
 
     async def scene() -> None:
         async with linked(client):
@@ -185,9 +174,9 @@ def test_what_a_robot_says_arrives_and_its_journals_become_columns(
             assert held(with_database) == recorded(path)
             watcher.close()
             seal(open_store(path))
-            context = await asyncio.to_thread(context_for, line.url, line.ca, path)
-            sending = HttpSending(client.options, lambda: context)
-            copier = Copier(open_store(path), client.options, sending)
+            context = await asyncio.to_thread(tls_context, line.url, line.ca, path)
+            sending = HttpTransport(client.options, lambda: context)
+            copier = JournalCopier(open_store(path), client.options, sending)
             while await asyncio.to_thread(copier.step):
                 pass
             sending.close()
@@ -202,7 +191,7 @@ def test_what_a_robot_says_arrives_and_its_journals_become_columns(
     assert main(["items", str(server.data)]) == 0
 
 
-def committed(database: Database) -> set[str]:
+def committed(database: ServerDatabase) -> set[str]:
     with database.reading() as connection:
         return set(connection.execute(select(JOURNALS.c.state)).scalars())
 
@@ -215,14 +204,14 @@ def test_a_robot_that_claims_to_be_another_is_sent_away(
     server: Server, line: JoinLine, tmp_path: Path
 ) -> None:
     async def scene() -> None:
-        context = await asyncio.to_thread(context_for, line.url, line.ca, tmp_path)
+        context = await asyncio.to_thread(tls_context, line.url, line.ca, tmp_path)
         socket_ = await dial(options_of(line), context)
         await socket_.send(encode(hello("r2")))
         answer = from_server(await socket_.receive())
         assert isinstance(answer, Bye) and answer.for_good
         await socket_.close()
         wrong = LinkOptions(line.url, "r2", line.key, line.ca)
-        with pytest.raises(RefusedError):
+        with pytest.raises(LinkRefusedError):
             await dial(wrong, context)
 
     asyncio.run(scene())
@@ -230,36 +219,36 @@ def test_a_robot_that_claims_to_be_another_is_sent_away(
 
 def test_a_key_that_is_revoked_ends_the_open_connection(server: Server, tmp_path: Path) -> None:
     done = subprocess.run(
-        command("add-robot", "r3", "--data", server.data, "--group", "new"),
+        command("serve", "add-robot", "r3", "--data", server.data, "--group", "new"),
         capture_output=True,
         text=True,
     )
     mine = read_join_line(done.stdout)
 
     async def scene() -> None:
-        context = await asyncio.to_thread(context_for, mine.url, mine.ca, tmp_path)
+        context = await asyncio.to_thread(tls_context, mine.url, mine.ca, tmp_path)
         socket_ = await dial(options_of(mine), context)
         await socket_.send(encode(hello("r3")))
         await socket_.receive()
-        database = Database(server.data / "server.db")
+        database = ServerDatabase(server.data / "server.db")
         with database.begin() as connection:
             revoke_keys(connection, time.time_ns(), "r3")
         database.close()
         answer = from_server(await asyncio.wait_for(socket_.receive(), PATIENCE_S))
         assert isinstance(answer, Bye) and "key" in answer.reason
-        with pytest.raises(RefusedError):
+        with pytest.raises(LinkRefusedError):
             await dial(options_of(mine), context)
 
     asyncio.run(scene())
 
 
 def test_a_line_goes_to_a_file_that_nobody_else_reads(server: Server, tmp_path: Path) -> None:
-    file, add = tmp_path / "line", command("add-robot", "r8", "--data", server.data)
+    file, add = tmp_path / "line", command("serve", "add-robot", "r8", "--data", server.data)
     done = subprocess.run([*add, "--line-file", file], capture_output=True, text=True)
     assert done.returncode == 0 and "abr_" not in done.stdout
     assert stat.S_IMODE(file.stat().st_mode) == 0o600
     assert read_join_line(file.read_text()).robot == "r8"
-    again = command("add-robot", "r9", "--data", server.data)
+    again = command("serve", "add-robot", "r9", "--data", server.data)
     done = subprocess.run([*again, "--line-file", file], capture_output=True, text=True)
     assert done.returncode == 2 and "is there already" in done.stderr
     with (tmp_path / "open").open("w") as out:
@@ -284,10 +273,10 @@ def test_the_audit_log_holds_while_the_server_runs(
 def test_a_jump_of_the_clock_is_told_and_confirmed(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    database = Database(tmp_path / "server.db")
-    mark = Mark(time.time_ns() - 32 * 86_400 * 10**9, "an earlier boot")
+    database = ServerDatabase(tmp_path / "server.db")
+    mark = ConfirmedTime(time.time_ns() - 32 * 86_400 * 10**9, "an earlier boot")
     with database.begin() as connection:
-        options.write(connection, 0, OPTION, mark)
+        settings.write(connection, 0, OPTION, mark)
     clock = ["serve", "clock", "--data", str(tmp_path)]
     assert main(clock) == 1
     said = capsys.readouterr().out
@@ -303,7 +292,7 @@ def test_a_jump_of_the_clock_is_told_and_confirmed(
 
 def test_it_ends_in_order_and_says_goodbye(server: Server, line: JoinLine, tmp_path: Path) -> None:
     async def scene() -> tuple[int, str]:
-        context = await asyncio.to_thread(context_for, line.url, line.ca, tmp_path)
+        context = await asyncio.to_thread(tls_context, line.url, line.ca, tmp_path)
         socket_ = await dial(options_of(line), context)
         await socket_.send(encode(hello("r1")))
         await socket_.receive()
@@ -354,7 +343,7 @@ def test_a_port_that_is_taken_is_told(tmp_path: Path, capsys: pytest.CaptureFixt
 
 
 def test_file_limits_are_raised() -> None:
-    from amberbox.fleet.serving.process import raise_file_limit
+    from amberbox.server.process import raise_file_limit
 
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     try:

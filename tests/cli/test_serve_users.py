@@ -11,12 +11,11 @@ import pytest
 from sqlalchemy import select
 
 from amberbox.cli.main import main
-from amberbox.fleet.accounts.passwords import Passwords
-from amberbox.fleet.accounts.tables import USERS
-from amberbox.fleet.accounts.users import User, list_users
-from amberbox.fleet.audit.tables import AUDIT
-from amberbox.fleet.database.database import FILE, Database
-from amberbox.link.refusals import NOT_SET_UP, why_unavailable
+from amberbox.link.limits import NOT_SET_UP, why_unavailable
+from amberbox.server.accounts.passwords import Passwords
+from amberbox.server.accounts.users import User, list_users
+from amberbox.server.database import FILE, ServerDatabase
+from amberbox.server.schema import AUDIT, USERS
 from tests.cli.test_serve import PASSWORD, started
 
 
@@ -32,7 +31,7 @@ def add(monkeypatch: pytest.MonkeyPatch, data: Path, *words: str, password: str 
 
 
 def users_of(data: Path) -> Sequence[User]:
-    database = Database(data / FILE, read_only=True)
+    database = ServerDatabase(data / FILE, read_only=True)
     try:
         with database.reading() as connection:
             return list_users(connection)
@@ -53,7 +52,7 @@ def test_the_first_admin_is_there_before_the_first_start(
     assert [(u.name, u.role, u.must_change) for u in users_of(data)] == [
         ("anna", "admin", False), ("bo", "viewer", False), ("cy", "operator", True),
     ]  # fmt: skip
-    database, hashes = Database(data / FILE, read_only=True), Passwords()
+    database, hashes = ServerDatabase(data / FILE, read_only=True), Passwords()
     with database.reading() as connection:
         held = dict(connection.execute(select(USERS.c.name, USERS.c.password_hash)).all())
         log = connection.execute(select(AUDIT.c.principal, AUDIT.c.action, AUDIT.c.object)).all()

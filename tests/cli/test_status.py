@@ -13,26 +13,24 @@ from typing import Any
 
 import pytest
 
-from amberbox.blackbox.doctor.supervised import LOCK as SUPERVISED
-from amberbox.blackbox.folder.folder import load_folder
-from amberbox.blackbox.store import WriterLock, create_store, open_store
+from amberbox.agent.doctor.processes import SUPERVISOR_LOCK as SUPERVISED
+from amberbox.blackbox.robot_folder.folder import load_folder
+from amberbox.blackbox.store.store import WriterLock, create_store, open_store
 from amberbox.cli.main import main
 from amberbox.core.clock import NS, SystemClock
 from amberbox.core.mode import Result
 from amberbox.core.needs import any_of
 from amberbox.core.types import Level, Output, Status
-from amberbox.monitoring.engine.findings import AlarmChange, Finding
-from amberbox.monitoring.messages.pulse import write_pulse
-from amberbox.monitoring.messages.records import record_of
-from amberbox.monitoring.messages.watched import write_watched
+from amberbox.monitoring.current_state import write_heartbeat, write_watched_files
+from amberbox.monitoring.findings import AlarmChange, Finding, record_of
 from amberbox.monitoring.plan import (
     ComponentPlan,
     DependencyPlan,
     Expectation,
     MappingPlan,
     ModePlan,
+    MonitoringPlan,
     OutputPlan,
-    Plan,
 )
 from amberbox.testing.records import FakeRun
 
@@ -41,7 +39,7 @@ WORKING = OutputPlan(
     expectation=Expectation(True), description="of the front scanner",
 )  # fmt: skip
 DEVICE = ModePlan("laser_device", "laser_device_monitor", None, None, [MappingPlan((), [WORKING])])
-PLAN = Plan(
+PLAN = MonitoringPlan(
     "ropod_001",
     "abc",
     (
@@ -119,7 +117,7 @@ def test_documented_overview_is_what_is_shown(
     store: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     needs = {"navigation": ("localisation", "base"), "localisation": ("laser",)}
-    plan = Plan("ropod_001", "abc", [
+    plan = MonitoringPlan("ropod_001", "abc", [
         ComponentPlan(name, name, (), [DependencyPlan(n, component=n) for n in needs.get(name, ())])
         for name in ("navigation", "localisation", "laser", "base", "wifi")
     ])  # fmt: skip
@@ -141,7 +139,7 @@ def test_documented_overview_is_what_is_shown(
         ),
     )
     main(["status", str(store)])
-    page = (Path(__file__).resolve().parents[2] / "docs" / "status.md").read_text("utf-8")
+    page = (Path(__file__).resolve().parents[2] / "docs" / "robot" / "status.md").read_text("utf-8")
     assert f"$ amberbox status ropod_001\n{capsys.readouterr().out}```" in page
 
 
@@ -260,7 +258,7 @@ def test_files_that_have_changed_since_the_watcher_began_are_named(
     store = create_store(tmp_path / "store")
     say(tmp_path / "store", *statuses())
     lock = WriterLock(store, "watch")
-    write_watched(store, load_folder(tmp_path))
+    write_watched_files(store, load_folder(tmp_path))
     orders.write_text("fault laser_front_silent\n")  # is state, no configuration
     main(["status", str(tmp_path)])
     assert "has changed" not in capsys.readouterr().err
@@ -286,7 +284,7 @@ def test_files_that_have_changed_since_the_watcher_began_are_named(
 def test_overloaded_monitoring_is_shown(store: Path, capsys: pytest.CaptureFixture[str]) -> None:
     say(store, *statuses())
     lock = WriterLock(open_store(store), "watch")
-    write_pulse(open_store(store), SystemClock(), 12.4)
+    write_heartbeat(open_store(store), SystemClock(), 12.4)
     assert main(["status", str(store)]) == 1
     assert "monitoring overloaded: the watcher is 12 s behind" in capsys.readouterr().out
     main(["status", str(store), "--json"])

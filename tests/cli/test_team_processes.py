@@ -1,11 +1,10 @@
-"""docs/teams.md with everything running: two simulated robots and their team, diagnosed."""
+"""docs/robot/teams.md with everything running: two simulated robots and their team, diagnosed."""
 
 from __future__ import annotations
 
 import json
 import re
 import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -15,12 +14,13 @@ from pathlib import Path
 
 import pytest
 
-from amberbox.blackbox.store import is_store, open_store
+from amberbox.blackbox.store.store import is_store, open_store
 from amberbox.cli.main import main
-from amberbox.consult.journal import said_until
 from amberbox.core.types import Diagnosis
-from amberbox.testing.patience import PATIENCE_S
+from amberbox.monitoring.current_state import findings_until
+from amberbox.testing.clock import PATIENCE_S
 from tests.monitoring.test_teams import files_of_the_page, write
+from tests.support.processes import command
 
 SILENT, LOST = "laser_rear#silent", "ropod_001:carry_carts#lost"
 DEADLINE_S = 90.0
@@ -103,8 +103,7 @@ def running(folders: Sequence[Path]) -> Iterator[None]:
 def start(verb: str, folder: Path) -> subprocess.Popen[bytes]:
     """Begin to run a verb; what it prints goes to a file beside the folder."""
     with folder.with_name(f"{folder.name}.{verb}").open("w") as file:
-        command = [sys.executable, "-m", "amberbox", verb, str(folder)]
-        return subprocess.Popen(command, stdout=file, stderr=file)
+        return subprocess.Popen(command(verb, folder), stdout=file, stderr=file)
 
 
 def robot(number: int) -> dict[str, str]:
@@ -133,7 +132,7 @@ def world(root: Path, port: int) -> None:
 def standing(folder: Path) -> Diagnosis | None:
     """Return the last diagnosis that the watcher of a folder has written."""
     path = folder / "store"
-    found = said_until(open_store(path), 1 << 62).diagnoses if is_store(path) else ()
+    found = findings_until(open_store(path), 1 << 62).diagnoses if is_store(path) else ()
     return found[-1] if found else None
 
 

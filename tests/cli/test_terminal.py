@@ -11,10 +11,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from amberbox.cli._output import print_grid, text_output
-from amberbox.cli._text import fold
+from amberbox.cli._output import fold, print_grid, text_output
 from amberbox.cli.main import main
-from amberbox.core.terminal import BACK, OWN, harmless
+from amberbox.core.safe_text import LINE_START, OWN_ESCAPE, terminal_safe
 from amberbox.testing.records import fill_store
 from tests.fuzzing import examples, fuzz
 
@@ -36,18 +35,18 @@ def test_errors_show_escapes_of_others_as_text(capsys: pytest.CaptureFixture[str
 @pytest.mark.parametrize("stream", [Terminal, io.StringIO])
 def test_tables_show_escapes_as_text_and_ours_work(stream: type[io.StringIO]) -> None:
     below = stream()
-    with redirect_stdout(harmless(below)):
+    with redirect_stdout(terminal_safe(below)):
         print_grid(["name"], [["\x1b]0;owned\x07"]])
-        print(f"{OWN}[31mred{OWN}[0m{BACK}")
+        print(f"{OWN_ESCAPE}[31mred{OWN_ESCAPE}[0m{LINE_START}")
     shown = below.getvalue()
     assert "\\u001b]0;owned\\u0007" in shown
     assert shown.endswith("\x1b[31mred\x1b[0m\r\n") and shown.count("\x1b") == 2
-    assert OWN not in shown
+    assert OWN_ESCAPE not in shown
 
 
 def test_data_stay_as_they_are_in_a_pipe_and_are_harmless_in_a_terminal() -> None:
     for stream, shown in ((io.StringIO(), "\x1b[2J"), (Terminal(), "\\u001b[2J")):
-        with redirect_stdout(harmless(stream)), text_output(None) as file:
+        with redirect_stdout(terminal_safe(stream)), text_output(None) as file:
             file.write("\x1b[2J")
         assert stream.getvalue() == shown
     assert sys.stdout is not None
@@ -88,11 +87,11 @@ def test_lines_fit_the_terminal(robot: Path, monkeypatch: pytest.MonkeyPatch, li
 
 @fuzz
 @settings(max_examples=examples(50))
-@given(text=st.text("ab " + OWN, max_size=80), width=st.integers(10, 40))
+@given(text=st.text("ab " + OWN_ESCAPE, max_size=80), width=st.integers(10, 40))
 def test_folding_loses_no_word(text: str, width: int) -> None:
-    folded = fold(text.replace(OWN, f"{OWN}[31m"), width)
-    plain = [line.replace(f"{OWN}[31m", "") for line in folded]
-    assert "".join(plain).replace(" ", "") == text.replace(OWN, "").replace(" ", "")
+    folded = fold(text.replace(OWN_ESCAPE, f"{OWN_ESCAPE}[31m"), width)
+    plain = [line.replace(f"{OWN_ESCAPE}[31m", "") for line in folded]
+    assert "".join(plain).replace(" ", "") == text.replace(OWN_ESCAPE, "").replace(" ", "")
 
 
 def test_folded_lines_go_on_below_the_last_column() -> None:
@@ -103,7 +102,7 @@ def test_folded_lines_go_on_below_the_last_column() -> None:
 
 
 def test_pages_write_out_what_names_hide() -> None:
-    from amberbox.fleet.pages.page import environment
+    from amberbox.server.web.page import environment
 
     page = environment().from_string("<b title='{{ name }}'>{{ name }}</b>{{ 3 }}")
     shown = page.render(name="r\u202e1\x1b<i>")

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from amberbox.blackbox.keeper.keeper import seal
-from amberbox.blackbox.store import open_store
+from amberbox.blackbox.retention.maintenance import seal
+from amberbox.blackbox.store.store import open_store
 from amberbox.cli.main import main
-from amberbox.testing.box import COUNT, ManualBox, number
+from tests.support.manual_recorder import COUNT, ManualBox, number
 
 pytest.importorskip("cryptography", reason="signatures need it; pip install 'amberbox[keep]'")
 

@@ -14,20 +14,20 @@ from pathlib import Path
 
 import pytest
 
-from amberbox.blackbox.folder.folder import load_folder
-from amberbox.blackbox.store import Store, WriterLock, create_store, open_store
+from amberbox.blackbox.robot_folder.folder import load_folder
+from amberbox.blackbox.store.store import Store, WriterLock, create_store, open_store
 from amberbox.cli.main import main
-from amberbox.consult.knowledge import diagnoser_of
+from amberbox.consult.folder_knowledge import load_diagnoser
 from amberbox.core.types import Schema, Topic
-from amberbox.monitoring.configuration import load_plan
-from amberbox.monitoring.engine.engine import Engine
-from amberbox.monitoring.plan import Plan
-from amberbox.monitoring.watcher.memory import Place, recall
-from amberbox.monitoring.watcher.reader import Reader
-from amberbox.monitoring.watcher.replay import replay
-from amberbox.testing.box import ManualBox
-from amberbox.testing.patience import PATIENCE_S
+from amberbox.monitoring.engine import Engine
+from amberbox.monitoring.plan import MonitoringPlan
+from amberbox.monitoring.plan_loader import load_plan
+from amberbox.monitoring.record_evaluation import replay
+from amberbox.monitoring.record_reader import RecordedItemsReader
+from amberbox.monitoring.watcher_journal import EvaluatedPosition, recover_progress
+from amberbox.testing.clock import PATIENCE_S
 from tests.monitoring.watcher.stand import line_of, written
+from tests.support.manual_recorder import ManualBox
 
 TEMPERATURE = Topic("/temperature", "ros1", Schema("t/T", "ros1msg", b"float64 data\n"))
 BLACK_BOX = """\
@@ -200,11 +200,11 @@ def watching(folder: Path) -> subprocess.Popen[str]:
     return process
 
 
-def wait_until_evaluated(plan: Plan, store: Store) -> None:
+def wait_until_evaluated(plan: MonitoringPlan, store: Store) -> None:
     """Wait until the watcher has noted that it is at the end of a record that has ended."""
-    *_, last = Reader(store, Engine(plan).items).step()
-    end, deadline_s = Place(last.epoch, last.until_ns), time.monotonic() + 30.0
-    while (reached := recall(store).place) != end:
+    *_, last = RecordedItemsReader(store, Engine(plan).items).step()
+    end, deadline_s = EvaluatedPosition(last.epoch, last.until_ns), time.monotonic() + 30.0
+    while (reached := recover_progress(store).place) != end:
         assert time.monotonic() < deadline_s, f"evaluated up to {reached}, recorded up to {end}"
         time.sleep(0.05)
 
@@ -231,7 +231,7 @@ def test_watchers_killed_at_random_lose_and_double_nothing(folder: Path) -> None
     output, _ = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 0, output
     live = written(store)
-    diagnoser, _ = diagnoser_of(loaded, plan)
+    diagnoser, _ = load_diagnoser(loaded, plan)
     assert sum(line.startswith(b"amberbox/diagnosis ") for line in live) > 0
     found = replay(plan, open_store(store), diagnoser=diagnoser)
     assert live == [line_of(finding) for finding in found]

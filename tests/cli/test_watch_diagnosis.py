@@ -8,16 +8,16 @@ from pathlib import Path
 
 import pytest
 
-from amberbox.blackbox.folder.folder import load_folder
-from amberbox.blackbox.store import open_store
+from amberbox.blackbox.robot_folder.folder import load_folder
+from amberbox.blackbox.store.store import open_store
 from amberbox.cli.main import main
-from amberbox.consult.knowledge import diagnoser_of
+from amberbox.consult.folder_knowledge import load_diagnoser
 from amberbox.core.types import Diagnosis
-from amberbox.diagnosis.fmea.load import read_fmea
+from amberbox.diagnosis.fmea.loader import read_fmea
 from amberbox.diagnosis.knowledge import Knowledge
-from amberbox.diagnosis.tracking.tracker import Tracker
-from amberbox.monitoring.configuration import load_plan
-from amberbox.monitoring.watcher.replay import replay
+from amberbox.diagnosis.tracker import FaultTracker
+from amberbox.monitoring.plan_loader import load_plan
+from amberbox.monitoring.record_evaluation import replay
 from tests.cli.test_watch import folder as folder  # a fixture
 from tests.cli.test_watch import record
 from tests.monitoring.watcher.stand import (
@@ -125,13 +125,13 @@ def test_the_diagnosis_is_that_of_the_folder(diagnosed: Path) -> None:
     record(diagnosed, *[50.0] * 30, *[99.0] * 20)
     loaded = load_folder(diagnosed)
     plan, _ = load_plan(loaded)
-    make, problems = diagnoser_of(loaded, plan)
+    make, problems = load_diagnoser(loaded, plan)
     assert problems == []
     found = replay(plan, open_store(loaded.store_path), diagnoser=make)
     diagnoses = [finding for finding in found if isinstance(finding, Diagnosis)]
     assert {d.config_hash for d in diagnoses} == {plan.config_hash}
     (diagnosed / "fmea.yaml").unlink()
-    assert diagnoser_of(loaded, plan) == (None, [])
+    assert load_diagnoser(loaded, plan) == (None, [])
 
 
 @pytest.mark.parametrize("seed", range(2))
@@ -140,7 +140,7 @@ def test_killed_at_any_moment_no_diagnosis_is_lost_or_doubled(tmp_path: Path, se
     assert fmea is not None, problems
     knowledge = Knowledge("robot", fmea, "hash")
     plan = plan_of(component("extra", positive, variable("ros_ring")))
-    stand = Stand(tmp_path / "store", 70 + seed, diagnoser=partial(Tracker, knowledge))
+    stand = Stand(tmp_path / "store", 70 + seed, diagnoser=partial(FaultTracker, knowledge))
     rng = stand.random
     stand.tick()
     watcher = stand.watcher(plan)

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from amberbox.cli._watchlines import Lines
+from amberbox.cli.watch import FindingLines
 from amberbox.core.clock import NS
 from amberbox.core.types import Status, Symptom
 from tests.monitoring.watcher.diagnoser import answer
-from tests.monitoring.watcher.test_causes import DEAD, WORDS, alarm
+from tests.monitoring.watcher.test_alarm_causes import DEAD, WORDS, alarm
 
 ANSWER = "1970-01-01T00:00:02.000 diagnosis robot-1: laser#dead (90 %); next: Look at the lamp"
 
 
 def test_a_diagnosis_is_a_line_when_its_leading_answer_is_another_one() -> None:
-    lines = Lines()
+    lines = FindingLines()
     other = answer(["laser#dirty"], [], 3, 3 * NS)
     said = [DEAD, replace(DEAD, revision=2), other, replace(other, state="healed")]
     found = [lines.line(finding) for finding in said]
@@ -25,7 +25,7 @@ def test_a_diagnosis_is_a_line_when_its_leading_answer_is_another_one() -> None:
 
 
 def test_an_alarm_that_only_gets_a_cause_is_no_line() -> None:
-    lines = Lines()
+    lines = FindingLines()
     opened = "1970-01-01T00:00:01.000 laser: alarm laser-1 open (urgent): it is dead"
     assert lines.line(alarm()) == opened
     assert lines.line(alarm(cause=WORDS, diagnosis="robot-1", changed_ns=2 * NS)) is None
@@ -36,7 +36,7 @@ def test_an_alarm_that_only_gets_a_cause_is_no_line() -> None:
 
 
 def test_symptoms_and_statuses_are_no_lines_but_silence_is() -> None:
-    lines = Lines()
+    lines = FindingLines()
     status = Status("r", "c", "", "ok", "nominal", {}, (), NS, NS, "", "h")
     assert lines.line(Symptom("c/m/o", "present")) is None
     assert lines.line(status) is None

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from amberbox.client import servers
+from amberbox.client import credentials
 from amberbox.client.fleet import Fleet
 from tests.client.served import Served, served
 
@@ -23,14 +23,14 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
 def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Keep sign-ins in a folder of the test's own."""
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
-    monkeypatch.delenv(servers.VARIABLE, raising=False)
+    monkeypatch.delenv(credentials.VARIABLE, raising=False)
     return tmp_path
 
 
 @pytest.fixture
 def technician(server: Served, monkeypatch: pytest.MonkeyPatch) -> Served:
     """The same server, with a technician's token in the environment."""
-    monkeypatch.setenv(servers.VARIABLE, server.tokens["technician"])
+    monkeypatch.setenv(credentials.VARIABLE, server.tokens["technician"])
     return server
 
 

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import socket
 import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -14,16 +12,16 @@ from pathlib import Path
 from amberbox.cli.main import main
 from amberbox.core.clock import NS
 from amberbox.core.tls import fingerprint
-from amberbox.fleet.accounts.tokens import add_token
-from amberbox.fleet.accounts.users import find_user
-from amberbox.fleet.linkend.tables import STATUS
-from amberbox.monitoring.messages.records import encoded
-from amberbox.testing.patience import PATIENCE_S
-from tests.fleet.archive.recordings import Robot
-from tests.fleet.data.filled import fill
-from tests.fleet.house import House, house
-from tests.fleet.knowledge import robot as sim
-from tests.fleet.state import lives
+from amberbox.monitoring.findings import encoded
+from amberbox.server.accounts.tokens import add_token
+from amberbox.server.accounts.users import find_user
+from amberbox.server.schema import STATUS
+from tests.server.archive.recordings import Robot
+from tests.server.data.filled import fill
+from tests.server.house import House, house
+from tests.server.knowledge import robot as sim
+from tests.server.state import lives
+from tests.support.processes import free_port, running, wait_for_listener
 
 
 @dataclass
@@ -51,12 +49,6 @@ class Served:
         return str(self.robot.store)
 
 
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
 @contextmanager
 def served(folder: Path) -> Iterator[Served]:
     """Fill a server's folder, start the server on it, and end it afterwards."""
@@ -69,18 +61,10 @@ def served(folder: Path) -> Iterator[Served]:
     assert main(["serve", "cert", "--data", str(data), "--host", "localhost"]) == 0
     pin = fingerprint((data / "tls" / "ca.pem").read_bytes())
     found = Served(data, robot, free_port(), pin, tokens)
-    words = ("--data", str(data), "--port", str(found.port), "--quiet")
-    with (folder / "server.log").open("wb") as log:
-        found.process = subprocess.Popen(
-            [sys.executable, "-m", "amberbox", "serve", *words], stdin=subprocess.DEVNULL,
-            stdout=log, stderr=log,
-        )  # fmt: skip
-    try:
-        _await(found, folder / "server.log")
+    log, words = folder / "server.log", ("--data", data, "--port", found.port, "--quiet")
+    with running("serve", *words, log=log) as found.process:
+        wait_for_listener(found.port, found.process, log)
         yield found
-    finally:
-        found.process.kill()
-        found.process.wait()
 
 
 _TOKENS: dict[str, tuple[str, ...]] = {
@@ -92,7 +76,7 @@ _TOKENS: dict[str, tuple[str, ...]] = {
 
 
 def _token(home: House, owner: str, *scopes: str) -> str:
-    from amberbox.fleet.accounts.actions import SCOPES
+    from amberbox.server.accounts.permissions import SCOPES
 
     with home.services.database.begin() as connection:
         now_ns = time.time_ns()
@@ -122,15 +106,3 @@ def _say(home: House) -> None:
     with home.services.database.begin() as connection:
         connection.execute(STATUS.insert(), rows)
     lives.put_alarm(home, 7, "ropod_001")
-
-
-def _await(found: Served, log: Path) -> None:
-    end_s = time.monotonic() + PATIENCE_S
-    while True:
-        assert found.process is not None and found.process.poll() is None, log.read_text()
-        try:
-            socket.create_connection(("127.0.0.1", found.port), PATIENCE_S).close()
-            return
-        except OSError:
-            assert time.monotonic() < end_s, log.read_text()
-            time.sleep(0.05)

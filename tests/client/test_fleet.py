@@ -9,25 +9,26 @@ import numpy as np
 import pytest
 
 import amberbox
-from amberbox.client import feed, remote, tables
-from amberbox.client.errors import (
+from amberbox.client import remote, table_reader, transport
+from amberbox.client.fleet import Fleet
+from amberbox.client.models import time_ns
+from amberbox.client.remote import RemoteRecord
+from amberbox.client.transport import (
+    ApiConnection,
     ConflictError,
     NotAllowedError,
     NotSignedInError,
     UnreachableError,
 )
-from amberbox.client.fleet import Fleet
-from amberbox.client.remote import RemoteRecord
-from amberbox.client.times import time_ns
-from amberbox.client.wire import Wire
 from amberbox.core.errors import UsageError
-from amberbox.core.timetext import format_time
+from amberbox.core.timestamps import format_time
 from amberbox.core.tls import PinError
-from amberbox.fleet.archive.holes import TO_COME
+from amberbox.server.archive.gaps import TO_COME
 from amberbox.testing.records import T0_NS
-from tests.client.served import Served, free_port
-from tests.fleet.data.filled import FORMULAS, ROWS
-from tests.fleet.knowledge import robot as sim
+from tests.client.served import Served
+from tests.server.data.filled import FORMULAS, ROWS
+from tests.server.knowledge import robot as sim
+from tests.support.processes import free_port
 
 ROBOT = "ropod_001"
 ALL = ROWS + 40
@@ -63,7 +64,7 @@ def test_items_and_columns(fleet: Fleet) -> None:
 def test_rows_are_those_of_the_robot_in_either_form(
     fleet: Fleet, server: Served, form: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(tables, "form", lambda: form)
+    monkeypatch.setattr(table_reader, "row_format", lambda: form)
     with amberbox.open(server.store) as record:
         for item in ("odom", "battery", "note"):
             ours = fleet.query(ROBOT, item, None)
@@ -74,10 +75,10 @@ def test_rows_are_those_of_the_robot_in_either_form(
 
 @pytest.mark.parametrize("form", ["arrow", "json"])
 def test_many_rows_come_in_pages(fleet: Fleet, form: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tables, "form", lambda: form)
+    monkeypatch.setattr(table_reader, "row_format", lambda: form)
     pages = [*fleet.pages(ROBOT, "odom", ["seq", "pose_x"], rows=50)]
     assert [len(page.table) for page in pages] == [50, 50, 50, 10]
-    table = tables.joined([page.table for page in pages])
+    table = table_reader.concatenate([page.table for page in pages])
     whole = fleet.query(ROBOT, "odom", ["seq", "pose_x"])
     assert [*table.rows()] == [*whole.rows()] and pages[-1].complete_to
 
@@ -178,7 +179,7 @@ def test_changes_are_followed(fleet: Fleet) -> None:
     change = next(one for one in changes if one.kind == "alarm")
     assert (change.robot, change.data) == (ROBOT, {"id": 7}) and change.number >= first.number
     with pytest.raises(NotSignedInError):
-        next(feed.follow(Wire(fleet.url, "abt_wrong", fleet.wire.context)))
+        next(transport.follow(ApiConnection(fleet.url, "abt_wrong", fleet.wire.context)))
 
 
 def test_a_connection_that_the_server_closed_is_made_anew(fleet: Fleet) -> None:

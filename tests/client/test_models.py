@@ -8,15 +8,15 @@ from typing import Any
 import msgspec
 import pytest
 
-from amberbox.client import alarm_models, models
+from amberbox.client import models
 from amberbox.client.models import Answer
-from tests.fleet.house import house
+from tests.server.house import house
 
 Schema = Mapping[str, Any]
 
 MODELS = [
     kind
-    for module in (models, alarm_models)
+    for module in (models, models)
     for kind in vars(module).values()
     if isinstance(kind, type) and issubclass(kind, Answer) and kind is not Answer
     if kind.__module__ == module.__name__

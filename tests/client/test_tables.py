@@ -10,14 +10,12 @@ from typing import Literal
 import numpy as np
 import pytest
 
+from amberbox.blackbox.columns import arrays as col
 from amberbox.blackbox.query.table import Table
-from amberbox.blackbox.segments import columns as col
-from amberbox.client import tables
-from amberbox.client.wire import Reply
+from amberbox.client import table_reader
+from amberbox.client.transport import ApiReply
 from amberbox.core.types import Column, ColumnData, Ragged
-from amberbox.fleet.data.asked import About
-from amberbox.fleet.data.forms import encoded
-from amberbox.fleet.data.rows import Answer
+from amberbox.server.data.query import AnswerInfo, RowAnswer, encoded
 
 _TIMES = np.array([1_800_000_000_000_000_001, 1_800_000_001_000_000_002])
 _FIELDS = (
@@ -49,19 +47,19 @@ def table() -> Table:
 @pytest.mark.parametrize("rows", [2, 0])
 def test_all_kinds_of_columns_come_as_they_were(form: Literal["json", "arrow"], rows: int) -> None:
     sent = table().take(slice(rows))
-    body = b"".join(encoded(Answer(sent, _TIMES[:rows], About(rows)), form))
+    body = b"".join(encoded(RowAnswer(sent, _TIMES[:rows], AnswerInfo(rows)), form))
     headers = {"content-type": _KINDS[form], "x-amberbox-notes": '["a note"]'}
-    came = tables.page_of(Reply(200, headers, body))
+    came = table_reader.page_of(ApiReply(200, headers, body))
     assert came.table.fields == sent.fields and came.table.notes == ("a note",)
     assert repr([*came.table.rows()]) == repr([*sent.rows()])
-    assert tables.joined([came.table, came.table]).item == "odom"
+    assert table_reader.concatenate([came.table, came.table]).item == "odom"
 
 
 def test_what_was_summed_up_is_shown_by_its_extremes() -> None:
     fields = (_FIELDS[0], *(Column(f"x:{end}", "", "float64") for end in ("min", "max")))
     low, high = np.array([1.0, 2.0]), np.array([5.0, 6.0])
     envelope = Table("odom", fields, {"timestamp": _TIMES, "x:min": low, "x:max": high})
-    rows = tables.as_rows(envelope, {"x": _FIELDS[1]})
+    rows = table_reader.as_rows(envelope, {"x": _FIELDS[1]})
     assert rows.values("x") == [1.0, 5.0, 2.0, 6.0]
     assert rows.values("received") == np.repeat(_TIMES, 2).tolist()
     assert rows.fields[-1].unit == "m" and "least and the greatest" in rows.notes[-1]

@@ -8,18 +8,20 @@ import json
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pyarrow.parquet as pq
 import pytest
 
 from amberbox.cli.main import main
-from amberbox.client import servers
+from amberbox.client import credentials
 from amberbox.client.fleet import Fleet
 from amberbox.client.models import Card
 from amberbox.client.remote import NOT_YET, RemoteRecord
 from amberbox.core.types import Gap
 from amberbox.testing.records import T0_NS
-from tests.client.served import Served, free_port
-from tests.fleet.house import PASSWORD
+from tests.client.served import Served
+from tests.server.house import PASSWORD
+from tests.support.processes import free_port
 
 Capture = pytest.CaptureFixture[str]
 
@@ -154,11 +156,11 @@ def test_robots_that_are_switched_off_are_last_and_do_not_count(
     monkeypatch: pytest.MonkeyPatch, capsys: Capture
 ) -> None:
     cards = [
-        Card("a", disabled=True, level="unknown"),
-        Card("b", online=True, level="ok", last_level="ok"),
-        Card("c", online=True, level="warn", last_level="warn"),
+        {"robot": "a", "disabled": True, "level": "unknown"},
+        {"robot": "b", "online": True, "level": "ok", "last_level": "ok"},
+        {"robot": "c", "online": True, "level": "warn", "last_level": "warn"},
     ]
-    monkeypatch.setattr(Fleet, "robots", lambda _: cards)
+    monkeypatch.setattr(Fleet, "robots", lambda _: msgspec.convert(cards, list[Card]))
     lines = said(capsys, "status", "https://server.example").splitlines()
     assert [line.split()[0] for line in lines[2:]] == ["c", "b", "a"]
     assert lines[-1].endswith("Switched off by an admin.")
@@ -196,6 +198,8 @@ def test_what_is_known_of_faults(technician: Served, capsys: Capture) -> None:
 
 def test_alarms_are_the_servers(technician: Served, capsys: Capture) -> None:
     listed = json.loads(said(capsys, "alarm", technician.where, "--json"))
+    assert list(listed[0])[10:14] == ["changed", "count", "revision", "window"]
+    assert list(listed[0])[-1] == "merged_into"
     assert [(one["id"], one["origin"]) for one in listed] == [(7, "laser")]
     assert "acknowledged" in said(capsys, "alarm", technician.where, "ack", "laser")
     words = ("alarm", technician.where, "shelve", "7", "--for", "2h")
@@ -241,9 +245,9 @@ def test_each_trouble_is_a_line(
     server: Served, capsys: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert "sign-in" in refused(capsys, "items", server.where)
-    monkeypatch.setenv(servers.VARIABLE, "abt_wrong")
+    monkeypatch.setenv(credentials.VARIABLE, "abt_wrong")
     assert "does not work" in refused(capsys, "items", server.where)
-    monkeypatch.setenv(servers.VARIABLE, server.tokens["viewer"])
+    monkeypatch.setenv(credentials.VARIABLE, server.tokens["viewer"])
     other = server.where.replace("ropod_001", "ropod_009")
     assert "no such robot" in refused(capsys, "items", other)
     assert "may not" in refused(capsys, "export", server.where, "--format", "csv", "-o", "all.zip")

@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 
 from amberbox import sim
-from amberbox.consult.declared import declared
+from amberbox.consult.folder_knowledge import read_declared_robot
 from amberbox.core.errors import Problem, UsageError
-from amberbox.core.nodes import load_yaml, only_below
+from amberbox.core.yaml_nodes import load_yaml, only_below
 
 HASH = "ab" * 32
 MODE = """\
@@ -38,7 +38,7 @@ def _folder(place: Path, **files: str) -> Path:
 
 
 def test_a_folder_without_its_python_has_all_its_outputs_and_faults(tmp_path: Path) -> None:
-    found = declared(_folder(tmp_path), "ropod_001", HASH)
+    found = read_declared_robot(_folder(tmp_path), "ropod_001", HASH)
     assert found.known.outputs == {"laser/own/fine"}
     assert list(found.faults().modes) == ["laser#silent"]
     assert found.knowledge().config_hash == HASH
@@ -50,7 +50,7 @@ def test_python_that_was_planted_is_not_imported(tmp_path: Path) -> None:
     files = {"modes/mine.py": own, "probes/mine.py": own, "sources/mine.py": own}
     folder = _folder(tmp_path / "copy", **files, **{"black_box.yaml": "- mine: {}\n"})
     before = set(sys.modules)
-    found = declared(folder, "ropod_001", HASH)
+    found = read_declared_robot(folder, "ropod_001", HASH)
     assert found.fmea is not None
     assert not (tmp_path / "ran").exists()
     assert [name for name in set(sys.modules) - before if "mine" in name] == []
@@ -58,7 +58,7 @@ def test_python_that_was_planted_is_not_imported(tmp_path: Path) -> None:
 
 def test_the_simulated_robots_folder_is_read_whole(tmp_path: Path) -> None:
     shutil.copytree(Path(sim.__file__).parent / "folder", tmp_path / "copy")
-    found = declared(tmp_path / "copy", "ropod_001", HASH)
+    found = read_declared_robot(tmp_path / "copy", "ropod_001", HASH)
     assert (found.problems, len(found.rules())) == ([], 2)
     assert len(found.faults().modes) > 40
 
@@ -73,26 +73,29 @@ def test_files_elsewhere_are_not_read(tmp_path: Path) -> None:
         laser = f"component_name: laser\nmodes: [laser/own.yaml, {path}]\n"
         team = "robots: {a: {where: ../other, functions: {hunter: {probability: 0.1, "
         files = {"components/laser.yaml": laser, "fmea.yaml": f"{FMEA}{team}symptoms: []}}}}}}}}\n"}
-        found = declared(_folder(tmp_path / "copy", **files), "ropod_001", HASH)
+        found = read_declared_robot(_folder(tmp_path / "copy", **files), "ropod_001", HASH)
         assert found.known.outputs == {"laser/own/fine"}
         assert "hunter2" not in str(found)
 
 
 def test_a_place_that_the_robot_names_for_its_store_is_not_looked_at(tmp_path: Path) -> None:
     folder = _folder(tmp_path, **{"robot.yaml": "id: other\nstore: {path: /proc/self}\n"})
-    found = declared(folder, "ropod_001", HASH)
+    found = read_declared_robot(folder, "ropod_001", HASH)
     assert found.folder.robot.id == "ropod_001"
     assert found.folder.store_path == tmp_path / "store"
 
 
 def test_what_is_wrong_is_told_when_somebody_asks(tmp_path: Path) -> None:
-    found = declared(_folder(tmp_path, **{"fmea.yaml": "types: {laser: {failur_modes: {}}}\n"}),
-                     "ropod_001", HASH)  # fmt: skip
+    found = read_declared_robot(
+        _folder(tmp_path, **{"fmea.yaml": "types: {laser: {failur_modes: {}}}\n"}),
+        "ropod_001",
+        HASH,
+    )
     with pytest.raises(UsageError, match=r"fmea\.yaml of ropod_001 is wrong: types\.laser"):
         found.faults()
     (tmp_path / "fmea.yaml").unlink()
     with pytest.raises(UsageError, match="nobody has said what can fail"):
-        declared(tmp_path, "ropod_001", HASH).knowledge()
+        read_declared_robot(tmp_path, "ropod_001", HASH).knowledge()
 
 
 def test_the_fence_is_taken_down_again(tmp_path: Path) -> None:

@@ -11,10 +11,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from amberbox.core.config import build, did_you_mean, load_yaml, parse_yaml, refuse
-from amberbox.core.errors import ConfigurationError, Problem
+from amberbox.core.config import build, raise_errors
+from amberbox.core.errors import ConfigurationError, Problem, did_you_mean
 from amberbox.core.expression import Expression
 from amberbox.core.options import option
+from amberbox.core.yaml_nodes import load_yaml, parse_yaml
 
 CONFIGS = Path(__file__).parent / "configs"
 
@@ -236,9 +237,9 @@ def test_legacy_keys_are_notes() -> None:
 
 def test_notes_do_not_refuse() -> None:
     note = Problem("f", 1, "w", "what", is_error=False)
-    refuse([note])
+    raise_errors([note])
     with pytest.raises(ConfigurationError) as caught:
-        refuse([note, Problem("f", 2, "w", "bad")])
+        raise_errors([note, Problem("f", 2, "w", "bad")])
     assert caught.value.exit_code == 2
     assert len(caught.value.problems) == 2
 

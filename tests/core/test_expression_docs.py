@@ -1,15 +1,14 @@
-"""The examples of docs/expressions.md run, and every function and operator is in it."""
+"""The examples of docs/reference/expressions.md run, and every function and operator is in it."""
 
 from __future__ import annotations
 
 import doctest
 from pathlib import Path
 
-from amberbox.core.expression_parse import FUNCTIONS
-from amberbox.core.expression_tokens import KEYWORDS
+from amberbox.core.expressions.parser import FUNCTIONS, KEYWORDS
 from amberbox.core.units import TIME_NS
 
-PAGE = Path(__file__).resolve().parents[2] / "docs" / "expressions.md"
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "reference" / "expressions.md"
 
 
 def test_examples_run() -> None:

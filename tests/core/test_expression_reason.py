@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from amberbox.core.expression import parse
-from amberbox.core.expression_reason import reason
+from amberbox.core.expression import parse, reason
 from amberbox.core.samples import Samples
 
 NOW = 10_000_000_000

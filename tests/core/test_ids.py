@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from amberbox.core.ids import derive_id, is_id
+from amberbox.core.names import derive_id, is_id
 
 
 @pytest.mark.parametrize("text", ["a", "ropod_001", "a.b-c", "x" * 64, "7"])

@@ -8,7 +8,7 @@ import pytest
 
 from amberbox.core.errors import Problem
 from amberbox.core.needs import NOTHING, Needs, all_of, any_of, at_least, cycles, parse_needs
-from amberbox.core.nodes import Node, parse_yaml
+from amberbox.core.yaml_nodes import Node, parse_yaml
 
 
 def parse(text: str, *, may_be_empty: bool = False) -> tuple[Needs | None, list[Problem]]:

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import pytest
 import yaml
 
-from amberbox.core.nodes import Node, parse_yaml
 from amberbox.core.options import option
-from amberbox.core.redaction import as_plain, likely_secrets, redact, secrets, sounds_secret
+from amberbox.core.redaction import masked_values, redact, secrets, secrets_by_name, sounds_secret
+from amberbox.core.yaml_nodes import Node, parse_yaml
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ def test_secrets_are_cut_out_of_the_text() -> None:
 
 def test_unknown_blocks_lose_what_sounds_secret() -> None:
     text = "host: a\nmqtt_password: x1\nnested: [{api_key: x2, Token: x3, tokens: {a: x4}}]\n"
-    redacted = redact(text, likely_secrets(tree(text)))
+    redacted = redact(text, secrets_by_name(tree(text)))
     assert yaml.safe_load(redacted)["host"] == "a"
     assert not any(secret in redacted for secret in ("x1", "x2", "x3", "x4"))
 
@@ -85,7 +85,7 @@ def test_what_does_not(key: str) -> None:
 
 def test_listings_mask_secrets() -> None:
     box = Box("swordfish", Login("bob", "swordfish"), (Login("eve"),), {"x": Login("", "s")})
-    assert as_plain(box) == {
+    assert masked_values(box) == {
         "token": "***",
         "login": {"user": "bob", "password": "***"},
         "topics": [{"user": "eve", "password": ""}],

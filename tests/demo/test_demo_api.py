@@ -12,12 +12,12 @@ from starlette.testclient import TestClient
 
 from amberbox.core.clock import NS
 from amberbox.core.errors import UsageError
-from amberbox.demo.faults import OFFERS
-from amberbox.fleet.accounts.signincodes import LASTS_NS, SignInCodes
-from amberbox.fleet.api.who import CSRF_HEADER
-from amberbox.fleet.pages import strings
-from amberbox.sim.catalogue import catalogue
-from tests.fleet.house import ROBOTS, URL, House, house
+from amberbox.demo.fleet import OFFERED_FAULTS
+from amberbox.server.accounts.signin import CODE_LASTS_NS, SignInCodes
+from amberbox.server.http.auth import CSRF_HEADER
+from amberbox.server.web import text as web_text
+from amberbox.sim.faults import catalogue
+from tests.server.house import ROBOTS, URL, House, house
 
 CODE = "/api/v1/session/code"
 FAULT = "imu_stuck"
@@ -87,7 +87,7 @@ def test_the_cookie_of_a_link_is_as_after_any_login(home: House, demo: Pretended
 
 def test_a_link_is_over_after_minutes(home: House, demo: Pretended) -> None:
     code = demo.codes.make("admin")
-    home.clock.advance((LASTS_NS + NS) / NS)
+    home.clock.advance((CODE_LASTS_NS + NS) / NS)
     assert here(home).post(CODE, json={"code": code}).status_code == 400
 
 
@@ -171,13 +171,15 @@ def test_the_bar_is_on_every_page_of_a_demonstration(home: House, demo: Pretende
 
 
 def test_every_fault_that_is_offered_is_one_with_plain_words() -> None:
-    assert set(OFFERS) <= set(catalogue())
-    texts = strings.catalogue().texts
-    for fault in OFFERS:
+    assert set(OFFERED_FAULTS) <= set(catalogue())
+    texts = web_text.catalogue().texts
+    for fault in OFFERED_FAULTS:
         assert texts[f"demo.faults.{fault}.name"]
         assert texts[f"demo.faults.{fault}.watch"]
     knowledge = Path(__file__).parents[2] / "src/amberbox/sim/folder/fmea.yaml"
     text = knowledge.read_text(encoding="utf-8")
     assert yaml.safe_load(text)
-    assert all(offer.failure_mode.partition("#")[2] + ":" in text for offer in OFFERS.values())
-    assert len({offer.component for offer in OFFERS.values()}) >= 4
+    assert all(
+        offer.failure_mode.partition("#")[2] + ":" in text for offer in OFFERED_FAULTS.values()
+    )
+    assert len({offer.component for offer in OFFERED_FAULTS.values()}) >= 4

@@ -7,25 +7,23 @@ import os
 import signal
 import socket
 import subprocess
-import sys
 from contextlib import closing
 from pathlib import Path
 
 import pytest
 
 import amberbox
-from amberbox.blackbox.folder.folder import load_folder
-from amberbox.blackbox.folder.missions import read_rules
-from amberbox.blackbox.missions import detect
-from amberbox.blackbox.sources.sim import Orders
+from amberbox.blackbox.query import mission_search
+from amberbox.blackbox.robot_folder.folder import load_folder
+from amberbox.blackbox.robot_folder.robot_yaml import read_rules
+from amberbox.blackbox.sources.sim import OrdersFile
 from amberbox.cli.main import main
 from amberbox.core.clock import NS
 from amberbox.core.errors import AmberboxError, UsageError
-from amberbox.demo.relay import Relay
-from amberbox.demo.robots import IDS, place_of
+from amberbox.demo.fleet import IDS, LiveDemo, Relay, robot_paths
 from amberbox.demo.show import free_port
-from amberbox.demo.stage import Stage
-from amberbox.testing.patience import wait_until
+from amberbox.testing.clock import wait_until
+from tests.support.processes import command
 
 
 def test_a_port_that_is_taken_is_passed_over() -> None:
@@ -74,7 +72,7 @@ async def _answers(port: int) -> bool:
 
 
 def test_the_robots_folders_are_right_and_report_to_the_server(tmp_path: Path) -> None:
-    stage = Stage(tmp_path, 18999)
+    stage = LiveDemo(tmp_path, 18999)
     stage.prepare()
     for robot in IDS:
         folder = load_folder(tmp_path / robot)
@@ -87,7 +85,7 @@ def test_the_robots_folders_are_right_and_report_to_the_server(tmp_path: Path) -
 
 
 def test_what_is_not_offered_or_does_not_run_is_refused(tmp_path: Path) -> None:
-    stage = Stage(tmp_path, 18999)
+    stage = LiveDemo(tmp_path, 18999)
     with pytest.raises(UsageError, match="no fault 'host_clock_jump'"):
         stage.damage(IDS[0], "host_clock_jump")
     with pytest.raises(UsageError, match="does not run"):
@@ -98,7 +96,7 @@ def test_what_is_not_offered_or_does_not_run_is_refused(tmp_path: Path) -> None:
 
 def test_orders_are_read_line_by_line_as_they_are_added(tmp_path: Path) -> None:
     path = tmp_path / "orders"
-    orders = Orders(path)
+    orders = OrdersFile(path)
     assert orders.new() == []
     path.write_text("fault a\nfault b\nhea")
     assert orders.new() == ["fault a", "fault b"]
@@ -110,10 +108,8 @@ def test_orders_are_read_line_by_line_as_they_are_added(tmp_path: Path) -> None:
 @pytest.mark.timeout(180)
 def test_nothing_is_left_when_the_demonstration_is_killed(tmp_path: Path) -> None:
     place = tmp_path / "place"
-    command = [sys.executable, "-m", "amberbox", "demo", "--seconds", "60", "--keep", str(place)]
-    process = subprocess.Popen(
-        [*command, "--port", "18543"], stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL
-    )
+    words = command("demo", "--seconds", "60", "--keep", place, "--port", "18543")
+    process = subprocess.Popen(words, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
     wait_until(lambda: len(_working_below(place)) > 4, "its processes run")
     process.send_signal(signal.SIGKILL)
     process.wait()
@@ -136,8 +132,8 @@ def _working_below(place: Path) -> list[str]:
 def test_deliveries_of_the_robots_are_missions_and_fail_when_it_cannot_drive(
     tmp_path: Path,
 ) -> None:
-    Stage(tmp_path, 18999).prepare()
-    place = place_of(IDS[0], tmp_path)
+    LiveDemo(tmp_path, 18999).prepare()
+    place = robot_paths(IDS[0], tmp_path)
     box = (place.folder / "black_box.yaml").read_text()
     assert "scenario: shuttle\n" in box
     hurried = "    speed: max\n    duration_s: 120\n    topics: [{name: tasks}]\n"
@@ -146,7 +142,7 @@ def test_deliveries_of_the_robots_are_missions_and_fail_when_it_cannot_drive(
     rules = read_rules(place.folder)
     (place.folder / "robot.yaml").write_text("id: r\n")  # no keeper that is ended on its way
     assert main(["record", str(place.folder), "--quiet"]) == 0
-    detect.detect(place.folder / "store", rules)
+    mission_search.detect(place.folder / "store", rules)
     found = amberbox.open(place.folder).missions()
     assert [(m.name, m.outcome, m.failed, m.parameters["to"]) for m in found[:2]] == [
         ("delivery", "finished", False, "ward_a"),

@@ -6,29 +6,28 @@ import itertools
 
 import pytest
 
+from amberbox.core.budget import Budget
 from amberbox.core.errors import UsageError
 from amberbox.core.types import Diagnosis, Symptom, SymptomState
-from amberbox.diagnosis.answering import Effort, Heading, answer
-from amberbox.diagnosis.covering.budget import Budget
-from amberbox.diagnosis.covering.prediction import predict
-from amberbox.diagnosis.faulttree_engine import conclude
+from amberbox.diagnosis.covering.observations import predict
+from amberbox.diagnosis.diagnose import DiagnosisId, Effort, ObservedSituation, answer
+from amberbox.diagnosis.evidence.faulttree import conclude
 from amberbox.diagnosis.knowledge import Knowledge
-from amberbox.diagnosis.situation import Situation
 from tests.diagnosis.fmea.small import small
 
-HEADING = Heading("small-1", 3, 77)
+HEADING = DiagnosisId("small-1", 3, 77)
 FRONT, REAR = "laser_front/heartbeat/alive", "laser_rear/heartbeat/alive"
 GIVEN_UP, HOST = "tasks/log/none_given_up", "host/heartbeat/alive"
 
 
-def seen(*present: str, absent: tuple[str, ...] = ()) -> Situation:
+def seen(*present: str, absent: tuple[str, ...] = ()) -> ObservedSituation:
     """Return a situation with symptoms that are there and that are not."""
     states: list[tuple[str, SymptomState]] = [(name, "present") for name in present]
     states += [(name, "absent") for name in absent]
-    return Situation(tuple(Symptom(name, state) for name, state in states))
+    return ObservedSituation(tuple(Symptom(name, state) for name, state in states))
 
 
-def of(situation: Situation, effort: Effort | None = None) -> Diagnosis:
+def of(situation: ObservedSituation, effort: Effort | None = None) -> Diagnosis:
     """Diagnose the small analysis."""
     return conclude(Knowledge("small", small(), "hash"), situation, HEADING, effort)
 
@@ -71,7 +70,7 @@ def test_absent_symptoms_and_answers_count_in_the_ranking() -> None:
         {"laser_front#wet"},
         {"laser_front#dirty"},
     ]
-    told = Situation(seen(window).symptoms, {"laser_front.look": "dirty"})
+    told = ObservedSituation(seen(window).symptoms, {"laser_front.look": "dirty"})
     assert of(told).hypotheses[0].faults == {"laser_front#dirty"}
 
 
@@ -84,10 +83,12 @@ def test_what_looks_alike_is_a_group_with_a_test_that_splits_it() -> None:
 
 def test_one_of_a_conflict_is_there() -> None:
     conflict = frozenset({"laser_front#dead", "hook#bent"})
-    found = of(Situation(seen(FRONT).symptoms, {}, (conflict, frozenset({"unknown#other"}))))
+    found = of(
+        ObservedSituation(seen(FRONT).symptoms, {}, (conflict, frozenset({"unknown#other"})))
+    )
     assert [h.faults for h in found.hypotheses] == [{"laser_front#dead"}]
     with pytest.raises(UsageError, match="laser_frnt#dead"):
-        of(Situation(conflicts=(frozenset({"laser_frnt#dead"}),)))
+        of(ObservedSituation(conflicts=(frozenset({"laser_frnt#dead"}),)))
 
 
 def test_of_what_the_analysis_does_not_know_it_concludes_nothing() -> None:
@@ -104,7 +105,7 @@ def test_a_component_with_a_symptom_that_nobody_linked_counts_as_lost() -> None:
 
 
 def test_what_other_engines_found_is_handed_on() -> None:
-    told = Situation(seen(FRONT, "nobody/is/this").symptoms, findings=("it smells",))
+    told = ObservedSituation(seen(FRONT, "nobody/is/this").symptoms, findings=("it smells",))
     assert of(told).findings == ("nobody/is/this", "it smells")
 
 
@@ -122,13 +123,13 @@ def test_what_is_cut_off_is_said() -> None:
 
 
 def test_time_that_runs_out_is_said() -> None:
-    found = of(seen(GIVEN_UP), Effort(budget=Budget(deadline=lambda: True)))
+    found = of(seen(GIVEN_UP), Effort(budget=Budget(is_over=lambda: True)))
     assert found.hypotheses == () and found.mass_covered == 0.0
     assert "the time was up" in found.incomplete
 
 
 def test_a_symptom_that_is_hardly_believed_needs_no_cause() -> None:
-    weak = Situation((Symptom(FRONT, "present"), Symptom(REAR, "present", strength=0.1)))
+    weak = ObservedSituation((Symptom(FRONT, "present"), Symptom(REAR, "present", strength=0.1)))
     first, *_ = of(weak).hypotheses
     assert first.faults == {"laser_front#dead"} and first.unexplained == (REAR,)
 
@@ -143,7 +144,7 @@ def test_ratios_are_those_of_covering_where_it_has_the_same_sets(
     """But for the chance that a failure mode is not there, which small priors make close to 1."""
     knowledge = Knowledge("small", small())
     expected = predict(knowledge.model, faults)
-    situation = Situation(tuple(
+    situation = ObservedSituation(tuple(
         Symptom(sign.id, "present" if expected.present(knowledge.model, place) > 0.3 else "absent",
                 strength=strength)
         for place, sign in enumerate(knowledge.model.signs)

@@ -12,13 +12,11 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from amberbox.core.types import Symptom, SymptomState
-from amberbox.diagnosis.answering import Effort, Heading
-from amberbox.diagnosis.faulttree_engine import conclude
+from amberbox.diagnosis.diagnose import DiagnosisId, Effort, ObservedSituation
+from amberbox.diagnosis.evidence.faulttree import conclude
 from amberbox.diagnosis.fmea import model
-from amberbox.diagnosis.fmea.model import Fmea, Link
-from amberbox.diagnosis.fmea.propagation import lost
+from amberbox.diagnosis.fmea.model import Fmea, SymptomLink, lost
 from amberbox.diagnosis.knowledge import Knowledge
-from amberbox.diagnosis.situation import Situation
 from tests.diagnosis.fmea.test_trees import fmeas
 
 LEAK = 0.01
@@ -33,18 +31,18 @@ def with_symptoms(draw: st.DrawFn) -> Fmea:
     chosen = st.lists(st.sampled_from(SYMPTOMS), max_size=2, unique=True)
     sure = st.sampled_from((0.3, 0.9, 0.99))
 
-    def links() -> tuple[Link, ...]:
-        return tuple(Link(symptom, draw(sure), 0.0, 0.0) for symptom in draw(chosen))
+    def links() -> tuple[SymptomLink, ...]:
+        return tuple(SymptomLink(symptom, draw(sure), 0.0, 0.0) for symptom in draw(chosen))
 
     return replace(
         fmea,
         modes={name: replace(mode, symptoms=links()) for name, mode in fmea.modes.items()},
         functions={name: replace(f, symptoms=links()) for name, f in fmea.functions.items()},
-        symptoms={name: model.Symptom(name, leak=LEAK) for name in SYMPTOMS},
+        symptoms={name: model.FmeaSymptom(name, leak=LEAK) for name in SYMPTOMS},
     )
 
 
-def active(fmea: Fmea, faults: frozenset[str]) -> Iterator[Link]:
+def active(fmea: Fmea, faults: frozenset[str]) -> Iterator[SymptomLink]:
     """Yield the links of what is there and of what is lost."""
     gone = lost(fmea, faults)
     for name in faults:
@@ -89,9 +87,9 @@ def test_it_lists_the_smallest_sets_that_explain_all(fmea: Fmea, drawn: list[Sym
     assume(to_explain or not present)
     weights = {f: weight(fmea, states, f) for f in smallest(fmea, to_explain)}
     expected = {f: w / sum(weights.values()) for f, w in weights.items() if w > 0.0}
-    situation = Situation(tuple(Symptom(name, state) for name, state in states.items()))
+    situation = ObservedSituation(tuple(Symptom(name, state) for name, state in states.items()))
     effort = Effort(hypotheses=10_000)
-    found = conclude(Knowledge("robot", fmea), situation, Heading("d", 1, 0), effort)
+    found = conclude(Knowledge("robot", fmea), situation, DiagnosisId("d", 1, 0), effort)
     listed = {h.faults: h.probability for h in found.hypotheses}
     assert listed == pytest.approx(expected, rel=1e-9)
     assert list(listed.values()) == sorted(listed.values(), reverse=True)

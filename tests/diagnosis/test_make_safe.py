@@ -11,19 +11,26 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from amberbox.consult.declared import declared
+from amberbox.consult.folder_knowledge import read_declared_robot
 from amberbox.core.types import AmbiguityGroup, Diagnosis, Hypothesis, Symptom
 from amberbox.core.types import Test as Proposed
-from amberbox.diagnosis.answering import Effort, Heading, answer
-from amberbox.diagnosis.explanation import Explanation, as_text, explain
-from amberbox.diagnosis.explanation.step import AS_LIKELY
+from amberbox.diagnosis.diagnose import DiagnosisId, Effort, ObservedSituation, answer
 from amberbox.diagnosis.fmea.model import FailureMode
 from amberbox.diagnosis.knowledge import Knowledge
-from amberbox.diagnosis.make_safe import CREDIBLE, DANGEROUS, make_safe, repair, safe_action
-from amberbox.diagnosis.situation import Situation
-from amberbox.monitoring.messages.diagnoses import diagnosis_of, diagnosis_values
-from tests.fleet.knowledge import robot as sim
+from amberbox.diagnosis.make_safe import (
+    CREDIBLE,
+    DANGEROUS,
+    repair_action,
+    safe_action,
+    safety_actions,
+)
+from amberbox.diagnosis.report.explain import explain
+from amberbox.diagnosis.report.explanation import Explanation
+from amberbox.diagnosis.report.next_step import AS_LIKELY
+from amberbox.diagnosis.report.text import as_text
+from amberbox.monitoring.findings import diagnosis_of, diagnosis_values
 from tests.fuzzing import examples, fuzz
+from tests.server.knowledge import robot as sim
 
 AT_NS = 1_795_305_600_000_000_000
 BATTERY = "battery#overheats"
@@ -33,7 +40,7 @@ SWITCH_OFF = "switch off, let it cool outside"
 @cache
 def knowledge() -> Knowledge:
     """Return what is known of the simulated robot."""
-    return declared(sim.FOLDER, "ropod_001", sim.HASH).knowledge()
+    return read_declared_robot(sim.FOLDER, "ropod_001", sim.HASH).knowledge()
 
 
 def shown_by(modes: Iterable[str]) -> tuple[Symptom, ...]:
@@ -50,7 +57,7 @@ def shown_by(modes: Iterable[str]) -> tuple[Symptom, ...]:
 def told_of(*modes: str) -> tuple[Diagnosis, Explanation]:
     """Return diagnosis and explanation of what failure modes show."""
     seen = shown_by(modes)
-    found = answer(knowledge(), Situation(seen, watched=True), Heading("d", 1, AT_NS),
+    found = answer(knowledge(), ObservedSituation(seen, watched=True), DiagnosisId("d", 1, AT_NS),
                    Effort(hypotheses=10))  # fmt: skip
     return found, explain(found, knowledge(), seen)
 
@@ -146,7 +153,7 @@ def test_an_analysis_without_make_safe_is_read_by_how_its_remedies_begin(
     remedy: str, safe: str, rest: str
 ) -> None:
     mode = FailureMode("a#b", "a", "b", severity="fatal", remedy=remedy)
-    assert (safe_action(mode), repair(mode)) == (safe, rest)
+    assert (safe_action(mode), repair_action(mode)) == (safe, rest)
     assert safe_action(replace(mode, severity="urgent")) == ""
     assert safe_action(replace(mode, make_safe="run")) == "run"
 
@@ -155,9 +162,9 @@ def test_the_worst_comes_first_and_what_is_hardly_possible_does_not() -> None:
     fmea = knowledge().fmea
     hot = "wheel_front_left#winding_hot"
     both = [Hypothesis("a", frozenset({hot}), 0.94), Hypothesis("b", frozenset({BATTERY}), 0.06)]
-    assert [a.faults for a in make_safe(fmea, both, {"a"})] == [(BATTERY,), (hot,)]
+    assert [a.faults for a in safety_actions(fmea, both, {"a"})] == [(BATTERY,), (hot,)]
     less = [replace(both[0], probability=0.96), replace(both[1], probability=0.04)]
-    assert [a.faults for a in make_safe(fmea, less, {"a"})] == [(hot,)]
+    assert [a.faults for a in safety_actions(fmea, less, {"a"})] == [(hot,)]
     assert fmea.modes[hot].severity in DANGEROUS
 
 

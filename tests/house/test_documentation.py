@@ -68,7 +68,9 @@ def test_what_is_not_documented_is_found(tmp_path: Path) -> None:
 def test_what_is_documented_is_not_complained_about(tmp_path: Path) -> None:
     (tmp_path / "README.md").write_text("`amberbox record X` listens to:\n\n- ros:\n")
     (tmp_path / "docs").mkdir()
-    (tmp_path / "docs" / "design.md").write_text("`max_frequency` is only for insiders here")
+    page = tmp_path / "docs" / "develop" / "design.md"
+    page.parent.mkdir()
+    page.write_text("`max_frequency` is only for insiders here")
     found = " ".join(finding.what for finding in check(tmp_path))
     assert "command 'amberbox record'" not in found
     assert "source 'ros'" not in found
@@ -87,7 +89,7 @@ def test_the_project_is_documented() -> None:
 
 def test_design_notes_are_numbered() -> None:
     """001-why.md, 002-...: each number once, without a hole."""
-    notes = sorted(path.name for path in (ROOT / "docs" / "notes").iterdir())
+    notes = sorted(path.name for path in (ROOT / "docs" / "develop" / "notes").iterdir())
     assert [name[:4] for name in notes] == [f"{n:03}-" for n in range(1, len(notes) + 1)]
 
 

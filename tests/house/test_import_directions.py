@@ -17,7 +17,7 @@ MODULES = (
     "blackbox/journal",
     "blackbox/recorder",
     "blackbox/query",
-    "blackbox/ros1/__init__",
+    "blackbox/sources/ros1/__init__",
     "blackbox/sources/__init__",
     "blackbox/sources/ros",
     "blackbox/sources/zmq",
@@ -29,7 +29,7 @@ MODULES = (
     "monitoring/probes/_ros",
     "monitoring/probes/ros_node",
     "diagnosis/covering",
-    "fleet/server",
+    "server/app",
     "cli/record",
 )
 
@@ -47,18 +47,22 @@ def tree(folder: Path, **planted: str) -> Path:
 @pytest.mark.parametrize(
     ("module", "text", "complaint"),
     [
-        ("core_types", "import amberbox.blackbox.store", "may not know"),
+        ("core_types", "import amberbox.blackbox.store.store", "may not know"),
         ("core_types", "from amberbox.blackbox import journal", "may not know"),
         ("core_types", "from ..blackbox import journal", "may not know"),
         ("core_types", "def f():\n    import amberbox.cli.record", "may not know"),
-        ("blackbox_query", "from amberbox.fleet import server", "may not know"),
-        ("diagnosis_covering", "from amberbox.blackbox.query.record import x", "may not know"),
-        ("fleet_server", "import amberbox.cli.record", "may not know"),
+        ("blackbox_query", "from amberbox.server import app", "may not know"),
+        (
+            "diagnosis_covering",
+            "from amberbox.blackbox.query.record import x",
+            "may not know",
+        ),
+        ("server_app", "import amberbox.cli.record", "may not know"),
         ("blackbox_sources_ros", "from amberbox.blackbox.sources import zmq", "another plugin"),
         ("blackbox_sources_ros", "from . import zmq", "another plugin"),
         (
             "blackbox_sources_ros",
-            "import amberbox.blackbox.store",
+            "import amberbox.blackbox.store.store",
             "core and its protocol",
         ),
         (
@@ -66,7 +70,11 @@ def tree(folder: Path, **planted: str) -> Path:
             "from amberbox.monitoring.modes import range",
             "another plugin",
         ),
-        ("monitoring_modes_device", "import amberbox.blackbox.ros1", "a mode knows core only"),
+        (
+            "monitoring_modes_device",
+            "import amberbox.blackbox.sources.ros1",
+            "a mode knows core only",
+        ),
         ("monitoring_modes_device", "from amberbox.monitoring import plan", "knows core only"),
         ("monitoring_probes_ros_node", "import amberbox.blackbox.query", "its protocol library"),
         ("monitoring_probes__ros", "import amberbox.monitoring.plan", "its protocol library"),
@@ -94,24 +102,55 @@ def test_pyarrow_is_found_behind_a_module_that_the_recorder_imports(tmp_path: Pa
     assert ["record process" in f.what for f in check(tree(tmp_path, **planted))] == [True]
 
 
+@pytest.mark.parametrize(
+    ("planted", "cycle"),
+    [
+        (
+            {
+                "blackbox_query": "from amberbox.blackbox import recorder",
+                "blackbox_recorder": "def f():\n    from amberbox.blackbox import query",
+            },
+            "amberbox.blackbox.query <- amberbox.blackbox.recorder",
+        ),
+        (
+            {
+                "blackbox_query": "import amberbox.blackbox.sources.zmq",
+                "blackbox_sources_ros1___init__": (
+                    "from typing import TYPE_CHECKING\n"
+                    "if TYPE_CHECKING:\n    import amberbox.blackbox.query"
+                ),
+            },
+            "query <- sources",
+        ),
+    ],
+)
+def test_a_cycle_is_found(tmp_path: Path, planted: dict[str, str], cycle: str) -> None:
+    """Of files and of folders; imports in functions and for type checkers count."""
+    found = [finding.what for finding in check(tree(tmp_path, **planted))]
+    start, end = cycle.split(" <- ")
+    assert any("cycle" in what and cycle in what + f" <- {start} <- {end}" for what in found)
+
+
 def test_allowed_imports_are_not_complained_about(tmp_path: Path) -> None:
     planted = {
         "core_types": "from __future__ import annotations\nimport numpy",
         "blackbox_query": "from amberbox.core.types import x\ndef f():\n    import pyarrow",
-        "blackbox_sources_ros": "import amberbox.blackbox.ros1\nfrom amberbox.core import types",
+        "blackbox_sources_ros": (
+            "import amberbox.blackbox.sources.ros1\nfrom amberbox.core import types"
+        ),
         "monitoring_modes_device": "from amberbox.core.types import x\nimport numpy",
         "monitoring_probes_ros_node": (
             "from amberbox.monitoring.probes._ros import x\nimport amberbox.core.types"
         ),
-        "monitoring_probes__ros": "import amberbox.blackbox.ros1",
+        "monitoring_probes__ros": "import amberbox.blackbox.sources.ros1",
         "monitoring_plan": "import amberbox.blackbox.query",
         "blackbox_sources_zmq": (
             "from typing import TYPE_CHECKING\n"
             "if TYPE_CHECKING:\n    import zmq\n"
             "def f():\n    import zmq"
         ),
-        "fleet_server": "import amberbox.blackbox.query.record, amberbox.diagnosis.covering",
-        "cli_record": "from amberbox.fleet import server\nfrom amberbox import __version__",
+        "server_app": "import amberbox.blackbox.query.record, amberbox.diagnosis.covering",
+        "cli_record": "from amberbox.server import app\nfrom amberbox import __version__",
     }
     assert check(tree(tmp_path, **planted)) == []
 

@@ -11,20 +11,20 @@ from collections.abc import Callable
 
 import pytest
 
-from amberbox.blackbox.exporting import ros1md5
-from amberbox.blackbox.formats import csv_columns, csv_times, message_types, ulog_types
+from amberbox.agent import folder_upload as robot_masking
+from amberbox.blackbox.columns import ros_definition
+from amberbox.blackbox.formats import csv, mongodump, ulog
+from amberbox.blackbox.query import export
 from amberbox.blackbox.sources import zmq
-from amberbox.blackbox.unroll import definition
-from amberbox.core.expression_tokens import tokens as expression_tokens
-from amberbox.core.expression_tree import Fault
-from amberbox.core.nodes import parse_yaml
-from amberbox.core.redaction import likely_secrets, redact
-from amberbox.diagnosis.rules.reader import sentences
-from amberbox.fleet.folders.masking import masked
-from amberbox.fleet.pages.alarms import wording
-from amberbox.monitoring.configuration import expectations
+from amberbox.core.expressions.parser import tokens as expression_tokens
+from amberbox.core.expressions.tree import ExpressionFault
+from amberbox.core.redaction import redact, secrets_by_name
+from amberbox.core.yaml_nodes import parse_yaml
+from amberbox.diagnosis.prolog.syntax import sentences
+from amberbox.monitoring import mode_bindings
 from amberbox.monitoring.probes import ping
-from amberbox.robot.folder import masking as robot_masking
+from amberbox.server.ingest.worker import masked
+from amberbox.server.web import text
 
 SHORT = 5000
 TIMES = 8
@@ -45,7 +45,7 @@ def _yaml(data: str) -> None:
 def _redacted(data: str) -> None:
     node = parse_yaml(data, "a.yaml", [])
     assert node is not None
-    redact(data, likely_secrets(node))
+    redact(data, secrets_by_name(node))
 
 
 def _robot(data: str) -> None:
@@ -59,7 +59,7 @@ def _rules(data: str) -> None:
 def _expression(data: str) -> None:
     try:
         list(expression_tokens(data))
-    except Fault:
+    except ExpressionFault:
         return
 
 
@@ -96,16 +96,16 @@ CASES: dict[str, tuple[Callable[[str], object], str, str, str]] = {
     "an expression: a long name": (_expression, "", "a.", ""),
     "a message: zeros before JSON": (_zmq, "a", "\0", "x"),
     "a message: blanks before JSON": (_zmq, "a", " ", "x"),
-    "a definition: blanks": (message_types._FIELD.findall, "a", " ", "-"),
-    "a definition: brackets": (message_types._FIELD.findall, "", "a[1", ""),
-    "a definition: constants": (definition._CONSTANT.findall, "", "a b", ""),
-    "a definition: separators": (definition._SEPARATOR.findall, "=" * 80, " ", "x"),
-    "a definition: arrays": (ros1md5._ARRAY.search, "", "[1", ""),
-    "a log: a field": (ulog_types._FIELD.fullmatch, "a", " ", "-"),
-    "a table: a unit": (csv_times._unit_of, "", "_", "x"),
-    "a table: numbers": (csv_columns._PATTERNS["float"].fullmatch, "", " 1", "x"),
-    "a status: its reason": (wording._CHECK.findall, "", "a ", ""),
-    "an expectation: blanks": (expectations._RANGE.fullmatch, "a", " ", "x"),
+    "a definition: blanks": (mongodump._FIELD.findall, "a", " ", "-"),
+    "a definition: brackets": (mongodump._FIELD.findall, "", "a[1", ""),
+    "a definition: constants": (ros_definition._CONSTANT.findall, "", "a b", ""),
+    "a definition: separators": (ros_definition._SEPARATOR.findall, "=" * 80, " ", "x"),
+    "a definition: arrays": (export._ARRAY.search, "", "[1", ""),
+    "a log: a field": (ulog._FIELD.fullmatch, "a", " ", "-"),
+    "a table: a unit": (csv._unit_of, "", "_", "x"),
+    "a table: numbers": (csv._PATTERNS["float"].fullmatch, "", " 1", "x"),
+    "a status: its reason": (text._CHECK.findall, "", "a ", ""),
+    "an expectation: blanks": (mode_bindings._RANGE.fullmatch, "a", " ", "x"),
     "an address: colons": (ping._BARE_V6.fullmatch, "", ":", "-"),
     "an answer: digits": (ping._SUMMARY.search, "", "1", ""),
 }

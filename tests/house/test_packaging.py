@@ -15,8 +15,8 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 from tools.check_files import committed
+from tools.check_imports import imports, modules
 from tools.findings import ROOT
-from tools.import_graph import imports, modules
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 EXTRAS: dict[str, list[str]] = PROJECT["project"]["optional-dependencies"]
@@ -75,10 +75,10 @@ def test_what_we_import_is_what_we_declare() -> None:
     own = {
         package: always | {_package(text) for text in EXTRAS[extra]}
         for package, extra in {
-            "fleet": "server",
+            "server": "server",
             "demo": "server",
             "link": "link",
-            "robot": "link",
+            "agent": "link",
         }.items()
     }  # who runs these has installed their extra
     known = modules(ROOT / "src")
@@ -132,7 +132,7 @@ import amberbox
 for name in {SERVER}:
     sys.modules[name] = None
 for info in pkgutil.walk_packages(amberbox.__path__, "amberbox."):
-    servers = info.name.startswith(("amberbox.fleet.", "amberbox.demo."))
+    servers = info.name.startswith(("amberbox.server.", "amberbox.demo."))
     if not servers and not info.name.endswith("__main__"):
         importlib.import_module(info.name)
 """

@@ -9,9 +9,7 @@ from typing import Any
 import pytest
 
 from tools.tour.__main__ import FAULTS, Trial
-from tools.tour.notes import Notes, notes_of
-from tools.tour.trail import Trail, trail_of
-from tools.tour.truth import truth_of
+from tools.tour.notes import Notes, Trail, notes_of, trail_of, truth_of
 
 _WHO = "user:technician"
 _CARD = """ropod_002

@@ -13,24 +13,28 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
-from amberbox.blackbox.journal import reserved
+from amberbox.blackbox.journal import channels
 from amberbox.link.frames import (
+    START,
     Ack,
-    Durable,
+    DurableFrame,
     FrameError,
     Hello,
+    JournalPosition,
+    LinkRow,
     RobotFrame,
-    Row,
+    RunEnd,
     ServerFrame,
     Welcome,
+    WriterReach,
     encode,
     from_robot,
     from_server,
 )
-from amberbox.link.ledger import Admission, MemoryLedger, StaleEpochError, Stored
-from amberbox.link.positions import START, Place, Reach, RunEnd
-from amberbox.link.robotend import LANES, OutOfStepError, RobotEnd
-from amberbox.link.serverend import Admit, Keep, Say, ServerEnd
+from amberbox.link.ledger import LinkAdmission, StaleEpochError, StoredRows
+from amberbox.link.robot_end import LANES, OutOfStepError, RobotEnd
+from amberbox.link.server_end import AdmitRobot, SendFrames, ServerEnd, StoreRows
+from tests.link.memory_ledger import MemoryLedger
 
 WRITERS = ("watch", "keep")
 
@@ -38,18 +42,18 @@ WRITERS = ("watch", "keep")
 class Ledger(Protocol):
     """What both ledgers can."""
 
-    def admit(self, hello: Hello) -> Admission: ...
+    def admit(self, hello: Hello) -> LinkAdmission: ...
 
     def store(
         self,
         epoch: int,
         store_id: str,
-        rows: Sequence[Row],
-        upto: Mapping[str, Place],
-        reaches: Mapping[str, Reach],
+        rows: Sequence[LinkRow],
+        upto: Mapping[str, JournalPosition],
+        reaches: Mapping[str, WriterReach],
         *,
         compare: bool = True,
-    ) -> Stored: ...
+    ) -> StoredRows: ...
 
 
 @dataclass
@@ -57,7 +61,7 @@ class Run:
     """One run of a writer on the robot's disk; ``durable`` rows survive a power cut."""
 
     boot: str
-    rows: list[Row | None] = field(default_factory=list)
+    rows: list[LinkRow | None] = field(default_factory=list)
     """None stands for a row that does not go over the link."""
     durable: int = 0
 
@@ -70,7 +74,7 @@ class Disk:
     runs: dict[str, dict[int, Run]] = field(default_factory=lambda: {w: {} for w in WRITERS})
     counter: int = 0
 
-    def rows(self) -> dict[tuple[str, str, int, int], Row]:
+    def rows(self) -> dict[tuple[str, str, int, int], LinkRow]:
         """Return everything that goes over the link, by position."""
         return {
             (self.store_id, writer, number, row.seq): row
@@ -110,10 +114,12 @@ class Robot:
             writer = self.chance.choice(WRITERS)
             run = self.disk.runs[writer][self.live[writer]]
             self.written += 1
-            channel = self.chance.choice([reserved.STATUS, reserved.ALARM, ""])
+            channel = self.chance.choice([channels.STATUS, channels.ALARM, ""])
             data = b"%d of %s" % (self.written, self.boot.encode())
             place = self.live[writer], len(run.rows)
-            run.rows.append(Row(writer, *place, channel, self.written, data) if channel else None)
+            run.rows.append(
+                LinkRow(writer, *place, channel, self.written, data) if channel else None
+            )
 
     def sync(self) -> None:
         """Make everything durable."""
@@ -145,23 +151,27 @@ class Robot:
         self.sync()
         self.start()
 
-    def reaches(self) -> dict[str, Reach]:
+    def reaches(self) -> dict[str, WriterReach]:
         """State how far the journals reach."""
         return {writer: self._reach(writer) for writer in WRITERS}
 
-    def _reach(self, writer: str) -> Reach:
+    def _reach(self, writer: str) -> WriterReach:
         runs = self.disk.runs[writer]
         newest = runs[self.live[writer]]
         ends = tuple(
             RunEnd(number, run.boot, len(run.rows), number != self.live[writer])
             for number, run in sorted(runs.items())
         )
-        end = Place(self.live[writer], len(newest.rows))
-        return Reach(Place(min(runs), 0), end, Place(end.run, newest.durable), ends)
+        end = JournalPosition(self.live[writer], len(newest.rows))
+        return WriterReach(
+            JournalPosition(min(runs), 0), end, JournalPosition(end.run, newest.durable), ends
+        )
 
-    def read(self, writer: str, start: Place, most: int) -> tuple[list[Row], Place]:
+    def read(
+        self, writer: str, start: JournalPosition, most: int
+    ) -> tuple[list[LinkRow], JournalPosition]:
         """Read at most so many positions from a place on."""
-        found: list[Row] = []
+        found: list[LinkRow] = []
         at = start
         for number, run in sorted(self.disk.runs[writer].items()):
             for seq in range(at.seq if number == at.run else 0, len(run.rows)):
@@ -169,7 +179,7 @@ class Robot:
                     break
                 row = run.rows[seq]
                 found += [row] if row is not None else []
-                at, most = Place(number, seq + 1), most - 1
+                at, most = JournalPosition(number, seq + 1), most - 1
         return found, at
 
 
@@ -181,8 +191,8 @@ class Connection:
     server_end: ServerEnd
     up: list[bytes] = field(default_factory=list)
     down: list[bytes] = field(default_factory=list)
-    fresh: dict[str, Place] = field(default_factory=dict)
-    old: dict[str, Place] = field(default_factory=dict)
+    fresh: dict[str, JournalPosition] = field(default_factory=dict)
+    old: dict[str, JournalPosition] = field(default_factory=dict)
     open: bool = True
 
 
@@ -198,8 +208,8 @@ class World:
         self.others = list(others())
         self.connection: Connection | None = None
         self.late: list[Connection] = []
-        self.received: dict[tuple[str, str, int, int, bytes], Row] = {}
-        self.acked: dict[str, dict[str, Place]] = {}
+        self.received: dict[tuple[str, str, int, int, bytes], LinkRow] = {}
+        self.acked: dict[str, dict[str, JournalPosition]] = {}
 
     def connect(self) -> None:
         """Connect anew; what is on its way of the connection before may still arrive."""
@@ -241,7 +251,7 @@ class World:
         one = self.connection
         assert one is not None
         if durable:
-            one.up.append(encode(Durable(one.robot_end.epoch, self.robot.reaches())))
+            one.up.append(encode(DurableFrame(one.robot_end.epoch, self.robot.reaches())))
         else:
             frame = one.robot_end.next_rows(LANES, self.chance.choice([200, 5000]))
             if frame is not None:
@@ -288,19 +298,19 @@ class World:
 
     def _take(self, one: Connection, frame: RobotFrame) -> None:
         for deed in one.server_end.receive(frame):
-            if isinstance(deed, Admit):
+            if isinstance(deed, AdmitRobot):
                 answers = [x.admit(deed.hello) for x in (self.ledger, *self.others)]
                 assert all(answer == answers[0] for answer in answers)
                 welcome = one.server_end.admitted(answers[0], 0, wants_folder=False, watch=())
                 one.down.append(encode(welcome))
-            elif isinstance(deed, Keep):
+            elif isinstance(deed, StoreRows):
                 one.down += map(encode, self._keep(one, deed))
-            elif isinstance(deed, Say):
+            elif isinstance(deed, SendFrames):
                 one.down += map(encode, deed.frames)
 
-    def _keep(self, one: Connection, deed: Keep) -> Sequence[ServerFrame]:
+    def _keep(self, one: Connection, deed: StoreRows) -> Sequence[ServerFrame]:
         """Store rows in all ledgers; they have to agree."""
-        outcomes: list[Stored | None] = []
+        outcomes: list[StoredRows | None] = []
         for ledger in (self.ledger, *self.others):
             try:
                 outcomes.append(
@@ -345,13 +355,13 @@ class World:
         assert kept == set(self.received)
 
 
-def _same(one: Stored | None, other: Stored | None) -> bool:
+def _same(one: StoredRows | None, other: StoredRows | None) -> bool:
     if one is None or other is None:
         return one is other
     same_rows = sorted(one.new, key=_place) == sorted(other.new, key=_place)
-    same_conflicts = set(one.conflicts) == set(other.conflicts)
-    return one.cursor == other.cursor and same_rows and same_conflicts and one.aside == other.aside
+    same_rows &= set(one.contradicting) == set(other.contradicting)
+    return one.cursor == other.cursor and same_rows and one.conflicts == other.conflicts
 
 
-def _place(row: Row) -> tuple[str, int, int]:
+def _place(row: LinkRow) -> tuple[str, int, int]:
     return row.writer, row.run, row.seq

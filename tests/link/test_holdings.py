@@ -7,13 +7,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from amberbox.link import holdings
-from amberbox.link.holdings import STRETCH, STRETCHES, Answer, Copy, Question
+from amberbox.link import uploads
+from amberbox.link.uploads import (
+    MOST_RANGES,
+    RANGE_FILES,
+    HoldingsAnswer,
+    HoldingsQuestion,
+    JournalCopy,
+)
 from tests.fuzzing import examples, fuzz
 
 COPIES = st.lists(
     st.builds(
-        lambda folder, run, number, size, holds: Copy(
+        lambda folder, run, number, size, holds: JournalCopy(
             f"{folder}/{run:06}-ab{run}-{number:04}.mcap", size, holds
         ),
         st.sampled_from(["journal", "ring"]),
@@ -27,15 +33,19 @@ COPIES = st.lists(
 )
 
 
-def lacking(counted_on: list[Copy], held: list[Copy]) -> tuple[list[str], list[Answer]]:
+def lacking(
+    counted_on: list[JournalCopy], held: list[JournalCopy]
+) -> tuple[list[str], list[HoldingsAnswer]]:
     """Ask as a robot does, through the bytes that go over the network."""
     found, answers = [], []
-    for asked in holdings.questions(holdings.stretches_of(counted_on)):
-        question = msgspec.msgpack.encode(Question([stretch for stretch, _ in asked]))
-        assert len(question) <= holdings.QUESTION_BYTES
-        answer = holdings.compared(msgspec.msgpack.decode(question, type=Question), held)
-        answer = msgspec.msgpack.decode(msgspec.msgpack.encode(answer), type=Answer)
-        found += holdings.lacking(asked, answer)
+    for asked in uploads.questions(uploads.journal_ranges(counted_on)):
+        question = msgspec.msgpack.encode(HoldingsQuestion([stretch for stretch, _ in asked]))
+        assert len(question) <= uploads.QUESTION_BYTES
+        answer = uploads.compare_holdings(
+            msgspec.msgpack.decode(question, type=HoldingsQuestion), held
+        )
+        answer = msgspec.msgpack.decode(msgspec.msgpack.encode(answer), type=HoldingsAnswer)
+        found += uploads.missing_copies(asked, answer)
         answers.append(answer)
     return found, answers
 
@@ -44,7 +54,7 @@ def lacking(counted_on: list[Copy], held: list[Copy]) -> tuple[list[str], list[A
 @given(COPIES, COPIES, st.data())
 @settings(max_examples=examples(60), deadline=None)
 def test_exactly_what_is_not_held_is_found(
-    counted_on: list[Copy], others: list[Copy], data: st.DataObject
+    counted_on: list[JournalCopy], others: list[JournalCopy], data: st.DataObject
 ) -> None:
     kept = data.draw(st.lists(st.sampled_from(counted_on), unique=True)) if counted_on else []
     held = [*kept, *others]  # of one name there may be several: what is aside
@@ -53,28 +63,34 @@ def test_exactly_what_is_not_held_is_found(
 
 
 def test_what_agrees_is_not_listed_and_a_missing_one_lists_its_stretch_alone() -> None:
-    held = [Copy(f"journal/000001-ab-{number:04}.mcap", 7) for number in range(10_000)]
+    held = [JournalCopy(f"journal/000001-ab-{number:04}.mcap", 7) for number in range(10_000)]
     later = held[5000:]  # the robot has deleted the others
-    assert lacking(later, held) == ([], [Answer({})])
+    assert lacking(later, held) == ([], [HoldingsAnswer({})])
     gone = held[7001]
     found, [answer] = lacking(later, [copy for copy in held if copy != gone])
     assert found == [gone.name]
-    assert [len(listed) for listed in answer.differing.values()] == [STRETCH - 1]
+    assert [len(listed) for listed in answer.differing.values()] == [RANGE_FILES - 1]
 
 
 def test_the_longest_question_and_answer_fit() -> None:
-    stretch = [Copy(f"journal/{0:012}-{'f' * 16}-{n:012}.mcap", 1 << 40) for n in range(STRETCH)]
-    runs = [f"journal/{run:012}-{'f' * 16}" for run in range(STRETCHES)]
-    [(one, _)] = holdings.stretches_of(stretch)
-    question = Question([msgspec.structs.replace(one, run=run) for run in runs])
-    assert len(msgspec.msgpack.encode(question)) < holdings.QUESTION_BYTES
-    held = (Copy(f"{run}-{n:012}.mcap", 1 << 40) for run in runs for n in range(1, STRETCH))
-    answer = holdings.compared(question, held)
-    assert len(answer.differing) == STRETCHES
+    stretch = [
+        JournalCopy(f"journal/{0:012}-{'f' * 16}-{n:012}.mcap", 1 << 40) for n in range(RANGE_FILES)
+    ]
+    runs = [f"journal/{run:012}-{'f' * 16}" for run in range(MOST_RANGES)]
+    [(one, _)] = uploads.journal_ranges(stretch)
+    question = HoldingsQuestion([msgspec.structs.replace(one, run=run) for run in runs])
+    assert len(msgspec.msgpack.encode(question)) < uploads.QUESTION_BYTES
+    held = (
+        JournalCopy(f"{run}-{n:012}.mcap", 1 << 40) for run in runs for n in range(1, RANGE_FILES)
+    )
+    answer = uploads.compare_holdings(question, held)
+    assert len(answer.differing) == MOST_RANGES
     assert len(msgspec.msgpack.encode(answer)) < 2 << 20, "a robot reads 4 MB"
 
 
 @pytest.mark.parametrize("name", ["", "journal/x.mcap", "../journal/1-a-1.mcap", "1-a-1.mcap"])
 def test_what_is_no_journal_s_name_is_left_out(name: str) -> None:
-    assert holdings.stretches_of([Copy(name, 1)]) == []
-    assert holdings.compared(Question([]), [Copy(name, 1)]) == Answer({})
+    assert uploads.journal_ranges([JournalCopy(name, 1)]) == []
+    assert uploads.compare_holdings(HoldingsQuestion([]), [JournalCopy(name, 1)]) == HoldingsAnswer(
+        {}
+    )

@@ -14,21 +14,20 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, precondition, rule
 
-from amberbox.fleet.database.database import Database
-from amberbox.fleet.linkend import ledger as sql
-from amberbox.link.frames import Hello, Row
-from amberbox.link.ledger import Admission, Stored
-from amberbox.link.positions import Place, Reach
+from amberbox.link.frames import Hello, JournalPosition, LinkRow, WriterReach
+from amberbox.link.ledger import LinkAdmission, StoredRows
+from amberbox.server.database import ServerDatabase
+from amberbox.server.ingest import ledger as sql
 from tests.link.machine import Connection, Disk, Ledger, World
 
 
 class DatabaseLedger:
     """The server's database behind the same words."""
 
-    def __init__(self, database: Database) -> None:
+    def __init__(self, database: ServerDatabase) -> None:
         self.database = database
 
-    def admit(self, hello: Hello) -> Admission:
+    def admit(self, hello: Hello) -> LinkAdmission:
         with self.database.begin() as connection:
             return sql.admit(connection, hello, 0)
 
@@ -36,16 +35,15 @@ class DatabaseLedger:
         self,
         epoch: int,
         store_id: str,
-        rows: Sequence[Row],
-        upto: Mapping[str, Place],
-        reaches: Mapping[str, Reach],
+        rows: Sequence[LinkRow],
+        upto: Mapping[str, JournalPosition],
+        reaches: Mapping[str, WriterReach],
         *,
         compare: bool = True,
-    ) -> Stored:
+    ) -> StoredRows:
         with self.database.begin() as connection:
-            return sql.store(
-                connection, "r1", epoch, store_id, rows, upto, reaches, 0, compare=compare
-            )
+            batch = sql.RowBatch("r1", epoch, store_id, rows, upto, reaches, 0, compare)
+            return batch(connection)
 
 
 class LinkMachine(RuleBasedStateMachine):
@@ -58,7 +56,7 @@ class LinkMachine(RuleBasedStateMachine):
         self.world: World
         self.image: Disk | None = None
         self.folder = Path(tempfile.mkdtemp()) if self.with_database else None
-        self.database = None if self.folder is None else Database(self.folder / "server.db")
+        self.database = None if self.folder is None else ServerDatabase(self.folder / "server.db")
 
     def _others(self) -> list[Ledger]:
         return [] if self.database is None else [DatabaseLedger(self.database)]

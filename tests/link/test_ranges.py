@@ -9,32 +9,37 @@ from typing import Any
 import msgspec
 import pytest
 
-from amberbox.fleet.uploads import verifying
 from amberbox.link.frames import (
-    Beat,
-    Durable,
+    LARGEST,
+    BeatFrame,
+    DurableFrame,
     FrameError,
-    Has,
-    Heads,
+    HasFrame,
+    HeadsFrame,
     Hello,
-    Live,
+    JournalPosition,
+    LinkRow,
+    LiveFrame,
     RobotFrame,
-    Row,
-    Rows,
+    RowsFrame,
+    RunEnd,
+    WriterReach,
     encode,
     from_robot,
 )
-from amberbox.link.positions import LARGEST, Place, Reach, RunEnd
+from amberbox.server.ingest import verification
 
-REACH = Reach(Place(1, 2), Place(1, 9), Place(1, 9), (RunEnd(1, "boot", 9),))
+REACH = WriterReach(
+    JournalPosition(1, 2), JournalPosition(1, 9), JournalPosition(1, 9), (RunEnd(1, "boot", 9),)
+)
 FRAMES: tuple[RobotFrame, ...] = (
     Hello("r1", "s", "boot", {"watch": REACH}, "", 5, 6, "1"),
-    Rows(1, 1, [Row("watch", 1, 2, "status", 3, b"{}")], {"watch": Place(1, 3)}),
-    Durable(1, {"watch": REACH}),
-    Live(1, {"a": (5, 1.5)}),
-    Beat(1, 2, 3, 4, 5, 6, 7),
-    Heads(1, b"{}"),
-    Has(1, [("file", 5)], "id"),
+    RowsFrame(1, 1, [LinkRow("watch", 1, 2, "status", 3, b"{}")], {"watch": JournalPosition(1, 3)}),
+    DurableFrame(1, {"watch": REACH}),
+    LiveFrame(1, {"a": (5, 1.5)}),
+    BeatFrame(1, 2, 3, 4, 5, 6, 7),
+    HeadsFrame(1, b"{}"),
+    HasFrame(1, [("file", 5)], "id"),
 )
 
 
@@ -64,9 +69,9 @@ def test_no_frame_with_a_number_out_of_range_is_read(number: int) -> None:
 
 
 def test_no_journal_with_a_number_out_of_range_is_taken() -> None:
-    sound = verifying.Result("", False, True, "main", 1, 2, 3, 4, 5, 6)
-    assert verifying._in_range(sound) is sound
+    sound = verification.VerificationResult("", False, True, "main", 1, 2, 3, 4, 5, 6)
+    assert verification._in_range(sound) is sound
     for name in ("run", "number", "first_seq", "end_seq", "start_ns", "end_ns"):
         wrong: dict[str, Any] = {name: 2**63 - 1}
-        refused = verifying._in_range(dataclasses.replace(sound, **wrong))
+        refused = verification._in_range(dataclasses.replace(sound, **wrong))
         assert refused.reason and getattr(refused, name) == 0

@@ -8,68 +8,77 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from amberbox.blackbox.journal import reserved
+from amberbox.blackbox.journal import channels
+from amberbox.core.pacing import Backoff, TokenBucket
 from amberbox.link import limits
-from amberbox.link.backoff import Backoff
-from amberbox.link.bucket import TokenBucket
+from amberbox.link.client import OffsetEstimate
 from amberbox.link.frames import (
-    Beat,
+    BeatFrame,
     Bye,
     FrameError,
     Hello,
+    JournalPosition,
+    LinkRow,
     Pong,
-    Row,
-    Rows,
+    RowsFrame,
+    RunEnd,
     Welcome,
+    WriterReach,
     encode,
     from_robot,
     from_server,
 )
-from amberbox.link.ledger import Admission, MemoryLedger, StaleEpochError
-from amberbox.link.offset import OffsetEstimate
-from amberbox.link.positions import Place, Reach, RunEnd
-from amberbox.link.robotend import RobotEnd
-from amberbox.link.serverend import Admit, Keep, Say, ServerEnd
+from amberbox.link.ledger import LinkAdmission, StaleEpochError
+from amberbox.link.robot_end import RobotEnd
+from amberbox.link.server_end import AdmitRobot, SendFrames, ServerEnd, StoreRows
+from tests.link.memory_ledger import MemoryLedger
 
 MS = 1_000_000
-REACH = Reach(Place(1, 0), Place(1, 9), Place(1, 9), (RunEnd(1, "b", 9, closed=False),))
+REACH = WriterReach(
+    JournalPosition(1, 0),
+    JournalPosition(1, 9),
+    JournalPosition(1, 9),
+    (RunEnd(1, "b", 9, closed=False),),
+)
 
 
 def hello(robot: str = "r1", protocol: int = limits.PROTOCOL) -> Hello:
     return Hello(robot, "s", "boot", {"watch": REACH}, "", 0, 0, "1", protocol)
 
 
-def row(seq: int, channel: str = reserved.STATUS, data: bytes = b"{}") -> Row:
-    return Row("watch", 1, seq, channel, 5, data)
+def row(seq: int, channel: str = channels.STATUS, data: bytes = b"{}") -> LinkRow:
+    return LinkRow("watch", 1, seq, channel, 5, data)
 
 
 def admitted() -> ServerEnd:
     end = ServerEnd("r1")
     end.receive(hello())
-    end.admitted(Admission(3, {}), 0, wants_folder=False, watch=())
+    end.admitted(LinkAdmission(3, {}), 0, wants_folder=False, watch=())
     return end
 
 
-def said(end: ServerEnd, frame: Rows | Beat | Hello) -> str:
+def said(end: ServerEnd, frame: RowsFrame | BeatFrame | Hello) -> str:
     """Return the reason with which a connection is ended."""
     [deed] = end.receive(frame)
-    assert isinstance(deed, Say) and deed.ends and end.closed
+    assert isinstance(deed, SendFrames) and deed.ends and end.closed
     [bye] = deed.frames
     assert isinstance(bye, Bye)
     return bye.reason
 
 
 def test_frames_come_back_as_they_went() -> None:
-    rows = Rows(3, 1, [row(1), row(2, data=bytes(range(256)))], {"watch": Place(1, 3)})
-    for frame in (hello(), rows, Beat(1, 2, 3), Bye("x")):
+    rows = RowsFrame(
+        3, 1, [row(1), row(2, data=bytes(range(256)))], {"watch": JournalPosition(1, 3)}
+    )
+    for frame in (hello(), rows, BeatFrame(1, 2, 3), Bye("x")):
         assert from_robot(encode(frame)) == frame
-    for answer in (Welcome(1, {"watch": Place(2, 3)}, 5), Pong(1, 2), Bye("y", True)):
+    for answer in (Welcome(1, {"watch": JournalPosition(2, 3)}, 5), Pong(1, 2), Bye("y", True)):
         assert from_server(encode(answer)) == answer
 
 
 @given(st.integers(0, 10_000), st.integers(0, 7))
 def test_one_changed_bit_is_seen(at: int, bit: int) -> None:
-    data = bytearray(encode(Rows(3, 1, [row(1)], {"watch": Place(1, 2)})))
+    data = bytearray(encode(RowsFrame(3, 1, [row(1)], {"watch": JournalPosition(1, 2)})))
     data[at % len(data)] ^= 1 << bit
     with pytest.raises(FrameError):
         from_robot(bytes(data))
@@ -84,13 +93,13 @@ def test_no_bytes_do_more_than_be_refused(data: bytes) -> None:
 
 def test_frames_that_are_too_large_are_neither_sent_nor_read() -> None:
     with pytest.raises(FrameError):
-        encode(Rows(1, 1, [row(1, data=bytes(limits.FRAME_BYTES))], {}))
+        encode(RowsFrame(1, 1, [row(1, data=bytes(limits.FRAME_BYTES))], {}))
     with pytest.raises(FrameError):
         from_robot(bytes(limits.FRAME_BYTES + 1))
 
 
 def test_nothing_is_taken_before_hello_nor_a_second_one() -> None:
-    assert "hello first" in said(ServerEnd("r1"), Beat(0, 1, 2))
+    assert "hello first" in said(ServerEnd("r1"), BeatFrame(0, 1, 2))
     end = admitted()
     assert "already" in said(end, hello())
 
@@ -101,7 +110,7 @@ def test_a_robot_speaks_for_itself_only_and_our_protocol() -> None:
 
 
 def test_an_older_epoch_is_refused() -> None:
-    assert "epoch 2 is over" in said(admitted(), Rows(2, 1, [row(1)], {}))
+    assert "epoch 2 is over" in said(admitted(), RowsFrame(2, 1, [row(1)], {}))
     ledger = MemoryLedger()
     first, second = ledger.admit(hello()), ledger.admit(hello())
     with pytest.raises(StaleEpochError):
@@ -111,18 +120,18 @@ def test_an_older_epoch_is_refused() -> None:
 
 def test_a_frame_twice_is_one_and_a_missing_one_ends_it() -> None:
     end = admitted()
-    [kept] = end.receive(Rows(3, 1, [row(1)], {}))
-    assert isinstance(kept, Keep) and kept.rows == [row(1)]
-    assert end.receive(Rows(3, 1, [row(1)], {})) == []
-    assert "frame 2 is missing" in said(end, Rows(3, 3, [row(2)], {}))
-    assert end.receive(Rows(3, 2, [row(2)], {})) == []
+    [kept] = end.receive(RowsFrame(3, 1, [row(1)], {}))
+    assert isinstance(kept, StoreRows) and kept.rows == [row(1)]
+    assert end.receive(RowsFrame(3, 1, [row(1)], {})) == []
+    assert "frame 2 is missing" in said(end, RowsFrame(3, 3, [row(2)], {}))
+    assert end.receive(RowsFrame(3, 2, [row(2)], {})) == []
 
 
 @pytest.mark.parametrize(
-    "bad", [row(1, "amberbox/run"), Row("bulk", 1, 1, reserved.STATUS, 0, b"")]
+    "bad", [row(1, "amberbox/run"), LinkRow("bulk", 1, 1, channels.STATUS, 0, b"")]
 )
-def test_other_channels_and_writers_are_not_taken(bad: Row) -> None:
-    assert "are taken" in said(admitted(), Rows(3, 1, [bad], {}))
+def test_other_channels_and_writers_are_not_taken(bad: LinkRow) -> None:
+    assert "are taken" in said(admitted(), RowsFrame(3, 1, [bad], {}))
 
 
 def test_rows_at_a_known_position_with_other_content_are_put_aside() -> None:
@@ -130,33 +139,33 @@ def test_rows_at_a_known_position_with_other_content_are_put_aside() -> None:
     epoch = ledger.admit(hello()).epoch
     ledger.store(epoch, "s", [row(1)], {}, {"watch": REACH})
     stored = ledger.store(epoch, "s", [row(1, data=b"[]"), row(1)], {}, {"watch": REACH})
-    assert (stored.new, stored.conflicts) == ((), (row(1, data=b"[]"),))
+    assert (stored.new, stored.contradicting) == ((), (row(1, data=b"[]"),))
     assert ledger.rows["s", "watch", 1, 1] == row(1)
 
 
 def test_what_is_urgent_goes_first_and_upto_waits_for_the_rest() -> None:
     end = RobotEnd()
-    end.welcome(Welcome(1, {"watch": Place(1, 0)}, 0), {"watch": Place(1, 5)})
-    end.offer_backlog("watch", [row(n) for n in range(5)], Place(1, 5))
-    end.offer_fresh("watch", [row(5), row(6, reserved.ALARM), row(7)], Place(1, 8))
+    end.welcome(Welcome(1, {"watch": JournalPosition(1, 0)}, 0), {"watch": JournalPosition(1, 5)})
+    end.offer_backlog("watch", [row(n) for n in range(5)], JournalPosition(1, 5))
+    end.offer_fresh("watch", [row(5), row(6, channels.ALARM), row(7)], JournalPosition(1, 8))
     frames = [end.next_rows() for _ in range(3)]
     assert [[r.seq for r in f.rows] for f in frames if f] == [[6], [5, 7], [0, 1, 2, 3, 4]]
-    assert [f.upto for f in frames if f] == [{}, {}, {"watch": Place(1, 8)}]
+    assert [f.upto for f in frames if f] == [{}, {}, {"watch": JournalPosition(1, 8)}]
     assert end.next_rows() is None
 
 
 def test_a_metered_network_carries_no_backlog() -> None:
     end = RobotEnd()
-    end.welcome(Welcome(1, {"watch": Place(1, 0)}, 0), {"watch": Place(1, 5)})
-    end.offer_backlog("watch", [row(0)], Place(1, 5))
+    end.welcome(Welcome(1, {"watch": JournalPosition(1, 0)}, 0), {"watch": JournalPosition(1, 5)})
+    end.offer_backlog("watch", [row(0)], JournalPosition(1, 5))
     assert end.next_rows(("urgent", "status")) is None
     assert end.next_rows() is not None
 
 
 def test_the_window_closes_until_something_is_acknowledged() -> None:
     end = RobotEnd()
-    end.welcome(Welcome(1, {}, 0), {"watch": Place(1, 0)})
-    end.offer_fresh("watch", [row(n) for n in range(100)], Place(1, 100))
+    end.welcome(Welcome(1, {}, 0), {"watch": JournalPosition(1, 0)})
+    end.offer_fresh("watch", [row(n) for n in range(100)], JournalPosition(1, 100))
     sent = 0
     while end.next_rows(most_bytes=1) is not None:
         sent += 1
@@ -199,7 +208,7 @@ def test_no_more_than_the_rate_is_let_through(sizes: list[int]) -> None:
 
 
 def test_hello_is_admitted_once_its_reach_can_be() -> None:
-    assert isinstance(ServerEnd("r1").receive(hello())[0], Admit)
-    wrong = Reach(Place(1, 0), Place(1, 3), Place(1, 9))
+    assert isinstance(ServerEnd("r1").receive(hello())[0], AdmitRobot)
+    wrong = WriterReach(JournalPosition(1, 0), JournalPosition(1, 3), JournalPosition(1, 9))
     frame = Hello("r1", "s", "b", {"watch": wrong}, "", 0, 0, "1")
     assert "more is durable" in said(ServerEnd("r1"), frame)

@@ -6,7 +6,6 @@ import json
 import shutil
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -15,9 +14,10 @@ from pathlib import Path
 from typing import Any
 
 from amberbox.blackbox.query.record import open as open_record
-from amberbox.blackbox.store import is_store, open_store
-from amberbox.monitoring.messages.board import BoardReader
-from amberbox.testing.patience import PATIENCE_S, wait_until
+from amberbox.blackbox.store.store import is_store, open_store
+from amberbox.monitoring.current_state import CurrentStateReader
+from amberbox.testing.clock import PATIENCE_S, wait_until
+from tests.support.processes import command
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "laser"
 DEVICE, HEARTBEAT = "laser_device_monitor", "laser_heartbeat_monitor"
@@ -34,7 +34,7 @@ class Laser:
         """Return the level of the component (by the empty name) and of its modes."""
         if not is_store(self.folder / "store"):
             return {}
-        board = BoardReader(open_store(self.folder / "store")).read(time.time_ns())
+        board = CurrentStateReader(open_store(self.folder / "store")).read(time.time_ns())
         return {status.mode: status.level for status in board.statuses}
 
     def become(self, **levels: str) -> None:
@@ -45,8 +45,8 @@ class Laser:
 
     def messages(self) -> dict[str, Any]:
         """Return what the paper's messages say, by the monitor's name."""
-        command = ["status", str(self.folder), "--format", "paper"]
-        shown = subprocess.run(_amberbox(*command), capture_output=True, text=True, check=False)
+        words = command("status", self.folder, "--format", "paper")
+        shown = subprocess.run(words, capture_output=True, text=True, check=False)
         found = [json.loads(line) for line in shown.stdout.splitlines()]
         assert all(set(m) == {"robotId", "monitorName", "healthStatus"} for m in found)
         return {message["monitorName"]: message["healthStatus"] for message in found}
@@ -70,9 +70,9 @@ def watched(place: Path, uri: str, topic: str) -> Iterator[Laser]:
     _replace(laser.folder / "components/laser/heartbeat.yaml", "/scan_front", topic)
     _replace(laser.folder / "components/laser/device.yaml", "/dev/front_laser", str(laser.device))
     laser.device.touch()
-    started = [subprocess.Popen(_amberbox("record", str(laser.folder), "--quiet"))]
+    started = [subprocess.Popen(command("record", str(laser.folder), "--quiet"))]
     wait_until(lambda: is_store(laser.folder / "store"), "a store")
-    started.append(subprocess.Popen(_amberbox("watch", str(laser.folder), "--quiet")))
+    started.append(subprocess.Popen(command("watch", str(laser.folder), "--quiet")))
     try:
         yield laser
     finally:
@@ -111,7 +111,3 @@ def _replace(path: Path, old: str, new: str) -> None:
     text = path.read_text()
     assert old in text
     path.write_text(text.replace(old, new))
-
-
-def _amberbox(*words: str) -> list[str]:
-    return [sys.executable, "-m", "amberbox", *words]

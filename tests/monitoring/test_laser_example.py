@@ -7,8 +7,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from amberbox.testing.rosnet import RosMaster, RosPublisher, RosTopic
 from tests.monitoring.laserexample import EXPECTED, play, watched
+from tests.support.ros_network import RosMaster, RosPublisher, RosTopic
 
 TOPIC = "/scan_front"
 SCAN = b"\4\0\0\0scan"

@@ -1,4 +1,4 @@
-"""docs/teams.md: two simulated robots make a team, the team is part of a system."""
+"""docs/robot/teams.md: two simulated robots make a team, the team is part of a system."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from typing import Any
 import pytest
 import zmq
 
-from amberbox.blackbox.folder.folder import load_folder
-from amberbox.blackbox.store import create_store, open_store
+from amberbox.blackbox.robot_folder.folder import load_folder
+from amberbox.blackbox.store.store import create_store, open_store
 from amberbox.cli.main import main
 from amberbox.core.types import Level, Status
-from amberbox.monitoring.configuration.load import load_plan
-from amberbox.monitoring.messages.board import Board, BoardReader
-from amberbox.monitoring.watcher.watcher import Watch, Watcher
-from amberbox.testing.box import recording
-from amberbox.testing.patience import PATIENCE_S
+from amberbox.monitoring.current_state import CurrentState, CurrentStateReader
+from amberbox.monitoring.plan_loader import load_plan
+from amberbox.monitoring.watcher import RecordWatcher, WatcherSetup
+from amberbox.testing.clock import PATIENCE_S
+from tests.support.manual_recorder import recording
 
-PAGE = Path(__file__).resolve().parents[2] / "docs" / "teams.md"
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "robot" / "teams.md"
 ROBOT = """\
 - sim:
     topics:
@@ -80,7 +80,7 @@ def watching(folder: Path) -> Iterator[None]:
     loaded = load_folder(folder)
     plan, problems = load_plan(loaded)
     assert not [problem for problem in problems if problem.is_error]
-    watcher = Watcher(Watch(plan, create_store(loaded.store_path), loaded))
+    watcher = RecordWatcher(WatcherSetup(plan, create_store(loaded.store_path), loaded))
     stop = threading.Event()
     thread = threading.Thread(target=watcher.run, args=(stop,))
     thread.start()
@@ -104,8 +104,8 @@ class Level1:
         self.record.enter_context(recording(self.folder))
         self.watch.enter_context(watching(self.folder))
 
-    def board(self) -> Board:
-        return BoardReader(open_store(self.folder / "store")).read(time.time_ns())
+    def board(self) -> CurrentState:
+        return CurrentStateReader(open_store(self.folder / "store")).read(time.time_ns())
 
     def wait_for(self, component: str, level: Level) -> Status:
         """Wait until a component has a level."""

@@ -8,12 +8,12 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-from amberbox.core.config import load_yaml
 from amberbox.core.errors import Problem
+from amberbox.core.yaml_nodes import load_yaml
 from tools.findings import ROOT
 from tools.markdown import fences
 
-PAGE = (ROOT / "docs" / "write-a-monitor.md").read_text(encoding="utf-8")
+PAGE = (ROOT / "docs" / "start" / "write-a-monitor.md").read_text(encoding="utf-8")
 MOST_LINES = 30
 
 
@@ -65,9 +65,8 @@ def test_the_monitor_is_one_short_file() -> None:
 
 def test_the_rule_test_of_the_page_can_fail(tmp_path: Path) -> None:
     """The page's rule test against a monitor that finds nothing."""
-    from amberbox.monitoring.plan import Plan
-    from amberbox.monitoring.ruletests.files import read_rules
-    from amberbox.monitoring.ruletests.running import run_rules
+    from amberbox.monitoring.plan import MonitoringPlan
+    from amberbox.monitoring.rule_tests import read_rule_tests, run_rule_tests
 
     blocks = {fence.info.partition(" ")[2]: fence.text for fence in fences(PAGE)}
     (tmp_path / "modes").mkdir()
@@ -79,7 +78,7 @@ def test_the_rule_test_of_the_page_can_fail(tmp_path: Path) -> None:
     path.write_text(f"mode:\n{mode}{rules}")
     problems: list[Problem] = []
     assert load_yaml(path, problems) is not None
-    read = read_rules(path, path.name, tmp_path, problems)
+    read = read_rule_tests(path, path.name, tmp_path, problems)
     assert read is not None, problems
-    told = [problem.where for problem in run_rules(read, Plan("", ""))]
+    told = [problem.where for problem in run_rule_tests(read, MonitoringPlan("", ""))]
     assert told == ["test 'the contacts fail while the robot charges' at 6 s"]

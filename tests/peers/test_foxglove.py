@@ -21,13 +21,19 @@ from websockets.sync.client import connect
 from websockets.sync.connection import Connection
 
 import amberbox
-from amberbox.blackbox.foxglove.live import LiveColumns, LiveMessages
-from amberbox.blackbox.foxglove.server import Listener, Server, is_loopback
+from amberbox.blackbox.query.foxglove import (
+    LiveColumns,
+    LiveMessages,
+    Server,
+    ViewerListener,
+)
 from amberbox.cli.main import main
+from amberbox.core.tls import is_loopback
 from amberbox.core.types import Schema, Topic
-from amberbox.testing.box import COUNT, ManualBox, number, raw_messages
-from amberbox.testing.patience import PATIENCE_S
+from amberbox.testing.clock import PATIENCE_S
 from amberbox.testing.records import fill_store
+from tests.support.manual_recorder import COUNT, ManualBox, number, raw_messages
+from tests.support.processes import command
 
 PLAYING, PAUSED, ENDED = 0, 1, 3
 TYPES = get_typestore(Stores.ROS1_NOETIC)
@@ -118,7 +124,7 @@ def viewer(port: int) -> Iterator[Viewer]:
 @contextmanager
 def live(store: Path, kind: Any = LiveMessages) -> Iterator[int]:
     """Serve a store live in a thread; gives the port."""
-    stop, server, source = threading.Event(), Server(Listener()), kind(store, [])
+    stop, server, source = threading.Event(), Server(ViewerListener()), kind(store, [])
     source.prepare(server)
     server.start("test", "127.0.0.1", 0)
     thread = threading.Thread(target=source.run, args=(server, stop))
@@ -144,8 +150,8 @@ def hear_until_heard(box: ManualBox, client: Viewer, topic: str) -> None:
 @contextmanager
 def program(*arguments: str) -> Iterator[tuple[subprocess.Popen[str], int]]:
     """Run the verb as a program of its own; gives process and port."""
-    command = [sys.executable, "-m", "amberbox", "foxglove", *arguments, "--port", "0"]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    words = command("foxglove", *arguments, "--port", "0")
+    process = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     assert process.stdout is not None
     try:
         yield process, int(process.stdout.readline().rpartition(":")[2])
@@ -289,7 +295,7 @@ def test_json_topics_have_schemas_that_viewers_read(tmp_path: Path) -> None:
 
 
 def test_a_port_that_is_taken(store: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    taken = Server(Listener())
+    taken = Server(ViewerListener())
     taken.start("test", "127.0.0.1", 0)
     port = taken.websocket.port
     assert main(["foxglove", str(store), "--port", str(port)]) == 1

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import socket
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -15,9 +14,10 @@ import zmq
 
 import amberbox
 from amberbox.blackbox.sources.zmq import Config, Source, ZmqTopic
-from amberbox.testing.box import ManualBox, events, last_counters
+from amberbox.testing.clock import PATIENCE_S, wait_until
 from amberbox.testing.contract import ObservedSink, observe
-from amberbox.testing.patience import PATIENCE_S, wait_until
+from tests.support.manual_recorder import ManualBox, events, last_counters
+from tests.support.processes import free_port
 
 
 @pytest.fixture
@@ -124,8 +124,7 @@ def test_publisher_restart_is_seen_and_survived(context: zmq.Context[Any]) -> No
 
 
 def test_publisher_that_comes_late_is_announced_and_found(context: zmq.Context[Any]) -> None:
-    with socket.create_server(("127.0.0.1", 0)) as probe:
-        port = probe.getsockname()[1]
+    port = free_port()
     config = Config(endpoint=f"tcp://127.0.0.1:{port}", topics=[ZmqTopic(name="odom")])
     with observe(Source(config, "zmq")) as sink:
         wait_until(lambda: bool(sink.events))

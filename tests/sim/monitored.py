@@ -10,29 +10,29 @@ from typing import Any
 
 import numpy as np
 
-from amberbox.blackbox.folder.folder import load_folder
+from amberbox.blackbox.robot_folder.folder import load_folder
 from amberbox.cli.main import main
 from amberbox.core.clock import NS
 from amberbox.core.errors import Problem
 from amberbox.core.types import Batch, Column, ItemSchema, Ragged
-from amberbox.monitoring.configuration import load_plan
-from amberbox.monitoring.engine.engine import Engine
-from amberbox.monitoring.engine.findings import AlarmChange, Finding, Transition
-from amberbox.monitoring.plan import Plan
-from amberbox.sim import Robot, catalogue
-from amberbox.sim.robot import START_NS, Message
+from amberbox.monitoring.engine import Engine
+from amberbox.monitoring.findings import AlarmChange, Finding, Transition
+from amberbox.monitoring.plan import MonitoringPlan
+from amberbox.monitoring.plan_loader import load_plan
+from amberbox.sim.faults import catalogue
+from amberbox.sim.robot import START_NS, Message, Robot
 
 FAULT_S = 20.0
 """When faults begin: the robot drives, and all windows of its monitors are full."""
 
 
-def plan_of(folder: Path) -> tuple[Plan, list[Problem]]:
+def plan_of(folder: Path) -> tuple[MonitoringPlan, list[Problem]]:
     """Make a new robot folder and load its plan."""
     assert main(["new", str(folder), "--from", "sim"]) == 0
     return load_plan(load_folder(folder))
 
 
-def find(plan: Plan, messages: Sequence[Message], until_s: float) -> list[Finding]:
+def find(plan: MonitoringPlan, messages: Sequence[Message], until_s: float) -> list[Finding]:
     """Return what the monitors find in messages of a robot."""
     engine = Engine(plan)
     engine.begin(START_NS - NS)

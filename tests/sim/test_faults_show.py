@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from amberbox.sim import Robot, catalogue
-from amberbox.sim.robot import Message
+from amberbox.sim.faults import catalogue
+from amberbox.sim.robot import Message, Robot
 
 _BEGIN_S = 9.0  # the robot of this seed drives along the corridor then
 _SEED = 3

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import amberbox.sim
-from amberbox.diagnosis.rules import ask, read_rules
+from amberbox import sim
+from amberbox.diagnosis.prolog.program import read_rules
+from amberbox.diagnosis.prolog.query import ask
 
-FOLDER = Path(amberbox.sim.__file__).parent / "folder" / "rules"
+FOLDER = Path(sim.__file__).parent / "folder" / "rules"
 FACTS = [
     ("now", 9),
     ("component", "bus"), ("component", "imu"), ("component", "wheel"), ("component", "host"),

@@ -14,10 +14,11 @@ from pathlib import Path
 import pytest
 
 from amberbox.core.errors import UsageError
-from amberbox.sim import Robot, catalogue
 from amberbox.sim.__main__ import main, parse_fault
-from amberbox.sim.live import Plan, listen, obey, publish
-from amberbox.testing.patience import PATIENCE_S
+from amberbox.sim.faults import catalogue
+from amberbox.sim.live import LiveRun, apply_order, listen, publish
+from amberbox.sim.robot import Robot
+from amberbox.testing.clock import PATIENCE_S
 
 
 class _Wire:
@@ -36,7 +37,7 @@ class _Wire:
 def test_the_truth_is_written_before_each_message_goes_out(tmp_path: Path) -> None:
     path = tmp_path / "truth.jsonl"
     wire = _Wire(path)
-    plan = Plan("max", 0.5, path)
+    plan = LiveRun("max", 0.5, path)
     count = publish(Robot(5), wire, plan, queue.SimpleQueue(), threading.Event())
     lines = [json.loads(line) for line in path.read_text().splitlines()]
     assert count == len(wire.sent) == len(lines) > 80
@@ -50,7 +51,7 @@ def test_orders_are_obeyed_between_ticks() -> None:
     orders: queue.SimpleQueue[str] = queue.SimpleQueue()
     listen(io.StringIO("fault wifi_drops\n\nfault wifi_weak 12\nheal wifi_drops\n"), orders)
     robot = Robot(5)
-    publish(robot, _Wire(), Plan("max", 0.2), orders, threading.Event())
+    publish(robot, _Wire(), LiveRun("max", 0.2), orders, threading.Event())
     assert [(fault.id, fault.magnitude) for fault in robot.active_faults()] == [("wifi_weak", 12.0)]
 
 
@@ -65,7 +66,7 @@ def test_orders_are_obeyed_between_ticks() -> None:
     ],
 )
 def test_answers_to_orders(order: str, answer: str) -> None:
-    assert answer in obey(Robot(), order)
+    assert answer in apply_order(Robot(), order)
 
 
 @pytest.mark.parametrize(

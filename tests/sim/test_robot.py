@@ -14,11 +14,10 @@ import numpy as np
 import pytest
 
 from amberbox.core.errors import AmberboxError, UsageError
-from amberbox.sim import TOPICS, Robot, catalogue
-from amberbox.sim.catalogue import DOMAINS, parse_faults
-from amberbox.sim.mission import SCENARIOS
-from amberbox.sim.robot import Message
-from amberbox.sim.topics import TOPIC_BY_NAME
+from amberbox.sim.faults import DOMAINS, catalogue, parse_faults
+from amberbox.sim.missions import SCENARIOS
+from amberbox.sim.robot import Message, Robot
+from amberbox.sim.topics import TOPIC_BY_NAME, TOPICS
 
 Stream = list[tuple[str, int, bytes]]
 _MISSION_S = 110.0

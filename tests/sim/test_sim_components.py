@@ -8,8 +8,9 @@ import pytest
 
 from amberbox.core.plugins import find as find_plugins
 from amberbox.core.types import Status, Symptom
-from amberbox.monitoring.plan import Plan
-from amberbox.sim import Robot, catalogue
+from amberbox.monitoring.plan import MonitoringPlan
+from amberbox.sim.faults import catalogue
+from amberbox.sim.robot import Robot
 from tests.sim.monitored import FAULT_S, alarms, failures, find, plan_of, with_fault
 
 INITIALISED_S = 6.0
@@ -30,13 +31,13 @@ SAMPLE = {  # fault: seconds until its component must have an alarm
 
 
 @pytest.fixture(scope="module")
-def plan(tmp_path_factory: pytest.TempPathFactory) -> Plan:
+def plan(tmp_path_factory: pytest.TempPathFactory) -> MonitoringPlan:
     loaded, problems = plan_of(tmp_path_factory.mktemp("robot") / "r")
     assert problems == []
     return loaded
 
 
-def test_the_configuration_is_complete_and_asks_no_probe(plan: Plan) -> None:
+def test_the_configuration_is_complete_and_asks_no_probe(plan: MonitoringPlan) -> None:
     outputs = [o for _, mode in plan.modes() for m in mode.mappings for o in m.outputs]
     assert len(outputs) >= 40 and not plan.probes()
     assert not [mode.problem for _, mode in plan.modes() if mode.problem]
@@ -45,7 +46,7 @@ def test_the_configuration_is_complete_and_asks_no_probe(plan: Plan) -> None:
     assert all(mode.description for _, mode in plan.modes())
 
 
-def test_every_alarm_says_what_to_do_or_what_it_is(plan: Plan) -> None:
+def test_every_alarm_says_what_to_do_or_what_it_is(plan: MonitoringPlan) -> None:
     silent = [
         f"{component.id}/{mode.id}/{output.name}"
         for component, mode in plan.modes()
@@ -56,7 +57,7 @@ def test_every_alarm_says_what_to_do_or_what_it_is(plan: Plan) -> None:
     assert silent == []
 
 
-def test_it_shows_a_good_part_of_the_modes(plan: Plan) -> None:
+def test_it_shows_a_good_part_of_the_modes(plan: MonitoringPlan) -> None:
     used = {Path(str(mode.module.__file__)).stem for _, mode in plan.modes() if mode.module}
     known = set(find_plugins("amberbox.monitoring.modes", defines=("Config", "evaluate")))
     assert used <= known
@@ -68,7 +69,7 @@ def test_it_shows_a_good_part_of_the_modes(plan: Plan) -> None:
     [("transport", 7, 240.0), ("charging", 5, 40.0), ("standing", 5, 30.0)],
 )
 def test_nothing_is_wrong_with_a_sound_robot(
-    plan: Plan, scenario: str, seed: int, seconds: float
+    plan: MonitoringPlan, scenario: str, seed: int, seconds: float
 ) -> None:
     messages = list(Robot(seed, scenario=scenario).step_until(seconds))
     findings = find(plan, messages, seconds - 1)
@@ -83,7 +84,7 @@ def test_nothing_is_wrong_with_a_sound_robot(
 
 
 @pytest.mark.parametrize("fault", SAMPLE)
-def test_a_fault_is_found_where_it_is(plan: Plan, fault: str) -> None:
+def test_a_fault_is_found_where_it_is(plan: MonitoringPlan, fault: str) -> None:
     within_s = SAMPLE[fault]
     findings = find(plan, with_fault(fault, within_s + 1), FAULT_S + within_s)
     opened = alarms(findings)
@@ -96,7 +97,7 @@ def test_a_fault_is_found_where_it_is(plan: Plan, fault: str) -> None:
     ("fault", "mode"), [("barometer_off", "barometer"), ("supply_sags", "supply")]
 )
 def test_a_sick_unit_makes_no_other_one_seem_sick(
-    plan: Plan, place: str, fault: str, mode: str
+    plan: MonitoringPlan, place: str, fault: str, mode: str
 ) -> None:
     robot = Robot(3)
     robot.inject(f"wheel_{place}_{fault}", 5.0, magnitude=4.5)
@@ -105,7 +106,7 @@ def test_a_sick_unit_makes_no_other_one_seem_sick(
     assert blamed == {(f"wheel_{place}", mode)}
 
 
-def test_a_frozen_gyroscope_of_a_unit_is_no_fault_of_others(plan: Plan) -> None:
+def test_a_frozen_gyroscope_of_a_unit_is_no_fault_of_others(plan: MonitoringPlan) -> None:
     robot = Robot(3)
     robot.inject("wheel_rear_left_bus_disconnected", 20.0)
     findings = find(plan, list(robot.step_until(40.0)), 39.0)
@@ -113,12 +114,12 @@ def test_a_frozen_gyroscope_of_a_unit_is_no_fault_of_others(plan: Plan) -> None:
     assert "bus" in blamed and "imu" not in blamed
 
 
-def test_a_robot_that_stops_hard_does_not_jump(plan: Plan) -> None:
+def test_a_robot_that_stops_hard_does_not_jump(plan: MonitoringPlan) -> None:
     findings = find(plan, with_fault("navigation_crash", 6.0), FAULT_S + 5.0)
     assert {"position"}.isdisjoint(found.mode for found in failures(findings))
 
 
-def test_what_depends_on_a_fault_is_blocked_and_has_no_alarm(plan: Plan) -> None:
+def test_what_depends_on_a_fault_is_blocked_and_has_no_alarm(plan: MonitoringPlan) -> None:
     findings = find(plan, with_fault("wheel_rear_right_bus_disconnected", 12), FAULT_S + 10)
     assert list(alarms(findings)) == ["bus"]
     blocked = {t.component: t.blocked_by for t in failures(findings) if not t.mode}

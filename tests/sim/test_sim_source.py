@@ -9,13 +9,14 @@ from typing import Any
 import pytest
 
 from amberbox.blackbox.sources import sim
-from amberbox.blackbox.sources.sim import Config, FaultOptions, Pace, Source
-from amberbox.core.config import build, parse_yaml
+from amberbox.blackbox.sources.sim import Config, FaultOptions, RealTimePacer, Source
+from amberbox.core.config import build
 from amberbox.core.errors import Problem
 from amberbox.core.source import TopicOptions
-from amberbox.sim import TOPICS
+from amberbox.core.yaml_nodes import parse_yaml
 from amberbox.sim.robot import START_NS
-from amberbox.testing import MemorySink
+from amberbox.sim.topics import TOPICS
+from amberbox.testing.contract import MemorySink
 
 
 def _run(config: Config) -> MemorySink:
@@ -81,7 +82,7 @@ class _Clock(threading.Event):
 def test_a_robot_that_was_held_up_makes_up_for_it_gently(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = _Clock()
     monkeypatch.setattr(sim, "time", clock)
-    pace = Pace(1.0, START_NS, clock)
+    pace = RealTimePacer(1.0, START_NS, clock)
     went_s = []
     for number in range(200):  # 100 messages a second
         pace.wait(START_NS + number * 10_000_000)
@@ -97,7 +98,7 @@ def test_a_robot_that_was_held_up_makes_up_for_it_gently(monkeypatch: pytest.Mon
 def test_a_machine_that_wakes_up_late_makes_no_robot_slow(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = _Clock()
     monkeypatch.setattr(sim, "time", clock)
-    pace = Pace(1.0, START_NS, clock)
+    pace = RealTimePacer(1.0, START_NS, clock)
     for number in range(500):  # 100 messages a second
         before_ns = clock.now_ns
         pace.wait(START_NS + number * 10_000_000)

@@ -1,4 +1,4 @@
-"""docs/simulator.md says what the simulator does: its tables are those of the code."""
+"""docs/start/simulator.md says what the simulator does: its tables are those of the code."""
 
 from __future__ import annotations
 
@@ -6,10 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from amberbox.sim import TOPICS, catalogue
+from amberbox.sim.faults import catalogue
 from amberbox.sim.tables import fault_table, topic_tables
+from amberbox.sim.topics import TOPICS
 
-PAGE = Path(__file__).parents[2] / "docs" / "simulator.md"
+PAGE = Path(__file__).parents[2] / "docs" / "start" / "simulator.md"
 
 
 def test_every_fault_and_topic_stands_in_the_page() -> None:

@@ -5,9 +5,8 @@ from __future__ import annotations
 import socket
 import threading
 
-from amberbox.testing.patience import PATIENCE_S
-from amberbox.testing.proxy import Faults, Proxy, plan
-from amberbox.testing.proxyframes import FrameFaults, Mangler
+from amberbox.testing.clock import PATIENCE_S
+from amberbox.testing.fault_proxy import Faults, FrameFaults, Mangler, Proxy, plan
 
 HEAD = b"GET / HTTP/1.1\r\nUpgrade: websocket\r\n\r\n"
 

@@ -2,12 +2,13 @@
 
 ``python -m tools.tour`` runs the demonstration for each of some faults, breaks a robot once all
 are well, and goes through the real pages; clicks and seconds are from the server's access log.
-``--shots docs/tour`` takes the pictures of docs/tour.md of the last fault.
+``--shots docs/start/tour`` takes the pictures of docs/start/tour.md of the last fault.
 """
 
 from __future__ import annotations
 
 import argparse
+import re
 import shutil
 import sys
 from collections.abc import Iterator, Sequence
@@ -16,17 +17,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from amberbox.core.errors import AmberboxError
-from amberbox.demo.faults import OFFERS
-from tools.tour.colleague import Colleague
-from tools.tour.notes import Notes
-from tools.tour.shots import take
+from amberbox.demo.fleet import OFFERED_FAULTS
+from tools.tour.notes import Notes, Trail, trail_of, truth_of
 from tools.tour.stage import Demonstration, demonstration
-from tools.tour.technician import find_out, opened
-from tools.tour.trail import Trail, trail_of
-from tools.tour.truth import truth_of
+from tools.tour.technician import Colleague, answer_of, find_out, opened, robot_card
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Browser
+    from playwright.sync_api import Browser, FloatRect, Page
+
 
 MOST_S, MOST_CLICKS = 60.0, 5
 FAULTS = ("localisation_crash", "laser_rear_motor_slow", "wheel_front_left_bus_disconnected")
@@ -80,7 +78,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m tools.tour", description=__doc__)
-    parser.add_argument("--faults", nargs="+", choices=tuple(OFFERS), default=FAULTS)
+    parser.add_argument("--faults", nargs="+", choices=tuple(OFFERED_FAULTS), default=FAULTS)
     parser.add_argument("--port", type=int, default=_PORT)
     parser.add_argument("--shots", type=Path, help="folder for pictures of the last fault")
     return parser
@@ -116,6 +114,55 @@ def _tell(trial: Trial) -> Trial:
     print(f"{trial.fault}: {' > '.join(trial.trail.pages)}, {trial.trail.seconds:.1f} s\n"
           f"{trial.notes}\n", flush=True)  # fmt: skip
     return trial
+
+
+_SETTLE_MS = 2500  # wait before a screenshot: plots and values have come by then
+
+
+def take(browser: Browser, demo: Demonstration, number: int, folder: Path) -> None:
+    """Write the pictures to a folder: a robot is broken now."""
+    folder.mkdir(parents=True, exist_ok=True)
+    with opened(browser, demo.links()[_WHO]) as page:
+        _walk(page, number, folder)
+    with opened(browser, demo.links()[_WHO], theme="dark") as page:
+        _to_answer(page, number)
+        _shot(page, folder, "diagnosis-dark")
+    with opened(browser, demo.links()[_WHO], width=390, height=844) as page:
+        _to_answer(page, number)
+        _shot(page, folder, "diagnosis-narrow", height=1100)
+
+
+def _walk(page: Page, number: int, folder: Path) -> None:
+    """Go from the list to the answer, to the data that it rests on, to robot and alarm."""
+    _shot(page, folder, "robots", height=420)
+    _to_answer(page, number)
+    _shot(page, folder, "diagnosis")
+    reason = page.get_by_role("main").get_by_title("The data of that moment").first
+    reason.click()
+    page.wait_for_url("**/data?*")
+    _shot(page, folder, "data")
+    page.get_by_role("link", name="Status", exact=True).click()
+    page.get_by_role("treegrid").first.wait_for()
+    _shot(page, folder, "robot", height=500)
+    page.get_by_role("main").get_by_role("link", name=re.compile("open alarm")).first.click()
+    page.get_by_role("heading", name="Alarms").wait_for()
+    _shot(page, folder, "alarms")
+
+
+def _to_answer(page: Page, number: int) -> None:
+    robot_card(page, number).get_by_role("link", name="What is broken?").click()
+    answer_of(page)
+
+
+def _shot(page: Page, folder: Path, name: str, height: int = 0) -> None:
+    """Take a picture of the upper part of the page."""
+    page.wait_for_timeout(_SETTLE_MS)
+    size = page.viewport_size
+    assert size is not None, "the window has a size"
+    clip: FloatRect = {"x": 0, "y": 0, "width": size["width"], "height": height or size["height"]}
+    path = folder / f"{name}.png"
+    page.screenshot(path=path, clip=clip, full_page=True)
+    print(f"{path}: {path.stat().st_size:,} bytes", flush=True)
 
 
 if __name__ == "__main__":

@@ -15,10 +15,10 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from amberbox.demo.stage import DATA
-from amberbox.demo.telling import until
-from amberbox.fleet.accounts.actions import Role
-from amberbox.fleet.serving.accesslog import FILE
+from amberbox.demo.fleet import DATA
+from amberbox.demo.story import until
+from amberbox.server.accounts.permissions import Role
+from amberbox.server.middleware import FILE
 
 _LINK = re.compile(r"^ +([a-z]+) +(http://\S+/in#\S+)\s*$", re.MULTILINE)
 _BEGIN_S, _END_S = 60.0, 60.0

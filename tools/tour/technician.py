@@ -1,4 +1,6 @@
-"""Somebody who knows an address and "robot 2 misbehaves", and nothing but what the pages show.
+"""The people of the tour: a technician who knows only what the pages show, and a colleague.
+
+The technician knows an address and "robot 2 misbehaves".
 
 Only text that is visible is read, and links are found by it. Reading takes as long as it takes
 people, and so does pointing at a link.
@@ -10,25 +12,26 @@ import re
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 from amberbox.core.errors import AmberboxError
+from amberbox.demo.story import BrowserClient, check, until
 from tools.tour.notes import Notes, notes_of
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Locator, Page
 
-WORD_S = 60 / 200
-"""People read about 200 words a minute."""
+
+WORD_S = 60 / 200  # people read about 200 words a minute
 POINT_S = 1.0
 _PATIENCE_S = 30.0
 _LOOK_S = 0.25
-_AGAIN = 2
-"""So often the answer is looked at again: it may become another one meanwhile."""
+_AGAIN = 2  # how often the answer is read again: it may change meanwhile
+# removes the bar that breaks robots: it names the fault
 _WITHOUT_BAR = """document.addEventListener("DOMContentLoaded", () => {
     document.getElementById("demo")?.remove()
 })"""
-"""The bar that breaks robots tells what is broken: whoever is to find that out must not see it."""
 
 
 @contextmanager
@@ -101,3 +104,39 @@ def _read(text: str, known: str = "") -> None:
     before = set(known.splitlines())
     new = [line for line in text.splitlines() if line not in before]
     time.sleep(WORD_S * sum(len(line.split()) for line in new))
+
+
+_SETTLE_S = 240.0  # limit; all is well, and wrong, within seconds unless the machine is very busy
+_LEAST_WELL = 15  # components that are well before a fault; the others wait for a first message
+
+
+@dataclass(frozen=True, slots=True)
+class Colleague:
+    """Somebody at another browser."""
+
+    browser: BrowserClient
+
+    @classmethod
+    def arrived(cls, link: str) -> Colleague:
+        """Let somebody sign in by a link."""
+        url, _, code = link.partition("/in#")
+        browser = BrowserClient(url)
+        check(browser.sign_in(code).status == 200, "the link signs in")
+        return cls(browser)
+
+    def damage(self, robot: str, fault: str) -> None:
+        """Break a robot that is well; return when there is an alarm: it "misbehaves"."""
+        until(lambda: self._is_well(robot) or None, lambda: f"{robot} is well", _SETTLE_S)
+        self.browser.send("POST", f"/demo/{robot}/fault", {"fault": fault})
+        until(lambda: self._card(robot)["alarms"] or None, lambda: "there is an alarm", _SETTLE_S)
+
+    def _is_well(self, robot: str) -> bool:
+        card = self._card(robot)
+        levels = card["components"]
+        return bool(
+            card["online"] and levels.get("ok", 0) >= _LEAST_WELL
+            and not levels.get("error", 0) and not card["alarms"]
+        )  # fmt: skip
+
+    def _card(self, robot: str) -> Any:
+        return next(card for card in self.browser.get("/robots") if card["robot"] == robot)

@@ -1,29 +1,30 @@
-"""List the alarms of a robot; acknowledge one, or shelve it for some time."""
+"""Alarms of a robot, from its record or its server: list them, acknowledge or shelve one."""
 
 from __future__ import annotations
 
 import argparse
-import getpass
 import time
 from collections.abc import Callable, Sequence
-from typing import Any
+from functools import partial
+from typing import TYPE_CHECKING, Any
 
-from amberbox.blackbox.follow.records import OwnRecords
-from amberbox.blackbox.journal.reserved import ALARM
-from amberbox.blackbox.requests import submit
-from amberbox.blackbox.store import is_locked, open_store
-from amberbox.blackbox.where import store_path
-from amberbox.cli._anyorder import add_actions
-from amberbox.cli._output import print_grid, print_json
-from amberbox.cli._server import PAGE, add_robot
+import msgspec
+
+from amberbox.blackbox.journal.channels import ALARM
+from amberbox.blackbox.store.own_records import OwnRecords
+from amberbox.blackbox.store.store import is_locked, open_store, store_path, submit
+from amberbox.cli._arguments import PAGE, add_actions, add_robot, robot_at, user_name
+from amberbox.cli._output import print_json, print_listing
 from amberbox.client.address import is_url
-from amberbox.core.config import did_you_mean
-from amberbox.core.errors import UsageError
-from amberbox.core.naming import component_named, endings
-from amberbox.core.timetext import NS, format_duration, format_time, parse_duration
+from amberbox.core.errors import UsageError, did_you_mean
+from amberbox.core.names import component_id, ids_ending_in
+from amberbox.core.timestamps import NS, format_duration, format_time, parse_duration
 
-KIND = "alarm"
-"""Kind of the requests that the watcher takes."""
+if TYPE_CHECKING:
+    from amberbox.client.fleet import Fleet
+    from amberbox.client.models import AlarmLine
+
+KIND = "alarm"  # kind of the requests to the watcher
 _WRITER = "watch"
 _USAGE = (
     "amberbox alarm [list] WHERE [--all] | ack WHERE ID | shelve WHERE ID --for 2h | "
@@ -49,7 +50,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """List the alarms, or leave a request that the watcher takes."""
+    """List the alarms, or submit a request to the watcher."""
     action, rest = args.action, args.rest
     if args.for_ is not None and action != "shelve":
         raise UsageError("--for goes with shelve", _USAGE)
@@ -57,11 +58,9 @@ def run(args: argparse.Namespace) -> int:
         wanted = "no more words" if action == "list" else "the ID of one alarm, or its component"
         raise UsageError(f"alarm {action} takes {wanted}", _USAGE)
     if is_url(args.where):
-        from amberbox.cli._remote_alarm import run_remote
-
-        run_remote(args, action, *(rest or [""]))
-        return 0
-    _ACTIONS[action](args, *rest)
+        _run_on_server(args, action, *rest)
+    else:
+        _ACTIONS[action](args, *rest)
     return 0
 
 
@@ -74,21 +73,21 @@ def newest(where: str) -> list[Row]:
 
 def _list(args: argparse.Namespace) -> None:
     rows = [row for row in newest(args.where) if args.all or row["state"] != "healed"]
-    if args.json:
-        print_json([_document(row) for row in rows])
-    elif rows:
-        causes = [row.get("cause", "") for row in rows]
-        if any(causes):
-            shown = [(*_shown(row), cause) for row, cause in zip(rows, causes, strict=True)]
-            print_grid((*_HEADER, "cause"), shown)
-        else:
-            print_grid(_HEADER, map(_shown, rows))
-    else:
-        print("no alarms" if args.all else "no alarms now")
+    with_cause = any(row.get("cause", "") for row in rows)
+    header = (*_HEADER, "cause") if with_cause else _HEADER
+
+    def shown(row: Row) -> tuple[object, ...]:
+        return (*_shown(row), row.get("cause", "")) if with_cause else _shown(row)
+
+    print_listing(rows, _document, header, shown, _nothing(args), as_json=args.json)
+
+
+def _nothing(args: argparse.Namespace) -> str:
+    return "no alarms" if args.all else "no alarms now"
 
 
 def _document(row: Row) -> Row:
-    """Return a record as programs get it: times as text."""
+    """Return a record for JSON output: times as text."""
     times = {"opened": row["opened_ns"], "changed": row["changed_ns"], "until": row["until_ns"]}
     rest = {key: row[key] for key in row if not key.endswith("_ns") and key != "timestamp"}
     return {**rest, **{key: None if t is None else format_time(t) for key, t in times.items()}}
@@ -105,10 +104,6 @@ def _shown(row: Row) -> tuple[object, ...]:
     )  # fmt: skip
 
 
-def _acknowledge(args: argparse.Namespace, alarm_id: str) -> None:
-    _request(args, alarm_id, "acknowledge", "acknowledged")
-
-
 def _shelve(args: argparse.Namespace, alarm_id: str) -> None:
     if args.for_ is None:
         raise UsageError("an alarm is shelved for some time", "--for 2h")
@@ -119,20 +114,16 @@ def _shelve(args: argparse.Namespace, alarm_id: str) -> None:
     _request(args, alarm_id, "shelve", told, time.time_ns() + duration_ns)
 
 
-def _unshelve(args: argparse.Namespace, alarm_id: str) -> None:
-    _request(args, alarm_id, "unshelve", "taken from the shelf")
-
-
 def _request(
     args: argparse.Namespace, alarm_id: str, action: str, told: str, until_ns: int | None = None
 ) -> None:
-    """Leave a request about an alarm that lasts; raises UsageError if there is none like that."""
+    """Submit a request about an open alarm; raises UsageError if there is none."""
     alarm_id = _check(newest(args.where), alarm_id, action, args.where)
     store = open_store(store_path(args.where))
     values = {
         "id": alarm_id,
         "action": action,
-        "who": args.who or _user(),
+        "who": args.who or user_name(),
         "until_ns": until_ns,
         "note": args.note,
     }
@@ -146,12 +137,12 @@ def _request(
 
 
 def _check(rows: Sequence[Row], name: str, action: str, where: str) -> str:
-    """Return the id of the alarm that lasts and has this id, or is of this component."""
+    """Return the id of the open alarm with this id, or of this component."""
     lasting = {row["id"]: row for row in rows if row["state"] != "healed"}
     of = {row["component"]: row["id"] for row in lasting.values()}
     alarm_id = name
-    if name not in lasting and endings(name, of):
-        alarm_id = of[component_named(name, of)]
+    if name not in lasting and ids_ending_in(name, of):
+        alarm_id = of[component_id(name, of)]
     hint = f"amberbox alarm list {where} shows them"
     if alarm_id not in lasting:
         healed = any(row["id"] == name for row in rows)
@@ -163,16 +154,84 @@ def _check(rows: Sequence[Row], name: str, action: str, where: str) -> str:
     return alarm_id
 
 
-def _user() -> str:
-    try:
-        return getpass.getuser()
-    except (KeyError, OSError):  # a user that the system has no name for
-        return ""
-
-
 _ACTIONS: dict[str, Callable[..., None]] = {
     "list": _list,
-    "ack": _acknowledge,
+    "ack": partial(_request, action="acknowledge", told="acknowledged"),
     "shelve": _shelve,
-    "unshelve": _unshelve,
+    "unshelve": partial(_request, action="unshelve", told="taken from the shelf"),
 }
+
+
+_SERVER_HEADER = ("id", "component", "state", "level", "severity", "opened (UTC)", "times", "who",
+                  "reason", "cause")  # fmt: skip
+_SERVER_KEYS = (
+    "id", "kind", "robots", "origin", "severity", "level", "state", "active", "reason", "opened",
+    "changed", "count", "revision", "window", "cause", "diagnosis", "cleared", "late", "owner",
+    "acknowledged", "shelved", "resolved", "merged_into",
+)  # fmt: skip
+_UNRESOLVED = ("open", "acknowledged", "shelved")
+
+
+def _run_on_server(args: argparse.Namespace, action: str, name: str = "") -> None:
+    """List the alarms of a robot on a server, or change one."""
+    if args.who:
+        raise UsageError("on a server it is who the token belongs to", "leave out --who")
+    fleet, robot = robot_at(args.where)
+    with fleet:
+        if action == "list":
+            alarms = fleet.alarms(robot, state=() if args.all else _UNRESOLVED)[::-1]
+            print_listing(
+                alarms, _server_json, _SERVER_HEADER, _server_row, _nothing(args),
+                as_json=args.json,
+            )  # fmt: skip
+            return
+        changed = _change(fleet, _alarm_named(fleet, robot, name), action, args)
+    if args.json:
+        print_json(_server_json(changed))
+    else:
+        print(f"{changed.id} ({changed.origin}): {_state_text(changed)}")
+
+
+def _server_json(alarm: AlarmLine) -> dict[str, Any]:
+    """Return the published fields of an alarm in their order; the type of the client has more."""
+    found = msgspec.to_builtins(alarm)
+    return dict(found)
+
+
+def _change(fleet: Fleet, alarm: AlarmLine, action: str, args: argparse.Namespace) -> AlarmLine:
+    if action == "ack":
+        return fleet.acknowledge(alarm.id, alarm.revision, args.note).alarm
+    if action == "unshelve":
+        return fleet.unshelve(alarm.id, alarm.revision).alarm
+    if args.for_ is None or not args.note:
+        raise UsageError("an alarm is shelved for some time, and for a reason",
+                         "--for 2h --note 'spare part'")  # fmt: skip
+    until_ns = time.time_ns() + parse_duration(args.for_)
+    return fleet.shelve(alarm.id, alarm.revision, until_ns, args.note).alarm
+
+
+def _alarm_named(fleet: Fleet, robot: str, name: str) -> AlarmLine:
+    """Return the alarm with this id, or of this component."""
+    known = fleet.alarms(robot, state=_UNRESOLVED)
+    of = {alarm.origin: alarm for alarm in reversed(known)}
+    by_name = of | {str(alarm.id): alarm for alarm in known}
+    if name not in by_name and ids_ending_in(name, of):
+        name = component_id(name, of)
+    if name not in by_name:
+        near = did_you_mean(name, by_name)
+        raise UsageError(f"there is no alarm '{name}'{near}", "amberbox alarm list URL shows them")
+    return by_name[name]
+
+
+def _server_row(alarm: AlarmLine) -> tuple[Any, ...]:
+    said = alarm.shelved or alarm.acknowledged
+    return (
+        alarm.id, alarm.origin, _state_text(alarm), alarm.level, alarm.severity, alarm.opened[:19],
+        alarm.count, alarm.owner or (said.who if said else ""), alarm.reason, alarm.cause,
+    )  # fmt: skip
+
+
+def _state_text(alarm: AlarmLine) -> str:
+    until = alarm.shelved.until if alarm.shelved else None
+    text = alarm.state + (f" until {until[:16]}" if until else "")
+    return text if alarm.active or alarm.state == "resolved" else f"{text}, quiet"

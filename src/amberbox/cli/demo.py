@@ -14,8 +14,7 @@ from pathlib import Path
 from amberbox.cli.serve import check_installed
 from amberbox.core.errors import UsageError
 
-SECONDS = 45.0
-"""How long the story takes where nobody watches a terminal."""
+SECONDS = 45.0  # length of the scripted story where stdout is no terminal
 _LEAST_S, _RECORDER_S = 8.0, 20.0
 _PORT = 8443
 _EXIT = "exit status: 0 it was ended, or every step of the story worked; 1 one did not"
@@ -39,7 +38,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run the demonstration; 0 only if every step worked."""
+    """Run the demonstration; return 0 only if every step worked."""
     if args.seconds is not None and args.seconds < _LEAST_S:
         raise UsageError("the demonstration needs at least 8 seconds", "DEMO_SECONDS=45")
     with _place(args.keep, keep=args.recorder) as place:
@@ -54,13 +53,13 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _seconds(said: float | None) -> float | None:
-    """Return how long the story is; None where somebody watches."""
+    """Return the length of the scripted story in seconds; None on a terminal: run until Ctrl-C."""
     return SECONDS if said is None and not sys.stdout.isatty() else said
 
 
 @contextmanager
 def _place(wanted: Path | None, *, keep: bool) -> Iterator[Path]:
-    """Give an empty folder; one that nobody has named goes afterwards."""
+    """Yield an empty folder; a temporary one is removed afterwards."""
     place = wanted or Path(tempfile.mkdtemp(prefix="amberbox-demo-"))
     place.mkdir(parents=True, exist_ok=True)
     if any(place.iterdir()):

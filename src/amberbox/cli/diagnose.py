@@ -1,41 +1,85 @@
-"""Say what is broken: one ranked answer with reasons, and what to look at next."""
+"""Diagnoses of a robot, from its record or its server: shown, drawn, or followed as they change."""
 
 from __future__ import annotations
 
 import argparse
+import json
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
+from operator import attrgetter
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
-from amberbox.cli._output import accept_relative_times, print_json, tell, text_output, time_of
-from amberbox.cli._server import add_where
-from amberbox.cli._text import print_lines
+import msgspec
+
+from amberbox.blackbox.journal import channels
+from amberbox.blackbox.query.record import Record
+from amberbox.blackbox.query.record import open as open_record
+from amberbox.blackbox.query.record_window import RecordWindow
+from amberbox.blackbox.robot_folder.folder import RobotFolder, load_folder, store_of
+from amberbox.blackbox.store.own_records import OwnRecords, newest_records
+from amberbox.blackbox.store.store import Store, is_locked, is_store, open_store
+from amberbox.cli._arguments import (
+    accept_relative_times,
+    add_where,
+    check_time,
+    refuse_options,
+    robot_at,
+    time_of,
+)
+from amberbox.cli._output import print_json, print_lines, print_notes, text_output
 from amberbox.client.address import is_url
+from amberbox.client.models import time_ns
+from amberbox.consult.context import RobotWindow, context_at, context_from_journal
+from amberbox.consult.folder_knowledge import load_knowledge
 from amberbox.core.clock import NS
-from amberbox.core.config import refuse
-from amberbox.core.errors import UsageError
-from amberbox.core.timetext import format_time, parse_duration
-
-if TYPE_CHECKING:
-    from amberbox.blackbox.folder.folder import RobotFolder
-    from amberbox.blackbox.query.record import Record
-    from amberbox.consult.case import Case
-    from amberbox.core.types import Diagnosis
-    from amberbox.diagnosis.explanation import Explanation
-    from amberbox.diagnosis.knowledge import Knowledge
-    from amberbox.monitoring.plan import Plan
+from amberbox.core.config import raise_errors
+from amberbox.core.contracts import GivenEvidence
+from amberbox.core.errors import AmberboxError, UsageError
+from amberbox.core.timestamps import format_time, parse_duration
+from amberbox.core.types import Diagnosis, Symptom
+from amberbox.diagnosis.diagnose import (
+    COVERING,
+    DiagnosisContext,
+    ObservedSituation,
+    diagnose_context,
+    diagnose_with_evidence,
+    engine_names,
+    is_fault_indicated,
+    load_engine,
+    observe,
+)
+from amberbox.diagnosis.knowledge import Knowledge
+from amberbox.diagnosis.report.explain import explain
+from amberbox.diagnosis.report.explanation import (
+    ExplainedGroup,
+    Explanation,
+    MemberDiagnosis,
+    MemberState,
+)
+from amberbox.diagnosis.report.serialiser import context_json, explain_context
+from amberbox.diagnosis.report.svg import as_svg
+from amberbox.diagnosis.report.text import as_text
+from amberbox.diagnosis.report.wording import WORTH_TELLING, date_and_clock, sentence
+from amberbox.monitoring.current_state import (
+    CHANNELS,
+    WRITER,
+    duration_text,
+    record_end_ns,
+    symptoms_and_diagnoses,
+    was_watched,
+)
+from amberbox.monitoring.plan import MonitoringPlan
+from amberbox.monitoring.plan_loader import load_plan
 
 _USAGE = (
     "amberbox diagnose WHERE [--at T] [--symptom ID[=absent|unknown]]... [--answer TEST=VALUE]... "
     "[--engine covering|rules|faulttree] [--follow] [--json] [--svg FILE]"
 )
-RULES = "rules"
-ENGINES = ("covering", RULES, "faulttree")
 _LOOKBACK = "10m"
 _LATE_NS = 3 * NS
 _TIMES = "ISO (UTC), epoch, -10m before the last record, now or now-10m"
@@ -53,7 +97,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
                         help="take a symptom for present, or for absent or unknown")  # fmt: skip
     parser.add_argument("--answer", action="append", default=[], metavar="TEST=VALUE",
                         help="what a test gave; 'cannot' if it cannot be done")  # fmt: skip
-    parser.add_argument("--engine", choices=ENGINES, default=ENGINES[0],
+    parser.add_argument("--engine", choices=engine_names(), default=COVERING,
                         help="who answers: all together (covering), or one alone")  # fmt: skip
     parser.add_argument("--lookback", default=_LOOKBACK, metavar="TIME", help="evaluate so much of "
                         "the record where no watcher has (default: 10m)")  # fmt: skip
@@ -66,13 +110,24 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Show the diagnosis; 0 if nothing is wrong, 1 if something is."""
-    _check(args)
+    """Show the diagnosis; return 0 without a fault, 1 with one."""
+    if args.exposure is not None and not 0.0 <= args.exposure < math.inf:
+        raise UsageError(f"an exposure of {args.exposure:g} h cannot be", "give hours from 0")
+    if args.follow and (args.at or args.symptom or args.answer or args.svg):
+        raise UsageError("--follow shows what the watcher finds", "leave out the other options")
+    if args.json and args.svg == "-":
+        raise UsageError("--json and --svg - both print", "--svg FILE")
+    if parse_duration(args.lookback) <= 0:
+        raise UsageError(f"--lookback {args.lookback} is too short", f"--lookback {_LOOKBACK}")
     if is_url(args.where):
-        from amberbox.cli._remote_diagnose import run_remote
-
-        return run_remote(args, _LOOKBACK)
-    folder = _folder(args)
+        return _run_on_server(args)
+    place = Path(args.folder or args.where)
+    if args.folder is None and place.exists() and store_of(place) is None:
+        raise UsageError(
+            f"{place} says nothing about failure modes",
+            "name the robot folder, or add --folder FOLDER",
+        )
+    folder = load_folder(place)
     subject = _subject(args, folder)
     with _record(args.where) as record:
         if args.follow:
@@ -83,119 +138,79 @@ def run(args: argparse.Namespace) -> int:
 
 
 @dataclass(frozen=True, slots=True)
-class Subject:
-    """The robot that it is about: its folder, its monitors, and what is known of its faults."""
+class DiagnosedFolder:
+    """A robot folder with its monitoring plan and its failure modes."""
 
     folder: RobotFolder
-    plan: Plan
+    plan: MonitoringPlan
     knowledge: Knowledge
 
 
-def _check(args: argparse.Namespace) -> None:
-    if args.exposure is not None and not 0.0 <= args.exposure < math.inf:
-        raise UsageError(f"an exposure of {args.exposure:g} h cannot be", "give hours from 0")
-    if args.follow and (args.at or args.symptom or args.answer or args.svg):
-        raise UsageError("--follow shows what the watcher finds", "leave out the other options")
-    if args.json and args.svg == "-":
-        raise UsageError("--json and --svg - both print", "--svg FILE")
-    if parse_duration(args.lookback) <= 0:
-        raise UsageError(f"--lookback {args.lookback} is too short", f"--lookback {_LOOKBACK}")
-
-
-def _folder(args: argparse.Namespace) -> RobotFolder:
-    """Read the robot folder that has the failure modes."""
-    from amberbox.blackbox.folder.folder import load_folder, store_of
-
-    place = Path(args.folder or args.where)
-    if args.folder is None and place.exists() and store_of(place) is None:
-        raise UsageError(
-            f"{place} says nothing about failure modes",
-            "name the robot folder, or add --folder FOLDER",
-        )
-    return load_folder(place)
-
-
-def _subject(args: argparse.Namespace, folder: RobotFolder) -> Subject:
-    from amberbox.consult.knowledge import knowledge_of
-    from amberbox.monitoring.configuration import load_plan
-
+def _subject(args: argparse.Namespace, folder: RobotFolder) -> DiagnosedFolder:
     plan, problems = load_plan(folder)
     errors = [problem for problem in problems if problem.is_error]
-    knowledge, found = knowledge_of(folder, plan, args.exposure)
-    refuse([problem for problem in found if problem.is_error])
+    knowledge, found = load_knowledge(folder, plan, args.exposure)
+    raise_errors([problem for problem in found if problem.is_error])
     if errors:
-        tell([f"{len(errors)} errors in the component files: amberbox check {folder.path}"])
+        print_notes([f"{len(errors)} errors in the component files: amberbox check {folder.path}"])
     if knowledge is None:
         raise UsageError(
             f"{folder.path} has no fmea.yaml: nobody has said what can fail on this robot",
-            "write one, see docs/fmea.md; amberbox new FOLDER makes a folder with an example",
+            "write one, see docs/robot/fmea.md; amberbox new FOLDER makes a folder with an example",
         )
-    return Subject(folder, plan, knowledge)
+    return DiagnosedFolder(folder, plan, knowledge)
 
 
 @contextmanager
 def _record(where: str) -> Iterator[Record | None]:
-    """Open what is recorded; None for a robot folder that has no record."""
-    from amberbox.blackbox.folder.folder import store_of
-    from amberbox.blackbox.query.record import open as open_record
-    from amberbox.blackbox.store import is_store
-
+    """Open the record; yield None for a robot folder without one."""
     store = store_of(Path(where))
     if store is not None and not is_store(store):
         yield None
         return
     with open_record(where) as record:
-        tell(record.notes)
+        print_notes(record.notes)
         yield record
 
 
-def _case(args: argparse.Namespace, subject: Subject, record: Record | None) -> Case:
-    """Read what was known, and add what somebody says."""
-    from amberbox.consult.case import Case
-    from amberbox.consult.given import given_answers, given_symptoms
-
+def _case(
+    args: argparse.Namespace, subject: DiagnosedFolder, record: Record | None
+) -> DiagnosisContext:
+    """Return the diagnosis context, with the observations that the user adds."""
     if record is None and (args.at is not None or not args.symptom):
         raise UsageError(
             f"there is no record in {args.where}, so nobody knows any symptom",
             "say what is seen: --symptom ID, or record something first",
         )
-    case = Case(time.time_ns()) if record is None else _read(args, subject, record)
-    symptoms = given_symptoms(args.symptom, subject.knowledge, case.at_ns)
-    answers = given_answers(args.answer, subject.knowledge)
-    return case.told(symptoms, answers) if symptoms or answers else case
+    case = DiagnosisContext(time.time_ns()) if record is None else _read(args, subject, record)
+    return observe(subject.knowledge, case, _window(args, subject, record))
 
 
-def _read(args: argparse.Namespace, subject: Subject, record: Record) -> Case:
-    """Read what was known at an instant: by the watcher's journal, else by evaluating."""
-    from amberbox.blackbox.store import open_store
-    from amberbox.consult.case import Case
-    from amberbox.consult.journal import end_ns
-    from amberbox.consult.reading import known_at
-
+def _read(args: argparse.Namespace, subject: DiagnosedFolder, record: Record) -> DiagnosisContext:
+    """Return the context at an instant: from the watcher's journal, else by evaluation."""
     store, knowledge = open_store(record.path), subject.knowledge
-    at_ns = end_ns(store) if args.at is None else time_of("--at", args.at, record.time_ns)
+    at_ns = record_end_ns(store) if args.at is None else time_of("--at", args.at, record.time_ns)
     at_ns = record.last_ns() if at_ns is None else at_ns
     if at_ns is None:
-        return Case(time.time_ns())  # a record without rows
+        return DiagnosisContext(time.time_ns())  # a record without rows
     lookback_s = parse_duration(args.lookback) / NS
-    case = known_at(knowledge, subject.plan, store, at_ns, lookback_s)
+    case = context_at(knowledge, subject.plan, store, at_ns, lookback_s)
     if at_ns - case.at_ns > _LATE_NS:
-        tell([f"nothing was recorded after {format_time(case.at_ns)[:19]}; this is as of then"])
+        print_notes(
+            [f"nothing was recorded after {format_time(case.at_ns)[:19]}; this is as of then"]
+        )
     return case
 
 
-def _follow(args: argparse.Namespace, subject: Subject, record: Record | None) -> int:
-    """Print the diagnosis that stands, and each revision as it comes, until Ctrl-C."""
-    from amberbox.blackbox.store import is_locked, open_store
-    from amberbox.cli._diagnosis_follow import revisions
-    from amberbox.cli._diagnosis_show import line_of, revision_text
-    from amberbox.monitoring.messages.board import WRITER
-
+def _follow(args: argparse.Namespace, subject: DiagnosedFolder, record: Record | None) -> int:
+    """Print the current diagnosis, and each revision as it is written, until Ctrl-C."""
     if record is None:
         raise UsageError(f"there is no record in {args.where} to follow", "record something first")
     store = open_store(record.path)
     if not is_locked(store, WRITER):
-        tell([f"nobody watches, so nothing new will come: amberbox watch {subject.folder.path}"])
+        print_notes(
+            [f"nobody watches, so nothing new will come: amberbox watch {subject.folder.path}"]
+        )
     show = line_of if args.json else revision_text
     for diagnosis, symptoms in revisions(store):
         print(show(subject.knowledge, diagnosis, symptoms), flush=True)
@@ -203,50 +218,278 @@ def _follow(args: argparse.Namespace, subject: Subject, record: Record | None) -
 
 
 def _diagnosed(
-    args: argparse.Namespace, subject: Subject, case: Case, record: Record | None
-) -> tuple[Case, Diagnosis | None]:
-    """Let the engine answer; what rules find is known to all of them."""
-    from amberbox.consult.engines import Ground, diagnosis_by, with_findings
-    from amberbox.consult.span import Window
+    args: argparse.Namespace,
+    subject: DiagnosedFolder,
+    case: DiagnosisContext,
+    record: Record | None,
+) -> tuple[DiagnosisContext, Diagnosis | None]:
+    """Diagnose with the chosen engine; all engines get the evidence of all providers."""
+    engine = load_engine(args.engine)
+    if engine is not None and engine.NO_ANSWERS and args.answer:
+        # A server ignores these answers silently.
+        print_notes([engine.NO_ANSWERS])
+    window = _window(args, subject, record)
+    return diagnose_with_evidence(subject.knowledge, case, window, args.engine)
 
-    if args.engine == RULES and args.answer:
-        tell(["answers to tests count for nothing where the rules alone are asked"])
-    lookback_ns = parse_duration(args.lookback)
-    past = None if record is None else partial(Window, record)
-    ground = Ground(subject.knowledge, subject.folder.path, past, lookback_ns)
-    if args.engine != RULES:
-        case = with_findings(ground, case)
-    return case, diagnosis_by(args.engine, ground, case)
+
+def _window(
+    args: argparse.Namespace, subject: DiagnosedFolder, record: Record | None
+) -> Callable[[DiagnosisContext], RobotWindow]:
+    """Return a function that opens the robot's folder and record for providers of evidence.
+
+    A server has no --lookback; rules there look back as far as they need.
+    """
+    return partial(
+        RobotWindow,
+        folder=subject.folder.path,
+        given=GivenEvidence(args.symptom, args.answer),
+        open_past=None if record is None else partial(RecordWindow, record),
+        lookback_ns=parse_duration(args.lookback),
+    )
 
 
 def _show(
-    args: argparse.Namespace, subject: Subject, case: Case, diagnosis: Diagnosis | None
+    args: argparse.Namespace,
+    subject: DiagnosedFolder,
+    case: DiagnosisContext,
+    diagnosis: Diagnosis | None,
 ) -> int:
-    from amberbox.cli._diagnosis_members import with_members
-    from amberbox.cli._diagnosis_show import alone_text, text_of
-    from amberbox.consult.case import is_wrong
-    from amberbox.consult.telling import explained, json_of
-
-    explanation = explained(subject.knowledge, case, diagnosis)
+    explanation = explain_context(subject.knowledge, case, diagnosis)
+    # Statements of a team's robots, which a server does not add.
     explanation = with_members(subject.knowledge, case, explanation)
     if args.svg:
         _draw(args.svg, explanation)
     if args.json:
-        made = json_of(subject.knowledge, case, diagnosis, explanation)
+        made = context_json(subject.knowledge, case, diagnosis, explanation)
         print_json({**made, "engine": args.engine})
     elif args.svg != "-":
-        text = text_of(case, diagnosis, explanation)
-        if diagnosis is None and args.engine == RULES:
-            text = "nothing follows from them"
-        print_lines([alone_text(args.engine, text)])
-    return int(is_wrong(case, diagnosis))
+        states = [symptom.state for symptom in case.situation.symptoms]
+        nothing = nothing_wrong(case.at_ns, states, case.situation.findings)
+        ended_ns = None
+        if diagnosis is not None and diagnosis.state == "healed":
+            ended_ns = case.at_ns - diagnosis.at_ns
+        print_lines([text_of(args.engine, explanation, ended_ns, nothing)])
+    return int(is_fault_indicated(case, diagnosis))
 
 
 def _draw(path: str, explanation: Explanation | None) -> None:
-    from amberbox.diagnosis.explanation import as_svg
-
     if explanation is None:
-        tell(["there is no diagnosis, so nothing is drawn"])
+        print_notes(["there is no diagnosis, so nothing is drawn"])
         return
     with text_output(None if path == "-" else path) as file:
         file.write(as_svg(explanation))
+
+
+_POLL_S = 0.1
+
+Known = dict[str, Symptom]
+
+
+def revisions(
+    store: Store, wait: Callable[[float], None] = time.sleep
+) -> Iterator[tuple[Diagnosis, Known]]:
+    """Yield the current diagnosis, if there is one, then each revision as it is written.
+
+    Each comes with the symptoms known by then, by id. Ends only when ``wait`` raises.
+    """
+    records = OwnRecords(store, WRITER, CHANNELS)
+    key = attrgetter("id", "revision", "state")
+    known: Known = {}
+    standing: Diagnosis | None = None
+    for finding in symptoms_and_diagnoses(records.step()):
+        if isinstance(finding, Diagnosis):
+            standing = finding
+        else:
+            known[finding.id] = finding
+    if standing is not None and standing.state == "open":
+        yield standing, dict(known)
+    while True:
+        for finding in symptoms_and_diagnoses(records.step()):
+            if not isinstance(finding, Diagnosis):
+                known[finding.id] = finding
+            elif standing is None or key(finding) != key(standing):  # files repeat it at first
+                standing = finding
+                yield finding, dict(known)
+        wait(_POLL_S)
+
+
+def text_of(
+    engine: str, explanation: Explanation | None, ended_ns: int | None, nothing: str
+) -> str:
+    """Return the explanation as text, or that nothing is wrong; a single engine is named on top.
+
+    ``ended_ns`` is how long ago (ns) the last diagnosis ended, None for an open one.
+    """
+    alone = load_engine(engine)
+    if explanation is None:
+        text = (alone.NOTHING if alone is not None else "") or nothing
+    else:
+        text = as_text(explanation).rstrip("\n")
+        if ended_ns is not None:
+            ended = f"the last diagnosis ended {duration_text(ended_ns)} ago:"
+            text = f"nothing is wrong now; {ended}\n\n{text}"
+    return text if alone is None else f"{alone.ALONE}\n\n{text}"
+
+
+def nothing_wrong(at_ns: int, states: Sequence[str], findings: Iterable[str]) -> str:
+    """Return a text that no symptom is present, and how many are unknown."""
+    unknown = states.count("unknown")
+    rest = f"; {unknown} are not known" if unknown else ""
+    count = f"{len(states)} symptom{'' if len(states) == 1 else 's'}"
+    lines = [f"  found, and no failure mode explains it: {text}" for text in findings]
+    at = format_time(at_ns)[:19]
+    return "\n".join([f"nothing is wrong at {at}: of {count} none is there{rest}", *lines])
+
+
+def revision_text(knowledge: Knowledge, diagnosis: Diagnosis, symptoms: Known) -> str:
+    """Return a revision as text, below a title line."""
+    at = format_time(diagnosis.at_ns)[:23]
+    title = f"== {at} {diagnosis.id}, revision {diagnosis.revision}"
+    if diagnosis.state == "healed":
+        return f"{title}: healed, nothing is wrong any more\n"
+    return f"{title}\n\n{as_text(explain(diagnosis, knowledge, symptoms.values()))}"
+
+
+def line_of(knowledge: Knowledge, diagnosis: Diagnosis, symptoms: Known) -> str:
+    """Return a revision as one line of JSON."""
+    case = DiagnosisContext(
+        diagnosis.at_ns, ObservedSituation(tuple(symptoms.values())), diagnosis, "watcher"
+    )
+    explanation = explain(diagnosis, knowledge, symptoms.values())
+    made = context_json(knowledge, case, diagnosis, explanation) | {"engine": COVERING}
+    return json.dumps(made, ensure_ascii=False)
+
+
+_WATCHER_LATE_NS = 10 * NS  # a watcher further behind its team's counts as silent
+
+
+def with_members(
+    knowledge: Knowledge, case: DiagnosisContext, explanation: Explanation | None
+) -> Explanation | None:
+    """Add to a team's explanation the diagnoses of the robots that it names, at that time.
+
+    They are read from what the robots' watchers wrote; nothing is evaluated.
+    """
+    if explanation is None or explanation.broken is None:
+        return explanation
+    names = _robots_named(knowledge, (explanation.broken, *explanation.others))
+    found = tuple(_member(name, knowledge.fmea.members[name], case.at_ns) for name in names)
+    return replace(explanation, members=found)
+
+
+def _robots_named(knowledge: Knowledge, groups: Sequence[ExplainedGroup]) -> list[str]:
+    """Return the robots with probable faults, the most probable first."""
+    worth = (g for g in groups if g.probability >= WORTH_TELLING)
+    faults = (f.id for g in worth for possible in g.members for f in possible.faults)
+    robots = (fault.partition("#")[0].partition(":")[0] for fault in faults)
+    return [name for name in dict.fromkeys(robots) if name in knowledge.fmea.members]
+
+
+def _member(name: str, where: str, at_ns: int) -> MemberDiagnosis:
+    try:
+        return _member_diagnosis(name, where, at_ns)
+    except (AmberboxError, OSError) as error:
+        lines = str(error).splitlines() or [""]
+        return _member_unknown(name, where, f"its folder cannot be read: {lines[0]}")
+
+
+def _member_diagnosis(name: str, where: str, at_ns: int) -> MemberDiagnosis:
+    """Return what a robot's watcher had written up to an instant of the same clock."""
+    folder = load_folder(Path(where))
+    plan, _ = load_plan(folder)
+    knowledge, _ = load_knowledge(folder, plan)
+    if knowledge is None:
+        return _member_unknown(name, where, "it has no fmea.yaml that can be read")
+    if not is_store(folder.store_path):
+        return _member_unknown(name, where, f"{folder.store_path} is no store: nothing is recorded")
+    store = open_store(folder.store_path)
+    then_ns = min(at_ns, _said_ns(store))
+    if at_ns - then_ns > _WATCHER_LATE_NS:
+        since = f" since {date_and_clock(then_ns)}" if then_ns else ""
+        return _member_unknown(name, where, f"its watcher has said nothing{since}")
+    case = None
+    if was_watched(store, knowledge.config_hash, then_ns):
+        case = context_from_journal(knowledge, store, then_ns)
+    if case is None:
+        return _member_unknown(
+            name, where, "nobody watched it then with the monitors that it has now"
+        )
+    return _member_summary(
+        name, where, explain_context(knowledge, case, diagnose_context(knowledge, case)), then_ns
+    )
+
+
+def _said_ns(store: Store) -> int:
+    """Return the time of the watcher's newest status (ns); 0 without one."""
+    newest = newest_records(store, WRITER, {channels.STATUS}, 0.0)
+    return max((record.values["measured_ns"] for record in newest), default=0)
+
+
+def _member_summary(name: str, where: str, own: Explanation | None, at_ns: int) -> MemberDiagnosis:
+    """Summarise a robot's own explanation."""
+    if own is None or own.state == "healed":
+        text = "nothing is wrong with it"
+        before = "" if own is None else f". {own.headline.rstrip('.')}"
+        state: MemberState = "none" if own is None else "healed"
+        return MemberDiagnosis(name, where, state, sentence(f"{text}{before}"), at_ns)
+    return MemberDiagnosis(
+        name, where, "open", own.headline, own.at_ns, own.diagnosis, own.sure.probability,
+        own.use.text, own.next.text,
+    )  # fmt: skip
+
+
+def _member_unknown(name: str, where: str, why: str) -> MemberDiagnosis:
+    return MemberDiagnosis(name, where, "unknown", sentence(f"nothing is known of it: {why}"))
+
+
+_SYMPTOM_STATES = ("present", "absent", "unknown")
+
+
+def _run_on_server(args: argparse.Namespace) -> int:
+    """Show a server's diagnosis; return 0 without a fault, 1 with one."""
+    given = {"follow": args.follow, "folder": args.folder, "lookback": args.lookback != _LOOKBACK}
+    refuse_options(args.where, given, "the server has the robot's folder, and looks itself; "
+                   "amberbox status URL --watch shows what changes")  # fmt: skip
+    check_time("--at", args.at)
+    fleet, robot = robot_at(args.where)
+    with fleet:
+        found = fleet.diagnose(
+            robot, args.at, dict(map(_symptom_given, args.symptom)),
+            dict(map(_answer_given, args.answer)), engine=args.engine, exposure_h=args.exposure,
+        )  # fmt: skip
+    said = found.get("explanation")
+    explanation = None if said is None else msgspec.convert(said, Explanation)
+    print_notes(str(note) for note in found.get("notes", ()))
+    if args.svg:
+        _draw(args.svg, explanation)
+    if args.json:
+        print_json(found)
+    elif args.svg != "-":
+        print_lines([_server_text(args.engine, found, explanation)])
+    return int(found["state"] == "open")
+
+
+def _symptom_given(text: str) -> tuple[str, str]:
+    name, _, state = text.partition("=")
+    if state and state not in _SYMPTOM_STATES:
+        raise UsageError(
+            f"'{state}' is no state of a symptom", f"one of {', '.join(_SYMPTOM_STATES)}"
+        )
+    return name, state or "present"
+
+
+def _answer_given(text: str) -> tuple[str, str]:
+    test, equals, value = text.partition("=")
+    if not (test and equals and value):
+        raise UsageError(f"'{text}' is no answer", "write --answer TEST=VALUE")
+    return test, value
+
+
+def _server_text(engine: str, found: dict[str, Any], explanation: Explanation | None) -> str:
+    at_ns = time_ns(found["at"])
+    states = [symptom["state"] for symptom in found.get("symptoms", [])]
+    ended_ns = None
+    if explanation is not None and found["state"] == "healed":
+        ended_ns = max(0, at_ns - explanation.at_ns)
+    nothing = nothing_wrong(at_ns, states, found.get("findings", ()))
+    return text_of(engine, explanation, ended_ns, nothing)

@@ -1,23 +1,57 @@
-"""Solve fault trees, compiled or of a file: minimal cut sets, exact probability, what matters."""
+"""Fault trees of a robot, its server or a file: cut sets, exact probability, importance."""
 
 from __future__ import annotations
 
 import argparse
 import math
 import time
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from amberbox.cli._anyorder import accept_any_order
-from amberbox.cli._faulttree_answer import show
-from amberbox.cli._output import accept_relative_times, print_json, tell, text_output
-from amberbox.cli._server import add_where
+from amberbox.cli._arguments import (
+    accept_any_order,
+    accept_relative_times,
+    add_where,
+    check_time,
+    opened,
+    refuse_options,
+    robot_at,
+    time_of,
+)
+from amberbox.cli._output import print_grid, print_json, print_lines, print_notes, text_output
+from amberbox.cli.fmea import FOR_LOCAL_FOLDER, fmea_path, loaded
 from amberbox.client.address import is_url
-from amberbox.consult.faulttrees import analysis_json
+from amberbox.core.budget import Budget
+from amberbox.core.config import raise_errors
 from amberbox.core.errors import UsageError
-from amberbox.diagnosis.faulttree import Analysis, Budget, FaultTree, analyse, read_mef, write_mef
-from amberbox.diagnosis.faulttree.tree import DEFAULT_MISSION_TIME_H
+from amberbox.core.timestamps import format_time
+from amberbox.diagnosis.faulttree.analysis import Analysis, Importance, NearCutSet, analyse
+from amberbox.diagnosis.faulttree.decision_diagrams import MOST_NODES
+from amberbox.diagnosis.faulttree.open_psa import read_mef, write_mef
+from amberbox.diagnosis.faulttree.tree import DEFAULT_MISSION_TIME_H, FaultTree
+from amberbox.diagnosis.fmea.fault_trees import (
+    FACTORS,
+    EffectOutlook,
+    analysis_json,
+    closest_json,
+    description,
+    effects,
+    effects_json,
+    fault_tree_of,
+    outlooks,
+    smallest_cut_sets,
+)
+from amberbox.diagnosis.fmea.model import Fmea
+
+if TYPE_CHECKING:
+    from amberbox.blackbox.robot_folder.folder import RobotFolder
+    from amberbox.core.types import Diagnosis
+    from amberbox.diagnosis.diagnose import DiagnosisContext
+
 
 _SECONDS = 300.0
+_EFFECT_HEADER = ("effect", "probability", "cut sets", "of order", "smallest", "what is lost")
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -46,11 +80,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="which cut sets the robot's diagnosis brings closest to complete",
     )  # fmt: skip
     parser.add_argument("--at", metavar="T", help="with --closest: as it was then")
-    _configure_solving(parser)
-    parser.add_argument("--json", action="store_true", help="one object")
-
-
-def _configure_solving(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--mission-time", type=float, default=DEFAULT_MISSION_TIME_H, metavar="H",
         help="hours, for expressions of a file that use it (default: a year)",
@@ -60,36 +89,22 @@ def _configure_solving(parser: argparse.ArgumentParser) -> None:
         help=f"give up after S seconds (default {_SECONDS:g})",
     )  # fmt: skip
     parser.add_argument(
-        "--nodes", type=int, default=Budget().nodes, metavar="N",
+        "--nodes", type=int, default=MOST_NODES, metavar="N",
         help="give up at N nodes, about 200 bytes each (default %(default)s)",
     )  # fmt: skip
+    parser.add_argument("--json", action="store_true", help="one object")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Solve and show; 1 when a budget ended before all was done."""
+    """Solve and show; return 1 when a budget ended before completion."""
     _check(args)
     if is_url(args.where):
-        from amberbox.cli._remote_knowledge import faulttree_remote
-
-        return faulttree_remote(args)
+        return _run_on_server(args)
     ends = time.monotonic() + args.seconds
     budget = Budget(args.nodes, lambda: time.monotonic() > ends)
     if _is_tree(args.where):
         files = [args.where, *args.more]
         return _one(read_mef(files, args.effect, args.mission_time), args, budget)
-    return _compiled(args, budget)
-
-
-def _is_tree(where: str) -> bool:
-    return Path(where).suffix.lower() == ".xml"
-
-
-def _compiled(args: argparse.Namespace, budget: Budget) -> int:
-    """Compile the trees of failure modes: one, all, or what is closest to happening."""
-    from amberbox.cli._faulttree_closest import show_closest
-    from amberbox.cli._faulttree_effects import fmea_of, show_all
-    from amberbox.diagnosis.fmea.trees import fault_tree_of
-
     fmea = fmea_of(args.where)
     if args.closest:
         show_closest(fmea, args, budget)
@@ -98,12 +113,16 @@ def _compiled(args: argparse.Namespace, budget: Budget) -> int:
         return _one(fault_tree_of(fmea, args.effect, args.exposure), args, budget)
     if show_all(fmea, args, budget):
         return 0
-    tell(["incomplete: --seconds and --nodes allow more"])
+    print_notes(["incomplete: --seconds and --nodes allow more"])
     return 1
 
 
+def _is_tree(where: str) -> bool:
+    return Path(where).suffix.lower() == ".xml"
+
+
 def _one(tree: FaultTree, args: argparse.Namespace, budget: Budget) -> int:
-    """Solve one tree and show it."""
+    """Solve one tree and show it; return 1 when a budget ended before completion."""
     if args.export:
         with text_output(args.export) as file:
             file.write(write_mef(tree))
@@ -114,13 +133,9 @@ def _one(tree: FaultTree, args: argparse.Namespace, budget: Budget) -> int:
         print_json({"file": args.where, **files, **made})
     else:
         show(analysis, args)
-    return _finished(analysis)
-
-
-def _finished(analysis: Analysis) -> int:
     if not analysis.incomplete:
         return 0
-    tell([f"incomplete: {analysis.incomplete}; --seconds and --nodes allow more"])
+    print_notes([f"incomplete: {analysis.incomplete}; --seconds and --nodes allow more"])
     return 1
 
 
@@ -136,19 +151,15 @@ def _check(args: argparse.Namespace) -> None:
     if args.more and not all(map(_is_tree, (args.where, *args.more))):
         raise UsageError("several can be given of FILE.xml only", "amberbox faulttree A.xml B.xml")
     if _is_tree(args.where):
-        _check_file(args)
+        if args.exposure is not None:
+            what = "--exposure is for failure modes; a file has its own probabilities"
+            raise UsageError(what, "--mission-time is what expressions of a file are computed with")
+        if args.closest or args.at:
+            raise UsageError(
+                "only of a robot folder is known what is close", "amberbox faulttree WHERE"
+            )
     else:
         _check_compiled(args)
-
-
-def _check_file(args: argparse.Namespace) -> None:
-    if args.exposure is not None:
-        what = "--exposure is for failure modes; a file has its own probabilities"
-        raise UsageError(what, "--mission-time is what expressions of a file are computed with")
-    if args.closest or args.at:
-        raise UsageError(
-            "only of a robot folder is known what is close", "amberbox faulttree WHERE"
-        )
 
 
 def _check_compiled(args: argparse.Namespace) -> None:
@@ -160,3 +171,247 @@ def _check_compiled(args: argparse.Namespace) -> None:
         raise UsageError("--mission-time is for expressions of a file", "--exposure H")
     if args.closest and args.importance:
         raise UsageError("--closest shows no importance", "leave out one of them")
+
+
+def show(analysis: Analysis, args: argparse.Namespace) -> None:
+    """Print an analysis as text."""
+    tree = analysis.tree
+    size = f"{len(analysis.gates)} gates, {len(analysis.events)} basic events"
+    print_lines([f"{called(tree, tree.top)}: {size}"])
+    if not analysis.coherent:
+        print("not coherent: cut sets are the positive parts of the minimal solutions")
+    missing = analysis.without_probability
+    if missing:
+        print(f"probability: none; without one: {', '.join(missing[:5])}, {len(missing)} in all")
+    elif analysis.top_probability is not None:
+        print(f"probability: {analysis.top_probability:.10g} (exact)")
+        upper, total = analysis.upper_bound(), analysis.rare_event_sum()
+        kind = "an upper bound" if analysis.truncated_at is None else "of these cut sets only"
+        if upper is not None:
+            print(f"  min cut upper bound: {upper:.10g} ({kind})")
+        if total is not None:
+            print(f"  rare-event sum: {total:.10g} ({kind})")
+    _show_cut_sets(analysis, args.cut_sets or 0)
+    if analysis.importance:
+        print()
+        rows = [_importance_row(tree, event, entry) for event, entry in analysis.importance.items()]
+        print_grid(("event", *(name.upper() for name in FACTORS)), rows)
+
+
+def _show_cut_sets(analysis: Analysis, count: int) -> None:
+    if analysis.by_order is None:
+        return
+    print(f"minimal cut sets: {analysis.minimal_cut_sets:,}{limit_note(analysis.truncated_at)}")
+    for order, number in enumerate(analysis.by_order):
+        if number:
+            print(f"  order {order}: {number:,}")
+    for entry in smallest_cut_sets(analysis, count):
+        print_lines(["  {" + ", ".join(called(analysis.tree, e) for e in sorted(entry)) + "}"])
+
+
+def limit_note(limit: int | None) -> str:
+    """Return the note that larger cut sets are left out; empty without a limit."""
+    return "" if limit is None else f", up to order {limit}: larger ones are not counted"
+
+
+def called(tree: FaultTree, name: str) -> str:
+    """Return the name of a gate or event, with its label where it has one."""
+    named = tree.gates.get(name) or tree.events.get(name)
+    return f"{name} ({named.label})" if named is not None and named.label else name
+
+
+def _importance_row(tree: FaultTree, event: str, entry: Importance) -> tuple[str, ...]:
+    values = (getattr(entry, name) for name in FACTORS)
+    return (called(tree, event), *(f"{value:.6g}" for value in values))
+
+
+def fmea_of(where: str) -> Fmea:
+    """Read the failure modes of a robot folder or a file; raise if anything is wrong."""
+    fmea, _, problems = loaded(fmea_path(where))
+    raise_errors(problems)
+    assert fmea is not None, "a file without errors has been read"
+    return fmea
+
+
+def analysed(fmea: Fmea, effect: str, args: argparse.Namespace, budget: Budget) -> Analysis:
+    """Solve the fault tree of one effect."""
+    tree = fault_tree_of(fmea, effect, args.exposure)
+    return analyse(tree, args.order, args.importance, budget)
+
+
+def show_all(fmea: Fmea, args: argparse.Namespace, budget: Budget) -> bool:
+    """Show all effects on the system; return whether all were completed."""
+    found = [analysed(fmea, effect, args, budget) for effect in effects(fmea)]
+    if not found:
+        print_notes(
+            [f"{args.where} has no functions that could be lost; --effect takes components, too"]
+        )
+    if args.json:
+        asked = args.exposure, args.importance, args.cut_sets or 0
+        print_json({"file": args.where, **effects_json(fmea, found, *asked)})
+    elif args.importance or args.cut_sets:
+        for place, analysis in enumerate(found):
+            print("\n" * (place > 0), end="")
+            show(analysis, args)
+    else:
+        rows = [
+            _effect_row(one.tree.top, one.top_probability, one.by_order, one.minimal_cut_sets,
+                        description(fmea, one)["description"])
+            for one in found
+        ]  # fmt: skip
+        print_grid(_EFFECT_HEADER, rows)
+        if args.order is not None:
+            print(f"cut sets{limit_note(args.order)}")
+    return not any(analysis.incomplete for analysis in found)
+
+
+def _effect_row(
+    effect: str, chance: float | None, by_order: Sequence[int] | None, number: int | None,
+    what: str,
+) -> list[str]:  # fmt: skip
+    """Return the row of an effect: probability, count of cut sets, and what its loss means."""
+    first = [effect, "-" if chance is None else f"{chance:.3g}"]
+    if by_order is None:
+        return [*first, "-", "-", "-", what]
+    counts = {order: count for order, count in enumerate(by_order) if count}
+    orders = ", ".join(f"{order}: {count:,}" for order, count in counts.items())
+    smallest = str(min(counts)) if counts else "-"
+    return [*first, f"{number:,}", orders or "-", smallest, what]
+
+
+_LISTED = 3
+_LOOKBACK_S = 600.0
+
+
+def show_closest(fmea: Fmea, args: argparse.Namespace, budget: Budget) -> None:
+    """Show the closest cut sets of each effect, the closest effect first."""
+    names = (args.effect,) if args.effect else effects(fmea)
+    solved = [analysed(fmea, name, args, budget) for name in names]
+    at_ns, diagnosis = _standing(args)
+    count = args.cut_sets or _LISTED
+    found = outlooks(solved, diagnosis, count)
+    if args.json:
+        print_json({"file": args.where, **closest_json(fmea, at_ns, diagnosis, found)})
+        return
+    print(_heading(at_ns, diagnosis))
+    for outlook in found:
+        print_lines(_outlook_lines(outlook))
+    if args.order is not None:
+        print(f"\ncut sets{limit_note(args.order)}")
+
+
+def _standing(args: argparse.Namespace) -> tuple[int | None, Diagnosis | None]:
+    """Return the instant (ns) and the open diagnosis at it; None without a record."""
+    from amberbox.blackbox.robot_folder.folder import load_folder, store_of
+    from amberbox.blackbox.store.store import is_store
+
+    store = store_of(Path(args.where)) if Path(args.where).is_dir() else None
+    if store is None or not is_store(store):
+        if args.at:
+            raise UsageError(f"there is no record in {args.where}", "leave out --at")
+        return None, None
+    folder = load_folder(args.where)
+    with opened(args.where) as record:
+        at_ns = time_of("--at", args.at, record.time_ns)
+        if at_ns is None:
+            at_ns = record.last_ns()
+    if at_ns is None:
+        return None, None
+    return at_ns, _context_at(folder, at_ns, args.exposure).open
+
+
+def _context_at(folder: RobotFolder, at_ns: int, exposure_h: float | None) -> DiagnosisContext:
+    """Return the diagnosis context at an instant."""
+    from amberbox.blackbox.store.store import open_store
+    from amberbox.consult.context import context_at
+    from amberbox.consult.folder_knowledge import load_knowledge
+    from amberbox.monitoring.plan_loader import load_plan
+
+    plan, _ = load_plan(folder)
+    knowledge, _ = load_knowledge(folder, plan, exposure_h)
+    assert knowledge is not None, "the failure modes have been read before"
+    store = open_store(folder.store_path)
+    return context_at(knowledge, plan, store, at_ns, _LOOKBACK_S)
+
+
+def _heading(at_ns: int | None, diagnosis: Diagnosis | None) -> str:
+    if at_ns is None:
+        return "nothing is recorded: only what is known beforehand counts"
+    if diagnosis is None:
+        return f"no diagnosis at {format_time(at_ns)}: only what is known beforehand counts"
+    leading = diagnosis.hypotheses[:1]
+    names = [f"{entry.id} ({entry.probability:.0%})" for entry in leading]
+    return f"{format_time(at_ns)}, {diagnosis.id}: {', '.join(names) or 'no hypothesis'}"
+
+
+def _outlook_lines(outlook: EffectOutlook) -> Iterator[str]:
+    yield f"\n{called(outlook.analysis.tree, outlook.analysis.tree.top)}"
+    for near in outlook.near:
+        parts = (("happened", near.happened), ("missing", near.missing))
+        named = (f"{what}: {_named(near, events)}" for what, events in parts if events)
+        yield f"  {near.probability:.3g}  {'; '.join(named)}"
+    if not outlook.near:
+        yield "  nothing can lead to it"
+
+
+def _named(near: NearCutSet, events: tuple[str, ...]) -> str:
+    return ", ".join(f"{name} ({near.events[name]:.2g})" for name in events)
+
+
+def _run_on_server(args: argparse.Namespace) -> int:
+    """Show the trees of all functions, of one, or which cut sets are closest to complete."""
+    refuse_options(args.where, {"export": args.export}, FOR_LOCAL_FOLDER)
+    if args.at and not args.closest:
+        raise UsageError("--at is for --closest", "amberbox faulttree URL --closest --at T")
+    if args.importance and not args.effect:
+        raise UsageError("a server tells of one function what matters", "--effect NAME")
+    check_time("--at", args.at)
+    fleet, robot = robot_at(args.where)
+    with fleet:
+        found = fleet.faulttrees(
+            robot, args.effect, cut_sets=args.cut_sets or 0, order=args.order, at=args.at,
+            exposure_h=args.exposure,
+        )  # fmt: skip
+    print_notes(found["notes"])
+    if args.json:
+        print_json(found)
+    elif args.closest:
+        print("\n".join(_server_closest_lines(found, args.cut_sets or _LISTED)))
+    elif args.effect:
+        print("\n".join(_server_tree_lines(found, importance=args.importance)))
+    else:
+        columns = ("effect", "top_probability", "by_order", "minimal_cut_sets", "description")
+        rows = [_effect_row(*(one[name] for name in columns)) for one in found["effects"]]
+        print_grid(_EFFECT_HEADER, rows)
+    if found.get("incomplete"):
+        print_notes(["incomplete: the server gave up after its time"])
+        return 1
+    return 0
+
+
+def _server_tree_lines(found: Mapping[str, Any], *, importance: bool) -> Iterator[str]:
+    size = f"{found['gates']} gates, {found['basic_events']} basic events"
+    yield f"{found['effect']} ({found['description']}): {size}"
+    if found["top_probability"] is not None:
+        yield f"probability: {found['top_probability']:.10g} (exact)"
+    if found["by_order"] is not None:
+        yield f"minimal cut sets: {found['minimal_cut_sets']:,}"
+        counts = enumerate(found["by_order"])
+        yield from (f"  order {order}: {count:,}" for order, count in counts if count)
+    yield from ("  {" + ", ".join(entry) + "}" for entry in found.get("cut_sets", ()))
+    if importance and found["importance"]:
+        yield ""
+        for event, factors in found["importance"].items():
+            told = (f"{k.upper()} {'-' if v is None else f'{v:.6g}'}" for k, v in factors.items())
+            yield f"{event}: {', '.join(told)}"
+
+
+def _server_closest_lines(found: Mapping[str, Any], count: int) -> Iterator[str]:
+    standing = found["diagnosis"]
+    yield f"{found['at']}, {standing or 'no diagnosis: only what is known beforehand counts'}"
+    for effect in found["closest"]:
+        yield f"\n{effect['effect']}"
+        for near in effect["closest"][:count]:
+            parts = (("happened", near["happened"]), ("missing", near["missing"]))
+            told = (f"{what}: {', '.join(events)}" for what, events in parts if events)
+            yield f"  {near['probability']:.3g}  {'; '.join(told)}"

@@ -1,37 +1,46 @@
-"""Judge what can fail: check the FMEA, show its sheet, what matters most, what nobody sees."""
+"""Failure modes of a robot or a server: check the FMEA; show sheet, criticality and coverage."""
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from amberbox.blackbox.folder.folder import inspect_folder
-from amberbox.cli._anyorder import accept_where_first
-from amberbox.cli._output import print_grid, print_json, tell, writable
-from amberbox.cli._server import add_where
-from amberbox.cli._text import print_lines
+from amberbox.blackbox.robot_folder.folder import inspect_folder
+from amberbox.cli._arguments import accept_where_first, add_where, refuse_options, robot_at
+from amberbox.cli._output import (
+    print_grid,
+    print_json,
+    print_lines,
+    print_notes,
+    writable,
+)
 from amberbox.client.address import is_url
-from amberbox.consult.known import known_of
-from amberbox.consult.sheets import coverage_json, criticality_json
-from amberbox.core.config import did_you_mean, refuse
-from amberbox.core.errors import ConfigurationError, Problem, UsageError
-from amberbox.core.redaction import as_plain
-from amberbox.diagnosis.fmea.coverage import Alike, Coverage, coverage
+from amberbox.consult.folder_knowledge import fmea_references
+from amberbox.core.config import raise_errors
+from amberbox.core.errors import ConfigurationError, Problem, UsageError, did_you_mean
+from amberbox.core.redaction import masked_values
 from amberbox.diagnosis.fmea.criticality import (
-    Matrix,
-    by_number,
+    AmbiguousModes,
+    PriorityRule,
+    by_risk_number,
+    coverage,
     criticalities,
+    load_priorities,
     matrix,
     mode_criticality,
+    priority,
 )
-from amberbox.diagnosis.fmea.known import Known
-from amberbox.diagnosis.fmea.load import FILE, load_fmea
-from amberbox.diagnosis.fmea.model import FailureMode, Fmea
-from amberbox.diagnosis.fmea.priorities import Rule, load_priorities, priority
-from amberbox.diagnosis.fmea.sheet import row_of, write_sheet
-from amberbox.diagnosis.fmea.sheet_reading import read_sheet
+from amberbox.diagnosis.fmea.loader import FILE, load_fmea
+from amberbox.diagnosis.fmea.model import FailureMode, Fmea, FmeaReferences
+from amberbox.diagnosis.fmea.sheet import (
+    coverage_json,
+    criticality_json,
+    read_sheet,
+    row_of,
+    write_sheet,
+)
 
 _USAGE = (
     "amberbox fmea check|table|criticality|coverage WHERE [--json] [--csv FILE] "
@@ -59,27 +68,25 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Do what is asked; 2 if the file is wrong, 1 if ``check`` finds nothing to judge."""
+    """Run the action; return 2 if the file has errors."""
     if args.action not in _ACTIONS:
         near = did_you_mean(args.action, _ACTIONS)
         raise UsageError(f"there is no action '{args.action}'{near}", _USAGE)
     if args.exposure is not None and not args.exposure >= 0:
         raise UsageError(f"an exposure of {args.exposure:g} h cannot be", "give hours from 0")
     if is_url(args.where):
-        from amberbox.cli._remote_knowledge import fmea_remote
-
-        fmea_remote(args)
+        _run_on_server(args)
         return 0
     path = fmea_path(args.where)
     if args.import_:
         _import(Path(args.import_), path)
     fmea, known, problems = loaded(path)
-    rules: list[Rule] = []
+    rules: list[PriorityRule] = []
     if args.priorities:
         rules = load_priorities(Path(args.priorities), problems)
     if args.action == "check":
         return _check(args, fmea, known, problems)
-    refuse(problems)
+    raise_errors(problems)
     assert fmea is not None
     if args.csv == "-":
         print(write_sheet(fmea, rules), end="")
@@ -92,39 +99,43 @@ def run(args: argparse.Namespace) -> int:
 
 
 def fmea_path(where: str) -> Path:
-    """Return the file that a robot folder, or the path of a file itself, means."""
+    """Return the path of the FMEA file for a robot folder, or for the file itself."""
     path = Path(where)
     return path / FILE if path.is_dir() else path
 
 
-def loaded(path: Path) -> tuple[Fmea | None, Known | None, list[Problem]]:
-    """Read the file; symptoms are compared with the monitors of the robot folder it lies in."""
+def loaded(path: Path) -> tuple[Fmea | None, FmeaReferences | None, list[Problem]]:
+    """Read the file, with problems; symptoms are checked against its robot folder's monitors."""
     if not path.exists():
-        hint = f"write one (docs/fmea.md), or: amberbox fmea check {path.parent} --import FILE.csv"
+        importing = f"amberbox fmea check {path.parent} --import FILE.csv"
+        hint = f"write one (docs/robot/fmea.md), or: {importing}"
         raise UsageError(f"there is no {path}", hint)
     folder, _ = inspect_folder(path.parent) if (path.parent / "robot.yaml").exists() else (None, [])
-    known = known_of(folder) if folder is not None else None
+    known = fmea_references(folder) if folder is not None else None
     fmea, problems = load_fmea(path, known)
     return fmea, known, problems
 
 
 def _import(sheet: Path, path: Path) -> None:
-    """Make the file from a sheet; never over one that is there."""
+    """Create the file from a sheet; never overwrites one."""
     if path.exists():
         raise UsageError(f"there is a {path} already, nothing was written", "move it away first")
     problems: list[Problem] = []
     text = read_sheet(sheet, problems)
-    refuse(problems)
-    tell(str(problem) for problem in problems)
+    raise_errors(problems)
+    print_notes(str(problem) for problem in problems)
     writable(str(path)).write_text(text, encoding="utf-8")
 
 
 def _check(
-    args: argparse.Namespace, fmea: Fmea | None, known: Known | None, problems: Sequence[Problem]
+    args: argparse.Namespace,
+    fmea: Fmea | None,
+    known: FmeaReferences | None,
+    problems: Sequence[Problem],
 ) -> int:
     wrong = any(problem.is_error for problem in problems)
     if args.json:
-        report = {"ok": not wrong, "problems": [as_plain(problem) for problem in problems]}
+        report = {"ok": not wrong, "problems": [masked_values(problem) for problem in problems]}
         print_json(report | (_counts(fmea) if fmea else {}))
     else:
         for problem in problems:
@@ -132,7 +143,7 @@ def _check(
         said = _in_words(fmea) if fmea and not wrong else _errors(problems)
         print_lines([f"{args.where}: {said}"])
     if fmea and known is None and not args.json:
-        tell([f"no robot folder that can be read at {args.where}: {_NOT_COMPARED}"])
+        print_notes([f"no robot folder that can be read at {args.where}: {_NOT_COMPARED}"])
     return ConfigurationError.exit_code if wrong else 0
 
 
@@ -164,19 +175,24 @@ def _in_words(fmea: Fmea) -> str:
     return f"fine: {of['components']} components, {once}, {rest}"
 
 
-def _table(args: argparse.Namespace, fmea: Fmea, known: Known | None, rules: list[Rule]) -> None:
+def _table(
+    args: argparse.Namespace, fmea: Fmea, known: FmeaReferences | None, rules: list[PriorityRule]
+) -> None:
     """Show the sheet, the highest S x O x D first."""
-    rows = [row_of(fmea, mode, rules) for mode in by_number(_modes(fmea))]
+    rows = [row_of(fmea, mode, rules) for mode in by_risk_number(_modes(fmea))]
     if args.json:
         print_json(rows)
         return
-    columns = (*_SHOWN[:7], *(["Priority"] if rules else []), *_SHOWN[7:])
-    print_grid([column.lower() if len(column) > 3 else column for column in columns],
-               [[row[column] for column in columns] for row in rows])  # fmt: skip
+    _print_sheet(rows, (*_SHOWN[:7], *(["Priority"] if rules else []), *_SHOWN[7:]))
+
+
+def _print_sheet(rows: Sequence[Mapping[str, Any]], columns: Sequence[str] = _SHOWN) -> None:
+    header = [column.lower() if len(column) > 3 else column for column in columns]
+    print_grid(header, [[row[column] for column in columns] for row in rows])
 
 
 def _criticality(
-    args: argparse.Namespace, fmea: Fmea, known: Known | None, rules: list[Rule]
+    args: argparse.Namespace, fmea: Fmea, known: FmeaReferences | None, rules: list[PriorityRule]
 ) -> None:
     """Show C_m of modes, C_r of components and the matrix."""
     modes = sorted(_modes(fmea), key=lambda mode: -mode_criticality(mode, args.exposure))
@@ -189,40 +205,41 @@ def _criticality(
     header = ("failure mode", "severity", "S x O x D", *(["priority"] if rules else []), "C_m")
     print_grid(header, [_mode_row(mode, args.exposure, rules) for mode in modes])
     print()
-    print_grid(*_matrix_table(cells))
+    rows = [
+        [level, *(str(len(cells.cells.get((level, word), ())) or "") for word in cells.columns)]
+        for level in cells.rows
+    ]
+    print_grid(("failure modes by occurrence", *cells.columns), rows)
 
 
-def _mode_row(mode: FailureMode, exposure: float | None, rules: list[Rule]) -> list[str]:
+def _mode_row(mode: FailureMode, exposure: float | None, rules: list[PriorityRule]) -> list[str]:
     number = "-" if mode.ranks.number is None else str(mode.ranks.number)
     word = [priority(mode.ranks, rules)] if rules else []
     return [mode.id, mode.severity, number, *word, f"{mode_criticality(mode, exposure):.3g}"]
 
 
-def _matrix_table(cells: Matrix) -> tuple[Sequence[str], list[list[str]]]:
-    rows = [
-        [level, *(str(len(cells.cells.get((level, word), ())) or "") for word in cells.columns)]
-        for level in cells.rows
-    ]
-    return ("failure modes by occurrence", *cells.columns), rows
-
-
-def _coverage(args: argparse.Namespace, fmea: Fmea, known: Known | None, rules: list[Rule]) -> None:
-    """Show what nobody sees, what nothing explains and what looks the same."""
+def _coverage(
+    args: argparse.Namespace, fmea: Fmea, known: FmeaReferences | None, rules: list[PriorityRule]
+) -> None:
+    """Show undetected failure modes, unexplained symptoms and indistinguishable modes."""
     found = coverage(fmea, sorted(known.watched) if known else ())
     if args.json:
         print_json(coverage_json(found))
     else:
-        print_lines(_coverage_lines(found))
+        alike = [_alike_line(group) for group in found.ambiguous]
+        print_lines(_coverage_lines(coverage_json(found), alike))
 
 
-def _coverage_lines(found: Coverage) -> Iterator[str]:
-    seen = found.modes - len(found.unseen)
-    yield f"{seen} of {found.modes} failure modes show; {found.distinct} can be told apart by that"
-    yield from _section("nothing shows", [f"{m}: {why}" for m, why in found.unseen.items()])
-    weak = [f"{mode}: seen in {share:.0%} of cases" for mode, share in found.weak.items()]
+def _coverage_lines(found: Mapping[str, Any], alike: Sequence[str]) -> Iterator[str]:
+    """Yield the lines of the coverage; ``alike`` are those of indistinguishable modes."""
+    total, unseen = found["modes"], found["unseen"]
+    told_apart = f"{found['distinct']} can be told apart by that"
+    yield f"{total - len(unseen)} of {total} failure modes show; {told_apart}"
+    yield from _section("nothing shows", [f"{m}: {why}" for m, why in unseen.items()])
+    weak = [f"{mode}: seen in {share:.0%} of cases" for mode, share in found["weak"].items()]
     yield from _section("show weakly", weak)
-    yield from _section("no failure mode explains", found.unexplained)
-    yield from _section("look the same", [_alike_line(group) for group in found.alike])
+    yield from _section("no failure mode explains", found["unexplained"])
+    yield from _section("look the same", alike)
 
 
 def _section(title: str, lines: Sequence[str]) -> Iterator[str]:
@@ -231,7 +248,7 @@ def _section(title: str, lines: Sequence[str]) -> Iterator[str]:
         yield from (f"  {line}" for line in lines)
 
 
-def _alike_line(group: Alike) -> str:
+def _alike_line(group: AmbiguousModes) -> str:
     tests = f"told apart by {', '.join(group.tests)}" if group.tests else "no test tells them apart"
     left = [" = ".join(modes) for modes in group.left] if group.tests else []
     rest = f"; no test tells {' and '.join(left)}" if left else ""
@@ -243,4 +260,48 @@ _ACTIONS: dict[str, Callable[..., Any]] = {
     "table": _table,
     "criticality": _criticality,
     "coverage": _coverage,
+}
+
+
+FOR_LOCAL_FOLDER = "they are for a robot folder on this computer"
+
+
+def _run_on_server(args: argparse.Namespace) -> None:
+    """Show the sheet, criticality or coverage that a server computed."""
+    given = {"csv": args.csv, "import": args.import_, "priorities": args.priorities}
+    refuse_options(args.where, given, FOR_LOCAL_FOLDER)
+    if args.action not in _SERVER_ACTIONS:
+        raise UsageError(f"fmea {args.action} is about files on this computer",
+                         f"of a server: {', '.join(_SERVER_ACTIONS)}")  # fmt: skip
+    fleet, robot = robot_at(args.where)
+    with fleet:
+        found = fleet.fmea(robot, exposure_h=args.exposure)
+    print_notes(found["notes"])
+    if args.json:
+        print_json(found[args.action])
+    else:
+        _SERVER_ACTIONS[args.action](found[args.action])
+
+
+def _print_server_criticality(found: Mapping[str, Any]) -> None:
+    rows = [(one["component"], f"{one['C_r']:.3g}") for one in found["components"]]
+    print_grid(("component", "C_r"), rows)
+    print()
+    modes = [
+        (one["mode"], one["severity"], "-" if one["RPN"] is None else one["RPN"],
+         f"{one['C_m']:.3g}")
+        for one in found["modes"]
+    ]  # fmt: skip
+    print_grid(("failure mode", "severity", "S x O x D", "C_m"), modes)
+
+
+def _print_server_coverage(found: Mapping[str, Any]) -> None:
+    alike = [", ".join(group["modes"]) for group in found["alike"]]
+    print("\n".join(_coverage_lines(found, alike)))
+
+
+_SERVER_ACTIONS: dict[str, Callable[[Any], None]] = {
+    "table": _print_sheet,
+    "criticality": _print_server_criticality,
+    "coverage": _print_server_coverage,
 }

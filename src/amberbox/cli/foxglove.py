@@ -6,15 +6,25 @@ import argparse
 import sys
 import threading
 
-from amberbox.blackbox.foxglove.frames import ColumnFrames, MessageFrames, span_of
-from amberbox.blackbox.foxglove.live import LiveColumns, LiveMessages
-from amberbox.blackbox.foxglove.playback import Playback
-from amberbox.blackbox.foxglove.server import HOST, PORT, Listener, Server, is_loopback
-from amberbox.blackbox.where import store_path
-from amberbox.cli._output import add_range_only, opened, tell
-from amberbox.cli._output import span_of as asked_span
+from amberbox.blackbox.query.foxglove import (
+    HOST,
+    PORT,
+    ColumnFrames,
+    LiveColumns,
+    LiveMessages,
+    MessageFrames,
+    Playback,
+    Server,
+    ViewerListener,
+    span_of,
+)
+from amberbox.blackbox.store.store import store_path
+from amberbox.cli._arguments import add_range_only, opened
+from amberbox.cli._arguments import span_of as asked_span
+from amberbox.cli._output import print_notes
 from amberbox.core.errors import UsageError
-from amberbox.core.timetext import format_time
+from amberbox.core.timestamps import format_time
+from amberbox.core.tls import is_loopback
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -42,7 +52,15 @@ def run(args: argparse.Namespace) -> int:
     stop = threading.Event()
     try:
         if args.live:
-            _live(args, stop)
+            path, server = store_path(args.where), Server(ViewerListener())
+            source = (LiveColumns if args.columns else LiveMessages)(path, args.item)
+            source.prepare(server)
+            server.start(f"amberbox {path.name}", args.host, args.port)
+            try:
+                _greet(args, server, "live")
+                source.run(server, stop)
+            finally:
+                server.stop()
         else:
             _range(args, stop)
     except KeyboardInterrupt:
@@ -59,30 +77,22 @@ def _check(args: argparse.Namespace) -> None:
     if not 0 <= args.port < 1 << 16:
         raise UsageError(f"there is no port {args.port}", "choose one from 1024 to 65535")
     if not is_loopback(args.host):
-        tell([f"everybody who reaches {args.host}:{args.port} can read this record: the protocol "
-              "has no login"])  # fmt: skip
-
-
-def _live(args: argparse.Namespace, stop: threading.Event) -> None:
-    path, server = store_path(args.where), Server(Listener())
-    source = (LiveColumns if args.columns else LiveMessages)(path, args.item)
-    source.prepare(server)
-    server.start(f"amberbox {path.name}", args.host, args.port)
-    try:
-        _greet(args, server, "live")
-        source.run(server, stop)
-    finally:
-        server.stop()
+        print_notes(
+            [
+                f"everybody who reaches {args.host}:{args.port} can read this record: the protocol "
+                "has no login"
+            ]
+        )
 
 
 def _range(args: argparse.Namespace, stop: threading.Event) -> None:
     with opened(args.where) as record:
         window = asked_span(args, record)
         frames = (ColumnFrames if args.columns else MessageFrames)(record, args.item, window)
-        span = frames.looking.ask(lambda catalogue: span_of(catalogue, window))
-        tell(frames.report.missing)
+        span = frames.current.ask(lambda catalogue: span_of(catalogue, window))
+        print_notes(frames.report.missing)
         playback = Playback(frames, span, args.speed)
-        server = Server(Listener(playback.control))
+        server = Server(ViewerListener(playback.control))
         for topic in frames.topics:
             server.advertise(topic)
         server.start(f"amberbox {record.path.name}", args.host, args.port, span)

@@ -1,22 +1,31 @@
-"""List the missions of a record, begin and end one by hand, find them in old recordings."""
+"""Missions, of a record or a server: list them, begin and end one, find them in recordings."""
 
 from __future__ import annotations
 
 import argparse
-import getpass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from amberbox.blackbox.folder.missions import read_rules
-from amberbox.blackbox.missions import Mission, choose
-from amberbox.blackbox.missions.ask import end, start
-from amberbox.blackbox.missions.detect import detect, find
-from amberbox.blackbox.where import store_path
-from amberbox.cli._anyorder import accept_where_first
-from amberbox.cli._output import add_range_only, opened, print_grid, print_json, span_of, tell
-from amberbox.cli._server import add_where
+from amberbox.blackbox.query.mission_search import detect, find
+from amberbox.blackbox.retention.missions import RecordedMission, choose, end, start
+from amberbox.blackbox.robot_folder.robot_yaml import read_rules
+from amberbox.blackbox.store.store import store_path
+from amberbox.cli._arguments import (
+    accept_where_first,
+    add_range_only,
+    add_where,
+    opened,
+    robot_at,
+    span_of,
+    user_name,
+)
+from amberbox.cli._output import print_listing, print_notes
 from amberbox.client.address import is_url
 from amberbox.core.errors import UsageError
-from amberbox.core.timetext import format_duration, format_time
+from amberbox.core.timestamps import format_duration, format_time
+
+if TYPE_CHECKING:
+    from amberbox.client.fleet import Fleet
 
 _HEADER = ("id", "name", "from (UTC)", "lasted", "outcome", "who", "parameters")
 
@@ -67,7 +76,7 @@ def _detect(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Do what the action says."""
+    """Run the action."""
     return {"list": _run_list, "start": _run_start, "end": _run_end, "detect": _run_detect}[
         args.action
     ](args)
@@ -80,32 +89,46 @@ def _run_list(args: argparse.Namespace) -> int:
         span = span_of(args, record)
         known = record.missions()
     found = choose(known, args.name, failed=args.failed, last=args.last, span=span)
-    _show(found, args.json, "no missions" if known == [] else "no such mission")
+    _print_missions(found, args, "no missions" if known == [] else "no such mission")
     return 0
 
 
 def _run_start(args: argparse.Namespace) -> int:
     parameters = dict(_pair(text) for text in args.parameter)
-    if is_url(args.where):
-        from amberbox.cli._remote_mission import start_remote
-
-        print(start_remote(args.where, args.name, args.id, parameters))
+    if not is_url(args.where):
+        made = start(
+            args.where, args.name, mission_id=args.id, parameters=parameters, who=user_name()
+        )
+        print(made.id)
         return 0
-    mission = start(args.where, args.name, mission_id=args.id, parameters=parameters, who=_user())
-    print(mission.id)
+    if args.id:
+        raise UsageError("a server makes the ids of its missions itself", "leave out --id")
+    fleet, robot = robot_at(args.where)
+    with fleet:
+        print(fleet.begin_mission(robot, args.name, parameters).id)
     return 0
 
 
 def _run_end(args: argparse.Namespace) -> int:
-    if is_url(args.where):
-        from amberbox.cli._remote_mission import end_remote
-
-        ended = end_remote(args.where, args.id, args.outcome)
-        print(f"{ended.id}: {ended.outcome}")
+    if not is_url(args.where):
+        mission = end(args.where, args.id, outcome=args.outcome, who=user_name())
+        print(f"{mission.id}: {mission.outcome} after {_lasted(mission)}")
         return 0
-    mission = end(args.where, args.id, outcome=args.outcome, who=_user())
-    print(f"{mission.id}: {mission.outcome} after {_lasted(mission)}")
+    fleet, robot = robot_at(args.where)
+    with fleet:
+        name = args.id or _open_server_mission(fleet, robot)
+        ended = fleet.end_mission(robot, name, args.outcome or "done")
+    print(f"{ended.id}: {ended.outcome}")
     return 0
+
+
+def _open_server_mission(fleet: Fleet, robot: str) -> str:
+    """Return the id of the newest mission that was begun on the server and has not ended."""
+    lasting = [m for m in fleet.missions(robot) if m.to is None and m.origin == "server"]
+    if not lasting:
+        raise UsageError("no mission that was begun on the server lasts",
+                         "a robot's own mission ends on the robot")  # fmt: skip
+    return lasting[0].id
 
 
 def _run_detect(args: argparse.Namespace) -> int:
@@ -124,21 +147,18 @@ def _run_detect(args: argparse.Namespace) -> int:
             missions, notes = find(record, rules)
         else:
             missions, notes = detect(store_path(args.where), rules)
-    tell(notes)
-    _show(missions, args.json, "no new missions")
+    print_notes(notes)
+    _print_missions(missions, args, "no new missions")
     return 0
 
 
-def _show(missions: list[Mission], as_json: bool, nothing: str) -> None:
-    if as_json:
-        print_json([mission.to_json() for mission in missions])
-    elif missions:
-        print_grid(_HEADER, map(_row, missions))
-    else:
-        print(nothing)
+def _print_missions(
+    missions: list[RecordedMission], args: argparse.Namespace, nothing: str
+) -> None:
+    print_listing(missions, RecordedMission.to_json, _HEADER, _row, nothing, as_json=args.json)
 
 
-def _row(mission: Mission) -> tuple[object, ...]:
+def _row(mission: RecordedMission) -> tuple[object, ...]:
     outcome = mission.outcome
     if mission.failed and outcome != "failed":
         outcome += " (failed)"
@@ -147,7 +167,7 @@ def _row(mission: Mission) -> tuple[object, ...]:
     return mission.id, mission.name, start_text, _lasted(mission), outcome, mission.who, parameters
 
 
-def _lasted(mission: Mission) -> str:
+def _lasted(mission: RecordedMission) -> str:
     return "lasts" if mission.to_ns is None else format_duration(mission.to_ns - mission.from_ns)
 
 
@@ -156,10 +176,3 @@ def _pair(text: str) -> tuple[str, str]:
     if not (key and equals):
         raise UsageError(f"'{text}' is no parameter", "write --parameter KEY=VALUE")
     return key, value
-
-
-def _user() -> str:
-    try:
-        return getpass.getuser()
-    except (KeyError, OSError):  # a user that the system has no name for
-        return ""

@@ -8,37 +8,31 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from amberbox.blackbox.folder.folder import SOURCES
-from amberbox.cli._text import in_columns, print_lines
-from amberbox.core.config import did_you_mean
-from amberbox.core.describe import OptionRow, describe
-from amberbox.core.errors import UsageError
+from amberbox.blackbox.robot_folder.folder import SOURCES
+from amberbox.cli._output import in_columns, print_lines
+from amberbox.core.errors import UsageError, did_you_mean
+from amberbox.core.options import OptionRow, describe
 from amberbox.core.plugins import Plugin, find, install_hint, missing_packages
-from amberbox.monitoring.configuration.functions import (
-    MODE_DEFINES,
-    MODES,
-    PROBE_DEFINES,
-    PROBES,
-)
+from amberbox.monitoring.component_files import MODE_DEFINES, MODES, PROBE_DEFINES, PROBES
 
 
 @dataclass(frozen=True)
-class Kind:
-    """One kind of plugin: where it lies, what it defines, and what it is for."""
+class PluginKind:
+    """One kind of plugin: its package, required definitions, and purpose."""
 
     package: str
     defines: tuple[str, ...]
     use: str
 
     def plugins(self) -> Mapping[str, Plugin]:
-        """Find all of this kind."""
+        """Return all plugins of this kind."""
         return find(self.package, defines=self.defines)
 
 
 KINDS = {
-    "source": Kind(SOURCES, ("Config", "Source"), "each a block of black_box.yaml"),
-    "mode": Kind(MODES, MODE_DEFINES, "named by 'monitor:' in a mode file"),
-    "probe": Kind(PROBES, PROBE_DEFINES, "what modes ask the robot's computer for"),
+    "source": PluginKind(SOURCES, ("Config", "Source"), "each a block of black_box.yaml"),
+    "mode": PluginKind(MODES, MODE_DEFINES, "named by 'monitor:' in a mode file"),
+    "probe": PluginKind(PROBES, PROBE_DEFINES, "what modes ask the robot's computer for"),
 }
 
 
@@ -97,7 +91,7 @@ def _show(name: str, kinds: Sequence[str], as_json: bool) -> int:
 
 
 def _one(name: str, kinds: Sequence[str]) -> tuple[str, Plugin]:
-    """Return the plugin of a name; raise UsageError if there is none, or more than one."""
+    """Return the plugin with a name; raise UsageError if there is none, or several."""
     known = {kind: KINDS[kind].plugins() for kind in kinds}
     found = [(kind, plugins[name]) for kind, plugins in known.items() if name in plugins]
     if len(found) > 1:

@@ -12,20 +12,27 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from amberbox.blackbox.folder.folder import load_folder
-from amberbox.cli._output import print_json, tell
-from amberbox.cli._text import in_columns, print_lines
+from amberbox.blackbox.robot_folder.folder import load_folder
+from amberbox.cli._output import in_columns, print_json, print_lines, print_notes
 from amberbox.core.errors import UsageError
-from amberbox.core.probe import ProbeOrder, in_order
-from amberbox.monitoring.probing.probe import Row, known_probes, load_probe
-from amberbox.monitoring.probing.publisher import HERE, Publisher, encode, is_open
-from amberbox.monitoring.probing.runner import ProbeRunner, Put
+from amberbox.core.probe import ProbeOrder, sorted_orders
+from amberbox.monitoring.probe_runner import (
+    HERE,
+    ProbePublisher,
+    ProbeRunner,
+    Put,
+    Row,
+    encode,
+    is_open,
+    known_probes,
+    load_probe,
+)
 
 if TYPE_CHECKING:
     from types import ModuleType
 
 _EXIT = "exit status with --once or --probe: 0 all are ok, 1 something is not, or is unknown"
-_SAID_AGAIN_S = 0.2  # how soon a signal is noticed
+_SAID_AGAIN_S = 0.2  # how soon a signal is noticed, in seconds
 
 _Found: TypeAlias = "queue.SimpleQueue[tuple[ProbeOrder, Row]]"
 
@@ -52,7 +59,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Look, and print or publish what is found."""
+    """Run the probes; print or publish their rows."""
     if args.list and not (args.folder or args.probe):
         _list_kinds(args.json)
         return 0
@@ -63,7 +70,21 @@ def run(args: argparse.Namespace) -> int:
     if not orders:
         raise UsageError("there is nothing to probe", "name a FOLDER, or --probe KIND SUBJECT")
     if args.publish is None and (args.once or not args.folder):
-        return _once(orders, extra_dirs, args.json)
+        found: _Found = queue.SimpleQueue()
+        rows: dict[ProbeOrder, Row] = {}
+        with _running(orders, lambda order, row: found.put((order, row)), extra_dirs):
+            while len(rows) < len(orders):
+                order, row = found.get()
+                rows.setdefault(order, row)
+        ordered = [(order, rows[order]) for order in orders]
+        if args.json:
+            for order, row in ordered:
+                print(_line(order, row))
+        else:
+            _print_table(
+                ("probe", "subject", "ok", "measured"), [_cells(*entry) for entry in ordered]
+            )
+        return 0 if all(row["ok"] for row in rows.values()) else 1
     if args.once:
         raise UsageError("--once does not go with --publish: nobody would be listening yet")
     with _stopped_by_signal() as stop:
@@ -75,22 +96,24 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _orders(args: argparse.Namespace) -> tuple[Sequence[ProbeOrder], Sequence[Path]]:
-    """Return what is to be probed, and where else probes are."""
+    """Return the probes to run, and extra folders with probes."""
     orders: list[ProbeOrder] = []
     extra_dirs: list[Path] = []
     if args.folder:
-        from amberbox.monitoring.configuration.load import load_plan
+        from amberbox.monitoring.plan_loader import load_plan
 
         folder = load_folder(args.folder)
         plan, problems = load_plan(folder)
         count = sum(problem.is_error for problem in problems)
         if count:
-            tell([f"{count} errors in the monitors; amberbox check {args.folder} shows them"])
+            print_notes(
+                [f"{count} errors in the monitors; amberbox check {args.folder} shows them"]
+            )
         orders, extra_dirs = list(plan.probes()), [folder.path / "probes"]
     for kind, subject in args.probe:
         load_probe(kind, extra_dirs)
         orders.append(ProbeOrder(kind, subject))
-    return in_order(orders), extra_dirs
+    return sorted_orders(orders), extra_dirs
 
 
 @contextmanager
@@ -113,30 +136,13 @@ def _running(
         runner.close()
 
 
-def _once(orders: Sequence[ProbeOrder], extra_dirs: Sequence[Path], as_json: bool) -> int:
-    """Take the first row of each probe; one that hangs has its row as well."""
-    found: _Found = queue.SimpleQueue()
-    rows: dict[ProbeOrder, Row] = {}
-    with _running(orders, lambda order, row: found.put((order, row)), extra_dirs):
-        while len(rows) < len(orders):
-            order, row = found.get()
-            rows.setdefault(order, row)
-    ordered = [(order, rows[order]) for order in orders]
-    if as_json:
-        for order, row in ordered:
-            print(_line(order, row))
-    else:
-        _print_table(("probe", "subject", "ok", "measured"), [_cells(*entry) for entry in ordered])
-    return 0 if all(row["ok"] for row in rows.values()) else 1
-
-
 def _print_on(
     orders: Sequence[ProbeOrder],
     extra_dirs: Sequence[Path],
     as_json: bool,
     stop: threading.Event,
 ) -> None:
-    """Print rows as they come; for people only when one differs in ``ok`` or its error."""
+    """Print rows as they arrive; as text only when ``ok`` or the error changes."""
     found: _Found = queue.SimpleQueue()
     said: dict[ProbeOrder, tuple[Any, Any]] = {}
     with _running(orders, lambda order, row: found.put((order, row)), extra_dirs):
@@ -158,7 +164,7 @@ def _publish(
     args: argparse.Namespace,
     stop: threading.Event,
 ) -> None:
-    with Publisher(args.publish) as publisher:
+    with ProbePublisher(args.publish) as publisher:
         who = "whoever reaches this computer" if is_open(args.publish) else "only this computer"
         count = f"{len(orders)} probe{'s' if len(orders) > 1 else ''}"
         text = f"{count}, published at {publisher.endpoint}; {who} can read them"
@@ -183,7 +189,7 @@ def _cells(order: ProbeOrder, row: Row) -> tuple[str, str, str, str]:
 
 
 def _print_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """Print whole cells: an error or a name that is cut helps nobody."""
+    """Print a table without shortened cells."""
     print_lines(in_columns([header, *rows], indent=""))
 
 
@@ -214,7 +220,7 @@ def _list_orders(orders: Sequence[ProbeOrder], as_json: bool) -> None:
 
 
 def _list_kinds(as_json: bool) -> None:
-    """List all probes: what each is for, its subject, and what it measures."""
+    """List all probes: purpose, subject, and measured values."""
     modules = {name: plugin.load() for name, plugin in known_probes().items()}
     if as_json:
         print_json([_described(name, module) for name, module in modules.items()])

@@ -1,4 +1,4 @@
-"""Print the variables of a data item as a table, CSV, JSON or Parquet."""
+"""Rows of a record: the variables of a data item, or the answer to a SQL query."""
 
 from __future__ import annotations
 
@@ -6,22 +6,20 @@ import argparse
 from collections.abc import Callable
 from typing import IO
 
+from amberbox.blackbox.columns.table_text import write_grid
 from amberbox.blackbox.query.record import Record
 from amberbox.blackbox.query.table import Table
-from amberbox.blackbox.query.tabletext import write_grid
-from amberbox.cli._missions import missions_of
-from amberbox.cli._output import add_range, opened, room, tell, text_output, writable
-from amberbox.cli._server import add_where
-from amberbox.cli._window import add_window, window_of
+from amberbox.cli._arguments import add_range, add_where, add_window, missions_of, opened, window_of
+from amberbox.cli._output import grid_width, print_notes, text_output, writable
 from amberbox.client.address import is_url
 from amberbox.core.errors import UsageError
-from amberbox.core.timetext import format_time
+from amberbox.core.timestamps import format_time
 
 FORMATS = ("table", "csv", "json", "parquet")
 _MORE = "name some, or --format csv"
 
 
-def configure(parser: argparse.ArgumentParser) -> None:
+def configure_query(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
     add_where(parser, "robot folder, store or recording file")
     parser.add_argument("item", metavar="ITEM", help="data item; 'amberbox items' lists them")
@@ -48,8 +46,8 @@ def add_format(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-o", "--output", metavar="FILE", help="write to a file")
 
 
-def run(args: argparse.Namespace) -> int:
-    """Print rows, and with ``--follow`` go on until stopped."""
+def run_query(args: argparse.Namespace) -> int:
+    """Print rows, and with ``--follow`` further ones until stopped."""
     form = chosen_format(args.format, args.output)
     with opened(args.where) as record:
         if args.follow:
@@ -63,12 +61,12 @@ def run(args: argparse.Namespace) -> int:
         if not len(table):
             notes.append(_nothing(record, table.item))
     write(table, form, args.output)
-    tell(notes)
+    print_notes(notes)
     return 0
 
 
 def _nothing(record: Record, item: str) -> str:
-    """Say where the rows are when the range has none."""
+    """Return why a result is empty: the rows that the item has, or why it has none."""
     known = next((info for info in record.items() if info.name == item), None)
     if known is None or known.no_columns:
         why = "nothing of it can be read" if known is None else known.no_columns
@@ -78,7 +76,7 @@ def _nothing(record: Record, item: str) -> str:
 
 
 def chosen_format(named: str | None, output: str | None) -> str:
-    """Return the format that was named, else the one that the file's ending says."""
+    """Return the named format, else that of the file's suffix."""
     ending = output.rpartition(".")[2] if output else ""
     form = named or (ending if ending in FORMATS else "table")
     if form == "parquet" and output is None:
@@ -96,7 +94,7 @@ def write(table: Table, form: str, output: str | None) -> None:
 
 
 def _write_grid(table: Table, file: IO[str]) -> None:
-    write_grid(file, table.fields, table.columns, room=room(file, _MORE))
+    write_grid(file, table.fields, table.columns, room=grid_width(file, _MORE))
 
 
 _WRITERS: dict[str, Callable[[Table, IO[str]], None]] = {
@@ -107,7 +105,7 @@ _WRITERS: dict[str, Callable[[Table, IO[str]], None]] = {
 
 
 def _follow(record: Record, args: argparse.Namespace, form: str) -> int:
-    """Stream rows; JSON comes as one object per line."""
+    """Print rows as they arrive; JSON as one object per line."""
     if is_url(args.where):
         hint = "amberbox status URL --watch shows what is live"
         raise UsageError("a server gets rows journal by journal: there is nothing to follow", hint)
@@ -117,22 +115,35 @@ def _follow(record: Record, args: argparse.Namespace, form: str) -> int:
         raise UsageError("--follow prints rows as they come", hint)
     if args.by != "received" or args.mission is not None:
         raise UsageError("--follow goes by time of receipt", "leave out --by and --mission")
-    from amberbox.blackbox.query.livequery import follow_tables  # what only asks starts sooner
+    from amberbox.blackbox.query.record import follow_tables  # for --follow only
 
     with text_output(args.output) as file:
         first = True
         for table in follow_tables(record, args.item, args.variables or None, args.from_):
-            _stream(table, form, file, header=first)
+            if form == "json":
+                table.to_json(file, lines=True)
+            elif form == "csv":
+                table.to_csv(file, header=first)
+            else:
+                space = grid_width(file, _MORE)
+                write_grid(file, table.fields, table.columns, header=first, steady=True, room=space)
+            file.flush()
             first = False
     return 0
 
 
-def _stream(table: Table, form: str, file: IO[str], *, header: bool) -> None:
-    if form == "json":
-        table.to_json(file, lines=True)
-    elif form == "csv":
-        table.to_csv(file, header=header)
-    else:
-        space = room(file, _MORE)
-        write_grid(file, table.fields, table.columns, header=header, steady=True, room=space)
-    file.flush()
+def configure_sql(parser: argparse.ArgumentParser) -> None:
+    """Add the verb's arguments."""
+    add_where(parser, "robot folder, store or recording file")
+    parser.add_argument("statement", metavar="SQL", help='such as "select ... from ros_odom"')
+    add_format(parser)
+
+
+def run_sql(args: argparse.Namespace) -> int:
+    """Print the answer to a SELECT."""
+    form = chosen_format(args.format, args.output)
+    with opened(args.where) as record:
+        table = record.sql(args.statement)
+    write(table, form, args.output)
+    print_notes(table.notes)
+    return 0

@@ -11,13 +11,13 @@ import time
 from contextlib import suppress
 from dataclasses import asdict
 
-from amberbox.blackbox.folder.folder import load_folder
 from amberbox.blackbox.recorder.recorder import Recorder, RecorderState
-from amberbox.blackbox.service import is_service
+from amberbox.blackbox.robot_folder.folder import load_folder
 from amberbox.cli._output import warn_readable
 from amberbox.core.files import keep_to_group
-from amberbox.core.terminal import OWN
-from amberbox.core.units import in_bytes, in_unit
+from amberbox.core.safe_text import OWN_ESCAPE
+from amberbox.core.systemd import is_service
+from amberbox.core.units import bytes_text, in_unit
 
 _TABLE_S = 1.0
 _NO_TROUBLE = {"started", "stopped", "source_ended", "imported", "power_mains"}
@@ -74,9 +74,9 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _tell(kind: str, text: str) -> None:
-    """Say on stderr what goes wrong while recording; all of it is in the record, too."""
+    """Print an event about a problem to stderr; the record holds all events."""
     if kind not in _NO_TROUBLE:
-        with suppress(OSError):  # whoever reads stderr may be gone; recording goes on
+        with suppress(OSError):  # stderr may be closed; recording goes on
             print(f"{time.strftime('%H:%M:%S')} {kind}: {text}", file=sys.stderr, flush=True)
 
 
@@ -88,34 +88,27 @@ def _seconds(text: str) -> float:
 
 
 def _watch(recorder: Recorder, args: argparse.Namespace) -> None:
-    """Show what is being recorded for as long as somebody reads it."""
+    """Print the state of the recorder every second, until stdout is closed."""
     with suppress(BrokenPipeError):
-        _show(recorder, args)
-
-
-def _show(recorder: Recorder, args: argparse.Namespace) -> None:
-    lines, started = 0, time.monotonic()
-    while not recorder.stop.wait(_TABLE_S):
-        state = recorder.state()
-        if args.json:
-            print(json.dumps(asdict(state)), flush=True)
-        elif sys.stdout.isatty():
-            lines = _redraw(table(state, time.monotonic() - started), lines)
-        elif round(time.monotonic() - started) % 10 == 0:
-            print(summary(state), flush=True)
-
-
-def _redraw(rows: list[str], before: int) -> int:
-    up = f"{OWN}[{before}A" if before else ""
-    print(up + "".join(f"{OWN}[K{row}\n" for row in rows), end="", flush=True)
-    return len(rows)
+        lines, started = 0, time.monotonic()
+        while not recorder.stop.wait(_TABLE_S):
+            state = recorder.state()
+            if args.json:
+                print(json.dumps(asdict(state)), flush=True)
+            elif sys.stdout.isatty():
+                rows = table(state, time.monotonic() - started)
+                up = f"{OWN_ESCAPE}[{lines}A" if lines else ""
+                print(up + "".join(f"{OWN_ESCAPE}[K{row}\n" for row in rows), end="", flush=True)
+                lines = len(rows)
+            elif round(time.monotonic() - started) % 10 == 0:
+                print(summary(state), flush=True)
 
 
 def table(state: RecorderState, elapsed_s: float) -> list[str]:
-    """Lay the live table out as lines of text."""
+    """Return the live table as lines of text."""
     rows = [_HEADINGS, *(
         (i.name, f"{i.rate_hz:.1f}", str(i.kept), str(i.filtered), str(i.dropped),
-         in_bytes(i.bytes))
+         bytes_text(i.bytes))
         for i in state.items
     )]  # fmt: skip
     widths = [max(len(row[column]) for row in rows) for column in range(len(_HEADINGS))]
@@ -124,23 +117,23 @@ def table(state: RecorderState, elapsed_s: float) -> list[str]:
         + "".join("  " + c.rjust(w) for c, w in zip(row[1:], widths[1:], strict=True))
         for row in rows
     ]
-    foot = f"{elapsed_s:.0f} s, written {in_bytes(state.written_bytes)}, "
-    foot += f"queue {in_bytes(state.queue_bytes)}, disk left {in_bytes(state.disk_free_bytes)}"
+    foot = f"{elapsed_s:.0f} s, written {bytes_text(state.written_bytes)}, "
+    foot += f"queue {bytes_text(state.queue_bytes)}, disk left {bytes_text(state.disk_free_bytes)}"
     return [*lines, foot, *_trouble(state)]
 
 
 def summary(state: RecorderState) -> str:
-    """Say in one line what the table says."""
+    """Return the summary of the table in one line."""
     kept = sum(item.kept for item in state.items)
     dropped = sum(item.dropped for item in state.items)
     rate = sum(item.rate_hz for item in state.items)
     text = f"{len(state.items)} items, {rate:.0f} messages/s, {kept} kept, {dropped} dropped, "
-    text += f"{in_bytes(state.written_bytes)} written, {in_bytes(state.disk_free_bytes)} left"
+    text += f"{bytes_text(state.written_bytes)} written, {bytes_text(state.disk_free_bytes)} left"
     return "; ".join([text, *_trouble(state)])
 
 
 def _trouble(state: RecorderState) -> list[str]:
-    """Say what is wrong with the disk, if anything is."""
+    """Return lines about a full or failing disk."""
     full = [f"{state.full.upper()}: only events are recorded"] if state.full else []
     return [*full, f"DISK: {state.disk_error}"] if state.disk_error else full
 

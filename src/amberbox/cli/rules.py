@@ -5,22 +5,22 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from amberbox.blackbox.query.record import Record
-from amberbox.cli._output import add_range_only, opened, print_json, span_of, tell, writable
-from amberbox.cli._server import add_robot
+from amberbox.cli._arguments import add_range_only, add_robot, check_time, opened, robot_at, span_of
+from amberbox.cli._output import print_json, print_notes, writable
 from amberbox.client.address import is_url
-from amberbox.consult.facts import Place, facts_of, place_of
-from amberbox.core.config import refuse
+from amberbox.consult.rule_lookups import RuleTarget, rule_facts, rule_target
+from amberbox.core.budget import Budget
+from amberbox.core.config import raise_errors
 from amberbox.core.errors import UsageError
-from amberbox.diagnosis.rules import Answers, Budget, Program, ask, export, read_rules
-from amberbox.diagnosis.rules.answers import show
-from amberbox.diagnosis.rules.ask import Want
-from amberbox.diagnosis.rules.faults import RuleError, RuleFault
-from amberbox.diagnosis.rules.terms import show_key
+from amberbox.diagnosis.prolog.program import Program, export, read_rules
+from amberbox.diagnosis.prolog.query import Answers, Want, answer_text, ask
+from amberbox.diagnosis.prolog.terms import RuleError, RuleFault, show_key
 
 _NOTHING = Answers(())
 
@@ -50,25 +50,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Read the files, then export or ask; without either, say what is defined."""
-    _refuse(args)
-    if is_url(args.where):
-        from amberbox.cli._remote_knowledge import rules_remote
-
-        return rules_remote(args)
-    place = place_of(args.where) if args.where is not None else None
-    program = _read(args, place)
-    if not args.json:
-        _tell(program)
-    refuse(program.problems())
-    if args.export is None and args.ask is None:
-        _list(program, as_json=args.json)
-        return 0
-    with _record(place) as record:
-        return _answer(_with_facts(program, place, record, args), args)
-
-
-def _refuse(args: argparse.Namespace) -> None:
+    """Read the files, then export or query them; without either, list what is defined."""
     if (args.why or args.why_not) and args.ask is None:
         raise UsageError("--why and --why-not explain an answer", "add --ask GOAL")
     if args.steps < 1 or args.seconds <= 0:
@@ -77,22 +59,32 @@ def _refuse(args: argparse.Namespace) -> None:
         raise UsageError("--from and --to are about a record", "add --where WHERE")
     if args.where is None and not args.files:
         raise UsageError("there are no rules", "name files, or a robot folder with --where")
-
-
-def _read(args: argparse.Namespace, place: Place | None) -> Program:
-    """Read the files that are named, else those of the folder."""
+    if is_url(args.where):
+        return _run_on_server(args)
+    place = rule_target(args.where) if args.where is not None else None
     files = [Path(name) for name in args.files] or (place.rules if place is not None else [])
     if not files and args.ask is None and args.export is None:
         raise UsageError(f"there are no rules/*.pl in {args.where}", "name files, or --ask GOAL")
-    return read_rules(files)
+    program = read_rules(files)
+    if not args.json:
+        for note in program.notes:
+            print(note, file=sys.stderr)
+    raise_errors(program.problems())
+    if args.export is None and args.ask is None:
+        _list(program, as_json=args.json)
+        return 0
+    with _record(place) as record:
+        return _answer(_with_facts(program, place, record, args), args)
 
 
 @contextmanager
-def _record(place: Place | None) -> Iterator[Record | None]:
-    """Open the record of a place; None if there is none."""
+def _record(place: RuleTarget | None) -> Iterator[Record | None]:
+    """Open the record of a place; yield None if there is none."""
     if place is None or not place.has_record():
         if place is not None:
-            tell([f"no record at {place.path}: nothing is known of missions, statuses, conditions"])
+            print_notes(
+                [f"no record at {place.path}: nothing is known of missions, statuses, conditions"]
+            )
         yield None
         return
     with opened(str(place.path)) as record:
@@ -100,20 +92,14 @@ def _record(place: Place | None) -> Iterator[Record | None]:
 
 
 def _with_facts(
-    program: Program, place: Place | None, record: Record | None, args: argparse.Namespace
+    program: Program, place: RuleTarget | None, record: Record | None, args: argparse.Namespace
 ) -> Program:
     if place is None:
         return program
     span: tuple[int | None, int | None] = (None, None)
     if record is not None:
         span = span_of(args, record)
-    return facts_of(place, record, span).added_to(program)
-
-
-def _tell(program: Program) -> None:
-    """Say on stderr what in the rules looks like a mistake."""
-    for note in program.notes:
-        print(note, file=sys.stderr)
+    return rule_facts(place, record, span).added_to(program)
 
 
 def _answer(program: Program, args: argparse.Namespace) -> int:
@@ -130,7 +116,14 @@ def _answer(program: Program, args: argparse.Namespace) -> int:
     if args.json:
         print_json(found.to_json())
     else:
-        _show(found)
+        for number, answer in enumerate(found.answers):
+            print(answer_text(answer))
+            for node in found.proof[number] if found.proof else ():
+                print("\n".join(f"  {line}" for line in node.text().splitlines()))
+        for failure in found.failed:
+            print("\n".join(failure.lines()))
+        if not found.answers and not found.failed:
+            print("no")
     return 0
 
 
@@ -139,17 +132,6 @@ def _exported(program: Program, goal: str) -> str:
         return export(program, goal)
     except RuleFault as fault:
         raise RuleError(fault.what, fault.hint) from fault
-
-
-def _show(found: Answers) -> None:
-    for number, answer in enumerate(found.answers):
-        print(show(answer))
-        for node in found.proof[number] if found.proof else ():
-            print("\n".join(f"  {line}" for line in node.text().splitlines()))
-    for failure in found.failed:
-        print("\n".join(failure.lines()))
-    if not found.answers and not found.failed:
-        print("no")
 
 
 def _list(program: Program, *, as_json: bool) -> None:
@@ -161,3 +143,51 @@ def _list(program: Program, *, as_json: bool) -> None:
         facts = len(predicate.clauses) - rules
         tabled = ", tabled" if predicate.tabled else ""
         print(f"{show_key(key)}: {facts} facts, {rules} rules{tabled}")
+
+
+def _run_on_server(args: argparse.Namespace) -> int:
+    """Query the rules of a robot on a server."""
+    if args.files or args.export:
+        raise UsageError("a server asks the rules that the robot has", "leave out files, --export")
+    if args.ask is None:
+        raise UsageError("a server is asked a goal", "--ask 'broken(X)'")
+    want = "why_not" if args.why_not else "why" if args.why else ""
+    check_time("--from", args.from_)
+    check_time("--to", args.to)
+    fleet, robot = robot_at(args.where)
+    with fleet:
+        found = fleet.rules(robot, args.ask, want, args.from_, args.to)
+    print_notes(found["notes"])
+    if args.json:
+        print_json({name: found[name] for name in ("answers", "proof", "failed")})
+    else:
+        print("\n".join(_server_answers(found)))
+    return 0
+
+
+def _server_answers(found: Mapping[str, Any]) -> Iterator[str]:
+    for number, answer in enumerate(found["answers"]):
+        yield ", ".join(f"{name} = {value}" for name, value in answer.items()) or "yes"
+        for node in found["proof"][number] if found["proof"] else ():
+            yield from _server_proof(node, "  ")
+    for failure in found["failed"]:
+        yield from _server_failure(failure, "")
+    if not found["answers"] and not found["failed"]:
+        yield "no"
+
+
+def _server_proof(node: Mapping[str, Any], indent: str) -> Iterator[str]:
+    kind = "" if node["by"] in ("builtin", "lookup") else node["by"]
+    source = ", ".join(filter(None, (kind, node.get("at", ""))))
+    again = "   (shown above)" if node.get("shown_above") else f"   {source}" if source else ""
+    yield f"{indent}{node['goal']}{again}"
+    for below in node.get("because", ()):
+        yield from _server_proof(below, f"{indent}  ")
+
+
+def _server_failure(failure: Mapping[str, Any], indent: str) -> Iterator[str]:
+    yield f"{indent}fails: {failure['goal']}   {failure['what']}".rstrip()
+    for tried in failure["tried"]:
+        yield f"{indent}  {tried['head']}   {tried['at']}"
+        yield from (f"{indent}    holds: {goal}" for goal in tried["held"])
+        yield from _server_failure(tried["failed"], f"{indent}    ")

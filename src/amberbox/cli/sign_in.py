@@ -1,4 +1,4 @@
-"""Keep a token of a server here, and whom to trust there, so that its address can be WHERE."""
+"""Sign in to a server, so that its address can be WHERE: keep a token and whom to trust there."""
 
 from __future__ import annotations
 
@@ -9,13 +9,11 @@ import sys
 from pathlib import Path
 from urllib.parse import urlsplit
 
-from amberbox.cli._output import secret, tell
-from amberbox.client import servers, trust
+from amberbox.cli._output import print_notes, secret
+from amberbox.client import credentials
 from amberbox.client.address import Address, read_address
-from amberbox.client.errors import NotAllowedError, UnreachableError
-from amberbox.client.making import make_token
-from amberbox.client.servers import SignIn
-from amberbox.client.wire import Wire
+from amberbox.client.credentials import StoredSignIn, make_token
+from amberbox.client.transport import ApiConnection, NotAllowedError, UnreachableError
 from amberbox.core import tls
 from amberbox.core.errors import AmberboxError, UsageError
 
@@ -23,7 +21,7 @@ _SHORT_S = 10.0
 _YES = ("yes", "y")
 
 
-def configure(parser: argparse.ArgumentParser) -> None:
+def configure_sign_in(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
     parser.add_argument(
         "url", metavar="URL",
@@ -38,20 +36,27 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def run(args: argparse.Namespace) -> int:
-    """Ask whom to trust and for the token, try them, keep them."""
+def run_sign_in(args: argparse.Namespace) -> int:
+    """Confirm the authority, get a token, try both and store them."""
     address = read_address(args.url)
     pin, authority = _trusted(address)
     token = _made(address, args.user, pin, authority) if args.user else _token(address)
-    entry = SignIn(token, pin, authority)
-    _try(address, entry)
-    servers.keep(address.url, entry)
-    print(f"signed in to {address.url}; kept in {_shown(servers.path())}")
+    entry = StoredSignIn(token, pin, authority)
+    context = credentials.context_of(address.url, entry.pin, entry)
+    wire = ApiConnection(address.url, entry.token, context)
+    try:
+        wire.get("/robots", {"limit": 1})
+    except NotAllowedError as error:
+        print_notes([f"the token works, but not for seeing robots: {error.what}"])
+    finally:
+        wire.close()
+    credentials.keep(address.url, entry)
+    print(f"signed in to {address.url}; kept in {_shown(credentials.path())}")
     return 0
 
 
 def _shown(path: Path) -> str:
-    """Write a path as people do: the home folder is ``~``."""
+    """Return a path with the home folder as ``~``."""
     home = Path.home()
     return f"~/{path.relative_to(home)}" if path.is_relative_to(home) else str(path)
 
@@ -59,47 +64,43 @@ def _shown(path: Path) -> str:
 def _trusted(address: Address) -> tuple[str, str]:
     """Return the pin and the certificate of the authority; empty for one that the system trusts.
 
-    Raises UsageError when a stranger's would have to be confirmed and nobody is there.
+    Raises UsageError when an unknown authority is not confirmed by the user.
     """
     if urlsplit(address.url).scheme == "http":
         return "", ""
     if not address.pin and _is_trusted_anyway(address):
         return "", ""
-    pem = trust.authority_of(address.url)
+    pem = credentials.authority_of(address.url)
     found = tls.fingerprint(pem)
     if address.pin:
         tls.pinned_context(pem, address.pin)  # raises when it is another
     else:
-        _confirm(address, found)
+        question = f"{address.url} is vouched for by an authority that is not known here:\nsha256:"
+        if not sys.stdin.isatty():
+            raise UsageError(
+                f"nobody is here to confirm the authority of {address.url}, sha256:{found}",
+                f"is it what 'amberbox serve cert' printed? then: {address.url}#ca=sha256:...",
+            )
+        print(f"{question}{found}\nIs it what 'amberbox serve cert' printed on the server?",
+              file=sys.stderr)  # fmt: skip
+        if input("yes or no: ").strip().lower() not in _YES:
+            raise UsageError("not signed in", "ask who runs the server for the fingerprint")
     return found, pem.decode("ascii")
 
 
 def _is_trusted_anyway(address: Address) -> bool:
-    """Tell whether the system trusts the server's certificate."""
+    """Return whether the system trusts the server's certificate."""
     try:
-        with Wire(address.url, context=ssl.create_default_context(), timeout_s=_SHORT_S).stream(
-            "/health", 0
-        ):
+        with ApiConnection(
+            address.url, context=ssl.create_default_context(), timeout_s=_SHORT_S
+        ).stream("/health", 0):
             return True
     except UnreachableError as error:
         if isinstance(error.__cause__, ssl.SSLCertVerificationError):
             return False
         raise
-    except AmberboxError:  # it answers, and that is enough
+    except AmberboxError:  # any answer shows that TLS worked
         return True
-
-
-def _confirm(address: Address, found: str) -> None:
-    question = f"{address.url} is vouched for by an authority that is not known here:\nsha256:"
-    if not sys.stdin.isatty():
-        raise UsageError(
-            f"nobody is here to confirm the authority of {address.url}, sha256:{found}",
-            f"is it what 'amberbox serve cert' printed? then: {address.url}#ca=sha256:...",
-        )
-    print(f"{question}{found}\nIs it what 'amberbox serve cert' printed on the server?",
-          file=sys.stderr)  # fmt: skip
-    if input("yes or no: ").strip().lower() not in _YES:
-        raise UsageError("not signed in", "ask who runs the server for the fingerprint")
 
 
 def _token(address: Address) -> str:
@@ -112,25 +113,27 @@ def _token(address: Address) -> str:
 
 
 def _made(address: Address, name: str, pin: str, authority: str) -> str:
-    """Make a token with a password; it lasts 90 days and is listed as this computer's."""
-    from amberbox.fleet.accounts.actions import SCOPES
+    """Create a token with a password; it lasts 90 days and is listed with this computer's name."""
+    from amberbox.server.accounts.permissions import SCOPES
 
     password = secret(f"password of {name} at {address.url}: ")
-    context = trust.context_of(address.url, pin, SignIn("", pin, authority))
-    wire = Wire(address.url, context=context)
+    context = credentials.context_of(address.url, pin, StoredSignIn("", pin, authority))
+    wire = ApiConnection(address.url, context=context)
     try:
         return make_token(wire, name, password, f"amberbox on {socket.gethostname()}", SCOPES)
     finally:
         wire.close()
 
 
-def _try(address: Address, entry: SignIn) -> None:
-    """Raise NotSignedInError when the token does not work."""
-    context = trust.context_of(address.url, entry.pin, entry)
-    wire = Wire(address.url, entry.token, context)
-    try:
-        wire.get("/robots", {"limit": 1})
-    except NotAllowedError as error:
-        tell([f"the token works, but not for seeing robots: {error.what}"])
-    finally:
-        wire.close()
+def configure_sign_out(parser: argparse.ArgumentParser) -> None:
+    """Add the verb's arguments."""
+    parser.add_argument("url", metavar="URL", help="the server")
+
+
+def run_sign_out(args: argparse.Namespace) -> int:
+    """Delete the stored token; it stays valid until it is revoked on the server."""
+    url = read_address(args.url).url
+    if not credentials.forget(url):
+        raise UsageError(f"nobody is signed in to {url} here", "amberbox sign-in URL")
+    print(f"signed out of {url}; the token itself works until it is revoked there")
+    return 0

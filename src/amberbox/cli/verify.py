@@ -7,13 +7,12 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import asdict
 
+from amberbox.blackbox.signing.findings import STATES, VerifyFinding, VerifyReport, time_text
 from amberbox.blackbox.signing.keys import parse_public
-from amberbox.blackbox.verify.findings import STATES, Finding, Report, as_text
-from amberbox.blackbox.verify.verify import verify
-from amberbox.blackbox.where import store_path
-from amberbox.cli._output import print_json, tell
-from amberbox.cli._text import in_columns, print_lines
-from amberbox.core.units import in_bytes
+from amberbox.blackbox.signing.verify import verify
+from amberbox.blackbox.store.store import store_path
+from amberbox.cli._output import in_columns, print_json, print_lines, print_notes
+from amberbox.core.units import bytes_text
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -33,7 +32,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print what was found; 1 if anything is damaged, altered or missing."""
+    """Print the findings; return 1 if anything is damaged, altered or missing."""
     key = parse_public(args.key) if args.key else ""
     report = verify(store_path(args.where), key=key, noted=args.head)
     good = report.is_good(strict=args.strict)
@@ -41,12 +40,12 @@ def run(args: argparse.Namespace) -> int:
         print_json(_as_json(report, good=good))
     else:
         print_lines(_lines(report))
-        tell(report.notes)
+        print_notes(report.notes)
     return 0 if good else 1
 
 
-def _lines(report: Report) -> Iterator[str]:
-    """Write findings, worst first, then the count of files and the heads to note down."""
+def _lines(report: VerifyReport) -> Iterator[str]:
+    """Yield findings, worst first, then the count of files and the heads to note down."""
     for finding in sorted(report.findings, key=lambda f: (STATES.index(f.state), f.file)):
         yield f"{finding.state:<8}  {finding.file}: {finding.text}"
         place = _place(finding)
@@ -54,15 +53,15 @@ def _lines(report: Report) -> Iterator[str]:
             yield f"{'':<8}  {place}"
     counts = Counter(report.files.values())
     states = ", ".join(f"{counts[state]} {state}" for state in STATES if counts[state])
-    yield f"{len(report.files)} files, {in_bytes(report.bytes)}: {states or 'nothing to verify'}"
+    yield f"{len(report.files)} files, {bytes_text(report.bytes)}: {states or 'nothing to verify'}"
     heads = [("head", h.what, h.hash, _short(h.at_ns), h.file) for h in report.heads]
     yield from in_columns(heads, "")
     for file, reason in report.uncovered.items():
         yield f"not covered  {file}: {reason}"
 
 
-def _place(finding: Finding) -> str:
-    """Say where in the file, and when it was received."""
+def _place(finding: VerifyFinding) -> str:
+    """Return the position of a finding in its file, and its receive time."""
     parts = []
     if finding.item:
         parts.append(finding.item)
@@ -76,11 +75,11 @@ def _place(finding: Finding) -> str:
 
 
 def _short(time_ns: int | None) -> str:
-    text = as_text(time_ns)
+    text = time_text(time_ns)
     return "" if text is None else text[:23] + "Z"
 
 
-def _as_json(report: Report, *, good: bool) -> dict[str, object]:
+def _as_json(report: VerifyReport, *, good: bool) -> dict[str, object]:
     return {
         "good": good,
         "signed": report.signed,
@@ -88,6 +87,6 @@ def _as_json(report: Report, *, good: bool) -> dict[str, object]:
         "files": dict(report.files),
         "uncovered": dict(report.uncovered),
         "findings": [finding.to_json() for finding in report.findings],
-        "heads": [{**asdict(head), "at": as_text(head.at_ns)} for head in report.heads],
+        "heads": [{**asdict(head), "at": time_text(head.at_ns)} for head in report.heads],
         "notes": list(report.notes),
     }

@@ -7,21 +7,24 @@ import signal
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from amberbox.cli._output import accept_relative_times, span_of, tell
+from amberbox.cli._arguments import accept_relative_times, span_of
+from amberbox.cli._output import print_notes
 from amberbox.core.errors import UsageError
 from amberbox.core.files import keep_to_group
+from amberbox.core.timestamps import format_time
+from amberbox.core.types import Diagnosis, Status
+from amberbox.monitoring.findings import AlarmChange, Finding, Transition
 
 if TYPE_CHECKING:
-    from amberbox.blackbox.folder.folder import RobotFolder
-    from amberbox.blackbox.store import Store
-    from amberbox.core.types import Status
-    from amberbox.monitoring.engine.findings import Finding
-    from amberbox.monitoring.plan import Plan
-    from amberbox.monitoring.watcher.diagnosing import MakeDiagnoser
-    from amberbox.monitoring.watcher.replay import Part
+    from amberbox.blackbox.robot_folder.folder import RobotFolder
+    from amberbox.blackbox.store.store import Store
+    from amberbox.monitoring.plan import MonitoringPlan
+    from amberbox.monitoring.record_evaluation import MakeDiagnoser, ReplayOptions
+
 
 Say = Callable[["Finding"], None]
 
@@ -47,7 +50,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Watch as asked."""
+    """Run the watcher live, once, or as a replay."""
     keep_to_group()
     if not args.replay and (args.from_ or args.to or args.speed != "max"):
         raise UsageError("--from, --to and --speed are about a replay", "add --replay")
@@ -62,8 +65,8 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _folder(args: argparse.Namespace) -> RobotFolder:
-    """Read the robot folder that says what is to be monitored."""
-    from amberbox.blackbox.folder.folder import load_folder, store_of
+    """Load the robot folder with the components."""
+    from amberbox.blackbox.robot_folder.folder import load_folder, store_of
 
     place = Path(args.folder or args.where)
     if args.folder is None and (not place.is_dir() or store_of(place) is None):
@@ -74,41 +77,45 @@ def _folder(args: argparse.Namespace) -> RobotFolder:
     return load_folder(place)
 
 
-def _plan(folder: RobotFolder) -> Plan:
-    """Return what is to be monitored; errors of single parts are said, their statuses unknown."""
-    from amberbox.monitoring.configuration import load_plan
+def _plan(folder: RobotFolder) -> MonitoringPlan:
+    """Load the monitoring plan; parts with errors are noted, their statuses are unknown."""
+    from amberbox.monitoring.plan_loader import load_plan
 
     plan, problems = load_plan(folder)
     if not plan.components:
         raise UsageError(
-            f"{folder.path} has no components", "write components/*.yaml, see docs/components.md"
+            f"{folder.path} has no components",
+            "write components/*.yaml, see docs/robot/components.md",
         )
     errors = [problem for problem in problems if problem.is_error]
     if errors:
-        tell([f"{len(errors)} errors in the component files: amberbox check {folder.path}"])
+        print_notes([f"{len(errors)} errors in the component files: amberbox check {folder.path}"])
     return plan
 
 
-def _diagnoser(folder: RobotFolder, plan: Plan) -> MakeDiagnoser | None:
-    """Return what makes diagnoses by the folder's failure modes; with errors in them nothing."""
-    from amberbox.consult.knowledge import diagnoser_of
-    from amberbox.diagnosis.fmea.load import FILE
+def _diagnoser(folder: RobotFolder, plan: MonitoringPlan) -> MakeDiagnoser | None:
+    """Return the factory of diagnosers from the folder's failure modes; None on errors."""
+    from amberbox.consult.folder_knowledge import load_diagnoser
+    from amberbox.diagnosis.fmea.loader import FILE
 
-    make, problems = diagnoser_of(folder, plan)
+    make, problems = load_diagnoser(folder, plan)
     count = sum(problem.is_error for problem in problems)
     if count:
         errors = f"{count} error{'' if count == 1 else 's'} in {folder.path / FILE}"
         hint = f"amberbox fmea check {folder.path}"
-        tell([f"{errors}: goes on without diagnosis; see {hint}"])
+        print_notes([f"{errors}: goes on without diagnosis; see {hint}"])
     return make
 
 
 def _live(
-    args: argparse.Namespace, plan: Plan, folder: RobotFolder, diagnoser: MakeDiagnoser | None
+    args: argparse.Namespace,
+    plan: MonitoringPlan,
+    folder: RobotFolder,
+    diagnoser: MakeDiagnoser | None,
 ) -> int:
-    from amberbox.blackbox.store import create_store
-    from amberbox.monitoring.configuration.summary import in_words
-    from amberbox.monitoring.watcher.watcher import Watch, Watcher
+    from amberbox.blackbox.store.store import create_store
+    from amberbox.monitoring.plan import plan_text
+    from amberbox.monitoring.watcher import RecordWatcher, WatcherSetup
 
     if args.folder is not None and Path(args.where) != folder.path:
         raise UsageError("a store is watched by its robot folder", f"amberbox watch {args.folder}")
@@ -119,23 +126,22 @@ def _live(
             say(finding)
 
     store = create_store(folder.store_path)
-    watcher = Watcher(Watch(plan, store, folder, diagnoser=diagnoser), hear)
+    watcher = RecordWatcher(WatcherSetup(plan, store, folder, diagnoser=diagnoser), hear)
     if not args.quiet and not args.json:
-        print(f"watching {plan.robot}: {in_words(plan)}", flush=True)
+        print(f"watching {plan.robot}: {plan_text(plan)}", flush=True)
     with _stoppable() as stop:
         watcher.run(stop)
     return 0
 
 
-def _once(args: argparse.Namespace, plan: Plan, diagnoser: MakeDiagnoser | None) -> int:
-    from amberbox.blackbox.store import is_locked
-    from amberbox.cli._watchlines import shown
-    from amberbox.monitoring.watcher.replay import newest
+def _once(args: argparse.Namespace, plan: MonitoringPlan, diagnoser: MakeDiagnoser | None) -> int:
+    from amberbox.blackbox.store.store import is_locked
+    from amberbox.monitoring.record_evaluation import end_of_record
 
     with _record(args.where) as store:
-        statuses, at_ns, diagnosis = newest(plan, store, diagnoser)
+        statuses, at_ns, diagnosis = end_of_record(plan, store, diagnoser)
         if not is_locked(store, "main"):
-            tell([f"nothing is being recorded; this is as of {shown(at_ns)}"])
+            print_notes([f"nothing is being recorded; this is as of {shown(at_ns)}"])
     say = _sayer(args)
     for status in statuses:
         if args.json:
@@ -147,8 +153,8 @@ def _once(args: argparse.Namespace, plan: Plan, diagnoser: MakeDiagnoser | None)
     return int(any(status.level == "error" for status in statuses))
 
 
-def _replay(args: argparse.Namespace, plan: Plan, diagnoser: MakeDiagnoser | None) -> int:
-    from amberbox.monitoring.watcher.replay import replay
+def _replay(args: argparse.Namespace, plan: MonitoringPlan, diagnoser: MakeDiagnoser | None) -> int:
+    from amberbox.monitoring.record_evaluation import replay
 
     say = _sayer(args)
     with _record(args.where) as store, _stoppable() as stop:
@@ -160,33 +166,34 @@ def _replay(args: argparse.Namespace, plan: Plan, diagnoser: MakeDiagnoser | Non
     return 0
 
 
-def _tell_lead(plan: Plan, diagnoser: MakeDiagnoser | None) -> None:
-    """Say why it takes a while until the first finding of a part comes."""
-    from amberbox.monitoring.engine.engine import Engine
-    from amberbox.monitoring.watcher.diagnosing import Diagnosing
-    from amberbox.monitoring.watcher.replay import WARM_UP_S
+def _tell_lead(plan: MonitoringPlan, diagnoser: MakeDiagnoser | None) -> None:
+    """Print how far before its range a replay begins."""
+    from amberbox.monitoring.engine import Engine
+    from amberbox.monitoring.record_evaluation import WARM_UP_S, DiagnosedEngine
 
-    minutes = (WARM_UP_S + Diagnosing(Engine(plan), diagnoser and diagnoser()).history_s) / 60
-    tell([f"monitors look back: begins {minutes:.0f} min before --from, if there is a record"])
+    minutes = (WARM_UP_S + DiagnosedEngine(Engine(plan), diagnoser and diagnoser()).history_s) / 60
+    print_notes(
+        [f"monitors look back: begins {minutes:.0f} min before --from, if there is a record"]
+    )
 
 
 @contextmanager
 def _record(where: str) -> Iterator[Store]:
-    """Open what is recorded: a store, or a recording that is imported for the moment."""
+    """Open a store, or a recording that is imported temporarily."""
     from amberbox.blackbox.query.record import open as open_record
-    from amberbox.blackbox.store import open_store
+    from amberbox.blackbox.store.store import open_store
 
     with open_record(where) as record:
-        tell(record.notes)
+        print_notes(record.notes)
         yield open_store(record.path)
 
 
-def _part(args: argparse.Namespace, store: Store) -> Part:
+def _part(args: argparse.Namespace, store: Store) -> ReplayOptions:
     from amberbox.blackbox.query.record import open as open_record
-    from amberbox.monitoring.watcher.replay import Part
+    from amberbox.monitoring.record_evaluation import ReplayOptions
 
     record = open_record(store.path)
-    return Part(*span_of(args, record), _speed(args.speed))
+    return ReplayOptions(*span_of(args, record), _speed(args.speed))
 
 
 def _speed(text: str) -> float | None:
@@ -202,11 +209,10 @@ def _speed(text: str) -> float | None:
 
 
 def _sayer(args: argparse.Namespace) -> Say:
-    """Return what prints a finding: as the journal has it, or for a person what has changed."""
-    from amberbox.cli._watchlines import Lines
-    from amberbox.monitoring.messages.records import encoded
+    """Return the printer of findings: JSON as in the journal, or text about changes."""
+    from amberbox.monitoring.findings import encoded
 
-    lines = Lines()
+    lines = FindingLines()
 
     def as_json(finding: Finding) -> None:
         _, data = encoded(finding)
@@ -231,7 +237,7 @@ def _status_line(status: Status) -> str:
 
 @contextmanager
 def _stoppable() -> Iterator[threading.Event]:
-    """Give an event that SIGTERM and SIGINT set."""
+    """Yield an event that SIGTERM and SIGINT set."""
     stop = threading.Event()
     numbers = (signal.SIGTERM, signal.SIGINT)
     before = [signal.signal(number, lambda *_: stop.set()) for number in numbers]
@@ -240,3 +246,73 @@ def _stoppable() -> Iterator[threading.Event]:
     finally:
         for number, handler in zip(numbers, before, strict=True):
             signal.signal(number, handler)
+
+
+@dataclass(slots=True)
+class FindingLines:
+    """Formats findings as lines, without repetitions."""
+
+    _reasons: set[tuple[int, str, str]] = field(default_factory=set)
+    _alarms: dict[tuple[str, bool], AlarmChange] = field(default_factory=dict)
+    _answers: dict[str, str] = field(default_factory=dict)
+    _silent: bool = False
+
+    def line(self, finding: Finding) -> str | None:
+        """Return the line for a finding; None if it contains nothing new."""
+        if isinstance(finding, Status):
+            return self._silence(finding)
+        if isinstance(finding, Diagnosis):
+            return self._diagnosis(finding)
+        if isinstance(finding, Transition):
+            text = finding.text.removesuffix(f": {finding.reason}")
+            hint = f" (hint: {finding.hint})" if finding.hint else ""
+            return self._once(finding.at_ns, finding.component, text, finding.reason, hint)
+        return self._alarm(finding) if isinstance(finding, AlarmChange) else None
+
+    def _silence(self, status: Status) -> str | None:
+        """Return a line when the recorder becomes silent, and one when it resumes."""
+        if status.live_only == self._silent:
+            return None
+        self._silent = status.live_only
+        text = f"everything is unknown: {status.reason}" if self._silent else "the record goes on"
+        return f"{shown(status.measured_ns)} {text}"
+
+    def _diagnosis(self, diagnosis: Diagnosis) -> str | None:
+        """Return a line when the leading hypothesis changed."""
+        from amberbox.monitoring.alarm_causes import diagnosis_text, hypotheses_text
+
+        answer = "" if diagnosis.state == "healed" else hypotheses_text(diagnosis.leading())
+        if self._answers.get(diagnosis.id) == answer:
+            return None
+        self._answers[diagnosis.id] = answer
+        return f"{shown(diagnosis.at_ns)} diagnosis {diagnosis.id}: {diagnosis_text(diagnosis)}"
+
+    def _alarm(self, alarm: AlarmChange) -> str | None:
+        """Return a line when an alarm changed, other than in its cause."""
+        key, plain = (alarm.id, alarm.live_only), replace(alarm, cause="", diagnosis="")
+        before = self._alarms.get(key)
+        self._alarms[key] = plain
+        if before is not None and replace(before, changed_ns=alarm.changed_ns) == plain:
+            return None
+        text = f"{alarm.component}: alarm {alarm.id} {alarm.state}"
+        if alarm.state == "healed":
+            return f"{shown(alarm.changed_ns)} {text}"
+        times = f", {alarm.count} times" if alarm.count > 1 else ""
+        cause = f" because of {alarm.cause}" if alarm.cause else ""
+        text += f" ({alarm.severity}{times}){cause}"
+        return self._once(alarm.changed_ns, alarm.component, text, alarm.reason)
+
+    def _once(self, at_ns: int, component: str, text: str, reason: str, hint: str = "") -> str:
+        """Return a line; the same reason at one instant is printed for the first component only."""
+        said = (at_ns, component, reason)
+        if not reason or said in self._reasons:
+            return f"{shown(at_ns)} {text}"
+        if not any(entry[0] == at_ns for entry in self._reasons):
+            self._reasons.clear()
+        self._reasons.add(said)
+        return f"{shown(at_ns)} {text}: {reason}{hint}"
+
+
+def shown(at_ns: int) -> str:
+    """Format a time of the record, UTC, to the millisecond."""
+    return format_time(at_ns)[:23]

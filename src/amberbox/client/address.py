@@ -1,4 +1,4 @@
-"""Addresses of servers: ``https://host:port``, with a robot, with the authority to be trusted."""
+"""Addresses of servers: ``https://host:port``, optionally with a robot and a pinned authority."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import TypeGuard
 from urllib.parse import quote, unquote, urlsplit
 
 from amberbox.core.errors import UsageError
-from amberbox.core.ids import is_id
+from amberbox.core.names import is_id
 
 _LOOPBACK = frozenset({"localhost", "127.0.0.1", "::1"})
 _ROBOTS = "/robots/"
@@ -16,9 +16,9 @@ _HINT = "such as https://fleet.example:8443/robots/ropod_001"
 
 @dataclass(frozen=True, slots=True)
 class Address:
-    """A server and, where one is named, a robot of it.
+    """A server and, if named, one of its robots.
 
-    ``pin`` is the SHA-256 of the server's authority (64 hex digits), empty where none is named.
+    ``pin`` is the SHA-256 of the server's authority (64 hex digits), empty if none is named.
     """
 
     url: str
@@ -30,19 +30,19 @@ class Address:
 
 
 def is_url(where: object) -> TypeGuard[str]:
-    """Tell whether WHERE is the address of a server."""
+    """Return whether WHERE is a URL of a server."""
     return isinstance(where, str) and where.startswith(("https://", "http://"))
 
 
 def read_address(text: str) -> Address:
-    """Read an address as it stands above a robot's page.
+    """Return the address in a text, such as the URL of a robot's page.
 
-    ``#ca=sha256:...`` at its end names the authority. Raises UsageError for what is no address,
-    and for one without TLS that leads to another machine.
+    ``#ca=sha256:...`` at its end pins the authority. Raises UsageError for an invalid address, and
+    for one without TLS on another machine.
     """
     try:
         parts = urlsplit(text.strip())
-        _ = parts.port  # looks at it: a port may be no number
+        _ = parts.port  # raises ValueError for an invalid port
     except ValueError:
         raise UsageError(f"{text} is no address", _HINT) from None
     if parts.scheme not in ("https", "http") or not parts.hostname:
@@ -59,7 +59,7 @@ def read_address(text: str) -> Address:
 
 
 def with_robot(where: str, robot: str) -> str:
-    """Name a robot in an address; raises UsageError when another one stands there."""
+    """Return an address with a robot; raises UsageError when it names another one."""
     address = read_address(where)
     if address.robot not in ("", robot):
         raise UsageError(f"{where} is {address.robot}, and --robot is {robot}", "leave out one")
@@ -68,7 +68,7 @@ def with_robot(where: str, robot: str) -> str:
 
 
 def _robot(path: str) -> tuple[str, str]:
-    """Split what stands before the robot's page; a server behind a proxy may have a path."""
+    """Return base path and robot of a path; a server behind a proxy may have a base path."""
     base, found, rest = path.rstrip("/").partition(_ROBOTS)
     if not found:
         return base.removesuffix("/robots"), ""
@@ -81,6 +81,6 @@ def _robot(path: str) -> tuple[str, str]:
 def _pin(fragment: str) -> str:
     if not fragment.startswith("ca="):
         return ""
-    from amberbox.core.tls import normal
+    from amberbox.core.tls import normal_fingerprint
 
-    return normal(fragment.removeprefix("ca="))
+    return normal_fingerprint(fragment.removeprefix("ca="))

@@ -1,25 +1,185 @@
-"""A server of a fleet, asked in Python: ``Fleet("https://fleet.example:8443").robots()``."""
+"""The Python client of a server: ``Fleet("https://fleet.example:8443").robots()``.
+
+Paged lists are returned as one. Downloads are waited for, then saved; an interrupted one is
+resumed.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+import os
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 from urllib.parse import quote
 
 import msgspec
 
-from amberbox.client import data_models, downloading, models, tables
+from amberbox.client import models, table_reader
 from amberbox.client.address import read_address
-from amberbox.client.fleet_alarms import AlarmCalls
-from amberbox.client.paging import PAGE, paged
-from amberbox.client.times import Time, said
-from amberbox.client.wire import TIMEOUT_S, Wire
+from amberbox.client.models import Time, time_text
+from amberbox.client.transport import TIMEOUT_S, ApiConnection, Query
+from amberbox.core.errors import AmberboxError
 
 if TYPE_CHECKING:
+    from http.client import HTTPResponse
+
     from amberbox.blackbox.query.table import Table
-    from amberbox.client.downloading import Progress
-    from amberbox.client.feed import Change
+    from amberbox.client.models import Download
+    from amberbox.client.transport import Change
+
+
+PAGE = 1000
+One = TypeVar("One")
+
+
+def paged(
+    wire: ApiConnection,
+    path: str,
+    kind: type[One],
+    last: Callable[[One], Any],
+    query: Query | None = None,
+    page: int = PAGE,
+) -> Iterator[One]:
+    """Yield all entries of a paged list; ``last(entry)`` returns its ``after`` parameter."""
+    after: Any = ""
+    while True:
+        asked = {**(query or {}), "limit": page, "after": after}
+        said = msgspec.json.decode(wire.get(path, asked).body)
+        found = [msgspec.convert(one, kind) for one in said]
+        yield from found
+        if len(found) < page:
+            return
+        after = last(found[-1])
+
+
+class AlarmCalls:
+    """Requests about the alarms of a server.
+
+    Changes take the ``revision`` that the caller has read; they raise ConflictError if the alarm
+    was changed since.
+    """
+
+    wire: ApiConnection
+
+    def alarms(
+        self, robot: str = "", *, state: Sequence[str] = (), group: str = "",
+        severity: str = "warning", since: Time = None,
+    ) -> list[models.AlarmLine]:  # fmt: skip
+        """Return alarms, newest first: of ``severity`` and worse, changed ``since`` then."""
+        asked = {"robot": robot, "state": list(state), "group": group, "severity": severity,
+                 "since": time_text(since)}  # fmt: skip
+        return [*paged(self.wire, "/alarms", models.AlarmLine, lambda a: a.id, asked)]
+
+    def alarm(self, alarm: int) -> models.AlarmPage:
+        """Return an alarm with its consequences and its history."""
+        found = self.wire.get(f"/alarms/{alarm}").body
+        return msgspec.json.decode(found, type=models.AlarmPage)
+
+    def acknowledge(self, alarm: int, revision: int, note: str = "") -> models.AlarmPage:
+        """Acknowledge an alarm."""
+        return self._do(alarm, "acknowledge", {"revision": revision, "note": note})
+
+    def shelve(self, alarm: int, revision: int, until: Time, reason: str) -> models.AlarmPage:
+        """Shelve an alarm until a time."""
+        body = {"revision": revision, "until": time_text(until), "reason": reason}
+        return self._do(alarm, "shelve", body)
+
+    def unshelve(self, alarm: int, revision: int) -> models.AlarmPage:
+        """Unshelve an alarm."""
+        return self._do(alarm, "unshelve", {"revision": revision})
+
+    def own(self, alarm: int, revision: int, user: str) -> models.AlarmPage:
+        """Assign an owner to an alarm; an empty name removes the owner."""
+        return self._do(alarm, "own", {"revision": revision, "user": user})
+
+    def note(self, alarm: int, text: str) -> models.AlarmPage:
+        """Add a note to the history of an alarm."""
+        return self._do(alarm, "note", {"text": text})
+
+    def resolve(self, alarm: int, revision: int, reason: str) -> models.AlarmPage:
+        """Resolve an alarm; it reopens if the robot reports the fault again."""
+        return self._do(alarm, "resolve", {"revision": revision, "reason": reason})
+
+    def _do(self, alarm: int, action: str, body: Mapping[str, Any]) -> models.AlarmPage:
+        reply = self.wire.send("POST", f"/alarms/{alarm}/{action}", body)
+        return msgspec.json.decode(reply.body, type=models.AlarmPage)
+
+
+Progress = Callable[[float], None]
+_PIECE = 1 << 18
+_POLLS_S = (0.05, 0.1, 0.2, 0.5, 1.0)
+_ATTEMPTS = 3
+
+
+def wait_for_download(
+    fleet: Fleet, download: str, progress: Progress | None, limit_s: float | None
+) -> Download:
+    """Wait until the file of a download is ready; return its state.
+
+    Raises AmberboxError when it failed, was cancelled, or took longer than ``limit_s``.
+    """
+    end_s = None if limit_s is None else time.monotonic() + limit_s
+    number = 0
+    while not (found := fleet.download(download)).is_over:
+        if progress is not None:
+            progress(found.progress)
+        if end_s is not None and time.monotonic() > end_s:
+            raise AmberboxError(f"the download {download} is not made after {limit_s:g} s")
+        time.sleep(_POLLS_S[min(number, len(_POLLS_S) - 1)])
+        number += 1
+    if found.state != "done":
+        why = f": {found.error}" if found.error else ""
+        raise AmberboxError(f"{fleet.url}: the download {found.id} is {found.state}{why}")
+    return found
+
+
+def save_file(fleet: Fleet, download: str, target: Path, progress: Progress | None) -> Path:
+    """Save the file of a finished download; ``target`` may be a folder. Return its path.
+
+    The file appears when it is complete. A partial file of an earlier attempt, ``NAME.ID.part``
+    beside it, is continued.
+    """
+    found = fleet.download(download)
+    file = target / Path(found.file or download).name if target.is_dir() else target
+    part = file.with_name(f"{file.name}.{download}.part")
+    for left in reversed(range(_ATTEMPTS)):
+        try:
+            _append(fleet, found, part, progress)
+            break
+        except AmberboxError:
+            if not left or not part.exists():
+                raise
+    size = part.stat().st_size
+    if size != found.bytes:
+        part.unlink()
+        raise AmberboxError(f"{found.bytes} bytes were to come, {size} came", "try again")
+    part.replace(file)
+    return file
+
+
+def _append(fleet: Fleet, found: Download, part: Path, progress: Progress | None) -> None:
+    have = part.stat().st_size if part.exists() else 0
+    if have > found.bytes:
+        part.unlink()
+        have = 0
+    if have == found.bytes and part.exists():
+        return
+    with fleet.wire.stream(f"/downloads/{found.id}/file", have) as answer:
+        _take(answer, part, "ab" if have and answer.status == 206 else "wb", found, progress)
+
+
+def _take(
+    answer: HTTPResponse, part: Path, mode: str, found: Download, progress: Progress | None
+) -> None:
+    with part.open(mode) as opened:
+        while piece := answer.read(_PIECE):
+            opened.write(piece)
+            if progress is not None:
+                progress(opened.tell() / max(found.bytes, 1))
+        opened.flush()
+        os.fsync(opened.fileno())
+
 
 By = Literal["received", "timestamp"]
 ROWS = 200_000
@@ -28,24 +188,25 @@ _Answer = TypeVar("_Answer")
 
 
 class Fleet(AlarmCalls):
-    """One server. A context manager; threads may share it.
+    """A connection to one server. A context manager; threads may share it.
 
-    ``token`` is an API token; without one it is ``AMBERBOX_TOKEN`` of the environment, else that
-    of ``amberbox sign-in``. ``ca`` is the fingerprint of the server's authority
-    (``sha256:...``) or a PEM file; without, what sign-in pinned, else what the system trusts.
+    ``token`` is an API token; by default ``AMBERBOX_TOKEN`` of the environment, else that of
+    ``amberbox sign-in``. ``ca`` is the fingerprint of the server's authority (``sha256:...``) or a
+    PEM file; by default the pin of sign-in, else the system's authorities.
 
-    All methods raise UnreachableError, NotSignedInError, NotAllowedError, UsageError for what is
-    not there, and AmberboxError for what the server could not do; each names the address.
+    All methods raise UnreachableError, NotSignedInError, NotAllowedError, UsageError for wrong
+    input or unknown objects, and AmberboxError for other errors of the server; each names the
+    address.
     """
 
     def __init__(
         self, url: str, token: str | None = None, ca: str | Path | None = None,
         timeout_s: float = TIMEOUT_S,
     ) -> None:  # fmt: skip
-        from amberbox.client.opening import wire_to
+        from amberbox.client.credentials import wire_to
 
         self.url = read_address(url).url
-        self.wire: Wire = wire_to(url, token, ca, timeout_s)
+        self.wire: ApiConnection = wire_to(url, token, ca, timeout_s)
 
     def __enter__(self) -> Fleet:
         return self
@@ -54,17 +215,17 @@ class Fleet(AlarmCalls):
         self.close()
 
     def close(self) -> None:
-        """Let the connection go."""
+        """Close the connection."""
         self.wire.close()
 
-    # Robots and how they are.
+    # Robots and their statuses.
 
     def robots(self, group: str = "") -> list[models.Card]:
-        """Return the robots that one may see, by id."""
+        """Return the robots that the token may see, by id."""
         return [*paged(self.wire, "/robots", models.Card, lambda r: r.robot, {"group": group})]
 
     def robot(self, robot: str) -> models.Card:
-        """Return one robot at a glance."""
+        """Return the overview of one robot."""
         return self._get(_of(robot), models.Card)
 
     def status(self, robot: str) -> models.StatusTree:
@@ -75,7 +236,7 @@ class Fleet(AlarmCalls):
         self, robot: str, from_: Time = "now-1h", to: Time = "now", component: str = "",
         points: int = 500,
     ) -> models.Timeline:  # fmt: skip
-        """Return which component was in what state when."""
+        """Return the states of components over time, by default over the last hour."""
         asked = {**_span(from_, to), "component": component, "points": points}
         return self._get(f"{_of(robot)}/timeline", models.Timeline, asked)
 
@@ -83,43 +244,48 @@ class Fleet(AlarmCalls):
         self, robot: str, from_: Time = None, to: Time = None, kind: str = "", limit: int = 100,
         newest: bool = True,
     ) -> list[models.Event]:  # fmt: skip
-        """Return events in order of time: the newest of a range, or the first ones."""
+        """Return events in order of time: the newest ones of a range, or the first ones."""
         asked = {**_span(from_, to), "kind": kind, "limit": limit, "newest": newest}
         return self._get(f"{_of(robot)}/events", list[models.Event], asked)
 
-    # What was recorded.
+    # Recorded data.
 
-    def items(self, robot: str) -> list[data_models.Item]:
+    def items(self, robot: str) -> list[models.Item]:
         """Return the data items that the server has rows of."""
-        return self._get(f"{_of(robot)}/items", list[data_models.Item])
+        return self._get(f"{_of(robot)}/items", list[models.Item])
 
-    def item(self, robot: str, item: str) -> data_models.ItemDetail:
+    def item(self, robot: str, item: str) -> models.ItemDetail:
         """Return an item with its columns."""
-        return self._get(f"{_of(robot)}/items/{quote(item, safe='')}", data_models.ItemDetail)
+        return self._get(f"{_of(robot)}/items/{quote(item, safe='')}", models.ItemDetail)
 
     def query(
         self, robot: str, item: str, variables: Sequence[str] | None = None, from_: Time = None,
         to: Time = None, by: By = "received", points: int | None = None,
     ) -> Table:  # fmt: skip
-        """Return rows of ``[from_, to)`` (see ``Record.query``); ``points`` thins them out.
+        """Return rows of ``[from_, to)`` (see ``Record.query``); ``points`` reduces their number.
 
         Of more than a million rows, ``points`` gives ``x:min``, ``x:max``, ``x:mean``, ``x:count``.
         """
         pages = self.pages(robot, item, variables, from_, to, by, points)
-        return tables.joined([page.table for page in pages])
+        return table_reader.concatenate([page.table for page in pages])
 
     def pages(
         self, robot: str, item: str, variables: Sequence[str] | None = None, from_: Time = None,
         to: Time = None, by: By = "received", points: int | None = None, rows: int = ROWS,
-    ) -> Iterator[tables.Page]:  # fmt: skip
-        """Yield the rows of a query, some at a time."""
-        start: str = said(from_)
+    ) -> Iterator[table_reader.RowPage]:  # fmt: skip
+        """Yield the rows of a query in pages of at most ``rows``."""
+        start: str = time_text(from_)
         while True:
             asked = {
-                "item": item, "variables": variables, **_span(start, to), "by": by,
-                "points": points, "limit": None if points else rows, "format": tables.form(),
-            }  # fmt: skip
-            page = tables.page_of(self.wire.get(f"{_of(robot)}/query", asked))
+                "item": item,
+                "variables": variables,
+                **_span(start, to),
+                "by": by,
+                "points": points,
+                "limit": None if points else rows,
+                "format": table_reader.row_format(),
+            }
+            page = table_reader.page_of(self.wire.get(f"{_of(robot)}/query", asked))
             yield page
             if not page.next:
                 return
@@ -128,20 +294,20 @@ class Fleet(AlarmCalls):
     def statistics(
         self, robot: str, item: str, variables: Sequence[str] | None = None, from_: Time = None,
         to: Time = None,
-    ) -> data_models.Summaries:  # fmt: skip
-        """Return number of values, least, greatest and mean of a range."""
+    ) -> models.Summaries:  # fmt: skip
+        """Return count, minimum, maximum and mean of variables in a range."""
         asked = {"item": item, "variables": variables, **_span(from_, to)}
-        return self._get(f"{_of(robot)}/statistics", data_models.Summaries, asked)
+        return self._get(f"{_of(robot)}/statistics", models.Summaries, asked)
 
     def gaps(
         self, robot: str, item: str = "", from_: Time = None, to: Time = None
-    ) -> list[data_models.Gap]:
-        """Return what is missing in a range, and why, in order of time."""
-        found: dict[data_models.Gap, None] = {}
-        start = said(from_)
+    ) -> list[models.Gap]:
+        """Return the gaps in a range, with their reasons, in order of time."""
+        found: dict[models.Gap, None] = {}
+        start = time_text(from_)
         while True:
             asked = {"item": item, **_span(start, to), "limit": PAGE}
-            answer = self._get(f"{_of(robot)}/gaps", data_models.Gaps, asked)
+            answer = self._get(f"{_of(robot)}/gaps", models.Gaps, asked)
             fresh = [gap for gap in answer.gaps if gap not in found]
             found.update(dict.fromkeys(fresh))
             if not (answer.more and fresh):
@@ -150,128 +316,122 @@ class Fleet(AlarmCalls):
 
     def missions(
         self, robot: str, name: str = "", failed: bool = False, from_: Time = None, to: Time = None
-    ) -> list[data_models.Mission]:
+    ) -> list[models.Mission]:
         """Return missions, newest first."""
         asked = {"name": name, "failed": failed, **_span(from_, to)}
         path = f"{_of(robot)}/missions"
-        return [*paged(self.wire, path, data_models.Mission, lambda m: m.id, asked)]
+        return [*paged(self.wire, path, models.Mission, lambda m: m.id, asked)]
 
     def begin_mission(
         self, robot: str, name: str, parameters: Mapping[str, Any] | None = None, at: Time = None
-    ) -> data_models.Mission:
+    ) -> models.Mission:
         """Begin a mission on the server."""
-        body = {"name": name, "parameters": dict(parameters or {}), "at": said(at)}
-        return self._send("POST", f"{_of(robot)}/missions", data_models.Mission, body)
+        body = {"name": name, "parameters": dict(parameters or {}), "at": time_text(at)}
+        return self._send("POST", f"{_of(robot)}/missions", models.Mission, body)
 
     def end_mission(
         self, robot: str, mission: str, outcome: str = "done", at: Time = None
-    ) -> data_models.Mission:
+    ) -> models.Mission:
         """End a mission that was begun on the server."""
         path = f"{_of(robot)}/missions/{quote(mission, safe='')}/end"
-        return self._send("POST", path, data_models.Mission, {"outcome": outcome, "at": said(at)})
+        return self._send("POST", path, models.Mission, {"outcome": outcome, "at": time_text(at)})
 
-    def notes(
-        self, robot: str, from_: Time = None, to: Time = None
-    ) -> list[data_models.MomentNote]:
-        """Return what people remarked on moments, on missions too, newest first."""
+    def notes(self, robot: str, from_: Time = None, to: Time = None) -> list[models.MomentNote]:
+        """Return the notes of people on moments and on missions, newest first."""
         path = f"{_of(robot)}/notes"
-        return [*paged(self.wire, path, data_models.MomentNote, lambda n: n.id, _span(from_, to))]
+        return [*paged(self.wire, path, models.MomentNote, lambda n: n.id, _span(from_, to))]
 
-    def annotate(self, robot: str, text: str, at: Time = None) -> data_models.MomentNote:
-        """Remark something on a moment of a robot, whether a mission was under way or not."""
-        body = {"text": text, "at": said(at)}
-        return self._send("POST", f"{_of(robot)}/notes", data_models.MomentNote, body)
+    def annotate(self, robot: str, text: str, at: Time = None) -> models.MomentNote:
+        """Add a note at a moment of a robot, inside or outside of a mission."""
+        body = {"text": text, "at": time_text(at)}
+        return self._send("POST", f"{_of(robot)}/notes", models.MomentNote, body)
 
-    def incidents(
-        self, robot: str, from_: Time = None, to: Time = None
-    ) -> list[data_models.Incident]:
-        """Return the windows that robots or people want kept, newest first."""
+    def incidents(self, robot: str, from_: Time = None, to: Time = None) -> list[models.Incident]:
+        """Return the pinned windows of a robot's record, newest first."""
         path = f"{_of(robot)}/incidents"
-        return [*paged(self.wire, path, data_models.Incident, lambda i: i.id, _span(from_, to))]
+        return [*paged(self.wire, path, models.Incident, lambda i: i.id, _span(from_, to))]
 
-    def mark_incident(self, robot: str, from_: Time, to: Time, reason: str) -> data_models.Incident:
-        """Mark a window: what the server has of it, or gets, is kept until it is released."""
+    def mark_incident(self, robot: str, from_: Time, to: Time, reason: str) -> models.Incident:
+        """Pin a window: the server keeps what it has or gets of it until it is released."""
         body = {**_span(from_, to), "reason": reason}
-        return self._send("POST", f"{_of(robot)}/incidents", data_models.Incident, body)
+        return self._send("POST", f"{_of(robot)}/incidents", models.Incident, body)
 
-    def release_incident(self, robot: str, incident: str) -> data_models.Incident:
-        """Let a window go that was marked on the server."""
+    def release_incident(self, robot: str, incident: str) -> models.Incident:
+        """Release a window that was pinned on the server."""
         path = f"{_of(robot)}/incidents/{quote(incident, safe='')}/release"
-        return self._send("POST", path, data_models.Incident)
+        return self._send("POST", path, models.Incident)
 
-    def recordings(self, robot: str) -> list[data_models.Recording]:
-        """Return the journals of a robot by name, with what is known of their integrity."""
+    def recordings(self, robot: str) -> list[models.Recording]:
+        """Return the journals of a robot by name, with the results of their integrity checks."""
         path = f"{_of(robot)}/recordings"
-        return [
-            *paged(self.wire, path, data_models.Recording, lambda r: f"{r.store_id}/{r.journal}")
-        ]
+        return [*paged(self.wire, path, models.Recording, lambda r: f"{r.store_id}/{r.journal}")]
 
-    # What is still on the robot.
+    # Data still on the robot.
 
-    def fetch(self, robot: str, item: str, from_: Time, to: Time) -> data_models.Fetch:
-        """Ask a robot for a window of an item, of all items without a name."""
+    def fetch(self, robot: str, item: str, from_: Time, to: Time) -> models.Fetch:
+        """Request a window of an item from a robot; of all items with an empty name."""
         body = {"item": item, **_span(from_, to)}
-        return self._send("POST", f"{_of(robot)}/fetches", data_models.Fetch, body)
+        return self._send("POST", f"{_of(robot)}/fetches", models.Fetch, body)
 
-    def fetches(self, robot: str) -> list[data_models.Fetch]:
-        """Return what was asked of a robot, newest first."""
+    def fetches(self, robot: str) -> list[models.Fetch]:
+        """Return the requests for windows to a robot, newest first."""
         path = f"{_of(robot)}/fetches"
-        return [*paged(self.wire, path, data_models.Fetch, lambda f: f.id)]
+        return [*paged(self.wire, path, models.Fetch, lambda f: f.id)]
 
-    def fetched(self, robot: str, fetch: str) -> data_models.Fetch:
-        """Return how far a window is that was asked of a robot."""
-        return self._get(f"{_of(robot)}/fetches/{fetch}", data_models.Fetch)
+    def fetched(self, robot: str, fetch: str) -> models.Fetch:
+        """Return the progress of a request for a window."""
+        return self._get(f"{_of(robot)}/fetches/{fetch}", models.Fetch)
 
-    # Files.
+    # Downloads.
 
     def start_download(
         self, robots: Sequence[str], items: Sequence[str] = (), *, format: str = "csv",
         from_: Time = None, to: Time = None, missions: Sequence[str] = (),
         variables: Mapping[str, Sequence[str]] | None = None,
-    ) -> data_models.Download:  # fmt: skip
-        """Let the server make a file: ``csv``, ``parquet``, ``mcap`` or ``journals``."""
+    ) -> models.Download:  # fmt: skip
+        """Start making a file on the server: ``csv``, ``parquet``, ``mcap`` or ``journals``."""
         body = {
             "robots": list(robots), "items": list(items), "missions": list(missions),
             "variables": {k: list(v) for k, v in (variables or {}).items()}, "format": format,
             **_span(from_, to),
         }  # fmt: skip
-        return self._send("POST", "/downloads", data_models.Download, body)
+        return self._send("POST", "/downloads", models.Download, body)
 
-    def downloads(self) -> list[data_models.Download]:
+    def downloads(self) -> list[models.Download]:
         """Return one's own downloads, newest first."""
-        return [*paged(self.wire, "/downloads", data_models.Download, lambda d: d.id)]
+        return [*paged(self.wire, "/downloads", models.Download, lambda d: d.id)]
 
-    def download(self, download: str) -> data_models.Download:
-        """Return how far a download is."""
-        return self._get(f"/downloads/{download}", data_models.Download)
+    def download(self, download: str) -> models.Download:
+        """Return the state of a download."""
+        return self._get(f"/downloads/{download}", models.Download)
 
-    def cancel_download(self, download: str) -> data_models.Download:
-        """Stop a download, or throw it away when it is done."""
-        return self._send("DELETE", f"/downloads/{download}", data_models.Download)
+    def cancel_download(self, download: str) -> models.Download:
+        """Cancel a download, or delete it when it is done."""
+        return self._send("DELETE", f"/downloads/{download}", models.Download)
 
     def wait_download(
         self, download: str, progress: Progress | None = None, limit_s: float | None = None
-    ) -> data_models.Download:
-        """Wait until a download is made; raises AmberboxError when it will not be."""
-        return downloading.waited(self, download, progress, limit_s)
+    ) -> models.Download:
+        """Wait until a download is ready; raises AmberboxError when it fails."""
+        return wait_for_download(self, download, progress, limit_s)
 
     def save_download(
         self, download: str, target: Path | str, progress: Progress | None = None
     ) -> Path:
-        """Save the file of a download; what was cut short before goes on where it ended."""
-        return downloading.saved(self, download, Path(target), progress)
+        """Save the file of a download; an interrupted one continues where it stopped."""
+        return save_file(self, download, Path(target), progress)
 
-    # What is wrong, and what can be.
+    # Diagnosis.
 
     def diagnoses(
         self, robot: str, from_: Time = None, to: Time = None
     ) -> list[models.DiagnosisLine]:
-        """Return what the robot's watcher found, newest first."""
+        """Return the diagnoses of a robot's watcher, newest first."""
         path = f"{_of(robot)}/diagnoses"
         return [*paged(self.wire, path, models.DiagnosisLine, lambda d: d.id, _span(from_, to))]
 
     def diagnosis(self, robot: str, diagnosis: str) -> dict[str, Any]:
-        """Return a diagnosis with all revisions and what people added."""
+        """Return a diagnosis with all revisions, answers and causes."""
         return self._get(f"{_of(robot)}/diagnoses/{quote(diagnosis, safe='')}", dict[str, Any])
 
     def diagnose(
@@ -279,29 +439,32 @@ class Fleet(AlarmCalls):
         answers: Mapping[str, str] | None = None, *, diagnosis: str = "",
         engine: str = "covering", exposure_h: float | None = None,
     ) -> dict[str, Any]:  # fmt: skip
-        """Ask what is broken, now or then, what if: the object of ``amberbox diagnose --json``."""
+        """Return a diagnosis now, at a time, or with assumed symptoms and answers.
+
+        The object is that of ``amberbox diagnose --json``.
+        """
         body = {
-            "at": said(at), "symptoms": dict(symptoms or {}), "answers": dict(answers or {}),
+            "at": time_text(at), "symptoms": dict(symptoms or {}), "answers": dict(answers or {}),
             "diagnosis": diagnosis, "engine": engine, "exposure_h": exposure_h,
         }  # fmt: skip
         return self._send("POST", f"{_of(robot)}/diagnose", dict[str, Any], body)
 
     def answer(self, robot: str, diagnosis: str, test: str, answer: str) -> dict[str, Any]:
-        """Say what a test gave; returns the diagnosis ranked anew."""
+        """Store the answer to a test; return the diagnosis ranked anew."""
         path = f"{_of(robot)}/diagnoses/{quote(diagnosis, safe='')}/answers"
         return self._send("POST", path, dict[str, Any], {"test": test, "answer": answer})
 
     def fmea(self, robot: str, at: Time = None, exposure_h: float | None = None) -> dict[str, Any]:
         """Return the failure modes: ``table``, ``criticality`` and ``coverage``."""
-        asked = {"at": said(at), "exposure_h": exposure_h}
+        asked = {"at": time_text(at), "exposure_h": exposure_h}
         return self._get(f"{_of(robot)}/fmea", dict[str, Any], asked)
 
     def faulttrees(
         self, robot: str, effect: str = "", *, cut_sets: int = 100, order: int | None = None,
         at: Time = None, exposure_h: float | None = None,
     ) -> dict[str, Any]:  # fmt: skip
-        """Return the fault trees of all functions; of one with cut sets and what matters."""
-        asked = {"effect": effect, "cut_sets": cut_sets, "order": order, "at": said(at),
+        """Return the fault trees of all functions, or one with its cut sets and importances."""
+        asked = {"effect": effect, "cut_sets": cut_sets, "order": order, "at": time_text(at),
                  "exposure_h": exposure_h}  # fmt: skip
         return self._get(f"{_of(robot)}/faulttrees", dict[str, Any], asked)
 
@@ -309,18 +472,18 @@ class Fleet(AlarmCalls):
         self, robot: str, query: str, want: str = "why", from_: Time = None, to: Time = None,
         steps: int = 0,
     ) -> dict[str, Any]:  # fmt: skip
-        """Return all answers of a goal to the robot's rules: ``answers``, ``proof``, ``failed``."""
+        """Return all answers of the robot's rules to a goal: ``answers``, ``proof``, ``failed``."""
         body = {"query": query, "want": want, **_span(from_, to), "steps": steps}
         return self._send("POST", f"{_of(robot)}/rules", dict[str, Any], body)
 
-    # The server itself, and what changes.
+    # The server itself, and its feed of changes.
 
     def follow(
         self, robots: Sequence[str] | None = None, kinds: Sequence[str] | None = None,
         live: Mapping[str, Sequence[str]] | None = None,
     ) -> Iterator[Change]:  # fmt: skip
-        """Yield changes as they come, a snapshot first (``feed.follow``); needs websockets."""
-        from amberbox.client.feed import follow
+        """Yield changes as they come, a snapshot first (``transport.follow``); needs websockets."""
+        from amberbox.client.transport import follow
 
         return follow(self.wire, robots, kinds, live)
 
@@ -329,7 +492,7 @@ class Fleet(AlarmCalls):
         return self._get("/audit", list[models.AuditRow], {**_span(from_, to), "limit": limit})
 
     def metrics(self) -> str:
-        """Return the server's own figures, in Prometheus' text format."""
+        """Return the metrics of the server in Prometheus' text format."""
         return self.wire.get("/metrics").body.decode()
 
     def _get(
@@ -346,4 +509,4 @@ def _of(robot: str) -> str:
 
 
 def _span(from_: Time, to: Time) -> dict[str, str]:
-    return {"from": said(from_), "to": said(to)}
+    return {"from": time_text(from_), "to": time_text(to)}

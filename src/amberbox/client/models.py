@@ -1,235 +1,107 @@
-"""What a server answers, typed. Times are RFC 3339 texts: ``times.time_ns`` makes them numbers.
+"""Typed answers of a server. Times are RFC 3339 texts; ``time_ns`` converts them.
 
-What a newer server says beyond this is left out.
+The types are those of ``core.api``, read so that client and server may differ in version: unknown
+fields are ignored, missing ones are empty, and a new word of an enumeration is plain text.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Mapping, Sequence
+from dataclasses import MISSING, Field, fields, is_dataclass
+from functools import cache
+from types import GenericAlias, UnionType
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Union, get_args, get_origin
+from typing import get_type_hints as type_hints
 
 import msgspec
+import numpy as np
 
-Value = bool | int | float | str | None
+from amberbox.core import api
+from amberbox.core.timestamps import format_time
+from amberbox.core.types import IntArray, Missing
 
+if TYPE_CHECKING:
+    from amberbox.core.api import *  # noqa: F403
 
-def _json_name(name: str) -> str:
-    return name.removesuffix("_")
-
-
-class Answer(msgspec.Struct, frozen=True, kw_only=True, rename=_json_name):
-    """A part of an answer; ``from_`` is ``from`` in JSON."""
-
-
-class Battery(Answer, frozen=True):
-    """Charge of the battery, as an output of its component says."""
-
-    output: str
-    value: float
+_EMPTY: Mapping[Any, Any] = {str: "", bool: False, int: 0, float: 0.0, tuple: ()}
 
 
-class OnMission(Answer, frozen=True):
-    """The mission that a robot is on."""
-
-    id: str
-    name: str
-    since: str | None = None
+class Answer(msgspec.Struct, frozen=True, kw_only=True, rename=api.json_name):
+    """The base of all answers; ``from_`` is ``from`` in JSON."""
 
 
-class Lead(Answer, frozen=True):
-    """The first answer of a robot's newest open diagnosis."""
-
-    id: str
-    faults: tuple[str, ...]
-    probability: float
-    at: str | None = None
-
-
-class RobotStatus(Answer, frozen=True):
-    """The one status of a robot, as the server makes it of everything that it knows.
-
-    ``level`` is ``unknown`` where nothing is known of now; then ``last_level`` is what it was at
-    ``as_of``. ``severity`` is what it can still do, ``text`` a sentence, ``reason`` what is worst.
-    The higher ``rank``, the worse.
-    """
-
-    level: str
-    last_level: str = "unknown"
-    severity: str = ""
-    text: str = ""
-    reason: str = ""
-    as_of: str | None = None
-    contact: str = ""
-    monitoring: str = ""
-    rank: int = 0
+@cache
+def struct_of(kind: Any) -> Any:
+    """Return a frozen msgspec type with the fields and properties of a type of ``core.api``."""
+    hints = type_hints(kind, include_extras=True)
+    members = [(field.name, *_member(hints[field.name], field)) for field in fields(kind)]
+    members.sort(key=len)  # required fields first, as Python requires
+    properties = {name: one for name, one in vars(kind).items() if isinstance(one, property)}
+    namespace = {"__doc__": kind.__doc__, **properties}
+    return msgspec.defstruct(
+        kind.__name__, members, bases=(Answer,), module=__name__, namespace=namespace, frozen=True
+    )
 
 
-class Card(Answer, frozen=True):
-    """A robot at a glance; ``level`` is ``unknown`` where nobody can know."""
-
-    robot: str
-    groups: tuple[str, ...] = ()
-    model: str = ""
-    disabled: bool = False
-    online: bool = False
-    last_seen: str | None = None
-    connected_since: str | None = None
-    backlog_rows: int = 0
-    backlog_bytes: int = 0
-    version: str = ""
-    config_hash: str = ""
-    level: str = "unknown"
-    last_level: str = ""
-    severity: str = ""
-    cause: str = ""
-    components: Mapping[str, int] = {}
-    alarms: int = 0
-    battery: Battery | None = None
-    mission: OnMission | None = None
-    diagnosis: Lead | None = None
-    alarms_over: int = 0
-    damaged_files: int = 0
-    damaged_new: int = 0
-    signing_key: str = ""
-    monitoring: str = ""
-    monitoring_delay_s: float = 0.0
-    status: RobotStatus | None = None
+def _member(hint: Any, field: Field[Any]) -> tuple[Any, ...]:
+    """Return type and, if an answer may lack it, default of a field."""
+    kind = _lenient(hint)
+    missing = next((one for one in get_args(hint)[1:] if isinstance(one, Missing)), None)
+    if field.default is not MISSING:
+        return kind, field.default
+    if missing is None and field.default_factory is MISSING:
+        return (kind,)
+    if get_origin(kind) is Mapping:
+        return kind, msgspec.field(default_factory=dict)
+    empty = _EMPTY.get(get_origin(kind) or kind)
+    return kind, empty if missing is None or missing.default is None else missing.default
 
 
-class Output(Answer, frozen=True):
-    """An output of a mode, and what is expected of it (empty: nothing)."""
-
-    name: str
-    value: Value = None
-    type: str = ""
-    expected: str = ""
-    severity: str = ""
-    description: str = ""
-    unit: str = ""
-
-
-class Condition(Answer, frozen=True):
-    """How a component or a mode is; ``age_s`` is how old the measurement is."""
-
-    level: str
-    state: str
-    reason: str = ""
-    blocked_by: tuple[str, ...] = ()
-    measured: str | None = None
-    since: str | None = None
-    age_s: float = 0.0
-    for_s: float = 0.0
+def _lenient(hint: Any) -> Any:
+    """Return the type that also accepts values of another version of the server."""
+    origin, inner = get_origin(hint), get_args(hint)
+    if is_dataclass(hint):
+        kind: Any = hint
+        return struct_of(kind)
+    if origin is Annotated:
+        return _lenient(inner[0])
+    if origin is Literal:
+        return str
+    if origin is Sequence:
+        return GenericAlias(tuple, (_lenient(inner[0]), ...))
+    if origin is Mapping:
+        return GenericAlias(Mapping, tuple(map(_lenient, inner)))
+    if origin in (Union, UnionType):
+        return Union[tuple(map(_lenient, inner))]  # noqa: UP007 - of any number of types
+    return hint
 
 
-class Mode(Answer, frozen=True):
-    """A mode of a component."""
+if not TYPE_CHECKING:
+    kinds = [one for one in vars(api).values() if is_dataclass(one) and one is not Missing]
+    globals().update({kind.__name__: struct_of(kind) for kind in kinds})
 
-    mode: str
-    name: str
-    condition: Condition
-    outputs: tuple[Output, ...] = ()
-
-
-class Need(Answer, frozen=True):
-    """What a component needs, and how that is."""
-
-    name: str
-    component: str
-    level: str
+Time = int | str | None
+"""Nanoseconds since the Unix epoch, or a text: RFC 3339, an epoch, ``now-10m``, ``-10m``."""
 
 
-class Component(Answer, frozen=True):
-    """A component in the tree; ``condition`` is None where nothing was said of it."""
-
-    component: str
-    name: str
-    depth: int = 0
-    description: str = ""
-    part_of: str = ""
-    needs: tuple[Need, ...] = ()
-    needs_rule: str = ""
-    recovery_actions: tuple[str, ...] = ()
-    condition: Condition | None = None
-    modes: tuple[Mode, ...] = ()
+def time_ns(text: str) -> int:
+    """Return a time that the server wrote, in nanoseconds since the Unix epoch."""
+    return int(times_ns([text])[0])
 
 
-class StatusTree(Answer, frozen=True):
-    """All components of a robot, and its one status (None: an older server).
-
-    ``silence`` says why nothing counts, ``note`` what is missing.
-    """
-
-    robot: str
-    online: bool
-    silence: str = ""
-    note: str = ""
-    clock_offset_s: float | None = None
-    components: tuple[Component, ...] = ()
-    status: RobotStatus | None = None
+def times_ns(texts: list[str]) -> IntArray:
+    """Return times that the server wrote, in nanoseconds since the Unix epoch."""
+    plain = np.array([text.removesuffix("Z") for text in texts], "datetime64[ns]")
+    return plain.astype(np.int64)
 
 
-class Stretch(Answer, frozen=True):
-    """From when to when something was so."""
-
-    from_: str
-    to: str
-    level: str
-    state: str
-    reason: str = ""
-    changes: int = 0
+def maybe_ns(text: str | None) -> int | None:
+    """Return a time in nanoseconds since the Unix epoch; None for None."""
+    return None if text is None else time_ns(text)
 
 
-class Lane(Answer, frozen=True):
-    """What was of a component, or of a mode of it."""
-
-    component: str
-    mode: str
-    stretches: tuple[Stretch, ...]
-
-
-class Timeline(Answer, frozen=True):
-    """The lanes of a window; not ``complete`` where there was more than can be shown."""
-
-    from_: str
-    to: str
-    lanes: tuple[Lane, ...]
-    complete: bool = True
-
-
-class Event(Answer, frozen=True):
-    """An event; ``at`` by the robot's clock, ``server_at`` by the server's."""
-
-    at: str | None
-    kind: str
-    text: str
-    server_at: str | None = None
-    source: str = ""
-    details: str = ""
-    aside: str = ""
-
-
-class DiagnosisLine(Answer, frozen=True):
-    """A diagnosis in a list; ``faults`` and ``probability`` are those of the leading answer."""
-
-    id: str
-    state: str
-    first: str
-    last: str
-    revisions: int
-    faults: tuple[str, ...] = ()
-    probability: float | None = None
-    config_hash: str = ""
-
-
-class AuditRow(Answer, frozen=True):
-    """A row of the audit log."""
-
-    seq: int
-    time: str
-    principal: str
-    address: str
-    action: str
-    object: str
-    result: str
-    details: Mapping[str, Any] = {}
-    hash: str = ""
+def time_text(moment: Time) -> str:
+    """Return a time as a parameter of a request: empty for None, a text as it is."""
+    if moment is None:
+        return ""
+    return moment if isinstance(moment, str) else format_time(moment)

@@ -1,29 +1,26 @@
-"""The record of a robot as a server has it: the same questions as on the robot."""
+"""The record of a robot on a server, with the interface of a local ``Record``."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, NoReturn
+from pathlib import Path
+from typing import TYPE_CHECKING, NoReturn
 
-import numpy as np
-
-from amberbox.blackbox.journal import reserved
-from amberbox.blackbox.query.clockbook import ClockBook
 from amberbox.blackbox.query.overview import ItemInfo
-from amberbox.blackbox.query.record import By, Record, Time
+from amberbox.blackbox.query.record import Record, Time, event_table
+from amberbox.blackbox.query.rows import By, check_order, query_missions
 from amberbox.blackbox.query.table import Table
-from amberbox.client import tables
-from amberbox.client.times import maybe_ns, time_ns
-from amberbox.core.config import did_you_mean
-from amberbox.core.errors import UsageError
-from amberbox.core.names import identifier
-from amberbox.core.types import Column, Gap, ItemSchema
+from amberbox.blackbox.store.clocks import ClockBook
+from amberbox.client import table_reader
+from amberbox.client.models import maybe_ns, time_ns
+from amberbox.core.errors import UsageError, did_you_mean
+from amberbox.core.types import Gap, ItemSchema
 
 if TYPE_CHECKING:
-    from amberbox.blackbox.missions import Mission
-    from amberbox.client.data_models import Item
+    from amberbox.blackbox.retention.missions import RecordedMission
     from amberbox.client.fleet import Fleet
+    from amberbox.client.models import Item
 
 _SQL_HINT = (
     "amberbox export URL -o robot.mcap, then amberbox sql robot.mcap; on the server itself: "
@@ -35,28 +32,31 @@ DRAWN_ROWS = 200_000
 """Rows that are drawn as they are; of more, the server thins them out."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class RemoteRecord(Record):
-    """A robot's record on a server; ``path`` is only its name here."""
+    """A robot's record on a server; ``path`` is only its name."""
 
+    path: Path
     fleet: Fleet = field(repr=False)
     robot: str = ""
-
-    def __enter__(self) -> RemoteRecord:
-        return self
+    notes: tuple[str, ...] = ()
 
     def close(self) -> None:
-        """Let the connection go."""
+        """Close the connection."""
         self.fleet.close()
 
     def items(self) -> list[ItemInfo]:
-        """Return what the server has rows of; stamps and sizes are not known there."""
+        """Return the items that the server has rows of; without stamps and sizes."""
         return [_info(item) for item in self.fleet.items(self.robot)]
+
+    def has_item(self, item: str) -> bool:
+        """Return whether the server has rows of an item."""
+        return any(one.name == item for one in self.fleet.items(self.robot))
 
     def variables(self, item: str) -> ItemSchema:
         """Return the columns of an item."""
         found = self.fleet.item(self.robot, item)
-        columns = tuple(_column(one) for one in found.columns)
+        columns = tuple(table_reader.column_of(one) for one in found.columns)
         return ItemSchema(found.type, columns, {}, found.stamp)
 
     def query(
@@ -68,26 +68,24 @@ class RemoteRecord(Record):
         by: By = "received",
         points: int | None = None,
         *,
-        missions: Sequence[Mission] | None = None,
+        missions: Sequence[RecordedMission] | None = None,
     ) -> Table:
-        """Return rows as on the robot (see ``Record.query``)."""
+        """Return rows as a local record does (see ``Record.query``)."""
         if missions is not None:
-            from amberbox.blackbox.missions.windows import query_missions
-
             return query_missions(
                 missions, lambda start, end: self.query(item, variables, start, end, by, points)
             )
-        _check(by, points)
+        check_order(by, points)
         pages = [*self.fleet.pages(self.robot, item, variables, from_, to, by, points)]
         if pages[0].kind == "envelope":
             known = {column.name: column for column in self.variables(item).columns}
-            return tables.as_rows(pages[0].table, known)
-        return tables.joined([page.table for page in pages])
+            return table_reader.as_rows(pages[0].table, known)
+        return table_reader.concatenate([page.table for page in pages])
 
     def drawn(
         self, item: str, variables: Sequence[str], span: tuple[Time, Time], by: By, points: int
     ) -> tuple[Table, bool]:
-        """Return what a plot shows; all rows of a short range, of a long one the thinned ones."""
+        """Return rows for a plot, and whether they are all; of a long range they are reduced."""
         pages = self.fleet.pages(self.robot, item, variables, *span, by, None, DRAWN_ROWS)
         first = next(pages)
         if not first.next:
@@ -95,11 +93,11 @@ class RemoteRecord(Record):
         return self.query(item, variables, *span, by, points), False
 
     def last_ns(self) -> int | None:
-        """Return when the newest row that the server has was received."""
+        """Return the receive time (ns) of the newest row on the server, None without rows."""
         return max((info.last_ns for info in self.items()), default=None)
 
     def gaps(self, item: str | None = None, from_: Time = None, to: Time = None) -> list[Gap]:
-        """Return what is missing in ``[from_, to)`` and why, also what never came to the server."""
+        """Return the gaps in ``[from_, to)`` with reasons, including data not copied yet."""
         return [
             Gap(
                 g.writer,
@@ -116,14 +114,14 @@ class RemoteRecord(Record):
 
     def missions(
         self, name: str | None = None, *, failed: bool = False, last: int | None = None
-    ) -> list[Mission]:
-        """Return missions in order of their start: those of the robot and of the server."""
-        from amberbox.blackbox.missions.mission import Mission, Moment, choose
+    ) -> list[RecordedMission]:
+        """Return missions in order of their start: those of the robot and those of the server."""
+        from amberbox.blackbox.retention.missions import MissionInstant, RecordedMission, choose
 
         found = [
-            Mission(
-                m.id, m.name, Moment(time_ns(m.from_)),
-                None if m.to is None else Moment(time_ns(m.to)),
+            RecordedMission(
+                m.id, m.name, MissionInstant(time_ns(m.from_)),
+                None if m.to is None else MissionInstant(time_ns(m.to)),
                 m.outcome, m.failed, m.who, m.parameters,
             )
             for m in self.fleet.missions(self.robot)
@@ -132,7 +130,7 @@ class RemoteRecord(Record):
         return choose(found, name, failed=failed, last=last)
 
     def incident_windows(self, incident: str) -> list[tuple[int, int]]:
-        """Return the window of an incident; ``last`` is the newest one."""
+        """Return the window (ns) of an incident; ``last`` is the newest one."""
         known = {one.id: one for one in self.fleet.incidents(self.robot)}
         chosen = next(iter(known.values()), None) if incident == "last" else known.get(incident)
         if chosen is None:
@@ -141,32 +139,16 @@ class RemoteRecord(Record):
         return [(time_ns(chosen.from_), time_ns(chosen.to))]
 
     def clock(self) -> ClockBook:
-        """Return nothing: the server has put the times right already."""
+        """Return an empty clock book: the server has already corrected the times."""
         return ClockBook()
 
     def sql(self, statement: str) -> NoReturn:
-        """Refuse: SQL of somebody else's is not run on a server."""
+        """Raise UsageError: a server runs no SQL of its clients."""
         raise UsageError("a server is not asked in SQL", _SQL_HINT)
 
     def events(self, from_: Time = None, to: Time = None) -> Table:
-        """Return what happened to the box."""
-        name = identifier(reserved.EVENT)
-        if all(item.name != name for item in self.fleet.items(self.robot)):
-            stamp = Column("timestamp", "timestamp", "time")
-            return Table("events", (stamp,), {"timestamp": np.empty(0, np.int64)})
-        return self.query(name, None, from_, to)
-
-    def _ask(self, question: Callable[..., Any]) -> NoReturn:
-        raise UsageError(
-            "this cannot be asked of a server", "amberbox export downloads what is recorded"
-        )
-
-
-def _check(by: str, points: int | None) -> None:
-    if by not in ("received", "timestamp"):
-        raise UsageError(f"rows are ordered by received or timestamp, not by {by!r}")
-    if points is not None and points < 1:
-        raise UsageError("points must be 1 or more")
+        """Return the events of a range, as ``Record.events`` does."""
+        return event_table(self, from_, to)
 
 
 def _info(item: Item) -> ItemInfo:
@@ -174,8 +156,3 @@ def _info(item: Item) -> ItemInfo:
     return ItemInfo(
         item.name, item.source, item.topic, item.type, item.rows, first, last, item.rate_hz, None, 0
     )
-
-
-def _column(said: Any) -> Column:
-    labels = {int(number): text for number, text in said.labels.items()}
-    return Column(said.name, said.path, said.type, said.unit, labels)

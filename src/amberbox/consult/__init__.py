@@ -1,1 +1,1 @@
-"""What is known of a robot, asked of its folder and its record: faults, rules, fault trees."""
+"""Diagnosis of a robot from its folder and its record: knowledge, context, lookups for rules."""

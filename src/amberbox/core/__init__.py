@@ -1,1 +1,1 @@
-"""The words that all parts share: types, clock, configuration, expressions, plugin lookup."""
+"""What all parts share: types, errors, clock, configuration, expressions, contracts of plugins."""

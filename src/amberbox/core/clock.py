@@ -1,4 +1,4 @@
-"""Clocks: the machine's own, and the one a run of the recorder stamps with."""
+"""Clocks: wall and boot time of the machine, and the log time of a recorder's run."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ NS = 1_000_000_000
 
 
 class Clock(Protocol):
-    """What the recorder asks of a clock; ``amberbox.testing`` has one that is moved by hand."""
+    """The clock interface of the recorder; ``amberbox.testing`` has one that tests move by hand."""
 
     def wall_ns(self) -> int:
-        """Nanoseconds since the Unix epoch; may step."""
+        """Return nanoseconds since the Unix epoch; may step."""
 
     def boot_ns(self) -> int:
-        """Nanoseconds since boot, suspend included; never steps."""
+        """Return nanoseconds since boot, suspend included; never steps."""
 
     def boot_id(self) -> str:
-        """Identify the boot that ``boot_ns`` counts from."""
+        """Return the id of the boot that ``boot_ns`` counts from."""
 
     def synchronised(self) -> bool | None:
-        """Tell whether wall time is disciplined by a reference; None if nobody can know."""
+        """Return whether wall time is disciplined by a reference; None if not known."""
 
 
 class SystemClock:
@@ -48,10 +48,26 @@ class SystemClock:
         return None if state < 0 else state != time_error
 
 
-class RunClock:
-    """Log time: wall time when the epoch began plus boot time since; it never steps.
+class LogClock(Protocol):
+    """The source of log time for records: a RunClock, or the log time of another recorder."""
 
-    ``new_epoch`` starts again from wall time, after a step that is too large to live with.
+    def now_ns(self) -> int:
+        """Log time now."""
+
+    def boot_ns(self, log_ns: int) -> int | None:
+        """Return nanoseconds since boot at a log time; None if that does not count from boot."""
+
+    def offset_ns(self) -> int:
+        """Wall minus log time."""
+
+    def synchronised(self) -> bool | None:
+        """Return whether the wall clock is disciplined; None if not known."""
+
+
+class RunClock:
+    """Log time in ns: wall time when the epoch began plus boot time since; it never steps.
+
+    ``new_epoch`` starts again from wall time, after a step that is too large to tolerate.
     """
 
     def __init__(self, clock: Clock) -> None:
@@ -59,11 +75,11 @@ class RunClock:
         self.new_epoch()
 
     def new_epoch(self) -> None:
-        """Take wall time as it is now for the start of log time."""
+        """Start log time again from the present wall time."""
         self._base_ns = self.clock.wall_ns() - self.clock.boot_ns()
 
     def now_ns(self) -> int:
-        """Log time now, nanoseconds."""
+        """Return log time now, nanoseconds."""
         return self._base_ns + self.clock.boot_ns()
 
     def boot_ns(self, log_ns: int) -> int:
@@ -71,9 +87,9 @@ class RunClock:
         return log_ns - self._base_ns
 
     def offset_ns(self) -> int:
-        """Wall minus log time: 0 until the wall clock is stepped or slewed."""
+        """Return wall minus log time, nanoseconds: 0 until the wall clock is stepped or slewed."""
         return self.clock.wall_ns() - self.now_ns()
 
     def synchronised(self) -> bool | None:
-        """Tell whether the wall clock is disciplined; None if nobody can know."""
+        """Return whether the wall clock is disciplined; None if not known."""
         return self.clock.synchronised()

@@ -1,41 +1,124 @@
-"""Configuration: YAML files become frozen dataclasses, and all that is wrong is said at once.
+"""Configuration: YAML files become frozen dataclasses; all errors are reported at once.
 
-A configuration class is a frozen dataclass whose fields are declared with
-``core.options.option``. It may define ``check(self)`` that yields what is wrong with the values
-together: a sentence, or ``(key, sentence)`` to name the line of that key, or these and a hint. A
-type with a ``from_text`` class method (such as ``Expression``) is built from the text as written.
+A configuration class is a frozen dataclass whose fields are declared with ``core.options.option``.
+It may define ``check(self)`` that yields problems of the values in combination: a sentence, or
+``(key, sentence)`` to name the line of that key, or these and a hint. A type with a ``from_text``
+class method (such as ``Expression``) is built from the text as written.
+
+``check`` needs all values. Those that could not be read are replaced by plausible values, one set
+after the other; only problems found with every set are certain, and are reported.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import math
 import re
 import types
 import typing
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, TypeVar, Union, get_args, get_origin
+from typing import Any, Literal, TypeAlias, TypeVar, Union, get_args, get_origin
 
-from amberbox.core.errors import AmberboxError, ConfigurationError, Problem
-from amberbox.core.fieldtypes import field_types
-from amberbox.core.nodes import Node, load_yaml, parse_yaml, scalar
-from amberbox.core.standins import Finding, Unread, certain_findings, findings, stand_ins
+from amberbox.core.errors import (
+    AmberboxError,
+    ConfigurationError,
+    Problem,
+    did_you_mean,
+    nearest_word,
+)
 from amberbox.core.units import in_unit, known_units
+from amberbox.core.yaml_nodes import Node, scalar
 
-__all__ = ["Node", "build", "did_you_mean", "field_keys", "load_yaml", "parse_yaml", "refuse"]
+_known: dict[type[Any], Mapping[str, Any]] = {}
+
+
+def field_types(cls: type[Any]) -> Mapping[str, Any]:
+    """Return the types of a dataclass' fields by name."""
+    found = _known.get(cls)
+    if found is None:
+        found = _known[cls] = typing.get_type_hints(cls)
+    return found
+
+
+# sentence; or key and sentence; or these and a hint
+Finding: TypeAlias = "str | tuple[str, str] | tuple[str, str, str]"
+
+_BY_TYPE: Mapping[Any, tuple[Any, ...]] = {
+    str: ("", "x"),
+    int: (0, 1, -(10**18), 10**18),
+    float: (0.0, 1.0, -math.inf, math.inf),
+    bool: (False, True),
+    types.NoneType: (None,),
+}
+
+
+@dataclass(frozen=True)
+class Unread:
+    """In place of a value that could not be read; ``good`` are the entries of a list that could."""
+
+    good: tuple[Any, ...] = ()
+
+
+def check_findings(built: Any) -> Iterator[Finding]:
+    """Run the check of an instance, if its class has one."""
+    yield from getattr(built, "check", tuple)()
+
+
+def certain_findings(
+    cls: type[Any], values: Mapping[str, Any], unread: Mapping[str, Sequence[Any]]
+) -> list[Finding]:
+    """Return the problems of ``values`` that remain with every stand-in of an ``unread`` field."""
+    count = max(map(len, unread.values()), default=1)
+    sets = [{name: some[n % len(some)] for name, some in unread.items()} for n in range(count)]
+    first, *others = [_found(cls, {**values, **some}) for some in sets]
+    return [f for f in first if _key(f) not in unread and all(f in found for found in others)]
+
+
+def _key(finding: Finding) -> str:
+    return "" if isinstance(finding, str) else finding[0]
+
+
+def _found(cls: type[Any], values: Mapping[str, Any]) -> list[Finding]:
+    """Return the findings up to the first exception that a stand-in causes."""
+    found: list[Finding] = []
+    try:
+        for finding in check_findings(cls(**values)):
+            found.append(finding)  # what came before an exception counts
+    except Exception:  # a stand-in may be of any wrong kind
+        return found
+    return found
+
+
+def stand_ins(field: dataclasses.Field[Any], kind: Any) -> tuple[Any, ...]:
+    """Return values that a field might have had: its default, and others of its type."""
+    default = () if field.default is dataclasses.MISSING else (field.default,)
+    return (*default, *_of_type(kind))
+
+
+def _of_type(kind: Any) -> tuple[Any, ...]:
+    origin = get_origin(kind) or kind
+    if origin in (Union, types.UnionType):
+        return tuple(value for member in get_args(kind) for value in _of_type(member))
+    if origin is Literal:
+        return get_args(kind)
+    if origin in (Sequence, tuple, list):
+        return ((), *((value,) for value in _of_type((*get_args(kind), Any)[0])))
+    if origin in (Mapping, dict):
+        return ({},)
+    return _BY_TYPE.get(origin, (object(),))
+
 
 T = TypeVar("T")
+# Returns a note for a known but unneeded key of older files, by its path
+# (``ros.topics.metadata``), or None.
 Legacy = Callable[[str], "str | None"]
-"""Answers with a note for a key that older files have and we do not need, by its path
-(``ros.topics.metadata``), or None if it does not know the key."""
 
+# single keys that the paper's format wraps around entries of a list
 WRAPPERS = frozenset(
     {"topic", "element", "listener", "interface_specification", "mapping", "output"}
 )
-"""Single keys that the paper's format wraps around the entries of a list."""
 
 _FAILED: Any = Unread()
 _PERCENT = re.compile(r"(\d+\.?\d*|\.\d+)\s*%")
@@ -58,22 +141,10 @@ def build(
     return None if _failed(built) else typing.cast(T, built)
 
 
-def refuse(problems: Sequence[Problem]) -> None:
+def raise_errors(problems: Sequence[Problem]) -> None:
     """Raise ConfigurationError if there is an error among the problems."""
     if any(problem.is_error for problem in problems):
         raise ConfigurationError(problems)
-
-
-def did_you_mean(word: str, known: Collection[str]) -> str:
-    """Return ``; did you mean 'x'?`` for the nearest other word that is known, or nothing."""
-    near = _nearest(word, known)
-    return f"; did you mean '{near}'?" if near is not None else ""
-
-
-def _nearest(word: str, known: Collection[str]) -> str | None:
-    lower = {name.lower(): name for name in known if name != word}
-    near = difflib.get_close_matches(word.lower(), lower, n=1, cutoff=0.6)
-    return lower[near[0]] if near else None
 
 
 def field_keys(field: dataclasses.Field[Any]) -> tuple[str, ...]:
@@ -87,20 +158,20 @@ def _failed(value: Any) -> bool:
 
 @dataclass(frozen=True)
 class _Context:
-    """What goes along down the tree."""
+    """The state that is passed down the tree while it is read."""
 
     problems: list[Problem]
     legacy: Legacy
 
     def fail(self, node: Node, where: str, what: str, hint: str = "") -> Any:
-        """Note an error and return the mark of failure."""
+        """Report an error and return the marker of failure."""
         self.problems.append(node.problem(where or "file", what, hint))
         return _FAILED
 
 
 @dataclass(frozen=True)
 class _Marks:
-    """What ``option`` says about a value, as far as reading it needs to know."""
+    """The metadata of ``option`` that reading a value needs."""
 
     unit: str = ""
     secret: bool = False
@@ -109,7 +180,7 @@ class _Marks:
     """What a union expects as a whole, while its members are tried."""
 
     def show(self, node: Node) -> str:
-        """Describe a wrong value without giving a secret away."""
+        """Return a wrong value as text for a message; secrets are masked."""
         is_word = node.mapping is None and node.items is None and node.value is not None
         return f"{node.kind} '{node.text}'" if is_word and not self.secret else node.kind
 
@@ -121,25 +192,24 @@ def _dataclass(ctx: _Context, cls: type[Any], node: Node, where: str) -> Any:
     fields = [field for field in dataclasses.fields(cls) if field.init]
     kinds = field_types(cls)
     known = [key for field in fields for key in field_keys(field)]
-    unknown = _unknown_keys(ctx, known, entries, where)
+    unknown = [k for k, value in entries.items() if not _known_key(ctx, k, value, known, where)]
     values: dict[str, Any] = {}
     for field in fields:
         value = _field(ctx, field, kinds[field.name], (node, entries), where)
         values |= {} if value is dataclasses.MISSING else {field.name: value}
     if not unknown and not any(map(_failed, values.values())):
-        return _instance(ctx, cls, values, node, where)
-    misspelt = {_nearest(key, known) for key in unknown}
-    _tell(ctx, _certain(cls, values, kinds, misspelt), node, where)
-    return _FAILED
-
-
-def _certain(
-    cls: type[Any],
-    values: Mapping[str, Any],
-    kinds: Mapping[str, Any],
-    misspelt: Collection[str | None],
-) -> Sequence[Finding]:
-    """Judge what could be read; a value under a misspelt key is there, but not known."""
+        # Make the instance and run the class's own check on the values together.
+        try:
+            built = cls(**values)
+        except AmberboxError as error:
+            return ctx.fail(node, where, error.what, error.hint)
+        except ValueError as error:
+            return ctx.fail(node, where, str(error))
+        found = list(check_findings(built))
+        _report(ctx, found, node, where)
+        return built if not found else _FAILED
+    misspelt = {nearest_word(key, known) for key in unknown}
+    # Judge what could be read; a value under a misspelt key is there, but not known.
     read = {name: value for name, value in values.items() if not _failed(value)}
     read |= {name: v.good for name, v in values.items() if _failed(v) and v.good}
     unread = {
@@ -148,21 +218,15 @@ def _certain(
         if field.name not in read
         and (field.name in values or not {*field_keys(field)}.isdisjoint(misspelt))
     }
-    return certain_findings(cls, read, unread)
-
-
-def _unknown_keys(
-    ctx: _Context, known: Sequence[str], entries: Mapping[str, Node], where: str
-) -> list[str]:
-    """Return the keys that nobody knows, each of which is an error."""
-    return [k for k, value in entries.items() if not _known_key(ctx, k, value, known, where)]
+    _report(ctx, certain_findings(cls, read, unread), node, where)
+    return _FAILED
 
 
 def _known_key(ctx: _Context, key: str, value: Node, known: Sequence[str], where: str) -> bool:
     if key in known:
         return True
     path = _join(where, key)
-    note = ctx.legacy(_without_indices(path))
+    note = ctx.legacy(".".join(part.split("[")[0] for part in path.split(".")))
     if note is not None:
         ctx.problems.append(value.problem(path, note, is_error=False))
         return True
@@ -202,20 +266,7 @@ def _field(
     return ctx.fail(node, where, f"the key '{field.name}' is missing", doc)
 
 
-def _instance(ctx: _Context, cls: type[Any], values: dict[str, Any], node: Node, where: str) -> Any:
-    """Make the instance and run the class's own check on the values together."""
-    try:
-        built = cls(**values)
-    except AmberboxError as error:
-        return ctx.fail(node, where, error.what, error.hint)
-    except ValueError as error:
-        return ctx.fail(node, where, str(error))
-    found = list(findings(built))
-    _tell(ctx, found, node, where)
-    return built if not found else _FAILED
-
-
-def _tell(ctx: _Context, found: Sequence[Finding], node: Node, where: str) -> None:
+def _report(ctx: _Context, found: Sequence[Finding], node: Node, where: str) -> None:
     for finding in found:
         key, what, *hint = ("", finding) if isinstance(finding, str) else finding
         place = (node.mapping or {}).get(key, node)
@@ -236,7 +287,15 @@ def _value(ctx: _Context, kind: Any, node: Node, where: str, marks: _Marks) -> A
         return _sequence(ctx, (*get_args(kind), Any)[0], node, where, marks)
     if origin in (Mapping, dict):
         return _mapping(ctx, (*get_args(kind), Any, Any)[1], node, where, marks)
-    return _scalar(ctx, kind, node, where, marks)
+    what = f"expected {marks.expected or type_text(kind)}, got {marks.show(node)}"
+    if node.mapping is not None or node.items is not None or node.value is None:
+        return ctx.fail(node, where, what, marks.doc)
+    try:
+        return _from_scalar(kind, node, marks.unit)
+    except AmberboxError as error:
+        return ctx.fail(node, where, error.what, error.hint)
+    except ValueError as error:
+        return ctx.fail(node, where, what + _reason(error, kind, node, marks), marks.doc)
 
 
 def _union(ctx: _Context, kind: Any, node: Node, where: str, marks: _Marks) -> Any:
@@ -250,7 +309,7 @@ def _union(ctx: _Context, kind: Any, node: Node, where: str, marks: _Marks) -> A
     if len(members) == 1:
         return _value(ctx, members[0], node, where, marks)
     names = " or ".join(type_text(member) for member in members)
-    alike: list[list[Problem]] = []
+    same_shape: list[list[Problem]] = []
     for member in sorted(members, key=lambda member: not _is_exactly(member, node)):
         attempt = _Context([], ctx.legacy)
         is_word = _shape(member) is str
@@ -261,16 +320,13 @@ def _union(ctx: _Context, kind: Any, node: Node, where: str, marks: _Marks) -> A
             ctx.problems.extend(attempt.problems)
             return value
         if _shape(member) is _shape_of(node):
-            alike.append(attempt.problems)
-    if not alike:
+            same_shape.append(attempt.problems)
+    if not same_shape:
         return ctx.fail(node, where, f"expected {names}, got {marks.show(node)}", marks.doc)
-    ctx.problems.extend(max(alike, key=_said))
+    ctx.problems.extend(
+        max(same_shape, key=lambda found: max((len(p.what) for p in found), default=0))
+    )
     return _FAILED
-
-
-def _said(problems: Iterable[Problem]) -> int:
-    """Return how much problems say, to choose the reading that explains most."""
-    return max((len(problem.what) for problem in problems), default=0)
 
 
 def _shape(kind: Any) -> type:
@@ -335,20 +391,8 @@ def _mapping(ctx: _Context, kind: Any, node: Node, where: str, marks: _Marks) ->
     return _FAILED if any(map(_failed, values.values())) else values
 
 
-def _scalar(ctx: _Context, kind: Any, node: Node, where: str, marks: _Marks) -> Any:
-    what = f"expected {marks.expected or type_text(kind)}, got {marks.show(node)}"
-    if node.mapping is not None or node.items is not None or node.value is None:
-        return ctx.fail(node, where, what, marks.doc)
-    try:
-        return _from_scalar(kind, node, marks.unit)
-    except AmberboxError as error:
-        return ctx.fail(node, where, error.what, error.hint)
-    except ValueError as error:
-        return ctx.fail(node, where, what + _reason(error, kind, node, marks), marks.doc)
-
-
 def _reason(error: ValueError, kind: Any, node: Node, marks: _Marks) -> str:
-    """Say why a word is no value of a type; of a share in percent, which number it is."""
+    """Describe why a word is no value of a type, with the number that a percentage means."""
     is_plain = kind is float and not marks.unit and not marks.secret
     percent = _PERCENT.fullmatch(node.text) if is_plain else None
     if percent is not None:
@@ -365,17 +409,13 @@ def _from_scalar(kind: Any, node: Node, unit: str) -> Any:
     if kind is Path:
         return Path(node.text)
     if kind is bool:
-        return _to_bool(node)
+        value = node.value if isinstance(node.value, bool) else _YES_NO.get(node.text.lower())
+        if value is None:
+            raise ValueError
+        return value
     if kind in (int, float):
         return _to_number(kind, node, unit)
     raise TypeError(f"configuration classes cannot hold {kind}")
-
-
-def _to_bool(node: Node) -> bool:
-    value = node.value if isinstance(node.value, bool) else _YES_NO.get(node.text.lower())
-    if value is None:
-        raise ValueError
-    return value
 
 
 def _to_number(kind: type[int] | type[float], node: Node, unit: str) -> int | float:
@@ -409,7 +449,7 @@ def _lossless(kind: type[int] | type[float], value: int | float) -> int | float:
 
 
 def type_text(kind: Any) -> str:
-    """Name a type for people: ``text``, ``a number``, ``a list of text``."""
+    """Return the name of a type for messages: ``text``, ``a number``, ``a list of text``."""
     names = {str: "text", int: "a whole number", float: "a number", bool: "yes or no"}
     names |= {Path: "a path", Any: "anything", types.NoneType: "nothing"}
     if kind in names:
@@ -432,7 +472,3 @@ def _has_text_form(kind: Any) -> bool:
 
 def _join(where: str, key: str) -> str:
     return f"{where}.{key}" if where else key
-
-
-def _without_indices(path: str) -> str:
-    return ".".join(part.split("[")[0] for part in path.split("."))

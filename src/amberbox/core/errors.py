@@ -1,8 +1,9 @@
-"""Errors that speak twice: what happened, and the next step."""
+"""Errors with what happened and a hint for the next step; suggestions for misspelt words."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import difflib
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 
@@ -53,3 +54,15 @@ class ConfigurationError(UsageError):
     def __init__(self, problems: Sequence[Problem]) -> None:
         self.problems = tuple(problems)
         super().__init__("\n".join(str(problem) for problem in problems))
+
+
+def did_you_mean(word: str, known: Collection[str]) -> str:
+    """Return ``; did you mean 'x'?`` for the nearest other word that is known, or nothing."""
+    near = nearest_word(word, known)
+    return f"; did you mean '{near}'?" if near is not None else ""
+
+
+def nearest_word(word: str, known: Collection[str]) -> str | None:
+    lower = {name.lower(): name for name in known if name != word}
+    near = difflib.get_close_matches(word.lower(), lower, n=1, cutoff=0.6)
+    return lower[near[0]] if near else None

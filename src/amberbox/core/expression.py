@@ -1,30 +1,48 @@
-"""The one expression language: conditions and numbers over what the robot's variables say.
+"""The one expression language: conditions and numbers over the robot's variables.
 
-Triggers, monitors, FMEA conditions and gateways use it; ``docs/expressions.md`` describes it.
+Triggers, monitors, FMEA conditions and gateways use it (``docs/reference/expressions.md``).
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, TypeAlias
+from itertools import pairwise
+from typing import Any, Final, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from amberbox.core.config import did_you_mean
-from amberbox.core.errors import UsageError
-from amberbox.core.expression_eval import Instants, Series, evaluate, rows_of, series_of
-from amberbox.core.expression_instant import At, Look, Track, at_instant
-from amberbox.core.expression_parse import parse_tree
-from amberbox.core.expression_tree import (
-    Address,
-    Age,
-    Fault,
+from amberbox.core.errors import UsageError, did_you_mean
+from amberbox.core.expressions.evaluation import (
+    At,
+    Instants,
+    InstantView,
+    Series,
+    Track,
+    at_instant,
+    evaluate,
+    rows_of,
+    series_of,
+)
+from amberbox.core.expressions.parser import parse_tree
+from amberbox.core.expressions.tree import (
+    AddressNode,
+    AgeNode,
+    ArithmeticNode,
+    CallNode,
+    ComparisonNode,
+    ConstantNode,
+    ExpressionFault,
+    ExpressionNode,
+    HeldNode,
     Kind,
-    Tree,
+    LogicNode,
+    NegativeNode,
+    NotNode,
+    WindowNode,
     current_addresses,
     delays_ns,
     history_ns,
@@ -34,7 +52,7 @@ from amberbox.core.expression_tree import (
     walk,
     with_addresses,
 )
-from amberbox.core.expression_values import KIND_OF_DTYPE, Values
+from amberbox.core.expressions.values import KIND_OF_DTYPE, Values
 from amberbox.core.samples import Samples
 from amberbox.core.types import IntArray
 
@@ -44,7 +62,7 @@ Value: TypeAlias = bool | int | float | str | None
 class ExpressionError(UsageError):
     """An expression that cannot be read or evaluated; ``column`` counts from 1."""
 
-    def __init__(self, text: str, fault: Fault) -> None:
+    def __init__(self, text: str, fault: ExpressionFault) -> None:
         line_start = text.rfind("\n", 0, fault.at) + 1
         line = text[line_start:].split("\n")[0]
         self.column = fault.at + 1
@@ -57,7 +75,7 @@ class Expression:
     """An expression that has been read; ``text`` is what was written."""
 
     text: str
-    tree: Tree = field(repr=False, hash=False)
+    tree: ExpressionNode = field(repr=False, hash=False)
 
     @classmethod
     def from_text(cls, text: str) -> Expression:
@@ -73,37 +91,37 @@ class Expression:
         return tuple(address.name for address in self._reads)
 
     @cached_property
-    def _reads(self) -> tuple[Address, ...]:
-        found = (part for part in walk(self.tree) if isinstance(part, Address))
+    def _reads(self) -> tuple[AddressNode, ...]:
+        found = (part for part in walk(self.tree) if isinstance(part, AddressNode))
         return tuple({address.name: address for address in found}.values())
 
     @property
     def kind(self) -> Kind:
-        """Tell what it gives: ``any`` if only the data can tell."""
+        """Return the kind of its value: ``any`` if it depends on the data."""
         return kind_of(self.tree)
 
     @cached_property
     def needs_history(self) -> bool:
-        """Tell whether it looks back in time (``for``, ``over``, ``age``)."""
+        """Return whether it looks back in time (``for``, ``over``, ``age``)."""
         return needs_history(self.tree)
 
     @cached_property
     def history_ns(self) -> int:
-        """How far it looks back: series must reach back this far, and one sample further."""
+        """Return how far it looks back, nanoseconds: series need this and one sample more."""
         return history_ns(self.tree)
 
     @property
     def shortest_ns(self) -> int | None:
-        """The shortest time that it looks back by ``over`` or ``for``; None without."""
+        """Return the shortest ``over`` or ``for`` in it, nanoseconds; None without."""
         return shortest_ns(self.tree)
 
     @property
     def reads_age(self) -> bool:
-        """Tell whether it reads an age, which grows between samples."""
-        return any(isinstance(part, Age) for part in walk(self.tree))
+        """Return whether it reads an age, which grows between samples."""
+        return any(isinstance(part, AgeNode) for part in walk(self.tree))
 
     def delays_ns(self) -> tuple[int, ...]:
-        """Return how long after a sample its value may change: at once, and later by windows."""
+        """Return how long (ns) after a sample its value may change: 0, and later by windows."""
         return tuple(sorted(delays_ns(self.tree)))
 
     def resolve(self, known: Collection[str]) -> Expression:
@@ -164,8 +182,8 @@ class Expression:
     ) -> Any:
         """Return the same as numbers, bools as 0 and 1: NaN where it is unknown.
 
-        ``windows`` is filled with what windows give: expressions over the same samples at the
-        same instants work out each once if they share it.
+        ``windows`` caches the results of windows: expressions over the same samples at the same
+        instants that share it compute each window once.
         """
         tracks = [_track(address, samples[address.name]) for address in self._reads]
         with _located(self.text):
@@ -197,18 +215,19 @@ class Expression:
         has_time: bool = True,
         windows: dict[str, Any] | None = None,
     ) -> Value:
-        look = Look(at_ns, dict(zip(self._names, tracks, strict=True)), has_time, windows)
-        kinds = look.take(self._current)
+        view = InstantView(at_ns, dict(zip(self._names, tracks, strict=True)), has_time, windows)
+        kinds = view.take(self._current)
         function = self._functions.get(kinds)
         if function is None:
             named = dict(zip(self._current, kinds, strict=True))
             function = self._functions[kinds] = at_instant(self.tree, named)
         with np.errstate(all="ignore"):
-            return _python(function(look))
+            result: Value = function(view)
+            return result
 
     @cached_property
     def _functions(self) -> dict[tuple[Kind, ...], At]:
-        """What it is at one instant, by the kinds of what it reads there."""
+        """Return a cache: its function at one instant, by the kinds of the values that it reads."""
         return {}
 
     @cached_property
@@ -227,24 +246,19 @@ def _located(text: str) -> Iterator[None]:
     """Turn a fault into an error that shows the text and the place."""
     try:
         yield
-    except Fault as fault:
+    except ExpressionFault as fault:
         raise ExpressionError(text, fault) from None
 
 
-def _python(value: Any) -> Value:
-    result: Value = value
-    return result
-
-
-def _track(address: Address, samples: Samples) -> Track:
+def _track(address: AddressNode, samples: Samples) -> Track:
     data, null = samples.values, samples.null
     kind = KIND_OF_DTYPE.get(data.dtype.kind)
     if not len(data) or (null is not None and null.all()):
-        kind = "null"  # what is not known yet may become anything
+        kind = "null"  # a value not known yet may be of any kind
     return Track(samples.times_ns, data, null, kind, address.at)
 
 
-def _track_of(address: Address, series: Series) -> Track:
+def _track_of(address: AddressNode, series: Series) -> Track:
     values = series.values
     return Track(series.times_ns, values.data, values.null, values.kind, address.at)
 
@@ -256,7 +270,7 @@ def _checked_times(times_ns: IntArray, whose: str) -> IntArray:
     return times_ns
 
 
-def _full(address: Address, known: Collection[str]) -> Address:
+def _full(address: AddressNode, known: Collection[str]) -> AddressNode:
     name, bracket, index = address.name.partition("[")
     if address.name in known or name in known:
         return address
@@ -266,6 +280,127 @@ def _full(address: Address, known: Collection[str]) -> Address:
     if len(matches) == 1:
         return replace(address, name=matches[0] + bracket + index)
     if matches:
-        raise Fault(f"'{name}' is ambiguous: {' or '.join(matches)}", address.at)
+        raise ExpressionFault(f"'{name}' is ambiguous: {' or '.join(matches)}", address.at)
     what = f"there is no variable or output '{name}'{did_you_mean(name, known)}"
-    raise Fault(what, address.at)
+    raise ExpressionFault(what, address.at)
+
+
+MOST_TERMS: Final = 2  # in the reason of a condition
+_LONGEST: Final = 90  # characters of a comparison that people still read
+_NOT: Final = {"<": ">=", "<=": ">", ">": "<=", ">=": "<", "==": "!=", "!=": "=="}
+_TURNED: Final = {"<": ">", "<=": ">=", ">": "<", ">=": "<=", "==": "==", "!=": "!="}
+_WORDS: Final = {
+    "<": "below", "<=": "at most", ">": "above", ">=": "at least",
+    "==": "expected", "!=": "expected other than",
+}  # fmt: skip
+
+
+def reason(
+    expression: Expression, samples: Mapping[str, Samples], now_ns: int, *, expected: bool
+) -> str:
+    """Return the terms that make a condition other than expected; empty if too long to read.
+
+    ``expected`` is the value that it should have. ``sim_battery.current < 0.3`` that is expected
+    and does not hold gives ``current is 0.52, below 0.3``.
+    """
+    terms = dict.fromkeys(_Values(samples, now_ns).terms(expression.tree, expected))
+    told = "; ".join(list(terms)[:MOST_TERMS])
+    return told if len(told) <= MOST_TERMS * _LONGEST else ""
+
+
+def number_text(value: float) -> str:
+    """Return a number as text that can be compared with a limit."""
+    return f"{value:.4g}"
+
+
+def variable_text(address: str) -> str:
+    """Return a variable's own name without its item: ``cell voltage[3]``."""
+    return address.rpartition("/")[2].partition(".")[2].replace("_", " ").strip() or address
+
+
+class _Values:
+    """The values of terms at an instant, as text."""
+
+    def __init__(self, samples: Mapping[str, Samples], now_ns: int) -> None:
+        self._samples = samples
+        self._now_ns = now_ns
+
+    def terms(self, tree: ExpressionNode, expected: bool) -> Iterator[str]:
+        """Yield the terms that make a part other than expected."""
+        if isinstance(tree, NotNode):
+            yield from self.terms(tree.inner, not expected)
+        elif isinstance(tree, HeldNode):
+            yield from self.terms(tree.inner, expected)
+        elif isinstance(tree, LogicNode):
+            for part in self._to_blame(tree, expected):
+                yield from self.terms(part, expected)
+        elif isinstance(tree, ComparisonNode):
+            yield from self._compared(tree, expected)
+        elif isinstance(tree, AddressNode):
+            yield f"{variable_text(tree.name)} is {'false' if expected else 'true'}"
+
+    def _to_blame(self, tree: LogicNode, expected: bool) -> Iterable[ExpressionNode]:
+        """Return the parts that are other than expected, without guards that only count samples."""
+        wrong = [part for part in tree.operands if self._number(part) == float(not expected)]
+        return [part for part in wrong if not _is_guard(part)] or wrong
+
+    def _compared(self, tree: ComparisonNode, expected: bool) -> Iterator[str]:
+        for operator, (left, right) in zip(tree.operators, pairwise(tree.operands), strict=True):
+            pair = ComparisonNode(tree.at, (operator,), (left, right))
+            if self._number(pair) != float(not expected):
+                continue
+            allowed = operator if expected else _NOT[operator]
+            if isinstance(left, ConstantNode):
+                left, right, allowed = right, left, _TURNED[allowed]
+            yield f"{_words(left)} is {self._shown(left)}, {_WORDS[allowed]} {self._limit(right)}"
+
+    def _limit(self, tree: ExpressionNode) -> str:
+        if isinstance(tree, ConstantNode):
+            return _constant(tree.value)
+        return f"{self._shown(tree)} ({_words(tree)})"
+
+    def _shown(self, tree: ExpressionNode) -> str:
+        if isinstance(tree, AddressNode):
+            return _constant(self._samples[tree.name].at(self._now_ns))
+        return number_text(self._number(tree))
+
+    def _number(self, tree: ExpressionNode) -> float:
+        """Return a part as a number; NaN where it is unknown, or no number."""
+        try:
+            return float(Expression("", tree).numbers(self._samples, self._now_ns))
+        except (ExpressionError, ValueError, TypeError):
+            return float("nan")
+
+
+def _is_guard(tree: ExpressionNode) -> bool:
+    """Return whether a part only checks that there are samples enough."""
+    operands = tree.operands if isinstance(tree, ComparisonNode) else ()
+    return any(isinstance(part, WindowNode) and part.name == "count" for part in operands)
+
+
+def _constant(value: Any) -> str:
+    if hasattr(value, "item"):
+        value = value.item()
+    if value is None or isinstance(value, bool):
+        return {True: "true", False: "false", None: "unknown"}[value]
+    return number_text(value) if isinstance(value, int | float) else f"'{value}'"
+
+
+def _words(tree: ExpressionNode) -> str:
+    """Return a part in plain words; parts without a short form are ``the condition``."""
+    if isinstance(tree, ConstantNode):
+        return _constant(tree.value)
+    if isinstance(tree, AddressNode):
+        return variable_text(tree.name)
+    if isinstance(tree, AgeNode):
+        return f"the age of {_words(tree.inner)}"
+    if isinstance(tree, WindowNode):
+        return f"the {tree.name} of {_words(tree.inner)} over {tree.over_ns / 1e9:g} s"
+    if isinstance(tree, NegativeNode):
+        return f"-{_words(tree.inner)}"
+    if isinstance(tree, ArithmeticNode):
+        return f"{_words(tree.left)} {tree.operator} {_words(tree.right)}"
+    if isinstance(tree, CallNode):
+        shown = [_words(part) for part in tree.arguments[:1]]
+        return f"{tree.name}({', '.join([*shown, *(['...'] if len(tree.arguments) > 1 else [])])})"
+    return "the condition"

@@ -1,10 +1,13 @@
-"""Small files that a power cut leaves as they were or as they shall be, never half written."""
+"""Files: written durably, replaced atomically, appended to whole, locked between processes."""
 
 from __future__ import annotations
 
+import fcntl
 import os
 import stat
+import time
 from pathlib import Path
+from typing import IO
 
 from amberbox.core.errors import AmberboxError
 
@@ -12,7 +15,7 @@ _LONGEST_NAME = 255
 
 
 def below(folder: Path, *names: str) -> Path:
-    """Join names to a path that lies below a folder, whoever made the names.
+    """Join names, also untrusted ones, to a path that lies below a folder.
 
     Each may have several parts (``a/b``). Raises AmberboxError for a name that would lead
     elsewhere (``..``, an absolute path) or that no file can have.
@@ -41,7 +44,7 @@ def keep_to_group() -> None:
 
 
 def open_to_all(path: Path) -> str:
-    """Say that everybody on this computer can look into a folder; empty if that is not so."""
+    """Return a warning if every user can read a folder, else an empty text."""
     mode = stat.S_IMODE(path.stat().st_mode) if path.exists() else 0
     return f"everybody on this computer can read {path} (mode {mode:04o})" if mode & 0o007 else ""
 
@@ -58,9 +61,9 @@ def replace_file(path: Path, text: str) -> None:
 
 
 def write_private(path: Path, text: str, mode: int = 0o600) -> None:
-    """Do the same for a file that is not for everybody: it never has more rights than ``mode``.
+    """Write a small private file as ``replace_file`` does; it never has more rights than ``mode``.
 
-    What lies at its place is replaced, also a link: nothing is written through it. Raises OSError.
+    A link at its place is replaced, not followed. Raises OSError.
     """
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     part.unlink(missing_ok=True)
@@ -84,3 +87,43 @@ def sync_folder(folder: Path) -> None:
         os.fsync(fd)
     finally:
         os.close(fd)
+
+
+def sync_file(path: Path) -> None:
+    """Make the content of a file survive a power cut; raises FileNotFoundError if it is gone."""
+    fd = os.open(path, os.O_RDONLY)
+    try:
+        os.fdatasync(fd)
+    finally:
+        os.close(fd)
+
+
+def write_all(fd: int, data: bytes) -> None:
+    """Write bytes to a file, however many calls of the system that takes."""
+    view = memoryview(data)
+    while view:
+        view = view[os.write(fd, view) :]
+
+
+def try_lock(file: IO[str], tries: int = 10, pause_s: float = 0.02) -> bool:
+    """Lock a file until it is closed; tries again, as readers hold the lock for a moment."""
+    for _ in range(tries):
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            time.sleep(pause_s)
+        else:
+            return True
+    return False
+
+
+def is_file_locked(path: Path) -> bool:
+    """Return whether a process holds the lock of a file; it is held for a moment to find out."""
+    try:
+        with path.open("r") as file:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except FileNotFoundError:
+        return False
+    except OSError:
+        return True
+    return False

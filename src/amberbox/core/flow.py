@@ -1,4 +1,8 @@
-"""How messages of an item have come, before any filter: when the last one did, and how often."""
+"""Arrival of an item's messages before any filter: last time, rate, stalls of the recorder.
+
+What was received during such a stall has late stamps or is lost, so absence, rates and jumps prove
+nothing there.
+"""
 
 from __future__ import annotations
 
@@ -10,20 +14,83 @@ from numpy.typing import NDArray
 
 from amberbox.core.clock import NS
 from amberbox.core.samples import Now, Samples, is_one
-from amberbox.core.stalls import Stalls
 from amberbox.core.types import IntArray
 
-COUNTED_NS = 3 * NS // 2
-"""Recorders write what they counted once a second, or a little later."""
-NONE_OPEN = 1 << 62
-"""Stands for the beginning of a gap where none is open."""
+SETTLES_NS = NS  # a backlog of a stall is taken in within its length, at most this
+_MOST_STALLS = 256
+
+
+class Stalls:
+    """The stalls of an epoch in order of time (log time, nanoseconds); none overlaps another."""
+
+    __slots__ = ("_ends", "_starts", "_sums")
+
+    def __init__(self) -> None:
+        self.clear()
+
+    def __len__(self) -> int:
+        return len(self._starts)
+
+    def clear(self) -> None:
+        """Forget all."""
+        self._starts = np.zeros(0, np.int64)
+        self._ends = np.zeros(0, np.int64)
+        self._sums = np.zeros(1, np.int64)
+
+    def add(self, from_ns: int, to_ns: int) -> None:
+        """Add a stall; one that does not begin after those before is known already."""
+        if to_ns > from_ns and (not len(self) or from_ns >= self._ends[-1]):
+            self._starts = np.append(self._starts, from_ns)[-_MOST_STALLS:]
+            self._ends = np.append(self._ends, to_ns)[-_MOST_STALLS:]
+            self._sums = np.concatenate([[0], np.cumsum(self._ends - self._starts)])
+
+    def snapshot(self) -> list[list[int]]:
+        """Return the stalls, for ``add`` to restore."""
+        return np.stack([self._starts, self._ends], axis=1).tolist()  # type: ignore[no-any-return]  # numpy says Any
+
+    def next_after(self, time_ns: int) -> tuple[int, int] | None:
+        """Return the first stall whose effects reach beyond a time, and when these are over."""
+        found = None
+        for place in range(len(self) - 1, -1, -1):
+            from_ns, to_ns = int(self._starts[place]), int(self._ends[place])
+            over_ns = to_ns + min(to_ns - from_ns, SETTLES_NS)
+            if over_ns <= time_ns:
+                break
+            found = from_ns, over_ns
+        return found
+
+    def within_ns(self, since_ns: Any, until_ns: Any) -> Any:
+        """Return for how long the recorder was held up between two times (or columns of them)."""
+        return self._before_ns(until_ns) - self._before_ns(since_ns)
+
+    def spoils(self, instants: IntArray, window_ns: int) -> Any:
+        """Return at which instants a window holds a stall that is more than a tenth of it."""
+        spoilt = np.zeros(len(instants), bool)
+        first = int(self._ends.searchsorted(instants[0] - window_ns)) if len(instants) else 0
+        for from_ns, to_ns in zip(self._starts[first:], self._ends[first:], strict=True):
+            if 10 * (to_ns - from_ns) > window_ns:
+                spoilt |= (instants > from_ns) & (instants <= to_ns + window_ns)
+        return spoilt
+
+    def _before_ns(self, time_ns: Any) -> Any:
+        """Return for how long it was held up before a time."""
+        place = self._starts.searchsorted(time_ns, "right")
+        if not len(self):
+            return self._sums[place]
+        last = np.maximum(place - 1, 0)
+        under_way = np.where(place > 0, np.maximum(self._ends[last] - time_ns, 0), 0)
+        return self._sums[place] - under_way
+
+
+COUNTED_NS = 3 * NS // 2  # recorders write counts once a second, or a little later
+NONE_OPEN = 1 << 62  # start of a gap where none is open
 
 
 @dataclass(slots=True, eq=False)
 class Flow:
-    """How messages of an item have come: as the recorder counted them, before any filter.
+    """The arrival of an item's messages, as the recorder counted them before any filter.
 
-    Where nobody counted (another program's recording), the rows themselves are what is known.
+    Without counts (a recording of another program), the rows themselves are used.
     """
 
     received: Samples = field(default_factory=Samples)
@@ -39,16 +106,16 @@ class Flow:
     stalls: Stalls = field(default_factory=Stalls)
     """When the recorder was held up: time that does not count for silence and rates."""
     began_ns: int | None = None
-    """When listening began, as far as the record tells; before it nobody could have heard it."""
+    """When listening began, as far as the record tells; no message can be known from before."""
 
     def last_received_ns(self, now: Now) -> Any:
-        """Return when the last message known of at ``now`` was received; -1 before the first."""
+        """Return when the last message known at ``now`` was received, ns; -1 before the first."""
         seen = _held(self.rows, now, self.rows.times_ns, -1)
         counted = _held(self.last_ns, now, self.last_ns.values, -1)
         return max(seen, counted) if is_one(now) else np.maximum(seen, counted)
 
     def age_s(self, now: Now) -> Any:
-        """Return for how long nothing has been received; infinite before the first message."""
+        """Return the time since the last message, seconds; infinite before the first."""
         last_ns = self.last_received_ns(now)
         stalled_ns = self.stalls.within_ns(last_ns, now) if len(self.stalls) else 0
         if is_one(now):
@@ -59,8 +126,8 @@ class Flow:
     def rate_hz(self, now: Now, seconds: float) -> Any:
         """Return messages received per second over the last ``seconds``, silence included.
 
-        Less is looked at where less is known; NaN before anything is. Counts come late where a
-        robot runs faster than the box writes: then the rows show more.
+        A shorter time is used where less is known; NaN before anything is. Where a robot runs
+        faster than the box writes, counts come late, and the rows are used.
         """
         counted = _rate(self.received, now, seconds, self.stalls)
         kept = _rate(self.rows, now, seconds, self.stalls)
@@ -69,10 +136,10 @@ class Flow:
         return np.fmax(counted, kept)[()]
 
     def heard_ns(self, since_ns: int, until_ns: int) -> IntArray:
-        """Return when messages are known to have come, from the last time by ``since_ns`` on.
+        """Return times (ns) at which messages surely came, from the last one by ``since_ns`` on.
 
-        These are the times of rows, and of counts that tell of a message after the last row: one
-        that a filter left out, as it said nothing new.
+        These are the times of rows, and of counts that show a message after the last row: one that
+        a filter left out because its value had not changed.
         """
         rows, counts = self.rows.times_ns, self.last_ns.times_ns
         first, end = (int(rows.searchsorted(at, "right")) for at in (since_ns, until_ns))
@@ -89,7 +156,7 @@ class Flow:
         return joined[max(int(joined.searchsorted(since_ns, "right")) - 1, 0) :]
 
     def longest_gap_s(self, now_ns: int, seconds: float, heard_ns: IntArray) -> float:
-        """Return the longest time between messages of the last ``seconds``, and since the last.
+        """Return the longest time (s) between messages of the last ``seconds``, and since the last.
 
         ``heard_ns`` are those that count, of ``heard_ns()``. Counts come once a second: where a
         filter leaves messages out, what is missing between two counts is no gap.
@@ -102,7 +169,7 @@ class Flow:
         return max(0, longest_ns - spared_ns) / NS
 
     def is_filtered(self, now_ns: int) -> bool:
-        """Tell whether a count that is not old tells of a message after the last row."""
+        """Return whether a recent count shows a message after the last row."""
         last = int(self.last_ns.last(now_ns))
         if last < 0 or now_ns - self.last_ns.times_ns[last] > 2 * COUNTED_NS:
             return False
@@ -110,18 +177,18 @@ class Flow:
         return bool(self.last_ns.values[last] > row_ns)
 
     def reaches_back(self, now: Now, seconds: float) -> Any:
-        """Tell whether something had been heard of it ``seconds`` ago already."""
+        """Return whether a message had come ``seconds`` ago already."""
         before = now - round(seconds * NS)
         return (self.received.last(before) >= 0) | (self.rows.last(before) >= 0)
 
     def listened(self, now: Now, seconds: float) -> Any:
-        """Tell whether it has been listened to for ``seconds``, heard or not."""
+        """Return whether the source has listened for ``seconds``, with messages or without."""
         if self.began_ns is None:
             return self.reaches_back(now, seconds)
         return now - self.began_ns >= round(seconds * NS)
 
     def lost(self, now: Now) -> Any:
-        """Tell whether a publisher is known to be lost, and nothing has come since for a second.
+        """Return whether a publisher is known to be lost, and nothing has come since for a second.
 
         Of several publishers of an item one may be lost while the others go on.
         """
@@ -141,7 +208,7 @@ def _held(samples: Samples, now: Now, values: NDArray[Any], missing: int) -> Any
 
 
 def _rate(counts: Samples, now: Now, seconds: float, stalls: Stalls) -> Any:
-    """Return how much a growing count has grown per second; NaN where nobody can know."""
+    """Return how much a count has grown per second; NaN where it is not known."""
     if not len(counts):
         return np.nan if is_one(now) else np.full(np.shape(now), np.nan)
     before = now - round(seconds * NS)

@@ -9,7 +9,7 @@ from types import FrameType
 class Interrupt:
     """Handles SIGINT: leaves at once while modules load, raises KeyboardInterrupt afterwards.
 
-    ``came`` tells that it was raised, also where a library made another error of it.
+    ``came`` is true once it was raised, even if a library turned it into another error.
     """
 
     STATUS = 130

@@ -1,4 +1,4 @@
-"""What something needs to work: all, any, or at least some of the things named, nested freely.
+"""Needs of a component: all, any, or at least some of the things named, nested freely.
 
 In a file it is a list (all of them), ``{any: [...]}``, ``{all: [...]}`` or
 ``{at_least: 2, of: [...]}``; an entry is a name or such a mapping again.
@@ -9,9 +9,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
-from amberbox.core.config import did_you_mean
-from amberbox.core.errors import Problem
-from amberbox.core.nodes import Node
+from amberbox.core.errors import Problem, did_you_mean
+from amberbox.core.yaml_nodes import Node
 
 _KEYS = ("all", "any", "at_least", "of")
 _HINT = "write a list of names, {any: [...]}, {all: [...]} or {at_least: 2, of: [...]}"
@@ -28,7 +27,7 @@ class Needs:
     parts: tuple[Needs | str, ...]
 
     def met(self, is_up: Callable[[str], bool]) -> bool:
-        """Tell whether they are met, given what is up."""
+        """Return whether they are met, given what is up."""
         up = sum(is_up(p) if isinstance(p, str) else p.met(is_up) for p in self.parts)
         return up >= self.at_least
 
@@ -95,26 +94,20 @@ def cycles(needs: Mapping[str, Needs]) -> Iterator[tuple[str, ...]]:
     done: set[str] = set()
     for start in needs:
         if start not in done:
-            yield from _cycles_from(start, needs, done)
-
-
-def _cycles_from(
-    start: str, needs: Mapping[str, Needs], done: set[str]
-) -> Iterator[tuple[str, ...]]:
-    path, on_path = [start], {start}
-    waiting = [iter(needs[start].names())]
-    while waiting:
-        target = next(waiting[-1], None)
-        if target is None:
-            waiting.pop()
-            done.add(path[-1])
-            on_path.discard(path.pop())
-        elif target in on_path:
-            yield tuple(path[path.index(target) :])
-        elif target in needs and target not in done:
-            path.append(target)
-            on_path.add(target)
-            waiting.append(iter(needs[target].names()))
+            path, on_path = [start], {start}
+            waiting = [iter(needs[start].names())]
+            while waiting:
+                target = next(waiting[-1], None)
+                if target is None:
+                    waiting.pop()
+                    done.add(path[-1])
+                    on_path.discard(path.pop())
+                elif target in on_path:
+                    yield tuple(path[path.index(target) :])
+                elif target in needs and target not in done:
+                    path.append(target)
+                    on_path.add(target)
+                    waiting.append(iter(needs[target].names()))
 
 
 def _names(needs: Needs) -> Iterator[str]:
@@ -131,7 +124,7 @@ def _of(count: int, inner: Sequence[str]) -> str:
 
 @dataclass(frozen=True, slots=True)
 class _Reader:
-    """Reads needs and tells all that is wrong with them."""
+    """Reads needs and reports everything wrong with them."""
 
     problems: list[Problem]
 
@@ -190,6 +183,6 @@ class _Reader:
         return node.text
 
     def _fail(self, node: Node, where: str, what: str, hint: str = "") -> Needs | None:
-        """Tell what is wrong; the answer is always None."""
+        """Report what is wrong; always returns None."""
         self.problems.append(node.problem(where, what, hint))
         return None

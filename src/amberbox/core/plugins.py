@@ -1,4 +1,4 @@
-"""Plugins are files: their names are known without importing them, and they load when used."""
+"""Discovery of plugins by file name: they are imported only when they are used."""
 
 from __future__ import annotations
 
@@ -10,17 +10,16 @@ import sys
 import threading
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from importlib.metadata import EntryPoint, entry_points, metadata
+from importlib.metadata import entry_points, metadata
 from pathlib import Path
 from types import ModuleType
 
-from amberbox.core.config import did_you_mean
-from amberbox.core.errors import AmberboxError, UsageError
+from amberbox.core.errors import AmberboxError, UsageError, did_you_mean
 
 
 @dataclass(frozen=True, slots=True)
 class Plugin:
-    """A plugin as found: nothing of it has run yet.
+    """A plugin that was found and is not imported yet.
 
     ``target`` is a module's dotted name, or empty for a loose file.
     """
@@ -93,7 +92,7 @@ def missing_packages(plugin: Plugin) -> list[str]:
 
 
 def install_hint(name: str) -> str:
-    """Say how to install what a plugin needs, if there is an extra of its name."""
+    """Return how to install what a plugin needs, if there is an extra of its name."""
     extras = metadata("amberbox").get_all("Provides-Extra") or ()
     return f"pip install 'amberbox[{name}]'" if name in extras else ""
 
@@ -105,8 +104,7 @@ def _candidates(
         yield from _in_folder(folder, package, defines)
     for folder in extra_dirs:
         yield from _in_folder(folder, "", defines)
-    for point in entry_points(group=f"amberbox.{package.rpartition('.')[2]}"):
-        yield _from_entry_point(point)
+    yield from entry_points_of(f"amberbox.{package.rpartition('.')[2]}")
 
 
 def _folders(package: str) -> list[Path]:
@@ -130,8 +128,8 @@ def _in_folder(folder: Path, package: str, defines: Collection[str]) -> Iterator
             yield Plugin(stem.rstrip("_"), _summary(tree), target, path)
 
 
+# Python 3.11 counts the depth of a syntax tree once for all threads, and raises
 _PARSING = threading.Lock()
-"""Python 3.11 counts how deep it is in a syntax tree once for all threads, and raises."""
 
 
 def _parsed(text: str) -> ast.Module | None:
@@ -149,7 +147,7 @@ def _summary(tree: ast.Module | None) -> str:
 
 
 def _defines(tree: ast.Module | None, names: Collection[str]) -> bool:
-    """Tell whether a module defines the names; a module with an error counts, to be reported."""
+    """Return whether a module defines the names; a module with an error counts, to be reported."""
     if tree is None or not names:
         return True
     return set(names) <= {name for statement in tree.body for name in _names(statement)}
@@ -171,6 +169,8 @@ def _imported(node: ast.AST) -> Iterator[str]:
         yield node.module
 
 
-def _from_entry_point(point: EntryPoint) -> Plugin:
-    owner = point.dist.name if point.dist else "another package"
-    return Plugin(point.name, f"From the package {owner}.", point.value)
+def entry_points_of(group: str) -> Iterator[Plugin]:
+    """Yield the plugins that installed packages declare in a group of entry points."""
+    for point in entry_points(group=group):
+        owner = point.dist.name if point.dist else "another package"
+        yield Plugin(point.name, f"From the package {owner}.", point.value)

@@ -9,36 +9,35 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Union, get_args, get_origin
 
-from amberbox.core.config import WRAPPERS, field_keys
-from amberbox.core.fieldtypes import field_types
-from amberbox.core.nodes import Node
+from amberbox.core.config import WRAPPERS, field_keys, field_types
+from amberbox.core.yaml_nodes import Node
 
 MASK = "***"
+# in names of secrets; for ``_`` also a space, a hyphen, or nothing
 SECRET_WORDS = (
     "password", "passwd", "passphrase", "secret", "token", "credential",
     "api_key", "access_key", "private_key",
 )  # fmt: skip
-"""What the name of a secret has in it; for ``_`` there may be a space, a hyphen, or nothing."""
 
+# pattern of one of these words, for ``re.IGNORECASE``
 SOUNDS_SECRET = "(?:" + "|".join(word.replace("_", "[ _-]?") for word in SECRET_WORDS) + ")"
-"""Matches one of these words in a text: a pattern, for ``re.IGNORECASE``."""
 
 _SOUNDS_SECRET = re.compile(SOUNDS_SECRET, re.IGNORECASE)
 
 
-def word_with(sounds: str) -> str:
+def secret_word_pattern(sounds: str) -> str:
     """Return a pattern for a word with one of some words in it, ``SOUNDS_SECRET`` or more.
 
     Found in linear time: a plain ``\\w*secret\\w*`` would try each ``secret`` of a long word, and
-    read on to its end from each. The first one tells as much as the others, but for one with a
-    space or hyphen (``API key``), with which the word goes on beyond what ``\\w*`` takes.
+    read on to its end from each. The first one is enough, except for one with a space or hyphen
+    (``API key``), with which the word goes on beyond what ``\\w*`` takes.
     """
     beyond = "|".join(word.replace("_", "[ -]") for word in SECRET_WORDS if "_" in word)
     return rf"(?:(?>\w*?{sounds})|(?>\w*?(?:{beyond})))\w*+"
 
 
 def sounds_secret(key: str) -> bool:
-    """Tell whether what has this name is a secret: ``mqtt_password``, ``apiKey``, ``API key``."""
+    """Return whether a key names a secret: ``mqtt_password``, ``apiKey``, ``API key``."""
     return _SOUNDS_SECRET.search(key) is not None
 
 
@@ -56,15 +55,15 @@ def secrets(cls: type[Any], node: Node) -> Iterator[Node]:
                 yield from _secrets_below(kinds[field.name], value)
 
 
-def likely_secrets(node: Node, key: str = "") -> Iterator[Node]:
+def secrets_by_name(node: Node, key: str = "") -> Iterator[Node]:
     """Yield values whose key sounds secret, for blocks of which no class is known."""
     if sounds_secret(key):
         yield node
         return
     for name, value in (node.mapping or {}).items():
-        yield from likely_secrets(value, name)
+        yield from secrets_by_name(value, name)
     for entry in node.items or ():
-        yield from likely_secrets(entry, key)
+        yield from secrets_by_name(entry, key)
 
 
 def redact(text: str, nodes: Iterable[Node]) -> str:
@@ -80,17 +79,19 @@ def redact(text: str, nodes: Iterable[Node]) -> str:
     return "".join([*parts, text[at:]])
 
 
-def as_plain(value: Any) -> Any:
-    """Turn a configuration into what JSON can hold, secrets masked."""
+def masked_values(value: Any) -> Any:
+    """Convert a configuration to JSON-compatible values, secrets masked."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {
-            field.name: _masked(getattr(value, field.name), field)
+            field.name: MASK
+            if field.metadata.get("secret") and getattr(value, field.name)
+            else masked_values(getattr(value, field.name))
             for field in dataclasses.fields(value)
         }
     if isinstance(value, Mapping):
-        return {str(key): as_plain(inner) for key, inner in value.items()}
+        return {str(key): masked_values(inner) for key, inner in value.items()}
     if isinstance(value, Sequence) and not isinstance(value, str | bytes):
-        return [as_plain(inner) for inner in value]
+        return [masked_values(inner) for inner in value]
     return str(value) if isinstance(value, Path) else value
 
 
@@ -98,10 +99,6 @@ def _mask(written: str) -> str:
     anchor = re.match(r"&\S+\s+", written)
     line_end = "\n" if written.endswith("\n") else ""
     return (anchor[0] if anchor else "") + f"'{MASK}'{line_end}"
-
-
-def _masked(value: Any, field: dataclasses.Field[Any]) -> Any:
-    return MASK if field.metadata.get("secret") and value else as_plain(value)
 
 
 def _secrets_below(kind: Any, node: Node) -> Iterator[Node]:

@@ -1,4 +1,4 @@
-"""What is known of a variable over time: its newest samples, looked at from one instant or many.
+"""Samples of a variable over time, and windows of them, evaluated at one instant or many.
 
 ``now`` is an instant (an int, which gives one value) or an array of instants (which gives a
 column); both give the same answers. A variable has the value of its last sample at or before an
@@ -15,23 +15,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amberbox.core.clock import NS
-from amberbox.core.expression_windows import reduce_windows
+from amberbox.core.expressions.values import reduce_windows
 from amberbox.core.types import IntArray
 
-Now: TypeAlias = "int | IntArray"
-"""Nanoseconds: one instant, or many in order."""
+Now: TypeAlias = "int | IntArray"  # nanoseconds: one instant, or many in order
 
 _ROOM = 64
 _FLOAT = np.dtype(np.float64)
 
 
 def is_one(now: Now) -> bool:
-    """Tell whether one instant is meant."""
+    """Return whether one instant is meant."""
     return not isinstance(now, np.ndarray)
 
 
 class Samples:
-    """Samples of one variable in order of time; old ones are forgotten when told to.
+    """Samples of one variable in order of time; old ones are forgotten on demand.
 
     Numbers are held as int64 or float64 whatever their column had, so that what is computed of
     them does not depend on it, and nothing runs over.
@@ -50,17 +49,17 @@ class Samples:
 
     @property
     def times_ns(self) -> IntArray:
-        """Times of the samples, not decreasing."""
+        """Return the times of the samples (ns), not decreasing."""
         return self._times[self._start : self._end]
 
     @property
     def values(self) -> NDArray[Any]:
-        """Values of the samples; what stands where ``null`` is true means nothing."""
+        """Return the values of the samples; those where ``null`` is true are undefined."""
         return self._values[self._start : self._end]
 
     @property
     def null(self) -> NDArray[np.bool_] | None:
-        """Which samples are unknown; None if all are known."""
+        """Return which samples are unknown; None if all are known."""
         return None if self._null is None else self._null[self._start : self._end]
 
     def column(self) -> NDArray[Any]:
@@ -75,7 +74,7 @@ class Samples:
         return objects
 
     def extend(self, times_ns: IntArray, values: NDArray[Any]) -> None:
-        """Take further samples, none of them before the last one; masked or None is unknown."""
+        """Append samples, none of them before the last one; masked or None is unknown."""
         count = len(times_ns)
         if not count:
             return
@@ -98,7 +97,7 @@ class Samples:
         self._end += count
 
     def _takes_as_they_are(self, values: NDArray[Any], count: int) -> bool:
-        """Tell whether these are known floats that there is room for, as nearly always."""
+        """Return whether these are known floats that there is room for, as nearly always."""
         return (
             type(values) is np.ndarray
             and values.dtype == _FLOAT == self._values.dtype
@@ -145,14 +144,14 @@ class Samples:
         return self.times_ns.searchsorted(now, "right") - 1
 
     def at(self, now: Now) -> Any:
-        """Return the value at ``now``; what it gives means something only where ``known``."""
+        """Return the value at ``now``; it is defined only where ``known``."""
         if type(now) is int and self._ends_by(now):
             return self._values[self._end - 1]
         values = self.values if len(self) else np.zeros(1, self._values.dtype)
         return values[self.last(now)]
 
     def known(self, now: Now) -> Any:
-        """Tell where there is a value."""
+        """Return where there is a value."""
         if type(now) is int and self._ends_by(now):
             return np.True_ if self._null is None else ~self._null[self._end - 1]
         last = self.last(now)
@@ -162,7 +161,7 @@ class Samples:
         return (last >= 0) & ~null[last]
 
     def _ends_by(self, now: int) -> bool:
-        """Tell whether the newest sample is the last one at an instant, as live it always is."""
+        """Return whether the newest sample is the last one at an instant, as live it always is."""
         return self._end > self._start and bool(self._times[self._end - 1] <= now)
 
     def since_ns(self, now: Now) -> Any:

@@ -7,7 +7,7 @@ A source is a module whose file name is its name in ``black_box.yaml``. It defin
   and ``notes()``, which yields key and sentence for what is odd but no error, as ``check`` does;
 - ``Source``: a class that takes ``(config, name)`` and offers ``topics`` and ``run``;
 - ``SAMPLE``: a block of YAML as one would write it, shown by ``amberbox plugins`` and checked;
-- ``PASSIVE``: one line that says why it does not disturb, shown by ``amberbox doctor``; it may
+- ``PASSIVE``: one line on why it does not disturb the bus, shown by ``amberbox doctor``; it may
   name parts of the configuration, as in ``{config.caller_id}``;
 - optionally ``known_topics(config)``: the topics that it will announce, with their schemas, as far
   as that is certain without a device; ``check`` judges names of variables by them.
@@ -20,15 +20,15 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Literal, Protocol
 
 from amberbox.core.options import option
 from amberbox.core.types import Topic
 
 Keep = Literal["all", "bulk", "ring", "incident", "none"]
+# supply of the box: external, its own battery, or the rest of it
 Power = Literal["mains", "battery", "low"]
-"""How the box itself is powered: from outside, from its own battery, from what is left of it."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class ChangeOptions:
     heartbeat_s: float = option(5.0, "keep a message at least this often", unit="s")
 
     def check(self) -> Iterator[tuple[str, str]]:
-        """Say which values cannot work."""
+        """Yield what is wrong with the values."""
         numbers = {"absolute": self.absolute, "relative": self.relative}
         numbers |= {"heartbeat_s": self.heartbeat_s}
         numbers |= {f"bands.{name}": width for name, width in self.bands.items()}
@@ -66,35 +66,35 @@ class TopicOptions:
     stamp: str | None = option(None, "path of the own time stamp; '' for none")
 
     def check(self) -> Iterator[tuple[str, str]]:
-        """Say which values cannot work."""
+        """Yield what is wrong with the values."""
         if self.max_frequency is not None and self.max_frequency <= 0:
             yield "max_frequency", "must be above 0"
 
 
 class Sink(Protocol):
-    """Where a source puts what it hears. All calls may come from any thread."""
+    """The receiver of a source's messages and events. All calls may come from any thread."""
 
     def now_ns(self) -> int:
-        """Time of receipt for a message that arrives now (log time)."""
+        """Return the time of receipt of a message that arrives now (log time, ns)."""
 
     def topic(self, topic: Topic) -> int:
-        """Make a topic known and return its stream number; the same topic gives the same one."""
+        """Register a topic and return its stream number; the same topic gives the same one."""
 
     def message(self, stream: int, data: bytes, received_ns: int) -> None:
-        """Take one message as it came. Never blocks a live source: a full queue drops, counted."""
+        """Put one raw message. Never blocks a live source: a full queue drops it, counted."""
 
     def longest_message(self) -> int:
         """Return how many bytes a message may have to find room; a longer one is always lost."""
 
     def link_up(self, topic: str, peer: str, since_ns: int | None = None) -> None:
-        """Say that messages of ``peer`` on ``topic`` arrive from now on.
+        """Report that messages of ``peer`` on ``topic`` arrive from now on.
 
         Closes the gap that is open for it. For a peer never seen before, ``since_ns`` is the last
         moment at which it is known not to have published.
         """
 
     def link_down(self, topic: str, peer: str, reason: str, since_ns: int | None = None) -> None:
-        """Say that nothing of ``peer`` on ``topic`` can arrive from now on; opens a gap.
+        """Report that no message of ``peer`` on ``topic`` can arrive from now on; opens a gap.
 
         ``since_ns`` is given when the loss is noticed late: the gap begins there.
         """
@@ -102,13 +102,13 @@ class Sink(Protocol):
     def lost(
         self, topic: str, peer: str, from_ns: int, to_ns: int, count: int, reason: str
     ) -> None:
-        """Say that messages of ``peer`` were lost before the box, between two that arrived."""
+        """Report that messages of ``peer`` were lost before the box, between two that arrived."""
 
     def event(self, kind: str, text: str, **details: Any) -> None:
         """Record an event; ``kind`` is a short identifier, ``text`` one line for a person."""
 
     def power(self, state: Power, text: str) -> None:
-        """Say how the box is powered now, ``text`` being one line for a person.
+        """Report how the box is powered now; ``text`` is one line for a person.
 
         On ``battery`` the recorder makes everything durable at once and from then on more often,
         and marks an incident; on ``low`` it ends the run cleanly while it still can.
@@ -118,14 +118,14 @@ class Sink(Protocol):
         """Return the last latched message of a topic in the store, also of an earlier run."""
 
     def state(self) -> dict[str, Any]:
-        """Return what ``save_state`` was given last, also by an earlier run; empty at first."""
+        """Return the state saved last by ``save_state``, also in an earlier run; empty at first."""
 
     def save_state(self, state: Mapping[str, Any]) -> None:
-        """Keep a few values (JSON) of this source across restarts of the box."""
+        """Store a few values (JSON) of this source across restarts of the box."""
 
 
 class Source(Protocol):
-    """One configured block, ready to listen."""
+    """One configured source, ready to receive."""
 
     lossless: bool
     """True for files: ``message`` then waits for room instead of dropping."""
@@ -139,11 +139,3 @@ class Source(Protocol):
         A device that is missing is retried in here, with back-off and an event; an exception
         ends the run and is recorded, then the recorder starts it again with back-off.
         """
-
-
-@dataclass(frozen=True)
-class SourcePlugin:
-    """A source module as found by file name."""
-
-    name: str
-    module: Any = field(repr=False)

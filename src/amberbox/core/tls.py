@@ -1,13 +1,14 @@
-"""TLS to a server whose certificate authority is pinned by its fingerprint, whatever the date.
+"""Network peers: loopback addresses, and TLS to a server pinned by its authority's fingerprint.
 
-Robots without a battery for their clock start in 1970 and have no time before they have a network.
-So a pinned server is verified by its chain and name, not by dates: nobody else has the key.
+A pinned server is verified by its certificate chain and name, not by dates: robots without a
+battery for their clock start in 1970 and have no time before they have a network.
 """
 
 from __future__ import annotations
 
 import base64
 import hashlib
+import ipaddress
 import re
 import socket
 import ssl
@@ -15,11 +16,9 @@ from urllib.parse import urlsplit
 
 from amberbox.core.errors import AmberboxError, UsageError
 
-CA_PATH = "/link/v1/ca.pem"
-"""Where a server gives away its authority's certificate, to anybody."""
+CA_PATH = "/link/v1/ca.pem"  # where a server publishes its authority's certificate
 _ANOTHER_HINT = "is this the right server? if its authority was made anew, trust it anew"
-_NO_CHECK_TIME = 0x200000
-"""X509_V_FLAG_NO_CHECK_TIME of OpenSSL, which Python's enumeration leaves out."""
+_NO_CHECK_TIME = 0x200000  # X509_V_FLAG_NO_CHECK_TIME of OpenSSL, which Python's enumeration lacks
 _MOST_BYTES = 64 << 10
 _TIMEOUT_S = 10.0
 _PEM = re.compile(rb"-----BEGIN CERTIFICATE-----\s+([A-Za-z0-9+/=\s]+?)-----END CERTIFICATE-----")
@@ -40,7 +39,7 @@ def fingerprint(pem: bytes) -> str:
     return hashlib.sha256(base64.b64decode(found.group(1))).hexdigest()
 
 
-def normal(pin: str) -> str:
+def normal_fingerprint(pin: str) -> str:
     """Write a fingerprint as 64 lower-case digits; raises UsageError when it is none."""
     digits = pin.lower().removeprefix("sha256:").replace(":", "").strip()
     if not re.fullmatch(r"[0-9a-f]{64}", digits):
@@ -53,9 +52,9 @@ def pinned_context(pem: bytes, pin: str) -> ssl.SSLContext:
 
     Raises PinError when the certificate is another than the pinned one.
     """
-    if fingerprint(pem) != normal(pin):
+    if fingerprint(pem) != normal_fingerprint(pin):
         raise PinError(
-            f"the server's authority is {fingerprint(pem)}, not {normal(pin)}",
+            f"the server's authority is {fingerprint(pem)}, not {normal_fingerprint(pin)}",
             _ANOTHER_HINT,
         )
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
@@ -66,7 +65,7 @@ def pinned_context(pem: bytes, pin: str) -> ssl.SSLContext:
 
 
 def fetch_ca(url: str) -> bytes:
-    """Ask a server for its authority's certificate; nothing is told to it, nothing is believed.
+    """Fetch a server's authority certificate (PEM); no secret is sent, nothing is trusted.
 
     Raises OSError when it does not answer, PinError when it has none.
     """
@@ -74,7 +73,7 @@ def fetch_ca(url: str) -> bytes:
     host, port = parts.hostname or "", parts.port or 443
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     context.check_hostname = False
-    context.verify_mode = ssl.CERT_NONE  # what comes is compared with the pin
+    context.verify_mode = ssl.CERT_NONE  # the certificate is compared with the pin
     request = f"GET {CA_PATH} HTTP/1.0\r\nHost: {parts.netloc}\r\n\r\n".encode()
     answer = b""
     with (
@@ -90,3 +89,11 @@ def fetch_ca(url: str) -> bytes:
             f"{url} does not give its authority's certificate", "is this an Amberbox server?"
         )
     return found.group(0) + b"\n"
+
+
+def is_loopback(host: str) -> bool:
+    """Return whether a host is this computer's loopback, without asking a name server."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host.lower() == "localhost"

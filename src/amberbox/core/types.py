@@ -1,16 +1,28 @@
-"""What flows between the parts: topics and messages in, batches, gaps and watermarks out."""
+"""Types shared by all parts: topics and schemas, batches, gaps, cursors, statuses, diagnoses."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Final, Literal, NamedTuple, TypeAlias
+from typing import Annotated, Any, Final, Literal, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 IntArray: TypeAlias = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class Missing:
+    """Marks a field of an API answer that older servers do not send, and what it is then."""
+
+    default: Any = None
+
+
+_T = TypeVar("_T")
+Later: TypeAlias = Annotated[_T, Missing()]
+"""A field that older servers do not send: the client takes it as None, zero or empty then."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,10 +68,10 @@ class Ragged:
         return self.values[self.offsets[row] : self.offsets[row + 1]]
 
 
+# Numbers and bools as their own dtype; strings as object arrays of ``str``, binary as object
+# arrays of ``bytes``; time and duration as int64 nanoseconds. A column with nulls is a numpy
+# masked array (numbers) or holds None (objects). NaN is a value, not a null.
 ColumnData: TypeAlias = "NDArray[Any] | Ragged"
-"""Numbers and bools as their own dtype; strings as object arrays of ``str``, binary as object
-arrays of ``bytes``; time and duration as int64 nanoseconds. A column with nulls is a numpy
-masked array (numbers) or holds None (objects). NaN is a value, not a null."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,7 +124,7 @@ class WriterCursor:
     ahead: Mapping[str, int] = field(default_factory=dict)
 
     def has_read(self, run: int, seq: int, item: str) -> bool:
-        """Tell whether a row lies before this cursor."""
+        """Return whether a row lies before this cursor."""
         return (run, seq) < (self.run, max(self.seq, self.ahead.get(item, 0)))
 
 
@@ -218,8 +230,8 @@ class Watermark:
     cursor: Cursor = field(default_factory=Cursor)
 
 
+# of a component; ``docs/robot/monitoring.md`` describes each
 Level: TypeAlias = Literal["ok", "warn", "error", "stale", "unknown"]
-"""What a monitor makes of a component; ``docs/monitoring.md`` describes each."""
 
 Output: TypeAlias = "bool | int | float | str | None"
 
@@ -283,8 +295,7 @@ class Symptom:
     gone_ns: int | None = None
 
 
-UNKNOWN_FAULT: Final = "unknown#other"
-"""The failure mode that stands for everything that is not in the FMEA."""
+UNKNOWN_FAULT: Final = "unknown#other"  # stands for every failure mode that is not in the FMEA
 
 
 @dataclass(frozen=True, slots=True)
@@ -363,3 +374,12 @@ class Diagnosis:
     state: Literal["open", "healed"] = "open"
     live_only: bool = False
     make_safe: tuple[str, ...] = ()
+
+    def members(self, group: AmbiguityGroup) -> tuple[Hypothesis, ...]:
+        """Return the hypotheses of a group."""
+        by_id = {hypothesis.id: hypothesis for hypothesis in self.hypotheses}
+        return tuple(by_id[name] for name in group.members if name in by_id)
+
+    def leading(self) -> tuple[Hypothesis, ...]:
+        """Return the most probable hypothesis, and those that nothing known tells from it."""
+        return self.members(self.groups[0]) if self.groups else self.hypotheses[:1]

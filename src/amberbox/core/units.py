@@ -1,4 +1,4 @@
-"""Quantities as people write them: ``5s``, ``10 min``, ``64 MB``, ``2 kHz``."""
+"""Quantities as people write and read them: ``5s``, ``64 MB``, ``2 kHz``, probabilities."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from fractions import Fraction
 
 from amberbox.core.errors import UsageError
 
+# nanoseconds; there is no ``m``, which might be a metre
 TIME_NS: Mapping[str, int] = {
     "ns": 1,
     "us": 1_000,
@@ -17,7 +18,6 @@ TIME_NS: Mapping[str, int] = {
     "h": 3_600_000_000_000,
     "d": 86_400_000_000_000,
 }
-"""Units of time and their length in nanoseconds; there is no ``m``, which might be a metre."""
 
 _BYTES: Mapping[str, int] = {
     **{"B": 1, "kB": 10**3, "KB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12},
@@ -69,7 +69,7 @@ def parse_duration_s(text: str) -> float:
     return seconds
 
 
-def in_bytes(count: float) -> str:
+def bytes_text(count: float) -> str:
     """Write a number of bytes for a person."""
     value = float(count)
     for unit in ("B", "kB", "MB", "GB"):
@@ -83,3 +83,26 @@ def _unknown_unit(written: str, units: Mapping[str, int]) -> str:
     if not units:
         return f"has a unit '{written}' where a plain number is expected"
     return f"has the unknown unit '{written}'; use one of {', '.join(units)}"
+
+
+# least probability of each word
+CONFIDENCE_WORDS: tuple[tuple[float, str], ...] = (
+    (0.95, "almost certain"),
+    (0.80, "very likely"),
+    (0.50, "likely"),
+    (0.20, "possible"),
+    (0.0, "only a guess"),
+)
+LIKELY = 0.5  # least probability of a likely cause: more probable than not
+
+
+def confidence_word(probability: float) -> str:
+    """Return a probability in words."""
+    return next(word for least, word in CONFIDENCE_WORDS if probability >= least)
+
+
+def percent(probability: float) -> str:
+    """Write a probability in whole percent; what is not quite sure is never 0 or 100 %."""
+    if probability >= 0.995:
+        return "over 99 %"
+    return "under 1 %" if probability < 0.005 else f"{probability:.0%}".replace("%", " %")

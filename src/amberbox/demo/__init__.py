@@ -1,1 +1,1 @@
-"""The demonstration: a server, three simulated robots that may be broken, and the story of it."""
+"""The demonstration: a server, three simulated robots with faults, and a scripted story."""

@@ -1,4 +1,4 @@
-"""Go through the story against a demonstration that runs; its address and codes come on stdin."""
+"""Run the story against a running demonstration; its URL and codes are read from stdin."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ import json
 import sys
 
 from amberbox.core.errors import AmberboxError
-from amberbox.demo.story import tell
+from amberbox.demo.story import run_story
 
 
 def main() -> int:
-    """Tell the story; 0 only if every step worked."""
+    """Run the story; return 0 only if every step worked."""
     asked = json.load(sys.stdin)
     try:
-        tell(asked["url"], asked["codes"])
+        run_story(asked["url"], asked["codes"])
     except AmberboxError as error:
         print(f"error: the story broke off: {error.what}", file=sys.stderr)
         print(f"hint: {error.hint}", file=sys.stderr)

@@ -1,4 +1,6 @@
-"""The recorder's demonstration: a simulated robot, the box killed once, and nothing lost."""
+"""The recorder's demonstration: a simulated robot, a recorder that is killed once, and no data
+loss.
+"""
 
 from __future__ import annotations
 
@@ -19,16 +21,16 @@ from pathlib import Path
 import numpy as np
 
 import amberbox
-from amberbox.blackbox.follow import read
-from amberbox.blackbox.incidents.incident import load_all
 from amberbox.blackbox.sources.sim import FOLDER
-from amberbox.blackbox.store import open_store
+from amberbox.blackbox.store import journal_reader
+from amberbox.blackbox.store.incident import load_all
+from amberbox.blackbox.store.store import open_store
 from amberbox.core.clock import NS
 from amberbox.core.errors import AmberboxError
 
 FAULT = "wheel_front_left_motor_weak"
+# a fault that the monitors find within seconds, and its component
 SLOW, SLOWED = "laser_rear_motor_slow", "laser_rear"
-"""A fault that the monitors find within a second or two, and the component it is in."""
 SHOWN = ("sensors_front_left_current_1_q", "sensors_front_right_current_1_q")
 WEAK = " - ".join(f"abs(zmq_wheels.{name})" for name in SHOWN)
 TRIGGER = f"""triggers:
@@ -39,13 +41,13 @@ TRIGGER = f"""triggers:
   reason: a wheel draws more current than its neighbour
 """
 PASSENGER = "recording_odom"
+# the failure mode that explains it best
 SUSPECT = "laser_rear#motor_slow"
-"""What is to be blamed for it, first of all."""
 _LOST_AT_KILL_S = 0.15
 
 
 def run(place: Path, seconds: float) -> int:
-    """Run it in an empty folder; 0 only if every step worked."""
+    """Run it in an empty folder; return 0 only if every step worked."""
     demo = Demo(place, seconds)
     steps = (demo.prepare, demo.record, demo.tell, demo.diagnose, demo.account, demo.show)
     for step in (*steps, demo.defend):
@@ -77,12 +79,12 @@ class Demo:
 
     @property
     def watched(self) -> Path:
-        """What the monitors have printed."""
+        """The file with the monitors' output."""
         return self.place / "watched.txt"
 
     @property
     def truth(self) -> Path:
-        """What the robot says it has sent."""
+        """The file with the messages that the robot has sent."""
         return self.place / "truth.jsonl"
 
     def prepare(self) -> None:
@@ -97,12 +99,12 @@ class Demo:
         journal = next(iter(sorted((maker / "store" / "journal").glob("*.mcap"))))
         self.recording = self.place / "yesterday.mcap"
         self.recording.write_bytes(journal.read_bytes())
-        rows = read.journal_file(self.recording).items.get("sim_odom", 0)
+        rows = journal_reader.journal_file(self.recording).items.get("sim_odom", 0)
         self.recorded_before = rows
         check(rows > 0, f"{rows} messages in {self.recording.name}, an ordinary MCAP file")
 
     def record(self) -> None:
-        """Record the live robot and the recording; kill the box once; make a part fail."""
+        """Record the live robot and the recording; kill the recorder once; inject a fault."""
         say(
             "A simulated robot speaks ZMQ; the black box listens, and replays the recording beside."
         )
@@ -133,24 +135,24 @@ class Demo:
         check(box.wait(30) == 0, "the box stopped cleanly")
 
     def look(self) -> None:
-        """Show how the robot is, while it runs."""
+        """Show the robot's status while it runs."""
         say("How is the robot? Its monitors follow the record while it is written.")
         amberbox_verb("status", str(self.folder), expected=1)
         amberbox_verb("alarm", str(self.folder))
 
     def failures(self) -> list[str]:
-        """Return what the monitors have printed of the slow laser so far."""
+        """Return the lines of the monitors about the second fault so far."""
         lines = self.watched.read_text().splitlines()
         return [line for line in lines if SLOWED in line and "speed_right is false" in line]
 
     def tell(self) -> None:
-        """Show what the monitors have said of the second fault, and since when."""
+        """Show the lines of the monitors about the second fault."""
         say("What the monitors said of the second fault, as it came:")
         print("\n".join(f"  {line}" for line in self.failures()))
         check(bool(self.failures()), f"the monitors saw that the motor of {SLOWED} is slow")
 
     def diagnose(self) -> None:
-        """Show what is broken, why, and what to do next."""
+        """Show the diagnosis and what to do next."""
         say("What is broken? One answer from all that was seen, by the robot's failure modes:")
         amberbox_verb("diagnose", str(self.folder), expected=1)
         command = [sys.executable, "-m", "amberbox", "diagnose", str(self.folder), "--json"]
@@ -165,7 +167,7 @@ class Demo:
         )
 
     def account(self) -> None:
-        """Compare the record with what the robot says it has sent."""
+        """Compare the record with the messages that the robot has sent."""
         say("Is anything lost? The robot's own account against the record:")
         sent = sent_messages(self.truth)
         kept = kept_messages(self.folder / "store")
@@ -185,7 +187,7 @@ class Demo:
         check(explained == len(lost), "what is missing lies in the gap that the record names")
 
     def _may_be_missing(self, at_ns: int, gaps: list[tuple[int, int]]) -> bool:
-        """Only what came in the last write interval before the kill, or until the restart, may."""
+        """Return whether a message may be missing: within a gap, or just before a kill."""
         edge = round(_LOST_AT_KILL_S * NS)
         in_gap = any(start - edge <= at_ns <= end + edge for start, end in gaps)
         return in_gap or any(kill - edge <= at_ns <= kill for kill in self.kills_ns)
@@ -203,7 +205,7 @@ class Demo:
         check(rows > 0, f"{rows} messages of the recording went the same way")
 
     def defend(self) -> None:
-        """Show what the box has kept for good, and that nobody changes the record unseen."""
+        """Show the incident that is kept, and that a changed bit of the record is found."""
         say("The fault was noticed: the seconds around it stay whatever else has to go.")
         amberbox_verb("incident", "list", str(self.folder))
         held = load_all(open_store(self.folder / "store"))
@@ -239,7 +241,7 @@ def write_folder(folder: Path, name: str, blocks: str, more: str = "") -> None:
 
 
 def write_knowledge(folder: Path) -> None:
-    """Give a robot what the simulated one has, whose messages come by ZMQ here."""
+    """Copy the simulated robot's monitors and failure modes, for messages over ZMQ."""
     rooms = ("components/**/*.yaml", "rules/*.pl")
     for path in (FOLDER / "fmea.yaml", *(path for room in rooms for path in FOLDER.glob(room))):
         target = folder / path.relative_to(FOLDER)
@@ -257,7 +259,7 @@ def flip_a_bit(path: Path) -> None:
 
 
 def amberbox_verb(*arguments: str, expected: int = 0) -> None:
-    """Run a verb as a user would."""
+    """Run a verb as a user would; raises AmberboxError for another exit status."""
     print("  $ amberbox " + " ".join(arguments), flush=True)
     done = subprocess.run([sys.executable, "-m", "amberbox", *arguments], check=False)
     if done.returncode != expected:
@@ -269,14 +271,14 @@ def start_box(folder: Path) -> subprocess.Popen[bytes]:
     before = journals(folder)
     command = [sys.executable, "-m", "amberbox", "record", str(folder), "--quiet"]
     box = subprocess.Popen(command, start_new_session=True)
-    atexit.register(box.kill)  # whatever ends the demonstration ends the box
+    atexit.register(box.kill)  # the recorder ends with the demonstration
     wait_until(lambda: len(journals(folder)) > len(before) or box.poll() is not None)
     check(box.poll() is None, "the box records")
     return box
 
 
 def start_watcher(folder: Path, output: Path) -> subprocess.Popen[bytes]:
-    """Start the monitors; what they find goes to a file."""
+    """Start the monitors; their findings go to a file."""
     command = [sys.executable, "-m", "amberbox", "watch", str(folder)]
     with output.open("wb") as file:
         watcher = subprocess.Popen(command, start_new_session=True, stdout=file)
@@ -290,7 +292,7 @@ def journals(folder: Path) -> list[Path]:
 
 
 def wait_until(condition: Callable[[], bool], timeout_s: float = 30.0) -> None:
-    """Wait for something that another process does."""
+    """Wait for a condition; raises AmberboxError after ``timeout_s`` seconds."""
     end = time.monotonic() + timeout_s
     while not condition():
         if time.monotonic() > end:
@@ -300,7 +302,7 @@ def wait_until(condition: Callable[[], bool], timeout_s: float = 30.0) -> None:
 
 @contextmanager
 def robot(truth: Path) -> Iterator[tuple[subprocess.Popen[str], str]]:
-    """Run the simulated robot; it begins to move when the box listens."""
+    """Run the simulated robot; it begins to move when the recorder listens."""
     command = [sys.executable, "-m", "amberbox.sim", "--zmq", "tcp://127.0.0.1:*", "--wait"]
     process = subprocess.Popen(
         [*command, "--seed", "7", "--truth", str(truth)],
@@ -322,15 +324,15 @@ def tell_robot(process: subprocess.Popen[str], line: str) -> None:
 
 
 def sent_messages(truth: Path) -> dict[tuple[str, int], int]:
-    """Return topic and number of every message sent, with its stamp."""
+    """Return the stamp (ns) of every sent message, by topic and number."""
     lines = [json.loads(line) for line in truth.read_text().splitlines() if line.endswith("}")]
     return {(line["topic"], line["seq"]): line["stamp_ns"] for line in lines}
 
 
 def kept_messages(store: Path) -> Counter[tuple[str, int]]:
-    """Count topic and number of every message in the record."""
+    """Return how often each message is in the record, by topic and number."""
     kept: Counter[tuple[str, int]] = Counter()
-    for batch in read.batches(store):
+    for batch in journal_reader.batches(store):
         if batch.source == "zmq" and "header_seq" in batch.columns:
             numbers = np.asarray(batch.columns["header_seq"]).tolist()
             kept.update((batch.topic, number) for number in numbers)

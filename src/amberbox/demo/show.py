@@ -1,4 +1,4 @@
-"""Run the demonstration: until Ctrl-C for people, or through its story, which judges itself."""
+"""Run the demonstration: until Ctrl-C, or through its story, which checks itself."""
 
 from __future__ import annotations
 
@@ -14,26 +14,23 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from amberbox.core.errors import AmberboxError
-from amberbox.demo.processes import start_tied
-from amberbox.demo.stage import Absence, Stage
-from amberbox.fleet.accounts.actions import Role
-from amberbox.fleet.accounts.signincodes import LASTS_NS
-from amberbox.fleet.serving import starting
-from amberbox.fleet.serving.binding import Wanted
-from amberbox.fleet.serving.starting import Start
+from amberbox.demo.fleet import LiveDemo, OutagePlan, start_tied
+from amberbox.server import start
+from amberbox.server.accounts.permissions import Role
+from amberbox.server.accounts.signin import CODE_LASTS_NS
+from amberbox.server.config import ListenOptions
+from amberbox.server.start import StartedServer
 
 HOST = "127.0.0.1"
 PORT = 8443
-_PORTS = 50
-"""So many are tried."""
-_NOW_AND_THEN = Absence(60.0, 30.0, 90.0)
-_OF_STORY = 0.15
-"""Share of the story for which a robot has no way to the server."""
-_MINUTES = LASTS_NS // 60_000_000_000
+_PORTS = 50  # number of ports that are tried
+_NOW_AND_THEN = OutagePlan(60.0, 30.0, 90.0)
+_OF_STORY = 0.15  # share of the story for which a robot is disconnected
+_MINUTES = CODE_LASTS_NS // 60_000_000_000
 
 
 def free_port(first: int) -> int:
-    """Return the first port from there on that nobody listens at; raises AmberboxError."""
+    """Return the first free port from ``first`` on; raises AmberboxError without one."""
     for port in range(first, min(first + _PORTS, 65536)):
         with closing(socket.socket()) as probe:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -46,19 +43,20 @@ def free_port(first: int) -> int:
 
 
 def run(folder: Path, port: int, seconds: float | None) -> int:
-    """Run the demonstration below a folder; ``seconds`` is how long its story is, None for people.
+    """Run the demonstration below a folder; ``seconds`` is the length of its story, None for
+    people.
 
-    Returns 0 when somebody ended it, or every step of the story worked.
+    Returns 0 when a person ended it, or every step of the story worked.
     """
     free = free_port(port)
     if free != port:
         print(f"port {port} is taken, so it is {free}")
-    stage = Stage(folder, free)
+    stage = LiveDemo(folder, free)
     stage.prepare()
-    show = Show(stage, seconds)
+    show = DemoRun(stage, seconds)
     try:
-        stage.begin()  # robots and server start together, and nearly take the same time
-        starting.run(stage.data, Wanted(HOST, free), begun=show.begin, demo=stage)
+        stage.begin()  # robots and server start in parallel, in nearly the same time
+        start.run(stage.data, ListenOptions(HOST, free), begun=show.begin, demo=stage)
     finally:
         stage.close()
     show.raise_if_broken()
@@ -66,21 +64,21 @@ def run(folder: Path, port: int, seconds: float | None) -> int:
 
 
 @dataclass(eq=False)
-class Show:
-    """What goes on beside the server, on its event loop."""
+class DemoRun:
+    """The task beside the server, on its event loop."""
 
-    stage: Stage
+    stage: LiveDemo
     seconds: float | None
     status: int = 0
     _task: asyncio.Task[None] | None = None
 
-    def begin(self, start: Start) -> None:
-        """Begin; the server answers by now."""
+    def begin(self, start: StartedServer) -> None:
+        """Start the task, once the server answers."""
         self._task = asyncio.get_running_loop().create_task(self._go_on(start.settings.public_url))
         self._task.add_done_callback(_end_if_broken)
 
     def raise_if_broken(self) -> None:
-        """Raise what went wrong beside the server, if anything did."""
+        """Raise the exception of the task, if there is one."""
         if self._task is not None and not self._task.cancelled():
             error = self._task.exception()
             if error is not None:
@@ -88,16 +86,16 @@ class Show:
 
     async def _go_on(self, url: str) -> None:
         if self.seconds is None:
-            away = self.stage.come_and_go(_NOW_AND_THEN, say, self.stage.relay.was_used)
+            away = self.stage.cycle_outages(_NOW_AND_THEN, say, self.stage.relay.was_used)
         else:
             off_s = self.seconds * _OF_STORY
-            once = Absence(off_s / 2, off_s, self.seconds)
-            away = self.stage.come_and_go(once, _be_silent, self.stage.broken)
+            once = OutagePlan(off_s / 2, off_s, self.seconds)
+            away = self.stage.cycle_outages(once, _be_silent, self.stage.broken)
         told = self._welcome(url) if self.seconds is None else self._tell(url)
         await asyncio.gather(away, told)
 
     async def _welcome(self, url: str) -> None:
-        """Print links, and new ones whenever somebody presses Enter."""
+        """Print sign-in links, and new ones on each Enter."""
         print(f"\nThree simulated robots run, recorded and watched, at {url}")
         pressed = asyncio.Event()
         asyncio.get_running_loop().add_reader(sys.stdin, _read_line, pressed)
@@ -117,7 +115,7 @@ class Show:
               "\nEnter prints new links, Ctrl-C ends everything.\n", flush=True)  # fmt: skip
 
     async def _tell(self, url: str) -> None:
-        """Let the story be gone through, then end the server."""
+        """Run the story as a process, then end the server."""
         codes = {str(role): self.stage.codes.make(str(role)) for role in Role}
         story = start_tied(("amberbox.demo",), stdin=subprocess.PIPE)
         try:
@@ -130,22 +128,22 @@ class Show:
 
 
 def say(text: str) -> None:
-    """Tell whoever watches the terminal."""
+    """Print a line at once."""
     print(text, flush=True)
 
 
 def _be_silent(text: str) -> None:
-    """Say nothing: the story tells what it sees itself."""
+    """Print nothing, as the story prints its own steps."""
 
 
 def _read_line(pressed: asyncio.Event) -> None:
     if sys.stdin.readline():
         pressed.set()
     else:
-        asyncio.get_running_loop().remove_reader(sys.stdin)  # closed: nobody presses anything
+        asyncio.get_running_loop().remove_reader(sys.stdin)  # stdin is closed
 
 
 def _end_if_broken(task: asyncio.Task[None]) -> None:
-    """End the server when what goes on beside it cannot go on; ``run`` raises why."""
+    """End the server when the task has failed; ``run`` raises the reason."""
     if not task.cancelled() and task.exception() is not None:
         os.kill(os.getpid(), signal.SIGTERM)

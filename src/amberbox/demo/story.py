@@ -1,70 +1,434 @@
-"""The story: break a robot, see it found out, acknowledge, answer, repair; and look at the rest."""
+"""The story: break a robot, find the fault, acknowledge, answer, repair, download the data.
+
+It also watches a robot disconnect and return, and visits one page of each kind. Each step is
+printed with its seconds; the first failure ends it.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import http.client
+import json
+import re
+import threading
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, TypeVar
+from urllib.parse import urlsplit
 
-from amberbox.demo.away import watch_the_absence
-from amberbox.demo.browser import Browser
-from amberbox.demo.listening import Heard, Listener, is_kind, is_status
-from amberbox.demo.robots import IDS
-from amberbox.demo.taking import take_home
-from amberbox.demo.telling import PATIENCE_S, Telling, check, until
-from amberbox.demo.visits import visit_pages
+from amberbox.core.clock import NS
+from amberbox.core.errors import AmberboxError
+from amberbox.core.timestamps import format_time
+from amberbox.demo.fleet import IDS, SOMETIMES_AWAY
+from amberbox.server.http.auth import COOKIE, CSRF_HEADER, PREFIX
+
+if TYPE_CHECKING:
+    from websockets.sync.client import ClientConnection
+
+
+_TIMEOUT_S = 30.0
+_MOST_BYTES = 64 << 20
+_NOT_HERE = 400  # status of an answer about an item that is in no journal yet
+
+
+@dataclass(frozen=True, slots=True)
+class BrowserReply:
+    """A response; ``headers`` have lower-case names."""
+
+    status: int
+    headers: Mapping[str, str]
+    body: bytes
+
+    @property
+    def value(self) -> Any:
+        """Return the body as JSON."""
+        return json.loads(self.body)
+
+
+@dataclass
+class BrowserClient:
+    """The browser of one person; ``url`` is the server's URL, without a trailing slash."""
+
+    url: str
+    _cookie: str = field(default="", repr=False)
+    _csrf: str = field(default="", repr=False)
+
+    def page(self, path: str) -> BrowserReply:
+        """Open a path of the server and return the response, whatever its status."""
+        return self._once("GET", path, None)
+
+    def sign_in(self, code: str) -> BrowserReply:
+        """Use a one-time code, as its page does."""
+        reply = self._once("POST", f"{PREFIX}/session/code", {"code": code})
+        for part in reply.headers.get("set-cookie", "").split(";"):
+            name, _, value = part.strip().partition("=")
+            if name == COOKIE:
+                self._cookie, self._csrf = value, reply.value["csrf"]
+        return reply
+
+    def get(self, path: str) -> Any:
+        """Request a route of the API; raises AmberboxError for any answer but 200."""
+        return self._checked("GET", path, None).value
+
+    def get_data(self, path: str) -> Any:
+        """Request data of the API; None while no journal that has them has arrived."""
+        reply = self.page(PREFIX + path)
+        return None if reply.status == _NOT_HERE else _of(reply, "GET", path).value
+
+    def send(self, method: str, path: str, body: Any = None) -> Any:
+        """Send a change; raises AmberboxError when it is refused."""
+        reply = self._checked(method, path, body)
+        return reply.value if reply.body else None
+
+    def fetch(self, path: str) -> bytes:
+        """Download a file."""
+        return self._checked("GET", path, None).body
+
+    def feed(self) -> ClientConnection:
+        """Open the feed, subscribed to all changes."""
+        from websockets.sync.client import connect
+
+        socket = connect(
+            f"ws{self.url.removeprefix('http')}{PREFIX}/feed", origin=self.url,  # type: ignore[arg-type]  # a NewType of str
+            additional_headers={"Cookie": f"{COOKIE}={self._cookie}"},
+            proxy=None, max_size=_MOST_BYTES, open_timeout=_TIMEOUT_S,
+        )  # fmt: skip
+        socket.send(json.dumps({"robots": None, "kinds": None, "live": {}, "resume": None}))
+        return socket
+
+    def _checked(self, method: str, path: str, body: Any) -> BrowserReply:
+        return _of(self._once(method, PREFIX + path, body), method, path)
+
+    def _once(self, method: str, target: str, body: Any) -> BrowserReply:
+        headers = {"Origin": self.url, "Cookie": f"{COOKIE}={self._cookie}" if self._cookie else ""}
+        data = None
+        if body is not None:
+            data, headers["Content-Type"] = json.dumps(body), "application/json"
+        if method != "GET" and self._csrf:
+            headers[CSRF_HEADER] = self._csrf
+        connection = http.client.HTTPConnection(urlsplit(self.url).netloc, timeout=_TIMEOUT_S)
+        try:
+            connection.request(method, target, data, headers)
+            answer = connection.getresponse()
+            known = {name.lower(): value for name, value in answer.getheaders()}
+            return BrowserReply(answer.status, known, answer.read())
+        except (OSError, http.client.HTTPException) as error:
+            raise AmberboxError(f"{self.url} does not answer: {error}") from error
+        finally:
+            connection.close()
+
+
+def _of(reply: BrowserReply, method: str, path: str) -> BrowserReply:
+    """Return a response; raises AmberboxError for a refusal."""
+    if reply.status >= 300:
+        what = reply.body.decode("utf-8", "replace")[:300]
+        raise AmberboxError(f"{method} {path} answered {reply.status}: {what}")
+    return reply
+
+
+T = TypeVar("T")
+
+PATIENCE_S = 60.0  # limit of each step; one takes a few seconds unless the machine is very busy
+_POLL_S = 0.2
+
+
+class FailedError(AmberboxError):
+    """A step of the story failed."""
+
+
+@dataclass
+class StoryLog:
+    """The clock and step counter of the story."""
+
+    began_s: float = field(default_factory=time.monotonic)
+    steps: int = 0
+
+    def say(self, text: str) -> None:
+        """Print a line, with the time since the story began."""
+        print(f"[{time.monotonic() - self.began_s:5.1f} s] {text}", flush=True)
+
+    def worked(self, text: str) -> None:
+        """Print that a step worked."""
+        self.steps += 1
+        self.say(f"ok: {text}")
+
+
+def until(find: Callable[[], T | None], what: Callable[[], str], within_s: float = PATIENCE_S) -> T:
+    """Poll until something is found and return it; raises FailedError after the limit."""
+    end_s = time.monotonic() + within_s
+    while (found := find()) is None:
+        if time.monotonic() > end_s:
+            raise FailedError(f"{what()}: waited {within_s:.0f} s in vain", "is the machine busy?")
+        time.sleep(_POLL_S)
+    return found
+
+
+def check(fine: bool, what: str) -> None:
+    """Raise FailedError unless ``fine``."""
+    if not fine:
+        raise FailedError(f"it is not true that {what}", "please report this")
+
+
+@dataclass(frozen=True, slots=True)
+class FeedChange:
+    """A change of the feed; ``at_s`` by the monotonic clock."""
+
+    at_s: float
+    kind: str
+    robot: str
+    data: Any
+
+
+class FeedListener:
+    """Stores all changes of the feed from its creation on; ``close`` it."""
+
+    def __init__(self, browser: BrowserClient) -> None:
+        self._heard: list[FeedChange] = []
+        self._new = threading.Condition()
+        self._is_over = False
+        self._socket = browser.feed()
+        self._thread = threading.Thread(target=self._listen, daemon=True)
+        self._thread.start()
+
+    def wait(
+        self, is_it: Callable[[FeedChange], bool], within_s: float, since_s: float = 0.0
+    ) -> FeedChange:
+        """Wait for the first matching change since ``since_s``; raises FailedError."""
+        end_s = time.monotonic() + within_s
+        seen = 0
+        while True:
+            news = self._after(seen, end_s)
+            seen += len(news)
+            for one in news:
+                if one.at_s >= since_s and is_it(one):
+                    return one
+
+    def close(self) -> None:
+        """Close the connection."""
+        self._socket.close()
+        self._thread.join(5)
+
+    def _after(self, seen: int, end_s: float) -> list[FeedChange]:
+        """Return the changes after the first ``seen``, waiting until there are any."""
+        with self._new:
+            while len(self._heard) == seen:
+                left_s = end_s - time.monotonic()
+                if left_s <= 0 or self._is_over:
+                    raise FailedError("what should follow did not come", "is the machine busy?")
+                self._new.wait(left_s)
+            return self._heard[seen:]
+
+    def _listen(self) -> None:
+        from websockets.exceptions import ConnectionClosed
+
+        with contextlib.suppress(ConnectionClosed):
+            for message in self._socket:
+                self._take(json.loads(message))
+        with self._new:
+            self._is_over = True
+            self._new.notify_all()
+
+    def _take(self, changes: Any) -> None:
+        now_s = time.monotonic()
+        with self._new:
+            self._heard += [
+                FeedChange(now_s, one["kind"], one.get("robot") or "", one.get("data"))
+                for one in changes
+            ]
+            self._new.notify_all()
+
+
+def is_status(component: str, level: str, robot: str) -> Callable[[FeedChange], bool]:
+    """Return a predicate for changes in which a component reaches a level."""
+
+    def is_it(heard: FeedChange) -> bool:
+        return (heard.kind, heard.robot) == ("status", robot) and any(
+            one["component"] == component and not one["mode"] and one["level"] == level
+            for one in heard.data
+        )
+
+    return is_it
+
+
+def is_kind(kind: str, robot: str) -> Callable[[FeedChange], bool]:
+    """Return a predicate for changes of a kind about a robot."""
+    return lambda heard: heard.kind == kind and heard.robot == robot
+
+
+ITEM, VARIABLE = "sim_bus", "working_counter"
+WELL, BROKEN = 12, 9  # fieldbus working counter with all units, and with one missing
+_AROUND_NS = 5 * NS
+
+
+def download_fault_data(
+    telling: StoryLog, browser: BrowserClient, robot: str, broken_ns: int
+) -> None:
+    """Find the fault in the recorded data, and download that view as CSV."""
+    window = {
+        "from": format_time(broken_ns - _AROUND_NS),
+        "to": format_time(broken_ns + _AROUND_NS),
+    }
+    rows = until(lambda: _rows(browser, robot, window), lambda: "the data of the fault are here")
+    telling.worked(f"{rows} rows of {ITEM}.{VARIABLE} show the fault: {WELL}, then {BROKEN}")
+    asked = {"robots": [robot], "items": [ITEM], "variables": {ITEM: [VARIABLE]}, **window}
+    number = browser.send("POST", "/downloads", {**asked, "format": "csv"})["id"]
+    made = until(lambda: _made(browser, number), lambda: "the download is made")
+    text = browser.fetch(f"/downloads/{number}/file").decode()
+    check(f",{BROKEN}" in text and f",{WELL}" in text, "the file shows the fault as well")
+    telling.worked(f"downloaded {made['file']}: {len(text.splitlines()) - 1} rows")
+
+
+def _rows(browser: BrowserClient, robot: str, window: dict[str, str]) -> int | None:
+    """Return the number of rows once both values are among them, else None."""
+    span = f"from={window['from']}&to={window['to']}"
+    answer = browser.get_data(f"/robots/{robot}/query?item={ITEM}&variables={VARIABLE}&{span}")
+    if answer is None:
+        return None
+    names = [column["name"] for column in answer["columns"]]
+    at = names.index(VARIABLE) if VARIABLE in names else -1
+    values = {row[at] for row in answer["data"]}
+    return int(answer["rows"]) if {WELL, BROKEN} <= values else None
+
+
+def _made(browser: BrowserClient, number: str) -> Any:
+    job = browser.get(f"/downloads/{number}")
+    check(job["state"] not in ("failed", "cancelled", "expired"), f"it is made: {job['error']}")
+    return job if job["state"] == "done" else None
+
+
+_OPEN = ("/in", "/sign-in", "/licences", "/help")
+_SEEN = ("/", "/robots/{robot}", "/robots/{robot}/data", "/robots/{robot}/diagnosis",
+         "/recordings",
+    "/recordings/{robot}", "/downloads", "/alarms", "/alarms/{alarm}", "/knowledge",
+         "/knowledge/{robot}", "/account")  # fmt: skip
+_ADMIN = ("/admin", "/admin/users", "/admin/robots", "/admin/teams", "/admin/system",
+          "/admin/audit", "/admin/health")  # fmt: skip
+_ASSET = re.compile(rb"(?:src|href)=\"(/static/[^\"#]+)")
+
+
+def visit_pages(
+    telling: StoryLog, people: Mapping[str, BrowserClient], robot: str, alarm: int
+) -> None:
+    """Open every kind of page with a role that may see it; raises FailedError unless it is 200."""
+    nobody = BrowserClient(people["admin"].url)
+    visits = [(nobody, path) for path in _OPEN]
+    visits += [(people["technician"], path.format(robot=robot, alarm=alarm)) for path in _SEEN]
+    visits += [(people["admin"], path) for path in _ADMIN]
+    assets = {asset for browser, path in visits for asset in _visit(browser, path)}
+    for asset in sorted(assets):
+        check(nobody.page(asset).status == 200, f"{asset} is there")
+    telling.worked(f"{len(visits)} pages and the {len(assets)} files they are made of answer 200")
+
+
+def _visit(browser: BrowserClient, path: str) -> Iterator[str]:
+    """Open a page; yield its assets."""
+    reply = browser.page(path)
+    check(reply.status == 200, f"the page {path} answers 200 (it was {reply.status})")
+    is_html = reply.headers.get("content-type", "").startswith("text/html")
+    check(is_html, f"{path} is a page")
+    yield from (found.decode() for found in _ASSET.findall(reply.body))
+
+
+_ITEM = "sim_odom"
+_RATE_HZ, _MOST_OF_IT = 50, 0.8
+_LEAST_LANES = 50
+
+
+def watch_outage(telling: StoryLog, browser: BrowserClient, feed: FeedListener) -> None:
+    """Wait until the robot goes offline, returns, and its records of that time arrive."""
+    went = feed.wait(_is_presence(online=False), PATIENCE_S)
+    telling.worked(f"{SOMETIMES_AWAY} went offline")
+    came = feed.wait(_is_presence(online=True), PATIENCE_S, went.at_s)
+    telling.worked(f"{SOMETIMES_AWAY} came back after {came.at_s - went.at_s:.0f} s")
+    span = {"from": _time_of(went), "to": _time_of(came)}
+    count = until(lambda: _lanes(browser, span), lambda: "what it found meanwhile is here")
+    telling.worked(f"{SOMETIMES_AWAY} has told how {count} parts of it were meanwhile")
+    least = round((came.at_s - went.at_s) * _RATE_HZ * _MOST_OF_IT)
+    rows = until(
+        lambda: _rows_of_absence(browser, span, least),
+        lambda: "what was recorded meanwhile is here",
+    )
+    telling.worked(f"{rows} rows of {_ITEM} of that time are here")
+
+
+def _is_presence(*, online: bool) -> Any:
+    def is_it(heard: FeedChange) -> bool:
+        is_his = (heard.kind, heard.robot) == ("presence", SOMETIMES_AWAY)
+        return is_his and heard.data["online"] is online
+
+    return is_it
+
+
+def _lanes(browser: BrowserClient, span: dict[str, str]) -> int | None:
+    """Return the number of components and modes that were well in a time span; None if too few."""
+    path = f"/robots/{SOMETIMES_AWAY}/timeline?from={span['from']}&to={span['to']}"
+    lanes = browser.get(path)["lanes"]
+    well = [lane for lane in lanes if any(one["level"] == "ok" for one in lane["stretches"])]
+    return len(well) if len(well) >= _LEAST_LANES else None
+
+
+def _rows_of_absence(browser: BrowserClient, span: dict[str, str], least: int) -> int | None:
+    path = f"/robots/{SOMETIMES_AWAY}/query?item={_ITEM}&from={span['from']}&to={span['to']}"
+    answer = browser.get_data(path)
+    found = int(answer["rows"]) if answer else 0
+    return found if found >= least else None
+
+
+def _time_of(heard: FeedChange) -> str:
+    """Return the wall time of a change; all processes share one clock here."""
+    return format_time(time.time_ns() - round((time.monotonic() - heard.at_s) * 1e9))
+
 
 ROBOT = "ropod_001"
 FAULT = "wheel_front_left_bus_disconnected"
 COMPONENT = "bus"
 CAUSE = "wheel_front_left#bus_disconnected"
+# the test of the story and its answer, which determines the fault
 TEST, ANSWER = "wheel_front_left.plug", "off"
-"""What the plug of the wheel unit is found to be: that is the fault."""
-_LEAST_WELL = 15
-"""So many components are well before anything is broken; the others wait for a first message."""
+_LEAST_WELL = 15  # components that are ok before a fault; others wait for a first message
 _SURE = 0.9
 
 
-def tell(url: str, codes: Mapping[str, str]) -> None:
-    """Go through all of it; ``codes`` sign each role in. Raises AmberboxError where it fails."""
-    telling = Telling()
+def run_story(url: str, codes: Mapping[str, str]) -> None:
+    """Run all steps; ``codes`` sign each role in. Raises AmberboxError where one fails."""
+    telling = StoryLog()
     people = {role: sign_in(url, code) for role, code in codes.items()}
     telling.worked(f"{len(people)} people signed in by their links; none works a second time")
-    feed = Listener(people["technician"])
+    feed = FeedListener(people["technician"])
     try:
-        one = Broken(telling, people["technician"], feed)
+        one = FaultStory(telling, people["technician"], feed)
         one.go_through()
-        watch_the_absence(telling, people["technician"], feed)
-        take_home(telling, people["technician"], ROBOT, one.broken_ns)
+        watch_outage(telling, people["technician"], feed)
+        download_fault_data(telling, people["technician"], ROBOT, one.broken_ns)
     finally:
         feed.close()
     visit_pages(telling, people, ROBOT, one.alarm)
     telling.say(f"all {telling.steps} steps worked")
 
 
-def sign_in(url: str, code: str) -> Browser:
-    """Sign somebody in by a link, as its page does; it works once."""
-    browser = Browser(url)
+def sign_in(url: str, code: str) -> BrowserClient:
+    """Sign in by a one-time link, as its page does."""
+    browser = BrowserClient(url)
     check(browser.sign_in(code).status == 200, "the link signs in")
-    check(Browser(url).sign_in(code).status == 400, "a link that was used is refused")
+    check(BrowserClient(url).sign_in(code).status == 400, "a link that was used is refused")
     return browser
 
 
 @dataclass
-class Broken:
-    """What happens to one robot, as a technician sees it in the browser."""
+class FaultStory:
+    """The story of one robot, as a technician sees it in the browser."""
 
-    telling: Telling
-    browser: Browser
-    feed: Listener
+    telling: StoryLog
+    browser: BrowserClient
+    feed: FeedListener
     broken_s: float = 0.0
     broken_ns: int = 0
     alarm: int = 0
     diagnosis: str = ""
 
     def go_through(self) -> None:
-        """Go from a robot that is well to one that is well again."""
+        """Run all steps, from a robot that is ok to one that is ok again."""
         for step in (
             self.see_robots, self.damage, self.see_symptom, self.see_alarm, self.see_diagnosis,
             self.acknowledge, self.answer, self.repair,
@@ -72,22 +436,22 @@ class Broken:
             step()
 
     def see_robots(self) -> None:
-        """Wait until all are there, and their monitors have seen that they are well."""
+        """Wait until all robots are online and their monitors report ok."""
         until(self._all_well, lambda: f"all are well; but {'; '.join(self._troubles())}")
         self.telling.worked(f"{', '.join(IDS)} are online and well")
 
     def damage(self) -> None:
-        """Press the button."""
+        """Inject the fault."""
         self.broken_s, self.broken_ns = time.monotonic(), time.time_ns()
         self.browser.send("POST", f"/demo/{ROBOT}/fault", {"fault": FAULT})
         self.telling.worked(f"{ROBOT} is broken: {FAULT}")
 
     def see_symptom(self) -> None:
-        """See the component in error."""
+        """Wait for the status of the component."""
         self._found("symptom", self._wait(is_status(COMPONENT, "error", ROBOT)), COMPONENT)
 
     def see_alarm(self) -> None:
-        """See the alarm, with its reason in words."""
+        """Wait for the alarm, with its reason."""
         heard = self._wait(is_kind("alarm", ROBOT))
         self.alarm = int(heard.data["id"])
         alarm = self._alarm()
@@ -95,7 +459,7 @@ class Broken:
         self._found("alarm", heard, f"{alarm['severity']}: {alarm['reason']}")
 
     def see_diagnosis(self) -> None:
-        """See what is to blame, and which test tells more."""
+        """Wait for the diagnosis and its next test."""
         heard = self._wait(self._blames(lambda revision: CAUSE in _leading(revision)))
         self._found("diagnosis", heard, CAUSE)
         heard = self._wait(self._blames(lambda revision: bool(_test(revision))))
@@ -103,14 +467,14 @@ class Broken:
         self._found("next test", heard, next(texts)["text"])
 
     def acknowledge(self) -> None:
-        """Say that somebody sees to it."""
+        """Acknowledge the alarm."""
         said = {"revision": self._alarm()["revision"], "note": "on my way"}
         self.browser.send("POST", f"/alarms/{self.alarm}/acknowledge", said)
         check(self._alarm()["acknowledged"] is not None, "the alarm is acknowledged")
         self.telling.worked(f"alarm {self.alarm} is acknowledged")
 
     def answer(self) -> None:
-        """Say what the test gave; then one cause is left."""
+        """Answer the test, which leaves one cause."""
         body = {"test": TEST, "answer": ANSWER}
         path = f"/robots/{ROBOT}/diagnoses/{self.diagnosis}/answers"
         first = self.browser.send("POST", path, body)["hypotheses"][0]
@@ -119,23 +483,23 @@ class Broken:
         self.telling.worked(f"the plug is off: {CAUSE} ({first['probability']:.0%})")
 
     def repair(self) -> None:
-        """Repair it, and see it well again."""
+        """Repair the robot, and wait until it is ok again."""
         since_s = time.monotonic()
         self.browser.send("DELETE", f"/demo/{ROBOT}/fault")
         self._wait(is_status(COMPONENT, "ok", ROBOT), since_s)
         self.telling.worked(f"{ROBOT} is repaired; {COMPONENT} is well again")
 
-    def _wait(self, is_it: Callable[[Heard], bool], since_s: float = 0.0) -> Heard:
+    def _wait(self, is_it: Callable[[FeedChange], bool], since_s: float = 0.0) -> FeedChange:
         return self.feed.wait(is_it, PATIENCE_S, since_s or self.broken_s)
 
-    def _found(self, what: str, heard: Heard, which: str) -> None:
+    def _found(self, what: str, heard: FeedChange, which: str) -> None:
         self.telling.worked(f"{what} after {heard.at_s - self.broken_s:.1f} s: {which}")
 
     def _all_well(self) -> bool | None:
         return None if self._troubles() else True
 
     def _troubles(self) -> list[str]:
-        """Say of each robot that is not there, or not well, why."""
+        """Describe each robot that is offline or not well."""
         cards = {card["robot"]: card for card in self.browser.get("/robots")}
         return [
             f"{robot}: {cards[robot]['cause']} {cards[robot]['components']}"
@@ -146,10 +510,10 @@ class Broken:
     def _alarm(self) -> Any:
         return self.browser.get(f"/alarms/{self.alarm}")["alarm"]
 
-    def _blames(self, is_it: Callable[[Any], bool]) -> Callable[[Heard], bool]:
-        """Make what knows a change by which a diagnosis of the robot is as is wanted."""
+    def _blames(self, is_it: Callable[[Any], bool]) -> Callable[[FeedChange], bool]:
+        """Return a predicate for changes with a diagnosis of the robot that matches."""
 
-        def found(heard: Heard) -> bool:
+        def found(heard: FeedChange) -> bool:
             if heard.kind != "diagnosis" or heard.robot != ROBOT:
                 return False
             self.diagnosis = heard.data[-1]["id"]
@@ -164,7 +528,7 @@ class Broken:
 
 
 def _is_well(card: Any) -> bool:
-    """Tell whether a robot is there, and nothing is in error."""
+    """Return whether a robot is online and nothing is in error."""
     levels = card["components"]
     return bool(
         card["online"] and levels.get("ok", 0) >= _LEAST_WELL and not levels.get("error", 0)
@@ -172,11 +536,11 @@ def _is_well(card: Any) -> bool:
 
 
 def _leading(revision: Any) -> list[str]:
-    """Return what may be to blame first of all: one failure mode, or some that look alike."""
+    """Return the failure modes of the leading group."""
     groups = revision["groups"]
     return list(groups[0]["members"]) if groups else []
 
 
 def _test(revision: Any) -> Any:
-    """Return the test of the story, if it is one of those to do next."""
+    """Return the test of the story, if it is among the next tests, else None."""
     return next((test for test in revision["next_tests"] if test["id"] == TEST), None)

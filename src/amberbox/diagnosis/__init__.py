@@ -1,1 +1,1 @@
-"""From symptoms to causes: FMEA, covering, fault trees, rules, explanation. Pure functions."""
+"""Diagnosis: from symptoms to ranked causes, by FMEA, covering, fault trees and rules."""

@@ -1,4 +1,4 @@
-"""What makes a robot safe before anybody tests or repairs it: actions against dangerous causes."""
+"""Actions that make a robot safe before tests and repairs."""
 
 from __future__ import annotations
 
@@ -7,27 +7,28 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
+from amberbox.core.robot_status import SEVERITIES, Severity
 from amberbox.core.types import AmbiguityGroup, Diagnosis, Hypothesis
-from amberbox.diagnosis.fmea.model import SEVERITIES, FailureMode, Fmea, Severity
+from amberbox.diagnosis.fmea.model import FailureMode, Fmea
 
+# From this probability of being present on a cause is credible; one that leads always is
 CREDIBLE: Final = 0.05
-"""From this probability of being present on a cause is credible; one that leads always is."""
 
 DANGEROUS: Final[tuple[Severity, ...]] = ("critical", "fatal")
 
+# How a remedy begins that makes safe, in an FMEA that has no make_safe
 _MAKES_SAFE = re.compile(
     r"(switch|turn|power) (it |everything |the \w+ )?off|stop|shut (it )?down|unplug|disconnect"
     r"|keep (away|clear|people)|evacuate|press the emergency stop|block off",
     re.IGNORECASE,
 )
-"""How a remedy begins that makes safe, in an FMEA that has no ``make_safe``."""
 _REPAIRS = re.compile(r"(then )?(replace|repair|mend|exchange|change|fit|swap|renew)\b", re.I)
 _CLAUSE_ENDS = re.compile(r"\s*[;,.]\s+")
 
 
 @dataclass(frozen=True, slots=True)
-class MakeSafe:
-    """An action that comes before every test, in the FMEA's words, and what it is against.
+class MakeSafeAction:
+    """An action before every test, in the FMEA's words, with the failure modes it is against.
 
     ``faults`` are failure modes, ``probability`` that of the most probable of the worst.
     """
@@ -49,19 +50,19 @@ def safe_action(mode: FailureMode) -> str:
     return mode.remedy[: _repair_at(mode.remedy)].rstrip(" ;,.")
 
 
-def repair(mode: FailureMode) -> str:
-    """Return what mends a failure mode, without what makes it safe."""
+def repair_action(mode: FailureMode) -> str:
+    """Return the repair of a failure mode, without the part that makes it safe."""
     if mode.make_safe or mode.severity not in DANGEROUS:
         return mode.remedy
     return mode.remedy[_repair_at(mode.remedy) :]
 
 
-def make_safe(
+def safety_actions(
     fmea: Fmea,
     hypotheses: Sequence[Hypothesis],
     leading: Collection[str],
     cleared: Collection[str] = (),
-) -> tuple[MakeSafe, ...]:
+) -> tuple[MakeSafeAction, ...]:
     """Return the actions against credible causes, the worst and most probable first.
 
     ``leading`` are the ids of the hypotheses that lead, ``cleared`` failure modes of which nothing
@@ -69,7 +70,7 @@ def make_safe(
     """
     first = {fault for h in hypotheses if h.id in leading for fault in h.faults}
     found: dict[str, list[tuple[int, float, str]]] = {}
-    for name, share in presence(hypotheses).items():
+    for name, share in mode_probabilities(hypotheses).items():
         mode = fmea.modes.get(name)
         if mode is None or (name in cleared and mode.severity != "fatal"):
             continue
@@ -80,15 +81,15 @@ def make_safe(
     return tuple(sorted(made, key=lambda m: (-SEVERITIES.index(m.severity), -m.probability)))
 
 
-def with_make_safe(fmea: Fmea, diagnosis: Diagnosis) -> Diagnosis:
+def with_safety_actions(fmea: Fmea, diagnosis: Diagnosis) -> Diagnosis:
     """Return a diagnosis with the actions that come before its tests."""
     leading = leading_ids(diagnosis.groups, diagnosis.hypotheses)
-    actions = make_safe(fmea, diagnosis.hypotheses, leading)
+    actions = safety_actions(fmea, diagnosis.hypotheses, leading)
     return replace(diagnosis, make_safe=tuple(action.text for action in actions))
 
 
-def presence(hypotheses: Sequence[Hypothesis]) -> dict[str, float]:
-    """Return how probable each failure mode is to be present, alone or with others."""
+def mode_probabilities(hypotheses: Sequence[Hypothesis]) -> dict[str, float]:
+    """Return the probability of each failure mode, alone or with others."""
     shares: dict[str, float] = {}
     for hypothesis in hypotheses:
         for fault in sorted(hypothesis.faults):
@@ -107,9 +108,9 @@ def leading_ids(groups: Sequence[AmbiguityGroup], hypotheses: Sequence[Hypothesi
     return set(best.members)
 
 
-def _against(action: str, modes: Sequence[tuple[int, float, str]]) -> MakeSafe:
+def _against(action: str, modes: Sequence[tuple[int, float, str]]) -> MakeSafeAction:
     rank, share, _ = modes[0]
-    return MakeSafe(action, tuple(name for _, _, name in modes), SEVERITIES[rank], share)
+    return MakeSafeAction(action, tuple(name for _, _, name in modes), SEVERITIES[rank], share)
 
 
 def _repair_at(remedy: str) -> int:

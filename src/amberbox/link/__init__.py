@@ -1,1 +1,1 @@
-"""What robot and server say to each other: frames, positions, and the rules of both ends."""
+"""The link of robot and server: one protocol, the rules of both ends, the robot's client."""

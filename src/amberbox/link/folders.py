@@ -1,6 +1,7 @@
-"""A robot's folder on its way to the server: files that declare, never files that run.
+"""Robot folders packed for the server: declarations only, never executable files.
 
-Packed it is msgpack of contents by name, compressed with zstd. Both ends keep to the same limits.
+A packed folder is msgpack of contents by name, compressed with zstd. Both ends apply the same
+limits.
 """
 
 from __future__ import annotations
@@ -15,8 +16,8 @@ import zstandard
 from amberbox.core.errors import UsageError
 from amberbox.link.limits import PATH
 
+# Suffixes of the files that are sent
 SUFFIXES = frozenset({".yaml", ".yml", ".pl", ".bpmn", ".md", ".txt", ".csv", ".xml"})
-"""Files of a folder that travel."""
 PACKED_BYTES = 8 << 20
 UNPACKED_BYTES = 32 << 20
 FILES = 2000
@@ -30,11 +31,11 @@ _LEVEL = 9
 
 
 class FolderError(UsageError):
-    """This is no folder, or not one that is taken."""
+    """Invalid data of a packed folder, or a folder beyond a limit."""
 
 
 def is_config_hash(text: str) -> bool:
-    """Tell whether this is the hash of a folder, as a robot states it."""
+    """Return whether a text has the form of a configuration hash."""
     return _HASH.fullmatch(text) is not None
 
 
@@ -44,15 +45,15 @@ def address(config_hash: str) -> str:
 
 
 def travels(name: str) -> bool:
-    """Tell whether a file of a folder goes to the server, by its name relative to the folder."""
+    """Return whether a file is sent to the server, by its name relative to the folder."""
     path = PurePosixPath(name)
     return path.suffix.lower() in SUFFIXES and not _complaint(name)
 
 
 def pack(files: Mapping[str, bytes]) -> bytes:
-    """Pack the files of a folder that travel; the others stay where they are.
+    """Pack the files of a folder that may be sent; leave out the others.
 
-    Raises FolderError for more than the limits allow.
+    Raises FolderError beyond the limits.
     """
     chosen = {name: files[name] for name in sorted(files) if travels(name)}
     _check(chosen)
@@ -63,9 +64,9 @@ def pack(files: Mapping[str, bytes]) -> bytes:
 
 
 def unpack(data: bytes) -> dict[str, bytes]:
-    """Return the files of a packed folder by their names, which are safe below any folder.
+    """Return the files of a packed folder by name; the names are safe as relative paths.
 
-    Raises FolderError for what is damaged, too large, or has a file that does not travel.
+    Raises FolderError for a damaged or too large folder, or one with a file that may not be sent.
     """
     try:
         files = msgspec.msgpack.decode(_decompressed(data), type=dict[str, bytes])
@@ -80,7 +81,7 @@ def unpack(data: bytes) -> dict[str, bytes]:
 
 
 def _decompressed(data: bytes) -> bytes:
-    """Decompress what says beforehand how much it will be, and not too much."""
+    """Decompress data that states its size, if that is within the limit."""
     if len(data) > PACKED_BYTES:
         raise FolderError(f"a packed folder has at most {PACKED_BYTES} bytes")
     if not 0 <= zstandard.frame_content_size(data) <= UNPACKED_BYTES + (1 << 20):
@@ -100,7 +101,7 @@ def _check(files: Mapping[str, bytes]) -> None:
 
 
 def _complaint(name: str) -> str:
-    """Say why a name is no safe path below a folder."""
+    """Return why a name is no safe path below a folder; empty for one that is."""
     parts = name.split("/")
     if len(name) > _NAME_LENGTH or len(parts) > _DEPTH:
         return "its name is too long"
@@ -122,6 +123,6 @@ def _no_declaration(name: str) -> str:
 
 
 def _in_the_way(names: Collection[str]) -> Iterator[str]:
-    """Yield names that would have to be a file and a folder."""
+    """Yield names that are both a file and a folder."""
     above = {str(parent) for name in names for parent in PurePosixPath(name).parents}
     yield from (name for name in names if name in above)

@@ -1,33 +1,91 @@
-"""The frames of the link: one struct each, msgpack with a checksum in front.
+"""The frames of the link: one struct each, MessagePack with a checksum; journal positions.
 
-TCP's own checksum lets one damaged segment in some millions through, and a link without TLS has no
+TCP's checksum misses about one damaged segment in some millions, and a link without TLS has no
 other; so each frame begins with the CRC-32 of its content, little-endian.
 """
 
 from __future__ import annotations
 
 import zlib
-from typing import Annotated, TypeAlias
+from typing import Annotated, NamedTuple, TypeAlias, TypeVar
 
 import msgspec
 from msgspec import Meta, Struct
 
 from amberbox.link import limits
-from amberbox.link.positions import Count, Place, Reach, TimeNs
+
+# Largest number that a robot may send: sums and ends of ranges still fit into 64 bits
+LARGEST = 2**62
+
+# A number, size or position that a robot sends
+Count: TypeAlias = Annotated[int, Meta(ge=0, le=LARGEST)]
+# A time, duration or clock offset in nanoseconds that a robot sends; until the year 2116
+TimeNs: TypeAlias = Annotated[int, Meta(ge=-LARGEST, le=LARGEST)]
+
+
+def is_in_range(*numbers: int) -> bool:
+    """Return whether numbers from a robot fit into databases, columns and times."""
+    return all(-LARGEST <= number <= LARGEST for number in numbers)
+
+
+class JournalPosition(NamedTuple):
+    """A position in a writer's journals: all rows before ``(run, seq)``."""
+
+    run: Count = 0
+    seq: Count = 0
+
+
+START = JournalPosition()
+
+
+class RunEnd(msgspec.Struct, frozen=True, array_like=True):
+    """One run of a writer on the robot's disk: the boot that wrote it, and its present end.
+
+    ``closed``: it is no longer written, and its end survives a power cut.
+    """
+
+    run: Count
+    boot: str
+    end_seq: Count
+    closed: bool = True
+
+
+class WriterReach(msgspec.Struct, frozen=True, array_like=True):
+    """The reach of a writer's journals: oldest row, end, durable end, and runs."""
+
+    oldest: JournalPosition
+    end: JournalPosition
+    durable: JournalPosition
+    runs: tuple[RunEnd, ...] = ()
+
+    def problem(self) -> str:
+        """Return what is contradictory in it; empty where nothing is."""
+        if min(*self.oldest, *self.end, *self.durable) < 0:
+            return "a position below 0"
+        numbers = [run.run for run in self.runs]
+        ends = [run.end_seq for run in self.runs]
+        if not is_in_range(*self.oldest, *self.end, *self.durable, *ends, *numbers):
+            return "a position that is out of range"
+        if self.durable > self.end:
+            return "more is durable than was written"
+        if numbers != sorted(set(numbers)):
+            return "runs out of order"
+        return "a run that ends below 0" if any(run.end_seq < 0 for run in self.runs) else ""
+
 
 Name = Annotated[str, Meta(max_length=128)]
 Text = Annotated[str, Meta(max_length=limits.TEXT_BYTES)]
-Writers = Annotated[dict[Name, Reach], Meta(max_length=8)]
-Cursor: TypeAlias = dict[str, Place]
-Upto = Annotated[dict[Name, Place], Meta(max_length=8)]
+Writers = Annotated[dict[Name, WriterReach], Meta(max_length=8)]
+Cursor: TypeAlias = dict[str, JournalPosition]
+Upto = Annotated[dict[Name, JournalPosition], Meta(max_length=8)]
 
 
 class FrameError(ValueError):
-    """What came is no frame: damaged, too large, or of another protocol."""
+    """Invalid data instead of a frame: damaged, too large, or of another protocol."""
 
 
-class Row(Struct, frozen=True, array_like=True):
-    """One record of a robot's conclusions, its bytes as they stand in the journal."""
+class LinkRow(Struct, frozen=True, array_like=True):
+    """One record of a robot's conclusions, with the bytes as in the journal."""
 
     writer: Name
     run: Count
@@ -37,13 +95,13 @@ class Row(Struct, frozen=True, array_like=True):
     data: bytes
 
     @property
-    def place(self) -> Place:
-        """Where it stands in its writer's journal."""
-        return Place(self.run, self.seq)
+    def place(self) -> JournalPosition:
+        """Its position in the writer's journals."""
+        return JournalPosition(self.run, self.seq)
 
 
 class Hello(Struct, frozen=True, tag="hello"):
-    """The robot's first word: who it is, and what its store holds."""
+    """The robot's first frame: its id and store, and how far its journals reach."""
 
     robot: Name
     store_id: Name
@@ -57,24 +115,24 @@ class Hello(Struct, frozen=True, tag="hello"):
     public_key: Name = ""
 
 
-class Rows(Struct, frozen=True, tag="rows"):
-    """Rows, and up to where all rows of each writer have been sent by now."""
+class RowsFrame(Struct, frozen=True, tag="rows"):
+    """Rows, and the position up to which all rows of each writer have been sent."""
 
     epoch: Count
     number: Count
-    rows: Annotated[list[Row], Meta(max_length=limits.ROWS_COUNT)]
+    rows: Annotated[list[LinkRow], Meta(max_length=limits.ROWS_COUNT)]
     upto: Upto
 
 
-class Durable(Struct, frozen=True, tag="durable"):
+class DurableFrame(Struct, frozen=True, tag="durable"):
     """How far the robot's journals survive a power cut."""
 
     epoch: Count
     writers: Writers
 
 
-class Live(Struct, frozen=True, tag="live"):
-    """The latest value of each variable that somebody looks at; never stored."""
+class LiveFrame(Struct, frozen=True, tag="live"):
+    """The latest value of each watched variable; never stored."""
 
     epoch: Count
     values: Annotated[
@@ -82,13 +140,13 @@ class Live(Struct, frozen=True, tag="live"):
     ]
 
 
-class Beat(Struct, frozen=True, tag="beat"):
-    """The robot is there. ``mono_ns`` is its time since boot; ``backlog`` rows are not sent yet.
+class BeatFrame(Struct, frozen=True, tag="beat"):
+    """A heartbeat. ``mono_ns`` is the robot's time since boot; ``backlog`` counts unsent rows.
 
     ``offset_ns`` is its estimate of the server's clock minus its own, ``round_ns`` the round trip
-    that it comes from; None before there is one. ``monitoring`` is how its watcher is doing
-    (running, overloaded, silent, absent; empty where that is not known), ``delay_s`` how late that
-    evaluates what is recorded, in seconds.
+    of that estimate; None before there is one. ``monitoring`` is the state of its watcher (running,
+    overloaded, silent, absent; empty where unknown), ``delay_s`` how late that evaluates rows, in
+    seconds.
     """
 
     epoch: Count
@@ -102,15 +160,15 @@ class Beat(Struct, frozen=True, tag="beat"):
     delay_s: float = 0.0
 
 
-class Heads(Struct, frozen=True, tag="heads"):
-    """The robot's signed statement of how far everything reaches, as JSON."""
+class HeadsFrame(Struct, frozen=True, tag="heads"):
+    """The robot's signed statement of how far its journals reach, as JSON."""
 
     epoch: Count
     heads: bytes
 
 
-class Has(Struct, frozen=True, tag="has"):
-    """Journals that hold the window of a Fetch, which are copied now: name and bytes.
+class HasFrame(Struct, frozen=True, tag="has"):
+    """Journals that hold the window of a Fetch and are copied now: name and bytes.
 
     ``id`` is that of the Fetch; without files the robot holds nothing of the window.
     """
@@ -121,7 +179,7 @@ class Has(Struct, frozen=True, tag="has"):
 
 
 class Welcome(Struct, frozen=True, tag="welcome"):
-    """The server's answer to Hello: from where on it wants rows, in which epoch."""
+    """The server's answer to Hello: the epoch, and the positions from which to send rows."""
 
     epoch: int
     cursor: Cursor
@@ -131,27 +189,27 @@ class Welcome(Struct, frozen=True, tag="welcome"):
 
 
 class Ack(Struct, frozen=True, tag="ack"):
-    """All frames of rows up to ``number`` are stored; ``cursor`` need never be sent again."""
+    """All row frames up to ``number`` are stored; rows before ``cursor`` are never needed again."""
 
     number: int
     cursor: Cursor
 
 
 class Pong(Struct, frozen=True, tag="pong"):
-    """The answer to Beat: the server's clock, and the robot's time given back."""
+    """The answer to a heartbeat: the server's clock, and the heartbeat's ``mono_ns``."""
 
     wall_ns: int
     mono_ns: int
 
 
-class Watch(Struct, frozen=True, tag="watch"):
-    """Variables whose latest values somebody looks at now, in place of those before."""
+class WatchFrame(Struct, frozen=True, tag="watch"):
+    """The variables whose latest values are requested, replacing earlier ones."""
 
     variables: Annotated[list[Text], Meta(max_length=limits.VARIABLES)]
 
 
-class Fetch(Struct, frozen=True, tag="fetch"):
-    """Somebody wants a window of an item; empty means all items."""
+class FetchFrame(Struct, frozen=True, tag="fetch"):
+    """Request for a window of an item's record; empty means all items."""
 
     id: str
     item: str
@@ -160,14 +218,17 @@ class Fetch(Struct, frozen=True, tag="fetch"):
 
 
 class Bye(Struct, frozen=True, tag="bye"):
-    """Why the sender ends the link; ``for_good`` says that to try again is of no use now."""
+    """Why the sender closes the link; ``for_good``: reconnecting is useless."""
 
     reason: Text
     for_good: bool = False
 
 
-RobotFrame: TypeAlias = Hello | Rows | Durable | Live | Beat | Heads | Has | Bye
-ServerFrame: TypeAlias = Welcome | Ack | Pong | Watch | Fetch | Bye
+RobotFrame: TypeAlias = (
+    Hello | RowsFrame | DurableFrame | LiveFrame | BeatFrame | HeadsFrame | HasFrame | Bye
+)
+ServerFrame: TypeAlias = Welcome | Ack | Pong | WatchFrame | FetchFrame | Bye
+FrameT = TypeVar("FrameT")
 
 _ENCODER = msgspec.msgpack.Encoder()
 _FROM_ROBOT: msgspec.msgpack.Decoder[RobotFrame] = msgspec.msgpack.Decoder(RobotFrame)
@@ -175,7 +236,7 @@ _FROM_SERVER: msgspec.msgpack.Decoder[ServerFrame] = msgspec.msgpack.Decoder(Ser
 
 
 def encode(frame: RobotFrame | ServerFrame) -> bytes:
-    """Write a frame; raises FrameError when it is too large to be taken."""
+    """Encode a frame; raises FrameError when it is too large."""
     content = _ENCODER.encode(frame)
     if len(content) + 4 > limits.FRAME_BYTES:
         raise FrameError(f"a frame of {len(content)} bytes is too large")
@@ -183,25 +244,22 @@ def encode(frame: RobotFrame | ServerFrame) -> bytes:
 
 
 def from_robot(data: bytes) -> RobotFrame:
-    """Read a frame that a robot sent; raises FrameError when it is none."""
-    try:
-        return _FROM_ROBOT.decode(_checked(data))
-    except (msgspec.DecodeError, ValueError, RecursionError) as error:
-        raise FrameError(f"no frame: {error}") from error
+    """Decode a frame from a robot; raises FrameError for invalid data."""
+    return _decoded(_FROM_ROBOT, data)
 
 
 def from_server(data: bytes) -> ServerFrame:
-    """Read a frame that a server sent; raises FrameError when it is none."""
+    """Decode a frame from a server; raises FrameError for invalid data."""
+    return _decoded(_FROM_SERVER, data)
+
+
+def _decoded(decoder: msgspec.msgpack.Decoder[FrameT], data: bytes) -> FrameT:
     try:
-        return _FROM_SERVER.decode(_checked(data))
+        if not 4 < len(data) <= limits.FRAME_BYTES:
+            raise FrameError(f"{len(data)} bytes")
+        content = memoryview(data)[4:]
+        if zlib.crc32(content) != int.from_bytes(data[:4], "little"):
+            raise FrameError("the checksum does not fit")
+        return decoder.decode(content)
     except (msgspec.DecodeError, ValueError, RecursionError) as error:
         raise FrameError(f"no frame: {error}") from error
-
-
-def _checked(data: bytes) -> memoryview:
-    if not 4 < len(data) <= limits.FRAME_BYTES:
-        raise FrameError(f"{len(data)} bytes")
-    content = memoryview(data)[4:]
-    if zlib.crc32(content) != int.from_bytes(data[:4], "little"):
-        raise FrameError("the checksum does not fit")
-    return content

@@ -1,146 +1,177 @@
-"""What a server keeps of the link, and the rules by which it does; and one that keeps it in memory.
+"""The ledger of a server: which rows of each writer it holds, and the rules of admission.
 
-The server's database follows the same rules (``fleet/linkend``), and tests compare the two.
+Rows are sent before they are durable on the robot's disk. Rows that the robot loses at a power cut
+are kept on the server, marked, and never joined with rows that were written later.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Literal
 
-from amberbox.link.frames import Cursor, Hello, Row
-from amberbox.link.history import OTHER, Aside, Held, Why, aside, set_back
-from amberbox.link.positions import START, Place, Reach
+from amberbox.link.frames import START, Cursor, JournalPosition, LinkRow, WriterReach
 
-Key = tuple[str, str, int, int]
-"""Store, writer, run, seq: what makes a row of a robot the one it is."""
-
-
-class StaleEpochError(Exception):
-    """The robot has connected again since: what comes on an older connection is not taken."""
+ConflictReason = Literal["lost_at_power_cut", "other_history"]
+LOST: ConflictReason = "lost_at_power_cut"
+OTHER: ConflictReason = "other_history"
 
 
 @dataclass(frozen=True, slots=True)
-class Admission:
-    """A robot was let in: its epoch, where its rows go on, and what was put aside."""
+class HeldRun:
+    """What a server holds of one run of a writer: the boot that wrote it, and the run's end."""
+
+    run: int
+    boot: str
+    end_seq: int
+
+
+@dataclass(frozen=True, slots=True)
+class RowConflict:
+    """Rows of a run from ``from_seq`` on that are no longer part of the record, and why."""
+
+    writer: str
+    run: int
+    from_seq: int
+    why: ConflictReason
+
+
+def find_conflicts(
+    writer: str,
+    held: Sequence[HeldRun],
+    cursor: JournalPosition,
+    reach: WriterReach,
+    *,
+    is_hello: bool,
+) -> Iterator[RowConflict]:
+    """Yield the conflicts between what a server holds of a writer and what the robot states.
+
+    Only at Hello no rows are in transit, so that runs being written are compared too. A run of
+    another boot, a run that the robot never had, or an end before one stated as durable mean
+    another history: an old image of its disk was restored.
+    """
+    stated = {run.run: run for run in reach.runs}
+    for one in held:
+        now = stated.get(one.run)
+        if now is None:
+            if is_hello and one.run > reach.end.run:
+                yield _conflict(writer, one.run, 0, cursor)
+        elif one.boot and now.boot and one.boot != now.boot:
+            yield RowConflict(writer, one.run, 0, OTHER)
+        elif (now.closed or is_hello) and now.end_seq < one.end_seq:
+            yield _conflict(writer, one.run, now.end_seq, cursor)
+
+
+def _conflict(writer: str, run: int, from_seq: int, cursor: JournalPosition) -> RowConflict:
+    is_other = JournalPosition(run, from_seq) < cursor
+    return RowConflict(writer, run, from_seq, OTHER if is_other else LOST)
+
+
+def rewind_cursor(
+    cursor: Mapping[str, JournalPosition], found: Sequence[RowConflict]
+) -> dict[str, JournalPosition]:
+    """Return the cursor, moved back to where the record of a writer differs."""
+    back = dict(cursor)
+    for one in found:
+        if one.writer in back:
+            back[one.writer] = min(back[one.writer], JournalPosition(one.run, one.from_seq))
+    return back
+
+
+def advance_cursor(
+    cursor: Mapping[str, JournalPosition],
+    upto: Mapping[str, JournalPosition],
+    reaches: Mapping[str, WriterReach],
+) -> dict[str, JournalPosition]:
+    """Return the cursor, advanced to what was received and is durable on the robot; never back."""
+    moved = {w: min(at, reaches[w].durable) for w, at in upto.items() if w in reaches}
+    return {w: max(at, moved.get(w, START)) for w, at in {**moved, **cursor}.items()}
+
+
+@dataclass(slots=True)
+class StoreLedger:
+    """What a server holds of one store; ``received`` is how far rows arrived in this epoch."""
+
+    cursor: Cursor = field(default_factory=dict)
+    received: Cursor = field(default_factory=dict)
+    runs: dict[tuple[str, int], HeldRun] = field(default_factory=dict)
+    """By writer and number."""
+
+    def conflicts(self, reaches: Mapping[str, WriterReach], *, is_hello: bool) -> list[RowConflict]:
+        """Return the conflicts: rows that the robot no longer has, by the reach of its journals."""
+        found: list[RowConflict] = []
+        for writer, reach in reaches.items():
+            at = self.cursor.get(writer, START)
+            held = [
+                replace(one, end_seq=max(one.end_seq, at.seq)) if run == at.run else one
+                for (of, run), one in sorted(self.runs.items())
+                if of == writer
+            ]
+            found += find_conflicts(writer, held, at, reach, is_hello=is_hello)
+        return found
+
+    def cut(self, conflict: RowConflict) -> None:
+        """Truncate a run at a conflict."""
+        key = conflict.writer, conflict.run
+        if conflict.from_seq == 0:
+            self.runs.pop(key, None)
+        elif key in self.runs:
+            self.runs[key] = replace(self.runs[key], end_seq=conflict.from_seq)
+
+    def note_boots(self, reaches: Mapping[str, WriterReach]) -> Iterator[tuple[str, int]]:
+        """Set the boots of runs where they are unknown; yield the runs that changed."""
+        for writer, reach in reaches.items():
+            for stated in reach.runs:
+                known = self.runs.get((writer, stated.run))
+                if known is None or (stated.boot and not known.boot):
+                    end_seq = 0 if known is None else known.end_seq
+                    self.runs[writer, stated.run] = HeldRun(stated.run, stated.boot, end_seq)
+                    yield writer, stated.run
+
+    def end_of(self, writer: str, run: int) -> int:
+        """Return the end of a run: the number of its last stored row plus one."""
+        known = self.runs.get((writer, run))
+        return 0 if known is None else known.end_seq
+
+    def extend(self, writer: str, run: int, end_seq: int) -> None:
+        """Extend a run to the end of newly stored rows."""
+        known = self.runs.get((writer, run), HeldRun(run, "", 0))
+        self.runs[writer, run] = replace(known, end_seq=max(known.end_seq, end_seq))
+
+    def advance(
+        self,
+        upto: Mapping[str, JournalPosition],
+        reaches: Mapping[str, WriterReach],
+        conflicts: Sequence[RowConflict],
+    ) -> None:
+        """Advance the cursors, or move them back to where conflicts begin."""
+        self.received = rewind_cursor({**self.received, **upto}, conflicts)
+        back = rewind_cursor(self.cursor, conflicts)
+        self.cursor = advance_cursor(back, self.received, reaches)
+
+
+class StaleEpochError(Exception):
+    """The robot has reconnected: frames of an older connection are refused."""
+
+
+@dataclass(frozen=True, slots=True)
+class LinkAdmission:
+    """An admission: the robot's epoch, the cursor to send from, and conflicts."""
 
     epoch: int
     cursor: Cursor
-    aside: tuple[Aside, ...] = ()
+    conflicts: tuple[RowConflict, ...] = ()
     is_new_store: bool = False
 
 
 @dataclass(frozen=True, slots=True)
-class Stored:
-    """What came of some rows: the new cursor, those that were new, those put aside."""
+class StoredRows:
+    """The result of storing rows: the new cursor, new rows, and rows that contradict stored ones.
+
+    ``conflicts`` are earlier rows that the robot no longer has.
+    """
 
     cursor: Cursor
-    new: tuple[Row, ...] = ()
-    conflicts: tuple[Row, ...] = ()
-    aside: tuple[Aside, ...] = ()
-
-
-@dataclass(slots=True)
-class _Store:
-    """What is held of one store."""
-
-    cursor: dict[str, Place] = field(default_factory=dict)
-    upto: dict[str, Place] = field(default_factory=dict)
-    boots: dict[tuple[str, int], str] = field(default_factory=dict)
-
-
-class MemoryLedger:
-    """Keeps one robot's rows in memory; the rules in their plainest form."""
-
-    def __init__(self) -> None:
-        self.epoch = 0
-        self.rows: dict[Key, Row] = {}
-        self.aside: list[tuple[str, Row, Why]] = []
-        self._stores: dict[str, _Store] = {}
-
-    def admit(self, hello: Hello) -> Admission:
-        """Begin a new epoch: whatever comes in an older one is refused from now on."""
-        self.epoch += 1
-        is_new = hello.store_id not in self._stores
-        store = self._stores.setdefault(hello.store_id, _Store())
-        found = self._compare(hello.store_id, hello.writers, is_hello=True)
-        store.cursor = set_back(store.cursor, found)
-        store.upto = dict(store.cursor)
-        for writer in hello.writers:
-            store.cursor.setdefault(writer, START)
-        self._note_boots(store, hello.writers)
-        return Admission(self.epoch, dict(store.cursor), tuple(found), is_new)
-
-    def store(
-        self,
-        epoch: int,
-        store_id: str,
-        rows: Sequence[Row],
-        upto: Mapping[str, Place],
-        reaches: Mapping[str, Reach],
-        *,
-        compare: bool = True,
-    ) -> Stored:
-        """Take rows once each; raises StaleEpochError in an older epoch."""
-        if epoch != self.epoch:
-            raise StaleEpochError
-        store = self._stores[store_id]
-        news = reaches if compare else {}
-        found = self._compare(store_id, news, is_hello=False)
-        self._note_boots(store, news)
-        new, conflicts = [], []
-        for row in rows:
-            key = (store_id, row.writer, row.run, row.seq)
-            if key not in self.rows:
-                self.rows[key] = row
-                new.append(row)
-            elif self.rows[key] != row and (store_id, row, OTHER) not in self.aside:
-                self.aside.append((store_id, row, OTHER))
-                conflicts.append(row)
-        store.upto = set_back({**store.upto, **upto}, found)
-        store.cursor = advanced(set_back(store.cursor, found), store.upto, reaches)
-        return Stored(dict(store.cursor), tuple(new), tuple(conflicts), tuple(found))
-
-    def _compare(
-        self, store_id: str, reaches: Mapping[str, Reach], *, is_hello: bool
-    ) -> list[Aside]:
-        """Put aside what the robot has no more."""
-        store = self._stores[store_id]
-        found: list[Aside] = []
-        for writer, reach in reaches.items():
-            held, cursor = self._held(store_id, writer), store.cursor.get(writer, START)
-            found += aside(writer, held, cursor, reach, is_hello=is_hello)
-        for one in found:
-            self._move(store_id, one)
-        return found
-
-    def _held(self, store_id: str, writer: str) -> list[Held]:
-        store = self._stores[store_id]
-        ends = {run: 0 for w, run in store.boots if w == writer}
-        for of, w, run, seq in self.rows:
-            if (of, w) == (store_id, writer):
-                ends[run] = max(ends.get(run, 0), seq + 1)
-        at = store.cursor.get(writer, START)
-        if at.seq and at.run in ends:
-            ends[at.run] = max(ends[at.run], at.seq)
-        return [Held(r, store.boots.get((writer, r), ""), end) for r, end in sorted(ends.items())]
-
-    def _move(self, store_id: str, one: Aside) -> None:
-        for key in [k for k in self.rows if k[:3] == (store_id, one.writer, one.run)]:
-            if key[3] >= one.from_seq:
-                self.aside.append((store_id, self.rows.pop(key), one.why))
-        if one.from_seq == 0:
-            self._stores[store_id].boots.pop((one.writer, one.run), None)
-
-    def _note_boots(self, store: _Store, reaches: Mapping[str, Reach]) -> None:
-        for writer, reach in reaches.items():
-            for run in reach.runs:
-                store.boots[writer, run.run] = run.boot
-
-
-def advanced(
-    cursor: Mapping[str, Place], upto: Mapping[str, Place], reaches: Mapping[str, Reach]
-) -> dict[str, Place]:
-    """Move a cursor on to what was received and is durable on the robot; never back."""
-    moved = {w: min(at, reaches[w].durable) for w, at in upto.items() if w in reaches}
-    return {w: max(at, moved.get(w, START)) for w, at in {**moved, **cursor}.items()}
+    new: tuple[LinkRow, ...] = ()
+    contradicting: tuple[LinkRow, ...] = ()
+    conflicts: tuple[RowConflict, ...] = ()

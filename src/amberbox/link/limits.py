@@ -1,40 +1,64 @@
-"""Limits that both ends of the link keep to."""
+"""Limits of the link that both ends keep to, its version, and the codes of a 503 answer."""
 
 from __future__ import annotations
 
-from amberbox.blackbox.journal import reserved
+import json
+
+from amberbox.blackbox.journal import channels
 
 PROTOCOL = 1
 PATH = "/link/v1"
 
+# Largest size of a frame; larger ones are refused unread
 FRAME_BYTES = 1 << 20
-"""Most that a frame may have; a larger one is refused unread."""
+# Larger rows are not sent; they arrive with their journal
 ROW_BYTES = 900_000
-"""Rows above this are not sent: they come with their journal."""
+# Approximate size of a frame of rows, so that urgent ones do not wait behind it
 ROWS_BYTES = 256 << 10
-"""A frame of rows is closed at about this size, so that urgent ones do not wait behind it."""
 ROWS_COUNT = 2000
+# Number of frames of rows that may be unacknowledged
 WINDOW = 32
-"""Frames of rows that may be on their way without an acknowledgement."""
+# Number of runs of a writer that a robot states, the newest ones
 RUNS_STATED = 256
-"""Runs of a writer that a robot tells of, the newest ones."""
+# Live values in one frame
 VARIABLES = 1000
-"""Live values in one frame."""
+# Journals named in one frame
 FILES = 2000
-"""Journals named in one frame."""
+# Longest reason or name in a frame
 TEXT_BYTES = 4096
-"""Most that a reason or a name in a frame may have."""
 
 BEAT_S = 1.0
+# An end that receives nothing for so long takes the link as dead, whatever TCP reports
 SILENT_S = 5.0
-"""An end that hears nothing for so long takes the link for dead, whatever TCP says."""
-BACKOFF_S = (0.5, 30.0)
+# Journals are uploaded in pieces of this size
 PIECE_BYTES = 4 << 20
-"""Journals are uploaded in pieces of this size."""
 
+# Writers whose conclusions go over the link
 WRITERS = ("main", "keep", "watch")
-"""Writers whose conclusions go over the link."""
-URGENT = frozenset({reserved.ALARM, reserved.DIAGNOSIS, reserved.EVENT, reserved.SYMPTOM,
-                    reserved.INCIDENT, reserved.MISSION, reserved.GAP})  # fmt: skip
-CHANNELS = URGENT | {reserved.STATUS}
-"""Channels whose rows go over the link; of these all but statuses go first."""
+URGENT = frozenset({channels.ALARM, channels.DIAGNOSIS, channels.EVENT, channels.SYMPTOM,
+                    channels.INCIDENT, channels.MISSION, channels.GAP})  # fmt: skip
+# Channels whose rows go over the link; of these all but statuses go first
+CHANNELS = URGENT | {channels.STATUS}
+
+
+# The server has no admin yet; retrying helps only once one exists
+NOT_SET_UP = "not_set_up"
+# Too busy at the moment: retry
+BUSY = "busy"
+# The server's database is damaged: a person has to restore it
+DAMAGED = "damaged"
+
+
+def why_unavailable(body: bytes) -> str:
+    """Return the reason why a server answered 503, from the body of its answer."""
+    try:
+        error = json.loads(body)["error"]
+        code, what = str(error.get("code", "")), str(error["what"])
+    except (ValueError, KeyError, TypeError, AttributeError):  # sent by a proxy, or no body
+        return "it is too busy, or not set up yet"
+    if code == NOT_SET_UP:
+        return (
+            "it is not set up yet and waits for its first admin: on the server "
+            "'amberbox serve add-user NAME --data DIR', or its page /setup"
+        )
+    return what[:300]

@@ -15,11 +15,11 @@ from pathlib import Path
 from typing import Literal
 
 from amberbox.core.errors import AmberboxError, UsageError
-from amberbox.core.timetext import parse_time
+from amberbox.core.timestamps import parse_time
 from amberbox.core.units import parse_duration_s
-from amberbox.sim.catalogue import catalogue
-from amberbox.sim.live import Plan, listen, open_publisher, publish, wait_for_subscriber
-from amberbox.sim.mission import SCENARIOS
+from amberbox.sim.faults import catalogue
+from amberbox.sim.live import LiveRun, listen, open_publisher, publish, wait_for_subscriber
+from amberbox.sim.missions import SCENARIOS
 from amberbox.sim.robot import Robot
 
 
@@ -28,7 +28,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = _parser().parse_args(arguments)
     try:
         if options.list_faults:
-            print(_faults_as_json() if options.json else _faults_as_table())
+            faults = [dataclasses.asdict(fault) for fault in catalogue().values()]
+            print(json.dumps(faults, indent=2) if options.json else _faults_as_table())
             return 0
         return _run(options)
     except AmberboxError as error:
@@ -59,7 +60,7 @@ def _run(options: argparse.Namespace) -> int:
     if not options.zmq:
         raise UsageError("nowhere to publish", "--zmq tcp://127.0.0.1:5556, or --list-faults")
     for_s = float("inf") if options.for_time is None else parse_duration_s(options.for_time)
-    plan = Plan(_speed(options.speed), for_s, options.truth)
+    plan = LiveRun(_speed(options.speed), for_s, options.truth)
     faults = [parse_fault(text) for text in options.fault]
     publisher = open_publisher(options.zmq)
     stop = threading.Event()
@@ -101,10 +102,6 @@ def _speed(text: str) -> float | Literal["max"]:
     if not 0 < speed < float("inf"):
         raise UsageError(f"--speed {text} is no speed", "a number above 0, or max")
     return speed
-
-
-def _faults_as_json() -> str:
-    return json.dumps([dataclasses.asdict(fault) for fault in catalogue().values()], indent=2)
 
 
 def _faults_as_table() -> str:

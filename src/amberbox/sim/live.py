@@ -20,16 +20,16 @@ from amberbox.core.errors import AmberboxError, UsageError
 from amberbox.sim.robot import TICK_NS, Message, Robot
 
 
-class Publisher(Protocol):
-    """Where messages go: a ZeroMQ socket, or a list in a test."""
+class PublishingSocket(Protocol):
+    """The output of messages: a ZeroMQ socket, or a list in a test."""
 
     def send_multipart(self, msg_parts: list[bytes]) -> Any:
         """Send topic and payload."""
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
-    """How a robot is let loose: speed, end (seconds of robot time), file of the truth."""
+class LiveRun:
+    """Options of a live run: speed, end (seconds of robot time), file of the truth."""
 
     speed: float | Literal["max"] = 1.0
     for_s: float = float("inf")
@@ -46,7 +46,7 @@ def open_publisher(endpoint: str) -> Any:
     except ImportError as error:
         raise AmberboxError("pyzmq is not installed", "pip install 'amberbox[zmq]'") from error
     socket: Any = zmq.Context.instance().socket(zmq.XPUB)
-    socket.setsockopt(zmq.SNDHWM, 0)  # a robot that waits for nobody, and loses nothing here
+    socket.setsockopt(zmq.SNDHWM, 0)  # no limit: nothing is dropped here
     socket.setsockopt(zmq.LINGER, 2000)
     try:
         socket.bind(endpoint)
@@ -59,26 +59,29 @@ def open_publisher(endpoint: str) -> Any:
 
 
 def wait_for_subscriber(socket: Any, stop: threading.Event) -> None:
-    """Return when somebody has subscribed, or ``stop`` is set."""
+    """Wait until a subscriber has connected, or ``stop`` is set."""
     while not stop.is_set() and not socket.poll(100):
         pass
 
 
 def publish(
     robot: Robot,
-    publisher: Publisher,
-    plan: Plan,
+    publisher: PublishingSocket,
+    plan: LiveRun,
     orders: queue.SimpleQueue[str],
     stop: threading.Event,
 ) -> int:
     """Publish until the plan's end or ``stop``; return how many messages went out.
 
     The truth (topic, seq, stamp in ns) of each batch is written and flushed before the batch is
-    sent, so that whatever was sent stands in it.
+    sent, so that it contains every message sent.
     """
     encode = msgspec.json.Encoder().encode
     sent = 0
-    with _truth_file(plan.truth) as truth:
+    file = (
+        contextlib.nullcontext() if plan.truth is None else plan.truth.open("w", encoding="utf-8")
+    )
+    with file as truth:
         for batch in _batches(robot, plan, orders, stop):
             if truth is not None:
                 truth.write("".join(truth_line(topic, message) for topic, _, message in batch))
@@ -96,8 +99,8 @@ def truth_line(topic: str, message: dict[str, Any]) -> str:
     return json.dumps({"topic": topic, "seq": header["seq"], "stamp_ns": stamp_ns}) + "\n"
 
 
-def obey(robot: Robot, order: str) -> str:
-    """Carry out one line: ``fault ID [magnitude]`` or ``heal ID``; return what to tell."""
+def apply_order(robot: Robot, order: str) -> str:
+    """Carry out one line: ``fault ID [magnitude]`` or ``heal ID``; return the answer."""
     words = order.split()
     try:
         if len(words) in (2, 3) and words[0] == "fault":
@@ -112,24 +115,20 @@ def obey(robot: Robot, order: str) -> str:
 
 
 def listen(lines: IO[str], orders: queue.SimpleQueue[str]) -> None:
-    """Pass lines on until their end (run it in a thread of its own)."""
+    """Put lines into the queue until their end (run it in a thread of its own)."""
     for line in lines:
         if line.strip():
             orders.put(line.strip())
 
 
-def _truth_file(path: Path | None) -> contextlib.AbstractContextManager[IO[str] | None]:
-    return contextlib.nullcontext() if path is None else path.open("w", encoding="utf-8")
-
-
 def _batches(
-    robot: Robot, plan: Plan, orders: queue.SimpleQueue[str], stop: threading.Event
+    robot: Robot, plan: LiveRun, orders: queue.SimpleQueue[str], stop: threading.Event
 ) -> Iterator[list[Message]]:
-    """Yield tick by tick what is published, each when its time has come."""
+    """Yield the messages of each tick when they are due."""
     began_ns, began_s = time.monotonic_ns(), robot.now_s
     while robot.now_s < plan.for_s and not stop.is_set():
         while not orders.empty():
-            print(obey(robot, orders.get()), file=sys.stderr, flush=True)
+            print(apply_order(robot, orders.get()), file=sys.stderr, flush=True)
         batch = list(robot.step_until(robot.now_s + TICK_NS / NS))
         if plan.speed != "max":
             due_ns = began_ns + (robot.now_s - began_s) * NS / plan.speed

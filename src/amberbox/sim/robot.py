@@ -9,24 +9,16 @@ from typing import Any
 
 from amberbox.core.clock import NS
 from amberbox.core.errors import UsageError
-from amberbox.sim.base import Base, Odometry, twist_fields
-from amberbox.sim.battery import Battery
-from amberbox.sim.bus import Bus
-from amberbox.sim.catalogue import Fault
-from amberbox.sim.executor import Executor
-from amberbox.sim.faults import ActiveFault, Injector
-from amberbox.sim.geometry import Pose2D
-from amberbox.sim.imu import Imu
-from amberbox.sim.laser import Laser, look_around
-from amberbox.sim.localisation import Localisation
-from amberbox.sim.mission import SCENARIOS, Planner
-from amberbox.sim.navigation import Navigation
-from amberbox.sim.noise import Noise
-from amberbox.sim.safety import Safety
-from amberbox.sim.software import Host, LogLine, Node
+from amberbox.sim.base import BatteryPack, MovingBase, Odometry, SafetyLine, twist_fields
+from amberbox.sim.faults import ActiveFault, Injector, SimulatedFault
+from amberbox.sim.fieldbus import Fieldbus
+from amberbox.sim.missions import SCENARIOS, Executor, Planner
+from amberbox.sim.navigation import Localisation, Navigation
+from amberbox.sim.noise import Noise, Pose2D
+from amberbox.sim.sensors import Imu, Laser, Wifi, cast_views
+from amberbox.sim.software import HostComputer, LogLine, SimulatedNode
 from amberbox.sim.topics import TOPICS, TopicSpec
-from amberbox.sim.wifi import Wifi
-from amberbox.sim.world import PLACES, World
+from amberbox.sim.world import PLACES, HospitalWorld
 
 TICK_NS = 10_000_000
 TICKS_PER_S = NS // TICK_NS
@@ -44,11 +36,11 @@ Reading = tuple[int, dict[str, Any]]
 
 @dataclass(slots=True)
 class _Outlet:
-    """One topic on its way out: who publishes it, how far it has counted, its delays."""
+    """The output of one topic: its publishing node, message count and delays."""
 
     topic: str
     frame_id: str
-    node: Node
+    node: SimulatedNode
     noise: Noise
     count: int = 0
     last_sent_ns: int = 0
@@ -57,8 +49,8 @@ class _Outlet:
 class Robot:
     """A robot and its software; ``step_until`` gives what it publishes, in order of time.
 
-    The same seed, scenario and faults give the same messages byte for byte. What the messages
-    say is what sensors see; the truth stands in ``truth()`` and is never published.
+    The same seed, scenario and faults give the same messages byte for byte. Messages carry what
+    sensors measure; ``truth()`` is never published.
     """
 
     def __init__(
@@ -88,19 +80,19 @@ class Robot:
         where = PLACES[setting["place"]].spot
         start = Pose2D(where[0], where[1], 1.5708)
         noise = self._noise
-        self.world = World(noise("world"))
-        self.base = Base(noise, start)
+        self.world = HospitalWorld(noise("world"))
+        self.base = MovingBase(noise, start)
         self.odometry = Odometry(start)
-        self.bus = Bus(self.base.units, noise("bus"))
+        self.bus = Fieldbus(self.base.units, noise("bus"))
         charge = noise("mission").uniform(*setting["charge"])
-        self.battery = Battery(charge, noise("battery"))
+        self.battery = BatteryPack(charge, noise("battery"))
         self.laser_front = Laser(0.35, 0.0, noise("laser_front"))
         self.laser_rear = Laser(-0.35, 3.14159265, noise("laser_rear"))
         self.imu = Imu(start.yaw, noise("imu"))
         self.localisation = Localisation(noise("localisation"))
         self.wifi = Wifi(noise("wifi"))
-        self.host = Host(noise("host"))
-        self.safety = Safety()
+        self.host = HostComputer(noise("host"))
+        self.safety = SafetyLine()
         self.navigation = Navigation()
         self.executor = Executor(Planner(scenario, noise("tasks")), self.navigation, self.base)
 
@@ -113,17 +105,17 @@ class Robot:
 
     @property
     def now_ns(self) -> int:
-        """Virtual time: nanoseconds since the Unix epoch."""
+        """Return virtual time: nanoseconds since the Unix epoch."""
         return self.start_ns + self._ticks * TICK_NS
 
     @property
     def now_s(self) -> float:
-        """Seconds since the robot was switched on."""
+        """Return seconds since the robot was switched on."""
         return self._ticks / TICKS_PER_S
 
     @property
     def parts(self) -> dict[str, object]:
-        """Every part that a fault may sit in, by name."""
+        """Return every part that a fault can affect, by name."""
         units = {f"wheel_{name}": unit for name, unit in self.base.units.items()}
         drives = {f"{name}.drive_1": unit.drive_1 for name, unit in units.items()} | {
             f"{name}.drive_2": unit.drive_2 for name, unit in units.items()
@@ -134,12 +126,12 @@ class Robot:
 
     def inject(
         self,
-        fault: str | Fault,
+        fault: str | SimulatedFault,
         at_s: float | None = None,
         magnitude: float | None = None,
         until_s: float | None = None,
     ) -> None:
-        """Let a fault of the catalogue, or one of your own, begin at a time (now when not given).
+        """Inject a fault of the catalogue, or one of your own, at a time (now when not given).
 
         ``magnitude`` is the catalogue's default when not given, and must lie in its range.
         Raises UsageError for an unknown fault, a magnitude out of range or a time in the past.
@@ -155,7 +147,7 @@ class Robot:
         self._injector.heal(fault_id, self.now_s)
 
     def truth(self) -> dict[str, Any]:
-        """Return what is really so: pose, twist and the faults that act. Never published."""
+        """Return the ground truth: pose, twist and the active faults. Never published."""
         pose = self.base.pose
         return {
             "time_ns": self.now_ns,
@@ -165,11 +157,11 @@ class Robot:
         }
 
     def active_faults(self) -> list[ActiveFault]:
-        """Return the faults that act at this moment with their present level."""
+        """Return the active faults with their present level."""
         return self._injector.active(self.now_s)
 
     def step_until(self, t_s: float) -> Iterator[Message]:
-        """Let the robot live until ``t_s`` (seconds since switched on).
+        """Simulate until ``t_s`` (seconds since switched on).
 
         Yields (topic, time of publication in ns, message) in order of time. Faults injected
         while the caller iterates act from the next tick (10 ms) on.
@@ -199,7 +191,7 @@ class Robot:
             self._speak()
 
     def _move(self, dt: float) -> None:
-        """Drives and body, 50 Hz."""
+        """Step drives and body, at 50 Hz."""
         has_command = self.now_ns - self._command_ns < _WATCHDOG_NS
         controls = self.host.is_working("base_controller")
         self.base.step(dt, self._command if has_command and controls else (0.0, 0.0, 0.0))
@@ -210,7 +202,7 @@ class Robot:
             self.odometry.step(dt, motions)
 
     def _feel(self, dt: float) -> None:
-        """Everything slow: people, battery, contact, software, 10 Hz."""
+        """Step the slow parts, at 10 Hz: people, battery, contact, software."""
         pose = self.base.pose
         self.world.step(dt, (pose.x, pose.y))
         for unit in self.base.units.values():
@@ -230,7 +222,7 @@ class Robot:
 
     def _scan(self) -> None:
         lasers = {"laser_front": self.laser_front, "laser_rear": self.laser_rear}
-        views = look_around(list(lasers.values()), self.base.pose, self.world.scene)
+        views = cast_views(list(lasers.values()), self.base.pose, self.world.scene)
         self.safety.feel(*(float(view.expected.min()) for view in views))
         for (name, laser), view in zip(lasers.items(), views, strict=True):
             if self.host.is_working(name):
@@ -246,7 +238,7 @@ class Robot:
         self._command, self._command_ns = self.navigation.command, self.now_ns
 
     def _free(self, dt: float) -> None:
-        """After a while somebody pushes a robot that stands against a wall back on its way."""
+        """Move a robot that has stood against an obstacle for a while back to the corridor."""
         self._stuck_s = self._stuck_s + dt if self.safety.touches else 0.0
         if self._stuck_s < _FREED_AFTER_S:
             return

@@ -33,9 +33,9 @@ class LogLine(NamedTuple):
     msg: str
 
 
-class Node:
+class SimulatedNode:
     """A process. Knobs (nominal value): ``killed`` (0) above 0.5 it dies and does not come up,
-    ``stalled`` (0) above 0.5 it is there but does nothing, ``leak_mb_s`` (0)."""
+    ``stalled`` (0) above 0.5 it exists but does nothing, ``leak_mb_s`` (0)."""
 
     def __init__(self, name: str, noise: Noise) -> None:
         self.name = name
@@ -51,12 +51,12 @@ class Node:
 
     @property
     def is_working(self) -> bool:
-        """Whether it does its work now."""
+        """Return whether it works now."""
         return self.killed < 0.5 and self.stalled < 0.5 and self.pid != 0
 
     @property
     def rss_mb(self) -> float:
-        """Memory it holds."""
+        """Return the memory it holds, MB."""
         return _USUAL[self.name][1] + self.leaked_mb if self.pid else 0.0
 
     def die(self) -> None:
@@ -64,12 +64,18 @@ class Node:
         self.pid, self.leaked_mb, self._down_s = 0, 0.0, 0.0
 
     def step(self, dt: float) -> list[LogLine]:
-        """Advance by ``dt``; return what the supervisor has to say."""
+        """Advance by ``dt``; return the supervisor's log lines."""
         if self.pid and self.killed > 0.5:
             self.die()
             return [LogLine(ERROR, "supervisor", f"process {self.name} ended with code -11")]
         if not self.pid:
-            return self._restart(dt)
+            self._down_s += dt
+            if self._down_s < _RESTART_AFTER_S:
+                return []
+            self._down_s = 0.0
+            self.restarts += 1
+            self.pid = 1000 + self._noise.integer(1000, 30000)
+            return [LogLine(WARNING, "supervisor", f"process {self.name} started, pid {self.pid}")]
         self.leaked_mb += self.leak_mb_s * dt
         if self.is_working:
             self.beats += 1
@@ -89,42 +95,33 @@ class Node:
             "rss_mb": round(self.rss_mb + (self._noise.normal(0.3) if self.pid else 0.0), 2),
         }
 
-    def _restart(self, dt: float) -> list[LogLine]:
-        self._down_s += dt
-        if self._down_s < _RESTART_AFTER_S:
-            return []
-        self._down_s = 0.0
-        self.restarts += 1
-        self.pid = 1000 + self._noise.integer(1000, 30000)
-        return [LogLine(WARNING, "supervisor", f"process {self.name} started, pid {self.pid}")]
 
-
-class Host:
-    """The computer. Knobs (nominal value): ``load_percent`` (0) processor time somebody else
-    takes, ``disk_fill_mb_s`` (0), ``clock_shift_s`` (0) how far its clock is off."""
+class HostComputer:
+    """The computer. Knobs (nominal value): ``load_percent`` (0) processor time that others use,
+    ``disk_fill_mb_s`` (0), ``clock_shift_s`` (0) how far its clock is off."""
 
     def __init__(self, noise: Noise) -> None:
         self._noise = noise
         self.load_percent = 0.0
         self.disk_fill_mb_s = 0.0
         self.clock_shift_s = 0.0
-        self.nodes = {name: Node(name, noise) for name in NODES}
+        self.nodes = {name: SimulatedNode(name, noise) for name in NODES}
         self.disk_used_mb = 21000.0 + noise.uniform(0.0, 4000.0)
         self.uptime_s = 120.0 + noise.uniform(0.0, 600.0)
         self._load_1min = 1.2
 
     @property
     def memory_used_mb(self) -> float:
-        """Memory in use by everybody."""
+        """Return the memory in use by all, MB."""
         return 1350.0 + sum(node.rss_mb for node in self.nodes.values())
 
     @property
     def slowness(self) -> float:
-        """How many times longer than usual a message waits for the processor."""
+        """Return how many times longer than usual a message waits for the processor."""
         return 1.0 + 0.25 * max(0.0, self.load_percent)
 
     def is_working(self, name: str) -> bool:
-        """Whether a process does its work."""
+        """Return whether a process works."""
         return self.nodes[name].is_working
 
     def step(self, dt: float) -> list[LogLine]:

@@ -1,12 +1,11 @@
-"""The tables of docs/simulator.md, written from the topics and the catalogue themselves."""
+"""Print the tables of docs/start/simulator.md from the topics and the catalogue of faults."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
-from amberbox.sim.catalogue import Fault, catalogue
-from amberbox.sim.shapes import leaves
-from amberbox.sim.topics import NODES, TOPICS, WHEELS, TopicSpec
+from amberbox.sim.faults import SimulatedFault, catalogue
+from amberbox.sim.topics import NODES, TOPICS, WHEELS, TopicSpec, leaves
 
 _REPEATED = {"wheels": ("<wheel>", WHEELS), "nodes": ("<node>", NODES)}
 
@@ -40,7 +39,7 @@ def _without_repetition(spec: TopicSpec) -> Iterator[tuple[str, str, str]]:
             yield ".".join(word if part in names[:1] else part for part in parts), kind, unit
 
 
-def _fault_row(fault: Fault) -> str:
+def _fault_row(fault: SimulatedFault) -> str:
     size = fault.magnitude
     amount = f"{size.default:g} ({size.low:g} to {size.high:g}) {size.unit}"
     shows = ", ".join(f"`{variable}`" for variable in fault.shows_in)

@@ -1,14 +1,129 @@
-"""The topics that the simulated robot publishes: rate, frame, shape and who publishes them."""
+"""Topics that the simulated robot publishes: rate, frame, shape, publisher, and the codes in them.
+
+The shape of a message is JSON Schema with units, built from short functions.
+"""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 from amberbox.core.types import Schema, Topic
-from amberbox.sim import shapes
-from amberbox.sim.codes import LOG_LEVELS, STATUS
-from amberbox.sim.shapes import Shape, code, flag, integer, number, numbers, record, text, xyz
+
+# of a wheel unit
+STATUS_BITS: Mapping[int, str] = {
+    0: "operational",
+    1: "power stage on",
+    2: "emergency stop pressed",
+    3: "supply voltage low",
+    4: "winding warm",
+    5: "drive 1 at its current limit",
+    6: "drive 2 at its current limit",
+    7: "no setpoint",
+}
+
+# names of usual values of these bits, short enough for an axis of a plot
+STATUS: Mapping[int, str] = {
+    0: "off",
+    1: "stage off",
+    3: "on",
+    5: "stopped",
+    8: "brown-out",
+    19: "warm",
+    35: "limit 1",
+    67: "limit 2",
+    99: "limit 1+2",
+    129: "no orders",
+}
+
+LOG_LEVELS: Mapping[int, str] = {
+    10: "debug",
+    20: "info",
+    30: "warning",
+    40: "error",
+    50: "fatal",
+}
+
+
+Shape = dict[str, Any]
+
+
+def _unit(shape: Shape, unit: str) -> Shape:
+    return {**shape, "unit": unit} if unit else shape
+
+
+def number(unit: str = "") -> Shape:
+    """Return the shape of a floating-point number, also where its value happens to be whole."""
+    return _unit({"type": "number"}, unit)
+
+
+def integer(unit: str = "") -> Shape:
+    """Return the shape of a whole number."""
+    return _unit({"type": "integer"}, unit)
+
+
+def code(names: Mapping[int, str]) -> Shape:
+    """Return the shape of a whole number whose values have names."""
+    return {"type": "integer", "labels": {str(value): name for value, name in names.items()}}
+
+
+def text() -> Shape:
+    """Return the shape of a string."""
+    return {"type": "string"}
+
+
+def flag() -> Shape:
+    """Return the shape of a bool."""
+    return {"type": "boolean"}
+
+
+def numbers(unit: str = "", count: int | None = None) -> Shape:
+    """Return the shape of a list of numbers, of fixed length when ``count`` is given."""
+    shape: Shape = {"type": "array", "items": number(unit)}
+    return shape if count is None else {**shape, "minItems": count, "maxItems": count}
+
+
+def record(**fields: Shape) -> Shape:
+    """Return the shape of a structure whose fields are all required."""
+    return {
+        "type": "object",
+        "properties": fields,
+        "required": list(fields),
+        "additionalProperties": False,
+    }
+
+
+def xyz(unit: str) -> Shape:
+    """Return the shape of a vector."""
+    return record(x=number(unit), y=number(unit), z=number(unit))
+
+
+def pose() -> Shape:
+    """Return the shape of a position and an orientation (quaternion)."""
+    turn = record(x=number(), y=number(), z=number(), w=number())
+    return record(position=xyz("m"), orientation=turn)
+
+
+def header() -> Shape:
+    """Return the shape of a message header: own stamp, frame and a count without holes."""
+    stamp = record(sec=integer("s"), nanosec=integer("ns"))
+    return record(seq=integer(), stamp=stamp, frame_id=text())
+
+
+def leaves(shape: Mapping[str, Any], path: str = "") -> list[tuple[str, str, str]]:
+    """Return the leaves of a shape as (path, type, unit)."""
+    if shape["type"] == "object":
+        below = shape["properties"].items()
+        return [leaf for key, value in below for leaf in leaves(value, f"{path}.{key}".lstrip("."))]
+    if shape["type"] == "array":
+        size = shape.get("maxItems", "")
+        kind = f"{shape['items']['type']}[{size}]"
+        return [(path, kind, shape["items"].get("unit", ""))]
+    named = ", ".join(f"{value} {name}" for value, name in shape.get("labels", {}).items())
+    return [(path, f"{shape['type']} ({named})" if named else shape["type"], shape.get("unit", ""))]
+
 
 WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
 NODES = (
@@ -28,7 +143,7 @@ CELLS = 7
 
 @dataclass(frozen=True)
 class TopicSpec:
-    """One topic: what it says, how often (0: when something happens), and its fields."""
+    """One topic: its description, its rate in Hz (0: on events), and its fields."""
 
     name: str
     rate_hz: float
@@ -39,7 +154,7 @@ class TopicSpec:
 
     def shape(self) -> Shape:
         """Return the JSON Schema of the whole message, header included."""
-        whole = record(header=shapes.header(), **self.body["properties"])
+        whole = record(header=header(), **self.body["properties"])
         return {**whole, "title": self.name, "description": self.description}
 
     def topic(self) -> Topic:
@@ -136,7 +251,7 @@ TOPICS: tuple[TopicSpec, ...] = (
         "odom",
         "base_controller",
         "Pose and twist as computed from the four wheel units.",
-        record(child_frame_id=text(), pose=shapes.pose(), twist=_TWIST),
+        record(child_frame_id=text(), pose=pose(), twist=_TWIST),
     ),
     TopicSpec(
         "cmd_vel", 10, "base_link", "navigation", "What navigation wants the base to do.", _TWIST
@@ -173,7 +288,7 @@ TOPICS: tuple[TopicSpec, ...] = (
         "localisation",
         "Pose on the map with its covariance (x, y, z, roll, pitch, yaw).",
         record(
-            pose=shapes.pose(),
+            pose=pose(),
             covariance=numbers("", 36),
             match_score=number(),
             beams_used=integer(),

@@ -43,8 +43,8 @@ _FURNITURE: tuple[tuple[float, float, float, float], ...] = (
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
-    """Somewhere a task can send the robot: the way in from the corridor's middle line."""
+class HospitalPlace:
+    """A place that a task can name: the way in from the corridor's middle line."""
 
     name: str
     way_in: tuple[Point, ...]
@@ -58,23 +58,23 @@ class Place:
 PLACES = {
     place.name: place
     for place in (
-        Place("charging_station", ((5.2, CORRIDOR_Y), (5.2, -0.9))),
-        Place("ward_a", ((8.7, CORRIDOR_Y), (8.7, 6.0))),
-        Place("storage", ((14.7, CORRIDOR_Y), (14.7, -3.6))),
-        Place("ward_b", ((20.7, CORRIDOR_Y), (20.7, 6.0))),
-        Place("kitchen", ((32.7, CORRIDOR_Y), (32.7, -3.4))),
-        Place("elevator", ((40.7, CORRIDOR_Y), (40.7, 4.6))),
+        HospitalPlace("charging_station", ((5.2, CORRIDOR_Y), (5.2, -0.9))),
+        HospitalPlace("ward_a", ((8.7, CORRIDOR_Y), (8.7, 6.0))),
+        HospitalPlace("storage", ((14.7, CORRIDOR_Y), (14.7, -3.6))),
+        HospitalPlace("ward_b", ((20.7, CORRIDOR_Y), (20.7, 6.0))),
+        HospitalPlace("kitchen", ((32.7, CORRIDOR_Y), (32.7, -3.4))),
+        HospitalPlace("elevator", ((40.7, CORRIDOR_Y), (40.7, 4.6))),
     )
 }
 CART_PLACES = ("ward_a", "storage", "ward_b", "kitchen")
 
 
-def route(start: Place, goal: Place) -> list[Point]:
+def route(start: HospitalPlace, goal: HospitalPlace) -> list[Point]:
     """Return the waypoints from one place to another, along the corridor's middle."""
     return [*reversed(start.way_in[:-1]), *goal.way_in]
 
 
-def way_from(position: Point, goal: Place) -> list[Point]:
+def way_from(position: Point, goal: HospitalPlace) -> list[Point]:
     """Return waypoints from anywhere: out to the corridor by the nearest place's way, then in."""
     if abs(position[1] - CORRIDOR_Y) < 1.0:
         return list(goal.way_in)
@@ -96,8 +96,8 @@ def _building() -> Array:
     return np.array(walls + boxes, dtype=np.float64)
 
 
-class Person:
-    """Somebody who walks up and down the corridor and gives way to the robot."""
+class Pedestrian:
+    """A person who walks up and down the corridor and gives way to the robot."""
 
     def __init__(self, x: float, y: float, speed: float) -> None:
         self.x, self.y, self.speed = x, y, speed
@@ -117,7 +117,7 @@ class Person:
         return _chain(((x + r, y), (x, y + r), (x - r, y), (x, y - r), (x + r, y)))
 
 
-class Scene:
+class LaserScene:
     """Walls as lines that a laser can be cast against, prepared once for many beams."""
 
     def __init__(self, segments: Array) -> None:
@@ -129,28 +129,27 @@ class Scene:
         self.offset = self.normal_x * self.x0 + self.normal_y * self.y0
 
 
-class World:
-    """All that stands or walks around the robot."""
+class HospitalWorld:
+    """The surroundings of the robot: walls, furniture and people."""
 
     def __init__(self, noise: Noise) -> None:
         self._building = _building()
         self.people = [
-            Person(noise.uniform(10, 20), 0.45, noise.uniform(0.5, 1.1)),
-            Person(noise.uniform(28, 40), 2.5, -noise.uniform(0.5, 1.1)),
+            Pedestrian(noise.uniform(10, 20), 0.45, noise.uniform(0.5, 1.1)),
+            Pedestrian(noise.uniform(28, 40), 2.5, -noise.uniform(0.5, 1.1)),
         ]
         self.step(0.0, (0.0, 0.0))
 
     def step(self, dt: float, robot: Point) -> None:
-        """Let people walk."""
+        """Advance the people by ``dt`` seconds."""
         outlines: list[tuple[float, float, float, float]] = []
         for person in self.people:
             person.step(dt, robot)
             outlines += person.outline()
-        self.scene = Scene(np.concatenate([self._building, np.array(outlines)]))
+        self.scene = LaserScene(np.concatenate([self._building, np.array(outlines)]))
 
 
-CIRCLE = 240
-"""Beams in a full turn: one every 1.5 degrees."""
+CIRCLE = 240  # beams in a full turn: one every 1.5 degrees
 _TURN = 2 * math.pi
 _STEP = _TURN / CIRCLE
 _ORIGINS = 4
@@ -160,11 +159,11 @@ _COS = np.cos(np.arange(2 * CIRCLE * _ORIGINS) * _STEP)
 _SIN = np.sin(np.arange(2 * CIRCLE * _ORIGINS) * _STEP)
 
 
-def cast(scene: Scene, origins: Array, beams: int, limit_m: float) -> Array:
+def cast(scene: LaserScene, origins: Array, beams: int, limit_m: float) -> Array:
     """Return how far each beam gets until it hits something, metres, one row per origin.
 
     An origin is (x, y, angle of its first beam); beams go round to the left in steps of 1.5
-    degrees. Each segment is asked only about the beams between its ends; beams that hit nothing
+    degrees. Each segment is tested only against the beams between its ends; beams that hit nothing
     give ``limit_m``. Up to four origins are cast at once: calls cost more than numbers.
     """
     x, y, turn = origins.T[:, :, None]

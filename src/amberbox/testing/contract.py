@@ -1,4 +1,4 @@
-"""What every source must do, as checks that a plugin's own tests can run.
+"""The contract of sources, as checks that a plugin's own tests can run.
 
 In the tests of a plugin::
 
@@ -26,16 +26,108 @@ from dataclasses import dataclass, field
 from types import ModuleType
 from typing import Any
 
-from amberbox.core.config import build, parse_yaml
-from amberbox.core.describe import describe
+from amberbox.core.config import build
 from amberbox.core.errors import AmberboxError, Problem
-from amberbox.core.source import Source, TopicOptions
+from amberbox.core.options import describe
+from amberbox.core.source import Power, Source, TopicOptions
 from amberbox.core.types import Topic
-from amberbox.testing.sink import MemorySink
+from amberbox.core.yaml_nodes import parse_yaml
+from amberbox.testing.clock import PATIENCE_S
 
+
+@dataclass
+class MemorySink:
+    """Keeps topics, messages, links and events in the order they came."""
+
+    topics: list[Topic] = field(default_factory=list)
+    messages: list[tuple[int, bytes, int]] = field(default_factory=list)
+    links: list[tuple[str, str, str, str, int]] = field(default_factory=list)
+    """(``up`` or ``down``, topic, peer, reason, time in ns)"""
+    events: list[tuple[str, str, Mapping[str, Any]]] = field(default_factory=list)
+    latched: dict[str, bytes] = field(default_factory=dict)
+    saved: dict[str, Any] = field(default_factory=dict)
+    powers: list[tuple[Power, str]] = field(default_factory=list)
+    longest_bytes: int = 64_000_000
+    losses: list[tuple[str, str, int, int, int, str]] = field(default_factory=list)
+    """(topic, peer, from and to in ns, how many, reason)"""
+
+    def __post_init__(self) -> None:
+        self._lock = threading.Condition(threading.RLock())
+
+    def now_ns(self) -> int:
+        return time.time_ns()
+
+    def topic(self, topic: Topic) -> int:
+        with self._lock:
+            if topic not in self.topics:
+                self.topics.append(topic)
+            return self.topics.index(topic)
+
+    def message(self, stream: int, data: bytes, received_ns: int) -> None:
+        with self._lock:
+            self.messages.append((stream, data, received_ns))
+            if self.topics[stream].latched:
+                self.latched[self.topics[stream].name] = data
+            self._lock.notify_all()
+
+    def longest_message(self) -> int:
+        return self.longest_bytes
+
+    def link_up(self, topic: str, peer: str, since_ns: int | None = None) -> None:
+        self._note_link("up", topic, peer, "", since_ns or self.now_ns())
+
+    def link_down(self, topic: str, peer: str, reason: str, since_ns: int | None = None) -> None:
+        self._note_link("down", topic, peer, reason, since_ns or self.now_ns())
+
+    def lost(
+        self, topic: str, peer: str, from_ns: int, to_ns: int, count: int, reason: str
+    ) -> None:
+        with self._lock:
+            self.losses.append((topic, peer, from_ns, to_ns, count, reason))
+            self._lock.notify_all()
+
+    def event(self, kind: str, text: str, **details: Any) -> None:
+        with self._lock:
+            self.events.append((kind, text, details))
+            self._lock.notify_all()
+
+    def power(self, state: Power, text: str) -> None:
+        with self._lock:
+            self.powers.append((state, text))
+            self._lock.notify_all()
+
+    def last_latched(self, topic: str) -> bytes | None:
+        return self.latched.get(topic)
+
+    def state(self) -> dict[str, Any]:
+        return dict(self.saved)
+
+    def save_state(self, state: Mapping[str, Any]) -> None:
+        self.saved = dict(state)
+
+    def of(self, topic: str) -> list[bytes]:
+        """Return the messages of one topic in order."""
+        with self._lock:
+            return [data for s, data, _ in self.messages if self.topics[s].name == topic]
+
+    def wait_for(self, topic: str, count: int, timeout_s: float = PATIENCE_S) -> list[bytes]:
+        """Wait until a topic has that many messages; raise TimeoutError if it never does."""
+        with self._lock:
+            if not self._lock.wait_for(lambda: len(self._of(topic)) >= count, timeout_s):
+                raise TimeoutError(f"{topic}: {len(self._of(topic))} of {count} messages")
+        return self.of(topic)
+
+    def _of(self, topic: str) -> list[bytes]:
+        return [data for s, data, _ in self.messages if self.topics[s].name == topic]
+
+    def _note_link(self, way: str, topic: str, peer: str, reason: str, at_ns: int) -> None:
+        with self._lock:
+            self.links.append((way, topic, peer, reason, at_ns))
+            self._lock.notify_all()
+
+
+# limit from setting ``stop`` to the return of ``run``: a second, and time for a busy machine
 STOP_S = 10.0
-"""Limit in seconds from setting ``stop`` to the return of ``run``. A source ends within a second;
-the rest is for a busy machine."""
 
 _KIND = re.compile(r"[a-z][a-z0-9_]*")
 
@@ -43,7 +135,7 @@ _KIND = re.compile(r"[a-z][a-z0-9_]*")
 def assert_source_contract(module: ModuleType, name: str, *, run_s: float = 0.3) -> None:
     """Check a source module: what it defines, its sample, and a run without its device.
 
-    Raises AssertionError with everything that is wrong.
+    Raises AssertionError with all problems found.
     """
     problems = module_problems(module, name)
     assert not problems, "\n".join(problems)
@@ -96,7 +188,7 @@ def sample_config(module: ModuleType, name: str) -> Any:
 
 
 def source_problems(source: Source) -> list[str]:
-    """Return what is wrong with a source that is ready to run."""
+    """Return the problems of a source that is ready to run."""
     problems = []
     if not isinstance(getattr(source, "lossless", None), bool):
         problems.append("'lossless' must be True or False")
@@ -145,7 +237,8 @@ class ObservedSink(MemorySink):
         super().message(stream, data, received_ns)
 
     def link_up(self, topic: str, peer: str, since_ns: int | None = None) -> None:
-        self._check_declared(topic)
+        if self.declared and not any(topic.startswith(name) for name in self.declared):
+            self._note(f"{topic}: was not asked for")
         self._up.add((topic, peer))
         super().link_up(topic, peer, since_ns)
 
@@ -165,12 +258,8 @@ class ObservedSink(MemorySink):
         super().event(kind, text, **details)
 
     def open_links(self) -> set[tuple[str, str]]:
-        """Return (topic, peer) of what is up."""
+        """Return (topic, peer) of the links that are up."""
         return set(self._up)
-
-    def _check_declared(self, topic: str) -> None:
-        if self.declared and not any(topic.startswith(name) for name in self.declared):
-            self._note(f"{topic}: was not asked for")
 
     def _note(self, problem: str) -> None:
         if problem not in self.problems:
@@ -206,7 +295,7 @@ def observe(source: Source) -> Iterator[ObservedSink]:
 def _run(source: Source, sink: ObservedSink, stop: threading.Event) -> None:
     try:
         source.run(sink, stop)
-    except BaseException as error:  # the thread's error is judged by whoever started it
+    except BaseException as error:  # the thread's error is judged by the code that started it
         sink.error = error
     finally:
         sink.ended.set()

@@ -9,20 +9,19 @@ from typing import Any
 
 import msgspec
 
-from amberbox.blackbox.follow.read import journals
-from amberbox.blackbox.journal import reserved
+from amberbox.blackbox.columns.json_messages import widen_schema
+from amberbox.blackbox.journal import channels
 from amberbox.blackbox.journal.writer import JournalOptions, JournalWriter
-from amberbox.blackbox.segments import build as segments
-from amberbox.blackbox.store import FOLDERS, create_store
-from amberbox.blackbox.unroll.infer import widen
+from amberbox.blackbox.store import segment_builder as segments
+from amberbox.blackbox.store.journal_reader import journals
+from amberbox.blackbox.store.store import FOLDERS, create_store
 from amberbox.core.clock import NS
 from amberbox.core.types import Topic
 
 _CHUNK_ROWS = 50
 _MS = 1_000_000
 
-T0_NS = 1_790_000_000 * NS
-"""When the sample record begins: 2026-09-21T14:13:20Z."""
+T0_NS = 1_790_000_000 * NS  # start of the sample record: 2026-09-21T14:13:20Z
 
 
 @dataclass(frozen=True)
@@ -39,7 +38,7 @@ class FakeItem:
     def mcap_topic(self) -> Topic:
         """Return the topic as a journal's channel has it."""
         messages = [msgspec.json.encode(example) for example in self.examples]
-        schema, _ = widen(None, messages, "json", self.name)
+        schema, _ = widen_schema(None, messages, "json", self.name)
         return Topic(self.topic or f"/{self.name}", "json", schema)
 
 
@@ -71,19 +70,19 @@ class FakeRun:
 
     def clock(self, at_ns: int, offset_ns: int) -> None:
         """Record that wall time differs from log time from now on."""
-        self.own(reserved.CLOCK, at_ns, {"offset_ns": offset_ns, "synchronised": True})
+        self.own(channels.CLOCK, at_ns, {"offset_ns": offset_ns, "synchronised": True})
 
     def start(self, at_ns: int) -> None:
-        """Record what the run is: the variables chosen for its items."""
+        """Write the start record of the run: the variables chosen for its items."""
         items = {item.name: {"variables": list(item.variables)} for item in self.items}
         text = msgspec.json.encode(items).decode()
-        self.own(reserved.RUN, at_ns, {"writer": self.writer, "run": self.run, "items": text})
+        self.own(channels.RUN, at_ns, {"writer": self.writer, "run": self.run, "items": text})
 
     def own(self, topic: str, at_ns: int, values: Mapping[str, Any]) -> None:
         """Write a message on one of the box's own channels."""
         if topic not in self._channels:
-            marks = {"item": topic.replace("/", "_"), "source": reserved.SOURCE}
-            self._channels[topic] = self.journal.channel(reserved.topic_of(topic), marks)
+            marks = {"item": topic.replace("/", "_"), "source": channels.SOURCE}
+            self._channels[topic] = self.journal.channel(channels.topic_of(topic), marks)
         self._write([(self._channels[topic], at_ns, msgspec.json.encode(values))])
 
     def rotate(self) -> None:
@@ -107,7 +106,7 @@ class FakeRun:
 
 
 def pose(number: int) -> dict[str, Any]:
-    """Values of the sample record's message of that number."""
+    """Return the values of the sample record's message of that number."""
     return {
         "stamp": T0_NS + number * 10 * _MS - 3 * _MS,
         "pose": {"x": float(number), "y": -number / 4},
@@ -122,7 +121,7 @@ BATTERY = FakeItem("battery", [{"volts": 1.5}], variables=["volts"])
 
 
 def pose_rows(start: int, stop: int) -> list[tuple[int, FakeItem, Any]]:
-    """Messages of the sample record: POSE every 10 ms, BATTERY with every tenth."""
+    """Return messages of the sample record: POSE every 10 ms, BATTERY with every tenth."""
     made: list[tuple[int, FakeItem, Any]] = []
     for number in range(start, stop):
         at = T0_NS + number * 10 * _MS
@@ -133,7 +132,7 @@ def pose_rows(start: int, stop: int) -> list[tuple[int, FakeItem, Any]]:
 
 
 def fill_store(store: Path) -> None:
-    """Make the sample record: three journal files of 100 POSEs, the last unfinished."""
+    """Write the sample record: three journal files of 100 POSEs, the last unfinished."""
     run = FakeRun(store, items=[POSE, BATTERY])
     run.start(T0_NS - 1)
     for start in (0, 100, 200):

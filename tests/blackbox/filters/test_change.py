@@ -112,7 +112,7 @@ def kept(
 
 
 def beyond(value: float | None, last: float | None, absolute: float, relative: float) -> bool:
-    """The rule for one number, as docs/filters.md puts it."""
+    """The rule for one number, as docs/robot/filters.md puts it."""
     if value is None or last is None:
         return value is not last
     if not (math.isfinite(value) and math.isfinite(last)):

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from rosbags.typesys import Stores, get_typestore
 
+from amberbox.blackbox.columns.unroll import unroller
 from amberbox.blackbox.filters.change import ChangeFilter
-from amberbox.blackbox.unroll import unroller
 from amberbox.core.source import ChangeOptions
 from amberbox.core.types import Schema, Topic
 

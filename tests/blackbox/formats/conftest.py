@@ -12,9 +12,20 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Ros2Writer
 from rosbags.typesys import Stores, get_typestore
 
+from amberbox.blackbox.formats._open import open_recording
+from amberbox.blackbox.formats._recording import RecordingReader
+
 Messages = list[tuple[str, int, bytes]]
 TYPES = {"/odom": "geometry_msgs/msg/Pose", "/text": "std_msgs/msg/String"}
 START_NS = 1_600_000_000_000_000_000
+
+
+def read_all(path: Path) -> tuple[Messages, RecordingReader]:
+    """Read a recording; return its messages by name of the topic, and what it was read with."""
+    with open_recording(path) as recording:
+        topics = recording.topics
+        found = [(topics[m.topic_index].name, m.log_time_ns, m.data) for m in recording.messages()]
+    return found, recording
 
 
 def make_messages(count: int, seed: int = 1) -> Messages:

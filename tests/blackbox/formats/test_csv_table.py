@@ -14,11 +14,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import amberbox
-from amberbox.blackbox.formats import csv_lines, csv_scan, open_recording
-from amberbox.blackbox.formats.bytesource import FileBytes
-from amberbox.blackbox.formats.csv_columns import ColumnKind, convert
-from amberbox.blackbox.formats.options import ReadOptions
-from amberbox.blackbox.importing import import_recordings
+from amberbox.blackbox.formats import csv as formats_csv
+from amberbox.blackbox.formats._open import open_recording
+from amberbox.blackbox.formats._recording import FileBytes, ReadOptions
+from amberbox.blackbox.formats.csv import ColumnKind, convert
+from amberbox.blackbox.query.importing import import_recordings
 from amberbox.blackbox.query.table import Table
 from amberbox.core.errors import AmberboxError, UsageError
 
@@ -183,8 +183,8 @@ def test_the_name_of_a_table_names_its_item(tmp_path: Path) -> None:
 
 
 def test_large_tables_are_read_in_pieces(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(csv_lines, "_BLOCK", 1000)
-    monkeypatch.setattr(csv_scan, "_BATCH_ROWS", 7)
+    monkeypatch.setattr(formats_csv, "_BLOCK", 1000)
+    monkeypatch.setattr(formats_csv, "_BATCH_ROWS", 7)
     lines = [f'{NOON + n},{n},"{"x" * (n % 300)}"' for n in range(500)]
     report, table = imported("time,n,pad\n" + "\n".join(lines), tmp_path)
     assert table.values("n") == list(range(500))
@@ -334,8 +334,8 @@ def test_rows_are_those_of_the_csv_module(rows: list[list[str]]) -> None:
         temporary.write(text.getvalue().encode())
         temporary.flush()
         file = FileBytes(Path(temporary.name))
-        dialect = csv_lines.find_dialect(file)
-        found = list(csv_lines.read_rows(file, dialect, dialect.start, file.size, 2))
+        dialect = formats_csv.find_dialect(file)
+        found = list(formats_csv.read_rows(file, dialect, dialect.start, file.size, 2))
         file.close()
     assert [row.cells for row in found] == [["1", *row] for row in rows]
     assert all(not row.problem for row in found)

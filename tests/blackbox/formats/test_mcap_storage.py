@@ -11,7 +11,8 @@ import pytest
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, IndexType, Writer
 
-from amberbox.blackbox.formats import Recording, open_recording
+from amberbox.blackbox.formats._open import open_recording
+from tests.blackbox.formats.conftest import read_all
 
 Messages = list[tuple[str, int, bytes]]
 EXPECTED = [
@@ -34,13 +35,6 @@ def write_mcap(path: Path, *, finish: bool = True, **options: Any) -> None:
             writer.add_message(channels[topic], time_ns, data, time_ns - 5, sequence)
         if finish:
             writer.finish()  # type: ignore[no-untyped-call]  # the library leaves it untyped
-
-
-def read_all(path: Path) -> tuple[Messages, Recording]:
-    with open_recording(path) as recording:
-        topics = recording.topics
-        found = [(topics[m.topic_index].name, m.log_time_ns, m.data) for m in recording.messages()]
-    return found, recording
 
 
 VARIANTS: list[dict[str, Any]] = [

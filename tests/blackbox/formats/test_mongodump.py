@@ -18,11 +18,12 @@ from rosbags.rosbag1 import Writer
 from rosbags.typesys import Stores, get_typestore
 
 import amberbox
-from amberbox.blackbox.formats import Recording, bson_file, kept, open_recording
-from amberbox.blackbox.formats.options import ReadOptions
-from amberbox.blackbox.importing import ImportReport, import_recordings
+from amberbox.blackbox.columns.unroll import unroller
+from amberbox.blackbox.formats import _recording, mongodump
+from amberbox.blackbox.formats._open import open_recording
+from amberbox.blackbox.formats._recording import ReadOptions, RecordingReader
+from amberbox.blackbox.query.importing import ImportReport, import_recordings
 from amberbox.blackbox.query.table import Table
-from amberbox.blackbox.unroll import unroller
 from amberbox.core.errors import AmberboxError, UsageError
 from tests.blackbox.formats.dump_folder import (
     START_S,
@@ -127,12 +128,14 @@ def comparable(table: Table) -> list[tuple[Any, ...]]:
     return [(f.name, f.type, f.unit, str(table.values(f.name))) for f in table.fields]
 
 
-@pytest.mark.parametrize("room", [kept.ROOM_BYTES, 0])
+@pytest.mark.parametrize("room", [_recording.ROOM_BYTES, 0])
 def test_typed_collections_are_columns_as_if_recorded_live(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, room: int
 ) -> None:
-    monkeypatch.setattr(kept.Kept, "__init__", lambda self: setattr(self, "room_bytes", room))
-    monkeypatch.setattr(bson_file, "STRETCH_BYTES", 10_000)
+    monkeypatch.setattr(
+        _recording.ConversionCache, "__init__", lambda self: setattr(self, "room_bytes", room)
+    )
+    monkeypatch.setattr(mongodump, "STRETCH_BYTES", 10_000)
     report = imported(write_dump(tmp_path / "dump"), tmp_path / "store")
     imported(write_bag(tmp_path / "same.bag"), tmp_path / "live")
     dumped, live = (amberbox.open(tmp_path / name) for name in ("store", "live"))
@@ -411,13 +414,13 @@ def test_without_pymongo_the_error_says_what_to_install(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = write_dump(tmp_path / "dump", 1)
-    bson_file.bson_package.cache_clear()
+    mongodump.bson_package.cache_clear()
     with monkeypatch.context() as patch:
         patch.setitem(sys.modules, "bson", None)
         with pytest.raises(UsageError) as caught:
             open_recording(folder)
         assert "pip install amberbox[formats]" in caught.value.hint
-    bson_file.bson_package.cache_clear()
+    mongodump.bson_package.cache_clear()
 
 
 # -- the real ones
@@ -520,7 +523,7 @@ def test_topics_can_be_chosen(tmp_path: Path) -> None:
 
 def test_a_recording_source_replays_a_dump(tmp_path: Path) -> None:
     with open_recording(write_dump(tmp_path / "dump", 2)) as recording:
-        assert isinstance(recording, Recording)
+        assert isinstance(recording, RecordingReader)
         assert {origin.source for origin in recording.origins} == {"ros"}
         assert len(list(recording.messages())) == 2 * len(KINDS)
         assert recording.report.messages == 2 * len(KINDS)

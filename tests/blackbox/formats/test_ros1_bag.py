@@ -11,21 +11,15 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from rosbags.rosbag1 import Reader
 
-from amberbox.blackbox.formats import Recording, open_recording
-from amberbox.blackbox.formats.ros1_records import parse_fields
+from amberbox.blackbox.formats._open import open_recording
+from amberbox.blackbox.formats.ros1_bag import parse_fields
 from amberbox.core.errors import AmberboxError
+from tests.blackbox.formats.conftest import read_all
 from tests.fuzzing import examples, fuzz
 
 Messages = list[tuple[str, int, bytes]]
 WriteBag = Callable[..., None]
 BAG_SIZE_WITHOUT_MAGIC = 13
-
-
-def read_all(path: Path) -> tuple[Messages, Recording]:
-    with open_recording(path) as recording:
-        topics = recording.topics
-        found = [(topics[m.topic_index].name, m.log_time_ns, m.data) for m in recording.messages()]
-    return found, recording
 
 
 @pytest.mark.parametrize("compression", ["", "bz2", "lz4"])

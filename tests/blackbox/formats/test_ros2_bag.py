@@ -12,9 +12,10 @@ import pytest
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
-from amberbox.blackbox.formats import Recording, open_recording
-from amberbox.blackbox.formats.ros2_qos import is_latched
+from amberbox.blackbox.formats._open import open_recording
+from amberbox.blackbox.formats._ros2_types import is_latched
 from amberbox.core.errors import AmberboxError
+from tests.blackbox.formats.conftest import read_all
 
 Messages = list[tuple[str, int, bytes]]
 WriteBag = Callable[..., None]
@@ -27,13 +28,6 @@ KINDS = [
     ("mcap", "message"),
     ("mcap", "storage"),
 ]
-
-
-def read_all(path: Path) -> tuple[Messages, Recording]:
-    with open_recording(path) as recording:
-        topics = recording.topics
-        found = [(topics[m.topic_index].name, m.log_time_ns, m.data) for m in recording.messages()]
-    return found, recording
 
 
 @pytest.mark.parametrize(("storage", "compression"), KINDS)

@@ -13,10 +13,11 @@ import pytest
 from pyulog import ULog  # type: ignore[import-untyped]  # the package has no type hints
 
 import amberbox
-from amberbox.blackbox.formats import Recording, kept, open_recording, ulog
-from amberbox.blackbox.formats.options import ReadOptions
-from amberbox.blackbox.importing import ImportReport, import_recordings
-from amberbox.blackbox.unroll import unroller
+from amberbox.blackbox.columns.unroll import unroller
+from amberbox.blackbox.formats import _recording, ulog
+from amberbox.blackbox.formats._open import open_recording
+from amberbox.blackbox.formats._recording import ReadOptions, RecordingReader
+from amberbox.blackbox.query.importing import ImportReport, import_recordings
 from amberbox.core.errors import AmberboxError
 from amberbox.core.types import Rows
 from tests.blackbox.formats.ulog_file import (
@@ -31,7 +32,7 @@ from tests.blackbox.formats.ulog_file import (
 )
 
 
-def rows_of(recording: Recording, topic: str) -> tuple[list[int], Rows]:
+def rows_of(recording: RecordingReader, topic: str) -> tuple[list[int], Rows]:
     """Return log times and columns of a topic."""
     place = next(n for n, t in enumerate(recording.topics) if t.name == topic)
     found = [m for m in recording.messages() if m.topic_index == place]
@@ -39,7 +40,7 @@ def rows_of(recording: Recording, topic: str) -> tuple[list[int], Rows]:
     return [m.log_time_ns for m in found], rows
 
 
-def documents(recording: Recording, topic: str) -> list[tuple[int, dict[str, Any]]]:
+def documents(recording: RecordingReader, topic: str) -> list[tuple[int, dict[str, Any]]]:
     place = next(n for n, t in enumerate(recording.topics) if t.name == topic)
     return [
         (m.log_time_ns, msgspec.msgpack.decode(m.data))
@@ -48,7 +49,7 @@ def documents(recording: Recording, topic: str) -> list[tuple[int, dict[str, Any
     ]
 
 
-def check_against_pyulog(path: Path, recording: Recording, base_us: int) -> int:
+def check_against_pyulog(path: Path, recording: RecordingReader, base_us: int) -> int:
     """Compare every number of every topic; returns how many were compared."""
     compared = 0
     for data in ULog(str(path)).data_list:
@@ -66,11 +67,13 @@ def check_against_pyulog(path: Path, recording: Recording, base_us: int) -> int:
     return compared
 
 
-@pytest.mark.parametrize("room", [kept.ROOM_BYTES, 0])
+@pytest.mark.parametrize("room", [_recording.ROOM_BYTES, 0])
 def test_every_value_is_that_of_pyulog(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, room: int
 ) -> None:
-    monkeypatch.setattr(kept.Kept, "__init__", lambda self: setattr(self, "room_bytes", room))
+    monkeypatch.setattr(
+        _recording.ConversionCache, "__init__", lambda self: setattr(self, "room_bytes", room)
+    )
     monkeypatch.setattr(ulog, "_BLOCK", 70_000)
     path = flight(3000).write(tmp_path / "flight.ulg")
     with open_recording(path) as recording:
@@ -179,7 +182,7 @@ def small(count: int = 300) -> UlogFile:
     return log
 
 
-def devices(path: Path) -> tuple[list[int], Recording]:
+def devices(path: Path) -> tuple[list[int], RecordingReader]:
     with open_recording(path) as recording:
         _, rows = rows_of(recording, "/sensor_accel")
         return list(np.asarray(rows.columns["device_id"]) - 1000), recording

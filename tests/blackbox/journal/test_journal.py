@@ -13,10 +13,9 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from mcap.reader import NonSeekingReader, make_reader
 
-from amberbox.blackbox.journal.buffer import open_buffer
-from amberbox.blackbox.journal.frame import CHUNK_BYTES
+from amberbox.blackbox.journal.chunk import open_buffer
 from amberbox.blackbox.journal.scan import FileScan, read_chunk, scan
-from amberbox.blackbox.journal.writer import JournalOptions, JournalWriter
+from amberbox.blackbox.journal.writer import CHUNK_BYTES, JournalOptions, JournalWriter
 from amberbox.core.types import Schema, Topic
 
 Row = tuple[int, int, bytes]

@@ -13,7 +13,7 @@ from amberbox.blackbox.recorder.pipeline import PipelineOptions
 from amberbox.core.clock import NS
 from amberbox.core.source import ChangeOptions, TopicOptions
 from amberbox.core.types import Schema, Topic
-from amberbox.testing.box import (
+from tests.support.manual_recorder import (
     ManualBox,
     events,
     last_counters,

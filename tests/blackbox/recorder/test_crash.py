@@ -14,12 +14,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from amberbox.blackbox.folder.folder import load_folder
-from amberbox.blackbox.follow import read
 from amberbox.blackbox.recorder.recorder import Recorder
-from amberbox.blackbox.store import open_store
+from amberbox.blackbox.robot_folder.folder import load_folder
+from amberbox.blackbox.store import journal_reader
+from amberbox.blackbox.store.store import open_store
 from amberbox.core.clock import NS
 from amberbox.core.types import Batch
+from tests.support.processes import free_port
 
 KILLS = 50
 WRITE_S = 0.1
@@ -47,17 +48,12 @@ def send(truth: Path, port: int) -> None:
 
 
 def record(folder: Path) -> None:
-    Recorder(load_folder(folder), keeper=False).run()
+    Recorder(load_folder(folder), retention=False).run()
 
 
 @pytest.fixture
 def sender(tmp_path: Path) -> Iterator[tuple[Path, int]]:
-    import socket
-
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = int(probe.getsockname()[1])
-    truth = tmp_path / "truth"
+    truth, port = tmp_path / "truth", free_port()
     process = _FORK.Process(target=send, args=(truth, port), daemon=True)
     process.start()
     yield truth, port
@@ -87,7 +83,7 @@ def counted(store: Path) -> NDArray[np.int64]:
     """Return the numbers that are in the record, in the order of their positions."""
     found = [
         (batch.run, batch.seq, batch.columns["n"])
-        for batch in read.batches(store, items={"zmq_count"})
+        for batch in journal_reader.batches(store, items={"zmq_count"})
         if isinstance(batch, Batch)
     ]
     found.sort(key=lambda part: (part[0], int(part[1][0])))

@@ -13,12 +13,14 @@ from pathlib import Path
 import pytest
 
 import amberbox
-from amberbox.blackbox.follow import read
 from amberbox.blackbox.journal import writer
 from amberbox.blackbox.recorder.pipeline import PipelineOptions
 from amberbox.blackbox.recorder.recorder import Recorder
+from amberbox.blackbox.store import journal_reader
+from amberbox.core import files as core_files
 from amberbox.core.clock import NS
-from amberbox.testing.box import (
+from amberbox.testing.clock import PATIENCE_S, wait_until
+from tests.support.manual_recorder import (
     COUNT,
     ManualBox,
     events,
@@ -27,8 +29,7 @@ from amberbox.testing.box import (
     raw_messages,
     recording,
 )
-from amberbox.testing.patience import PATIENCE_S, wait_until
-from amberbox.testing.rosnet import RosMaster, RosPublisher, RosTopic
+from tests.support.ros_network import RosMaster, RosPublisher, RosTopic
 
 RATE_HZ = 1000
 STALL_S = 5.0
@@ -45,7 +46,7 @@ class Disk:
         self.works.set()
         self.stalled = threading.Event()
         self.room: int | None = None
-        self._write = writer._write_all
+        self._write = core_files.write_all
 
     def write(self, fd: int, data: bytes) -> None:
         if not self.works.is_set():
@@ -62,7 +63,7 @@ class Disk:
 @pytest.fixture
 def disk(monkeypatch: pytest.MonkeyPatch) -> Iterator[Disk]:
     made = Disk()
-    monkeypatch.setattr(writer, "_write_all", made.write)
+    monkeypatch.setattr(writer, "write_all", made.write)
     yield made
     made.works.set()
 
@@ -120,7 +121,7 @@ def test_a_stalling_disk_neither_slows_the_robot_nor_hides_a_loss(
         assert disk.stalled.wait(PATIENCE_S)
         slowest_s = max(slowest_s, publish(node, during, before))
         disk.works.set()
-        wait_until(lambda: recorder.pipeline.intake.size_bytes < 100_000, "written")
+        wait_until(lambda: recorder.pipeline.queue.size_bytes < 100_000, "written")
         slowest_s = max(slowest_s, publish(node, after, before + during))
         sent = before + during + after
         received = recorder.pipeline.items[ITEM].counters
@@ -182,13 +183,15 @@ def test_a_full_disk_is_told_and_recording_resumes_when_there_is_room(
     assert box.pipeline.disk_error == ""
     box.close()
     assert numbers_of(box.store) == said
-    told = [event["text"] for event in events(box.store, "disk")]
-    assert told[0::2] == ["the disk does not take data: No space left on device"] * (len(told) // 2)
-    assert told[1::2] == ["the disk takes data again"] * (len(told) // 2)
-    assert told
-    assert [journal.items["amberbox_run"] for journal in read.journals(box.store)] == [1] * len(
-        list((box.store / "journal").glob("*.mcap"))
+    texts = [event["text"] for event in events(box.store, "disk")]
+    assert texts[0::2] == ["the disk does not take data: No space left on device"] * (
+        len(texts) // 2
     )
+    assert texts[1::2] == ["the disk takes data again"] * (len(texts) // 2)
+    assert texts
+    assert [journal.items["amberbox_run"] for journal in journal_reader.journals(box.store)] == [
+        1
+    ] * len(list((box.store / "journal").glob("*.mcap")))
     assert last_counters(box.store)["ros_count"]["kept"] == len(said)
 
 
@@ -196,7 +199,7 @@ def test_a_full_disk_is_told_and_recording_resumes_when_there_is_room(
 def test_a_clock_that_is_set_when_a_write_fails_ends_nothing(
     tmp_path: Path, disk: Disk, fails_at: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    writes, write = [], writer._write_all
+    writes, write = [], core_files.write_all
 
     def fail_once(fd: int, data: bytes) -> None:
         writes.append(data)
@@ -207,7 +210,7 @@ def test_a_clock_that_is_set_when_a_write_fails_ends_nothing(
     box = ManualBox(tmp_path / "store")
     box.hear(COUNT, number(0))
     box.write()
-    monkeypatch.setattr(writer, "_write_all", fail_once)
+    monkeypatch.setattr(writer, "write_all", fail_once)
     box.clock.step(-3600)
     for n in range(1, 9):
         box.hear(COUNT, number(n))

@@ -14,19 +14,20 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import amberbox
-from amberbox.blackbox.follow.follow import follow
 from amberbox.blackbox.journal import writer
-from amberbox.blackbox.recorder import room as module
+from amberbox.blackbox.recorder import disk_room as module
+from amberbox.blackbox.recorder.disk_room import DiskRoom
 from amberbox.blackbox.recorder.pipeline import PipelineOptions
-from amberbox.blackbox.recorder.room import Room
-from amberbox.blackbox.recorder.sink import BlockSink
+from amberbox.blackbox.recorder.supervisor import BlockSink
+from amberbox.blackbox.store.tail import follow
+from amberbox.core import files as core_files
 from amberbox.core.clock import NS
 from amberbox.core.source import TopicOptions
 from amberbox.core.types import Gap, Topic
-from amberbox.testing.box import (
+from tests.support.manual_recorder import (
     COUNT,
     ManualBox,
-    events,
+    event_texts,
     last_counters,
     number,
     own_records,
@@ -46,8 +47,8 @@ class Disk:
         self.others = 0
         self.broken = 0
         self._folder = folder
-        self._write = writer._write_all
-        patch.setattr(writer, "_write_all", self.write)
+        self._write = core_files.write_all
+        patch.setattr(writer, "write_all", self.write)
         patch.setattr(writer, "_expect_room", lambda fd, size: None)
         patch.setattr(module, "free_bytes", lambda folder: self.free)
 
@@ -76,13 +77,9 @@ def disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Disk]:
 def box_on(store: Path, *topics: TopicOptions, queue: int = 10**7) -> ManualBox:
     options = PipelineOptions(queue_bytes=queue)
     store.mkdir(exist_ok=True)
-    room = Room(store, RESERVE)
+    room = DiskRoom(store, RESERVE)
     room.begin()
     return ManualBox(store, topics, options=options, room=room)
-
-
-def told(store: Path, kind: str) -> list[str]:
-    return [event["text"] for event in events(store, kind)]
 
 
 def said(store: Path) -> list[int]:
@@ -113,10 +110,10 @@ def test_what_is_turned_away_is_named_with_its_time(tmp_path: Path, disk: Disk) 
     assert not any(g.from_ns <= times[n] < g.to_ns for g in gaps for n in kept)
     counters = last_counters(box.store)["ros_count"]
     assert (counters["kept"], counters["dropped"]) == (len(kept), len(lost))
-    assert told(box.store, "events_only") == [
+    assert event_texts(box.store, "events_only") == [
         "disk full: only events are recorded until there is room"
     ]
-    assert told(box.store, "recording_resumed") == [
+    assert event_texts(box.store, "recording_resumed") == [
         f"there is room: recording goes on; {len(lost)} messages of 1 items were dropped"
     ]
 
@@ -132,11 +129,11 @@ def test_nothing_that_waited_is_lost_when_the_reserve_is_given_up(
     box.pipeline.event("collision", "bumper hit")
     box.write()
     assert said(box.store) == list(range(100))
-    assert told(box.store, "collision") == ["bumper hit"]
+    assert event_texts(box.store, "collision") == ["bumper hit"]
     assert (box.store / "reserve").stat().st_size == 0
     assert box.pipeline.disk_error == ""
     box.close()
-    assert told(box.store, "disk") == []
+    assert event_texts(box.store, "disk") == []
 
 
 def test_events_find_room_though_much_data_waited(tmp_path: Path, disk: Disk) -> None:
@@ -149,7 +146,7 @@ def test_events_find_room_though_much_data_waited(tmp_path: Path, disk: Disk) ->
     for n in range(20):
         box.pipeline.event("collision", f"bumper hit {n}")
         box.write(1.0)
-    assert len(told(box.store, "collision")) == 20
+    assert len(event_texts(box.store, "collision")) == 20
     kept = len(raw_messages(box.store, "/noise"))
     assert kept == RESERVE // 8 // 10_000
     box.close()
@@ -234,7 +231,7 @@ def test_a_broken_disk_is_not_a_full_one(tmp_path: Path, disk: Disk, error: int)
         box.write()
     box.close()
     assert said(box.store) == list(range(30))
-    assert told(box.store, "events_only") == []
+    assert event_texts(box.store, "events_only") == []
     assert (box.store / "reserve").stat().st_size == RESERVE
 
 
@@ -251,7 +248,7 @@ def test_when_even_the_reserve_is_used_up_events_wait(tmp_path: Path, disk: Disk
     disk.others = 0
     for _ in range(3):
         box.write()
-    assert told(box.store, "collision") == [f"bumper hit {n}" for n in range(20)]
+    assert event_texts(box.store, "collision") == [f"bumper hit {n}" for n in range(20)]
     box.close()
     counters = last_counters(box.store)["ros_count"]
     assert counters["kept"] + counters["dropped"] == 20
@@ -267,15 +264,15 @@ def test_a_file_waits_for_room_and_loses_nothing(tmp_path: Path, disk: Disk) -> 
     box.write()
     disk.fill()
     for n in range(5, 25):
-        if box.pipeline.intake.size_bytes < 2500:
+        if box.pipeline.queue.size_bytes < 2500:
             file.message(stream, number(n), box.sink.now_ns())
             last = n
         box.write()
-    assert box.pipeline.intake.size_bytes > 1000
+    assert box.pipeline.queue.size_bytes > 1000
     disk.others = 0
     for _ in range(3):
         box.write()
-    assert box.pipeline.intake.size_bytes == 0
+    assert box.pipeline.queue.size_bytes == 0
     box.close()
     assert said(box.store) == list(range(last + 1))
     assert last_counters(box.store)["file_count"]["dropped"] == 0
@@ -307,7 +304,7 @@ def test_a_ring_elsewhere_goes_on_and_its_own_full_disk_holds_nobody_up(
     memory.mkdir(parents=True)
     (box.store / "ring").symlink_to(memory)
     box.pipeline.keep_elsewhere({"ring"})
-    ring_is_full, write = [False], writer._write_all
+    ring_is_full, write = [False], core_files.write_all
 
     def write_to(fd: int, data: bytes) -> None:
         in_ring = "memory" in str(Path(f"/proc/self/fd/{fd}").readlink())
@@ -315,7 +312,7 @@ def test_a_ring_elsewhere_goes_on_and_its_own_full_disk_holds_nobody_up(
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         write(fd, data) if not in_ring else os.write(fd, data)
 
-    monkeypatch.setattr(writer, "_write_all", write_to)
+    monkeypatch.setattr(writer, "write_all", write_to)
     for n in range(30):
         if n == 10:
             disk.fill()
@@ -367,7 +364,7 @@ def test_accounts_are_exact_whatever_the_disk_does(
     assert (counters["kept"], counters["dropped"]) == (len(kept), sent - len(kept))
     gaps = amberbox.open(store).gaps("ros_count") if sent else []
     assert sum(gap.count or 0 for gap in gaps) == sent - len(kept)
-    ticks = told(store, "tick")
+    ticks = event_texts(store, "tick")
     assert ticks == sorted(ticks, key=int)
     holes = [d for d in follow(store, live=False) if isinstance(d, Gap) and d.from_seq is not None]
     assert holes == []

@@ -12,13 +12,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from amberbox.blackbox.follow.follow import follow
 from amberbox.blackbox.recorder.pipeline import Pipeline, PipelineOptions
-from amberbox.blackbox.recorder.sink import BlockSink
-from amberbox.blackbox.store import create_store
+from amberbox.blackbox.recorder.supervisor import BlockSink
+from amberbox.blackbox.store.store import create_store
+from amberbox.blackbox.store.tail import follow
 from amberbox.core.clock import NS, RunClock
 from amberbox.core.types import Batch, Cursor, Gap, Schema, Topic, Watermark
-from amberbox.testing import ManualClock
+from amberbox.testing.clock import ManualClock
 
 TOPICS = [
     Topic(f"/{name}", "ros1", Schema("std_msgs/Int64", "ros1msg", b"int64 data\n"))

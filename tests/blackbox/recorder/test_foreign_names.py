@@ -9,9 +9,9 @@ import pytest
 
 import amberbox
 from amberbox.cli.main import main
-from amberbox.core.names import fitted
+from amberbox.core.names import shortened
 from amberbox.core.types import Topic
-from amberbox.testing.box import ManualBox
+from tests.support.manual_recorder import ManualBox
 
 TOPICS = ("/" + "x" * 5000, "/" + "x" * 4999 + "y", "/скорость", "/Skorost", "/速度")
 MESSAGE = json.dumps({"скорость": 2.5, "温度": 3, "x": 1, "k" * 5000: 4}).encode()
@@ -58,9 +58,9 @@ def test_tables_stay_narrow(store: Path, capsys: pytest.CaptureFixture[str]) -> 
 
 def test_files_of_items_with_names_of_any_length_have_short_and_distinct_names() -> None:
     long = ["zmq_" + "x" * 5000 + end for end in ("a", "b")]
-    assert len({fitted(name) for name in long}) == 2
-    assert max(len(fitted(name)) for name in long) == 200
-    assert fitted("ros_odom") == "ros_odom"
+    assert len({shortened(name) for name in long}) == 2
+    assert max(len(shortened(name)) for name in long) == 200
+    assert shortened("ros_odom") == "ros_odom"
 
 
 def test_a_store_of_before_keeps_its_names(tmp_path: Path) -> None:

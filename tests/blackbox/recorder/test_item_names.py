@@ -14,8 +14,8 @@ import amberbox
 from amberbox.cli.main import main
 from amberbox.core.source import TopicOptions
 from amberbox.core.types import Schema, Topic
-from amberbox.testing import ManualClock
-from amberbox.testing.box import COUNT, ManualBox, number
+from amberbox.testing.clock import ManualClock
+from tests.support.manual_recorder import COUNT, ManualBox, number
 
 TYPES = get_typestore(Stores.ROS1_NOETIC)
 ALIKE = ("/a/b_c", "/a_b/c", "/a/b/c", "/A/b_c", "/a b/c", "/a.b_c", "/a_b_c")

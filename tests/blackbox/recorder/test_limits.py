@@ -11,8 +11,8 @@ import pytest
 import amberbox
 from amberbox.blackbox.filters.rate import TOLERANCE_PERIODS
 from amberbox.core.source import TopicOptions
-from amberbox.testing import ManualClock
-from amberbox.testing.box import COUNT, ManualBox, last_counters, number
+from amberbox.testing.clock import ManualClock
+from tests.support.manual_recorder import COUNT, ManualBox, last_counters, number
 
 LIMIT_HZ = 10.0
 MESSAGES = 3000

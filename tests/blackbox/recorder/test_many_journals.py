@@ -6,16 +6,16 @@ from pathlib import Path
 
 import pytest
 
-from amberbox.blackbox.follow import read, tail
-from amberbox.blackbox.follow.tail import position_at
 from amberbox.blackbox.journal.scan import FileScan, scan
-from amberbox.blackbox.keeper.ownjournal import last_progress
 from amberbox.blackbox.recorder.pipeline import PipelineOptions
-from amberbox.blackbox.recorder.recovery import previous_end_ns
-from amberbox.blackbox.store import Store, open_store
+from amberbox.blackbox.recorder.recorder import previous_end_ns
+from amberbox.blackbox.store import journal_reader, tail
+from amberbox.blackbox.store.derived_journal import last_progress
+from amberbox.blackbox.store.store import Store, open_store
+from amberbox.blackbox.store.tail import position_at
 from amberbox.core.clock import NS
 from amberbox.core.types import WriterCursor
-from amberbox.testing.box import COUNT, ManualBox, number
+from tests.support.manual_recorder import COUNT, ManualBox, number
 
 
 @pytest.fixture(scope="module")
@@ -39,8 +39,8 @@ def test_what_begins_at_the_end_opens_few_files(
         looked.append(path)
         return scan(path)
 
-    read._journal_file.cache_clear()
-    monkeypatch.setattr(read, "scan", look)
+    journal_reader._journal_file.cache_clear()
+    monkeypatch.setattr(journal_reader, "scan", look)
     assert len(store.journal_files("main")) > 20
     assert previous_end_ns(store) is not None
     assert position_at(store, "main", None, 1.0).seq > 0
@@ -52,7 +52,7 @@ def test_what_begins_at_the_end_opens_few_files(
 def test_the_file_of_a_position_is_found_from_the_end(store: Store, back: int) -> None:
     files = store.journal_files("main")
     wanted = len(files) - 1 - back
-    starts = [read.journal_file(path).first_seq for path in files]
+    starts = [journal_reader.journal_file(path).first_seq for path in files]
     assert tail._first_of_interest(files, 1, starts[wanted]) == wanted
     assert tail._first_of_interest(files, 1, starts[wanted] + 1) == wanted
     assert tail._first_of_interest(files, 0, 10**9) == 0
@@ -63,6 +63,6 @@ def test_a_lookback_reaches_over_files(store: Store) -> None:
     end = position_at(store, "main", None, 0.001)
     back = position_at(store, "main", None, 10.0)
     assert position_at(store, "main", WriterCursor(1, back.seq), 0.001).seq <= back.seq < end.seq
-    files = [read.journal_file(path) for path in store.journal_files("main")]
+    files = [journal_reader.journal_file(path) for path in store.journal_files("main")]
     (of,) = [f for f in files if f.first_seq <= back.seq < f.end_seq]
     assert 9.0 <= (files[-1].end_ns - of.end_ns) / NS <= 11.0

@@ -10,13 +10,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from amberbox.blackbox.follow import read
 from amberbox.blackbox.recorder.pipeline import Pipeline, PipelineOptions
-from amberbox.blackbox.recorder.sink import BlockSink
-from amberbox.blackbox.store import create_store
+from amberbox.blackbox.recorder.supervisor import BlockSink
+from amberbox.blackbox.store import journal_reader
+from amberbox.blackbox.store.store import create_store
 from amberbox.core.clock import NS, RunClock
 from amberbox.core.types import Schema, Topic
-from amberbox.testing import ManualClock
+from amberbox.testing.clock import ManualClock
 
 WRITE_S, SYNC_S = 0.1, 1.0
 COUNTED = Topic("/count", "ros1", Schema("std_msgs/Int64", "ros1msg", b"int64 data\n"))
@@ -63,7 +63,7 @@ def test_everything_synced_survives(
     assert end_ns - last_sync_ns <= (SYNC_S + WRITE_S) * NS
     found = [
         n
-        for b in read.batches(store, {"ros_count"})
+        for b in journal_reader.batches(store, {"ros_count"})
         for n in np.asarray(b.columns["data"]).tolist()
     ]
     survivors = round((last_sync_ns - ManualClock().wall_ns()) / (WRITE_S / 10 * NS))

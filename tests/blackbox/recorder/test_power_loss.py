@@ -8,16 +8,13 @@ from pathlib import Path
 
 import pytest
 
-from amberbox.blackbox import requests
-from amberbox.blackbox.follow import read
-from amberbox.blackbox.recorder.power import PowerWatch
-from amberbox.blackbox.recorder.recorder import Recorder
-from amberbox.blackbox.recorder.streams import Counters
-from amberbox.blackbox.recorder.syncer import Syncer
-from amberbox.blackbox.store import open_store
+from amberbox.blackbox.recorder.queue import ItemCounters
+from amberbox.blackbox.recorder.recorder import PowerWatch, Recorder, Syncer
+from amberbox.blackbox.store import journal_reader, store
+from amberbox.blackbox.store.store import open_store
 from amberbox.core.source import Power
-from amberbox.testing.box import COUNT, ManualBox, events, number, recording
-from amberbox.testing.patience import wait_until
+from amberbox.testing.clock import wait_until
+from tests.support.manual_recorder import COUNT, ManualBox, events, number, recording
 
 BOX = "- ros: {ros_master_uri: 'http://127.0.0.1:1', topics: [{name: /count}]}\n"
 
@@ -57,7 +54,7 @@ def test_lost_power_hurries_the_syncs_and_asks_for_an_incident(tmp_path: Path) -
     ends, syncer, box = watched(tmp_path / "store", "mains", "battery", "mains")
     assert ends == [False] * 4
     assert syncer.asked == [("every", 1.0), ("at once", 0.2), ("every", 1.0)]
-    (request,) = requests.pending(open_store(box.store))
+    (request,) = store.pending(open_store(box.store))
     assert request.kind == "incident"
     assert request.values == {
         "before_s": 60, "after_s": 20, "reason": "external power lost", "who": "recorder",
@@ -81,7 +78,7 @@ def test_a_low_battery_ends_a_run_but_not_one_that_begins_with_it(
 ) -> None:
     asked, _, box = watched(tmp_path / "store", *states)
     assert (asked[-1], any(asked[:-1])) == (ends, False)
-    assert len(requests.pending(open_store(box.store))) == incidents
+    assert len(store.pending(open_store(box.store))) == incidents
 
 
 def test_a_request_that_cannot_be_left_is_told(
@@ -90,10 +87,10 @@ def test_a_request_that_cannot_be_left_is_told(
     def refuse(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(requests, "submit", refuse)
+    monkeypatch.setattr(store, "submit", refuse)
     _, _, box = watched(tmp_path / "store", "mains", "battery")
-    (told,) = events(box.store, "disk")
-    assert told["text"].endswith("is not marked: No space left on device")
+    (event,) = events(box.store, "disk")
+    assert event["text"].endswith("is not marked: No space left on device")
 
 
 def robot(folder: Path, sync_s: float) -> Path:
@@ -126,7 +123,7 @@ def _is_beyond(value: Callable[[Recorder], int], recorder: Recorder, before: int
     return value(recorder) > before
 
 
-def _has_kept(counters: Counters, n: int) -> bool:
+def _has_kept(counters: ItemCounters, n: int) -> bool:
     return counters.kept > n
 
 
@@ -144,4 +141,6 @@ def test_a_low_battery_leaves_finished_files(tmp_path: Path) -> None:
         wait_until(recorder.stop.is_set, "the end of the run")
     (stopped,) = events(tmp_path / "robot" / "store", "stopped")
     assert stopped["text"] == "recording stopped: the battery is low"
-    assert all(journal.finished for journal in read.journals(tmp_path / "robot" / "store"))
+    assert all(
+        journal.finished for journal in journal_reader.journals(tmp_path / "robot" / "store")
+    )

@@ -8,14 +8,14 @@ from typing import Any
 import pytest
 
 import amberbox
-from amberbox.blackbox.folder.folder import load_folder
+from amberbox.blackbox.columns.arrays import compact
 from amberbox.blackbox.recorder.recorder import Recorder
-from amberbox.blackbox.segments.columns import compact
+from amberbox.blackbox.robot_folder.folder import load_folder
 from amberbox.core.clock import NS
 from amberbox.core.errors import UsageError
 from amberbox.core.types import ColumnData, Ragged
 from amberbox.sim.robot import START_NS
-from amberbox.testing.box import last_counters
+from tests.support.manual_recorder import last_counters
 
 TOPICS = (
     "[{topic: {name: odom}}, {topic: {name: scan_rear, max_frequency: 5}}, {topic: {name: wheels}}]"
@@ -28,7 +28,7 @@ def record(folder: Path, seed: int, more: str = "") -> Path:
         f"- sim:\n    seed: {seed}\n    speed: max\n    duration_s: 20\n"
         f"    topics: {TOPICS}\n{more}"
     )
-    Recorder(load_folder(folder), keeper=False).run()
+    Recorder(load_folder(folder), retention=False).run()
     return folder / "store"
 
 

@@ -8,16 +8,15 @@ from pathlib import Path
 import pytest
 
 import amberbox
-from amberbox.blackbox.follow import read
-from amberbox.blackbox.keeper.keeper import Keeper
-from amberbox.blackbox.keeper.options import KeeperOptions
-from amberbox.blackbox.recorder.messageclock import MessageClock
-from amberbox.blackbox.recorder.pipeline import PipelineOptions
-from amberbox.blackbox.store import open_store
+from amberbox.blackbox.recorder.pipeline import MessageClock, PipelineOptions
+from amberbox.blackbox.retention.maintenance import RetentionService
+from amberbox.blackbox.robot_folder.robot_yaml import RetentionOptions
+from amberbox.blackbox.store import journal_reader
+from amberbox.blackbox.store.store import open_store
 from amberbox.core.clock import NS
 from amberbox.core.source import Keep, TopicOptions
 from amberbox.core.types import Topic
-from amberbox.testing.box import COUNT, ManualBox, events, number, own_records
+from tests.support.manual_recorder import COUNT, ManualBox, events, number, own_records
 
 KEEPS: tuple[Keep, ...] = ("all", "ring")
 
@@ -29,8 +28,11 @@ def received(store: Path) -> list[int]:
 def clock_points(store: Path) -> list[list[int]]:
     """Log times of the clock records, file by file, in seconds from the first."""
     times = [
-        [log_ns for log_ns, _ in read._own_messages(journal, "amberbox/clock", journal.places)]
-        for journal in read.journals(store)
+        [
+            log_ns
+            for log_ns, _ in journal_reader._own_messages(journal, "amberbox/clock", journal.places)
+        ]
+        for journal in journal_reader.journals(store)
     ]
     return [[round((t - times[0][0]) / NS) for t in file] for file in times]
 
@@ -47,8 +49,8 @@ def test_each_file_says_what_the_clock_does_at_its_start_and_every_10_s(tmp_path
     assert [c["synchronised"] for c in own_records(box.store, "amberbox/clock")] == [
         True, True, True, None, None, None,
     ]  # fmt: skip
-    files = read.journals(box.store)
-    assert [read.run_messages(journal)["run"] for journal in files] == [1, 1]
+    files = journal_reader.journals(box.store)
+    assert [journal_reader.run_messages(journal)["run"] for journal in files] == [1, 1]
 
 
 @pytest.mark.parametrize("keep", KEEPS)
@@ -128,7 +130,7 @@ def test_the_ring_is_trimmed_to_its_length_whatever_the_clock_does(
     ring = [TopicOptions("/count", keep="ring"), TopicOptions("/main")]
     main = Topic("/main", COUNT.message_encoding, COUNT.schema)
     box = ManualBox(tmp_path / "store", ring, options=PipelineOptions(ring_rotate_ns=2 * NS))
-    keeper = Keeper(open_store(box.store), KeeperOptions(ring_s=10.0, min_free=0))
+    keeper = RetentionService(open_store(box.store), RetentionOptions(ring_s=10.0, min_free=0))
     for n in range(600):
         if n == 300:
             box.clock.step(step_s)
@@ -158,8 +160,8 @@ def test_a_step_is_noted_with_what_the_clock_was_before(tmp_path: Path, keep: Ke
         box.hear(COUNT, number(n))
         box.write()
     box.close()
-    journal = next(j for j in read.journals(box.store) if j.items.get("ros_count"))
-    found = read._own_messages(journal, "amberbox/clock", journal.places)
+    journal = next(j for j in journal_reader.journals(box.store) if j.items.get("ros_count"))
+    found = journal_reader._own_messages(journal, "amberbox/clock", journal.places)
     points = [(log_ns, values["offset_ns"]) for log_ns, values in found]
     after = next(place for place, point in enumerate(points) if point[1] == stepped_ns)
     assert points[after - 1] == (before_ns, 0)
@@ -176,8 +178,10 @@ def test_each_point_says_how_long_the_computer_runs(tmp_path: Path) -> None:
         box.write()
     box.close()
     count = 0
-    for journal in read.journals(box.store):
-        for log_ns, values in read._own_messages(journal, "amberbox/clock", journal.places):
+    for journal in journal_reader.journals(box.store):
+        for log_ns, values in journal_reader._own_messages(
+            journal, "amberbox/clock", journal.places
+        ):
             assert log_ns - values["boot_ns"] == base_ns
             count += 1
     assert count >= 6

@@ -9,17 +9,16 @@ from pathlib import Path
 import pytest
 
 import amberbox
-from amberbox.blackbox.follow.follow import follow
 from amberbox.blackbox.recorder.pipeline import PipelineOptions
-from amberbox.blackbox.recorder.recorder import Recorder
-from amberbox.blackbox.recorder.ringfolder import place_ring, writers_elsewhere
-from amberbox.blackbox.store import Store, create_store
+from amberbox.blackbox.recorder.recorder import Recorder, place_ring, writers_elsewhere
+from amberbox.blackbox.store.store import Store, create_store
+from amberbox.blackbox.store.tail import follow
 from amberbox.core.clock import NS
 from amberbox.core.errors import AmberboxError
 from amberbox.core.source import TopicOptions
 from amberbox.core.types import Batch
-from amberbox.testing.box import COUNT, ManualBox, number, recording
-from amberbox.testing.patience import wait_until
+from amberbox.testing.clock import wait_until
+from tests.support.manual_recorder import COUNT, ManualBox, number, recording
 
 RING = [TopicOptions("/count", keep="ring")]
 

@@ -8,17 +8,16 @@ from pathlib import Path
 
 import pytest
 
-from amberbox.blackbox.follow.chain import previous_chain
 from amberbox.blackbox.journal.mcap import CHAIN_METADATA
-from amberbox.blackbox.journal.scan import start_record
-from amberbox.blackbox.journal.walk import Metadata, Walk
+from amberbox.blackbox.journal.scan import JournalWalk, MetadataRecord, start_record
 from amberbox.blackbox.journal.writer import EMPTY_CHAIN
-from amberbox.blackbox.keeper.ownjournal import OwnJournal, event
-from amberbox.blackbox.segments import manifest
-from amberbox.blackbox.segments.entries import Tombstone, to_record
-from amberbox.blackbox.store import Store, open_store
+from amberbox.blackbox.store import manifest
+from amberbox.blackbox.store.derived_journal import DerivedJournal, event
+from amberbox.blackbox.store.journal_reader import previous_chain
+from amberbox.blackbox.store.manifest_entries import Tombstone, to_record
+from amberbox.blackbox.store.store import Store, open_store
 from amberbox.core.source import TopicOptions
-from amberbox.testing.box import COUNT, ManualBox, number
+from tests.support.manual_recorder import COUNT, ManualBox, number
 
 RING = [TopicOptions("/count", keep="ring")]
 
@@ -36,7 +35,7 @@ def record(store: Path, topics: Sequence[TopicOptions] = (), *, crash_after: int
 
 
 def links(path: Path) -> list[str]:
-    found = [m for m in Walk(path.read_bytes()) if isinstance(m, Metadata)]
+    found = [m for m in JournalWalk(path.read_bytes()) if isinstance(m, MetadataRecord)]
     return [m.values["chain"] for m in found if m.name == CHAIN_METADATA]
 
 
@@ -119,7 +118,7 @@ def test_a_journal_of_conclusions_goes_on_the_same_way(tmp_path: Path) -> None:
     ManualBox(tmp_path / "store").close()
     store = open_store(tmp_path / "store")
     for _ in range(2):
-        journal = OwnJournal(store, "keep", chain=lambda: previous_chain(store, "keep"))
+        journal = DerivedJournal(store, "keep", chain=lambda: previous_chain(store, "keep"))
         journal.write([event("kept", "something")])
         journal.close()
     first, second = store.journal_files("keep")

@@ -9,13 +9,13 @@ from pathlib import Path
 import pytest
 
 from amberbox.blackbox.journal import writer
-from amberbox.blackbox.recorder.syncer import Syncer
-from amberbox.testing.box import COUNT, ManualBox, events, number, raw_messages
+from amberbox.blackbox.recorder.recorder import Syncer
+from tests.support.manual_recorder import COUNT, ManualBox, events, number, raw_messages
 
 
 def sync(syncer: Syncer) -> None:
     syncer.at_once(1.0)
-    syncer.poke()
+    syncer.sync_if_due()
     syncer.stop()
 
 

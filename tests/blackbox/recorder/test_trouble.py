@@ -11,14 +11,15 @@ import numpy as np
 import pytest
 
 import amberbox
-from amberbox.blackbox.folder.folder import load_folder
-from amberbox.blackbox.follow.follow import follow
 from amberbox.blackbox.query.record import Record
 from amberbox.blackbox.recorder.recorder import Recorder
+from amberbox.blackbox.robot_folder.folder import load_folder
+from amberbox.blackbox.store.tail import follow
 from amberbox.cli.main import main
 from amberbox.core.errors import AmberboxError, UsageError
 from amberbox.core.types import Gap, Schema, Topic
-from amberbox.testing.box import (
+from amberbox.testing.clock import wait_until
+from tests.support.manual_recorder import (
     COUNT,
     ManualBox,
     events,
@@ -27,9 +28,8 @@ from amberbox.testing.box import (
     raw_messages,
     recording,
 )
-from amberbox.testing.patience import wait_until
-from amberbox.testing.realros import free_port
-from amberbox.testing.rosnet import RosMaster, RosPublisher, RosTopic
+from tests.support.processes import free_port
+from tests.support.ros_network import RosMaster, RosPublisher, RosTopic
 
 INT, FLOAT = (
     Topic("/value", "ros1", Schema("test/Value", "ros1msg", definition))
@@ -126,8 +126,8 @@ def test_a_master_that_comes_late_is_waited_for(tmp_path: Path) -> None:
         wait_until(lambda: box.pipeline.items["ros_chat"].counters.received == 1, "a message")
     publisher.kill()
     master.stop()
-    (told,) = events(folder / "store", "ros_master_unreachable")
-    assert str(port) in told["text"]
+    (event,) = events(folder / "store", "ros_master_unreachable")
+    assert str(port) in event["text"]
     assert amberbox.open(folder).query("ros_chat").values("data") == ["hi"]
 
 
@@ -148,8 +148,8 @@ def test_a_source_that_fails_is_told_and_started_again(
     folder = robot(tmp_path / "robot", ros_block("http://127.0.0.1:1", "/odom"))
     with recording(folder):
         wait_until(lambda: len(runs) == 2, "a second run")
-    (told,) = events(folder / "store", "source_failed")
-    assert "ros failed and starts again in 1 s: no such device" in told["text"]
+    (event,) = events(folder / "store", "source_failed")
+    assert "ros failed and starts again in 1 s: no such device" in event["text"]
 
 
 def test_a_type_that_changes_keeps_both_halves(tmp_path: Path) -> None:
@@ -160,8 +160,8 @@ def test_a_type_that_changes_keeps_both_halves(tmp_path: Path) -> None:
     box.hear(INT, number(4) + number(5))
     box.write()
     box.close()
-    (told,) = events(box.store, "type_changed")
-    assert told["details"] == {
+    (event,) = events(box.store, "type_changed")
+    assert event["details"] == {
         "item": "ros_value", "before": "test/Value", "after": "test/Value",
     }  # fmt: skip
     table = amberbox.open(box.store).query("ros_value")
@@ -218,8 +218,8 @@ def test_a_type_that_cannot_be_read_is_kept_raw_and_named(
     box.hear(COUNT, number(1))
     box.close()
     assert raw_messages(box.store, "/odd") == [b"abc", b"def"]
-    (told,) = events(box.store, "undecodable")
-    assert told["details"] == {"item": "ros_odd"}
+    (event,) = events(box.store, "undecodable")
+    assert event["details"] == {"item": "ros_odd"}
     gaps = [d for d in follow(box.store, live=False) if isinstance(d, Gap)]
     assert [(gap.item, gap.count) for gap in gaps] == [("ros_odd", 2)]
     assert amberbox.open(box.store).query("ros_count").values("data") == [1]
@@ -236,7 +236,7 @@ def test_a_disk_that_is_full_at_the_end_is_no_silent_loss(
     box = ManualBox(tmp_path / "store")
     box.hear(COUNT, number(1))
     box.write()
-    monkeypatch.setattr(writer, "_write_all", refuse)
+    monkeypatch.setattr(writer, "write_all", refuse)
     box.hear(COUNT, number(2), number(3))
     box.write()
     with pytest.raises(AmberboxError, match="2 messages are lost"):

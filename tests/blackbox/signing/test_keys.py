@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from amberbox.blackbox.signing import keys
-from amberbox.blackbox.store import create_store
+from amberbox.blackbox.store.store import create_store
 from amberbox.core.errors import UsageError
 
 pytest.importorskip("cryptography", reason="signatures need it; pip install 'amberbox[keep]'")

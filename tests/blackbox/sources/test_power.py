@@ -8,14 +8,18 @@ from typing import Any
 
 import pytest
 
-from amberbox.blackbox.folder.folder import load_folder
-from amberbox.blackbox.sources.power import Config, Source
-from amberbox.blackbox.sources.power.judge import Judge, Limits
-from amberbox.blackbox.sources.power.supply import Supply
-from amberbox.blackbox.sources.power.watch import Watch
+from amberbox.blackbox.robot_folder.folder import load_folder
+from amberbox.blackbox.sources.power import (
+    Config,
+    PowerLimits,
+    PowerStateFilter,
+    Source,
+    Supply,
+    SupplyWatch,
+)
 from amberbox.core.source import Power
-from amberbox.testing.box import ManualBox, events, raw_messages
 from amberbox.testing.contract import ObservedSink, observe
+from tests.support.manual_recorder import ManualBox, events, raw_messages
 
 
 class Hat:
@@ -43,8 +47,8 @@ def hat(tmp_path: Path) -> Hat:
 
 def watch(*hats: Hat, for_s: float = 1.0, low_after_s: float | None = None) -> Any:
     sink = ObservedSink()
-    limits = Limits(for_s, low_after_s)
-    return Watch([hat.supply for hat in hats], limits, 1.0, sink), sink
+    limits = PowerLimits(for_s, low_after_s)
+    return SupplyWatch([hat.supply for hat in hats], limits, 1.0, sink), sink
 
 
 def recorded(sink: ObservedSink, topic: str = "supply") -> list[dict[str, Any]]:
@@ -129,13 +133,13 @@ def test_a_long_time_on_battery_is_low_also_when_nothing_can_be_read(hat: Hat) -
 
 
 def test_the_time_on_battery_begins_anew_after_external_power() -> None:
-    judge = Judge(Limits(0, 60))
+    judge = PowerStateFilter(PowerLimits(0, 60))
     told: list[tuple[float, Power | None]] = []
     steps: list[tuple[float, Power]] = [
         (0, "battery"), (50, "mains"), (51, "battery"), (110, "battery"), (111, "battery")
     ]  # fmt: skip
     for now_s, state in steps:
-        if judge.heard(state, now_s):
+        if judge.update(state, now_s):
             told.append((now_s, judge.state))
     assert told == [(0, "battery"), (50, "mains"), (51, "battery"), (111, "low")]
 
@@ -199,7 +203,7 @@ def test_it_runs_as_a_source_and_stops(hat: Hat) -> None:
 def test_a_recorder_hears_it_and_triggers_can_read_it(tmp_path: Path, hat: Hat) -> None:
     hat.says("battery", 40)
     box = ManualBox(tmp_path / "store", source="power")
-    Watch([hat.supply], Limits(), 1.0, box.sink).poll(0)
+    SupplyWatch([hat.supply], PowerLimits(), 1.0, box.sink).poll(0)
     box.write()
     assert box.pipeline.power == "battery"
     (event,) = events(tmp_path / "store", "power_battery")

@@ -12,11 +12,15 @@ from typing import Any
 
 import pytest
 
-from amberbox.blackbox.sources.power import Config
-from amberbox.blackbox.sources.power.nut import Nut
-from amberbox.blackbox.sources.power.reading import Reading, UnreadableError, together
-from amberbox.blackbox.sources.power.supply import Supply
-from amberbox.blackbox.sources.power.sysfs import Sysfs
+from amberbox.blackbox.sources.power import (
+    Config,
+    Nut,
+    Supply,
+    SupplyReading,
+    Sysfs,
+    UnreadableError,
+    combine_readings,
+)
 
 BATTERY = {"type": "Battery", "status": "Discharging", "capacity": "87", "voltage_now": "12100000"}
 MAINS = {"type": "Mains", "online": "1"}
@@ -61,7 +65,7 @@ def test_a_fuel_gauge_alone_does_not_tell_the_state(tmp_path: Path) -> None:
     with pytest.raises(UnreadableError, match="does not tell whether there is external power"):
         Sysfs(tmp_path).read()
     write_supply(tmp_path, "charger", MAINS)
-    assert Sysfs(tmp_path).read() == Reading("mains", 100.0)
+    assert Sysfs(tmp_path).read() == SupplyReading("mains", 100.0)
 
 
 def test_one_supply_by_its_own_folder(tmp_path: Path) -> None:
@@ -172,7 +176,7 @@ def upsd() -> Iterator[Upsd]:
 
 def test_upsd_is_asked_over_one_connection(upsd: Upsd) -> None:
     nut = Nut("127.0.0.1", upsd.port, "")
-    assert [nut.read(), nut.read()] == [Reading("battery", 87.0, 13.5, None, 23.0)] * 2
+    assert [nut.read(), nut.read()] == [SupplyReading("battery", 87.0, 13.5, None, 23.0)] * 2
     assert upsd.asked == ["LIST UPS", "LIST VAR ups", "LIST VAR ups"]
     nut.close()
 
@@ -294,25 +298,25 @@ def test_a_file_of_words_with_battery_files_that_move(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("reading", "state"),
     [
-        (Reading("battery", 21), "battery"),
-        (Reading("battery", 20), "low"),
-        (Reading("mains", 5, 9.0), "mains"),
-        (Reading("battery", 90, 10.51), "battery"),
-        (Reading("battery", 90, 10.5), "low"),
-        (Reading("battery"), "battery"),
+        (SupplyReading("battery", 21), "battery"),
+        (SupplyReading("battery", 20), "low"),
+        (SupplyReading("mains", 5, 9.0), "mains"),
+        (SupplyReading("battery", 90, 10.51), "battery"),
+        (SupplyReading("battery", 90, 10.5), "low"),
+        (SupplyReading("battery"), "battery"),
     ],
 )
-def test_limits_hold_on_battery_only(reading: Reading, state: str) -> None:
+def test_limits_hold_on_battery_only(reading: SupplyReading, state: str) -> None:
     assert supply(low_percent=20, low_voltage=10.5).judged(reading).state == state
 
 
 def test_the_worst_supply_counts() -> None:
-    first = Reading("mains", 100, 5.1)
-    second = Reading("battery", 60, 12.0, -1.0, 40)
-    third = Reading("battery", 50, None, None, 90)
-    assert together([first, second, third]) == Reading("battery", 50, 12.0, -1.0, 40)
-    assert together([first]) == first
-    assert together([Reading("low"), second]).state == "low"
+    first = SupplyReading("mains", 100, 5.1)
+    second = SupplyReading("battery", 60, 12.0, -1.0, 40)
+    third = SupplyReading("battery", 50, None, None, 90)
+    assert combine_readings([first, second, third]) == SupplyReading("battery", 50, 12.0, -1.0, 40)
+    assert combine_readings([first]) == first
+    assert combine_readings([SupplyReading("low"), second]).state == "low"
 
 
 @pytest.mark.parametrize(

@@ -14,9 +14,8 @@ from mcap.writer import Writer
 from amberbox.blackbox.sources.recording import Config, Source, find_paths
 from amberbox.core.errors import AmberboxError
 from amberbox.core.source import TopicOptions
-from amberbox.testing import MemorySink
-from amberbox.testing.contract import observe
-from amberbox.testing.patience import PATIENCE_S
+from amberbox.testing.clock import PATIENCE_S
+from amberbox.testing.contract import MemorySink, observe
 
 MS = 1_000_000
 START_NS = 1_700_000_000_000_000_000

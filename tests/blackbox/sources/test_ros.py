@@ -8,9 +8,10 @@ import pytest
 import yaml
 
 from amberbox.blackbox.sources.ros import SAMPLE, Config, Source, settings
-from amberbox.core.config import build, parse_yaml
+from amberbox.core.config import build
 from amberbox.core.errors import Problem, UsageError
 from amberbox.core.source import TopicOptions
+from amberbox.core.yaml_nodes import parse_yaml
 
 
 def configure(text: str) -> tuple[Config | None, list[str]]:

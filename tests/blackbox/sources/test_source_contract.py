@@ -15,13 +15,13 @@ from amberbox.core.options import option
 from amberbox.core.plugins import Plugin, find
 from amberbox.core.source import Sink, TopicOptions
 from amberbox.core.types import Topic
+from amberbox.testing.clock import PATIENCE_S
 from amberbox.testing.contract import (
     assert_source_contract,
     module_problems,
     observe,
     source_problems,
 )
-from amberbox.testing.patience import PATIENCE_S
 
 PLUGINS = find("amberbox.blackbox.sources", defines=("Config", "Source"))
 

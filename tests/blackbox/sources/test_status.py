@@ -10,13 +10,13 @@ from typing import Any
 import msgspec
 import pytest
 
-from amberbox.blackbox.folder.folder import inspect_folder
-from amberbox.blackbox.journal import reserved
+from amberbox.blackbox.journal import channels
+from amberbox.blackbox.robot_folder.folder import inspect_folder
 from amberbox.blackbox.sources import status
 from amberbox.core.clock import NS
 from amberbox.core.source import TopicOptions
+from amberbox.testing.clock import PATIENCE_S
 from amberbox.testing.contract import ObservedSink, assert_source_contract, observe
-from amberbox.testing.patience import PATIENCE_S
 from amberbox.testing.records import FakeRun
 
 
@@ -52,12 +52,12 @@ def say(run: FakeRun, component: str, level: str = "ok", *, ago_s: float = 0, **
         "measured_ns": measured_ns, "since_ns": measured_ns - 7, "live_only": False,
         "reason": "" if level == "ok" else f"{component} is broken", "config_hash": "",
     }  # fmt: skip
-    run.own(reserved.STATUS, now_ns, {**values, **others})
+    run.own(channels.STATUS, now_ns, {**values, **others})
     return measured_ns
 
 
 def alarm(run: FakeRun, name: str, state: str) -> None:
-    run.own(reserved.ALARM, time.time_ns(), {"id": name, "state": state})
+    run.own(channels.ALARM, time.time_ns(), {"id": name, "state": state})
 
 
 def heard(sink: ObservedSink, topic: str, act: Callable[[], object]) -> dict[str, Any]:

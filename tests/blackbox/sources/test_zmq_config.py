@@ -11,8 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from amberbox.blackbox.sources.zmq import Config, ZmqTopic, detect_encoding
-from amberbox.core.config import build, parse_yaml
+from amberbox.core.config import build
 from amberbox.core.errors import Problem
+from amberbox.core.yaml_nodes import parse_yaml
 
 KEY = "x" * 40
 JSON = st.recursive(

@@ -11,8 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from amberbox.blackbox.sources.zmq import ZmqTopic
-from amberbox.blackbox.sources.zmq.continuity import Continuity
+from amberbox.blackbox.sources.zmq import Continuity, ZmqTopic
 from tests.fuzzing import examples, fuzz
 
 T = 1_700_000_000

@@ -8,9 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from amberbox.core.clock import NS
-from amberbox.diagnosis.covering.evidence import Evidence
 from amberbox.diagnosis.covering.model import UNKNOWN, Model
-from amberbox.diagnosis.covering.prediction import outcomes, predict
+from amberbox.diagnosis.covering.observations import Evidence, outcomes, predict
 
 Floats = NDArray[np.float64]
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from amberbox.diagnosis.covering.answer import Answer
-from amberbox.diagnosis.covering.evidence import Evidence, Observation
+from amberbox.diagnosis.covering.hypotheses import RankedHypotheses
 from amberbox.diagnosis.covering.model import Link, Mode, Model, Sign
+from amberbox.diagnosis.covering.observations import Evidence, Observation
 
 
 def two_causes() -> Model:
@@ -23,6 +23,6 @@ def evidence(present: str = "", absent: str = "") -> Evidence:
     return Evidence(seen | {name: Observation("absent") for name in absent.split()})
 
 
-def probabilities(answer: Answer) -> dict[str, float]:
+def probabilities(answer: RankedHypotheses) -> dict[str, float]:
     """Return the probability of each hypothesis by its id."""
     return {hypothesis.id: hypothesis.probability for hypothesis in answer.hypotheses}

@@ -6,9 +6,14 @@ import random
 
 from amberbox.core.needs import Needs
 from amberbox.core.types import SymptomState
-from amberbox.diagnosis.covering.check import Check, Sight
-from amberbox.diagnosis.covering.evidence import Answered, Evidence, Observation
 from amberbox.diagnosis.covering.model import Function, Link, Mode, Model, Sign, Unknown
+from amberbox.diagnosis.covering.observations import (
+    AnsweredCheck,
+    Check,
+    CheckDetection,
+    Evidence,
+    Observation,
+)
 
 STATES: tuple[SymptomState, ...] = ("present", "absent", "absent", "unknown")
 
@@ -50,17 +55,19 @@ def random_evidence(rng: random.Random, model: Model) -> Evidence:
     return Evidence(observations, conflicts, answers)
 
 
-def _answered(rng: random.Random, model: Model, number: int) -> Answered:
+def _answered(rng: random.Random, model: Model, number: int) -> AnsweredCheck:
     outcomes = ("fine", "odd", "broken")[: rng.randint(2, 3)]
     causes = [mode.id for mode in model.modes] + [function.id for function in model.functions]
-    sights = tuple(
-        Sight(cause, rng.choice(outcomes), rng.choice([0.9, 1.0, rng.random()]))
+    detections = tuple(
+        CheckDetection(cause, rng.choice(outcomes), rng.choice([0.9, 1.0, rng.random()]))
         for cause in causes
         if rng.random() < 0.5
     )
     sure = rng.uniform(0.5, 1.0)
-    check = Check(f"t{number}", "check", "Look.", outcomes=outcomes, sure=sure, sights=sights)
-    return Answered(check, rng.choice(outcomes))
+    check = Check(
+        f"t{number}", "check", "Look.", outcomes=outcomes, sure=sure, detections=detections
+    )
+    return AnsweredCheck(check, rng.choice(outcomes))
 
 
 def _prior(rng: random.Random) -> float:

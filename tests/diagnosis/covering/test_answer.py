@@ -5,10 +5,9 @@ from itertools import pairwise
 
 import pytest
 
+from amberbox.core.budget import Budget
 from amberbox.core.needs import all_of, any_of
-from amberbox.diagnosis.covering.answer import NO_FAULT, Answer, diagnose
-from amberbox.diagnosis.covering.budget import Budget
-from amberbox.diagnosis.covering.evidence import Evidence, Observation
+from amberbox.diagnosis.covering.hypotheses import NO_FAULT, RankedHypotheses, diagnose
 from amberbox.diagnosis.covering.model import (
     UNKNOWN,
     Function,
@@ -18,6 +17,7 @@ from amberbox.diagnosis.covering.model import (
     Sign,
     Unknown,
 )
+from amberbox.diagnosis.covering.observations import Evidence, Observation
 from benchmarks.covering import random_case, random_robot
 from tests.diagnosis.covering.known import evidence, probabilities, two_causes
 
@@ -175,7 +175,7 @@ def test_the_best_that_was_reached_is_listed_when_a_budget_ends_the_search() -> 
 def test_a_deadline_ends_with_incomplete() -> None:
     model, seen = _robot()
     asked = iter([False, False, True])
-    answer = diagnose(model, seen, budget=Budget(deadline=lambda: next(asked)))
+    answer = diagnose(model, seen, budget=Budget(is_over=lambda: next(asked)))
     assert answer.incomplete == "the time was up" and answer.opened <= 2
 
 
@@ -201,6 +201,6 @@ def _robot() -> tuple[Model, Evidence]:
 
 
 def test_no_evidence_leaves_nothing_to_say() -> None:
-    answer: Answer = diagnose(two_causes(), Evidence())
+    answer: RankedHypotheses = diagnose(two_causes(), Evidence())
     assert [h.id for h in answer.hypotheses] == [NO_FAULT]
     assert answer.hypotheses[0].probability == 1.0 and answer.mass_covered == 1.0

@@ -9,9 +9,9 @@ from dataclasses import replace
 import pytest
 
 from amberbox.core.clock import NS
-from amberbox.diagnosis.covering.answer import diagnose
-from amberbox.diagnosis.covering.evidence import Evidence, Observation
+from amberbox.diagnosis.covering.hypotheses import diagnose
 from amberbox.diagnosis.covering.model import UNKNOWN, Link, Mode, Model, Sign, Unknown
+from amberbox.diagnosis.covering.observations import Evidence, Observation
 from tests.diagnosis.covering.brute import named, posterior, restricted, with_common_cause
 from tests.diagnosis.covering.small_models import random_evidence, random_model
 

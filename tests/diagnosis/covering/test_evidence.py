@@ -4,7 +4,7 @@ import pytest
 
 from amberbox.core.errors import UsageError
 from amberbox.core.types import Symptom
-from amberbox.diagnosis.covering.evidence import Observation, evidence_of
+from amberbox.diagnosis.covering.observations import Observation, collect_evidence
 
 
 def symptom(name: str, source: str, *addresses: str, strength: float = 1.0) -> Symptom:
@@ -14,7 +14,7 @@ def symptom(name: str, source: str, *addresses: str, strength: float = 1.0) -> S
 
 
 def test_of_two_sources_with_one_measurement_the_stronger_counts() -> None:
-    found = evidence_of(
+    found = collect_evidence(
         [symptom("drift", "residual", "odom.x", strength=0.6), symptom("odd", "bank", "odom.x")]
     )
     assert found.observations == {"odd": Observation("present")}
@@ -23,13 +23,13 @@ def test_of_two_sources_with_one_measurement_the_stronger_counts() -> None:
 
 def test_what_was_also_measured_elsewhere_counts() -> None:
     drift = symptom("drift", "residual", "odom.x", "imu.yaw", strength=0.6)
-    found = evidence_of([symptom("odd", "bank", "odom.x"), drift])
+    found = collect_evidence([symptom("odd", "bank", "odom.x"), drift])
     assert set(found.observations) == {"odd", "drift"} and not found.doubled
 
 
 def test_measurements_at_other_times_are_others() -> None:
     later = Symptom("drift", "present", source="residual", evidence=(("odom.x", 21, 30),))
-    assert set(evidence_of([symptom("odd", "bank", "odom.x"), later]).observations) == {
+    assert set(collect_evidence([symptom("odd", "bank", "odom.x"), later]).observations) == {
         "odd",
         "drift",
     }
@@ -37,11 +37,11 @@ def test_measurements_at_other_times_are_others() -> None:
 
 def test_symptoms_of_one_source_all_count() -> None:
     both = [symptom("late", "monitor", "scan.ranges"), symptom("dark", "monitor", "scan.ranges")]
-    assert set(evidence_of(both).observations) == {"late", "dark"}
+    assert set(collect_evidence(both).observations) == {"late", "dark"}
 
 
 def test_present_wins_over_absent_of_equal_strength_and_unknown_is_nothing() -> None:
-    found = evidence_of(
+    found = collect_evidence(
         [
             Symptom("s", "absent", source="a"),
             Symptom("s", "present", source="b"),

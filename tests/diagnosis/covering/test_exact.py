@@ -5,8 +5,8 @@ from itertools import pairwise
 
 import pytest
 
-from amberbox.diagnosis.covering.answer import diagnose
-from amberbox.diagnosis.covering.budget import Budget
+from amberbox.core.budget import Budget
+from amberbox.diagnosis.covering.hypotheses import diagnose
 from tests.diagnosis.covering.brute import named, posterior, restricted
 from tests.diagnosis.covering.small_models import random_evidence, random_model
 

@@ -6,18 +6,18 @@ import pytest
 
 from amberbox.core.errors import UsageError
 from amberbox.core.needs import Needs, all_of, any_of, at_least
-from amberbox.diagnosis.covering.answer import diagnose
-from amberbox.diagnosis.covering.evidence import Evidence
-from amberbox.diagnosis.covering.gates import Gates
+from amberbox.diagnosis.covering.hypotheses import diagnose
 from amberbox.diagnosis.covering.model import (
     UNKNOWN,
     Function,
+    FunctionGates,
     Link,
     Mode,
     Model,
     Sign,
     Unknown,
 )
+from amberbox.diagnosis.covering.observations import Evidence
 
 A, S = Mode("a#x", 0.1), Sign("s")
 
@@ -58,7 +58,7 @@ def test_gates_agree_with_the_definition_for_every_set_of_components() -> None:
         ("h", all_of("g", any_of("d", "nobody"))),
     ]
     components = ["a", "b", "c", "d"]
-    gates = Gates(needs, components)
+    gates = FunctionGates(needs, components)
     for down in itertools.chain.from_iterable(
         itertools.combinations(components, n) for n in range(5)
     ):

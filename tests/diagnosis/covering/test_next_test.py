@@ -5,19 +5,18 @@ import math
 import pytest
 
 from amberbox.core.errors import UsageError
-from amberbox.diagnosis.covering.answer import diagnose
-from amberbox.diagnosis.covering.check import Check, Sight
+from amberbox.diagnosis.covering.hypotheses import diagnose
 from amberbox.diagnosis.covering.model import Link, Mode, Model, Sign
 from amberbox.diagnosis.covering.next_test import (
     CANNOT,
-    Weights,
+    TestCosts,
     entropy_bits,
     next_tests,
-    reads,
+    reading_checks,
     splitting_test,
     with_answer,
 )
-from amberbox.diagnosis.covering.prediction import outcomes, predict
+from amberbox.diagnosis.covering.observations import Check, CheckDetection, outcomes, predict
 from tests.diagnosis.covering.known import evidence, probabilities
 
 
@@ -30,8 +29,10 @@ def even() -> Model:
 
 def check(name: str, detects: float, sure: float = 1.0, cost_s: float = 0.0) -> Check:
     """Make a check that sees a#x."""
-    sights = (Sight("a#x", "yes", detects),)
-    return Check(name, "check", "Look.", "technician", cost_s, 0.0, sure=sure, sights=sights)
+    detections = (CheckDetection("a#x", "yes", detects),)
+    return Check(
+        name, "check", "Look.", "technician", cost_s, 0.0, sure=sure, detections=detections
+    )
 
 
 SEEN = evidence(present="s")
@@ -43,7 +44,7 @@ def test_a_sure_check_between_two_equal_modes_tells_one_bit() -> None:
     (best, *_) = next_tests(even(), SEEN, hypotheses, [check("look", 1.0)])
     assert best.test.id == "look" and best.test.gain_bits == pytest.approx(1.0)
     assert best.test.outcomes == pytest.approx({"no": 0.5, "yes": 0.5})
-    assert best.value == pytest.approx(1.0 / Weights().fixed_s)
+    assert best.value == pytest.approx(1.0 / TestCosts().fixed_s)
 
 
 def test_a_check_that_may_err_tells_what_a_noisy_channel_carries() -> None:
@@ -58,22 +59,22 @@ def test_a_check_that_may_err_tells_what_a_noisy_channel_carries() -> None:
 def test_cost_and_risk_decide_between_equal_gains_as_the_user_weighs_them() -> None:
     hypotheses = diagnose(even(), SEEN, max_hypotheses=2).hypotheses
     slow = check("slow", 1.0, cost_s=300)
-    risky = Check("risky", "check", "Drive.", risk=0.4, sure=1.0, sights=slow.sights)
+    risky = Check("risky", "check", "Drive.", risk=0.4, sure=1.0, detections=slow.detections)
 
-    def order(weights: Weights) -> list[str]:
+    def order(weights: TestCosts) -> list[str]:
         found = next_tests(even(), SEEN, hypotheses, [slow, risky], weights)
         return [proposal.test.id for proposal in found]
 
-    assert order(Weights()) == ["read:t", "risky", "slow"]
-    assert order(Weights(risk_s=6000)) == ["read:t", "slow", "risky"]
+    assert order(TestCosts()) == ["read:t", "risky", "slow"]
+    assert order(TestCosts(risk_s=6000)) == ["read:t", "slow", "risky"]
 
 
 def test_only_symptoms_whose_state_is_not_known_are_read() -> None:
-    assert [r.reads for r in reads(even(), SEEN)] == ["t"]
-    assert [r.cost_s for r in reads(even(), SEEN)] == [30.0]
-    assert not list(reads(even(), evidence(present="s", absent="t")))
+    assert [r.reads for r in reading_checks(even(), SEEN)] == ["t"]
+    assert [r.cost_s for r in reading_checks(even(), SEEN)] == [30.0]
+    assert not list(reading_checks(even(), evidence(present="s", absent="t")))
     sealed = Model(even().modes, (Sign("s"), Sign("t", 0.0, None)), even().links, unknown=None)
-    assert not list(reads(sealed, SEEN))
+    assert not list(reading_checks(sealed, SEEN))
 
 
 def test_an_answer_ranks_anew_as_bayes_says() -> None:
@@ -81,7 +82,7 @@ def test_an_answer_ranks_anew_as_bayes_says() -> None:
     after = with_answer(SEEN, noisy, "yes")
     found = probabilities(diagnose(even(), after, max_hypotheses=2))
     assert found["a#x"] / found["b#y"] == pytest.approx(9.0)
-    read = next(iter(reads(even(), SEEN)))
+    read = next(iter(reading_checks(even(), SEEN)))
     ruled_out = probabilities(diagnose(even(), with_answer(SEEN, read, "absent")))
     assert list(ruled_out) == ["b#y"]
 
@@ -120,9 +121,9 @@ def test_a_group_names_the_test_that_splits_it_or_none() -> None:
 
 
 def test_of_three_outcomes_the_gravest_that_is_reached_is_seen() -> None:
-    sights = (Sight("a#x", "weak", 0.8), Sight("b#y", "dead", 0.5))
+    detections = (CheckDetection("a#x", "weak", 0.8), CheckDetection("b#y", "dead", 0.5))
     light = Check("light", "question", "Which light?", outcomes=("on", "weak", "dead"),
-                  sure=0.98, sights=sights)  # fmt: skip
+                  sure=0.98, detections=detections)  # fmt: skip
     both = outcomes(even(), light, predict(even(), {"a#x", "b#y"}))
     # at most on: .98 * .2 * .5; at most weak: .99 * .5
     assert both == pytest.approx((0.098, 0.495 - 0.098, 0.505))

@@ -9,8 +9,15 @@ import numpy as np
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from amberbox.diagnosis.faulttree import FaultTree, fault_tree
-from amberbox.diagnosis.faulttree.formula import Constant, Formula, Name, Operation, Operator
+from amberbox.diagnosis.faulttree.tree import (
+    BooleanConstant,
+    FaultTree,
+    Formula,
+    GateOperation,
+    Name,
+    Operator,
+    fault_tree,
+)
 
 COHERENT: tuple[Operator, ...] = ("and", "or", "atleast")
 OPERATORS: tuple[Operator, ...] = (
@@ -44,20 +51,20 @@ def trees(
 def _formula(draw: st.DrawFn, operators: Sequence[Operator], names: Sequence[str]) -> Formula:
     operator = draw(st.sampled_from(operators))
     entry = st.sampled_from([Name(name) for name in names])
-    some = st.one_of(entry, entry, entry, st.builds(Constant, st.booleans()), _pair(entry))
+    some = st.one_of(entry, entry, entry, st.builds(BooleanConstant, st.booleans()), _pair(entry))
     fewest, most = {"not": (1, 1)}.get(operator, (1, 5))
     if operator in ("xor", "iff", "imply"):
         fewest = most = 2
     inputs = tuple(draw(st.lists(some, min_size=fewest, max_size=most)))
     if operator not in ("atleast", "cardinality"):
-        return Operation(operator, inputs)
+        return GateOperation(operator, inputs)
     low = draw(st.integers(0, len(inputs)))
     high = draw(st.integers(low, len(inputs))) if operator == "cardinality" else 0
-    return Operation(operator, inputs, low, high)
+    return GateOperation(operator, inputs, low, high)
 
 
 def _pair(entry: st.SearchStrategy[Name]) -> st.SearchStrategy[Formula]:
-    return st.builds(lambda a, b: Operation("and", (a, b)), entry, entry)
+    return st.builds(lambda a, b: GateOperation("and", (a, b)), entry, entry)
 
 
 def truth(tree: FaultTree, events: Sequence[str]) -> States:
@@ -73,7 +80,7 @@ def truth(tree: FaultTree, events: Sequence[str]) -> States:
 def _truth(formula: Formula, known: Mapping[str, States], size: int) -> States:
     if isinstance(formula, Name):
         return known[formula.name]
-    if isinstance(formula, Constant):
+    if isinstance(formula, BooleanConstant):
         return np.full(size, formula.value)
     inputs = [_truth(entry, known, size) for entry in formula.inputs]
     count = np.sum(inputs, axis=0)

@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from amberbox.diagnosis.faulttree import FaultTree, analyse, closest
+from amberbox.diagnosis.faulttree.analysis import analyse, closest
+from amberbox.diagnosis.faulttree.tree import FaultTree
 from tests.diagnosis.faulttree.brute import COHERENT, minimal_states, probability, trees, truth
 
 

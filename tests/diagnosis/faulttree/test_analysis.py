@@ -10,17 +10,19 @@ from pathlib import Path
 
 import pytest
 
+from amberbox.core.budget import Budget
 from amberbox.core.errors import AmberboxError
-from amberbox.diagnosis.faulttree import (
-    Budget,
-    Closeness,
+from amberbox.diagnosis.faulttree.analysis import CutSetCloseness, analyse, closest
+from amberbox.diagnosis.faulttree.open_psa import read_mef
+from amberbox.diagnosis.faulttree.tree import (
     FaultTree,
-    analyse,
-    closest,
+    Formula,
+    all_of,
+    any_of,
+    at_least,
     fault_tree,
-    read_mef,
+    none_of,
 )
-from amberbox.diagnosis.faulttree.formula import Formula, all_of, any_of, at_least, none_of
 from benchmarks.faulttrees import robot
 
 
@@ -111,12 +113,12 @@ def test_a_budget_of_nodes_ends_with_incomplete_and_says_what() -> None:
 
 
 def test_a_deadline_ends_with_incomplete() -> None:
-    late = analyse(redundant(20), budget=Budget(deadline=lambda: True))
+    late = analyse(redundant(20), budget=Budget(is_over=lambda: True))
     assert late.incomplete == "probability and cut sets: the time was up"
 
 
 def test_a_deadline_during_the_cut_sets_leaves_the_probability() -> None:
-    results = [analyse(redundant(20), budget=Budget(deadline=after(n))) for n in range(40, 120)]
+    results = [analyse(redundant(20), budget=Budget(is_over=after(n))) for n in range(40, 120)]
     late = [entry for entry in results if entry.incomplete == "cut sets: the time was up"]
     assert late and all(entry.cut_sets is None for entry in late)
     assert {entry.top_probability for entry in late} == {analyse(redundant(20)).top_probability}
@@ -146,11 +148,11 @@ def test_what_is_closest_to_complete() -> None:
     tree = fault_tree("t", "top", gates, {"a": 0.1, "b": 0.2, "c": 0.5, "d": 0.5, "e": 0.5})
     assert [set(found.missing) for found in closest(tree, {})] == [set("cde"), set("ab")]
     assert closest(tree, {"b": True, "c": True}) == [
-        Closeness(("c",), ("d", "e"), 0.25), Closeness(("b",), ("a",), 0.1),
+        CutSetCloseness(("c",), ("d", "e"), 0.25), CutSetCloseness(("b",), ("a",), 0.1),
     ]  # fmt: skip
     (only,) = closest(tree, {"d": False, "a": 0.9})
     assert only.missing == ("a", "b") and only.probability == pytest.approx(0.18)
-    assert closest(tree, {"a": True, "b": True})[0] == Closeness(("a", "b"), (), 1.0)
+    assert closest(tree, {"a": True, "b": True})[0] == CutSetCloseness(("a", "b"), (), 1.0)
     assert len(closest(tree, {}, 1)) == 1
 
 
@@ -158,7 +160,10 @@ def test_without_probabilities_the_closest_is_what_misses_the_fewest_events() ->
     gates = {"top": any_of(all_of("a", "b"), all_of("c", "d", "e"))}
     tree = fault_tree("t", "top", gates, {**dict.fromkeys("abcd", 0.5), "e": None})
     found = closest(tree, {"c": True, "d": True})
-    assert found == [Closeness(("c", "d"), ("e",), None), Closeness((), ("a", "b"), 0.25)]
+    assert found == [
+        CutSetCloseness(("c", "d"), ("e",), None),
+        CutSetCloseness((), ("a", "b"), 0.25),
+    ]
 
 
 def test_an_event_without_which_nothing_happens_has_no_finite_reduction() -> None:

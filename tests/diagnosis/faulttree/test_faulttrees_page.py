@@ -8,10 +8,9 @@ from pathlib import Path
 import pytest
 
 from amberbox.cli.main import main
-from amberbox.diagnosis.faulttree.expression import FUNCTIONS
-from amberbox.diagnosis.faulttree.formula import ARITY
+from amberbox.diagnosis.faulttree.tree import ARITY, FUNCTIONS
 
-PAGE = Path(__file__).resolve().parents[3] / "docs" / "faulttrees.md"
+PAGE = Path(__file__).resolve().parents[3] / "docs" / "robot" / "faulttrees.md"
 
 
 def test_the_examples_run(

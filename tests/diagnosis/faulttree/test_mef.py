@@ -10,9 +10,19 @@ import pytest
 from hypothesis import given, settings
 
 from amberbox.core.errors import ConfigurationError, UsageError
-from amberbox.diagnosis.faulttree import FaultTree, analyse, fault_tree, read_mef, write_mef
-from amberbox.diagnosis.faulttree.formula import Constant, Name, all_of, any_of, at_least
-from amberbox.diagnosis.faulttree.tree import BasicEvent, Gate
+from amberbox.diagnosis.faulttree.analysis import analyse
+from amberbox.diagnosis.faulttree.open_psa import read_mef, write_mef
+from amberbox.diagnosis.faulttree.tree import (
+    BasicEvent,
+    BooleanConstant,
+    FaultTree,
+    Gate,
+    Name,
+    all_of,
+    any_of,
+    at_least,
+    fault_tree,
+)
 from tests.diagnosis.faulttree.brute import trees
 
 GOOD = """<?xml version="1.0"?>
@@ -267,7 +277,7 @@ def test_a_constant_top_has_no_event() -> None:
     answers: tuple[tuple[bool, list[frozenset[str]]], ...] = ((True, [frozenset()]), (False, []))
     for value, cut_sets in answers:
         analysis = analyse(replace(fault_tree("t", "g", {}, {}), gates={
-            "g": Gate("g", Constant(value)),
+            "g": Gate("g", BooleanConstant(value)),
         }))  # fmt: skip
         assert analysis.top_probability == float(value)
         assert list(analysis.cut_sets or ()) == cut_sets

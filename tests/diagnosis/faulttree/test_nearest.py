@@ -11,9 +11,8 @@ from hypothesis import strategies as st
 
 from amberbox.core.errors import AmberboxError
 from amberbox.core.types import Diagnosis, Hypothesis
-from amberbox.diagnosis.faulttree import FaultTree, analyse, fault_tree
-from amberbox.diagnosis.faulttree.formula import all_of, any_of
-from amberbox.diagnosis.faulttree.nearest import nearest
+from amberbox.diagnosis.faulttree.analysis import analyse, nearest
+from amberbox.diagnosis.faulttree.tree import FaultTree, all_of, any_of, fault_tree
 from tests.diagnosis.faulttree.brute import COHERENT, trees
 
 LASERS = fault_tree(

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from amberbox.core.needs import all_of
-from amberbox.diagnosis.fmea import Fmea, Known
-from amberbox.diagnosis.fmea.load import read_fmea
+from amberbox.diagnosis.fmea.loader import read_fmea
+from amberbox.diagnosis.fmea.model import Fmea, FmeaReferences
 
 TEXT = """\
 exposure_h: 100
@@ -61,7 +61,7 @@ ADDRESSES = (
     "host/heartbeat/alive",
     "tasks/log/none_given_up",
 )
-KNOWN = Known(
+KNOWN = FmeaReferences(
     (*ADDRESSES, "host/heartbeat/rate_hz"),
     ADDRESSES,
     {"hook": all_of("host", "somewhere_else")},

@@ -5,10 +5,10 @@ from __future__ import annotations
 import pytest
 
 from amberbox.core.types import Symptom
-from amberbox.diagnosis.covering.answer import diagnose
-from amberbox.diagnosis.covering.evidence import evidence_of
+from amberbox.diagnosis.covering.hypotheses import diagnose
 from amberbox.diagnosis.covering.model import Link
-from amberbox.diagnosis.fmea.compile import compile_checks, compile_model
+from amberbox.diagnosis.covering.observations import collect_evidence
+from amberbox.diagnosis.knowledge import compile_checks, compile_model
 from tests.diagnosis.fmea.small import small
 
 
@@ -42,7 +42,7 @@ def test_a_loss_explains_what_shows_at_the_top() -> None:
     fmea = small()
     present = ("tasks/log/none_given_up", "host/heartbeat/alive")
     symptoms = [Symptom(name, "present" if name in present else "absent") for name in fmea.symptoms]
-    best = diagnose(compile_model(fmea), evidence_of(symptoms)).hypotheses[0]
+    best = diagnose(compile_model(fmea), collect_evidence(symptoms)).hypotheses[0]
     assert best.faults == {"host#off"} and set(best.explains) == set(present)
 
 
@@ -50,5 +50,7 @@ def test_tests_know_what_each_mode_makes_them_give() -> None:
     checks = {check.id: check for check in compile_checks(small())}
     check = checks["laser_front.look"]
     assert (check.kind, check.cost_s, check.outcomes) == ("question", 60, ("clean", "dirty", "wet"))
-    given = [(sight.cause, sight.outcome, sight.detects) for sight in check.sights]
+    given = [
+        (detection.cause, detection.outcome, detection.detects) for detection in check.detections
+    ]
     assert given == [("laser_front#dirty", "dirty", 0.95), ("laser_front#wet", "wet", 0.8)]

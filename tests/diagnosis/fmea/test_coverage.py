@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import pytest
 
-from amberbox.diagnosis.fmea.coverage import coverage
-from amberbox.diagnosis.fmea.propagation import Structure, links_by_mode, lost
+from amberbox.diagnosis.fmea.criticality import coverage
+from amberbox.diagnosis.fmea.model import DependencyStructure, links_by_mode, lost
 from tests.diagnosis.fmea.small import ADDRESSES, small
 
 
 def test_modes_with_the_same_symptoms_are_alike_and_tests_tell_them_apart() -> None:
-    groups = {group.modes: group for group in coverage(small()).alike}
+    groups = {group.modes: group for group in coverage(small()).ambiguous}
     group = groups["laser_front#dirty", "laser_front#wet"]
     assert group.symptoms == ("laser_front/window/clear",)
     assert group.tests == ("laser_front.look",) and group.left == ()
@@ -18,7 +18,7 @@ def test_modes_with_the_same_symptoms_are_alike_and_tests_tell_them_apart() -> N
 
 def test_what_no_test_tells_apart_is_said() -> None:
     fmea = small("tests: {look: {outcome: wet, detects: 0.8}}", "tests: {look: dirty}")
-    group = next(g for g in coverage(fmea).alike if g.modes[0] == "laser_front#dirty")
+    group = next(g for g in coverage(fmea).ambiguous if g.modes[0] == "laser_front#dirty")
     assert group.tests == () and group.left == (group.modes,)
 
 
@@ -57,4 +57,4 @@ def test_what_is_lost() -> None:
     assert lost(fmea, ["host#off"]) == {
         "host", "laser_front", "laser_rear", "hook", "see", "carry",
     }  # fmt: skip
-    assert Structure.of(fmea.needs()).dependents(["hook"]) == {"carry"}
+    assert DependencyStructure.of(fmea.needs()).dependents(["hook"]) == {"carry"}

@@ -8,16 +8,15 @@ from pathlib import Path
 
 import pytest
 
-from amberbox.diagnosis.fmea import Fmea
 from amberbox.diagnosis.fmea.criticality import (
-    by_number,
+    by_risk_number,
     criticalities,
-    expected,
+    expected_failures,
     matrix,
     mode_criticality,
 )
-from amberbox.diagnosis.fmea.load import read_fmea
-from amberbox.diagnosis.fmea.model import Ranks
+from amberbox.diagnosis.fmea.loader import read_fmea
+from amberbox.diagnosis.fmea.model import Fmea, RiskRanks
 from tests.diagnosis.fmea.small import small
 
 
@@ -55,8 +54,8 @@ def test_criticality_by_hand() -> None:
 
 def test_a_probability_counts_as_the_rate_that_gives_it() -> None:
     mode = small().modes["hook#bent"]
-    assert -math.expm1(-expected(mode)) == pytest.approx(0.03)
-    assert expected(mode, 1e6) == expected(mode)
+    assert -math.expm1(-expected_failures(mode)) == pytest.approx(0.03)
+    assert expected_failures(mode, 1e6) == expected_failures(mode)
 
 
 @pytest.mark.needs_data
@@ -70,12 +69,12 @@ def test_s_x_o_x_d_takes_few_values_as_published(shared_data: Path) -> None:
 
 def test_s_x_o_x_d_takes_120_values() -> None:
     assert len(_all_numbers()) == 120
-    assert Ranks(1, 2).number is None
+    assert RiskRanks(1, 2).number is None
 
 
 def _all_numbers() -> set[int]:
     ranks = range(1, 11)
-    numbers = {Ranks(s, o, d).number for s in ranks for o in ranks for d in ranks}
+    numbers = {RiskRanks(s, o, d).number for s in ranks for o in ranks for d in ranks}
     return {number for number in numbers if number is not None}
 
 
@@ -90,5 +89,5 @@ def test_the_matrix_holds_every_mode_once() -> None:
 
 
 def test_the_highest_number_comes_first() -> None:
-    numbers = [mode.ranks.number for mode in by_number(small().modes.values())]
+    numbers = [mode.ranks.number for mode in by_risk_number(small().modes.values())]
     assert numbers == sorted(numbers, key=lambda number: -(number or 0))

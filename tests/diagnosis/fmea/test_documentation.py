@@ -7,11 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from amberbox.diagnosis.fmea.load import load_fmea, read_fmea
-from amberbox.diagnosis.fmea.vocabulary import resolve, vocabularies
+from amberbox.diagnosis.fmea.loader import load_fmea, read_fmea, resolve, vocabularies
 
 ROOT = Path(__file__).resolve().parents[3]
-PAGE = (ROOT / "docs/fmea.md").read_text(encoding="utf-8")
+PAGE = (ROOT / "docs/robot/fmea.md").read_text(encoding="utf-8")
 FILES = [block for block in re.findall(r"```yaml\n(.*?)```", PAGE, re.DOTALL) if "types:" in block]
 
 

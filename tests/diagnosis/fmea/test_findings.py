@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from amberbox.diagnosis.fmea.compile import compile_model
-from amberbox.diagnosis.fmea.findings import causes_of, instances, text_of
-from amberbox.diagnosis.fmea.known import Known
-from amberbox.diagnosis.fmea.load import read_fmea
+from amberbox.diagnosis.fmea.findings import causes_of, finding_instances, text_of
+from amberbox.diagnosis.fmea.loader import read_fmea
+from amberbox.diagnosis.fmea.model import FmeaReferences
+from amberbox.diagnosis.knowledge import compile_model
 
 TEXT = """\
 instances: {base: [ropod1, ropod-2], motor: [m1, m2]}
@@ -16,7 +16,7 @@ types:
   motor: {modes: {burnt: {probability: 0.01, unobservable: no sensor}}}
 findings:
 """
-KNOWN = Known(predicates=[("short_circuit", 1), ("broken", 2)])
+KNOWN = FmeaReferences(predicates=[("short_circuit", 1), ("broken", 2)])
 
 
 def errors(finding: str) -> str:
@@ -44,7 +44,7 @@ def test_variables_that_map_to_nothing_do_not_make_more_symptoms() -> None:
     text = "  - {rule: 'broken(M, _Why)', maps_to: [<M>#burnt, ropod1#short_circuit]}"
     fmea, _ = read_fmea(TEXT + text, KNOWN)
     assert fmea is not None
-    assert dict(instances(fmea.findings[0], fmea.modes)) == {
+    assert dict(finding_instances(fmea.findings[0], fmea.modes)) == {
         "rule:broken(m1,_)": ("m1#burnt", "ropod1#short_circuit"),
         "rule:broken(m2,_)": ("m2#burnt", "ropod1#short_circuit"),
     }
@@ -109,7 +109,9 @@ def test_a_finding_is_enough_to_show_a_failure_mode() -> None:
 
 
 def test_notes_name_what_moves_nothing() -> None:
-    known = Known(predicates=[("p", 0)], heads={("q", 1): ("rules/a.pl", 7), ("p", 0): ("b", 1)})
+    known = FmeaReferences(
+        predicates=[("p", 0)], heads={("q", 1): ("rules/a.pl", 7), ("p", 0): ("b", 1)}
+    )
     fmea, problems = read_fmea(TEXT + "  - {rule: p}", known)
     assert fmea is not None
     notes = [str(problem) for problem in problems]

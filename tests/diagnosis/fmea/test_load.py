@@ -8,9 +8,8 @@ from pathlib import Path
 import pytest
 
 from amberbox.core.needs import NOTHING, all_of, any_of
-from amberbox.diagnosis.fmea.load import load_fmea, read_fmea
-from amberbox.diagnosis.fmea.model import Link, Outcome
-from amberbox.diagnosis.fmea.propagation import lost
+from amberbox.diagnosis.fmea.loader import load_fmea, read_fmea
+from amberbox.diagnosis.fmea.model import ExpectedOutcome, SymptomLink, lost
 from tests.diagnosis.fmea.small import KNOWN, TEXT, small
 
 
@@ -19,9 +18,13 @@ def test_types_are_written_out_with_their_parameters() -> None:
     assert list(fmea.components) == ["laser_front", "laser_rear", "host", "hook"]
     assert fmea.components["laser_rear"].description == "the rear laser"
     assert fmea.modes["laser_front#dead"].description == "the front laser is dead"
-    assert fmea.modes["laser_rear#dirty"].symptoms == (Link("laser_rear/window/clear", 0.9, 5, 2),)
-    assert fmea.modes["laser_rear#dirty"].tests == (Outcome("laser_rear.look", "dirty", 0.95),)
-    assert fmea.modes["laser_rear#wet"].tests == (Outcome("laser_rear.look", "wet", 0.8),)
+    assert fmea.modes["laser_rear#dirty"].symptoms == (
+        SymptomLink("laser_rear/window/clear", 0.9, 5, 2),
+    )
+    assert fmea.modes["laser_rear#dirty"].tests == (
+        ExpectedOutcome("laser_rear.look", "dirty", 0.95),
+    )
+    assert fmea.modes["laser_rear#wet"].tests == (ExpectedOutcome("laser_rear.look", "wet", 0.8),)
     classes = fmea.modes["laser_front#dirty"].classes
     assert classes == ("carlson_murphy.sensor", "steinbauer.environment")
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from amberbox.diagnosis.fmea.load import load_fmea
-from amberbox.diagnosis.fmea.propagation import lost
+from amberbox.diagnosis.fmea.loader import load_fmea
+from amberbox.diagnosis.fmea.model import lost
 
 TEAM = """\
 types:

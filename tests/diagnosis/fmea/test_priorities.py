@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from amberbox.core.errors import Problem
-from amberbox.diagnosis.fmea.model import Ranks
-from amberbox.diagnosis.fmea.priorities import load_priorities, priority
+from amberbox.diagnosis.fmea.criticality import load_priorities, priority
+from amberbox.diagnosis.fmea.model import RiskRanks
 
 TABLE = "S,O,D,priority\n9-10,4-10,,high\n9-10,1-3,5-10,medium\n7-8,6-10,,high\n,,,low\n"
 
@@ -18,11 +18,11 @@ def test_the_first_line_that_fits_counts(tmp_path: Path) -> None:
     rules = load_priorities(path, problems)
     assert not problems
     given = [(9, 4, 1), (10, 3, 5), (10, 3, 4), (8, 5, 10), (7, 6, 1)]
-    assert [priority(Ranks(*ranks), rules) for ranks in given] == [
+    assert [priority(RiskRanks(*ranks), rules) for ranks in given] == [
         "high", "medium", "low", "low", "high",
     ]  # fmt: skip
-    assert priority(Ranks(9, 4, None), rules) == ""
-    assert priority(Ranks(9, 4, 1), rules[1:2]) == ""
+    assert priority(RiskRanks(9, 4, None), rules) == ""
+    assert priority(RiskRanks(9, 4, 1), rules[1:2]) == ""
 
 
 def test_wrong_tables_are_told_with_their_line(tmp_path: Path) -> None:

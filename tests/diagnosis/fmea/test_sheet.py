@@ -9,11 +9,10 @@ from pathlib import Path
 import pytest
 
 from amberbox.core.errors import Problem
-from amberbox.diagnosis.fmea import Fmea
 from amberbox.diagnosis.fmea.criticality import mode_criticality
-from amberbox.diagnosis.fmea.load import read_fmea
-from amberbox.diagnosis.fmea.sheet import COLUMNS, write_sheet
-from amberbox.diagnosis.fmea.sheet_reading import read_sheet
+from amberbox.diagnosis.fmea.loader import read_fmea
+from amberbox.diagnosis.fmea.model import Fmea
+from amberbox.diagnosis.fmea.sheet import COLUMNS, read_sheet, write_sheet
 from tests.diagnosis.fmea.small import small
 
 

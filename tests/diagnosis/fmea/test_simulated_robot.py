@@ -10,19 +10,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from amberbox.blackbox.folder.folder import load_folder
+from amberbox.blackbox.robot_folder.folder import load_folder
 from amberbox.cli.main import main
-from amberbox.consult.known import known_of
+from amberbox.consult.folder_knowledge import fmea_references
 from amberbox.core.clock import NS
 from amberbox.core.expression import Expression
 from amberbox.core.types import Batch, IntArray, Ragged
-from amberbox.diagnosis.fmea import Fmea, Known
-from amberbox.diagnosis.fmea.coverage import coverage
-from amberbox.diagnosis.fmea.load import load_fmea
-from amberbox.diagnosis.fmea.propagation import lost
-from amberbox.monitoring.configuration import load_plan
-from amberbox.monitoring.plan import Plan
-from amberbox.sim import catalogue
+from amberbox.diagnosis.fmea.criticality import coverage
+from amberbox.diagnosis.fmea.loader import load_fmea
+from amberbox.diagnosis.fmea.model import Fmea, FmeaReferences, lost
+from amberbox.monitoring.plan import MonitoringPlan
+from amberbox.monitoring.plan_loader import load_plan
+from amberbox.sim.faults import catalogue
 from amberbox.sim.robot import START_NS
 from tests.sim.monitored import FAULT_S, batches, failures, find, with_fault
 
@@ -48,19 +47,19 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def known(folder: Path) -> Known:
-    return known_of(load_folder(folder))
+def known(folder: Path) -> FmeaReferences:
+    return fmea_references(load_folder(folder))
 
 
 @pytest.fixture(scope="module")
-def fmea(folder: Path, known: Known) -> Fmea:
+def fmea(folder: Path, known: FmeaReferences) -> Fmea:
     loaded, problems = load_fmea(folder / "fmea.yaml", known)
     assert loaded is not None and problems == []
     return loaded
 
 
 @pytest.fixture(scope="module")
-def plan(folder: Path) -> Plan:
+def plan(folder: Path) -> MonitoringPlan:
     return load_plan(load_folder(folder))[0]
 
 
@@ -85,11 +84,11 @@ def test_every_fault_of_the_catalogue_is_a_failure_mode(fmea: Fmea) -> None:
     assert len(set(modes.values())) == len(modes) == 101
 
 
-def test_most_of_it_can_be_seen_and_told_apart(fmea: Fmea, known: Known) -> None:
+def test_most_of_it_can_be_seen_and_told_apart(fmea: Fmea, known: FmeaReferences) -> None:
     found = coverage(fmea, sorted(known.watched))
     assert not found.unexplained
     assert len(found.unseen) <= 2 and found.distinct >= 0.9 * found.modes
-    assert all(group.tests and not group.left for group in found.alike)
+    assert all(group.tests and not group.left for group in found.ambiguous)
 
 
 def test_redundancy_gives_cut_sets_of_higher_order(fmea: Fmea) -> None:
@@ -147,7 +146,9 @@ def _series(address: str, record: Mapping[str, Batch]) -> tuple[IntArray, Any]:
 
 
 @pytest.mark.parametrize("fault", REACTIONS)
-def test_monitors_react_as_the_failure_modes_say(fmea: Fmea, plan: Plan, fault: str) -> None:
+def test_monitors_react_as_the_failure_modes_say(
+    fmea: Fmea, plan: MonitoringPlan, fault: str
+) -> None:
     within_s = REACTIONS[fault]
     findings = find(plan, with_fault(fault, within_s + 1), FAULT_S + within_s)
     seen = {

@@ -11,15 +11,14 @@ from hypothesis import strategies as st
 
 from amberbox.core.errors import UsageError
 from amberbox.core.needs import NOTHING, Needs, all_of, any_of, at_least
-from amberbox.diagnosis.faulttree import analyse, read_mef, write_mef
-from amberbox.diagnosis.faulttree.formula import Constant, Name
-from amberbox.diagnosis.faulttree.formula import all_of as all_happen
-from amberbox.diagnosis.faulttree.formula import any_of as any_happens
-from amberbox.diagnosis.faulttree.formula import at_least as at_least_happen
-from amberbox.diagnosis.faulttree.tree import FaultTree, Gate
-from amberbox.diagnosis.fmea.model import Component, FailureMode, Fmea, Function
-from amberbox.diagnosis.fmea.propagation import lost
-from amberbox.diagnosis.fmea.trees import effects, fault_tree_of, tree_over, unmet
+from amberbox.diagnosis.faulttree.analysis import analyse
+from amberbox.diagnosis.faulttree.open_psa import read_mef, write_mef
+from amberbox.diagnosis.faulttree.tree import BooleanConstant, FaultTree, Gate, Name
+from amberbox.diagnosis.faulttree.tree import all_of as all_happen
+from amberbox.diagnosis.faulttree.tree import any_of as any_happens
+from amberbox.diagnosis.faulttree.tree import at_least as at_least_happen
+from amberbox.diagnosis.fmea.fault_trees import effects, fault_tree_of, tree_over, unmet
+from amberbox.diagnosis.fmea.model import FailureMode, Fmea, FmeaComponent, FmeaFunction, lost
 from tests.diagnosis.faulttree.brute import minimal_states, probability
 from tests.diagnosis.fmea.small import small
 
@@ -39,8 +38,8 @@ def needs_of(draw: st.DrawFn, names: Sequence[str], deep: int = 2) -> Needs:
 def fmeas(draw: st.DrawFn) -> Fmea:
     """Draw components with failure modes and functions; each may need what came before it."""
     modes: dict[str, FailureMode] = {}
-    components: dict[str, Component] = {}
-    functions: dict[str, Function] = {}
+    components: dict[str, FmeaComponent] = {}
+    functions: dict[str, FmeaFunction] = {}
     for number in range(draw(st.integers(1, 5))):
         name = f"c{number}"
         for place in range(draw(st.integers(0, 2))):
@@ -49,10 +48,10 @@ def fmeas(draw: st.DrawFn) -> Fmea:
                                       beta=0.5, takes_down=draw(st.integers(0, 3)) > 0)  # fmt: skip
         needed = draw(st.just(NOTHING) | needs_of([*components])) if components else NOTHING
         own = tuple(mode for mode in modes if mode.startswith(f"{name}#"))
-        components[name] = Component(name, "part", needs=needed, modes=own)
+        components[name] = FmeaComponent(name, "part", needs=needed, modes=own)
     for number in range(draw(st.integers(1, 3))):
         needed = draw(needs_of([*components, *functions]))
-        functions[f"f{number}"] = Function(f"f{number}", needed, system=draw(st.booleans()))
+        functions[f"f{number}"] = FmeaFunction(f"f{number}", needed, system=draw(st.booleans()))
     return Fmea("robot", modes, components, functions, {})
 
 
@@ -100,7 +99,7 @@ def same(one: FaultTree, other: FaultTree) -> bool:
         (at_least(2, "a", "b", "c", "d"), at_least_happen(3, "a", "b", "c", "d")),
         (all_of("a", any_of("b", "c")), any_happens("a", all_happen("b", "c"))),
         (any_of("a"), Name("a")),
-        (NOTHING, Constant(False)),
+        (NOTHING, BooleanConstant(False)),
     ],
 )
 def test_needs_turn_into_gates(needs: Needs, formula: object) -> None:

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from amberbox.blackbox.folder.folder import load_folder
+from amberbox.blackbox.robot_folder.folder import load_folder
 from amberbox.core.errors import Problem
-from amberbox.monitoring.configuration import load_plan
-from amberbox.monitoring.plan import ComponentPlan, MappingPlan, ModePlan, Plan
+from amberbox.monitoring.plan import ComponentPlan, MappingPlan, ModePlan, MonitoringPlan
+from amberbox.monitoring.plan_loader import load_plan
 
 BLACK_BOX = """\
 - ros:
@@ -33,7 +33,7 @@ def make_folder(path: Path, files: Mapping[str, str], black_box: str = BLACK_BOX
 
 def plan_of(
     path: Path, files: Mapping[str, str], black_box: str = BLACK_BOX
-) -> tuple[Plan, list[Problem]]:
+) -> tuple[MonitoringPlan, list[Problem]]:
     """Load the plan of a folder made of texts."""
     return load_plan(load_folder(make_folder(path, files, black_box)))
 
@@ -57,7 +57,7 @@ def mapping_of(path: Path, text: str, black_box: str = BLACK_BOX) -> MappingPlan
     return mapping
 
 
-def component(plan: Plan, name: str) -> ComponentPlan:
+def component(plan: MonitoringPlan, name: str) -> ComponentPlan:
     """Find a component."""
     return next(entry for entry in plan.components if entry.id == name)
 

@@ -10,7 +10,7 @@ import pytest
 
 from amberbox.core.clock import NS
 from amberbox.core.types import Batch, Column, ItemSchema
-from amberbox.monitoring.engine.engine import Engine
+from amberbox.monitoring.engine import Engine
 from tests.monitoring.configuration.folders import errors, mode_files, plan_of
 
 BLACK_BOX = "- ros: {topics: [{name: /parser/data, type: own_msgs/Wheels}]}\n"

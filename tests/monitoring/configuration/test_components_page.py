@@ -1,4 +1,4 @@
-"""docs/components.md names every key, and its examples are those that run."""
+"""docs/robot/components.md names every key, and its examples are those that run."""
 
 from __future__ import annotations
 
@@ -7,23 +7,30 @@ from pathlib import Path
 
 import pytest
 
-from amberbox.core.describe import describe
-from amberbox.monitoring.configuration.files import (
+from amberbox.core.options import describe
+from amberbox.monitoring.component_files import (
     LEGACY_KEYS,
-    ComponentFile,
+    ComponentFileOptions,
     FlappingOptions,
     MappingOptions,
-    ModeFile,
+    ModeFileOptions,
     OutputOptions,
     RecoveryOptions,
 )
-from amberbox.monitoring.configuration.predecessor import ENTRIES
+from amberbox.monitoring.legacy_mode_files import LEGACY_MONITORS
 from tests.monitoring.configuration.folders import errors, plan_of
 
 ROOT = Path(__file__).resolve().parents[3]
-PAGE = (ROOT / "docs" / "components.md").read_text(encoding="utf-8")
+PAGE = (ROOT / "docs" / "robot" / "components.md").read_text(encoding="utf-8")
 EXAMPLE = ROOT / "examples" / "laser" / "components"
-CLASSES = (ComponentFile, ModeFile, MappingOptions, OutputOptions, FlappingOptions, RecoveryOptions)
+CLASSES = (
+    ComponentFileOptions,
+    ModeFileOptions,
+    MappingOptions,
+    OutputOptions,
+    FlappingOptions,
+    RecoveryOptions,
+)
 
 
 @pytest.mark.parametrize("cls", CLASSES)
@@ -57,7 +64,7 @@ def test_the_other_example_loads(tmp_path: Path) -> None:
 
 
 def test_the_predecessor_s_names_are_listed() -> None:
-    for name, entry in ENTRIES.items():
+    for name, entry in LEGACY_MONITORS.items():
         line = next((text for text in PAGE.splitlines() if f"`{name}`" in text), "")
         assert f"`{entry.monitor}`" in line, name
     for key in LEGACY_KEYS:

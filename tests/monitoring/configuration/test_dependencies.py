@@ -9,7 +9,7 @@ import pytest
 
 from amberbox.core.errors import Problem
 from amberbox.core.needs import Needs, all_of, any_of, at_least
-from amberbox.monitoring.plan import DependencyPlan, Plan
+from amberbox.monitoring.plan import DependencyPlan, MonitoringPlan
 from tests.monitoring.configuration.folders import component, errors, notes, plan_of
 
 NODES = """\
@@ -143,7 +143,7 @@ def test_a_monitor_of_what_is_no_dependency(tmp_path: Path) -> None:
     ]
 
 
-def _circles(path: Path, needs: dict[str, str]) -> tuple[Plan, list[Problem]]:
+def _circles(path: Path, needs: dict[str, str]) -> tuple[MonitoringPlan, list[Problem]]:
     files = {
         f"{name}.yaml": f"component_name: {name}\ndependencies: [{', '.join(of)}]\n"
         for name, of in needs.items()
@@ -183,7 +183,7 @@ def test_a_circle_that_a_mode_judges_is_told_and_stays(tmp_path: Path) -> None:
     assert (edge.component, edge.output, edge.problem) == ("ros", "planner", "")
 
 
-def _needing(path: Path, text: str) -> tuple[Plan, list[Problem]]:
+def _needing(path: Path, text: str) -> tuple[MonitoringPlan, list[Problem]]:
     """Load a component ``x`` that needs something beside ``ros``, a, b, c and d."""
     files = {f"{name}.yaml": f"component_name: {name}\n" for name in "abcd"}
     return plan_of(path, ROS | files | {"x.yaml": f"component_name: x\ndependencies:{text}\n"})

@@ -8,7 +8,7 @@ from typing import Any, Literal
 import pytest
 
 from amberbox.core.mode import Result
-from amberbox.monitoring.configuration.expectations import expectation
+from amberbox.monitoring.mode_bindings import expectation
 from amberbox.monitoring.plan import Expectation
 
 Type = Literal["bool", "int", "float", "string"]

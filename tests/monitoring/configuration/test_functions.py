@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from amberbox.monitoring.configuration.functions import find_functions, function_of
+from amberbox.monitoring.component_files import find_functions, function_of
 from tests.monitoring.configuration.folders import errors, mode_of
 
 KNOWN = ("device", "heartbeat", "state_bits", "bits", "range", "rate_of_change")

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from amberbox.blackbox.folder.folder import load_folder
-from amberbox.monitoring.configuration import load_plan
+from amberbox.blackbox.robot_folder.folder import load_folder
+from amberbox.monitoring.plan_loader import load_plan
 from tests.monitoring.configuration.folders import (
     component,
     errors,

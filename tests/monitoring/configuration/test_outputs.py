@@ -9,9 +9,9 @@ import pytest
 
 from amberbox.core.errors import Problem
 from amberbox.core.mode import Result
-from amberbox.core.nodes import Node
-from amberbox.monitoring.configuration.files import OutputOptions, OutputType
-from amberbox.monitoring.configuration.outputs import bind_outputs
+from amberbox.core.yaml_nodes import Node
+from amberbox.monitoring.component_files import OutputOptions, OutputType
+from amberbox.monitoring.mode_bindings import bind_outputs
 from amberbox.monitoring.plan import OutputPlan
 from tests.monitoring.configuration.folders import errors, mapping_of, mode_of
 

@@ -18,8 +18,8 @@ from amberbox.monitoring.plan import (
     InputPlan,
     MappingPlan,
     ModePlan,
+    MonitoringPlan,
     OutputPlan,
-    Plan,
 )
 
 GOOD = Result("good", "bool", "it is well")
@@ -89,9 +89,9 @@ def mode(
     return ModePlan(name, name, module, None, [MappingPlan(inputs, outputs)], **options)
 
 
-def one(*modes: ModePlan) -> Plan:
+def one(*modes: ModePlan) -> MonitoringPlan:
     """Return a plan of one component."""
-    return Plan("robot", "hash", [ComponentPlan("part", "part", modes)])
+    return MonitoringPlan("robot", "hash", [ComponentPlan("part", "part", modes)])
 
 
 def rows(times_ns: Any, item: str = "a", /, **columns: Any) -> Batch:

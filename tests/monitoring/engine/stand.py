@@ -5,27 +5,25 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
+from amberbox.core.clock import NS
 from amberbox.core.mode import Result
-from amberbox.core.types import Output
-from amberbox.monitoring.engine.findings import (
-    NS,
+from amberbox.core.types import Output, Status, Symptom
+from amberbox.monitoring.findings import (
     AlarmChange,
     Finding,
-    Found,
-    Status,
-    Symptom,
+    OutputChange,
+    OutputCondition,
     Transition,
-    What,
 )
-from amberbox.monitoring.engine.states import States, outputs_of
 from amberbox.monitoring.plan import (
     ComponentPlan,
     DependencyPlan,
     MappingPlan,
     ModePlan,
+    MonitoringPlan,
     OutputPlan,
-    Plan,
 )
+from amberbox.monitoring.states import RobotStates, outputs_of
 
 T0_NS = 1_790_000_000 * NS
 
@@ -57,9 +55,9 @@ def component(
     return ComponentPlan(name, name, own, edges, **more)
 
 
-def plan(*components: ComponentPlan) -> Plan:
+def plan(*components: ComponentPlan) -> MonitoringPlan:
     """Plan a robot."""
-    return Plan("r1", "hash", components)
+    return MonitoringPlan("r1", "hash", components)
 
 
 class Stand:
@@ -67,11 +65,11 @@ class Stand:
 
     def __init__(self, *components: ComponentPlan, begin: bool = True) -> None:
         self.plan = plan(*components)
-        self.states = States(self.plan)
+        self.states = RobotStates(self.plan)
         self.places = outputs_of(self.plan)
         self.view = Values(self.plan)
         self.findings: list[Finding] = []
-        self._found: list[Found] = []
+        self._found: list[OutputChange] = []
         if begin:
             self.begin(0)
 
@@ -82,11 +80,11 @@ class Stand:
         return findings
 
     def find(
-        self, seconds: float, where: str, what: What, value: Output = None, why: str = ""
+        self, seconds: float, where: str, what: OutputCondition, value: Output = None, why: str = ""
     ) -> None:
         """Note what is found of an output; ``where`` begins its address."""
         (number,) = [n for n, p in enumerate(self.places) if _address(p).startswith(f"{where}/")]
-        self._found.append(Found(at_ns(seconds), number, what, value, why))
+        self._found.append(OutputChange(at_ns(seconds), number, what, value, why))
 
     def ok(self, seconds: float, *where: str) -> None:
         """Find outputs ok."""
@@ -126,15 +124,15 @@ class Stand:
 class Values:
     """The values of outputs over time, made from what was found."""
 
-    def __init__(self, plan: Plan) -> None:
+    def __init__(self, plan: MonitoringPlan) -> None:
         self._modes: list[list[tuple[int, str]]] = [[] for _ in plan.modes()]
         numbers = iter(range(len(outputs_of(plan))))
         for place, (_, of_mode) in zip(self._modes, plan.modes(), strict=True):
             for mapping in of_mode.mappings:
                 place += [(next(numbers), entry.name) for entry in mapping.outputs]
-        self._values: dict[int, list[Found]] = {}
+        self._values: dict[int, list[OutputChange]] = {}
 
-    def take(self, found: Iterable[Found]) -> None:
+    def take(self, found: Iterable[OutputChange]) -> None:
         """Take what is found, in order of time."""
         for entry in found:
             self._values.setdefault(entry.output, []).append(entry)

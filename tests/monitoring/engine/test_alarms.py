@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from amberbox.core.errors import UsageError
-from amberbox.monitoring.engine.findings import AlarmChange, Finding
+from amberbox.monitoring.findings import AlarmChange, Finding
 from tests.monitoring.engine.stand import Stand, alarms, at_ns, component, mode, output, seconds
 
 CHAIN = (component("loc", "laser"), component("laser"))

@@ -14,10 +14,9 @@ from amberbox.core.mode import Input, Result, where_known
 from amberbox.core.probe import ProbeOrder
 from amberbox.core.samples import Now
 from amberbox.core.types import Batch, Output, Ragged, Status
-from amberbox.monitoring.engine.engine import Engine
-from amberbox.monitoring.engine.lists import figures_of
-from amberbox.monitoring.engine.perinput import for_all
+from amberbox.monitoring.engine import Engine, evaluate_for_all
 from amberbox.monitoring.plan import InputPlan, ModePlan
+from amberbox.monitoring.sample_tables import figures_of
 from tests.monitoring.engine.plans import GOOD, mode, mode_module, one, output, rows, seconds
 
 
@@ -67,7 +66,7 @@ def test_bad_counts_before_unknown_and_unknown_before_as_before(
     def evaluate(config: Any, inputs: Sequence[Any], now: Now) -> Mapping[str, Any]:
         return {"good": inputs[0]}
 
-    assert int(for_all(evaluate, [GOOD])(None, results, 0)["good"]) == joined
+    assert int(evaluate_for_all(evaluate, [GOOD])(None, results, 0)["good"]) == joined
 
 
 def test_what_is_nominal_when_false_is_joined_the_other_way() -> None:
@@ -76,7 +75,7 @@ def test_what_is_nominal_when_false_is_joined_the_other_way() -> None:
     def evaluate(config: Any, inputs: Sequence[Any], now: Now) -> Mapping[str, Any]:
         return {"good": inputs[0]}
 
-    assert int(for_all(evaluate, [pressed])(None, [False, True], 0)["good"]) == 1
+    assert int(evaluate_for_all(evaluate, [pressed])(None, [False, True], 0)["good"]) == 1
 
 
 def test_figures_of_lists() -> None:

@@ -8,8 +8,8 @@ import pytest
 
 from amberbox.core.expression import parse
 from amberbox.core.needs import all_of, any_of, at_least
-from amberbox.monitoring.engine.edges import in_order
-from amberbox.monitoring.engine.findings import What
+from amberbox.monitoring.component_states import in_order
+from amberbox.monitoring.findings import OutputCondition
 from amberbox.monitoring.plan import DependencyPlan, Expectation, Policy
 from tests.monitoring.engine.stand import (
     Stand,
@@ -237,7 +237,7 @@ def test_modes_are_combined_by_policy(policy: Policy, found: str, expected: str)
     stand = Stand(component("x", modes=modes, policy=policy))
     stand.ok(1, "x/m0", "x/m1", "x/m2")
     for number, word in enumerate(found.split()):
-        what: What = "ok" if word == "ok" else "bad" if word == "bad" else "stale"
+        what: OutputCondition = "ok" if word == "ok" else "bad" if word == "bad" else "stale"
         what = "unknown" if word == "unknown" else what
         stand.find(2, f"x/m{number}", what, word == "ok", "" if what in ("ok", "bad") else word)
     stand.until(2)

@@ -16,9 +16,8 @@ from hypothesis import strategies as st
 from amberbox.core.clock import NS
 from amberbox.core.expression import parse
 from amberbox.core.types import Batch, Level, Status
-from amberbox.monitoring.engine.engine import Engine
-from amberbox.monitoring.engine.findings import TICK_NS, Finding
-from amberbox.monitoring.messages.records import encoded
+from amberbox.monitoring.engine import Engine
+from amberbox.monitoring.findings import TICK_NS, Finding, encoded
 from amberbox.monitoring.modes import expression
 from amberbox.monitoring.plan import InputPlan, MappingPlan, ModePlan
 from tests.monitoring.engine.plans import (

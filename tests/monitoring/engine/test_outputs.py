@@ -7,8 +7,9 @@ from typing import Any
 
 import pytest
 
-from amberbox.monitoring.engine.findings import TICK_NS, Found, What
-from amberbox.monitoring.engine.outputs import OutputState, expected_text, highest, worst
+from amberbox.core.robot_status import worst
+from amberbox.monitoring.component_states import OutputState, expected_text, highest
+from amberbox.monitoring.findings import TICK_NS, OutputChange, OutputCondition
 from amberbox.monitoring.plan import Expectation, OutputPlan
 from tests.monitoring.engine.stand import at_ns, output, seconds
 
@@ -20,9 +21,9 @@ class Run:
         self.state = OutputState(output(**plan), 0)
         self.levels: list[tuple[float, str]] = []
 
-    def find(self, second: float, what: What, value: Any = None, why: str = "") -> None:
+    def find(self, second: float, what: OutputCondition, value: Any = None, why: str = "") -> None:
         self.wait(second - 0.01)
-        self.state.take(Found(at_ns(second), 0, what, value, why))
+        self.state.take(OutputChange(at_ns(second), 0, what, value, why))
         self._settle(at_ns(second))
 
     def wait(self, until: float) -> None:
@@ -186,14 +187,14 @@ def test_a_warning_is_a_warning() -> None:
 
 def test_bools_and_texts_are_news_and_numbers_are_not() -> None:
     state = OutputState(output(type="string"), 0)
-    assert state.take(Found(at_ns(1), 0, "ok", "RUN")) == "value"
-    assert state.take(Found(at_ns(2), 0, "ok", "RUN")) == "none"
-    assert state.take(Found(at_ns(3), 0, "ok", "STOP")) == "value"
-    assert state.take(Found(at_ns(4), 0, "bad", "STOP")) == "other"
-    assert state.take(Found(at_ns(5), 0, "bad", "STOP", "why")) == "other"
+    assert state.take(OutputChange(at_ns(1), 0, "ok", "RUN")) == "value"
+    assert state.take(OutputChange(at_ns(2), 0, "ok", "RUN")) == "none"
+    assert state.take(OutputChange(at_ns(3), 0, "ok", "STOP")) == "value"
+    assert state.take(OutputChange(at_ns(4), 0, "bad", "STOP")) == "other"
+    assert state.take(OutputChange(at_ns(5), 0, "bad", "STOP", "why")) == "other"
     number = OutputState(output(type="float", expectation=Expectation(3, "<=")), 0)
-    assert number.take(Found(at_ns(1), 0, "bad", 3.25)) == "other"
-    assert number.take(Found(at_ns(2), 0, "bad", 9.0)) == "none"
+    assert number.take(OutputChange(at_ns(1), 0, "bad", 3.25)) == "other"
+    assert number.take(OutputChange(at_ns(2), 0, "bad", 9.0)) == "none"
     number.settle(at_ns(2))
     assert number.text() == ("working is 3.25, expected <= 3", "")
 
@@ -229,7 +230,7 @@ def test_a_number_that_is_ok_takes_no_room_in_a_snapshot() -> None:
 
 
 def test_it_goes_on_from_a_snapshot() -> None:
-    story: list[tuple[float, What]] = [
+    story: list[tuple[float, OutputCondition]] = [
         (0, "bad"), (3, "ok"), (4, "bad"), (5, "ok"), (9, "stale"), (10, "ok"), (20, "bad"),
     ]  # fmt: skip
     whole = Run(for_s=1, heal_s=1, flaps=2, flap_s=8)

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from amberbox.blackbox.recorder.stalls import BEAT_S, LATE_NS, StallMeter
+from amberbox.blackbox.recorder.pipeline import BEAT_S, LATE_NS, StallMeter
 from amberbox.core.clock import NS
-from amberbox.core.stalls import Stalls
+from amberbox.core.flow import Stalls
 from amberbox.testing.clock import ManualClock
 from tests.fuzzing import examples
 

@@ -12,25 +12,18 @@ from hypothesis import strategies as st
 
 from amberbox.core.expression import parse
 from amberbox.core.needs import Needs, all_of
-from amberbox.monitoring.engine.alarms import Action
-from amberbox.monitoring.engine.findings import (
-    TICK_NS,
-    Finding,
-    Found,
-    Status,
-    Symptom,
-    Transition,
-    What,
-)
-from amberbox.monitoring.engine.states import States, outputs_of
+from amberbox.core.types import Status, Symptom
+from amberbox.monitoring.alarms import Action
+from amberbox.monitoring.findings import TICK_NS, Finding, OutputChange, OutputCondition, Transition
 from amberbox.monitoring.plan import (
     ComponentPlan,
     DependencyPlan,
     Expectation,
     ModePlan,
+    MonitoringPlan,
     OutputPlan,
-    Plan,
 )
+from amberbox.monitoring.states import RobotStates, outputs_of
 from tests.monitoring.engine.stand import (
     T0_NS,
     Stand,
@@ -180,7 +173,7 @@ def test_an_epoch_may_begin_earlier_than_the_last_one_ended() -> None:
 
 
 def test_statuses_are_known_before_anything_and_after_resume() -> None:
-    fresh = States(plan(*LASER))
+    fresh = RobotStates(plan(*LASER))
     assert [(s.component, s.mode, s.level) for s in fresh.statuses()] == [
         ("loc", "device", "unknown"), ("loc", "", "unknown"),
         ("laser", "device", "unknown"), ("laser", "", "unknown"),
@@ -209,7 +202,7 @@ def test_a_fault_state_by_its_condition_is_followed_after_resume() -> None:
     stand.find(0.5, "battery", "bad", 15.0)
     stand.until(0.9)
     held = json.loads(json.dumps(stand.states.snapshot()))
-    stand.states = States(stand.plan)
+    stand.states = RobotStates(stand.plan)
     assert stand.states.resume(held)
     stand.find(1.5, "battery", "bad", 4.0)
     stand.until(2)
@@ -218,7 +211,7 @@ def test_a_fault_state_by_its_condition_is_followed_after_resume() -> None:
 
 # What follows: whatever the plan and whatever is found, in whatever pieces it is asked for.
 
-WHATS: list[What] = ["ok", "bad", "unknown", "stale"]
+WHATS: list[OutputCondition] = ["ok", "bad", "unknown", "stale"]
 
 
 @st.composite
@@ -245,7 +238,7 @@ def mode_plans(draw: st.DrawFn, name: str) -> ModePlan:
 
 
 @st.composite
-def plans(draw: st.DrawFn) -> Plan:
+def plans(draw: st.DrawFn) -> MonitoringPlan:
     """Draw a robot whose components need others that come later, mixed up."""
     made: list[ComponentPlan] = []
     for number in range(draw(st.integers(1, 6))):
@@ -284,8 +277,8 @@ class Story:
     """What happens to a robot: in each chapter something is found; then an epoch begins, or a
     person acknowledges or shelves an alarm."""
 
-    plan: Plan
-    chapters: Sequence[Sequence[Found]]
+    plan: MonitoringPlan
+    chapters: Sequence[Sequence[OutputChange]]
     ends: Sequence[int]
     between: Sequence[str]
 
@@ -297,7 +290,7 @@ def stories(draw: st.DrawFn) -> Story:
     now = T0_NS
     chapters, ends = [], []
     for _ in range(draw(st.integers(1, 3))):
-        found: list[Found] = []
+        found: list[OutputChange] = []
         for _ in range(draw(st.integers(0, 25)) if count else 0):
             now += draw(st.sampled_from([0, 1, 1, 3, 9, 20, 130])) * TICK_NS
             number = draw(st.integers(0, count - 1))
@@ -309,19 +302,19 @@ def stories(draw: st.DrawFn) -> Story:
     return Story(drawn, chapters, ends, between)
 
 
-def _drawn_found(draw: st.DrawFn, drawn: Plan, now: int, number: int) -> Found:
+def _drawn_found(draw: st.DrawFn, drawn: MonitoringPlan, now: int, number: int) -> OutputChange:
     what = draw(st.sampled_from([*WHATS, "ok", "bad", "ok", "bad"]))
     why = draw(st.sampled_from(["a", "b"])) if what in ("unknown", "stale") else ""
     values: dict[str, list[bool | float | str]] = {
         "bool": [True, False], "float": [1.5, 2.5, 7.25], "string": ["a", "b"],
     }  # fmt: skip
     value = draw(st.sampled_from(values[outputs_of(drawn)[number].output.type]))
-    return Found(now, number, what, None if why else value, why)
+    return OutputChange(now, number, what, None if why else value, why)
 
 
 def tell(story: Story, cuts: Sequence[int] = (), resumes: bool = False) -> list[Finding]:
     """Return all findings, asked for at the cuts as well, perhaps of a new object each time."""
-    states, view = States(story.plan), Values(story.plan)
+    states, view = RobotStates(story.plan), Values(story.plan)
     findings = states.begin(T0_NS)
     for chapter, end, between in zip(story.chapters, story.ends, story.between, strict=True):
         view.take(chapter)
@@ -332,13 +325,13 @@ def tell(story: Story, cuts: Sequence[int] = (), resumes: bool = False) -> list[
             findings += states.advance(taken, until, view)
             if resumes:
                 held = json.loads(json.dumps(states.snapshot(), allow_nan=False))
-                states = States(story.plan)
+                states = RobotStates(story.plan)
                 assert states.resume(held)
         findings += _do(states, between, end)
     return findings
 
 
-def _do(states: States, what: str, now_ns: int) -> list[Finding]:
+def _do(states: RobotStates, what: str, now_ns: int) -> list[Finding]:
     if what == "begin":
         return states.begin(now_ns)
     standing = states.alarms()
@@ -393,7 +386,7 @@ def _transitions_follow_one_another(findings: Sequence[Finding]) -> None:
             assert now.setdefault((finding.component, finding.mode), condition) == condition
 
 
-def _blocked_by_what_is_below(drawn: Plan, findings: Sequence[Finding]) -> None:
+def _blocked_by_what_is_below(drawn: MonitoringPlan, findings: Sequence[Finding]) -> None:
     """Compare with the definition, worked out anew for the last statuses of all."""
     newest = {(s.component, s.mode): s for s in statuses(findings)}
     known = {component.id: component for component in drawn.components}
@@ -440,7 +433,7 @@ def _alarms_are_of_roots(findings: Sequence[Finding]) -> None:
 SAYS = {"ok": "absent", "warn": "present", "error": "present"}
 
 
-def _symptoms_are_what_statuses_say(drawn: Plan, findings: Sequence[Finding]) -> None:
+def _symptoms_are_what_statuses_say(drawn: MonitoringPlan, findings: Sequence[Finding]) -> None:
     """Compare each with the statuses of its instant; none is told twice, none is left out.
 
     Only what speaks neither for nor against a fault may stay untold after unknown.
@@ -466,7 +459,7 @@ def _symptoms_are_what_statuses_say(drawn: Plan, findings: Sequence[Finding]) ->
     assert known <= expected
 
 
-def _expected_alone(drawn: Plan) -> dict[tuple[str, str], str]:
+def _expected_alone(drawn: MonitoringPlan) -> dict[tuple[str, str], str]:
     """Return the modes of one output of which something is expected, and the output's address."""
     alone = {}
     for place in outputs_of(drawn):

@@ -6,10 +6,10 @@ import json
 from collections.abc import Iterable, Sequence
 from typing import Any
 
+from amberbox.core.clock import NS
 from amberbox.core.mode import Result
 from amberbox.core.types import Symptom
-from amberbox.monitoring.engine.findings import NS, TICK_NS, Finding, Found
-from amberbox.monitoring.engine.states import States, outputs_of
+from amberbox.monitoring.findings import TICK_NS, Finding, OutputChange
 from amberbox.monitoring.plan import (
     ComponentPlan,
     Expectation,
@@ -18,6 +18,7 @@ from amberbox.monitoring.plan import (
     ModePlan,
     OutputPlan,
 )
+from amberbox.monitoring.states import RobotStates, SymptomEmitter, outputs_of
 from tests.monitoring.engine.stand import (
     T0_NS,
     Stand,
@@ -218,7 +219,7 @@ def test_an_output_that_was_known_before_it_was_left_goes_on_being_told() -> Non
     stand.stale(1, "laser")
     stand.until(2)
     held = json.loads(json.dumps(stand.states.snapshot()))
-    stand.states = States(stand.plan)
+    stand.states = RobotStates(stand.plan)
     assert stand.states.resume(held)
     stand.bad(3, "bus")
     assert told(stand.until(4)) == [
@@ -241,7 +242,7 @@ def test_when_it_began_is_known_after_resume() -> None:
 
 def _leave_and_go_on(stand: Stand) -> None:
     held = json.loads(json.dumps(stand.states.snapshot()))
-    stand.states = States(stand.plan)
+    stand.states = RobotStates(stand.plan)
     assert stand.states.resume(held)
 
 
@@ -252,7 +253,7 @@ def test_a_snapshot_from_before_there_were_symptoms_is_taken() -> None:
     held = stand.states.snapshot()
     del held["symptoms"]
     held["outputs"] = [entry[:9] for entry in held["outputs"]]
-    stand.states = States(stand.plan)
+    stand.states = RobotStates(stand.plan)
     assert stand.states.resume(held)
     stand.ok(3, "laser")
     assert told(stand.until(4)) == [(3, "laser", "absent", ())]
@@ -260,16 +261,14 @@ def test_a_snapshot_from_before_there_were_symptoms_is_taken() -> None:
 
 def test_a_change_of_one_output_costs_nothing_for_the_others(monkeypatch: Any) -> None:
     """Count what is looked at: one output of a thousand changes, ten are blocked by it."""
-    from amberbox.monitoring.engine import symptoms as module
-
     names = [f"c{n}" for n in range(1000)]
     parts = [laser(*(["c0"] if 0 < n <= 10 else []), name=name) for n, name in enumerate(names)]
-    states, view = States(plan(*parts)), Values(plan(*parts))
+    states, view = RobotStates(plan(*parts)), Values(plan(*parts))
     states.begin(T0_NS)
     count = len(outputs_of(states.plan))
-    states.advance([Found(at_ns(0.5), n, "ok", True) for n in range(count)], at_ns(1), view)
+    states.advance([OutputChange(at_ns(0.5), n, "ok", True) for n in range(count)], at_ns(1), view)
     looked: list[int] = []
-    real = module.Symptoms.tell
+    real = SymptomEmitter.emit
 
     def counted(
         self: Any, outputs: Sequence[int], components: Iterable[int], now_ns: int
@@ -278,8 +277,10 @@ def test_a_change_of_one_output_costs_nothing_for_the_others(monkeypatch: Any) -
         looked.append(len(numbers))
         return real(self, outputs, components, now_ns)
 
-    monkeypatch.setattr(module.Symptoms, "tell", counted)
-    found = states.advance([Found(at_ns(1) + TICK_NS, 0, "bad", False)], T0_NS + 4 * NS, view)
+    monkeypatch.setattr(SymptomEmitter, "emit", counted)
+    found = states.advance(
+        [OutputChange(at_ns(1) + TICK_NS, 0, "bad", False)], T0_NS + 4 * NS, view
+    )
     assert len(symptoms(found)) == 11
     assert sum(looked) == 11
 

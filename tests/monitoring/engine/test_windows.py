@@ -13,8 +13,9 @@ from hypothesis import strategies as st
 
 from amberbox.core.clock import NS
 from amberbox.core.expression import parse
-from amberbox.monitoring.engine.engine import Engine
-from amberbox.monitoring.engine.findings import TICK_NS, Status
+from amberbox.core.types import Status
+from amberbox.monitoring.engine import Engine
+from amberbox.monitoring.findings import TICK_NS
 from amberbox.monitoring.modes import expression
 from amberbox.monitoring.plan import MappingPlan, ModePlan
 from tests.fuzzing import examples, fuzz

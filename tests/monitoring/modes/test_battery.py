@@ -117,8 +117,8 @@ def test_what_gives_no_percentage_is_refused(config: Config) -> None:
 @pytest.mark.needs_data
 def test_the_real_robot_was_at_about_80_percent(shared_data: Path, tmp_path: Path) -> None:
     import amberbox
-    from amberbox.blackbox.formats.options import ReadOptions
-    from amberbox.blackbox.importing import import_recordings
+    from amberbox.blackbox.formats._recording import ReadOptions
+    from amberbox.blackbox.query.importing import import_recordings
 
     options = ReadOptions(messages=shared_data / "ropod/message_definitions")
     dump = shared_data / "ropod/bb_test_data"

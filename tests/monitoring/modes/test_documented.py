@@ -1,4 +1,4 @@
-"""``docs/modes.md`` has a section for each mode: all there is to write, and files that work."""
+"""``docs/robot/modes.md`` has a section for each mode, and files that work."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from amberbox.core.describe import describe
+from amberbox.core.options import describe
 from amberbox.core.plugins import find
 from amberbox.testing.modes import mode_file
 
-PAGE = Path(__file__).parents[3] / "docs" / "modes.md"
+PAGE = Path(__file__).parents[3] / "docs" / "robot" / "modes.md"
 MODES = find("amberbox.monitoring.modes", defines=("Config", "evaluate"))
 
 

@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from amberbox.core.config import build, parse_yaml
+from amberbox.core.config import build
 from amberbox.core.errors import Problem
 from amberbox.core.mode import FALSE, TRUE, UNKNOWN
+from amberbox.core.yaml_nodes import parse_yaml
 from amberbox.monitoring.modes import expected
 from amberbox.monitoring.modes.expected import Config
 from amberbox.testing.modes import assert_mode_contract, at_s, one_input

@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 
 from amberbox.core.clock import NS
-from amberbox.core.config import build, parse_yaml
+from amberbox.core.config import build
 from amberbox.core.errors import Problem
 from amberbox.core.expression import parse
 from amberbox.core.mode import FALSE, HOLD, TRUE, UNKNOWN, Input
+from amberbox.core.yaml_nodes import parse_yaml
 from amberbox.monitoring.modes import frozen
 from amberbox.monitoring.modes.frozen import Config
 from amberbox.testing.modes import assert_mode_contract, at_s, one_input
@@ -146,8 +147,8 @@ def test_real_wheels_move_and_one_cut_off_does_not(shared_data: Path, tmp_path: 
 def real_voltages(shared_data: Path, store: Path) -> tuple[Any, list[Any]]:
     """Return bus voltages of the four wheels of a real robot, and their times."""
     import amberbox
-    from amberbox.blackbox.formats.options import ReadOptions
-    from amberbox.blackbox.importing import import_recordings
+    from amberbox.blackbox.formats._recording import ReadOptions
+    from amberbox.blackbox.query.importing import import_recordings
 
     options = ReadOptions(messages=shared_data / "ropod/message_definitions")
     import_recordings([shared_data / "ropod/bb_test_data"], store, options=options, segments=False)

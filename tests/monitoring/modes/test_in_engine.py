@@ -12,22 +12,24 @@ import pytest
 
 from amberbox.core.clock import NS
 from amberbox.core.types import Batch, Column, ItemSchema, Level, Status
-from amberbox.monitoring.engine.engine import Engine
+from amberbox.monitoring.engine import Engine
 from amberbox.monitoring.modes import expected, frozen, heartbeat, state_bits
 from amberbox.monitoring.plan import (
     Expectation,
     InputPlan,
     MappingPlan,
     ModePlan,
+    MonitoringPlan,
     OutputPlan,
-    Plan,
 )
 from tests.monitoring.engine.plans import one, rows, seconds, variable
 
 ITEM = InputPlan("a", "item", "a")
 
 
-def plan(module: ModuleType, config: Any, entry: InputPlan, *, expects: bool = True) -> Plan:
+def plan(
+    module: ModuleType, config: Any, entry: InputPlan, *, expects: bool = True
+) -> MonitoringPlan:
     """Return a plan of one mode with its first result as output."""
     result = module.RESULTS[0]
     output = OutputPlan(result.name, "bool", result, place=0, expectation=Expectation(expects))
@@ -47,7 +49,7 @@ def run(engine: Engine, batches: Sequence[Batch], until_s: float) -> list[Any]:
     return list(engine.advance(round(until_s * NS)))
 
 
-def begun(of: Plan) -> Engine:
+def begun(of: MonitoringPlan) -> Engine:
     engine = Engine(of)
     engine.begin(0)
     return engine

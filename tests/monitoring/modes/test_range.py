@@ -7,7 +7,7 @@ from math import inf, nan
 import numpy as np
 import pytest
 
-from amberbox.core.expression_reason import variable_text
+from amberbox.core.expression import variable_text
 from amberbox.core.mode import FALSE, HOLD, TRUE, UNKNOWN, Given
 from amberbox.monitoring.modes import range as mode
 from amberbox.monitoring.modes.range import Config

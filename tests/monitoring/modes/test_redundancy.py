@@ -135,8 +135,8 @@ def test_what_means_nothing_is_refused(config: Config) -> None:
 def wheels(shared_data: Path, tmp_path: Path) -> dict[str, list[Input]]:
     """Read the four wheels of the real recording, a list of four inputs per variable."""
     import amberbox
-    from amberbox.blackbox.formats.options import ReadOptions
-    from amberbox.blackbox.importing import import_recordings
+    from amberbox.blackbox.formats._recording import ReadOptions
+    from amberbox.blackbox.query.importing import import_recordings
 
     options = ReadOptions(messages=shared_data / "ropod/message_definitions")
     import_recordings(

@@ -7,14 +7,15 @@ from math import nan
 import numpy as np
 import pytest
 
-from amberbox.core.config import build, parse_yaml
+from amberbox.core.config import build
 from amberbox.core.errors import Problem
 from amberbox.core.mode import FALSE, TRUE, UNKNOWN
+from amberbox.core.yaml_nodes import parse_yaml
 from amberbox.monitoring.modes import state_bits
-from amberbox.monitoring.modes.state_bits import Bit, Config
+from amberbox.monitoring.modes.state_bits import Config, StateBit
 from amberbox.testing.modes import assert_mode_contract, at_s, one_input
 
-WHEEL = Config({"enabled": 0, "e_stop": Bit(2, nominal=False)})
+WHEEL = Config({"enabled": 0, "e_stop": StateBit(2, nominal=False)})
 
 
 def test_contract() -> None:

@@ -68,7 +68,7 @@ def test_the_one_low_counter_among_182_real_samples_is_forgiven(
     shared_data: Path, tmp_path: Path
 ) -> None:
     import amberbox
-    from amberbox.blackbox.importing import import_recordings
+    from amberbox.blackbox.query.importing import import_recordings
 
     import_recordings([shared_data / "ropod/bb_test_data"], tmp_path, segments=False)
     with amberbox.open(tmp_path) as record:

@@ -14,7 +14,7 @@ import pytest
 
 from amberbox.core.errors import AmberboxError
 from amberbox.monitoring.probes.container import ask
-from amberbox.testing.patience import PATIENCE_S
+from amberbox.testing.clock import PATIENCE_S
 
 RUNNING = {"State": {"Status": "running", "Running": True}, "RestartCount": 2}
 SICK = {"State": {"Status": "running", "Health": {"Status": "unhealthy"}}, "RestartCount": 0}

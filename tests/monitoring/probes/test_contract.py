@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from amberbox.monitoring.probing.probe import known_probes, load_probe
+from amberbox.monitoring.probe_runner import known_probes, load_probe
 
-PAGE = (Path(__file__).parents[3] / "docs" / "probes.md").read_text(encoding="utf-8")
+PAGE = (Path(__file__).parents[3] / "docs" / "robot" / "probes.md").read_text(encoding="utf-8")
 PLUGINS = known_probes()
 NONSENSE = "/../ -no such thing- /.."
 
@@ -40,7 +40,7 @@ def test_nonsense_is_never_green_and_never_a_crash(kind: str) -> None:
     probe = load_probe(kind)
     assert 0 < probe.period_s <= 2, "inputs are stale after 5 s unless said otherwise"
     assert probe.timeout_s >= 1
-    row = probe.look(NONSENSE)
+    row = probe.measure_once(NONSENSE)
     assert list(row) == ["subject", "ok", "error", *probe.measures]
     assert row["ok"] is False or (row["ok"] is None and row["error"])
     assert "crashed" not in row["error"]

@@ -11,7 +11,7 @@ import pytest
 
 from amberbox.core.errors import UsageError
 from amberbox.monitoring.probes.http import measure
-from amberbox.testing.realros import free_port
+from tests.support.processes import free_port
 
 ASKED: list[str] = []
 

@@ -1,4 +1,4 @@
-"""What ``docs/probes.md`` shows works as it says: its own probe, its block for the box."""
+"""What ``docs/robot/probes.md`` shows works as it says: its own probe, its block for the box."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from amberbox.blackbox.folder.folder import load_folder
-from amberbox.monitoring.probing.probe import load_probe
+from amberbox.blackbox.robot_folder.folder import load_folder
+from amberbox.monitoring.probe_runner import load_probe
 
-PAGE = (Path(__file__).parents[3] / "docs" / "probes.md").read_text(encoding="utf-8")
+PAGE = (Path(__file__).parents[3] / "docs" / "robot" / "probes.md").read_text(encoding="utf-8")
 
 
 def example(language: str) -> str:
@@ -28,9 +28,9 @@ def test_the_probe_of_the_page_runs_from_a_robots_folder(tmp_path: Path) -> None
     (tmp_path / "probes" / "emergency_stop.py").write_text(written)
     probe = load_probe("emergency_stop", [tmp_path / "probes"])
     (inputs / "di3" / "value").write_text("1\n")
-    assert probe.look("di3") == {"subject": "di3", "ok": True, "error": "", "raw": 1}
+    assert probe.measure_once("di3") == {"subject": "di3", "ok": True, "error": "", "raw": 1}
     assert probe.period_s == 0.5
-    unknown = probe.look("di4")
+    unknown = probe.measure_once("di4")
     assert (unknown["ok"], unknown["raw"]) == (None, None)
     assert "No such file" in unknown["error"]
 

@@ -15,8 +15,8 @@ import pytest
 
 from amberbox.core.errors import AmberboxError, UsageError
 from amberbox.monitoring.probes.ping import by_program, echo_s, measure, repeated, split
-from amberbox.testing.patience import PATIENCE_S
-from amberbox.testing.realros import free_port
+from amberbox.testing.clock import PATIENCE_S
+from tests.support.processes import free_port
 
 IPUTILS = """\
 PING 192.168.1.7 (192.168.1.7) 56(84) bytes of data.

@@ -9,12 +9,12 @@ from xmlrpc.server import SimpleXMLRPCServer
 
 import pytest
 
-from amberbox.blackbox.ros1.settings import NoAnswerError
+from amberbox.blackbox.sources.ros1.master import RosNoAnswerError
 from amberbox.core.errors import UsageError
 from amberbox.monitoring.probes import ros_master, ros_node, ros_topic
 from amberbox.monitoring.probes._ros import settings_for
-from amberbox.testing.realros import free_port
-from amberbox.testing.rosnet import RosMaster
+from tests.support.processes import free_port
+from tests.support.ros_network import RosMaster
 
 
 @pytest.fixture
@@ -102,9 +102,9 @@ def test_a_master_that_answers_and_one_that_does_not(master: RosMaster) -> None:
 
 def test_without_a_master_nodes_and_topics_are_unknown() -> None:
     nowhere = f"127.0.0.1:{free_port()}"
-    with pytest.raises(NoAnswerError, match="refused"):
+    with pytest.raises(RosNoAnswerError, match="refused"):
         ros_topic.measure(f"/scan@{nowhere}")
-    with pytest.raises(NoAnswerError, match="refused"):
+    with pytest.raises(RosNoAnswerError, match="refused"):
         ros_node.measure(f"/laser@{nowhere}")
 
 

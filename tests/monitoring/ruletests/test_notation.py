@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from amberbox.core.errors import UsageError
-from amberbox.monitoring.ruletests.notation import ABSENT, Series, read_series
+from amberbox.monitoring.rule_tests import ABSENT, RuleTestSeries, read_series
 
 
 @pytest.mark.parametrize(
@@ -43,7 +43,7 @@ def test_nan_is_a_value() -> None:
 @pytest.mark.parametrize("text", ["drive", "5x", "x5", "'a'+1x3", "[1", "[a]", "5 x3", "true+1x2"])
 def test_what_cannot_be_read_is_named(text: str) -> None:
     with pytest.raises(UsageError, match="cannot read") as caught:
-        Series.from_text(text)
+        RuleTestSeries.from_text(text)
     assert "5x20" in caught.value.hint
 
 

@@ -8,18 +8,17 @@ from pathlib import Path
 import pytest
 
 from amberbox.core.errors import Problem
-from amberbox.monitoring.plan import Plan
-from amberbox.monitoring.ruletests.files import find_rules, read_rules
-from amberbox.monitoring.ruletests.running import run_rules
+from amberbox.monitoring.plan import MonitoringPlan
+from amberbox.monitoring.rule_tests import find_rule_tests, read_rule_tests, run_rule_tests
 
 FIXTURES = Path(__file__).parent / "fixtures"
-NOBODY = Plan("", "")
+NOBODY = MonitoringPlan("", "")
 
 
 def _problems(path: Path) -> list[Problem]:
     problems: list[Problem] = []
-    rules = read_rules(path, path.name, path.parent, problems)
-    return problems if rules is None else run_rules(rules, NOBODY)
+    rules = read_rule_tests(path, path.name, path.parent, problems)
+    return problems if rules is None else run_rule_tests(rules, NOBODY)
 
 
 @pytest.mark.parametrize("path", sorted(FIXTURES.glob("*.good.yaml")), ids=lambda path: path.name)
@@ -52,6 +51,6 @@ def test_files_are_found_below_a_folder_but_not_in_the_record(tmp_path: Path) ->
     (tmp_path / "components" / "deep" / "cooler.test.yaml").write_text(good)
     (tmp_path / "components" / "broken.test.yaml").write_text("tests: [")
     (tmp_path / "store" / "copy.test.yaml").write_text(good)
-    found = find_rules(tmp_path, skip=tmp_path / "store")
+    found = find_rule_tests(tmp_path, skip=tmp_path / "store")
     assert [Path(rules.node.file).name for rules in found.rules] == ["cooler.test.yaml"]
     assert [Path(problem.file).name for problem in found.problems] == ["broken.test.yaml"]

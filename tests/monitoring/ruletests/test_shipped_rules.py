@@ -6,15 +6,14 @@ from pathlib import Path
 
 import pytest
 
-import amberbox.monitoring.modes
 from amberbox.core.errors import Problem
 from amberbox.core.plugins import find
-from amberbox.monitoring.plan import Plan
-from amberbox.monitoring.ruletests.files import read_rules
-from amberbox.monitoring.ruletests.running import run_rules
+from amberbox.monitoring import modes
+from amberbox.monitoring.plan import MonitoringPlan
+from amberbox.monitoring.rule_tests import read_rule_tests, run_rule_tests
 
-FOLDER = Path(amberbox.monitoring.modes.__path__[0]) / "rules"
-NOBODY = Plan("", "")
+FOLDER = Path(modes.__path__[0]) / "rules"
+NOBODY = MonitoringPlan("", "")
 
 
 MODES = find("amberbox.monitoring.modes", defines=("Config", "evaluate"))
@@ -23,15 +22,15 @@ MODES = find("amberbox.monitoring.modes", defines=("Config", "evaluate"))
 @pytest.mark.parametrize("path", sorted(FOLDER.glob("*.test.yaml")), ids=lambda path: path.stem)
 def test_modes_pass_their_rules(path: Path) -> None:
     problems: list[Problem] = []
-    rules = read_rules(path, path.name, FOLDER, problems)
+    rules = read_rule_tests(path, path.name, FOLDER, problems)
     assert rules is not None, problems
-    assert run_rules(rules, NOBODY) == []
+    assert run_rule_tests(rules, NOBODY) == []
 
 
 def test_every_mode_has_rules() -> None:
     tested = set()
     for path in FOLDER.glob("*.test.yaml"):
-        rules = read_rules(path, path.name, FOLDER, [])
+        rules = read_rule_tests(path, path.name, FOLDER, [])
         assert rules is not None and rules.mode is not None
         tested.add((rules.mode.mapping or {})["monitor"].text)
     assert tested == set(MODES)

@@ -14,18 +14,17 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from amberbox.blackbox.follow import read
-from amberbox.blackbox.journal import reserved
+from amberbox.blackbox.journal import channels as journal_channels
 from amberbox.blackbox.recorder.pipeline import PipelineOptions
-from amberbox.blackbox.store import open_store
+from amberbox.blackbox.store import journal_reader
+from amberbox.blackbox.store.store import open_store
 from amberbox.core.clock import NS
 from amberbox.core.mode import Input, Result
 from amberbox.core.probe import ProbeOrder
 from amberbox.core.samples import Now
 from amberbox.core.source import TopicOptions
 from amberbox.core.types import Schema, Topic
-from amberbox.monitoring.engine.findings import Finding
-from amberbox.monitoring.messages.records import encoded
+from amberbox.monitoring.findings import Finding, encoded
 from amberbox.monitoring.plan import (
     ComponentPlan,
     DependencyPlan,
@@ -33,14 +32,13 @@ from amberbox.monitoring.plan import (
     InputPlan,
     MappingPlan,
     ModePlan,
+    MonitoringPlan,
     OutputPlan,
-    Plan,
 )
-from amberbox.monitoring.watcher.diagnosing import MakeDiagnoser
-from amberbox.monitoring.watcher.replay import replay
-from amberbox.monitoring.watcher.watcher import Watch, Watcher
-from amberbox.testing.box import ManualBox
+from amberbox.monitoring.record_evaluation import MakeDiagnoser, replay
+from amberbox.monitoring.watcher import RecordWatcher, WatcherSetup
 from amberbox.testing.clock import ManualClock
+from tests.support.manual_recorder import ManualBox
 
 VALUE = Schema("std_msgs/Float64", "ros1msg", b"float64 data\n")
 NUMBERS = {keep: Topic(f"/{keep}", "ros1", VALUE) for keep in ("main", "bulk", "ring")}
@@ -89,10 +87,10 @@ def variable(item: str) -> InputPlan:
     return InputPlan(f"{item}.data", "variable", item, "data")
 
 
-def plan_of(*more: ComponentPlan, config_hash: str = "hash") -> Plan:
+def plan_of(*more: ComponentPlan, config_hash: str = "hash") -> MonitoringPlan:
     probe = InputPlan(PROBE.subject, "probe", PROBE.item, "ok", probe=PROBE)
     back = {"history_s": lambda config: 1.0, "TIMED": True}
-    return Plan("robot", config_hash, [
+    return MonitoringPlan("robot", config_hash, [
         component("base", positive, variable("ros_main")),
         component("arm", steady, variable("ros_bulk"), "base", **back),
         component("eye", positive, variable("ros_ring"), "arm"),
@@ -132,25 +130,25 @@ class Stand:
         self.clock.advance(self.random.uniform(0.1, 2))
         self.box = self._box(self.random.choice([1.0, 600.0]))
 
-    def watcher(self, plan: Plan | None = None) -> Watcher:
+    def watcher(self, plan: MonitoringPlan | None = None) -> RecordWatcher:
         """Begin to watch; probes are not run, ``measured`` gives their rows."""
-        return Watcher(self.watch(plan))
+        return RecordWatcher(self.watch(plan))
 
-    def watch(self, plan: Plan | None = None) -> Watch:
+    def watch(self, plan: MonitoringPlan | None = None) -> WatcherSetup:
         store, diagnoser = open_store(self.path), self.diagnoser
-        return Watch(
+        return WatcherSetup(
             plan or plan_of(), store, clock=self.clock, clock_s=self.clock_s, diagnoser=diagnoser
         )
 
     def clock_s(self) -> float:
         return self.clock.boot / NS
 
-    def replayed(self, plan: Plan | None = None) -> list[bytes]:
+    def replayed(self, plan: MonitoringPlan | None = None) -> list[bytes]:
         store, diagnoser = open_store(self.path), self.diagnoser
         return [line_of(f) for f in replay(plan or plan_of(), store, diagnoser=diagnoser)]
 
 
-def kill(watcher: Watcher) -> None:
+def kill(watcher: RecordWatcher) -> None:
     """Leave what a watcher has written as ``kill -9`` does."""
     watcher._lock.release()
 
@@ -173,13 +171,13 @@ def values_of(lines: list[bytes], channel: str) -> list[dict[str, object]]:
 
 def _written(store: Path) -> Iterator[tuple[bytes, bool]]:
     channels = (
-        *(reserved.STATUS, reserved.EVENT, reserved.ALARM),
-        *(reserved.SYMPTOM, reserved.DIAGNOSIS),
+        *(journal_channels.STATUS, journal_channels.EVENT, journal_channels.ALARM),
+        *(journal_channels.SYMPTOM, journal_channels.DIAGNOSIS),
     )
-    for journal in read.files_of(open_store(store), "watch"):
+    for journal in journal_reader.files_of(open_store(store), "watch"):
         names = {n: s.topic.name for n, s in journal.streams.items()}
         wanted = [number for number, name in names.items() if name in channels]
-        for chunk in read.sound_chunks(journal):
+        for chunk in journal_reader.sound_chunks(journal):
             rows = np.flatnonzero(np.isin(chunk.channel, wanted))
             for number, data in zip(chunk.channel[rows], chunk.messages(rows), strict=True):
                 values = msgspec.json.decode(data)
@@ -188,7 +186,7 @@ def _written(store: Path) -> Iterator[tuple[bytes, bool]]:
                 yield names[int(number)].encode() + b" " + data, is_live
 
 
-def run_for(watcher: Watcher, stop: threading.Event, seconds: float) -> None:
+def run_for(watcher: RecordWatcher, stop: threading.Event, seconds: float) -> None:
     """Run a watcher for a while, in this thread."""
     timer = threading.Timer(seconds, stop.set)
     timer.start()

@@ -12,14 +12,12 @@ from typing import Any
 import pytest
 
 from amberbox.blackbox.journal.writer import JournalOptions
-from amberbox.blackbox.requests import FOLDER, pending, submit
-from amberbox.blackbox.store import open_store
+from amberbox.blackbox.store.store import REQUESTS, open_store, pending, submit
 from amberbox.core.clock import NS
 from amberbox.core.types import Status
-from amberbox.monitoring.plan import ComponentPlan, Plan
-from amberbox.monitoring.watcher.standing import CHANGED, standing_in
-from amberbox.monitoring.watcher.watcher import Watcher
-from amberbox.testing.box import events
+from amberbox.monitoring.plan import ComponentPlan, MonitoringPlan
+from amberbox.monitoring.watcher import RecordWatcher
+from amberbox.monitoring.watcher_journal import CHANGED, retained_findings
 from tests.monitoring.watcher.stand import (
     NUMBERS,
     Stand,
@@ -31,10 +29,11 @@ from tests.monitoring.watcher.stand import (
     variable,
     written,
 )
+from tests.support.manual_recorder import events
 
 
-def only(*parts: ComponentPlan, config_hash: str = "hash") -> Plan:
-    return Plan("robot", config_hash, list(parts))
+def only(*parts: ComponentPlan, config_hash: str = "hash") -> MonitoringPlan:
+    return MonitoringPlan("robot", config_hash, list(parts))
 
 
 def base() -> ComponentPlan:
@@ -45,7 +44,7 @@ def arm() -> ComponentPlan:
     return component("arm", positive, variable("ros_bulk"))
 
 
-def live(stand: Stand, watcher: Watcher, ticks: int, value: float) -> None:
+def live(stand: Stand, watcher: RecordWatcher, ticks: int, value: float) -> None:
     for _ in range(ticks):
         for topic in NUMBERS.values():
             stand.box.hear(topic, struct.pack("<d", value))
@@ -53,7 +52,7 @@ def live(stand: Stand, watcher: Watcher, ticks: int, value: float) -> None:
         watcher.step()
 
 
-def begun(stand: Stand, plan: Plan, value: float = -1.0) -> Watcher:
+def begun(stand: Stand, plan: MonitoringPlan, value: float = -1.0) -> RecordWatcher:
     """Watch something that has failed."""
     stand.box.write(0.1)
     watcher = stand.watcher(plan)
@@ -67,7 +66,9 @@ def states(stand: Stand) -> dict[str, str]:
     alarms = [*values_of(written(stand.path), "amberbox/alarm")]
     alarms += values_of(written(stand.path, live_only=True), "amberbox/alarm")
     newest = {str(a["component"]): a for a in sorted(alarms, key=lambda a: str(a["changed_ns"]))}
-    lasting = {a.component: a.state for a in standing_in(open_store(stand.path)).alarms.values()}
+    lasting = {
+        a.component: a.state for a in retained_findings(open_store(stand.path)).alarms.values()
+    }
     return {name: lasting.get(name, "healed") for name in newest}
 
 
@@ -118,7 +119,7 @@ def test_a_new_file_has_the_alarms_that_last(
 ) -> None:
     """Older ones may be deleted, the watcher ended or killed: nothing is forgotten."""
     options = partial(JournalOptions, rotate_ns=2 * NS)
-    monkeypatch.setattr("amberbox.blackbox.keeper.ownjournal.JournalOptions", options)
+    monkeypatch.setattr("amberbox.blackbox.store.derived_journal.JournalOptions", options)
     stand = Stand(tmp_path / "store")
     watcher = begun(stand, only(base()))
     store = open_store(stand.path)
@@ -127,15 +128,15 @@ def test_a_new_file_has_the_alarms_that_last(
     assert len(old) > 1
     for path in old:
         path.unlink()
-    (before,) = standing_in(store).alarms.values()
+    (before,) = retained_findings(store).alarms.values()
     assert (before.component, before.state) == ("base", "open")
-    for leave in (Watcher.close, kill):
+    for leave in (RecordWatcher.close, kill):
         leave(watcher)
         watcher = stand.watcher(only(base()))
         live(stand, watcher, 5, -1.0)
     watcher.close()
     newest.unlink()
-    assert standing_in(store).alarms == {before.id: before}
+    assert retained_findings(store).alarms == {before.id: before}
 
 
 class Ear:
@@ -154,7 +155,7 @@ class Ear:
         pass
 
 
-def levels(stand: Stand, watcher: Watcher, monkeypatch: pytest.MonkeyPatch) -> set[str]:
+def levels(stand: Stand, watcher: RecordWatcher, monkeypatch: pytest.MonkeyPatch) -> set[str]:
     ear = Ear()
     monkeypatch.setattr(watcher, "_publisher", ear)
     watcher.step()
@@ -189,7 +190,7 @@ def test_a_request_that_cannot_be_done_is_said(tmp_path: Path) -> None:
     live(stand, watcher, 5, 1.0)
     watcher.close()
     assert pending(store) == []
-    assert len(list((store.path / FOLDER).glob("*.refused"))) == 2
+    assert len(list((store.path / REQUESTS).glob("*.refused"))) == 2
     refused, *broken = sorted((e["text"] for e in events(stand.path, "alarm_refused")), key=len)
     assert "there is no alarm 'no-such'" in refused
     assert all("is no time" in text for text in broken) and len(broken) == 2
@@ -204,7 +205,7 @@ def stuck(config: Any, results: Any) -> str:
 def test_an_explanation_that_hangs_is_done_without(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("amberbox.monitoring.watcher.guard.LIMIT_S", 0.1)
+    monkeypatch.setattr("amberbox.monitoring.record_evaluation.LIMIT_S", 0.1)
     stand = Stand(tmp_path / "store")
     for _ in range(20):
         stand.box.hear(NUMBERS["main"], struct.pack("<d", -1.0))

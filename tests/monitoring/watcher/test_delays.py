@@ -10,31 +10,30 @@ from pathlib import Path
 import msgspec
 import pytest
 
-import amberbox.sim
-from amberbox.blackbox.folder.folder import load_folder
-from amberbox.blackbox.recorder.pipeline import PipelineOptions
-from amberbox.blackbox.recorder.stalls import StallMeter
-from amberbox.blackbox.store import open_store
+from amberbox import sim
+from amberbox.blackbox.recorder.pipeline import PipelineOptions, StallMeter
+from amberbox.blackbox.robot_folder.folder import load_folder
+from amberbox.blackbox.store.store import open_store
 from amberbox.core.clock import NS
 from amberbox.core.types import Status
-from amberbox.monitoring.configuration import load_plan
-from amberbox.monitoring.plan import Plan
-from amberbox.monitoring.watcher.replay import replay
-from amberbox.monitoring.watcher.watcher import Watch, Watcher
+from amberbox.monitoring.plan import MonitoringPlan
+from amberbox.monitoring.plan_loader import load_plan
+from amberbox.monitoring.record_evaluation import replay
+from amberbox.monitoring.watcher import RecordWatcher, WatcherSetup
 from amberbox.sim.robot import Robot
 from amberbox.sim.topics import TOPICS
-from amberbox.testing.box import ManualBox
 from amberbox.testing.clock import ManualClock
 from tests.fuzzing import examples, fuzz
 from tests.monitoring.watcher.stand import kill, line_of, written
+from tests.support.manual_recorder import ManualBox
 
 WATCHED = {"host", "imu", "laser_front", "localisation", "odometry", "wheel_front_left"}
 """Components of the robot whose modes look at silence, rates, jumps, means and frozen values."""
 
 
 @pytest.fixture(scope="module")
-def plan(tmp_path_factory: pytest.TempPathFactory) -> Plan:
-    source = Path(amberbox.sim.__file__).parent / "folder"
+def plan(tmp_path_factory: pytest.TempPathFactory) -> MonitoringPlan:
+    source = Path(sim.__file__).parent / "folder"
     folder = tmp_path_factory.mktemp("robot") / "robot"
     folder.mkdir()
     (folder / "robot.yaml").write_text("id: robot\n")
@@ -51,7 +50,7 @@ class Scene:
     """A healthy simulated robot, a recorder that can be held up, and a watcher beside it."""
 
     path: Path
-    plan: Plan
+    plan: MonitoringPlan
     seed: int = 7
     clock: ManualClock = field(default_factory=ManualClock)
     silent: frozenset[str] = frozenset()
@@ -100,10 +99,10 @@ class Scene:
         self.write()
         self.meter.beat()
 
-    def watcher(self) -> Watcher:
+    def watcher(self) -> RecordWatcher:
         store = open_store(self.path)
-        return Watcher(
-            Watch(self.plan, store, clock=self.clock, clock_s=lambda: self.clock.boot / NS)
+        return RecordWatcher(
+            WatcherSetup(self.plan, store, clock=self.clock, clock_s=lambda: self.clock.boot / NS)
         )
 
     def replayed(self) -> list[bytes]:
@@ -120,7 +119,9 @@ class Scene:
 
 @fuzz
 @pytest.mark.parametrize("seed", range(examples(1)))
-def test_delays_of_the_watcher_change_nothing(tmp_path: Path, plan: Plan, seed: int) -> None:
+def test_delays_of_the_watcher_change_nothing(
+    tmp_path: Path, plan: MonitoringPlan, seed: int
+) -> None:
     """It is stopped for any time, killed, and catches up; the recorder is held up meanwhile."""
     rng = random.Random(seed)
     scene = Scene(tmp_path / "store", plan, seed)
@@ -143,7 +144,7 @@ def test_delays_of_the_watcher_change_nothing(tmp_path: Path, plan: Plan, seed: 
     assert live == scene.replayed()
 
 
-def test_a_recorder_that_is_held_up_invents_no_faults(tmp_path: Path, plan: Plan) -> None:
+def test_a_recorder_that_is_held_up_invents_no_faults(tmp_path: Path, plan: MonitoringPlan) -> None:
     """All that the robot sent meanwhile is received at once, with the same stamp."""
     scene = Scene(tmp_path / "store", plan)
     for seconds in (0.2, 0.7, 25.0):
@@ -156,7 +157,7 @@ def test_a_recorder_that_is_held_up_invents_no_faults(tmp_path: Path, plan: Plan
     assert scene.bad() == set()
 
 
-def test_what_is_silent_after_a_stall_is_found(tmp_path: Path, plan: Plan) -> None:
+def test_what_is_silent_after_a_stall_is_found(tmp_path: Path, plan: MonitoringPlan) -> None:
     scene = Scene(tmp_path / "store", plan)
     for _ in scene.go_on(2.5):
         pass

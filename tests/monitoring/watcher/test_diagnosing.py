@@ -11,21 +11,24 @@ from typing import Any
 import pytest
 
 from amberbox.blackbox.journal.writer import JournalOptions
-from amberbox.blackbox.requests import submit
-from amberbox.blackbox.store import open_store
+from amberbox.blackbox.store.store import open_store, submit
 from amberbox.core.clock import NS
 from amberbox.core.types import Diagnosis, Symptom
-from amberbox.monitoring.engine.engine import Engine
-from amberbox.monitoring.engine.findings import AlarmChange
-from amberbox.monitoring.plan import Plan
-from amberbox.monitoring.watcher.diagnosing import PART, Diagnosing
-from amberbox.monitoring.watcher.evaluation import Evaluation
-from amberbox.monitoring.watcher.instants import instant_of
-from amberbox.monitoring.watcher.reader import Block
-from amberbox.monitoring.watcher.replay import Part, blocks, newest, replay
-from amberbox.monitoring.watcher.standing import Left, standing_in
-from amberbox.monitoring.watcher.watcher import Watcher
-from amberbox.testing.box import events
+from amberbox.monitoring.engine import Engine
+from amberbox.monitoring.findings import AlarmChange, instant_of
+from amberbox.monitoring.plan import MonitoringPlan
+from amberbox.monitoring.record_evaluation import (
+    PART,
+    DiagnosedEngine,
+    RecordEvaluation,
+    ReplayOptions,
+    blocks,
+    end_of_record,
+    replay,
+)
+from amberbox.monitoring.record_reader import RecordBlock
+from amberbox.monitoring.watcher import RecordWatcher
+from amberbox.monitoring.watcher_journal import RetainedFindings, retained_findings
 from tests.monitoring.watcher.diagnoser import ITEM, NEGATIVE, PlainDiagnoser
 from tests.monitoring.watcher.stand import (
     NUMBERS,
@@ -40,14 +43,15 @@ from tests.monitoring.watcher.stand import (
     variable,
     written,
 )
+from tests.support.manual_recorder import events
 
 
 def stand_of(path: Path, seed: int) -> Stand:
     return Stand(path / "store", seed, diagnoser=PlainDiagnoser)
 
 
-def base_only(config_hash: str = "hash") -> Plan:
-    return Plan("robot", config_hash, [component("base", positive, variable("ros_main"))])
+def base_only(config_hash: str = "hash") -> MonitoringPlan:
+    return MonitoringPlan("robot", config_hash, [component("base", positive, variable("ros_main"))])
 
 
 def say(stand: Stand, ticks: int, main: float, bulk: float = 1.0) -> None:
@@ -57,7 +61,7 @@ def say(stand: Stand, ticks: int, main: float, bulk: float = 1.0) -> None:
         stand.box.write(0.1)
 
 
-def live(stand: Stand, watcher: Watcher, ticks: int, main: float) -> None:
+def live(stand: Stand, watcher: RecordWatcher, ticks: int, main: float) -> None:
     for _ in range(ticks):
         say(stand, 1, main)
         watcher.step()
@@ -112,19 +116,19 @@ def test_items_that_only_conditions_read_are_read(tmp_path: Path) -> None:
     (negative,) = [one for one in found if isinstance(one, Symptom) and one.id == NEGATIVE]
     assert negative.state == "present"
     assert list(map(instant_of, found)) == sorted(map(instant_of, found))
-    last = newest(base_only(), open_store(stand.path), PlainDiagnoser)
+    last = end_of_record(base_only(), open_store(stand.path), PlainDiagnoser)
     assert last.diagnosis is not None
     assert last.diagnosis.symptoms == (NEGATIVE,)
-    assert newest(base_only(), open_store(stand.path)).diagnosis is None
+    assert end_of_record(base_only(), open_store(stand.path)).diagnosis is None
 
 
-def pieces_of(block: Block, stand: Stand) -> list[Block]:
+def pieces_of(block: RecordBlock, stand: Stand) -> list[RecordBlock]:
     """Cut a block into some: the rows come with the first."""
     cuts = sorted(stand.random.uniform(block.start_ns, block.until_ns) for _ in range(4))
     ends = [*(round(cut) for cut in cuts), block.until_ns]
     first, *others = ends
-    head = Block(block.epoch, block.start_ns, block.batches, first)
-    return [head, *(Block(block.epoch, block.start_ns, [], end) for end in others)]
+    head = RecordBlock(block.epoch, block.start_ns, block.batches, first)
+    return [head, *(RecordBlock(block.epoch, block.start_ns, [], end) for end in others)]
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -134,9 +138,9 @@ def test_how_calls_are_split_does_not_matter(tmp_path: Path, seed: int) -> None:
         stand.tick()
     stand.box.close()
     store = open_store(stand.path)
-    engine = Diagnosing(Engine(plan_of()), PlainDiagnoser())
-    evaluation, found = Evaluation(engine), []
-    for block in blocks(plan_of(), store, engine, Part()):
+    engine = DiagnosedEngine(Engine(plan_of()), PlainDiagnoser())
+    evaluation, found = RecordEvaluation(engine), []
+    for block in blocks(plan_of(), store, engine, ReplayOptions()):
         for piece in pieces_of(block, stand):
             found += [line_of(f) for new in evaluation.take(piece) for f in new]
     assert any(b"amberbox/diagnosis" in line for line in found)
@@ -168,17 +172,17 @@ def test_a_snapshot_without_diagnosis_begins_it_anew(tmp_path: Path) -> None:
     stand = stand_of(tmp_path, 1)
     say(stand, 20, -1.0)
     stand.box.close()
-    engine = Diagnosing(Engine(base_only()), PlainDiagnoser())
-    evaluation = Evaluation(engine)
-    for block in blocks(base_only(), open_store(stand.path), engine, Part()):
+    engine = DiagnosedEngine(Engine(base_only()), PlainDiagnoser())
+    evaluation = RecordEvaluation(engine)
+    for block in blocks(base_only(), open_store(stand.path), engine, ReplayOptions()):
         assert list(evaluation.take(block))
     assert engine.diagnosis is not None
     held = engine.snapshot()
-    again = Diagnosing(Engine(base_only()), PlainDiagnoser())
+    again = DiagnosedEngine(Engine(base_only()), PlainDiagnoser())
     again.resume(held)
     assert again.snapshot() == held
     del held[PART]
-    older = Diagnosing(Engine(base_only()), PlainDiagnoser())
+    older = DiagnosedEngine(Engine(base_only()), PlainDiagnoser())
     older.resume(held)
     assert older.diagnosis is None
     assert [alarm.cause for alarm in older.alarms()] == [""]
@@ -201,7 +205,7 @@ def test_other_monitors_close_what_the_ones_before_left_open(tmp_path: Path) -> 
     (over,) = channel(stand, "diagnosis", live_only=True)
     assert (over["id"], over["state"], over["revision"]) == (opened["id"], "healed", 2)
     assert over["at_ns"] > opened["at_ns"]
-    (alarm,) = standing_in(open_store(stand.path)).alarms.values()
+    (alarm,) = retained_findings(open_store(stand.path)).alarms.values()
     assert (alarm.state, alarm.cause, alarm.diagnosis) == ("open", "", "")
 
 
@@ -219,7 +223,7 @@ def test_a_diagnosis_that_new_monitors_make_in_silence_is_written(tmp_path: Path
     *_, now = channel(stand, "diagnosis", live_only=True)
     assert now["state"] == "open"
     assert now["hypotheses"][0]["faults"] == ["base#broken"]
-    (alarm,) = standing_in(open_store(stand.path)).alarms.values()
+    (alarm,) = retained_findings(open_store(stand.path)).alarms.values()
     assert (alarm.state, alarm.diagnosis) == ("open", now["id"])
 
 
@@ -227,7 +231,7 @@ def test_each_file_begins_with_the_open_diagnosis_and_the_causes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     options = partial(JournalOptions, rotate_ns=2 * NS)
-    monkeypatch.setattr("amberbox.blackbox.keeper.ownjournal.JournalOptions", options)
+    monkeypatch.setattr("amberbox.blackbox.store.derived_journal.JournalOptions", options)
     stand = stand_of(tmp_path, 1)
     say(stand, 1, 1.0)
     watcher = stand.watcher(base_only())
@@ -237,7 +241,7 @@ def test_each_file_begins_with_the_open_diagnosis_and_the_causes(
     assert len(old) > 1
     for path in old:
         path.unlink()
-    before = standing_in(store)
+    before = retained_findings(store)
     (diagnosis,) = before.diagnoses.values()
     (alarm,) = before.alarms.values()
     assert (alarm.cause, alarm.diagnosis) == ("base#broken (very likely)", diagnosis.id)
@@ -246,7 +250,7 @@ def test_each_file_begins_with_the_open_diagnosis_and_the_causes(
     live(stand, watcher, 5, -1.0)
     live(stand, watcher, 10, 1.0)
     watcher.close()
-    assert standing_in(store).diagnoses == {}
+    assert retained_findings(store).diagnoses == {}
     assert channel(stand, "diagnosis")[-1]["state"] == "healed"
 
 
@@ -255,14 +259,14 @@ def test_what_people_said_stays_when_the_cause_comes(tmp_path: Path) -> None:
     say(stand, 1, 1.0)
     watcher = stand.watcher(base_only())
     live(stand, watcher, 20, -1.0)
-    (known,) = standing_in(open_store(stand.path)).alarms.values()
+    (known,) = retained_findings(open_store(stand.path)).alarms.values()
     request = {"action": "acknowledge", "id": known.id, "who": "anna"}
     submit(open_store(stand.path), "alarm", request)
     live(stand, watcher, 5, -1.0)
     for _ in range(10):
         say(stand, 1, -1.0, -1.0)
         watcher.step()
-    (alarm,) = standing_in(open_store(stand.path)).alarms.values()
+    (alarm,) = retained_findings(open_store(stand.path)).alarms.values()
     assert (alarm.state, alarm.who) == ("acknowledged", "anna")
     assert alarm.cause == "base#broken (very likely)"
     stand.box.close()
@@ -298,7 +302,7 @@ def test_a_diagnosis_that_fails_is_over_and_the_monitors_go_on(tmp_path: Path) -
     }
     (first,) = channel(stand, "diagnosis")
     assert channel(stand, "diagnosis", live_only=True)[-1]["id"] == first["id"]
-    assert standing_in(open_store(stand.path)) == Left()
+    assert retained_findings(open_store(stand.path)) == RetainedFindings()
     assert channel(stand, "alarm")[-1]["state"] == "healed"
     with pytest.raises(ZeroDivisionError):
         stand.replayed(base_only())

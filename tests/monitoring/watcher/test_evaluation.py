@@ -2,51 +2,39 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
 import pytest
 
-from amberbox.core.types import Batch, Status
-from amberbox.monitoring.engine.findings import Finding
-from amberbox.monitoring.engine.states import States
-from amberbox.monitoring.plan import Plan
-from amberbox.monitoring.watcher.epoch import Epoch
-from amberbox.monitoring.watcher.evaluation import Evaluation
-from amberbox.monitoring.watcher.memory import Checkpoint, Memory, Place
-from amberbox.monitoring.watcher.reader import Block
-from tests.monitoring.watcher.test_causes import alarm
+from amberbox.monitoring.engine import Engine
+from amberbox.monitoring.findings import Finding
+from amberbox.monitoring.plan import MonitoringPlan
+from amberbox.monitoring.record_evaluation import DiagnosedEngine, RecordEvaluation
+from amberbox.monitoring.record_reader import RecordBlock
+from amberbox.monitoring.watcher_journal import (
+    Checkpoint,
+    EvaluatedPosition,
+    RecordEpoch,
+    RecoveredProgress,
+)
+from tests.monitoring.watcher.test_alarm_causes import alarm
 
-EPOCH = Epoch(1, 0)
+EPOCH = RecordEpoch(1, 0)
 FIRST, SECOND, THIRD = alarm("a"), alarm("b"), alarm("c")
 SAID = replace(FIRST, state="acknowledged", live_only=True)
 
 
-class Told:
+class Told(Engine):
     """An engine that finds what it is told, block by block."""
 
-    items: frozenset[str] = frozenset()
-    history_s = 0.0
-
-    def __init__(self, *found: Sequence[Finding]) -> None:
+    def __init__(self, *found: list[Finding]) -> None:
+        super().__init__(MonitoringPlan("robot", "hash", []))
         self.found = list(found)
-        self.states = States(Plan("robot", "hash", []))
 
-    def begin(self, at_ns: int) -> None:
-        """Begin nothing."""
-
-    def feed(self, batch: Batch) -> None:
-        """Take nothing."""
-
-    def advance(self, until_ns: int) -> Sequence[Finding]:
+    def advance(self, until_ns: int) -> list[Finding]:
         return self.found.pop(0)
-
-    def statuses(self) -> Sequence[Status]:
-        return []
-
-    def snapshot(self) -> dict[str, Any]:
-        return {}
 
     def resume(self, snapshot: Mapping[str, Any]) -> None:
         """Know all."""
@@ -63,9 +51,9 @@ class Told:
 )
 def test_what_people_said_is_not_counted(written: int, left: list[list[Finding]]) -> None:
     """A replay does not find it, so the count of what was written leaves it out."""
-    place = Place(EPOCH, 100)
-    memory = Memory(place, Checkpoint(place, {}, 0.0, {"known": 1}), written)
-    evaluation = Evaluation(Told([FIRST, SAID, SECOND], [THIRD]), memory)
-    blocks = [Block(EPOCH, 0, [], until_ns) for until_ns in (200, 300)]
+    place = EvaluatedPosition(EPOCH, 100)
+    memory = RecoveredProgress(place, Checkpoint(place, {}, 0.0, {"known": 1}), written)
+    evaluation = RecordEvaluation(DiagnosedEngine(Told([FIRST, SAID, SECOND], [THIRD])), memory)
+    blocks = [RecordBlock(EPOCH, 0, [], until_ns) for until_ns in (200, 300)]
     assert [new for block in blocks for new in evaluation.take(block)] == left
     assert evaluation.has_caught_up

@@ -10,36 +10,36 @@ from types import FrameType
 
 import pytest
 
-from amberbox.blackbox.store import WriterLock, create_store
+from amberbox.blackbox.store.store import WriterLock, create_store
 from amberbox.core.clock import NS
-from amberbox.monitoring.messages.board import BoardReader
-from amberbox.monitoring.messages.pulse import (
+from amberbox.monitoring.current_state import (
+    STARTING_NS,
     STATE_FILE,
-    Pulse,
-    monitoring_of,
-    write_pulse,
+    CurrentStateReader,
+    EvaluationLateness,
+    WatcherHeartbeat,
+    read_heartbeat,
+    write_heartbeat,
 )
-from amberbox.monitoring.watcher.evaluation import Evaluation
-from amberbox.monitoring.watcher.guard import HangError, _Guard
-from amberbox.monitoring.watcher.lateness import STARTING_NS, Lateness
+from amberbox.monitoring.record_evaluation import HangError, RecordEvaluation, _Guard
 from amberbox.testing.clock import ManualClock
 from tests.monitoring.watcher.stand import Stand, values_of, written
 
 
 def test_states_of_monitoring(tmp_path: Path) -> None:
     store, clock = create_store(tmp_path / "store"), ManualClock()
-    assert monitoring_of(store, clock) == Pulse("absent")
+    assert read_heartbeat(store, clock) == WatcherHeartbeat("absent")
     lock = WriterLock(store, "watch")
-    assert monitoring_of(store, clock) == Pulse("running")  # it says nothing yet
-    write_pulse(store, clock, 0.1)
-    assert monitoring_of(store, clock) == Pulse("running", 0.1)
-    write_pulse(store, clock, 12.5)
-    assert monitoring_of(store, clock) == Pulse("overloaded", 12.5)
+    assert read_heartbeat(store, clock) == WatcherHeartbeat("running")  # it says nothing yet
+    write_heartbeat(store, clock, 0.1)
+    assert read_heartbeat(store, clock) == WatcherHeartbeat("running", 0.1)
+    write_heartbeat(store, clock, 12.5)
+    assert read_heartbeat(store, clock) == WatcherHeartbeat("overloaded", 12.5)
     clock.advance(25.0)
     clock.step(-3600.0)
-    assert monitoring_of(store, clock) == Pulse("silent", 25.0)
+    assert read_heartbeat(store, clock) == WatcherHeartbeat("silent", 25.0)
     lock.release()
-    assert monitoring_of(store, clock) == Pulse("absent")
+    assert read_heartbeat(store, clock) == WatcherHeartbeat("absent")
 
 
 @pytest.mark.parametrize(
@@ -50,11 +50,11 @@ def test_sign_of_life_of_a_watcher_before_says_nothing(
 ) -> None:
     store, clock = create_store(tmp_path / "store"), ManualClock()
     lock = WriterLock(store, "watch")
-    write_pulse(store, clock, 40.0)
+    write_heartbeat(store, clock, 40.0)
     values = json.loads((store.path / STATE_FILE).read_text())
     assert values["pid"] == os.getpid()
     (store.path / STATE_FILE).write_text(json.dumps(values | change))
-    assert monitoring_of(store, clock) == Pulse("running")
+    assert read_heartbeat(store, clock) == WatcherHeartbeat("running")
     lock.release()
 
 
@@ -62,7 +62,7 @@ def test_sign_of_life_does_not_wait_for_the_evaluation(tmp_path: Path) -> None:
     """The thread writes while nothing is evaluated; a look that goes on makes it late."""
     store, clock = create_store(tmp_path / "store"), ManualClock()
     lock = WriterLock(store, "watch")
-    lateness = Lateness(store, clock)
+    lateness = EvaluationLateness(store, clock)
     lateness.began()
     assert lateness.ended() is None
     lateness.began()
@@ -71,8 +71,8 @@ def test_sign_of_life_does_not_wait_for_the_evaluation(tmp_path: Path) -> None:
     written_to = threading.Event()
     while not (store.path / STATE_FILE).exists():
         written_to.wait(0.01)
-    assert monitoring_of(store, clock) == Pulse("overloaded", 20.0)
-    board = BoardReader(store).read(clock.wall_ns())
+    assert read_heartbeat(store, clock) == WatcherHeartbeat("overloaded", 20.0)
+    board = CurrentStateReader(store).read(clock.wall_ns())
     assert board.monitoring is not None and board.monitoring.state == "running"  # another boot
     assert lateness.ended() == 20.0
     lateness.close()
@@ -81,7 +81,7 @@ def test_sign_of_life_does_not_wait_for_the_evaluation(tmp_path: Path) -> None:
 
 def test_watcher_that_begins_may_catch_up(tmp_path: Path) -> None:
     clock = ManualClock()
-    lateness = Lateness(create_store(tmp_path / "store"), clock)
+    lateness = EvaluationLateness(create_store(tmp_path / "store"), clock)
     lateness.began()
     clock.advance(STARTING_NS / NS - 1)
     assert lateness.delay_s() == 0.0
@@ -98,15 +98,15 @@ def test_slow_evaluation_is_overload_and_not_a_silent_recorder(
     for _ in range(5):
         stand.tick()
         watcher.step()
-    take = Evaluation.take
+    take = RecordEvaluation.take
 
-    def slowly(self: Evaluation, block: object) -> object:
+    def slowly(self: RecordEvaluation, block: object) -> object:
         yield from take(self, block)  # type: ignore[arg-type]  # the function that it stands for
         for _ in range(200):
             stand.tick()
 
     with monkeypatch.context() as patched:
-        patched.setattr(Evaluation, "take", slowly)
+        patched.setattr(RecordEvaluation, "take", slowly)
         stand.tick()
         watcher.step()
     for _ in range(3):
@@ -132,7 +132,7 @@ def test_one_look_that_finds_nothing_is_no_silence(
     for _ in range(250):
         stand.tick()
     with monkeypatch.context() as patched:
-        patched.setattr("amberbox.monitoring.watcher.reader.read_head", lambda folder: None)
+        patched.setattr("amberbox.monitoring.record_reader.read_head", lambda folder: None)
         watcher.step()
     watcher.step()
     watcher.close()
@@ -146,11 +146,11 @@ def test_waiting_for_a_processor_is_no_hang() -> None:
     for _ in range(50):
         now[0] += 0.4
         waited[0] += 0.39
-        guard.look(0, frame)
+        guard.check(0, frame)
     with pytest.raises(HangError):
         for _ in range(10):
             now[0] += 0.4
-            guard.look(0, frame)
+            guard.check(0, frame)
 
 
 def _frame() -> FrameType:

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from amberbox.blackbox.follow import joining
-from amberbox.blackbox.store import open_store
+from amberbox.blackbox.store import tail
+from amberbox.blackbox.store.store import open_store
 from amberbox.core.types import Batch
-from amberbox.monitoring.watcher.reader import Block, Reader
+from amberbox.monitoring.record_reader import RecordBlock, RecordedItemsReader
 from tests.monitoring.watcher.stand import Stand
 
 ITEMS = ("ros_main", "ros_bulk", "ros_ring")
@@ -25,13 +25,13 @@ def times_of(batches: list[Batch], item: str) -> list[int]:
     return [t for batch in batches if batch.item == item for t in batch.log_time_ns.tolist()]
 
 
-def blocks_of(store: Path) -> list[Block]:
-    return list(Reader(open_store(store), ITEMS).step())
+def blocks_of(store: Path) -> list[RecordBlock]:
+    return list(RecordedItemsReader(open_store(store), ITEMS).step())
 
 
 def test_a_record_streams_in_blocks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """No writer is read far ahead of the others, and nothing is held back for long."""
-    monkeypatch.setattr(joining, "BATCH_ROWS", 50)
+    monkeypatch.setattr(tail, "BATCH_ROWS", 50)
     stand = lived(Stand(tmp_path / "store", 2), 400)
     stand.box.close()
     blocks = blocks_of(stand.path)
@@ -44,7 +44,7 @@ def test_a_record_streams_in_blocks(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
 
 def test_everything_up_to_a_block_has_come(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(joining, "BATCH_ROWS", 30)
+    monkeypatch.setattr(tail, "BATCH_ROWS", 30)
     stand = lived(Stand(tmp_path / "store", 3), 200)
     stand.box.close()
     blocks = blocks_of(stand.path)
@@ -71,7 +71,7 @@ def test_batch_boundaries_do_not_matter(tmp_path: Path, monkeypatch: pytest.Monk
     stand.box.close()
     replays = []
     for rows in (1, 7, 60, 4096):
-        monkeypatch.setattr(joining, "BATCH_ROWS", rows)
+        monkeypatch.setattr(tail, "BATCH_ROWS", rows)
         replays.append(stand.replayed())
     assert len(replays[0]) > 100
     assert all(other == replays[0] for other in replays[1:])

@@ -11,17 +11,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from amberbox.blackbox.folder.folder import load_folder
 from amberbox.blackbox.query.record import open as open_record
-from amberbox.blackbox.store import Store, open_store
+from amberbox.blackbox.robot_folder.folder import load_folder
+from amberbox.blackbox.store.store import Store, open_store
 from amberbox.cli.main import main
 from amberbox.core.types import Batch, Ragged, Status
-from amberbox.monitoring.configuration.load import load_plan
-from amberbox.monitoring.engine.engine import Engine
-from amberbox.monitoring.engine.findings import Finding
-from amberbox.monitoring.messages.records import encoded
-from amberbox.monitoring.plan import Plan
-from amberbox.monitoring.watcher.replay import Part, blocks, replay
+from amberbox.monitoring.engine import Engine
+from amberbox.monitoring.findings import Finding, encoded
+from amberbox.monitoring.plan import MonitoringPlan
+from amberbox.monitoring.plan_loader import load_plan
+from amberbox.monitoring.record_evaluation import DiagnosedEngine, ReplayOptions, blocks, replay
 
 REAL = ("recordings/plotjuggler_tilt_laser.bag", "ropod/bb_test_data")
 KINDS = {
@@ -42,7 +41,7 @@ arguments: {arguments}
 """
 
 
-def folder_of(place: Path, recording: Path) -> tuple[Plan, Store]:
+def folder_of(place: Path, recording: Path) -> tuple[MonitoringPlan, Store]:
     """Import a recording, and monitor some of its numbers in every way."""
     folder = place / "robot"
     (folder / "components").mkdir(parents=True)
@@ -77,12 +76,12 @@ def in_bytes(findings: Iterator[Finding] | list[Finding]) -> list[bytes]:
     return [encoded(finding)[1] for finding in findings]
 
 
-def in_pieces(plan: Plan, store: Store, seed: int) -> list[bytes]:
+def in_pieces(plan: MonitoringPlan, store: Store, seed: int) -> list[bytes]:
     """Evaluate rows that come in random pieces, a random time after each other."""
     engine, rng = Engine(plan), random.Random(seed)
     found: list[Finding] = []
     epoch: Any = None
-    for block in blocks(plan, store, engine, Part()):
+    for block in blocks(plan, store, DiagnosedEngine(engine), ReplayOptions()):
         if block.epoch != epoch:
             epoch = block.epoch
             engine.begin(block.start_ns)
@@ -142,7 +141,7 @@ def test_speed_and_pieces_do_not_matter(name: str, tmp_path: Path, shared_data: 
     levels = {finding.level for finding in at_once if isinstance(finding, Status)}
     assert {"ok", "error"} <= levels
     expected = in_bytes(at_once)
-    assert in_bytes(replay(plan, store, Part(speed=8.0))) == expected
+    assert in_bytes(replay(plan, store, ReplayOptions(speed=8.0))) == expected
     for seed in range(3):
         assert in_pieces(plan, store, seed) == expected
 

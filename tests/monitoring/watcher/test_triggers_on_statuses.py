@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from amberbox.blackbox.incidents import load_all
-from amberbox.blackbox.keeper.incidents import IncidentKeeping
-from amberbox.blackbox.keeper.options import KeeperOptions, Trigger
-from amberbox.blackbox.keeper.ownjournal import OwnJournal
-from amberbox.blackbox.store import open_store
+from amberbox.blackbox.retention.incidents import IncidentMaintenance
+from amberbox.blackbox.robot_folder.robot_yaml import RetentionOptions, Trigger
+from amberbox.blackbox.store.derived_journal import DerivedJournal
+from amberbox.blackbox.store.incident import load_all
+from amberbox.blackbox.store.store import open_store
 from amberbox.core.clock import NS
 from tests.monitoring.watcher.diagnoser import PlainDiagnoser
 from tests.monitoring.watcher.stand import NUMBERS, Stand, plan_of
@@ -56,10 +56,10 @@ def test_a_trigger_on_a_status_makes_an_incident(
 ) -> None:
     """The keeper has always read the recorder's rows long before the watcher says anything."""
     stand = Stand(tmp_path / "store", diagnoser=PlainDiagnoser)
-    options = KeeperOptions(triggers=(trigger,))
+    options = RetentionOptions(triggers=(trigger,))
     store = open_store(stand.path)
     stand.box.write()
-    keeper = IncidentKeeping(store, options, OwnJournal(store, "keep", clock=stand.clock))
+    keeper = IncidentMaintenance(store, options, DerivedJournal(store, "keep", clock=stand.clock))
     watcher = stand.watcher(plan_of())
     value, fell_ns = 1.0, 0
     for number in range(60):
@@ -71,7 +71,9 @@ def test_a_trigger_on_a_status_makes_an_incident(
         keeper.step()
         if killed and number == 40:
             keeper.close()
-            keeper = IncidentKeeping(store, options, OwnJournal(store, "keep", clock=stand.clock))
+            keeper = IncidentMaintenance(
+                store, options, DerivedJournal(store, "keep", clock=stand.clock)
+            )
         if number < 20 or number % 15 == 0:  # late by more than a second
             watcher.step()
     watcher.step()

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from amberbox.blackbox.keeper.ownjournal import OwnJournal
+from amberbox.blackbox.store.derived_journal import DerivedJournal
 from tests.monitoring.watcher.stand import PROBE, Stand, kill, written
 
 
@@ -70,7 +70,7 @@ def test_what_the_disk_refuses_is_found_again(
         stand.tick()
         if number % 30 == 20:
             with monkeypatch.context() as patched:
-                patched.setattr(OwnJournal, "append", _refuse)
+                patched.setattr(DerivedJournal, "append", _refuse)
                 with pytest.raises(OSError, match="No space"):
                     watcher.step()
             watcher.close()

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from amberbox.testing.realros import PYTHON, Processes, Ros, free_port, missing_ros
+from tests.support.processes import free_port
+from tests.support.ros_nodes import PYTHON, Processes, Ros, missing_ros
 
 ROBOT = Path(__file__).with_name("robot.py")
 

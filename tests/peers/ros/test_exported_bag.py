@@ -11,12 +11,12 @@ import yaml
 from rosbags.typesys import Stores, get_typestore
 
 import amberbox
-from amberbox.blackbox.exporting import ExportOptions, View, export
-from amberbox.blackbox.exporting.job import Compression
+from amberbox.blackbox.query.export import export
+from amberbox.blackbox.query.export_job import Compression, ExportOptions, View
 from amberbox.core.types import Schema, Topic
-from amberbox.testing.box import ManualBox
-from amberbox.testing.patience import wait_until
-from amberbox.testing.realros import PYTHON, Ros, end
+from amberbox.testing.clock import wait_until
+from tests.support.manual_recorder import ManualBox
+from tests.support.ros_nodes import PYTHON, Ros, end
 
 LISTENER = Path(__file__).with_name("listener.py")
 TYPES = get_typestore(Stores.ROS1_NOETIC)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import signal
 from pathlib import Path
 
-from amberbox.testing.realros import Ros, end
 from tests.monitoring.laserexample import EXPECTED, play, watched
+from tests.support.ros_nodes import Ros, end
 
 
 def test_the_papers_laser(ros: Ros, tmp_path: Path) -> None:

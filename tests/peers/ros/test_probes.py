@@ -5,8 +5,8 @@ from __future__ import annotations
 import signal
 
 from amberbox.monitoring.probes import ros_master, ros_node, ros_topic
-from amberbox.testing.patience import wait_until
-from amberbox.testing.realros import Ros, end
+from amberbox.testing.clock import wait_until
+from tests.support.ros_nodes import Ros, end
 
 
 def test_a_node_that_is_killed_is_seen_though_the_master_still_lists_it(ros: Ros) -> None:

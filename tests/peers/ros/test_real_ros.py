@@ -18,8 +18,8 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from amberbox.blackbox.sources.ros import Config, Source
 from amberbox.core.source import TopicOptions
-from amberbox.testing.patience import PATIENCE_S, wait_until
-from amberbox.testing.realros import (
+from amberbox.testing.clock import PATIENCE_S, wait_until
+from tests.support.ros_nodes import (
     GapSink,
     Ros,
     Verdict,
@@ -261,7 +261,7 @@ def test_a_box_that_hangs_does_not_stop_the_master(ros: Ros) -> None:
         "import sys, threading\n"
         "from amberbox.blackbox.sources.ros import Config, Source\n"
         "from amberbox.core.source import TopicOptions\n"
-        "from amberbox.testing import MemorySink\n"
+        "from amberbox.testing.contract import MemorySink\n"
         "topics = [TopicOptions(f'robot/{n}') for n in sys.argv[2].split(',')]\n"
         "config = Config(sys.argv[1], topics, caller_id='hanging')\n"
         "Source(config, 'ros').run(MemorySink(), threading.Event())\n"

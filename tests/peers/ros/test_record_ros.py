@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -15,10 +14,11 @@ import numpy as np
 import pytest
 
 import amberbox
-from amberbox.blackbox.follow import read
+from amberbox.blackbox.store import journal_reader
 from amberbox.core.errors import UsageError
-from amberbox.testing.patience import PATIENCE_S, wait_until
-from amberbox.testing.realros import Published, Ros, Verdict, body_of, end, judge, read_truth
+from amberbox.testing.clock import PATIENCE_S, wait_until
+from tests.support.processes import command
+from tests.support.ros_nodes import Published, Ros, Verdict, body_of, end, judge, read_truth
 
 NAMES = ("odom", "scan", "imu", "battery", "state", "map")
 POLL_S = 0.25
@@ -44,7 +44,7 @@ class Box:
         environment = {**os.environ, "ROS_IP": "127.0.0.1"}
         with self.log.open("ab") as log:
             self.process = subprocess.Popen(
-                [sys.executable, "-m", "amberbox", "record", str(self.folder)],
+                command("record", self.folder),
                 stdout=log, stderr=log, env=environment,
             )  # fmt: skip
 
@@ -60,7 +60,9 @@ class Box:
     def rows(self, item: str) -> int:
         """Count an item's rows; what is being written counts, too."""
         try:
-            return sum(journal.items.get(item, 0) for journal in read.journals(self.store))
+            return sum(
+                journal.items.get(item, 0) for journal in journal_reader.journals(self.store)
+            )
         except UsageError:  # the store is about to be made
             return 0
 
@@ -71,9 +73,9 @@ class Box:
     def bodies(self, item: str) -> list[str]:
         """Return what is recorded of an item, raw and in order, as the truth file names it."""
         found = []
-        for journal in read.journals(self.store):
+        for journal in journal_reader.journals(self.store):
             numbers = [n for n, s in journal.streams.items() if s.item == item and not s.repeated]
-            for chunk in read.sound_chunks(journal):
+            for chunk in journal_reader.sound_chunks(journal):
                 rows = np.flatnonzero(np.isin(chunk.channel, numbers))
                 found += [body_of(data, has_header=True) for data in chunk.messages(rows)]
         return found

@@ -7,12 +7,13 @@ from pathlib import Path
 
 import pytest
 
-from amberbox.blackbox.folder.folder import load_folder
 from amberbox.blackbox.journal import writer
 from amberbox.blackbox.recorder.recorder import Recorder
-from amberbox.testing.box import last_counters, raw_messages
-from amberbox.testing.patience import PATIENCE_S, wait_until
-from amberbox.testing.realros import Ros, body_of, read_truth
+from amberbox.blackbox.robot_folder.folder import load_folder
+from amberbox.core import files as core_files
+from amberbox.testing.clock import PATIENCE_S, wait_until
+from tests.support.manual_recorder import last_counters, raw_messages
+from tests.support.ros_nodes import Ros, body_of, read_truth
 
 RATE_HZ = 1000
 STALL_S = 5.0
@@ -35,17 +36,17 @@ def robot_folder(ros: Ros) -> Path:
 def test_a_publisher_without_a_queue_is_not_slowed_by_a_stalling_disk(
     ros: Ros, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    works, write = threading.Event(), writer._write_all
+    works, write = threading.Event(), core_files.write_all
 
     def stalling(fd: int, data: bytes) -> None:
         works.wait()
         write(fd, data)
 
-    monkeypatch.setattr(writer, "_write_all", stalling)
+    monkeypatch.setattr(writer, "write_all", stalling)
     ros.master()
     folder = robot_folder(ros)
     works.set()
-    recorder = Recorder(load_folder(folder), keeper=False)
+    recorder = Recorder(load_folder(folder), retention=False)
     thread = threading.Thread(target=recorder.run)
     thread.start()
     try:

@@ -1,1 +1,1 @@
-"""What decides, before the journal, whether a whole message is kept."""
+"""Filters: decide before the journal whether a whole message is kept."""

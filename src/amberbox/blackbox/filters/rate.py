@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from amberbox.core.errors import UsageError
 from amberbox.core.types import IntArray
 
+# how many periods a message may be early; see docs/robot/filters.md for the simulation behind it
 TOLERANCE_PERIODS = 10
-"""How many periods a message may be early; see docs/filters.md for the simulation behind it."""
 
 
 class RateLimit:
@@ -38,16 +38,16 @@ class RateLimit:
         self._due_ns = 0
 
     def accept(self, received_ns: int) -> bool:
-        """Tell whether to keep a message received now (nanoseconds of log time)."""
+        """Return whether to keep a message received now (nanoseconds of log time)."""
         early_ns = self._due_ns - received_ns
         if early_ns > self._tolerance_ns:
             if early_ns <= self._horizon_ns:
                 return False
-            early_ns = 0  # no schedule reaches this far: log time began anew at an earlier moment
+            early_ns = 0  # no schedule reaches this far: a new epoch of log time is earlier
         self._due_ns = received_ns + self._period_ns + (early_ns if early_ns > 0 else 0)
         return True
 
     def mask(self, received_ns: IntArray) -> NDArray[np.bool_]:
-        """Tell the same for a batch of messages in the order of their receipt."""
+        """Return which messages of a batch to keep, in the order of their receipt."""
         accepted = map(self.accept, received_ns.tolist())
         return np.fromiter(accepted, dtype=np.bool_, count=len(received_ns))

@@ -1,1 +1,1 @@
-"""Journals on disk: MCAP files written for power cuts, and read whatever happened to them."""
+"""Journal files: MCAP written for power cuts, and read in whatever state they are."""

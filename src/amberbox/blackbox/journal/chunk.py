@@ -1,24 +1,47 @@
-"""One chunk of an MCAP file, checked and laid open."""
+"""A chunk of an MCAP file in memory: decompressed, checked, its messages as parallel arrays."""
 
 from __future__ import annotations
 
+import mmap
 import struct
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from pathlib import Path
+from typing import Any, TypeAlias
 
+import msgspec
 import numpy as np
 import zstandard
 from numpy.typing import NDArray
 
 from amberbox.blackbox.journal import mcap
-from amberbox.blackbox.journal.mcap import MESSAGE_HEAD, Channel, ChunkHead
+from amberbox.blackbox.journal.mcap import MESSAGE_HEAD, ChunkHead, McapChannel
 from amberbox.core.types import IntArray, Schema
 
-MAX_CHUNK_BYTES = 1 << 30
-"""Most that a compressed chunk may hold; no size that a file announces is allocated beyond it."""
+Buffer: TypeAlias = "bytes | memoryview"
+
+
+@contextmanager
+def open_buffer(path: Path) -> Iterator[Buffer]:
+    """Map a file into memory; an empty file gives empty bytes."""
+    with path.open("rb") as file:
+        if file.seek(0, 2) == 0:
+            yield b""
+            return
+        mapped = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+    view = memoryview(mapped)
+    try:
+        yield view
+    finally:
+        with suppress(BufferError):  # an exception may still hold a slice of it
+            view.release()
+            mapped.close()
+
+
+MAX_CHUNK_BYTES = 1 << 30  # largest uncompressed size of a chunk: a file may claim any size
 _KEPT_BYTES = 1 << 14
 
 
@@ -36,7 +59,7 @@ class Chunk:
     ends: IntArray
     body: bytes
     schemas: Mapping[int, Schema]
-    channels: Mapping[int, Channel]
+    channels: Mapping[int, McapChannel]
 
     def __len__(self) -> int:
         return len(self.channel)
@@ -87,7 +110,7 @@ def _unpack(
 def _unpack_zstd(
     packed: bytes | memoryview, size: int, zstd: zstandard.ZstdDecompressor
 ) -> bytes | None:
-    """Unpack at most ``size`` bytes: what a frame says of its own size is allocated unchecked."""
+    """Unpack at most ``size`` bytes: zstd allocates the size that a frame claims unchecked."""
     try:
         if zstandard.frame_content_size(packed) not in (size, -1):
             return None
@@ -97,7 +120,7 @@ def _unpack_zstd(
 
 
 def _unpack_lz4(packed: bytes, size: int) -> bytes | None:
-    """Unpack until there are more than ``size`` bytes, however many come then."""
+    """Unpack at most ``size + 1`` bytes."""
     import lz4.frame  # type: ignore[import-untyped]  # it ships no types; only others use it
 
     unpacker, body = lz4.frame.LZ4FrameDecompressor(), b""
@@ -109,9 +132,9 @@ def _unpack_lz4(packed: bytes, size: int) -> bytes | None:
 
 
 def open_chunk(body: bytes, offset: int, end: int, offsets: IntArray | None = None) -> Chunk | None:
-    """Lay a chunk's records open; None if they do not fit together.
+    """Parse a chunk's records; None if their lengths do not fit together.
 
-    ``offsets`` are the message offsets its indices state. They are only believed if they cover the
+    ``offsets`` are the message offsets its indices state. They are used only if they cover the
     records without a hole, otherwise the records are walked one by one.
     """
     try:
@@ -126,8 +149,8 @@ def open_chunk(body: bytes, offset: int, end: int, offsets: IntArray | None = No
 
 def _stated(
     body: bytes, offsets: IntArray | None
-) -> tuple[dict[int, Schema], dict[int, Channel], int]:
-    """Read the definitions that a chunk begins with; chunks repeat theirs, so they are kept."""
+) -> tuple[dict[int, Schema], dict[int, McapChannel], int]:
+    """Read the definitions that a chunk begins with; chunks repeat theirs, so they are cached."""
     end = int(offsets.min()) if offsets is not None and len(offsets) else 0
     if not 0 < end <= _KEPT_BYTES:
         return _definitions(body)
@@ -139,22 +162,22 @@ def _stated(
 
 
 @lru_cache(maxsize=256)
-def _kept(head: bytes) -> tuple[dict[int, Schema], dict[int, Channel], int]:
+def _kept(head: bytes) -> tuple[dict[int, Schema], dict[int, McapChannel], int]:
     return _definitions(head)
 
 
-def states_only(head: bytes) -> bool:
-    """Tell whether bytes are definitions and nothing else."""
+def is_definitions_only(head: bytes) -> bool:
+    """Return whether bytes are schema and channel records and nothing else."""
     try:
         return (_kept if len(head) <= _KEPT_BYTES else _definitions)(head)[2] == len(head)
     except (ValueError, struct.error, IndexError):
         return False
 
 
-def lay_open(
+def open_joined_chunks(
     bodies: bytes, starts: IntArray, bounds: IntArray, firsts: IntArray, offset: int
 ) -> Chunk | None:
-    """Lay the messages of joined chunks open; None if their records do not fit together.
+    """Parse the messages of concatenated chunks; None if their records do not fit together.
 
     ``starts`` are the message offsets in order, ``bounds`` where the chunks end, ``firsts`` the
     row that each chunk begins with.
@@ -170,16 +193,18 @@ def lay_open(
     return _columns(bodies, starts, offset, offset, {}, {})
 
 
-def _definitions(body: bytes) -> tuple[dict[int, Schema], dict[int, Channel], int]:
+def _definitions(body: bytes) -> tuple[dict[int, Schema], dict[int, McapChannel], int]:
     schemas: dict[int, Schema] = {}
-    channels: dict[int, Channel] = {}
+    channels: dict[int, McapChannel] = {}
     at = 0
     while at < len(body) and body[at] in (mcap.SCHEMA, mcap.CHANNEL):
         at = _define(body, at, schemas, channels)
     return schemas, channels, at
 
 
-def _define(body: bytes, at: int, schemas: dict[int, Schema], channels: dict[int, Channel]) -> int:
+def _define(
+    body: bytes, at: int, schemas: dict[int, Schema], channels: dict[int, McapChannel]
+) -> int:
     (length,) = struct.unpack_from("<Q", body, at + 1)
     content = body[at + 9 : at + 9 + length]
     if body[at] == mcap.SCHEMA:
@@ -192,22 +217,22 @@ def _define(body: bytes, at: int, schemas: dict[int, Schema], channels: dict[int
 
 
 def _believe(body: bytes, at: int, offsets: IntArray | None) -> IntArray | None:
-    """Check stated offsets: each message must begin where the one before ends."""
+    """Return the stated offsets if each message begins where the one before ends, else None."""
     if offsets is None or not len(offsets):
         return None
     starts = np.sort(offsets)
     if int(starts[0]) != at or int(starts[-1]) + MESSAGE_HEAD > len(body):
         return None
-    ends = starts + 9 + _numbers(body, "<u8", 7)[starts + 1].astype(np.int64)
+    ends = starts + 9 + overlapping_numbers(body, "<u8", 7)[starts + 1].astype(np.int64)
     whole = np.array_equal(ends[:-1], starts[1:]) and int(ends[-1]) == len(body)
     opcodes = np.frombuffer(body, np.uint8)[starts]
     return starts if whole and bool((opcodes == mcap.MESSAGE).all()) else None
 
 
 def _walk(
-    body: bytes, at: int, schemas: dict[int, Schema], channels: dict[int, Channel]
+    body: bytes, at: int, schemas: dict[int, Schema], channels: dict[int, McapChannel]
 ) -> IntArray:
-    """Find the messages record by record, as files of others need it."""
+    """Return the message offsets, record by record, as files of other writers need it."""
     starts, size = [], len(body)
     while at < size:
         opcode, length = struct.unpack_from("<BQ", body, at)
@@ -229,7 +254,7 @@ def _columns(
     offset: int,
     end: int,
     schemas: Mapping[int, Schema],
-    channels: Mapping[int, Channel],
+    channels: Mapping[int, McapChannel],
 ) -> Chunk:
     lengths = _take(body, "<u8", 7, starts + 1).astype(np.int64)
     return Chunk(
@@ -247,15 +272,26 @@ def _columns(
     )
 
 
-def _numbers(body: bytes, kind: str, tail: int) -> NDArray[Any]:
-    """View bytes as numbers that begin at every byte."""
+def overlapping_numbers(body: bytes | bytearray, kind: str, tail: int) -> NDArray[Any]:
+    """View bytes as numbers that begin at every byte; ``tail`` is their size less 1."""
     return np.ndarray((max(len(body) - tail, 0),), kind, body, 0, (1,))
 
 
 def _take(body: bytes, kind: str, tail: int, at: IntArray) -> NDArray[Any]:
     if not len(at):
         return np.empty(0, kind)
-    return _numbers(body, kind, tail)[at]
+    return overlapping_numbers(body, kind, tail)[at]
+
+
+def decode_own_messages(
+    chunk: Chunk, topics: Collection[str]
+) -> Iterator[tuple[int, str, dict[str, Any]]]:
+    """Yield log time, channel and values of the records on some of the reserved channels."""
+    names = {n: c.topic for n, c in chunk.channels.items() if c.topic in topics}
+    rows = np.flatnonzero(np.isin(chunk.channel, list(names)))
+    numbers, times = chunk.channel[rows].tolist(), chunk.log_ns[rows].tolist()
+    for number, log_ns, message in zip(numbers, times, chunk.messages(rows), strict=True):
+        yield log_ns, names[number], msgspec.json.decode(message)
 
 
 def sequences(chunk: Chunk, base: int) -> IntArray:

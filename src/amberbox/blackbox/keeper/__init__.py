@@ -1,1 +1,1 @@
-"""The keeper: seals, signs and condenses what was recorded, pins incidents, deletes by one rule."""
+"""Entry point of the maintenance process: ``python -m amberbox.blackbox.keeper STORE``."""

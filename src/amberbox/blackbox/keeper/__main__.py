@@ -1,4 +1,4 @@
-"""The keeper's process: keeps a store until told to stop, or until its recorder is gone."""
+"""Run the maintenance process of a store until it is stopped, or until its recorder is gone."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from amberbox.blackbox.keeper.keeper import PATIENCE_S, Keeper, wait_for_lock
-from amberbox.blackbox.keeper.options import KeeperOptions
-from amberbox.blackbox.segments.build import can_build
-from amberbox.blackbox.store import open_to_write
+from amberbox.blackbox.retention.maintenance import LOCK_TIMEOUT_S, RetentionService, wait_for_lock
+from amberbox.blackbox.robot_folder.robot_yaml import RetentionOptions
+from amberbox.blackbox.store.segment_file import can_build
+from amberbox.blackbox.store.store import open_to_write
 from amberbox.core.errors import UsageError
 
 PERIOD_S = 2.0
@@ -22,7 +22,7 @@ _PAUSE_S = 0.2
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Keep a store until told to stop, or until the recorder that started this is gone."""
+    """Maintain a store until stopped, or until the recorder that started this is gone."""
     parser = argparse.ArgumentParser(prog="python -m amberbox.blackbox.keeper")
     parser.add_argument("store", type=Path)
     parser.add_argument("--options", default="{}", help="KeeperOptions as JSON")
@@ -34,26 +34,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
         signal.signal(number, lambda *_: stop.set())
     try:
         store = open_to_write(options.store)
-        lock = wait_for_lock(store, PATIENCE_S if options.parent else 0.0, stop)
+        lock = wait_for_lock(store, LOCK_TIMEOUT_S if options.parent else 0.0, stop)
     except UsageError as error:
         print(f"amberbox keeper: {error}", file=sys.stderr)
         return error.exit_code
-    keeper = Keeper(store, KeeperOptions.from_json(options.options))
-    keeper.mind_room()  # at normal priority: what follows is about this thread only
+    keeper = RetentionService(store, RetentionOptions.from_json(options.options))
+    keeper.start_space_thread()  # at normal priority: the next call affects this thread only
     os.nice(10)
-    _load_ahead()
+    # load slow modules (a second) before any segment is to be built
+    if can_build():
+        import pyarrow.parquet  # noqa: F401  # only to have it loaded
     keeper.step(stop)
     while not options.once and _pause(stop, options.parent):
         keeper.step(stop)
     keeper.close()
     lock.release()
     return 0
-
-
-def _load_ahead() -> None:
-    """Load what takes a second before anything is to be built, not amid it."""
-    if can_build():
-        import pyarrow.parquet  # noqa: F401  # only to have it loaded
 
 
 def _pause(stop: threading.Event, parent: int) -> bool:

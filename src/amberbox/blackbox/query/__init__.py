@@ -1,1 +1,1 @@
-"""Questions to a record: items, rows of a time range, gaps, events, SQL."""
+"""Queries of a record: rows, gaps, SQL, overview, export, import, Foxglove."""

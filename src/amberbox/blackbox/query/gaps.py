@@ -1,4 +1,4 @@
-"""What is missing from a record and why: recorded gaps, damage, deletions, what does not decode."""
+"""Gaps of a record and their reasons: recorded gaps, damage, deletions, undecodable messages."""
 
 from __future__ import annotations
 
@@ -7,57 +7,54 @@ from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
-import numpy as np
-
-from amberbox.blackbox.follow.follow import RECORDED
-from amberbox.blackbox.follow.read import KEPT_RAW, batches_of, journal_file, with_columns
-from amberbox.blackbox.follow.tail import Delivery, WriterTail
-from amberbox.blackbox.journal import reserved
-from amberbox.blackbox.journal.clocktable import ClockTable
-from amberbox.blackbox.query.catalogue import Catalogue
-from amberbox.blackbox.query.gather import (
+from amberbox.blackbox.columns.flat_tables import FlatTable
+from amberbox.blackbox.columns.table_text import plain
+from amberbox.blackbox.journal import channels
+from amberbox.blackbox.store.catalogue import StoreCatalogue
+from amberbox.blackbox.store.clocks import ClockTable
+from amberbox.blackbox.store.journal_reader import KEPT_RAW, batches_of, journal_file, with_columns
+from amberbox.blackbox.store.manifest import ManifestJournal, has_size
+from amberbox.blackbox.store.manifest_entries import Segment
+from amberbox.blackbox.store.segment_file import overlaps, row_groups
+from amberbox.blackbox.store.store import Store, open_store
+from amberbox.blackbox.store.table_reader import (
     DamagedSegmentError,
-    Request,
-    Span,
+    RowRequest,
+    TimeSpan,
+    damage_raised,
     gap_of_part,
     gather,
     may_hold,
-    noticing_damage,
 )
-from amberbox.blackbox.query.tabletext import plain
-from amberbox.blackbox.segments.flat import Flat
-from amberbox.blackbox.segments.manifest import Journal, Segment
-from amberbox.blackbox.segments.parquet import overlaps, row_groups
-from amberbox.blackbox.segments.restoring import has_size
-from amberbox.blackbox.store import Store, open_store
+from amberbox.blackbox.store.tail import RECORDED, Delivery, WriterTail
 from amberbox.core.types import Gap, WriterCursor
 
 _SAME = ("writer", "run", "item", "reason", "peer")
 _FIELDS = ("item", "peer", "from_ns", "to_ns", "reason", "count")
 
 
-def gaps(catalogue: Catalogue, item: str | None, span: Span) -> list[Gap]:
-    """List gaps that meet ``[from, to)``, in order of time, of one item or of all."""
+def gaps(catalogue: StoreCatalogue, item: str | None, span: TimeSpan) -> list[Gap]:
+    """Return the gaps that overlap ``[from, to)``, in order of time, of one item or of all."""
     found = [
         *_holes(catalogue), *_deleted(catalogue), *_undecodable(catalogue),
         *_lost_columns(catalogue, span),
     ]  # fmt: skip
-    return chosen(known(catalogue, found), item, span)
+    return joined_gaps_in(recorded_and_known(catalogue, found), item, span)
 
 
-def known(catalogue: Catalogue, then: Iterable[Gap]) -> list[Gap]:
+def recorded_and_known(catalogue: StoreCatalogue, then: Iterable[Gap]) -> list[Gap]:
     """Return the recorded gaps and others whose times are as they were known ``then``."""
     return [*_recorded(catalogue), *(_as_known_now(gap, catalogue) for gap in then)]
 
 
-def chosen(found: Sequence[Gap], item: str | None, span: Span) -> list[Gap]:
+def joined_gaps_in(found: Sequence[Gap], item: str | None, span: TimeSpan) -> list[Gap]:
     """Join gaps that go on from each other; keep those of a range, in order of time."""
     kept = [gap for gap in _joined(found) if _concerns(gap, item, span)]
     return sorted(kept, key=lambda gap: (gap.from_ns, gap.to_ns, gap.item))
 
 
-def _as_known_now(gap: Gap, catalogue: Catalogue) -> Gap:
-    """Correct a gap whose times are as they were known when it was found."""
+def _as_known_now(gap: Gap, catalogue: StoreCatalogue) -> Gap:
+    """Return a gap with times corrected by the present knowledge of the clocks."""
     from_ns, to_ns = (
         catalogue.book.known_now_ns(gap.run, time_ns) for time_ns in (gap.from_ns, gap.to_ns)
     )
@@ -69,7 +66,7 @@ def _joined(known: Sequence[Gap]) -> Iterator[Gap]:
     last: Gap | None = None
     for gap in known:
         if last is not None and _goes_on(last, gap):
-            count = _sum(last.count, gap.count)
+            count = None if last.count is None or gap.count is None else last.count + gap.count
             last = replace(last, to_ns=gap.to_ns, to_seq=gap.to_seq, count=count)
             continue
         if last is not None:
@@ -84,22 +81,18 @@ def _goes_on(first: Gap, second: Gap) -> bool:
     return same and first.to_seq is not None and first.to_seq == second.from_seq
 
 
-def _sum(first: int | None, second: int | None) -> int | None:
-    return None if first is None or second is None else first + second
-
-
-def _concerns(gap: Gap, item: str | None, span: Span) -> bool:
+def _concerns(gap: Gap, item: str | None, span: TimeSpan) -> bool:
     last_ns = max(gap.to_ns - 1, gap.from_ns)
     return (item is None or gap.item in ("", item)) and overlaps(gap.from_ns, last_ns, span)
 
 
-def _recorded(catalogue: Catalogue) -> Iterator[Gap]:
+def _recorded(catalogue: StoreCatalogue) -> Iterator[Gap]:
     """Read the gap channel; a gap that was never closed lasts to the end of its run."""
-    table = next((n for n, v in catalogue.schemas.items() if v[-1].topic == reserved.GAP), None)
+    table = next((n for n, v in catalogue.schemas.items() if v[-1].topic == channels.GAP), None)
     if table is None:
         return
     still_open: dict[tuple[object, ...], Gap] = {}
-    pieces = gather(catalogue, Request(table, _FIELDS)).pieces
+    pieces = gather(catalogue, RowRequest(table, _FIELDS)).pieces
     for piece in sorted(pieces, key=lambda piece: (piece.run, int(piece.seq[0]))):
         for gap, is_open in _gap_rows(piece):
             key = (gap.run, gap.item, gap.peer, gap.reason)
@@ -113,7 +106,7 @@ def _recorded(catalogue: Catalogue) -> Iterator[Gap]:
         yield replace(gap, to_ns=max(ends.get(gap.run, gap.from_ns), gap.from_ns + 1))
 
 
-def _gap_rows(piece: Flat) -> Iterator[tuple[Gap, bool]]:
+def _gap_rows(piece: FlatTable) -> Iterator[tuple[Gap, bool]]:
     columns = [plain(piece.columns[name]) for name in _FIELDS]
     offsets = (piece.received_ns - piece.log_time_ns).tolist()
     for offset, row in zip(offsets, zip(*columns, strict=True), strict=True):
@@ -125,7 +118,7 @@ def _gap_rows(piece: Flat) -> Iterator[tuple[Gap, bool]]:
         yield gap, to_ns is None
 
 
-def _run_ends(catalogue: Catalogue) -> dict[int, int]:
+def _run_ends(catalogue: StoreCatalogue) -> dict[int, int]:
     """Return when the last row of each run was received."""
     ends: dict[int, int] = {}
     for run, end_ns in _ends(catalogue):
@@ -133,25 +126,24 @@ def _run_ends(catalogue: Catalogue) -> dict[int, int]:
     return ends
 
 
-def _ends(catalogue: Catalogue) -> Iterator[tuple[int, int]]:
+def _ends(catalogue: StoreCatalogue) -> Iterator[tuple[int, int]]:
     for segments in catalogue.manifest.segments.values():
         for segment in segments:
             yield segment.parts[-1].run, segment.received_range_ns[1]
     for journal in catalogue.journals(skip=catalogue.done):
         if journal.rows:
-            end = np.array([journal.end_ns])
-            yield journal.run, int(ClockTable(journal.clock).received(end)[0])
+            yield journal.run, ClockTable(journal.clock).at(journal.end_ns)
 
 
-def last_received_ns(catalogue: Catalogue) -> int | None:
+def last_received_ns(catalogue: StoreCatalogue) -> int | None:
     """Return when the newest record was received."""
     return max((end_ns for _, end_ns in _ends(catalogue)), default=None)
 
 
-def _holes(catalogue: Catalogue) -> Iterator[Gap]:
-    """Walk the journals for rows that are not there; what lives on in segments is no gap.
+def _holes(catalogue: StoreCatalogue) -> Iterator[Gap]:
+    """Yield the missing rows of the journals; rows that are in segments are no gap.
 
-    What was deleted comes with its reason, from the tombstones.
+    Deleted rows come with their reason, from the tombstones.
     """
     store = open_store(catalogue.store)
     for writer in (writer for writer in store.writers() if writer in RECORDED):
@@ -175,7 +167,7 @@ class _HoleTail(WriterTail):
         yield from super()._static(path)
 
 
-def _outside_segments(gap: Gap, catalogue: Catalogue) -> Iterator[Gap]:
+def _outside_segments(gap: Gap, catalogue: StoreCatalogue) -> Iterator[Gap]:
     """Cut out of a gap the journals whose rows are in segments."""
     assert gap.from_seq is not None
     reached, since_ns = gap.from_seq, gap.from_ns
@@ -189,7 +181,7 @@ def _outside_segments(gap: Gap, catalogue: Catalogue) -> Iterator[Gap]:
         yield _piece(gap, reached, end, since_ns, gap.to_ns)
 
 
-def _covered(catalogue: Catalogue, gap: Gap) -> list[Journal]:
+def _covered(catalogue: StoreCatalogue, gap: Gap) -> list[ManifestJournal]:
     if not catalogue.with_segments:
         return []
     found = [
@@ -207,15 +199,15 @@ def _piece(gap: Gap, from_seq: int, to_seq: int, from_ns: int, to_ns: int) -> Ga
     return replace(gap, from_seq=from_seq, to_seq=to_seq, count=count, from_ns=from_ns, to_ns=to_ns)
 
 
-def _deleted(catalogue: Catalogue) -> Iterator[Gap]:
+def _deleted(catalogue: StoreCatalogue) -> Iterator[Gap]:
     existing, sealed = set(catalogue.existing), catalogue.manifest.sealed
     for journal in catalogue.manifest.journals.values():
         if journal.name not in existing or journal.name in catalogue.done:
             yield from sealed[journal.name].gaps() if journal.name in sealed else ()
 
 
-def _undecodable(catalogue: Catalogue) -> Iterator[Gap]:
-    """Name messages without columns: as the manifest says, else by unrolling the journal once."""
+def _undecodable(catalogue: StoreCatalogue) -> Iterator[Gap]:
+    """Yield messages without columns: by the manifest, else by unrolling the journal once."""
     raw = {(journal.name, item) for item, found in catalogue.raw.items() for journal, _ in found}
     for done in catalogue.manifest.journals.values():
         for gap in done.gaps:
@@ -232,16 +224,16 @@ def _undecodable(catalogue: Catalogue) -> Iterator[Gap]:
 
 @lru_cache(maxsize=256)
 def _misfits(path: Path, name: str, _mtime_ns: int, _size: int) -> tuple[Gap, ...]:
-    """Unroll a journal for what does not decode; remembered until the file changes."""
+    """Return the undecodable messages of a journal as gaps; cached until the file changes."""
     journal, found = journal_file(path, name), list[Gap]()
     for _ in batches_of(journal, with_columns(journal, found.append), on_gap=found.append):
         pass
     return tuple(found)
 
 
-def _lost_columns(catalogue: Catalogue, span: Span) -> Iterator[Gap]:
-    """Give what damaged segments held of journals whose file is gone; pages are not read."""
-    wanted = Request("", (), span)
+def _lost_columns(catalogue: StoreCatalogue, span: TimeSpan) -> Iterator[Gap]:
+    """Yield the rows lost in damaged segments whose journals are gone; pages are not read."""
+    wanted = RowRequest("", (), span)
     listed = (s for found in catalogue.manifest.segments.values() for s in found)
     lost = {segment.path for segment in catalogue.manifest.lost}
     for segment in (*catalogue.manifest.lost, *(listed if catalogue.with_segments else ())):
@@ -254,10 +246,10 @@ def _lost_columns(catalogue: Catalogue, span: Span) -> Iterator[Gap]:
             yield from (gap_of_part(segment, part, reason) for part in gone)
 
 
-def _can_be_opened(catalogue: Catalogue, segment: Segment) -> bool:
+def _can_be_opened(catalogue: StoreCatalogue, segment: Segment) -> bool:
     schema = catalogue.manifest.schemas[segment.schema]
     try:
-        with noticing_damage(catalogue, segment):
+        with damage_raised(catalogue, segment):
             row_groups(catalogue.store, segment, schema, "received")
     except DamagedSegmentError:
         return False

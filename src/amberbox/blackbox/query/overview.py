@@ -1,4 +1,4 @@
-"""What a record holds, item by item: rows, times, rates, the stamps' distance from receipt.
+"""Summarise a record item by item: rows, times, rates, the stamps' distance from receipt.
 
 Of journals that are in no segments yet the index is counted, and messages of a few chunks are
 unrolled: a list of items has to come at once, also of an hour that is just being written.
@@ -6,32 +6,72 @@ unrolled: a list of items has to come at once, also of an hour that is just bein
 
 from __future__ import annotations
 
-from collections.abc import Collection, Container, Iterator, Mapping, Sequence
+from bisect import bisect_left
+from collections.abc import Collection, Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
-from amberbox.blackbox.follow.read import JournalFile, batches_of, sound_chunks
-from amberbox.blackbox.journal import reserved
-from amberbox.blackbox.journal.clocktable import ClockPoints, ClockTable
-from amberbox.blackbox.journal.growing import UnindexedError, counted
-from amberbox.blackbox.journal.scan import ChunkPlace, Tally, tally_of, together
-from amberbox.blackbox.query.catalogue import Catalogue, item_of, stream_tables, union
-from amberbox.blackbox.query.rates import Place, Share, deleted_places, rate_hz
-from amberbox.blackbox.segments.build import median
-from amberbox.blackbox.segments.flat import Flat, TableSchema, flatten
-from amberbox.blackbox.segments.manifest import Part, part_clock
+from amberbox.blackbox.columns.flat_tables import FlatTable, TableSchema, flatten
+from amberbox.blackbox.journal import channels
+from amberbox.blackbox.journal.index import UnindexedError, count_messages
+from amberbox.blackbox.journal.scan import ChannelTally, ChunkPlace, merge_tallies, tally_chunk
+from amberbox.blackbox.store.catalogue import StoreCatalogue, item_of, stream_tables, union
+from amberbox.blackbox.store.clocks import ClockPoints, ClockTable
+from amberbox.blackbox.store.journal_reader import JournalFile, batches_of, sound_chunks
+from amberbox.blackbox.store.manifest_entries import SegmentPart
+from amberbox.blackbox.store.segment_builder import median
 from amberbox.core.clock import NS
-from amberbox.core.timetext import format_time
+from amberbox.core.timestamps import format_time
 from amberbox.core.types import IntArray
 
-_SMALL_BYTES = 1 << 20
-"""A journal that is no larger is unpacked whole: then every count is exact."""
-_CHUNKS = 16
-"""Chunks of an item that are unpacked for what the index does not say."""
+Place: TypeAlias = tuple[str, int, int]  # writer, run, and the first sequence number
+
+
+@dataclass(frozen=True, slots=True)
+class JournalShare:
+    """The share of one journal in an item."""
+
+    place: Place
+    rows: int
+    first_ns: int
+    last_ns: int
+    bytes: int = 0
+    stamp_offset_ns: int | None = None
+    estimated: bool = False
+
+
+def rate_hz(shares: Iterable[JournalShare], holes: Iterable[Place]) -> float | None:
+    """Return the mean rate over all stretches that were recorded without a pause.
+
+    A stretch is one run of one writer, or the time between two holes in it. None where no stretch
+    has two rows.
+    """
+    cuts = sorted(holes)
+    stretches: dict[tuple[str, int, int], list[JournalShare]] = {}
+    for share in shares:
+        writer, run, _ = share.place
+        stretches.setdefault((writer, run, bisect_left(cuts, share.place)), []).append(share)
+    steps = sum(sum(share.rows for share in found) - 1 for found in stretches.values())
+    span_ns = sum(
+        max(share.last_ns for share in found) - min(share.first_ns for share in found)
+        for found in stretches.values()
+    )
+    return round(steps * NS / span_ns, 3) if span_ns > 0 else None
+
+
+def deleted_positions(catalogue: StoreCatalogue) -> Iterator[Place]:
+    """Yield where whole journals were deleted, columns and all."""
+    for stone in catalogue.manifest.tombstones:
+        if stone.what != "raw" and not set(stone.journals) & set(catalogue.existing):
+            yield stone.writer, stone.run, stone.first_seq
+
+
+_SMALL_BYTES = 1 << 20  # a journal that is no larger is unpacked whole: then every count is exact
+_CHUNKS = 16  # chunks of an item that are unpacked for data not in the index
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,12 +79,12 @@ class ItemInfo:
     """One data item or child table of a record.
 
     ``rate_hz`` is over the time of recording: pauses between runs, and what was deleted whole, do
-    not count; None where no two rows came in one run. ``stamp_offset_s`` is how far stamps lie
+    not count; None where no two rows came in one run. ``stamp_offset_s`` is how far stamps are
     behind receipt (median over the record), None without stamps; ``bytes`` counts the messages as
-    received (0 for child tables). ``estimated`` tells that ``rows`` of a child table come from a
-    sample of messages. Of items the rows are all messages: those that turn out not to decode are
-    left out when their journal becomes segments, and ``gaps`` names them. ``no_columns`` says why
-    the messages are there only as they came.
+    received (0 for child tables). ``estimated``: the ``rows`` of a child table come from a sample
+    of messages. Of items the rows are all messages: those that turn out not to decode are left out
+    when their journal becomes segments, and ``gaps`` names them. ``no_columns`` is why there are
+    only raw messages.
     """
 
     name: str
@@ -78,17 +118,17 @@ class ItemInfo:
         }
 
 
-def overview(catalogue: Catalogue) -> list[ItemInfo]:
-    """Describe each table that has rows, by name; the box's own channels come last."""
-    holes = list(deleted_places(catalogue))
+def overview(catalogue: StoreCatalogue) -> list[ItemInfo]:
+    """Return each table that has rows, by name; the box's own channels come last."""
+    holes = list(deleted_positions(catalogue))
     infos = [_info(catalogue, table, holes) for table in sorted(catalogue.schemas)]
     known = [info for info in infos if info is not None]
     known += _without_rows(catalogue, {info.name for info in known})
     known.sort(key=lambda info: info.name)
-    return sorted(known, key=lambda info: info.source == reserved.SOURCE)
+    return sorted(known, key=lambda info: info.source == channels.SOURCE)
 
 
-def _info(catalogue: Catalogue, table: str, holes: Sequence[Place]) -> ItemInfo | None:
+def _info(catalogue: StoreCatalogue, table: str, holes: Sequence[Place]) -> ItemInfo | None:
     shares = list(_shares(catalogue, table))
     rows, estimated = sum(share.rows for share in shares), any(share.estimated for share in shares)
     if not rows and not estimated:
@@ -109,8 +149,8 @@ def _info(catalogue: Catalogue, table: str, holes: Sequence[Place]) -> ItemInfo 
     )
 
 
-def _stamp_offset_s(shares: Sequence[Share]) -> float | None:
-    """Median over the journals' medians, each counting by its rows."""
+def _stamp_offset_s(shares: Sequence[JournalShare]) -> float | None:
+    """Return the median of the journals' medians, weighted by rows, seconds."""
     known = sorted(
         (share.stamp_offset_ns, share.rows) for share in shares if share.stamp_offset_ns is not None
     )
@@ -121,7 +161,7 @@ def _stamp_offset_s(shares: Sequence[Share]) -> float | None:
     return known[middle][0] / NS
 
 
-def _shares(catalogue: Catalogue, table: str) -> Iterator[Share]:
+def _shares(catalogue: StoreCatalogue, table: str) -> Iterator[JournalShare]:
     for segment in catalogue.segments(table):
         for part in segment.parts:
             yield _share_of_part(part)
@@ -131,20 +171,18 @@ def _shares(catalogue: Catalogue, table: str) -> Iterator[Share]:
             yield share
 
 
-def _share_of_part(part: Part) -> Share:
-    edges = np.array([part.from_ns, part.to_ns])
-    first, last = ClockTable(part_clock(part)).received(edges).tolist()
+def _share_of_part(part: SegmentPart) -> JournalShare:
     place = part.writer, part.run, part.first_seq
-    return Share(place, part.rows, first, last, part.bytes, part.stamp_offset_ns)
+    return JournalShare(place, part.rows, *part.received_range_ns, part.bytes, part.stamp_offset_ns)
 
 
-def _journal_shares(journal: JournalFile) -> Mapping[str, Share]:
+def _journal_shares(journal: JournalFile) -> Mapping[str, JournalShare]:
     key = journal.path, journal.bytes, journal.end_seq, journal.clock
-    return _counted(_Asked(key, journal))
+    return _counted(_JournalKey(key, journal))
 
 
 @dataclass(frozen=True, slots=True)
-class _Asked:
+class _JournalKey:
     """A journal as it was found; ``key`` changes with the file and its clock."""
 
     key: tuple[Path, int, int, ClockPoints]
@@ -160,8 +198,8 @@ class _Sample:
     last_ns: int = 0
     ages: list[IntArray] = field(default_factory=list)
 
-    def add(self, flat: Flat) -> None:
-        """Take rows."""
+    def add(self, flat: FlatTable) -> None:
+        """Add rows."""
         first_ns, last_ns = int(flat.received_ns.min()), int(flat.received_ns.max())
         self.first_ns = min(self.first_ns, first_ns) if self.rows else first_ns
         self.last_ns = max(self.last_ns, last_ns) if self.rows else last_ns
@@ -171,12 +209,12 @@ class _Sample:
 
 
 @lru_cache(maxsize=256)
-def _counted(asked: _Asked) -> Mapping[str, Share]:
+def _counted(journal_key: _JournalKey) -> Mapping[str, JournalShare]:
     """Count a journal's rows by its index; remembered until the file or its clock changes."""
-    journal = asked.journal
+    journal = journal_key.journal
     tallies = _tallies(journal)
     tables: dict[str, dict[str, TableSchema]] = {}
-    totals: dict[str, Tally] = {}
+    totals: dict[str, ChannelTally] = {}
     numbers: dict[str, set[int]] = {}
     for number, stream in journal.streams.items():
         made = stream_tables(stream)
@@ -186,7 +224,7 @@ def _counted(asked: _Asked) -> Mapping[str, Share]:
             numbers.setdefault(stream.item, set()).add(number)
     places, whole = _chosen(journal, numbers, {i for i in tables if _is_sampled(tables[i])})
     samples = _sampled(replace(journal, places=places), tables)
-    shares: dict[str, Share] = {}
+    shares: dict[str, JournalShare] = {}
     for item, total in totals.items():
         for table in tables[item].values():
             share = _share(journal, total, table, samples, exact=item in whole)
@@ -196,23 +234,23 @@ def _counted(asked: _Asked) -> Mapping[str, Share]:
 
 
 def _is_sampled(tables: Mapping[str, TableSchema]) -> bool:
-    """Tell whether an item's index does not say all: of stamps and child tables it does not."""
+    """Return whether an item's index is not enough: it has no stamps and no child tables."""
     return len(tables) > 1 or any(table.stamp for table in tables.values())
 
 
-def _tallies(journal: JournalFile) -> Mapping[int, Tally]:
+def _tallies(journal: JournalFile) -> Mapping[int, ChannelTally]:
     if journal.tallies is not None:
         return journal.tallies
     try:
-        return counted(journal.path)
+        return count_messages(journal.path)
     except UnindexedError:
-        return together(tally_of(chunk) for chunk in sound_chunks(journal))
+        return merge_tallies(tally_chunk(chunk) for chunk in sound_chunks(journal))
 
 
 def _chosen(
     journal: JournalFile, numbers: Mapping[str, Collection[int]], sampled: Collection[str]
 ) -> tuple[list[ChunkPlace], set[str]]:
-    """Choose chunks to be unpacked, and name the items of which these are all.
+    """Return the chunks to be unpacked, and the items of which these are all.
 
     All are of a small journal. In others ``_CHUNKS`` are taken evenly of each item with more.
     """
@@ -235,7 +273,7 @@ def _chosen(
 
 
 def _sampled(journal: JournalFile, items: Collection[str]) -> dict[str, _Sample]:
-    """Unroll the messages of some chunks; return what there is of each table."""
+    """Unroll the messages of some chunks; return the sample of each table."""
     found: dict[str, _Sample] = {}
     for batch in batches_of(journal, items) if journal.places else ():
         for flat in flatten(batch):
@@ -246,29 +284,30 @@ def _sampled(journal: JournalFile, items: Collection[str]) -> dict[str, _Sample]
 
 def _share(
     journal: JournalFile,
-    total: Tally,
+    total: ChannelTally,
     table: TableSchema,
     samples: Mapping[str, _Sample],
     *,
     exact: bool,
-) -> Share:
+) -> JournalShare:
     place = journal.writer, journal.run, journal.first_seq
     sample = samples.get(table.item, _Sample())
     size = 0 if table.parent else total.bytes
     if exact:
-        return Share(place, sample.rows, sample.first_ns, sample.last_ns, size, median(sample.ages))
-    edges = np.array([total.first_ns, total.last_ns])
-    first_ns, last_ns = ClockTable(journal.clock).received(edges).tolist()
+        return JournalShare(
+            place, sample.rows, sample.first_ns, sample.last_ns, size, median(sample.ages)
+        )
+    first_ns, last_ns = ClockTable(journal.clock).span(total.first_ns, total.last_ns)
     rows, estimated = total.rows, bool(table.parent)
     if estimated:
         messages = samples.get(table.parent, _Sample()).rows
         rows = round(total.rows * sample.rows / max(messages, 1))
-    return Share(place, rows, first_ns, last_ns, size, median(sample.ages), estimated)
+    return JournalShare(place, rows, first_ns, last_ns, size, median(sample.ages), estimated)
 
 
-def _without_rows(catalogue: Catalogue, named: Container[str]) -> Iterator[ItemInfo]:
-    """Describe items of which no message can be unrolled, by their receipt alone."""
-    found: dict[str, list[tuple[JournalFile, Tally]]] = {}
+def _without_rows(catalogue: StoreCatalogue, named: Container[str]) -> Iterator[ItemInfo]:
+    """Yield items of which no message can be unrolled, by their receipt alone."""
+    found: dict[str, list[tuple[JournalFile, ChannelTally]]] = {}
     for journal in catalogue.journals(skip=catalogue.columns_done):
         for item, count in journal.items.items():
             if count and item not in named:
@@ -277,9 +316,9 @@ def _without_rows(catalogue: Catalogue, named: Container[str]) -> Iterator[ItemI
                 for number in numbers:
                     if number in tallies and not journal.streams[number].repeated:
                         found.setdefault(item, []).append((journal, tallies[number]))
-    for item, told in found.items():
-        stream = next(s for s in told[-1][0].streams.values() if s.item == item)
-        shares = [_raw_share(journal, tally) for journal, tally in told]
+    for item, counted_in in found.items():
+        stream = next(s for s in counted_in[-1][0].streams.values() if s.item == item)
+        shares = [_raw_share(journal, tally) for journal, tally in counted_in]
         raw = catalogue.raw.get(item)
         why = raw[-1][1].reason.partition(": ")[2] if raw else "no message fits its definition"
         yield ItemInfo(
@@ -291,8 +330,7 @@ def _without_rows(catalogue: Catalogue, named: Container[str]) -> Iterator[ItemI
         )  # fmt: skip
 
 
-def _raw_share(journal: JournalFile, tally: Tally) -> Share:
+def _raw_share(journal: JournalFile, tally: ChannelTally) -> JournalShare:
     place = journal.writer, journal.run, journal.first_seq
-    edges = np.array([tally.first_ns, tally.last_ns])
-    first_ns, last_ns = ClockTable(journal.clock).received(edges).tolist()
-    return Share(place, tally.rows, first_ns, last_ns, tally.bytes, None)
+    first_ns, last_ns = ClockTable(journal.clock).span(tally.first_ns, tally.last_ns)
+    return JournalShare(place, tally.rows, first_ns, last_ns, tally.bytes, None)

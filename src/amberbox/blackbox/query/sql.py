@@ -9,21 +9,21 @@ from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from amberbox.blackbox.journal.clocktable import ClockTable, Piece
-from amberbox.blackbox.query.catalogue import Catalogue
-from amberbox.blackbox.query.gather import (
-    Request,
+from amberbox.blackbox.columns.arrays import NUMPY_TYPES, element_type
+from amberbox.blackbox.columns.arrow import arrow_type, from_arrow
+from amberbox.blackbox.columns.flat_tables import TableSchema
+from amberbox.blackbox.query.table import Table
+from amberbox.blackbox.store.catalogue import StoreCatalogue
+from amberbox.blackbox.store.clocks import ClockTable, OffsetPiece
+from amberbox.blackbox.store.manifest_entries import Segment, part_clock
+from amberbox.blackbox.store.segment_file import seq_name, stored_name
+from amberbox.blackbox.store.table_reader import (
+    RowRequest,
     from_journals,
     gather,
     merge,
     without_damage,
 )
-from amberbox.blackbox.query.table import Table
-from amberbox.blackbox.segments.columns import NUMPY_TYPES, element_type
-from amberbox.blackbox.segments.columns_io import arrow_type, from_arrow
-from amberbox.blackbox.segments.flat import TableSchema
-from amberbox.blackbox.segments.manifest import Segment, part_clock
-from amberbox.blackbox.segments.parquet import seq_name, stored_name
 from amberbox.core.errors import AmberboxError, UsageError
 from amberbox.core.files import below
 from amberbox.core.types import Column, ColumnData
@@ -32,16 +32,15 @@ if TYPE_CHECKING:
     import duckdb
     import pyarrow as pa
 
-Pieces: TypeAlias = tuple[tuple[int, Piece], ...]
+Pieces: TypeAlias = tuple[tuple[int, OffsetPiece], ...]
 
-_JOURNALS = "journals"
-"""Schema of the rows that no segment serves."""
+_JOURNALS = "journals"  # schema of the rows that no segment serves
 
 _PERIOD_S = 0.05
 _UNREAD = "amberbox: not read yet"
 _FAILS = f"error('{_UNREAD}')"
+# Words of statements that may get at columns without naming them
 _EVERY = frozenset({"columns", "explain"})
-"""Words of statements that may get at columns without naming them."""
 
 _TYPES = {
     "bool": "BOOLEAN",
@@ -61,15 +60,16 @@ _TYPES = {
 }
 
 
-def run_sql(catalogue: Catalogue, statement: str) -> Table:
-    """Answer a SELECT over the views of a record; times are UTC.
+def run_sql(catalogue: StoreCatalogue, statement: str) -> Table:
+    """Run a SELECT over the views of a record; times are UTC.
 
     Each data item and child table is a view: ``timestamp``, its variables, ``received``, ``seq``
     (``parent_seq`` in child tables). DuckDB sees the store's segments and nothing else: no other
     file, no network, no extension, and it changes nothing.
 
-    Rows of journals are read only of the tables, and only in the columns, that the statement
-    names. What it gets at in other ways (``*``, ``query_table``) is read when it turns out.
+    Rows of journals are read only of the tables, and only in the columns, that the statement names.
+    Tables used in other ways (``*``, ``query_table``) are read when the statement fails without
+    them.
 
     Raises UsageError without DuckDB, or when the statement is wrong or not a single SELECT,
     DESCRIBE, SHOW or EXPLAIN; AmberboxError when DuckDB cannot carry it out.
@@ -88,7 +88,7 @@ def run_sql(catalogue: Catalogue, statement: str) -> Table:
 
 @dataclass(frozen=True)
 class _Named:
-    """What a statement names, and so what has to be read of journals to answer it."""
+    """The names in a statement, and so the tables and columns to read from journals."""
 
     statement: str
     all_columns: bool = False
@@ -105,7 +105,7 @@ class _Named:
         )
 
     def table(self, name: str) -> bool:
-        """Tell whether rows of a table are wanted."""
+        """Return whether rows of a table are wanted."""
         return self.all_tables or self._names(name)
 
     def columns(self, schema: TableSchema) -> list[str]:
@@ -116,9 +116,12 @@ class _Named:
 
 
 def _create_views(
-    catalogue: Catalogue, named: _Named, notes: list[str], connection: duckdb.DuckDBPyConnection
+    catalogue: StoreCatalogue,
+    named: _Named,
+    notes: list[str],
+    connection: duckdb.DuckDBPyConnection,
 ) -> list[str]:
-    """Create a view for each table; ``notes`` get what is damaged of those that are read."""
+    """Create a view for each table; damage of those that are read is added to ``notes``."""
     files: list[str] = []
     for table in sorted(catalogue.schemas):
         if named.table(table):
@@ -135,16 +138,33 @@ def run_views(
     names: Sequence[str],
     statement: str,
 ) -> Table:
-    """Answer a SELECT over views that ``create`` makes; it returns the files that they read."""
+    """Run a SELECT over views that ``create`` makes; ``create`` returns the files they read."""
     duckdb = _duckdb()
     wrong = (duckdb.ProgrammingError, duckdb.DataError, duckdb.NotSupportedError,
              duckdb.PermissionException)  # fmt: skip
     with duckdb.connect(":memory:") as connection:
         connection.execute("SET TimeZone = 'UTC'")
-        _shut_off(connection, create(connection))
+        files = create(connection)
+        connection.execute("SET autoinstall_known_extensions = false")
+        connection.execute("SET autoload_known_extensions = false")
+        connection.execute("SET python_enable_replacements = false")
+        connection.execute(f"SET allowed_paths = [{', '.join(map(quoted, files))}]")
+        connection.execute("SET enable_external_access = false")
+        connection.execute("SET lock_configuration = true")
         try:
-            _refuse_all_but_questions(connection, statement)
-            return _to_table(_answer(connection, statement))
+            kinds = [parsed.type.name for parsed in connection.extract_statements(statement)]
+            if len(kinds) != 1 or kinds[0] not in ("SELECT", "EXPLAIN"):
+                raise UsageError(
+                    f"SQL: expected one SELECT, not {' and '.join(kinds) or 'nothing'}",
+                    "sql only reads; SELECT, DESCRIBE, SHOW TABLES and EXPLAIN work",
+                )
+            answer = _answer(connection, statement)
+            fields, columns = [], {}
+            for name, array in zip(_distinct(answer.column_names), answer.columns, strict=True):
+                kind, known = _known(array)
+                fields.append(Column(name, name, kind))
+                columns[name] = from_arrow(known, kind)
+            return Table("sql", tuple(fields), columns)
         except wrong as error:
             raise UsageError(f"SQL: {error}", _hint(names)) from error
         except duckdb.Error as error:  # memory, files: the statement is not at fault
@@ -164,15 +184,6 @@ def _answer(connection: duckdb.DuckDBPyConnection, statement: str) -> Any:
             raise
 
 
-def _refuse_all_but_questions(connection: duckdb.DuckDBPyConnection, statement: str) -> None:
-    kinds = [parsed.type.name for parsed in connection.extract_statements(statement)]
-    if len(kinds) != 1 or kinds[0] not in ("SELECT", "EXPLAIN"):
-        raise UsageError(
-            f"SQL: expected one SELECT, not {' and '.join(kinds) or 'nothing'}",
-            "sql only reads; SELECT, DESCRIBE, SHOW TABLES and EXPLAIN work",
-        )
-
-
 def _duckdb() -> Any:
     try:
         import duckdb
@@ -185,17 +196,8 @@ def _hint(names: Sequence[str]) -> str:
     return "views: " + ", ".join(names)
 
 
-def _shut_off(connection: duckdb.DuckDBPyConnection, files: Sequence[str]) -> None:
-    connection.execute("SET autoinstall_known_extensions = false")
-    connection.execute("SET autoload_known_extensions = false")
-    connection.execute("SET python_enable_replacements = false")
-    connection.execute(f"SET allowed_paths = [{', '.join(map(quoted, files))}]")
-    connection.execute("SET enable_external_access = false")
-    connection.execute("SET lock_configuration = true")
-
-
 def _create_unread_view(connection: duckdb.DuckDBPyConnection, schema: TableSchema) -> None:
-    """Make a view that has a table's columns, and fails when rows of it are asked for."""
+    """Make a view that has a table's columns, and fails when its rows are read."""
     columns = ", ".join(_unread(column) for column in _fields(schema))
     connection.execute(
         f"CREATE VIEW {quoted_name(schema.item)} AS SELECT {columns} WHERE {_FAILS}::BOOLEAN"
@@ -219,7 +221,7 @@ def _fields(schema: TableSchema) -> tuple[Column, ...]:
 
 def _create_view(
     connection: duckdb.DuckDBPyConnection,
-    catalogue: Catalogue,
+    catalogue: StoreCatalogue,
     table: str,
     named: _Named,
     files: list[str],
@@ -240,14 +242,14 @@ def _create_view(
 
 
 def _beside(connection: duckdb.DuckDBPyConnection, table: str, rows: pa.Table) -> str:
-    """Make a view of rows in memory where SHOW TABLES does not look, and return its full name."""
+    """Make a view of rows in memory that SHOW TABLES does not list, and return its full name."""
     connection.execute(f"CREATE SCHEMA IF NOT EXISTS {_JOURNALS}; USE {_JOURNALS}")
     connection.from_arrow(rows).create_view(table)
     connection.execute("USE main")
     return f"{_JOURNALS}.{quoted_name(table)}"
 
 
-def _groups(catalogue: Catalogue, table: str) -> dict[tuple[TableSchema, Pieces], list[str]]:
+def _groups(catalogue: StoreCatalogue, table: str) -> dict[tuple[TableSchema, Pieces], list[str]]:
     """Group a table's segments by schema version and clock: each group is one SELECT."""
     groups: dict[tuple[TableSchema, Pieces], list[str]] = {}
     for segment in catalogue.segments(table):
@@ -262,8 +264,8 @@ def _select(schema: TableSchema, version: TableSchema, pieces: Pieces, paths: Se
     return f"SELECT {columns} FROM read_parquet([{', '.join(map(quoted, paths))}])"
 
 
-def _needs_text(catalogue: Catalogue, schema: TableSchema) -> bool:
-    """Numbers that became text are converted by us, so that SQL and query say the same."""
+def _needs_text(catalogue: StoreCatalogue, schema: TableSchema) -> bool:
+    """Return whether numbers became text: we convert them, so that SQL and query agree."""
     kinds = {column.name: column.type for column in schema.columns}
     return any(
         column.type != kinds[column.name] and "string" in kinds[column.name]
@@ -273,14 +275,14 @@ def _needs_text(catalogue: Catalogue, schema: TableSchema) -> bool:
 
 
 def _pieces(segment: Segment) -> Pieces:
-    """Say how the offset goes, each entry from a log time on; most files have a single one."""
-    found: list[tuple[int, Piece]] = []
+    """Return the clock offsets, each from a log time on; most files have a single one."""
+    found: list[tuple[int, OffsetPiece]] = []
     for part in segment.parts:
         for piece in ClockTable(part_clock(part)).pieces():
             if not found or piece.rate or found[-1][1][1:] != piece[1:]:
                 found.append((max(piece.log_ns, part.from_ns), piece))
     if len(found) == 1 and not found[0][1].rate:
-        return ((0, Piece(0, found[0][1].offset_ns, 0.0)),)
+        return ((0, OffsetPiece(0, found[0][1].offset_ns, 0.0)),)
     return tuple(found)
 
 
@@ -303,7 +305,7 @@ def _offset(pieces: Pieces) -> str:
     return f"CASE {cases} ELSE {_offset_of(first)} END"
 
 
-def _offset_of(piece: Piece) -> str:
+def _offset_of(piece: OffsetPiece) -> str:
     """Compute as ``ClockTable`` does, to the nanosecond."""
     if not piece.rate:
         return str(piece.offset_ns)
@@ -322,7 +324,7 @@ def _column(column: Column, version: TableSchema) -> str:
 
 
 def sql_type(column_type: str) -> str:
-    """Name the type in DuckDB that holds a column."""
+    """Return the type in DuckDB that holds a column."""
     inner = element_type(column_type)
     if inner is not None:
         return f"{sql_type(inner)}[]"
@@ -330,20 +332,22 @@ def sql_type(column_type: str) -> str:
 
 
 def quoted_name(name: str) -> str:
-    """Quote a name for SQL."""
+    """Return a name quoted for SQL."""
     return '"' + name.replace('"', '""') + '"'
 
 
 def quoted(text: str) -> str:
-    """Quote a text for SQL."""
+    """Return a text quoted for SQL."""
     return "'" + text.replace("'", "''") + "'"
 
 
 def _journal_rows(
-    catalogue: Catalogue, schema: TableSchema, names: Sequence[str], *, also_segments: bool
+    catalogue: StoreCatalogue, schema: TableSchema, names: Sequence[str], *, also_segments: bool
 ) -> pa.Table | None:
     """Return the rows that no segment serves, as an Arrow table with some of the columns."""
-    request = Request(schema.item, names)
+    import pyarrow as pa
+
+    request = RowRequest(schema.item, names)
     found = gather(catalogue, request) if also_segments else from_journals(catalogue, request)
     if not found.pieces and not also_segments:
         return None
@@ -351,30 +355,14 @@ def _journal_rows(
     keys: dict[str, ColumnData] = {"received": rows.received_ns, seq_name(schema): rows.seq}
     columns = {"timestamp": rows.timestamp_ns, **rows.columns, **keys}
     fields = tuple(field for field in _fields(schema) if field.name in columns)
-    return _without_zone(Table(schema.item, fields, columns).to_arrow())
-
-
-def _without_zone(table: pa.Table) -> pa.Table:
-    """Make times plain UTC, as the segments' are in the views."""
-    import pyarrow as pa
-
-    plain = pa.timestamp("ns")
+    table = Table(schema.item, fields, columns).to_arrow()
+    plain = pa.timestamp("ns")  # times in plain UTC, as the segments' are in the views
     kinds = [plain if pa.types.is_timestamp(f.type) else f.type for f in table.schema]
     return table.cast(pa.schema(list(zip(table.schema.names, kinds, strict=True))))
 
 
-def _to_table(answer: pa.Table) -> Table:
-    """Turn DuckDB's answer into a table; what we have no type for becomes text."""
-    fields, columns = [], {}
-    for name, array in zip(_distinct(answer.column_names), answer.columns, strict=True):
-        kind, known = _known(array)
-        fields.append(Column(name, name, kind))
-        columns[name] = from_arrow(known, kind)
-    return Table("sql", tuple(fields), columns)
-
-
 def _distinct(names: Sequence[str]) -> list[str]:
-    """Tell columns of the same name apart: ``a``, ``a_2``."""
+    """Make names of columns unique: ``a``, ``a_2``."""
     seen: dict[str, int] = {}
     distinct = []
     for name in names:
@@ -405,7 +393,7 @@ def _known(array: pa.ChunkedArray) -> tuple[str, pa.ChunkedArray]:
 
 
 def _decimal(array: pa.ChunkedArray) -> tuple[str, pa.ChunkedArray]:
-    """DuckDB sums integers in 128 bits: give them back as integers where they fit."""
+    """Return DuckDB's 128-bit sums of integers as 64-bit integers where they fit."""
     import pyarrow as pa
 
     if array.type.scale == 0:

@@ -1,4 +1,4 @@
-"""From the queue through the filters into the journals: everything is accounted for.
+"""The pipeline: from the queue through the filters into the journals; every message is counted.
 
 ``tick`` does one write interval's work and runs in one thread. The recorder calls it every
 ``write_s``; an import calls it whenever enough has been read.
@@ -6,70 +6,370 @@
 
 from __future__ import annotations
 
+import errno
 import threading
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from contextlib import suppress
 from copy import copy
 from dataclasses import dataclass, field
 from operator import itemgetter
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeAlias
 
 import msgspec
 
-from amberbox import __version__
-from amberbox.blackbox.follow.chain import previous_chain
-from amberbox.blackbox.follow.follow import RECORDED
-from amberbox.blackbox.journal import reserved
-from amberbox.blackbox.journal.syncmark import SyncMark
-from amberbox.blackbox.journal.writer import JournalOptions, JournalWriter
-from amberbox.blackbox.recorder.admission import Admission
-from amberbox.blackbox.recorder.filtering import Message, change_filtered, rate_limited
-from amberbox.blackbox.recorder.gaplog import GapLog
-from amberbox.blackbox.recorder.intake import Intake
-from amberbox.blackbox.recorder.journals import Journals
-from amberbox.blackbox.recorder.messageclock import MessageClock
-from amberbox.blackbox.recorder.names import ItemNames
-from amberbox.blackbox.recorder.room import DISK_FULL, Room
-from amberbox.blackbox.recorder.stalls import StallMeter
-from amberbox.blackbox.recorder.streams import Item, Stream
-from amberbox.blackbox.store import Store, WriterLock
-from amberbox.core.clock import NS, RunClock
+from amberbox.blackbox.journal import channels
+from amberbox.blackbox.journal.writer import JournalOptions, JournalWriter, SyncMark
+from amberbox.blackbox.recorder.disk_room import DISK_FULL, AdmissionControl, DiskRoom, GapLog
+from amberbox.blackbox.recorder.queue import (
+    DataItem,
+    EmitEvent,
+    MessageQueue,
+    StreamMessage,
+    TopicStream,
+    change_filtered,
+    rate_limited,
+    report_bad_stamp,
+)
+from amberbox.blackbox.store.item_names import ItemNames
+from amberbox.blackbox.store.journal_reader import previous_chain
+from amberbox.blackbox.store.store import Store, WriterLock
+from amberbox.blackbox.store.tail import RECORDED
+from amberbox.core.clock import NS, LogClock, RunClock
 from amberbox.core.errors import AmberboxError
 from amberbox.core.source import Power, TopicOptions
+from amberbox.core.types import Topic
+from amberbox.core.version import __version__
 
-CLOCK_PERIOD_NS = 10 * NS
-SPARING_CLOCK_PERIOD_NS = 60 * NS
-"""The same while only events are recorded, so that their room lasts."""
-CLOCK_STEP_NS = 50_000_000
-EPOCH_STEP_NS = NS
-STALL_EVENT_NS = NS
-"""A stall of the recorder is an event of its own if it was that long."""
-HEARTBEAT_NS = NS
-"""In silence the counters are still written this often, so that replay's watermark advances."""
+JournalRow: TypeAlias = tuple[int, int, int, bytes]  # channel, log time, publish time, message
+
+# returns the own records that a writer's file begins with at a log time
+Preamble: TypeAlias = Callable[[str, int], Sequence[tuple[str, bytes]]]
+
+# called when a writer's disk is full; returns False if no room could be made
+MakeRoom: TypeAlias = Callable[[str], bool]
+
+_FULL = (errno.ENOSPC, errno.EDQUOT)
 
 
-class LogClock(Protocol):
-    """What stamps messages: a RunClock, or a MessageClock where messages bring their time."""
+class RunJournals:
+    """The journals of a run, one per keeping class; rows wait here until they are written.
+
+    All methods but ``use`` and ``repeat`` belong to the writing thread.
+    """
+
+    def __init__(
+        self,
+        make: Callable[[str], JournalWriter],
+        preamble: Preamble,
+        emit: EmitEvent,
+        make_room: MakeRoom,
+    ) -> None:
+        self._make = make
+        self._preamble_of = preamble
+        self._tell = emit
+        self._make_room = make_room
+        self._writers: dict[str, JournalWriter] = {"main": make("main")}
+        self._pending: dict[str, list[JournalRow]] = {}
+        self._channels: dict[tuple[str, Topic, str], int] = {}
+        self._items: dict[tuple[str, int], DataItem] = {}
+        self._own_channels: dict[tuple[str, str], int] = {}
+        self._repeats: dict[tuple[str, int], TopicStream] = {}
+        self._latched: list[TopicStream] = []
+        self.disk_error = ""  # text of the last write error; empty once a write has succeeded
+
+    def use(self, writer: str) -> None:
+        """Create the journal of a writer if there is none yet; from any thread."""
+        if writer not in self._writers:
+            self._writers[writer] = self._make(writer)
+
+    def repeat(self, stream: TopicStream) -> None:
+        """Repeat the last message of a latched stream in each file; from any thread."""
+        self._latched.append(stream)
+
+    def open_writers(self) -> list[str]:
+        """Return the names of the journals that have a file open, and of the main one."""
+        writers = list(self._writers.items())
+        return [name for name, writer in writers if name == "main" or writer.path]
+
+    def add(self, stream: TopicStream, received_ns: int, data: bytes) -> None:
+        """Add a message to be written."""
+        if stream.channel < 0:
+            stream.channel = self._channel(stream)
+        stamp_ns = stream.stamp_ns(data)
+        if stamp_ns is None:
+            report_bad_stamp(stream, data, self._tell)
+        row = (stream.channel, received_ns, stamp_ns or received_ns, data)
+        self._pending.setdefault(stream.item.writer, []).append(row)
+
+    def add_own(self, writer: str, name: str, at_ns: int, data: bytes) -> None:
+        """Add an own record to be written."""
+        row = (self._own_channel(writer, name), at_ns, at_ns, data)
+        self._pending.setdefault(writer, []).append(row)
+
+    def flush(self, now_ns: int) -> bool:
+        """Write all pending rows; False on an error (they stay pending)."""
+        errors = self._write_pending(now_ns)
+        full = [name for name, error in errors.items() if error.errno in _FULL]
+        made = [self._make_room(name) for name in full]
+        if any(made):
+            errors = self._write_pending(now_ns)
+        for error in errors.values():
+            text = error.strerror or str(error)
+            if text != self.disk_error:
+                self.disk_error = text
+                self._tell("disk", f"the disk does not take data: {text}")
+            return False
+        if self.disk_error:
+            self.disk_error = ""
+            self._tell("disk", "the disk takes data again")
+        return True
+
+    def _write_pending(self, now_ns: int) -> dict[str, OSError]:
+        """Write the pending messages as far as possible; return the errors by writer."""
+        errors = {}
+        for name, rows in self._pending.items():
+            rows.sort(key=itemgetter(1))
+            try:
+                if rows:
+                    self._write(name, rows, now_ns)
+            except OSError as error:
+                errors[name] = error
+        return errors
+
+    def take_back(self, writer: str, spared_bytes: int = 0) -> list[tuple[DataItem, int]]:
+        """Drop the newest messages of sources that wait for a disk; return their items and times.
+
+        The oldest ones, up to ``spared_bytes``, own records, and messages of files, which are read
+        without loss, go on waiting.
+        """
+        rows = sorted(self._pending.get(writer, ()), key=itemgetter(1))
+        stays, taken = [], []
+        for row in rows:
+            item = self._items.get((writer, row[0]))
+            spared_bytes -= len(row[3]) if item else 0
+            if item is None or item.waits or spared_bytes >= 0:
+                stays.append(row)
+                continue
+            item.counters.kept -= 1
+            item.counters.bytes -= len(row[3])
+            taken.append((item, row[1]))
+        self._pending[writer] = stays
+        return taken
+
+    def forget_own(self, writer: str) -> None:
+        """Drop the waiting own records: another journal has them as well."""
+        self._pending[writer] = []
+
+    def _write(self, name: str, rows: list[JournalRow], now_ns: int) -> None:
+        writer = self._writers[name]
+        if writer.rotation_due(now_ns):
+            writer.rotate()
+        preamble = self._preamble(name, rows[0][1]) if writer.path is None else []
+        rows[:0] = preamble
+        before = writer.next_seq
+        try:
+            channels, log_ns, publish_ns, messages = zip(*rows, strict=True)
+            writer.write(channels, log_ns, publish_ns, messages)
+        finally:  # whole chunks written before an error are not written again
+            if writer.path is None:  # no file was made: the next attempt has its own preamble
+                del rows[: len(preamble)]
+            del rows[: writer.next_seq - before]
+
+    def _preamble(self, writer: str, at_ns: int) -> list[JournalRow]:
+        """Return the rows that each file begins with: run, clock, last latched messages."""
+        rows: list[JournalRow] = [
+            (self._own_channel(writer, name), at_ns, at_ns, data)
+            for name, data in self._preamble_of(writer, at_ns)
+        ]
+        for stream in list(self._latched):
+            if stream.item.last_latched is not None:
+                self._channel(stream)
+        for (of_writer, channel), stream in self._repeats.items():
+            data = stream.item.last_latched
+            if of_writer == writer and data is not None:
+                rows.append((channel, at_ns, at_ns, data))
+        return rows
+
+    def _channel(self, stream: TopicStream) -> int:
+        """Register the channel of a stream, and the one that repeats its latched message."""
+        item, topic = stream.item, stream.topic
+        key = (item.writer, topic, item.name)
+        if key not in self._channels:
+            marks = {"item": item.name, "source": item.source}
+            if item.options.stamp is not None:
+                marks["stamp"] = item.options.stamp
+            if topic.latched:
+                marks["latched"] = "1"
+            writer = self._writers[item.writer]
+            number = self._channels[key] = writer.channel(topic, marks)
+            self._items[item.writer, number] = item
+            if topic.latched:
+                self._repeat_on(writer.channel(topic, {**marks, "repeated": "1"}), stream)
+        return self._channels[key]
+
+    def _repeat_on(self, channel: int, stream: TopicStream) -> None:
+        """Repeat an item's latched message on this channel, not on that of an old definition."""
+        for key, other in list(self._repeats.items()):
+            if other.item is stream.item:
+                del self._repeats[key]
+        self._repeats[stream.item.writer, channel] = stream
+
+    def _own_channel(self, writer: str, name: str) -> int:
+        key = (writer, name)
+        if key not in self._own_channels:
+            marks = {"item": name.replace("/", "_"), "source": channels.SOURCE}
+            topic = channels.topic_of(name)
+            self._own_channels[key] = self._writers[writer].channel(topic, marks)
+        return self._own_channels[key]
+
+    def publish_heads(self, watermark_ns: int) -> None:
+        """Write the heads, by which followers see how far the journals reach."""
+        with suppress(OSError):  # a hint only, and the flush has reported the disk
+            for writer in list(self._writers.values()):
+                writer.publish_head(0 if self.disk_error else watermark_ns)
+
+    def rotate(self) -> None:
+        """Begin new files with the next write."""
+        for writer in list(self._writers.values()):
+            writer.rotate()
+
+    def mark_sync(self) -> list[SyncMark]:
+        """Return the marks whose ``wait`` makes everything written so far durable."""
+        return [writer.mark_sync() for writer in list(self._writers.values())]
+
+    def close(self) -> str:
+        """Finish the files; return the text of the last write error, empty without one."""
+        refused = self.disk_error
+        for writer in list(self._writers.values()):
+            try:
+                writer.close()
+            except OSError as error:  # without its end the file is read by walking it
+                refused = error.strerror or str(error)
+        return refused
+
+    def unwritten(self) -> int:
+        """Return the number of messages of sources that wait for the disk."""
+        own = {(writer, number) for (writer, _), number in self._own_channels.items()}
+        waiting = [(writer, row[0]) for writer, rows in self._pending.items() for row in rows]
+        return sum(channel not in own for channel in waiting)
+
+    @property
+    def bytes_written(self) -> int:
+        """Bytes this run has put into its journals."""
+        return sum(writer.bytes_written for writer in list(self._writers.values()))
+
+    @property
+    def paths(self) -> list[Path]:
+        """Files being written right now."""
+        return [writer.path for writer in list(self._writers.values()) if writer.path]
+
+
+@dataclass
+class MessageClock:
+    """A clock that shows the time of the newest message received; it never steps."""
+
+    at_ns: int = 0
+
+    def advance(self, received_ns: int) -> None:
+        """Advance to the time of a received message."""
+        self.at_ns = max(self.at_ns, received_ns)
 
     def now_ns(self) -> int:
-        """Log time."""
+        return self.at_ns
 
-    def boot_ns(self, log_ns: int) -> int | None:
-        """Time since the computer's start at a log time; None if it does not count from there."""
+    def boot_ns(self, log_ns: int) -> None:
+        """Return None: this time is not counted from the start of a computer."""
 
     def offset_ns(self) -> int:
-        """Wall minus log time."""
+        return 0
 
     def new_epoch(self) -> None:
-        """Take wall time for the start of log time."""
+        """Do nothing: this time does not step."""
 
     def synchronised(self) -> bool | None:
-        """Tell whether the wall clock is disciplined."""
+        return None
+
+
+BEAT_S = 0.05
+# a thread that wakes later than this was stalled, and so were those of the sources
+LATE_NS = NS // 10
+
+Stall = tuple[int, int]  # start and end, nanoseconds since the computer's start
+
+
+class StallMeter:
+    """Measures how late a thread of the recorder wakes because of load, a stop or a suspend.
+
+    ``boot_ns`` is the time since the computer's start, suspend included.
+    """
+
+    def __init__(self, boot_ns: Callable[[], int]) -> None:
+        self._boot_ns = boot_ns
+        self._beat_ns = boot_ns()
+        self._stall: Stall | None = None
+        self._lock = threading.Lock()
+        self._end = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="stalls", daemon=True)
+
+    def beat(self) -> None:
+        """Record that the thread has woken."""
+        with self._lock:
+            self._note(self._boot_ns())
+
+    def take(self) -> Stall | None:
+        """Return the stall since the last call, a current one included; None without one."""
+        with self._lock:
+            now_ns = self._boot_ns()
+            if now_ns - self._beat_ns > _LIMIT_NS:
+                self._note(now_ns)
+            stall, self._stall = self._stall, None
+        return stall
+
+    def start(self) -> None:
+        """Start measuring."""
+        self._beat_ns = self._boot_ns()
+        self._thread.start()
+
+    def close(self) -> None:
+        """Stop measuring."""
+        self._end.set()
+        if self._thread.is_alive():
+            self._thread.join()
+
+    def _note(self, now_ns: int) -> None:
+        if now_ns - self._beat_ns > _LIMIT_NS:
+            from_ns = self._beat_ns if self._stall is None else self._stall[0]
+            self._stall = from_ns, now_ns
+        self._beat_ns = now_ns
+
+    def _run(self) -> None:
+        while not self._end.wait(BEAT_S):
+            self.beat()
+
+
+_LIMIT_NS = round(BEAT_S * NS) + LATE_NS
+
+
+CLOCK_PERIOD_NS = 10 * NS
+SPARING_CLOCK_PERIOD_NS = 60 * NS  # period of clock records while only events are recorded
+CLOCK_STEP_NS = 50_000_000
+EPOCH_STEP_NS = NS
+STALL_EVENT_NS = NS  # a stall of the recorder this long is an event
+# counters are written this often even without messages, so that replay's watermark advances
+HEARTBEAT_NS = NS
+
+
+class RecordingClock(LogClock, Protocol):
+    """Stamps messages: a RunClock, or a MessageClock where messages bring their time."""
+
+    def new_epoch(self) -> None:
+        """Begin a new epoch: log time starts again at wall time."""
 
 
 @dataclass(frozen=True)
 class PipelineOptions:
-    """How a run writes."""
+    """Options of one run."""
 
     robot: str = ""
     config_hash: str = ""
@@ -87,23 +387,23 @@ class Pipeline:
     """One run of the recorder: its items, its queue, its journals."""
 
     store: Store
-    clock: LogClock
+    clock: RecordingClock
     options: PipelineOptions
+    # received time up to which an earlier run reaches; gaps of this run begin there
     start_gap_ns: int | None = None
-    """Received time up to which an earlier run reaches; gaps of this run begin there."""
-    room: Room | None = None
-    """Room set aside for the last events of a full disk; an import has none."""
-    items: dict[str, Item] = field(default_factory=dict)
+    # room set aside for the last events of a full disk; an import has none
+    room: DiskRoom | None = None
+    items: dict[str, DataItem] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self._locks = [WriterLock(self.store, writer) for writer in RECORDED]
         self.run = self.store.next_run()
-        self.intake = Intake(self.options.queue_bytes)
+        self.queue = MessageQueue(self.options.queue_bytes)
         self.names = ItemNames(self.store.path, is_new=self.run == 1)
         self._own: list[tuple[str, bytes, int]] = []
         self._own_lock = threading.Lock()
         self._items_lock = threading.Lock()
-        self._journals = Journals(self._writer, self._preamble, self.event, self._make_room)
+        self._journals = RunJournals(self._writer, self._preamble, self.event, self._make_room)
         self._last_tick_ns = 0
         self._clock_written_ns: int | None = None
         self._clock_offset_ns = 0
@@ -111,21 +411,21 @@ class Pipeline:
         self._rotates = False
         self._counted_ns = 0
         self._filter_error = ""
+        # the power state that a source reported last; None if none has
         self.power: Power | None = None
-        """How the box is powered, as a source has said last; None if none has."""
+        # measures stalls of the recorder; None where messages bring their time
         self.stalls: StallMeter | None = None
-        """Measures when the recorder is held up; None where messages bring their time."""
         self.on_event: Callable[[str, str], None] | None = None
         now_ns = self.clock.now_ns()  # the clock may have been set back since the last run
         start = now_ns if self.start_gap_ns is None else min(self.start_gap_ns, now_ns)
-        self.gaps = GapLog(lambda values: self.own(reserved.GAP, values), start)
+        self.gaps = GapLog(lambda values: self.own(channels.GAP, values), start)
         if start < now_ns:
             self.gaps.pause(now_ns)
-        self._admission: Admission | None = None
+        self._admission: AdmissionControl | None = None
         if self.names.restored:
             self.event("restored", self.names.restored)
         if self.room is not None:
-            self._admission = Admission(self.room, self.intake, self.gaps, self.event)
+            self._admission = AdmissionControl(self.room, self.queue, self.gaps, self.event)
 
     def _writer(self, writer: str) -> JournalWriter:
         options = self.options
@@ -134,49 +434,51 @@ class Pipeline:
             self.store.folder(writer), self.store.id, writer, self.run, options.boot_id,
             options.rotate_bytes, age,
         )  # fmt: skip
-        # an import is staged elsewhere, but follows what the store has
+        # an import is staged elsewhere, but uses the names of the store
         chain = previous_chain(Store(self.store.path, self.store.id), writer)
         return JournalWriter(journal, chain=chain)
 
-    # -- what sources and the recorder put in
+    # -- calls of sources and the recorder
 
-    def item(self, source: str, topic: str, options: TopicOptions) -> Item:
-        """Return the data item of a topic, making it at its first mention."""
+    def item(self, source: str, topic: str, options: TopicOptions) -> DataItem:
+        """Return the data item of a topic; created at its first mention."""
         name = self.names.name(source, topic)
         with self._items_lock:
             item = self.items.get(name)
             if item is None:
-                item = self.items[name] = Item(name, source, topic, options)
+                item = self.items[name] = DataItem(name, source, topic, options)
                 if options.keep != "none":
                     self._journals.use(item.writer)
             return item
 
-    def latched(self, stream: Stream) -> None:
-        """Have the last message of a stream repeated in each file, also one of an earlier run."""
+    def latched(self, stream: TopicStream) -> None:
+        """Repeat the last message of a stream in each file, also one of an earlier run."""
         if stream.item.options.keep != "none":
             self._journals.repeat(stream)
 
     def own(self, topic: str, values: Mapping[str, Any]) -> None:
-        """Write a record of the box's own, stamped now."""
+        """Write an own record, stamped now."""
         with self._own_lock:
             self._own.append((topic, msgspec.json.encode(values), self.clock.now_ns()))
 
     def event(self, kind: str, text: str, source: str = "", **details: Any) -> None:
-        """Write an event, at once."""
+        """Emit an event and wake the writer."""
         if self.on_event is not None:
             self.on_event(kind, text)
         encoded = msgspec.json.encode(details, enc_hook=str).decode()
-        self.own(reserved.EVENT, {"kind": kind, "text": text, "source": source, "details": encoded})
-        self.intake.wake.set()
+        self.own(channels.EVENT, {"kind": kind, "text": text, "source": source, "details": encoded})
+        self.queue.wake.set()
 
     # -- one write interval
 
     def tick(self) -> None:
-        """Write what has come since the last tick; when the disk refuses, keep it and say so."""
-        taken = self.intake.take()
+        """Write the messages queued since the last tick; after a write error they stay pending."""
+        taken = self.queue.take()
         if self._admission is not None:
-            taken = self._admission.put_off(taken, self.bytes_written)
-        now_ns = self._advance(taken)
+            taken = self._admission.requeue_files(taken, self.bytes_written)
+        if taken and isinstance(self.clock, MessageClock):
+            self.clock.advance(max(map(itemgetter(2), taken)))
+        now_ns = max(self.clock.now_ns(), self._last_tick_ns)
         self._watch_clock(now_ns)
         kept = rate_limited(taken, self._last_tick_ns, now_ns)
         if self._admission is not None:
@@ -186,15 +488,18 @@ class Pipeline:
             self._rotates = False
             self._journals.rotate()
         if self._journals.flush(now_ns):
-            self.intake.release()
-            self._follow_steps()
+            self.queue.release()
+            # after a large step of the wall clock begin a new epoch in new files
+            step = abs(self.clock.offset_ns() - self._clock_offset_ns)
+            if step > EPOCH_STEP_NS:
+                self._new_epoch(step)
         self._journals.publish_heads(now_ns)
 
-    def _filtered(self, messages: list[Message]) -> list[Message]:
-        """Drop what did not change; a filter that fails keeps everything rather than nothing."""
+    def _filtered(self, messages: list[StreamMessage]) -> list[StreamMessage]:
+        """Drop unchanged messages; if a filter fails, all are kept."""
         try:
             return change_filtered(messages, self.event)
-        except Exception as error:  # whatever a message does to it, the recorder goes on
+        except Exception as error:  # any exception in a filter: the recorder goes on
             items = sorted({stream.item.name for stream, _, _ in messages})
             text = f"a change filter or schema inference failed: {error!r}; kept unfiltered"
             if text != self._filter_error:
@@ -202,14 +507,8 @@ class Pipeline:
                 self.event("filter_failed", text, items=items)
             return messages
 
-    def _advance(self, taken: Sequence[Message]) -> int:
-        """Return the time of this tick; never before the one of the last tick."""
-        if taken and isinstance(self.clock, MessageClock):
-            self.clock.heard(max(map(itemgetter(2), taken)))
-        return max(self.clock.now_ns(), self._last_tick_ns)
-
     def _make_room(self, writer: str) -> bool:
-        """Give up what there is to give, so that a full disk takes the rest; False if nothing."""
+        """Release the reserve or drop messages for a writer on a full disk; False if impossible."""
         if self._admission is None or self.room is None:
             return False
         if writer in self._admission.elsewhere:
@@ -218,7 +517,7 @@ class Pipeline:
             return True
         if not self.room.release():
             return False
-        self._admission.say()
+        self._admission.report()
         for other in RECORDED:
             if other not in self._admission.elsewhere:
                 late = self._journals.take_back(other, self.room.spared_bytes)
@@ -226,23 +525,13 @@ class Pipeline:
         return True
 
     def keep_elsewhere(self, writers: Collection[str]) -> None:
-        """Say which journals lie on another disk than the store."""
+        """Set which journals are on another disk than the store."""
         if self._admission is not None:
             self._admission.elsewhere = writers
 
-    def _account_due(self, now_ns: int) -> bool:
-        if self.disk_error:  # accounts of a long trouble would fill the memory
-            return False
-        return self._admission is None or self._admission.account_due(now_ns)
-
-    def _note_drops(self) -> None:
-        for item in list(self.items.values()):
-            for reason, drops in self.intake.take_drops(item).items():
-                self.gaps.dropped(item.name, drops, reason)
-
     # -- into the journals
 
-    def _sort_into_journals(self, kept: Iterable[Message], now_ns: int) -> None:
+    def _sort_into_journals(self, kept: Iterable[StreamMessage], now_ns: int) -> None:
         for stream, data, received_ns in kept:
             item = stream.item
             item.counters.kept += 1
@@ -250,26 +539,23 @@ class Pipeline:
             if stream.topic.latched:
                 item.last_latched = data
             self._journals.add(stream, received_ns, data)
-        if self._account_due(now_ns):
-            self._note_drops()
+        # while the disk refuses data, the accounts of a long trouble would fill the memory
+        if not self.disk_error and (self._admission is None or self._admission.account_due(now_ns)):
+            for item in list(self.items.values()):
+                for reason, drops in self.queue.take_drops(item).items():
+                    self.gaps.dropped(item.name, drops, reason)
             self._count(now_ns)
-        for name, data, at_ns in self._take_own():
+        with self._own_lock:
+            taken, self._own = self._own, []
+        for name, data, at_ns in taken:
             at_ns = min(max(at_ns, self._last_tick_ns), max(now_ns, self.clock.now_ns()))
-            for writer in self._writers_of(name):
+            # own records go to the main journal, those of the clock to every file that is open
+            for writer in self._journals.open_writers() if name == channels.CLOCK else ["main"]:
                 self._journals.add_own(writer, name, at_ns, data)
         self._last_tick_ns = now_ns
 
-    def _writers_of(self, name: str) -> list[str]:
-        """Own records go to the main journal, those of the clock to every file that is open."""
-        return self._journals.open_writers() if name == reserved.CLOCK else ["main"]
-
-    def _take_own(self) -> list[tuple[str, bytes, int]]:
-        with self._own_lock:
-            taken, self._own = self._own, []
-        return taken
-
     def _count(self, now_ns: int) -> None:
-        """Write the counters of items that something happened to, or a heartbeat in silence."""
+        """Write the counters of items that changed, or none as a heartbeat."""
         changed = []
         for item in list(self.items.values()):
             if item.counters != item.reported:
@@ -281,13 +567,13 @@ class Pipeline:
             self._counted_ns = now_ns
             with self._own_lock:
                 encoded = msgspec.json.encode({"items": changed, **stalled})
-                self._own.append((reserved.COUNTERS, encoded, now_ns))
+                self._own.append((channels.COUNTERS, encoded, now_ns))
 
     def _stalled(self, now_ns: int) -> dict[str, int]:
-        """Return when the recorder was held up since the last count; empty if it was not.
+        """Return the stall of the recorder since the last count; empty without one.
 
-        It is part of the counts, which say up to when the record is complete: whoever goes by
-        these knows of it before evaluating an instant of it.
+        It is part of the counters, which state up to when the record is complete, so that a
+        follower gets the stall before it evaluates an instant of it.
         """
         stall = self.stalls.take() if self.stalls is not None else None
         if stall is None:
@@ -303,9 +589,9 @@ class Pipeline:
         return {"stalled_from_ns": from_ns, "stalled_to_ns": to_ns}
 
     def _preamble(self, writer: str, at_ns: int) -> list[tuple[str, bytes]]:
-        """Return the own records that each file begins with: the run and the clock."""
+        """Return the own records that each file begins with: run and clock."""
         clock = self._clock_record(at_ns, self._clock_seen_ns)
-        return [(reserved.RUN, self._run_record(writer)), (reserved.CLOCK, clock)]
+        return [(channels.RUN, self._run_record(writer)), (channels.CLOCK, clock)]
 
     def _run_record(self, writer: str) -> bytes:
         items = {name: item.describe() for name, item in list(self.items.items())}
@@ -334,7 +620,7 @@ class Pipeline:
     # -- clock, sync, end
 
     def _watch_clock(self, now_ns: int) -> None:
-        """Record wall minus log time now and then; at a step, what it was before as well."""
+        """Record wall minus log time periodically; at a step, also the value before."""
         offset, written_ns = self.clock.offset_ns(), self._clock_written_ns
         step = abs(offset - self._clock_offset_ns)
         if self.disk_error or step > EPOCH_STEP_NS:
@@ -349,13 +635,7 @@ class Pipeline:
 
     def _own_clock(self, at_ns: int, offset_ns: int) -> None:
         with self._own_lock:
-            self._own.append((reserved.CLOCK, self._clock_record(at_ns, offset_ns), at_ns))
-
-    def _follow_steps(self) -> None:
-        """After a large step of the wall clock begin a new epoch in new files."""
-        step = abs(self.clock.offset_ns() - self._clock_offset_ns)
-        if step > EPOCH_STEP_NS:
-            self._new_epoch(step)
+            self._own.append((channels.CLOCK, self._clock_record(at_ns, offset_ns), at_ns))
 
     def _new_epoch(self, step_ns: int) -> None:
         self._journals.rotate()
@@ -363,7 +643,7 @@ class Pipeline:
         self.clock.new_epoch()
         now_ns = self.clock.now_ns()
         self.gaps.shift(now_ns - before_ns)
-        self.intake.shift_drops(list(self.items.values()), now_ns - before_ns)
+        self.queue.shift_drops(list(self.items.values()), now_ns - before_ns)
         self._clock_offset_ns, self._clock_written_ns = 0, now_ns
         self._clock_seen_ns = 0
         self._last_tick_ns = self._counted_ns = now_ns
@@ -374,23 +654,23 @@ class Pipeline:
         self._rotates = True
 
     def mark_sync(self) -> list[SyncMark]:
-        """Return what makes everything written so far durable."""
+        """Return the marks whose ``wait`` makes everything written so far durable."""
         return self._journals.mark_sync()
 
     def close(self) -> None:
-        """Write the rest, finish the files, give the store free.
+        """Write the rest, finish the files, release the locks of the store.
 
-        Raises AmberboxError when the disk does not take the rest.
+        Raises AmberboxError when the rest cannot be written.
         """
         self.gaps.close(self.clock.now_ns())
         if self._admission is not None:
             self._admission.end()
         had_trouble = self.disk_error
         self.tick()
-        if had_trouble:  # what was not accounted for meanwhile
+        if had_trouble:  # counts not recorded meanwhile
             self.tick()
         if self.room is not None:
-            self.room.relieve()
+            self.room.release_if_tight()
         lost, refused = self._journals.unwritten(), self._journals.close()
         for lock in self._locks:
             lock.release()
@@ -402,12 +682,12 @@ class Pipeline:
 
     @property
     def disk_error(self) -> str:
-        """What the disk said when it last refused a write; empty when all is well."""
+        """Return the text of the last write error; empty once a write has succeeded."""
         return self._journals.disk_error
 
     @property
     def full(self) -> str:
-        """Why only events are recorded; empty while everything is."""
+        """Return why only events are recorded; empty while everything is."""
         return self.room.reason if self.room is not None else ""
 
     @property

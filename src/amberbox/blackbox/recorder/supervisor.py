@@ -1,24 +1,176 @@
-"""Runs one source in a thread of its own: starts it again when it fails, says when it ends."""
+"""Run a source in a thread of its own, restart it with back-off, and provide its sink."""
 
 from __future__ import annotations
 
+import json
 import threading
 import time
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
-from amberbox.blackbox.folder.blocks import SourceBlock
-from amberbox.blackbox.folder.folder import SOURCES
+from amberbox.blackbox.columns.json_schema import notes_of
 from amberbox.blackbox.recorder.pipeline import Pipeline
-from amberbox.blackbox.recorder.sink import BlockSink
+from amberbox.blackbox.recorder.queue import TopicStream, report_unused_names
+from amberbox.blackbox.robot_folder.black_box_yaml import SourceBlock
+from amberbox.blackbox.robot_folder.folder import SOURCES
+from amberbox.blackbox.store import journal_reader
+from amberbox.core.files import replace_file
 from amberbox.core.plugins import get
+from amberbox.core.source import Power, TopicOptions
+from amberbox.core.types import Topic
+
+INFERRED = ("json", "msgpack")
+
+
+class BlockSink:
+    """The sink of one configured block."""
+
+    def __init__(
+        self, pipeline: Pipeline, name: str, topics: Sequence[TopicOptions], *, lossless: bool
+    ) -> None:
+        self._pipeline = pipeline
+        self._name = name
+        self._options = {options.name: options for options in topics}
+        self._streams: list[TopicStream] = []
+        self._numbers: dict[Topic, int] = {}
+        self._links: set[tuple[str, str]] = set()
+        self._lock = threading.Lock()
+        self._waits = lossless
+        self._put = pipeline.queue.put_waiting if lossless else pipeline.queue.put
+        self.now_ns = pipeline.clock.now_ns
+
+    def expect_topics(self) -> None:
+        """Create the item of each configured topic and open its gap until a publisher connects.
+
+        Files have no gaps of this kind.
+        """
+        for options in self._options.values():
+            item = self._pipeline.item(self._name, options.name, options)
+            if options.keep != "none" and not self._waits:
+                self._pipeline.gaps.expect(item.name)
+
+    def topic(self, topic: Topic) -> int:
+        with self._lock:
+            if topic not in self._numbers:
+                self._streams.append(self._new_stream(topic))
+                self._numbers[topic] = len(self._streams) - 1
+            return self._numbers[topic]
+
+    def message(self, stream: int, data: bytes, received_ns: int) -> None:
+        self._put(self._streams[stream], data, received_ns)
+
+    def longest_message(self) -> int:
+        return self._pipeline.queue.longest_bytes
+
+    def has_received(self) -> bool:
+        """Return whether any message was received so far."""
+        return any(stream.counters.received for stream in self._streams)
+
+    def lose_links(self, reason: str) -> None:
+        """Open the gaps of all peers after the source has failed."""
+        for topic, peer in list(self._links):
+            self.link_down(topic, peer, reason)
+
+    def link_up(self, topic: str, peer: str, since_ns: int | None = None) -> None:
+        self._links.add((topic, peer))
+        self._pipeline.gaps.up(self._item(topic), peer, self.now_ns(), since_ns)
+
+    def link_down(self, topic: str, peer: str, reason: str, since_ns: int | None = None) -> None:
+        self._links.discard((topic, peer))
+        at_ns = self.now_ns() if since_ns is None else since_ns
+        self._pipeline.gaps.down(self._item(topic), peer, at_ns, reason)
+
+    def lost(
+        self, topic: str, peer: str, from_ns: int, to_ns: int, count: int, reason: str
+    ) -> None:
+        item = self._pipeline.items[self._item(topic)]
+        self._pipeline.queue.count_lost(item, count)
+        self._pipeline.gaps.lost(item.name, peer, from_ns, to_ns, reason, count)
+
+    def event(self, kind: str, text: str, **details: Any) -> None:
+        self._pipeline.event(kind, text, self._name, **details)
+
+    def power(self, state: Power, text: str) -> None:
+        self._pipeline.power = state  # before the event, which wakes the threads that act on it
+        self._pipeline.event(f"power_{state}", text, self._name)
+
+    def last_latched(self, topic: str) -> bytes | None:
+        item = self._pipeline.items.get(self._item(topic))
+        if item is None:
+            return None
+        if item.last_latched is None:
+            item.last_latched = journal_reader.last_message(self._pipeline.store.path, item.name)
+        return item.last_latched
+
+    def state(self) -> dict[str, Any]:
+        try:
+            values = json.loads(self._state_file().read_text())
+        except (OSError, ValueError):  # none yet, or torn: the source starts without
+            return {}
+        return values if isinstance(values, dict) else {}
+
+    def save_state(self, state: Mapping[str, Any]) -> None:
+        path = self._state_file()
+        try:
+            path.parent.mkdir(exist_ok=True)
+            replace_file(path, json.dumps(state))
+        except OSError as error:  # the source shall go on listening
+            self.event("disk", f"the state of {self._name} is not kept: {error.strerror}")
+
+    def _state_file(self) -> Path:
+        return self._pipeline.store.path / "state" / f"{self._name}.json"
+
+    def _item(self, topic: str) -> str:
+        options = self._options.get(topic) or TopicOptions(name=topic)
+        return self._pipeline.item(self._name, topic, options).name
+
+    def _new_stream(self, topic: Topic) -> TopicStream:
+        item = self._pipeline.items[self._item(topic.name)]
+        item.waits = self._waits
+        infers = topic.message_encoding in INFERRED
+        sender_notes = notes_of(topic.schema) if infers else {}
+        if infers:  # the messages really sent count, not the declared ones
+            topic = replace(topic, schema=None)
+        stream = TopicStream(
+            item,
+            topic,
+            infers=infers,
+            sender_notes=sender_notes,
+            letters=self._pipeline.names.letters,
+        )
+        known = [s for s in self._streams if s.item is item]
+        if known and not stream.infers:
+            self._report_type_change(known[-1].topic, topic, item.name)
+        if topic.latched and not stream.infers:
+            self._pipeline.latched(stream)
+        wrong = "" if stream.infers else stream.compile()
+        if wrong:
+            self.event(
+                "undecodable", f"{item.name}: {wrong}; raw messages are kept", item=item.name
+            )
+        report_unused_names(stream, self._pipeline.event)
+        return stream
+
+    def _report_type_change(self, old: Topic, new: Topic, item: str) -> None:
+        if (old.message_encoding, old.schema) == (new.message_encoding, new.schema):
+            return  # one publisher latches, another does not
+        before = old.schema.name if old.schema else old.message_encoding
+        after = new.schema.name if new.schema else new.message_encoding
+        text = f"{item}: the definition changed from {before} to {after}"
+        if before == after:
+            text = f"{item}: the definition of {after} changed"
+        self.event("type_changed", text, item=item, before=before, after=after)
+
 
 _FIRST_BACKOFF_S = 1.0
 _MAX_BACKOFF_S = 30.0
 
 
-class Supervisor:
-    """Looks after the source of one configured block until ``stop`` is set."""
+class SourceSupervisor:
+    """Runs the source of one configured block until ``stop`` is set."""
 
     def __init__(self, pipeline: Pipeline, block: SourceBlock, stop: threading.Event) -> None:
         self._pipeline = pipeline
@@ -31,9 +183,9 @@ class Supervisor:
         self.thread = threading.Thread(target=self._run, name=block.name, daemon=True)
 
     def prepare(self) -> None:
-        """Make the configured topics known, so that the first file says what is configured.
+        """Create the configured items before the first file is written, which lists them.
 
-        A source that fails here fails again in its thread, which records why.
+        A source that fails here fails again in its thread, which records the error.
         """
         with suppress(Exception):
             source = self._module.Source(self._block.config, self._block.name)
@@ -45,12 +197,19 @@ class Supervisor:
         while not self._stop.is_set():
             began = time.monotonic()
             error = self._run_once()
-            if error is None or self._is_spent():
-                self._say_ended(error)
+            # a file that failed halfway is not played again: its first half would be there twice
+            if error is None or (
+                self._lossless and self._sink is not None and self._sink.has_received()
+            ):
+                if error is not None:
+                    self._report_failure(error, "failed and has ended")
+                elif not self._stop.is_set():
+                    name = self._block.name
+                    self._pipeline.event("source_ended", f"{name} has ended", name)
                 return
             if time.monotonic() - began > _MAX_BACKOFF_S:
                 backoff_s = _FIRST_BACKOFF_S
-            self._say_failed(error, f"failed and starts again in {backoff_s:.0f} s")
+            self._report_failure(error, f"failed and starts again in {backoff_s:.0f} s")
             self._stop.wait(backoff_s)
             backoff_s = min(2 * backoff_s, _MAX_BACKOFF_S)
 
@@ -73,20 +232,9 @@ class Supervisor:
         sink.expect_topics()
         return sink
 
-    def _is_spent(self) -> bool:
-        """A file that failed halfway is not played again: its first half would be there twice."""
-        return self._lossless and self._sink is not None and self._sink.has_heard()
-
-    def _say_failed(self, error: Exception, what: str) -> None:
+    def _report_failure(self, error: Exception, what: str) -> None:
         name = self._block.name
         if self._sink is not None:
             self._sink.lose_links(f"{name} failed")
         text = f"{name} {what}: {error}"
         self._pipeline.event("source_failed", text, name, error=repr(error))
-
-    def _say_ended(self, error: Exception | None) -> None:
-        if error is not None:
-            self._say_failed(error, "failed and has ended")
-        elif not self._stop.is_set():
-            name = self._block.name
-            self._pipeline.event("source_ended", f"{name} has ended", name)

@@ -1,1 +1,3 @@
-"""The robot's word for its record: its key, sealed journals, the signed manifest, signed heads."""
+"""Tamper evidence: the robot's key, sealed journals, signed manifest and heads, and their
+verification.
+"""

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
-from amberbox.blackbox.store import Store
+from amberbox.blackbox.store.store import Store
 from amberbox.core.errors import UsageError
 from amberbox.core.files import replace_file, write_private
 
@@ -21,7 +21,7 @@ _HEX_DIGITS = 64
 
 
 @dataclass(frozen=True, slots=True)
-class SigningKey:
+class RobotSigningKey:
     """An Ed25519 key; ``public`` is its public half, 64 hex digits."""
 
     public: str
@@ -33,60 +33,56 @@ class SigningKey:
 
 
 @dataclass(frozen=True, slots=True)
-class Keys:
-    """The key to sign with, if there is one, and what somebody should be told about it.
+class StoreKeys:
+    """The key to sign with, if there is one, and warnings about it.
 
-    ``is_new`` says that what was published before was another key, or none.
+    ``is_new``: the key published before was another one, or there was none.
     """
 
-    key: SigningKey | None
+    key: RobotSigningKey | None
     warnings: tuple[str, ...] = ()
     is_new: bool = False
 
 
 def can_sign() -> bool:
-    """Tell whether signatures can be made and checked here (cryptography is installed)."""
+    """Return whether signatures can be made and checked here (cryptography is installed)."""
     return importlib.util.find_spec("cryptography") is not None
 
 
-def open_keys(store: Store) -> Keys:
+def open_keys(store: Store) -> StoreKeys:
     """Read the store's key, or make one at the first start; only the keeper calls this.
 
-    Without a key that can be used everything goes on unsigned, and ``warnings`` says why.
+    Without a key that can be used everything goes on unsigned, and ``warnings`` hold why.
     """
     if not can_sign():
-        return Keys(None, ("nothing is signed: the package cryptography is not installed",))
+        return StoreKeys(None, ("nothing is signed: the package cryptography is not installed",))
     path = store.path / PRIVATE
     try:
         made = not path.exists()
         if made:
-            _create(path)
+            # Make a key; a power cut leaves a whole one or none.
+            from cryptography.hazmat.primitives import serialization as form
+            from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+
+            content = Ed25519PrivateKey.generate().private_bytes(
+                form.Encoding.PEM, form.PrivateFormat.PKCS8, form.NoEncryption()
+            )
+            write_private(path, content.decode("ascii"))
         key, known = _load(path), public_key(store.path)
         warnings = [*_width(path), *_publish(store, key.public, made=made)]
     except (OSError, ValueError, TypeError) as error:
-        return Keys(None, (f"nothing is signed: {path} cannot be used: {error}",))
-    return Keys(key, tuple(warnings), is_new=known != key.public)
+        return StoreKeys(None, (f"nothing is signed: {path} cannot be used: {error}",))
+    return StoreKeys(key, tuple(warnings), is_new=known != key.public)
 
 
-def _create(path: Path) -> None:
-    """Make a key; a power cut leaves a whole one or none."""
-    from cryptography.hazmat.primitives import serialization as form
-    from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
-
-    content = Ed25519PrivateKey.generate().private_bytes(
-        form.Encoding.PEM, form.PrivateFormat.PKCS8, form.NoEncryption()
-    )
-    write_private(path, content.decode("ascii"))
-
-
-def _load(path: Path) -> SigningKey:
+def _load(path: Path) -> RobotSigningKey:
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
     from cryptography.hazmat.primitives.serialization import load_pem_private_key
 
     private = load_pem_private_key(path.read_bytes(), None)
     if not isinstance(private, Ed25519PrivateKey):
         raise ValueError("it is no Ed25519 key")
-    return SigningKey(private.public_key().public_bytes_raw().hex(), private)
+    return RobotSigningKey(private.public_key().public_bytes_raw().hex(), private)
 
 
 def _width(path: Path) -> list[str]:
@@ -97,7 +93,7 @@ def _width(path: Path) -> list[str]:
 
 
 def _publish(store: Store, public: str, *, made: bool) -> list[str]:
-    """Write the public half beside the key; tell when another one stood there."""
+    """Write the public half beside the key; return a warning when another one was there."""
     path = store.path / PUBLIC
     known = public_key(store.path)
     if known == public:
@@ -139,7 +135,7 @@ def _from_pem(content: bytes) -> str:
 
 
 def is_private_key(public: str, store: Path) -> bool | None:
-    """Tell whether a store's private key belongs to this public one; None if it may not be read."""
+    """Return whether a store's private key belongs to a public one; None if it may not be read."""
     try:
         return _load(store / PRIVATE).public == public
     except PermissionError:
@@ -149,7 +145,7 @@ def is_private_key(public: str, store: Path) -> bool | None:
 
 
 def is_key(public: str, content: bytes) -> bool:
-    """Tell whether the bytes of a file hold this public key (hex)."""
+    """Return whether the bytes of a file hold this public key (hex)."""
     try:
         return _from_pem(content) == public
     except (ValueError, TypeError):
@@ -157,7 +153,7 @@ def is_key(public: str, content: bytes) -> bool:
 
 
 def parse_public(text: str) -> str:
-    """Read a public key as somebody noted it: 64 hex digits, or a file with them or with PEM.
+    """Read a public key as it was noted: 64 hex digits, or a file with them or with PEM.
 
     Raises UsageError when it is neither.
     """
@@ -186,7 +182,7 @@ def _refuse(text: str, why: str) -> NoReturn:
 
 
 def holds(public: str, signature: str, message: bytes) -> bool:
-    """Tell whether a signature (hex) was made with the private half of ``public`` (hex)."""
+    """Return whether a signature (hex) was made with the private half of ``public`` (hex)."""
     from cryptography.exceptions import InvalidSignature
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 

@@ -1,1 +1,3 @@
-"""Sources: one file for each bus or kind of recording the box can listen to."""
+"""Sources: one plugin file for each bus or kind of recording that the box can listen to; the
+contract is ``core.source``.
+"""

@@ -9,7 +9,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
-from amberbox.blackbox.formats import Recording, open_recording
+from amberbox.blackbox.formats._open import open_recording
+from amberbox.blackbox.formats._recording import RecordingReader
 from amberbox.core.clock import NS
 from amberbox.core.errors import AmberboxError
 from amberbox.core.options import option
@@ -27,7 +28,7 @@ _NOT_WORTH_WAITING_NS = 500_000
 
 
 @dataclass(frozen=True)
-class Config:
+class RecordingOptions:
     """The ``recording`` block."""
 
     path: str | Sequence[str] = option(
@@ -42,16 +43,16 @@ class Config:
 
     @property
     def patterns(self) -> Sequence[str]:
-        """The paths as a list."""
+        """Return the paths as a list."""
         return [self.path] if isinstance(self.path, str) else self.path
 
-    def in_folder(self, folder: Path) -> Config:
+    def in_folder(self, folder: Path) -> RecordingOptions:
         """Return the same with relative paths seen from a folder."""
         paths = [str(folder / Path(pattern).expanduser()) for pattern in self.patterns]
         return replace(self, path=paths)
 
     def check(self) -> Iterator[tuple[str, str]]:
-        """Say which values cannot work; opens nothing."""
+        """Yield each option with an invalid value, and why; opens nothing."""
         if not all(self.patterns) or not self.patterns:
             yield "path", "names no file"
         if self.speed != "max" and not 0 < self.speed < float("inf"):
@@ -62,22 +63,25 @@ class Config:
             yield "duration_s", "must be above 0"
 
     def notes(self) -> Iterator[tuple[str, str]]:
-        """Say which paths lead nowhere so far; what is not there when it is to play is an error."""
+        """Yield paths without a recording so far; when it is to play, that is an error."""
         for pattern in self.patterns:
             if not _matches(Path(pattern).expanduser()):
                 yield "path", f"there is no recording at {pattern} yet"
 
 
-class Source:
+Config = RecordingOptions
+
+
+class RecordingSource:
     """Replays recordings; messages are stamped on receipt like those of a robot."""
 
     lossless = True
 
-    def __init__(self, config: Config, name: str) -> None:
+    def __init__(self, config: RecordingOptions, name: str) -> None:
         self.config = config
         self.name = name
+        # fraction of all recordings that has been replayed (of this round, if it loops)
         self.progress = 0.0
-        """Fraction of all recordings that has been replayed (of this round, if it loops)."""
 
     def topics(self) -> Sequence[TopicOptions]:
         return self.config.topics
@@ -98,7 +102,14 @@ class Source:
         self, path: Path, before: float, share: float, sink: Sink, stop: threading.Event
     ) -> None:
         with open_recording(path) as recording:
-            streams = self._streams(recording, path, sink)
+            wanted = {topic.name for topic in self.config.topics}
+            names = {topic.name for topic in recording.topics}
+            for name in sorted(wanted - names):
+                sink.event("topic_missing", f"{path.name} has no topic {name}", topic=name)
+            chosen = [t if not wanted or t.name in wanted else None for t in recording.topics]
+            for name in dict.fromkeys(topic.name for topic in chosen if topic is not None):
+                sink.link_up(name, path.name)
+            streams = [None if topic is None else sink.topic(topic) for topic in chosen]
             messages = _chosen(recording, self.config)
             pace = _Pace(self.config.speed, stop)
             for topic_index, log_time_ns, _, data in messages:
@@ -108,24 +119,16 @@ class Source:
                 if stream is not None:
                     sink.message(stream, data, sink.now_ns())
                     self.progress = before + share * recording.progress
-            _say_goodbye(recording, path, streams, sink, stop)
+            _report_end(recording, path, streams, sink, stop)
         if not stop.is_set():
             self.progress = before + share
 
-    def _streams(self, recording: Recording, path: Path, sink: Sink) -> list[int | None]:
-        """Announce the topics to replay; None for those that are left out."""
-        wanted = {topic.name for topic in self.config.topics}
-        names = {topic.name for topic in recording.topics}
-        for name in sorted(wanted - names):
-            sink.event("topic_missing", f"{path.name} has no topic {name}", topic=name)
-        chosen = [t if not wanted or t.name in wanted else None for t in recording.topics]
-        for name in dict.fromkeys(topic.name for topic in chosen if topic is not None):
-            sink.link_up(name, path.name)
-        return [None if topic is None else sink.topic(topic) for topic in chosen]
+
+Source = RecordingSource
 
 
 def find_paths(patterns: Sequence[str]) -> list[Path]:
-    """Return what the patterns match, each pattern's matches sorted; raises AmberboxError."""
+    """Return the paths that match, sorted within each pattern; raises AmberboxError."""
     paths = []
     for pattern in patterns:
         matches = _matches(Path(pattern).expanduser())
@@ -148,7 +151,9 @@ def _matches(pattern: Path) -> list[Path]:
         return []
 
 
-def _chosen(recording: Recording, config: Config) -> Iterator[tuple[int, int, int | None, bytes]]:
+def _chosen(
+    recording: RecordingReader, config: RecordingOptions
+) -> Iterator[tuple[int, int, int | None, bytes]]:
     if not config.start_s and config.duration_s is None:
         return recording.messages()
     from_ns = (recording.report.start_ns or 0) + round(config.start_s * NS)
@@ -157,7 +162,7 @@ def _chosen(recording: Recording, config: Config) -> Iterator[tuple[int, int, in
 
 
 class _Pace:
-    """Waits until a message is due by the monotonic clock."""
+    """Waits until a message is due, by the monotonic clock."""
 
     def __init__(self, speed: float | Literal["max"], stop: threading.Event) -> None:
         self._speed = speed
@@ -165,7 +170,7 @@ class _Pace:
         self._start: tuple[int, int] | None = None
 
     def wait_for(self, log_time_ns: int) -> bool:
-        """Wait for the turn of a message; False if it is never to come."""
+        """Wait until a message is due; False when stopped."""
         if self._speed == "max":
             return not self._stop.is_set()
         now_ns = time.monotonic_ns()
@@ -178,8 +183,8 @@ class _Pace:
         return not self._stop.wait((due_ns - now_ns) / NS)
 
 
-def _say_goodbye(
-    recording: Recording,
+def _report_end(
+    recording: RecordingReader,
     path: Path,
     streams: Sequence[int | None],
     sink: Sink,

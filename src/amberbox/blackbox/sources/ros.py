@@ -7,9 +7,14 @@ import threading
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from amberbox.blackbox.ros1.client import Client
-from amberbox.blackbox.ros1.names import DEFAULT_MASTER, global_name, is_global_name, master_uri
-from amberbox.blackbox.ros1.settings import Settings
+from amberbox.blackbox.sources.ros1.client import RosSubscriber
+from amberbox.blackbox.sources.ros1.master import (
+    DEFAULT_MASTER,
+    SubscriberSettings,
+    global_name,
+    is_global_name,
+    master_uri,
+)
 from amberbox.core.errors import UsageError
 from amberbox.core.options import option
 from amberbox.core.source import Sink, TopicOptions
@@ -28,7 +33,7 @@ PASSIVE = "subscribes only, {config.seen_as}; no publisher, no service, no param
 
 
 @dataclass(frozen=True)
-class Config:
+class RosOptions:
     """The ``ros`` block."""
 
     ros_master_uri: str = option("", "the master; ROS_MASTER_URI, else localhost when absent")
@@ -47,23 +52,13 @@ class Config:
 
     @property
     def seen_as(self) -> str:
-        """What the robot's ROS sees of the box."""
+        """Return how the box appears in the robot's ROS."""
         if self.invisible:
             return "not registered at the master"
         return f"registered at the master as node {global_name(self.caller_id)}"
 
     def check(self) -> Iterator[tuple[str, str]]:
-        """Say which values cannot work; opens nothing."""
-        yield from self._check_addresses()
-        yield from self._check_topics()
-        if not 0.05 <= self.poll_s <= 3600:
-            yield "poll_s", "must be between 0.05 and 3600 seconds"
-        if self.max_message_mb is not None and not 0 < self.max_message_mb <= 4095:
-            yield "max_message_mb", "must be above 0, and TCPROS allows 4095 at most"
-        if not 4 <= self.dead_after_s <= 86400:
-            yield "dead_after_s", "must be between 4 seconds and a day"
-
-    def _check_addresses(self) -> Iterator[tuple[str, str]]:
+        """Yield each option with an invalid value, and why; opens nothing."""
         if self.ros_master_uri:
             try:
                 master_uri(self.ros_master_uri)
@@ -71,6 +66,13 @@ class Config:
                 yield "ros_master_uri", f"{error}; write http://HOST:11311"
         if not is_global_name(global_name(self.caller_id)):
             yield "caller_id", f"'{self.caller_id}' is not a name ROS allows for a node"
+        yield from self._check_topics()
+        if not 0.05 <= self.poll_s <= 3600:
+            yield "poll_s", "must be between 0.05 and 3600 seconds"
+        if self.max_message_mb is not None and not 0 < self.max_message_mb <= 4095:
+            yield "max_message_mb", "must be above 0, and TCPROS allows 4095 at most"
+        if not 4 <= self.dead_after_s <= 86400:
+            yield "dead_after_s", "must be between 4 seconds and a day"
 
     def _check_topics(self) -> Iterator[tuple[str, str]]:
         if not self.topics and not self.all_topics:
@@ -84,12 +86,15 @@ class Config:
                 yield "topics", f"'{seen[whole]}' and '{name}' are the same topic"
 
 
-class Source:
+Config = RosOptions
+
+
+class RosSource:
     """A ROS 1 subscriber in pure Python; records message bytes as they come."""
 
     lossless = False
 
-    def __init__(self, config: Config, name: str) -> None:
+    def __init__(self, config: RosOptions, name: str) -> None:
         self._config = config
         self._name = name
 
@@ -98,15 +103,18 @@ class Source:
         return [replace(topic, name=global_name(topic.name)) for topic in self._config.topics]
 
     def run(self, sink: Sink, stop: threading.Event) -> None:
-        """Listen until ``stop``; master and publishers may come, go and return."""
+        """Receive until ``stop`` is set; master and publishers may come, go and return."""
         types = {topic.name: topic.type for topic in self.topics()}
-        Client(settings(self._config, sink.longest_message()), types, sink).run(stop)
+        RosSubscriber(settings(self._config, sink.longest_message()), types, sink).run(stop)
 
 
-def settings(config: Config, longest_message: int) -> Settings:
+Source = RosSource
+
+
+def settings(config: RosOptions, longest_message: int) -> SubscriberSettings:
     """Complete a configuration from the environment; raise UsageError for a bad master URI.
 
-    ``longest_message`` is how many bytes the recorder takes where the configuration sets no limit.
+    ``longest_message`` is the recorder's limit in bytes, used where the configuration sets none.
     """
     text = config.ros_master_uri or os.environ.get("ROS_MASTER_URI") or DEFAULT_MASTER
     try:
@@ -114,7 +122,7 @@ def settings(config: Config, longest_message: int) -> Settings:
     except ValueError as error:
         raise UsageError(f"ros_master_uri: {error}", "write http://HOST:11311") from error
     limit_mb = config.max_message_mb
-    return Settings(
+    return SubscriberSettings(
         master_uri=uri,
         caller_id=global_name(config.caller_id),
         hosts=config.hosts,

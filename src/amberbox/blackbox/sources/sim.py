@@ -13,15 +13,14 @@ from typing import Literal
 import msgspec
 
 from amberbox.core.clock import NS
-from amberbox.core.config import did_you_mean
-from amberbox.core.errors import UsageError
+from amberbox.core.errors import UsageError, did_you_mean
 from amberbox.core.options import option
 from amberbox.core.source import Sink, TopicOptions
-from amberbox.core.timetext import parse_time
+from amberbox.core.timestamps import parse_time
 from amberbox.core.types import Topic
-from amberbox.sim.catalogue import catalogue
-from amberbox.sim.live import obey
-from amberbox.sim.mission import SCENARIOS
+from amberbox.sim.faults import catalogue
+from amberbox.sim.live import apply_order
+from amberbox.sim.missions import SCENARIOS
 from amberbox.sim.robot import START_NS, Robot
 from amberbox.sim.topics import TOPIC_BY_NAME, TOPICS, TopicSpec
 
@@ -35,14 +34,13 @@ SAMPLE = """\
       - topic: {name: odom, max_frequency: 10}
       - topic: {name: wheels}
 """
+# text that ``amberbox new`` writes for it: a block that records everything, and its monitors
 FOLDER = Path(__file__).parents[2] / "sim" / "folder"
-"""What ``amberbox new`` writes for it: a block that records everything, and its monitors."""
 PASSIVE = "simulated in this process: there is no robot that could be disturbed"
 _NOT_WORTH_WAITING_NS = 500_000
-_HURRY = 1.4
-"""So much faster a robot may be that was held up: all at once, it would seem to jump."""
+_HURRY = 1.4  # how much faster than real time a delayed robot may run to catch up
+# how far messages may be ahead of that rate, as this machine is not always on time
 _AT_ONCE_NS = 60_000_000
-"""So far ahead of that it may be: this machine does not always go on when it should."""
 _log = logging.getLogger(__name__)
 
 
@@ -56,7 +54,7 @@ class FaultOptions:
     magnitude: float | None = option(None, "how strong; the catalogue's default when absent")
 
     def check(self) -> Iterator[tuple[str, str]]:
-        """Say what does not fit the catalogue."""
+        """Yield each option that does not fit the catalogue, and why."""
         faults = catalogue()
         if self.id not in faults:
             yield "id", f"there is no fault '{self.id}'{did_you_mean(self.id, faults)}"
@@ -71,7 +69,7 @@ class FaultOptions:
 
 
 @dataclass(frozen=True)
-class Config:
+class SimOptions:
     """The ``sim`` block."""
 
     robot: str = option("ropod_001", "name of the simulated robot")
@@ -92,12 +90,12 @@ class Config:
 
     @property
     def is_virtual(self) -> bool:
-        """Whether messages are stamped with the robot's virtual time."""
+        """Return whether messages are stamped with the robot's virtual time."""
         return self.times == "virtual" if self.times else self.speed == "max"
 
     @property
     def state_files(self) -> Sequence[str]:
-        """Files that are no configuration, wherever they lie: new orders change nothing in it."""
+        """Return the files that are no configuration: new orders do not change that."""
         return (self.orders,) if self.orders else ()
 
     def start_ns(self) -> int:
@@ -107,7 +105,7 @@ class Config:
         return START_NS if self.is_virtual else time.time_ns()
 
     def check(self) -> Iterator[tuple[str, str]]:
-        """Say which values cannot work."""
+        """Yield each option with an invalid value, and why."""
         if self.speed != "max" and not 0 < self.speed < float("inf"):
             yield "speed", "must be above 0, or max"
         if self.scenario not in SCENARIOS:
@@ -117,9 +115,6 @@ class Config:
             yield "times", "virtual goes with speed max only: other speeds follow the box's clock"
         if self.duration_s is not None and self.duration_s <= 0:
             yield "duration_s", "must be above 0"
-        yield from self._check_names()
-
-    def _check_names(self) -> Iterator[tuple[str, str]]:
         for topic in self.topics:
             if topic.name not in TOPIC_BY_NAME:
                 near = did_you_mean(topic.name, TOPIC_BY_NAME)
@@ -130,33 +125,37 @@ class Config:
             yield "start", error.what
 
 
-def known_topics(config: Config) -> Sequence[Topic]:
+Config = SimOptions
+
+
+def known_topics(config: SimOptions) -> Sequence[Topic]:
     """Return the topics that will be announced, which are known without running the robot."""
     return [spec.topic() for spec in _chosen(config)]
 
 
-class Source:
-    """Runs one simulated robot and hands over what it publishes."""
+class SimSource:
+    """Runs one simulated robot and passes on its messages."""
 
-    def __init__(self, config: Config, name: str) -> None:
+    def __init__(self, config: SimOptions, name: str) -> None:
         self.config = config
         self.name = name
-        self.progress = 0.0
-        """Fraction of ``duration_s`` that is over."""
+        self.progress = 0.0  # fraction of ``duration_s`` that is over
 
     @property
     def lossless(self) -> bool:
-        """Whether the robot waits for the recorder; a live one (speed 1) does not."""
+        """Return whether the robot waits for the recorder; a live one (speed 1) does not."""
         return self.config.speed != 1
 
     def topics(self) -> Sequence[TopicOptions]:
         return self.config.topics
 
     def run(self, sink: Sink, stop: threading.Event) -> None:
-        """Let the robot live until ``stop`` is set or its time is over."""
+        """Run the robot until ``stop`` is set or its time is over."""
         config = self.config
         robot = make_robot(config)
-        streams = self._announce(sink)
+        streams = {spec.name: sink.topic(spec.topic()) for spec in _chosen(config)}
+        for name in streams:
+            sink.link_up(name, config.robot)
         for topic, sent_ns, data in self._messages(robot, stop):
             if topic in streams:
                 received_ns = sent_ns if config.is_virtual else sink.now_ns()
@@ -165,32 +164,29 @@ class Source:
         for topic in streams:
             sink.link_down(topic, config.robot, reason)
 
-    def _announce(self, sink: Sink) -> dict[str, int]:
-        streams = {spec.name: sink.topic(spec.topic()) for spec in _chosen(self.config)}
-        for name in streams:
-            sink.link_up(name, self.config.robot)
-        return streams
-
     def _messages(self, robot: Robot, stop: threading.Event) -> Iterator[tuple[str, int, bytes]]:
-        """Yield messages when their time has come."""
+        """Yield messages when they are due."""
         speed, end_s = self.config.speed, self.config.duration_s
-        pace = None if speed == "max" else Pace(speed, robot.start_ns, stop)
+        pace = None if speed == "max" else RealTimePacer(speed, robot.start_ns, stop)
         encode = msgspec.json.Encoder().encode
-        orders = Orders(Path(self.config.orders)) if self.config.orders else None
+        orders = OrdersFile(Path(self.config.orders)) if self.config.orders else None
         for topic, sent_ns, message in robot.step_until(float("inf") if end_s is None else end_s):
             if pace is not None:
                 pace.wait(sent_ns)
             if stop.is_set():
                 return
             for line in orders.new() if orders else ():
-                _log.info("%s", obey(robot, line))
+                _log.info("%s", apply_order(robot, line))
             if end_s is not None:
                 self.progress = robot.now_s / end_s
             yield topic, sent_ns, encode(message)
 
 
-class Pace:
-    """Lets messages out when their time has come; a delay of this machine is made up gently."""
+Source = SimSource
+
+
+class RealTimePacer:
+    """Waits until messages are due; after a delay it catches up at ``_HURRY`` times the speed."""
 
     def __init__(self, speed: float, start_ns: int, stop: threading.Event) -> None:
         self._speed, self._start_ns, self._stop = speed, start_ns, stop
@@ -198,7 +194,7 @@ class Pace:
         self._last_sent_ns = start_ns
 
     def wait(self, sent_ns: int) -> None:
-        """Wait until a message may go that the robot sends at this time of its own."""
+        """Wait until a message that the robot sends at this virtual time is due."""
         due_ns = self._began_ns + (sent_ns - self._start_ns) / self._speed
         since_ns = (sent_ns - self._last_sent_ns) / (self._speed * _HURRY)
         now_ns = time.monotonic_ns()
@@ -209,15 +205,15 @@ class Pace:
         self._last_sent_ns = sent_ns
 
 
-class Orders:
-    """A file to which lines are added while the robot lives; those there at first are obeyed."""
+class OrdersFile:
+    """Reads the lines that are added to a file while the robot runs, the first ones included."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
         self._read = 0
 
     def new(self) -> list[str]:
-        """Return the lines that were added since, whole ones only; none while there is no file."""
+        """Return the complete lines that were added since; none while there is no file."""
         try:
             if self._path.stat().st_size <= self._read:
                 return []
@@ -230,12 +226,12 @@ class Orders:
         return whole.decode("utf-8", "replace").splitlines()
 
 
-def _chosen(config: Config) -> Sequence[TopicSpec]:
+def _chosen(config: SimOptions) -> Sequence[TopicSpec]:
     wanted = {topic.name for topic in config.topics}
     return [spec for spec in TOPICS if not wanted or spec.name in wanted]
 
 
-def make_robot(config: Config) -> Robot:
+def make_robot(config: SimOptions) -> Robot:
     """Return the robot of a configuration with its faults scheduled."""
     catalogue()  # before the robot's time begins: at the first order it would stand still for it
     robot = Robot(config.seed, config.robot, config.scenario, config.start_ns())

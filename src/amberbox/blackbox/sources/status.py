@@ -12,11 +12,9 @@ from typing import Any
 
 import msgspec
 
-from amberbox.blackbox.follow.newest import Written
-from amberbox.blackbox.follow.records import OwnRecords
-from amberbox.blackbox.journal import reserved
-from amberbox.blackbox.store import open_store
-from amberbox.blackbox.where import store_path
+from amberbox.blackbox.journal import channels
+from amberbox.blackbox.store.own_records import OwnRecords, WrittenRecord
+from amberbox.blackbox.store.store import open_store, store_path
 from amberbox.core.clock import NS
 from amberbox.core.errors import AmberboxError
 from amberbox.core.options import option
@@ -32,16 +30,15 @@ SAMPLE = """\
 """
 PASSIVE = "reads the record of {config.where}; nothing there is written to"
 
-ROBOT = "robot"
-"""Topic of the member as a whole."""
+ROBOT = "robot"  # topic of the member as a whole
 WRITER = "watch"
+# levels from good to bad; ``level_code`` is the index of a level
 LEVELS = ("ok", "warn", "unknown", "stale", "error")
-"""From good to bad; ``level_code`` is the place of a level."""
 
 _POLL_S = 0.1
 _RETRY_S = 1.0
+# a watcher that writes nothing for this long is silent; it writes all statuses every second
 _SILENT_S = 3.0
-"""A watcher says all statuses every second."""
 _ROUND_NS = 5 * NS // 2
 _TEXT, _COUNT, _NUMBER = {"type": "string"}, {"type": "integer"}, {"type": "number"}
 _COMMON = {"level": _TEXT, "level_code": _COUNT, "reason": _TEXT, "measured_ns": _COUNT}
@@ -54,7 +51,7 @@ _FIELDS: Mapping[str, Mapping[str, Any]] = {
 
 
 @dataclass(frozen=True)
-class Config:
+class StatusOptions:
     """The ``status`` block."""
 
     where: str = option(doc="the member: its robot folder or its store, seen from this folder")
@@ -65,22 +62,25 @@ class Config:
         5.0, "what was written so long after it was measured is left out", unit="s"
     )
 
-    def in_folder(self, folder: Path) -> Config:
+    def in_folder(self, folder: Path) -> StatusOptions:
         """Return the same with the place seen from a folder."""
         return replace(self, where=str(folder / Path(self.where).expanduser()))
 
     def notes(self) -> Iterator[tuple[str, str]]:
-        """Say that the member may come later."""
+        """Yield a note if the member is not there yet."""
         if not Path(self.where).exists():
             yield "where", f"there is nothing at {self.where} yet"
 
     def check(self) -> Iterator[tuple[str, str]]:
-        """Say which values cannot work."""
+        """Yield each option with an invalid value, and why."""
         if self.late_s <= 0:
             yield "late_s", "must be above 0"
 
 
-def known_topics(config: Config) -> Sequence[Topic]:
+Config = StatusOptions
+
+
+def known_topics(config: StatusOptions) -> Sequence[Topic]:
     """Return the topics that are configured; without any, the member's own folder names them."""
     return [_topic(options.name) for options in config.topics]
 
@@ -92,12 +92,12 @@ def _topic(name: str) -> Topic:
     return Topic(name, "json", schema)
 
 
-class Source:
+class StatusSource:
     """Follows the statuses that the watcher of one member writes."""
 
     lossless = False
 
-    def __init__(self, config: Config, name: str) -> None:
+    def __init__(self, config: StatusOptions, name: str) -> None:
         self.config = config
         self.name = name
 
@@ -107,16 +107,16 @@ class Source:
     def run(self, sink: Sink, stop: threading.Event) -> None:
         """Follow until ``stop`` is set; a member that is not there yet is awaited."""
         member: _Member | None = None
-        was_told = False
+        is_reported = False
         while not stop.is_set():
             if member is None:
                 try:
                     member = _Member(self.config, sink)
                 except AmberboxError as error:
-                    if not was_told:
+                    if not is_reported:
                         text = f"{error.what}; it is tried again"
                         sink.event("unreachable", text, where=self.config.where)
-                    was_told = True
+                    is_reported = True
             if member is not None:
                 member.step()
             stop.wait(_RETRY_S if member is None else _POLL_S)
@@ -124,51 +124,54 @@ class Source:
             member.down("stopped")
 
 
+Source = StatusSource
+
+
 @dataclass
 class _Member:
-    """What is known of the member: the newest statuses of its components, and its alarms."""
+    """The state of the member: the newest statuses of its components, and its alarms."""
 
-    config: Config
+    config: StatusOptions
     sink: Sink
     streams: dict[str, int] = field(default_factory=dict)
     newest: dict[str, Mapping[str, Any]] = field(default_factory=dict)
     alarms: dict[str, str] = field(default_factory=dict)
     is_up: bool = False
-    heard_s: float = 0.0
+    received_s: float = 0.0
 
     def __post_init__(self) -> None:
         store = open_store(store_path(self.config.where))
-        self._statuses = OwnRecords(store, WRITER, {reserved.STATUS})
-        self._statuses.skip()  # what was said before is not how it is now
-        self._alarms = OwnRecords(store, WRITER, {reserved.ALARM})
+        self._statuses = OwnRecords(store, WRITER, {channels.STATUS})
+        self._statuses.skip()  # older statuses are not current
+        self._alarms = OwnRecords(store, WRITER, {channels.ALARM})
         self._wanted = {topic.name for topic in self.config.topics}
 
     def step(self) -> None:
-        """Hand on what is new; say so when the watcher falls silent."""
-        statuses = [record for record in self._statuses.step() if self._is_of_now(record)]
+        """Publish new records; report the links as down when the watcher is silent."""
+        statuses = [
+            record
+            for record in self._statuses.step()  # not those that the watcher catches up with
+            if _age_s(record) <= self.config.late_s or bool(record.values["live_only"])
+        ]
         components = [record for record in statuses if not record.values["mode"]]
         now_s = time.monotonic()
         if components:
-            self.heard_s = now_s
+            self.received_s = now_s
             for record in self._alarms.step():
                 self.alarms[record.values["id"]] = record.values["state"]
             self._hand_on(components)
-        elif self.is_up and now_s - self.heard_s > _SILENT_S:
+        elif self.is_up and now_s - self.received_s > _SILENT_S:
             name = Path(self.config.where).name
             self.down(f"the watcher of {name} has said nothing for {_SILENT_S:g} s")
 
     def down(self, reason: str) -> None:
-        """Say that nothing is heard any more."""
+        """Report the links as down."""
         if self.is_up:
             self.is_up = False
             for topic in self.streams:
                 self.sink.link_down(topic, self.config.where, reason)
 
-    def _is_of_now(self, record: Written) -> bool:
-        """Tell what the watcher only catches up with from what it sees now."""
-        return _age_s(record) <= self.config.late_s or bool(record.values["live_only"])
-
-    def _hand_on(self, records: Sequence[Written]) -> None:
+    def _hand_on(self, records: Sequence[WrittenRecord]) -> None:
         if not self.is_up:
             self.is_up = True
             for topic in self.streams:
@@ -176,16 +179,16 @@ class _Member:
         for record in records:
             component = record.values["component"]
             self.newest[component] = record.values
-            self._say(topic_name(component), _component_row(record))
+            self._publish(topic_name(component), _component_row(record))
         newest_ns = max(values["measured_ns"] for values in self.newest.values())
         self.newest = {
             component: values
             for component, values in self.newest.items()
             if values["measured_ns"] >= newest_ns - _ROUND_NS
         }
-        self._say(ROBOT, self._robot_row(records[-1]))
+        self._publish(ROBOT, self._robot_row(records[-1]))
 
-    def _robot_row(self, last: Written) -> Mapping[str, Any]:
+    def _robot_row(self, last: WrittenRecord) -> Mapping[str, Any]:
         known = [v for v in self.newest.values() if v["state"] != "not_monitored"]
         counts = Counter(values["level"] for values in known)
         worst = max(known, key=lambda values: LEVELS.index(values["level"]), default=None)
@@ -203,7 +206,7 @@ class _Member:
             "age_s": _age_s(last),
         }
 
-    def _say(self, topic: str, row: Mapping[str, Any]) -> None:
+    def _publish(self, topic: str, row: Mapping[str, Any]) -> None:
         if self._wanted and topic not in self._wanted:
             return
         if topic not in self.streams:
@@ -214,11 +217,11 @@ class _Member:
 
 
 def topic_name(component: str) -> str:
-    """Name the topic of a component; one that is called ``robot`` makes room for the whole."""
+    """Return the topic of a component; one called ``robot`` gets a suffix."""
     return f"{ROBOT}_component" if component == ROBOT else component
 
 
-def _component_row(record: Written) -> Mapping[str, Any]:
+def _component_row(record: WrittenRecord) -> Mapping[str, Any]:
     values = record.values
     return {
         "level": values["level"],
@@ -232,6 +235,6 @@ def _component_row(record: Written) -> Mapping[str, Any]:
     }
 
 
-def _age_s(record: Written) -> float:
-    """Seconds from the measurement to its record, both by the member's clock."""
+def _age_s(record: WrittenRecord) -> float:
+    """Return the seconds from a measurement to its record, both by the member's clock."""
     return float((record.wall_ns - record.values["measured_ns"]) / NS)

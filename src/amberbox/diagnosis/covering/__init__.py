@@ -1,1 +1,1 @@
-"""Which sets of failure modes explain the symptoms, from likely to unlikely, and what to test."""
+"""Probabilistic set covering: sets of failure modes that explain evidence, and the next test."""

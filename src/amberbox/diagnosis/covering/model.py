@@ -1,19 +1,244 @@
-"""The numbers of an FMEA that the covering engine reasons with, and nothing else."""
+"""The numbers of an FMEA that the covering engine reasons with, also as arrays and bit masks."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
-from amberbox.core.config import did_you_mean
-from amberbox.core.errors import UsageError
+import numpy as np
+from numpy.typing import NDArray
+
+from amberbox.core.errors import UsageError, did_you_mean
 from amberbox.core.needs import Needs, cycles
 from amberbox.core.types import UNKNOWN_FAULT
-from amberbox.diagnosis.covering.tables import Tables
 
-UNKNOWN = UNKNOWN_FAULT
-"""The mode that stands for everything that is not in the FMEA."""
+
+class FunctionGates:
+    """The functions over the components that can go down; sets of both are bit masks.
+
+    ``support[f]`` are the components on which function f depends at all, ``alone[c]`` the
+    functions that the loss of component c loses by itself.
+    """
+
+    def __init__(self, functions: Sequence[tuple[str, Needs]], components: Sequence[str]) -> None:
+        self._needs = [needs for _, needs in functions]
+        self._function_bits = {name: 1 << place for place, (name, _) in enumerate(functions)}
+        self._component_bits = {name: 1 << place for place, name in enumerate(components)}
+        order = _in_order(dict(functions), self._function_bits)
+        self.support = [0] * len(functions)
+        losers = [0] * len(functions)
+        for place in order:
+            own = self._component_bits.get(functions[place][0], 0)
+            names = self._needs[place].names()
+            self.support[place] = own | _union(self._of(name, self.support) for name in names)
+            losers[place] = own | self._alone(self._needs[place], losers)
+        self.alone = _transposed(losers, len(components))
+        self._hard = [place for place in order if self.support[place] != losers[place]]
+        self._memory: dict[int, int] = {0: 0}
+
+    def lost(self, down: int) -> int:
+        """Return the functions that are lost while these components are down."""
+        known = self._memory.get(down)
+        if known is None:
+            if len(self._memory) > 100_000:
+                self._memory = {0: 0}
+            known = self._memory[down] = self._lost(down)
+        return known
+
+    def _lost(self, down: int) -> int:
+        lost = _union(self.alone[place] for place in bits(down))
+        for place in self._hard:
+            if not lost >> place & 1 and (down & self.support[place]).bit_count() > 1:
+                lost |= self._loses(place, down, lost) << place
+        return lost
+
+    def _loses(self, place: int, down: int, lost: int) -> bool:
+        def is_up(name: str) -> bool:
+            gone = self._component_bits.get(name, 0) & down
+            return not gone and not self._function_bits.get(name, 0) & lost
+
+        return not self._needs[place].met(is_up)
+
+    def _of(self, name: str, masks: Sequence[int]) -> int:
+        function = self._function_bits.get(name)
+        inherited = 0 if function is None else masks[function.bit_length() - 1]
+        return inherited | self._component_bits.get(name, 0)
+
+    def _alone(self, needs: Needs, losers: Sequence[int]) -> int:
+        """Return the components of which each by itself makes the needs fail."""
+        parts = [
+            self._of(part, losers) if isinstance(part, str) else self._alone(part, losers)
+            for part in needs.parts
+        ]
+        spare = len(parts) - needs.at_least
+        if spare == 0:
+            return _union(parts)
+        return _union(
+            1 << place
+            for place in bits(_union(parts))
+            if sum(part >> place & 1 for part in parts) > spare
+        )
+
+
+def bits(mask: int) -> Iterator[int]:
+    """Yield the places of the bits that are set, from low to high."""
+    while mask:
+        low = mask & -mask
+        yield low.bit_length() - 1
+        mask ^= low
+
+
+def _union(masks: Iterator[int] | Sequence[int]) -> int:
+    result = 0
+    for mask in masks:
+        result |= mask
+    return result
+
+
+def _transposed(masks: Sequence[int], width: int) -> list[int]:
+    columns = [0] * width
+    for row, mask in enumerate(masks):
+        for place in bits(mask):
+            columns[place] |= 1 << row
+    return columns
+
+
+def _in_order(needs: Mapping[str, Needs], bit: Mapping[str, int]) -> list[int]:
+    """Return the places of the functions, each after those that it needs."""
+    order: list[int] = []
+    done: set[str] = set()
+    waiting = list(needs)
+    while waiting:
+        name = waiting[-1]
+        first = [n for n in needs[name].names() if n in needs and n not in done]
+        if name in done or not first:
+            waiting.pop()
+            if name not in done:
+                done.add(name)
+                order.append(bit[name].bit_length() - 1)
+        else:
+            waiting += first
+    return order
+
+
+LARGEST_PRIOR = 1 - 1e-12
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LinkArrays:
+    """Links by place, as arrays; ``log_miss`` is the logarithm of 1 - detects."""
+
+    cause: Ints
+    sign: Ints
+    log_miss: Floats
+    by_sign: tuple[tuple[tuple[int, float], ...], ...]
+    by_cause: tuple[tuple[tuple[int, float], ...], ...]
+
+    @classmethod
+    def of(cls, triples: Iterable[tuple[int, int, float]], causes: int, signs: int) -> LinkArrays:
+        """Collect (cause, sign, detects)."""
+        rows = [row for row in triples if row[2] > 0]
+        by_sign: list[list[tuple[int, float]]] = [[] for _ in range(signs)]
+        by_cause: list[list[tuple[int, float]]] = [[] for _ in range(causes)]
+        for cause, sign, detects in rows:
+            by_sign[sign].append((cause, detects))
+            by_cause[cause].append((sign, detects))
+        return cls(
+            np.array([row[0] for row in rows], np.int64),
+            np.array([row[1] for row in rows], np.int64),
+            np.array([log_miss(row[2]) for row in rows], np.float64),
+            tuple(map(tuple, by_sign)),
+            tuple(map(tuple, by_cause)),
+        )
+
+    def folded(self, absent: NDArray[np.bool_], causes: int) -> Floats:
+        """Return per cause the logarithm of the chance that no absent symptom shows."""
+        chosen = absent[self.sign]
+        weights = self.log_miss[chosen]
+        sums: Floats = np.bincount(self.cause[chosen], weights, causes).astype(np.float64)
+        return sums
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ModelTables:
+    """The arrays of a model for the search, by place; ``unknown`` is the unknown mode's, or -1.
+
+    ``component`` is the place of the component that a mode takes down, -1 for none.
+    ``pairs`` are (component, function) where the one alone loses the other.
+    """
+
+    log_odds: Floats
+    component: tuple[int, ...]
+    modes: LinkArrays
+    functions: LinkArrays
+    gates: FunctionGates
+    component_count: int
+    modes_of: tuple[tuple[int, ...], ...]
+    pair_component: Ints
+    pair_function: Ints
+    unknown: int
+
+    @classmethod
+    def of(cls, model: Model) -> ModelTables:
+        """Compile a model."""
+        names = list(dict.fromkeys(mode.component for mode in model.modes if mode.takes_down))
+        places = {name: place for place, name in enumerate(names)}
+        component = [places[m.component] if m.takes_down else -1 for m in model.modes]
+        gates = FunctionGates([(f.id, f.needs) for f in model.functions], names)
+        pairs = [(c, f) for c, mask in enumerate(gates.alone) for f in bits(mask)]
+        component += [-1] * (len(model.mode_ids) - len(model.modes))
+        return cls(
+            _log_odds(model),
+            tuple(component),
+            _links(model, model.mode_places),
+            _links(model, model.function_places),
+            gates,
+            len(names),
+            _modes_of(component, len(names)),
+            np.array([pair[0] for pair in pairs], np.int64),
+            np.array([pair[1] for pair in pairs], np.int64),
+            -1 if model.unknown is None else len(model.modes),
+        )
+
+
+def log_miss(detects: float) -> float:
+    """Return the logarithm of 1 - detects."""
+    return math.log1p(-detects) if detects < 1 else -math.inf
+
+
+def _log_odds(model: Model) -> Floats:
+    priors = [mode.prior for mode in model.modes]
+    if model.unknown is not None:
+        priors.append(model.unknown.prior)
+    chance = np.minimum(np.array(priors, np.float64), LARGEST_PRIOR)
+    with np.errstate(divide="ignore"):
+        odds: Floats = np.log(chance) - np.log1p(-chance)
+    return odds
+
+
+def _links(model: Model, causes: dict[str, int]) -> LinkArrays:
+    triples = [
+        (causes[link.cause], model.sign_places[link.symptom], link.detects)
+        for link in model.links
+        if link.cause in causes
+    ]
+    return LinkArrays.of(triples, len(causes), len(model.signs))
+
+
+def _modes_of(component: Iterable[int], count: int) -> tuple[tuple[int, ...], ...]:
+    modes: list[list[int]] = [[] for _ in range(count)]
+    for mode, place in enumerate(component):
+        if place >= 0:
+            modes[place].append(mode)
+    return tuple(map(tuple, modes))
+
+
+UNKNOWN = UNKNOWN_FAULT  # the mode that stands for everything that is not in the FMEA
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,12 +298,12 @@ class Link:
 
 @dataclass(frozen=True, slots=True)
 class Unknown:
-    """What is not in the FMEA competes with the prior ``prior``.
+    """The failure mode for all that is not in the FMEA, with the prior ``prior``.
 
-    It shows any symptom with probability ``detects``. Nobody knows which symptoms it would show,
-    so an absent symptom says nothing against it; ``denies`` above 0 makes each absent symptom
-    count like an absent symptom of a cause with that probability. A large ``detects`` makes it
-    a cheap excuse for two faults at once; the default leaves them most of their due.
+    It shows any symptom with probability ``detects``. Which symptoms it would show is unknown, so
+    an absent symptom is no evidence against it; ``denies`` above 0 makes each absent symptom count
+    like an absent symptom of a cause with that probability. A large ``detects`` makes it a cheap
+    excuse for two faults at once; the default leaves them most of their due.
 
     It may look like three or more known modes that begin within ``together_s`` of each other,
     like each with probability ``looks_like``; 0: it never does.
@@ -120,9 +345,9 @@ class Model:
                 _probability(getattr(self.unknown, name), f"{name} of {UNKNOWN}")
 
     @cached_property
-    def tables(self) -> Tables:
+    def tables(self) -> ModelTables:
         """Return the model as arrays and masks, made at first use."""
-        return Tables.of(self)
+        return ModelTables.of(self)
 
     @cached_property
     def mode_ids(self) -> tuple[str, ...]:

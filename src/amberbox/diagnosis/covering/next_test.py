@@ -1,4 +1,4 @@
-"""The next best test: how much each would tell, for what it costs and risks."""
+"""The next best test: expected information against cost and risk."""
 
 from __future__ import annotations
 
@@ -7,36 +7,41 @@ from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 from amberbox.core.types import Hypothesis, Test
-from amberbox.diagnosis.covering.check import Check, reading
-from amberbox.diagnosis.covering.clues import seers
-from amberbox.diagnosis.covering.evidence import Answered, Evidence
 from amberbox.diagnosis.covering.model import Model
-from amberbox.diagnosis.covering.prediction import Prediction, outcomes_seen, predict
+from amberbox.diagnosis.covering.observations import (
+    AnsweredCheck,
+    Check,
+    Evidence,
+    Prediction,
+    causes_seen,
+    outcomes_seen,
+    predict,
+    reading_check,
+)
 
+# The answer to a test that cannot be done: it changes nothing, and is not proposed again
 CANNOT = "cannot check"
-"""The answer of somebody who cannot do a test: nothing is learnt, and it is not asked again."""
 
-LEAST_GAIN_BITS = 1e-3
-"""Tests that tell less are not proposed."""
+LEAST_GAIN_BITS = 1e-3  # tests with less information are not proposed
 
 
 @dataclass(frozen=True, slots=True)
-class Weights:
-    """What a test is charged: ``fixed_s + cost_s + risk * risk_s``, in seconds.
+class TestCosts:
+    """Weights of a test's price: ``fixed_s + cost_s + risk * risk_s``, in seconds.
 
-    ``fixed_s`` is the bother of any test, ``risk_s`` how many seconds a risk of 1 is worth.
+    ``fixed_s`` is the effort of any test, ``risk_s`` how many seconds a risk of 1 is worth.
     """
 
     fixed_s: float = 10.0
     risk_s: float = 600.0
 
     def price_s(self, check: Check) -> float:
-        """Return what a test is charged."""
+        """Return the price of a test, seconds."""
         return self.fixed_s + check.cost_s + check.risk * self.risk_s
 
 
 @dataclass(frozen=True, slots=True)
-class Proposal:
+class TestProposal:
     """A test with its gain and outcomes; ``value`` is bits per second of its price."""
 
     test: Test
@@ -44,13 +49,13 @@ class Proposal:
     value: float
 
 
-def reads(model: Model, evidence: Evidence) -> Iterator[Check]:
+def reading_checks(model: Model, evidence: Evidence) -> Iterator[Check]:
     """Yield the readings of symptoms whose state is not known and that can be read on demand."""
     for sign in model.signs:
         observation = evidence.observations.get(sign.id)
         is_known = observation is not None and observation.state != "unknown"
         if not is_known and sign.read_cost_s is not None:
-            yield reading(sign.id, sign.read_cost_s)
+            yield reading_check(sign.id, sign.read_cost_s)
 
 
 def next_tests(
@@ -58,22 +63,24 @@ def next_tests(
     evidence: Evidence,
     hypotheses: Sequence[Hypothesis],
     checks: Iterable[Check] = (),
-    weights: Weights | None = None,
+    weights: TestCosts | None = None,
     most: int = 5,
-) -> tuple[Proposal, ...]:
+) -> tuple[TestProposal, ...]:
     """Return the tests that are worth most: expected bits of information per price.
 
-    The expectation is exact over the hypotheses given; failure modes that are in none of them
-    are taken to be absent, and what is not in the FMEA to show nothing more than it denies.
-    Tests that were asked are left out, as are those that tell nothing.
+    The expectation is exact over the hypotheses given; failure modes that are in none of them are
+    taken to be absent, and the unknown mode to show nothing more than it denies. Tests that were
+    done are left out, as are those without information.
     """
-    prices = weights or Weights()
+    prices = weights or TestCosts()
     total = math.fsum(h.probability for h in hypotheses)
     if total <= 0:
         return ()
     shares = [hypothesis.probability / total for hypothesis in hypotheses]
     predictions = [predict(model, hypothesis.faults) for hypothesis in hypotheses]
-    candidates = [c for c in (*checks, *reads(model, evidence)) if c.id not in evidence.asked]
+    candidates = [
+        c for c in (*checks, *reading_checks(model, evidence)) if c.id not in evidence.asked
+    ]
     proposals = [
         _proposal(check, shares, expected, prices)
         for check, expected in _informative(model, candidates, predictions)
@@ -88,9 +95,9 @@ def splitting_test(
     hypotheses: Sequence[Hypothesis],
     members: Collection[str],
     checks: Iterable[Check] = (),
-    weights: Weights | None = None,
-) -> Proposal | None:
-    """Return the best test that tells the members of an ambiguity group apart, None if none can."""
+    weights: TestCosts | None = None,
+) -> TestProposal | None:
+    """Return the best test that distinguishes the members of an ambiguity group, else None."""
     chosen = [hypothesis for hypothesis in hypotheses if hypothesis.id in members]
     return next(iter(next_tests(model, evidence, chosen, checks, weights, 1)), None)
 
@@ -106,11 +113,10 @@ def with_answer(evidence: Evidence, check: Check, answer: str) -> Evidence:
     level = check.level(answer)
     if check.reads:
         return asked.with_observation(check.reads, "present" if level else "absent")
-    return replace(asked, answers=(*asked.answers, Answered(check, answer)))
+    return replace(asked, answers=(*asked.answers, AnsweredCheck(check, answer)))
 
 
-Outcomes = list[tuple[float, ...]]
-"""Per hypothesis how probable each outcome is."""
+Outcomes = list[tuple[float, ...]]  # per hypothesis how probable each outcome is
 
 
 def _informative(
@@ -127,12 +133,14 @@ def _informative(
                 present = [prediction.expected(model, sign) for prediction in predictions]
                 yield check, [(1.0 - chance, chance) for chance in present]
             continue
-        of_modes, of_functions = seers(model, check)
+        of_modes, of_functions = causes_seen(model, check)
         if any(p in modes for p, _ in of_modes) or any(p in lost for p, _ in of_functions):
             yield check, [outcomes_seen(check, of_modes, of_functions, p) for p in predictions]
 
 
-def _proposal(check: Check, shares: Sequence[float], expected: Outcomes, by: Weights) -> Proposal:
+def _proposal(
+    check: Check, shares: Sequence[float], expected: Outcomes, by: TestCosts
+) -> TestProposal:
     chances = [
         sum(share * row[level] for share, row in zip(shares, expected, strict=True))
         for level in range(len(check.outcomes))
@@ -150,7 +158,7 @@ def _proposal(check: Check, shares: Sequence[float], expected: Outcomes, by: Wei
         dict(zip(check.outcomes, chances, strict=True)),
     )
     price_s = by.price_s(check)
-    return Proposal(test, check, gain / price_s if price_s > 0 else math.inf)
+    return TestProposal(test, check, gain / price_s if price_s > 0 else math.inf)
 
 
 def entropy_bits(chances: Iterable[float]) -> float:

@@ -1,7 +1,3 @@
-"""The robot's failure modes, written once: what fails, what it costs, how it shows."""
+"""Failure mode and effects analysis: the file, its entries, what is computed from it."""
 
-from amberbox.diagnosis.fmea.known import Known
-from amberbox.diagnosis.fmea.load import load_fmea
-from amberbox.diagnosis.fmea.model import Fmea
-
-__all__ = ["Fmea", "Known", "load_fmea"]
+from amberbox.diagnosis.fmea.loader import load_fmea as load_fmea

@@ -1,38 +1,30 @@
-"""Findings of other engines: which failure modes they speak for, in every instance of the file."""
+"""Findings of other engines mapped to the failure modes they indicate, in every instance."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from itertools import product
+from math import prod
 
-from amberbox.core.config import did_you_mean
-from amberbox.core.errors import Problem
-from amberbox.core.nodes import Node
+from amberbox.core.errors import Problem, did_you_mean
+from amberbox.core.yaml_nodes import Node
 from amberbox.diagnosis.covering.model import Link, Sign
-from amberbox.diagnosis.fmea.file import DefaultsFile, FindingFile
-from amberbox.diagnosis.fmea.known import Known
-from amberbox.diagnosis.fmea.model import Fmea, Mapped
-from amberbox.diagnosis.fmea.places import child
-from amberbox.diagnosis.fmea.reading import Sheet
-from amberbox.diagnosis.rules.faults import RuleFault
-from amberbox.diagnosis.rules.reader import Sentence, read_goal
-from amberbox.diagnosis.rules.terms import Key, key_of, show_key
-from amberbox.diagnosis.rules.unify import unify
-from amberbox.diagnosis.rules.writer import write
+from amberbox.diagnosis.fmea.model import FindingMapping, Fmea, FmeaReferences
+from amberbox.diagnosis.fmea.parser import DefaultsFile, FindingFile, ParsedFmea, child_node
+from amberbox.diagnosis.prolog.syntax import Sentence, read_goal, write
+from amberbox.diagnosis.prolog.terms import Key, RuleFault, key_of, show_key, unify
 
 _VARIABLE = re.compile(r"<([A-Za-z_]\w*)>", re.ASCII)
-_MOST = 5_000
-"""Most instances of one finding; more are a mistake in ``maps_to``."""
+_MOST = 5_000  # most instances of one finding; more are a mistake in maps_to
 
-Values = Mapping[str, str]
-"""Values of variables by name."""
+Values = Mapping[str, str]  # values of variables by name
 
 
-def mapped(
-    sheet: Sheet, modes: Collection[str], known: Known | None, problems: list[Problem]
-) -> tuple[Mapped, ...]:
-    """Return the findings of the file; tell what is wrong with them, and what nothing maps."""
+def map_findings(
+    sheet: ParsedFmea, modes: Collection[str], known: FmeaReferences | None, problems: list[Problem]
+) -> tuple[FindingMapping, ...]:
+    """Return the findings of the file; report what is wrong with them, and what nothing maps."""
     found = [_mapped(entry, sheet.file.defaults) for _, entry in sheet.findings]
     for number, (node, _) in enumerate(sheet.findings):
         problems.extend(_problems(found[number], node, f"findings[{number}]", modes, known))
@@ -40,8 +32,8 @@ def mapped(
     return tuple(found)
 
 
-def _mapped(entry: FindingFile, defaults: DefaultsFile) -> Mapped:
-    return Mapped(
+def _mapped(entry: FindingFile, defaults: DefaultsFile) -> FindingMapping:
+    return FindingMapping(
         entry.rule,
         entry.finding,
         tuple(entry.maps_to),
@@ -53,11 +45,11 @@ def _mapped(entry: FindingFile, defaults: DefaultsFile) -> Mapped:
 
 
 def _problems(
-    of: Mapped, node: Node, where: str, modes: Collection[str], known: Known | None
+    of: FindingMapping, node: Node, where: str, modes: Collection[str], known: FmeaReferences | None
 ) -> Iterator[Problem]:
     variables: Collection[str] = _VARIABLE.findall(of.finding)
     if of.goal:
-        place = child(node, "rule")
+        place = child_node(node, "rule")
         try:
             sentence = read_goal(of.goal)
         except RuleFault as fault:
@@ -66,19 +58,19 @@ def _problems(
         yield from _goal_problems(sentence, place, where, known)
         variables = sentence.names
     for number, pattern in enumerate(of.maps_to):
-        at = child(node, "maps_to", number)
+        at = child_node(node, "maps_to", number)
         yield from _pattern_problems(pattern, at, f"{where}.maps_to[{number}]", variables, modes)
     if not of.maps_to:
         what = "speaks for no failure mode: it is shown, but moves nothing"
         yield node.problem(where, what, is_error=False)
-    count = _count(of, modes)
+    count = prod(map(len, _options(of, modes).values()))
     if count > _MOST:
         what = f"stands for {count:,} findings, more than {_MOST:,}"
-        yield child(node, "maps_to").problem(f"{where}.maps_to", what, "use fewer variables")
+        yield child_node(node, "maps_to").problem(f"{where}.maps_to", what, "use fewer variables")
 
 
 def _goal_problems(
-    sentence: Sentence, place: Node, where: str, known: Known | None
+    sentence: Sentence, place: Node, where: str, known: FmeaReferences | None
 ) -> Iterator[Problem]:
     key = key_of(sentence.term)
     if key is None or key[0] in (",", ";", "->", "\\+"):
@@ -103,8 +95,8 @@ def _pattern_problems(
         yield node.problem(where, what, "write COMPONENT#MODE, or <Variable>#MODE")
 
 
-def _unmapped(found: Sequence[Mapped], known: Known | None) -> Iterator[Problem]:
-    """Tell which heads of rules lead to no finding, in one note for each file."""
+def _unmapped(found: Sequence[FindingMapping], known: FmeaReferences | None) -> Iterator[Problem]:
+    """Yield a note for each file about heads of rules that lead to no finding."""
     named = {key for of in found if of.goal and (key := _key(of.goal)) is not None}
     left: dict[str, list[tuple[int, Key]]] = {}
     for key, (file, line) in (known.heads if known is not None else {}).items():
@@ -126,7 +118,8 @@ def _key(goal: str) -> Key | None:
 def _expression(pattern: str) -> re.Pattern[str]:
     """Turn a pattern of addresses into a regular expression with a group for each variable."""
     parts, known = [], set[str]()
-    for text, name in _pieces(pattern):
+    pieces = [*_VARIABLE.split(pattern), ""]
+    for text, name in zip(pieces[::2], pieces[1::2], strict=True):
         parts.append(re.escape(text))
         if name:
             parts.append(f"(?P={name})" if name in known else f"(?P<{name}>[^#]+)")
@@ -134,12 +127,7 @@ def _expression(pattern: str) -> re.Pattern[str]:
     return re.compile("".join(parts))
 
 
-def _pieces(pattern: str) -> Iterator[tuple[str, str]]:
-    pieces = [*_VARIABLE.split(pattern), ""]
-    yield from zip(pieces[::2], pieces[1::2], strict=True)
-
-
-def _options(of: Mapped, modes: Collection[str]) -> dict[str, list[str]]:
+def _options(of: FindingMapping, modes: Collection[str]) -> dict[str, list[str]]:
     """Return the values that each variable of ``maps_to`` may have."""
     found: dict[str, dict[str, None]] = {}
     for pattern in of.maps_to:
@@ -152,14 +140,9 @@ def _options(of: Mapped, modes: Collection[str]) -> dict[str, list[str]]:
     return {name: list(values) for name, values in found.items()}
 
 
-def _count(of: Mapped, modes: Collection[str]) -> int:
-    count = 1
-    for values in _options(of, modes).values():
-        count *= len(values)
-    return count
-
-
-def instances(of: Mapped, modes: Collection[str]) -> Iterator[tuple[str, tuple[str, ...]]]:
+def finding_instances(
+    of: FindingMapping, modes: Collection[str]
+) -> Iterator[tuple[str, tuple[str, ...]]]:
     """Yield the symptom and the failure modes of each instance that the analysis can name."""
     options = _options(of, modes)
     for values in product(*options.values()):
@@ -169,16 +152,16 @@ def instances(of: Mapped, modes: Collection[str]) -> Iterator[tuple[str, tuple[s
             yield symptom_of(of, named), faults
 
 
-def faults_of(of: Mapped, values: Values, modes: Collection[str]) -> tuple[str, ...]:
-    """Return the failure modes that a finding speaks for, given the values of its variables."""
+def faults_of(of: FindingMapping, values: Values, modes: Collection[str]) -> tuple[str, ...]:
+    """Return the failure modes that a finding indicates, given the values of its variables."""
     names = (_filled(pattern, values) for pattern in of.maps_to)
     return tuple(dict.fromkeys(name for name in names if name in modes))
 
 
-def symptom_of(of: Mapped, values: Values) -> str:
+def symptom_of(of: FindingMapping, values: Values) -> str:
     """Return the id of the symptom: ``rule:GOAL``, or that of the detector's finding.
 
-    Variables that ``maps_to`` does not name stand as ``_``: whatever their values, it is one.
+    Variables that ``maps_to`` does not name are written ``_``: all their values give one symptom.
     """
     if not of.goal:
         return _filled(of.finding, values)
@@ -190,7 +173,7 @@ def symptom_of(of: Mapped, values: Values) -> str:
 
 
 def text_of(fmea: Fmea, symptom: str) -> str:
-    """Describe a symptom that is a finding; empty for any other."""
+    """Return the text of a symptom that is a finding; empty for any other."""
     for of in fmea.findings:
         if _is_of(of, symptom):
             said = f"rule {symptom.removeprefix('rule:')}" if of.goal else f"finding {symptom}"
@@ -199,14 +182,14 @@ def text_of(fmea: Fmea, symptom: str) -> str:
 
 
 def causes_of(fmea: Fmea, symptom: str) -> dict[str, float]:
-    """Return the failure modes that a finding speaks for, with how probable each shows it."""
+    """Return the failure modes that a finding indicates, each with its detection probability."""
     if symptom in fmea.symptoms or not any(_is_of(of, symptom) for of in fmea.findings):
         return {}
     return {link.cause: link.detects for link in finding_signs(fmea)[1] if link.symptom == symptom}
 
 
-def _is_of(of: Mapped, symptom: str) -> bool:
-    """Tell whether a symptom is an instance of a finding."""
+def _is_of(of: FindingMapping, symptom: str) -> bool:
+    """Return whether a symptom is an instance of a finding."""
     if not of.goal:
         return _expression(of.finding).fullmatch(symptom) is not None
     if not symptom.startswith("rule:"):
@@ -219,7 +202,7 @@ def _filled(pattern: str, values: Values) -> str:
 
 
 def finding_signs(fmea: Fmea) -> tuple[tuple[Sign, ...], tuple[Link, ...]]:
-    """Return the symptoms that findings are, and what causes them. Nobody can read them off."""
+    """Return the symptoms that findings are, and their causes; none can be read on demand."""
     found = list(_symptoms(fmea))
     signs = {name: Sign(name, of.leak, None) for name, of, _ in found}
     new = [sign for name, sign in signs.items() if name not in fmea.symptoms]
@@ -228,12 +211,12 @@ def finding_signs(fmea: Fmea) -> tuple[tuple[Sign, ...], tuple[Link, ...]]:
 
 
 def named_by_findings(fmea: Fmea) -> frozenset[str]:
-    """Return the failure modes that some finding speaks for."""
+    """Return the failure modes that some finding indicates."""
     patterns = [_expression(pattern) for of in fmea.findings for pattern in of.maps_to]
     return frozenset(mode for mode in fmea.modes if any(p.fullmatch(mode) for p in patterns))
 
 
-def _symptoms(fmea: Fmea) -> Iterator[tuple[str, Mapped, tuple[str, ...]]]:
+def _symptoms(fmea: Fmea) -> Iterator[tuple[str, FindingMapping, tuple[str, ...]]]:
     for of in fmea.findings:
-        for name, faults in instances(of, fmea.modes) if not of.proves else ():
+        for name, faults in finding_instances(of, fmea.modes) if not of.proves else ():
             yield name, of, faults

@@ -1,22 +1,48 @@
-"""A failure mode and effects analysis as it is used: types written out, names resolved."""
+"""A failure mode and effects analysis as it is used: types written out, names resolved.
+
+``FmeaReferences`` are the names of the robot's other files that failure modes can refer to;
+``DependencyStructure`` gives the components and functions lost when failure modes are present.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Literal, TypeAlias
 
 from amberbox.core.expression import Expression
 from amberbox.core.needs import NOTHING, Needs
-from amberbox.core.robotstatus import SEVERITIES as SEVERITIES
-from amberbox.core.robotstatus import Severity as Severity
+from amberbox.core.robot_status import Severity
+
+
+@dataclass(frozen=True, slots=True)
+class FmeaReferences:
+    """The names that failure modes can refer to.
+
+    ``outputs`` are the addresses of all outputs of monitors (``component/mode/output``),
+    ``watched`` those of which something is expected: only they can be symptoms. ``needs`` are those
+    of component files; they count where the failure modes' file has none. ``addresses`` are those
+    that conditions may also read, None if they are not known. ``needs`` has a key for every
+    component of the folder; ``files`` those with monitors, and where. ``predicates`` are the names
+    that a finding's goal may have, None if the rules are not known; ``heads`` those of rules that
+    no other rule calls, with file and line.
+    """
+
+    outputs: Collection[str] = ()
+    watched: Collection[str] = ()
+    needs: Mapping[str, Needs] = field(default_factory=dict)
+    addresses: Collection[str] | None = None
+    predicates: Collection[tuple[str, int]] | None = None
+    heads: Mapping[tuple[str, int], tuple[str, int]] = field(default_factory=dict)
+    files: Mapping[str, str] = field(default_factory=dict)
+
 
 Kind: TypeAlias = Literal["read", "question", "check"]
 
 
 @dataclass(frozen=True, slots=True)
-class Symptom:
+class FmeaSymptom:
     """Something that can be seen: a monitor's output that is bad, or a condition that is true.
 
     ``id`` is the address of the output, or a name of the file; then ``condition`` is what must
@@ -35,7 +61,7 @@ class Symptom:
 
 
 @dataclass(frozen=True, slots=True)
-class Link:
+class SymptomLink:
     """A cause shows a symptom: how probable, within what time, remembered for how long."""
 
     symptom: str
@@ -45,7 +71,7 @@ class Link:
 
 
 @dataclass(frozen=True, slots=True)
-class Effects:
+class ModeEffects:
     """What a failure mode does: to its component (text), next to it, and to the system.
 
     ``next`` and ``system`` are names of components and functions; what the file does not say is
@@ -58,8 +84,8 @@ class Effects:
 
 
 @dataclass(frozen=True, slots=True)
-class Ranks:
-    """Severity, occurrence and detection from 1 (good) to 10 (bad); None where nobody knows."""
+class RiskRanks:
+    """Severity, occurrence and detection from 1 (good) to 10 (bad); None where unknown."""
 
     severity: int | None = None
     occurrence: int | None = None
@@ -74,8 +100,8 @@ class Ranks:
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
-    """What a test gives when a failure mode is there, and how surely."""
+class ExpectedOutcome:
+    """The outcome of a test when a failure mode is present, with its probability."""
 
     test: str
     outcome: str
@@ -86,11 +112,11 @@ class Outcome:
 class FailureMode:
     """One way in which a component fails; its ``id`` is ``component#mode``.
 
-    ``rate`` is per hour of exposure (mode ratio times the component's rate, where the file says
-    it so); else ``probability`` holds whatever the exposure. ``beta`` is the conditional
-    probability that the effect on the system comes about. ``takes_down`` tells whether the
-    component stops serving those that need it. ``make_safe`` is what has to be done before anybody
-    tests or repairs it, ``remedy`` what mends it. ``line`` is where the file has it.
+    ``rate`` is per hour of exposure (mode ratio times the component's rate, where the file says it
+    so); else ``probability`` holds whatever the exposure. ``beta`` is the conditional probability
+    that the effect on the system comes about. ``takes_down``: the component stops serving those
+    that need it. ``make_safe`` is to be done before a test or repair, ``remedy`` is the repair.
+    ``line`` is where the file has it.
     """
 
     id: str
@@ -104,11 +130,11 @@ class FailureMode:
     probability: float | None = None
     exposure_h: float = 24.0
     beta: float = 1.0
-    ranks: Ranks = Ranks()
-    effects: Effects = Effects()
-    symptoms: tuple[Link, ...] = ()
+    ranks: RiskRanks = RiskRanks()
+    effects: ModeEffects = ModeEffects()
+    symptoms: tuple[SymptomLink, ...] = ()
     unobservable: str = ""
-    tests: tuple[Outcome, ...] = ()
+    tests: tuple[ExpectedOutcome, ...] = ()
     remedy: str = ""
     takes_down: bool = True
     intermittent: bool = False
@@ -123,7 +149,7 @@ class FailureMode:
 
 
 @dataclass(frozen=True, slots=True)
-class Component:
+class FmeaComponent:
     """A part that can fail; it serves when no mode has taken it down and its needs are met."""
 
     id: str
@@ -134,7 +160,7 @@ class Component:
 
 
 @dataclass(frozen=True, slots=True)
-class Function:
+class FmeaFunction:
     """Something the robot can do; lost when its needs are not met. ``system`` marks the top."""
 
     id: str
@@ -142,14 +168,14 @@ class Function:
     description: str = ""
     system: bool = False
     severity: Severity = "urgent"
-    symptoms: tuple[Link, ...] = ()
+    symptoms: tuple[SymptomLink, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
 class FmeaTest:
-    """Something to look at, ask or check; the first outcome is that of a sound robot.
+    """A test: a check or a question; the first outcome is that of a sound robot.
 
-    ``sure`` is how probable that outcome is when no failure mode says otherwise.
+    ``sure`` is the probability of that outcome when no failure mode affects it.
     """
 
     id: str
@@ -163,10 +189,10 @@ class FmeaTest:
 
 
 @dataclass(frozen=True, slots=True)
-class Mapped:
-    """What another engine finds: answers of a ``goal`` of rules, or a ``finding`` by its id.
+class FindingMapping:
+    """A finding of another engine: answers of a ``goal`` of rules, or a ``finding`` by its id.
 
-    ``maps_to`` are failure modes that it speaks for, in which ``<Variable>`` stands for a value;
+    ``maps_to`` are failure modes that it indicates, in which ``<Variable>`` stands for a value;
     none: it is only shown. ``proves``: at least one of them is there, so that it is no symptom.
     """
 
@@ -180,7 +206,7 @@ class Mapped:
 
 
 @dataclass(frozen=True, slots=True)
-class Other:
+class UnlistedFault:
     """Something that is not in this analysis: how probable, and what it shows of anything.
 
     ``looks_like`` is how probable it looks like a failure mode when it looks like several that
@@ -195,20 +221,20 @@ class Other:
 
 @dataclass(frozen=True, slots=True)
 class Fmea:
-    """Everything, by id. ``members`` are the robots of a team with their folders, where named.
+    """The whole analysis, by id. ``members`` are a team's robots with their folders, where named.
 
-    For ``remember_s`` a symptom that nobody can look at any more goes on to count.
+    For ``remember_s`` a symptom that cannot be evaluated any more goes on to count.
     """
 
     name: str
     modes: Mapping[str, FailureMode]
-    components: Mapping[str, Component]
-    functions: Mapping[str, Function]
-    symptoms: Mapping[str, Symptom]
+    components: Mapping[str, FmeaComponent]
+    functions: Mapping[str, FmeaFunction]
+    symptoms: Mapping[str, FmeaSymptom]
     tests: Mapping[str, FmeaTest] = field(default_factory=dict)
-    other: Other = Other()
+    other: UnlistedFault = UnlistedFault()
     exposure_h: float = 24.0
-    findings: tuple[Mapped, ...] = ()
+    findings: tuple[FindingMapping, ...] = ()
     members: Mapping[str, str] = field(default_factory=dict)
     remember_s: float = 600.0
 
@@ -221,3 +247,73 @@ class Fmea:
         """Return the effects on the system: functions that are marked so, else all."""
         marked = tuple(name for name, function in self.functions.items() if function.system)
         return marked or tuple(self.functions)
+
+
+@dataclass(frozen=True, slots=True)
+class DependencyStructure:
+    """The inverse of needs: ``users`` are the components and functions that need one directly."""
+
+    needs: Mapping[str, Needs]
+    users: Mapping[str, tuple[str, ...]]
+
+    @classmethod
+    def of(cls, needs: Mapping[str, Needs]) -> DependencyStructure:
+        """Return the structure of needs."""
+        users: dict[str, list[str]] = {}
+        for user, of in needs.items():
+            for name in of.names():
+                users.setdefault(name, []).append(user)
+        return cls(needs, {name: tuple(found) for name, found in users.items()})
+
+    def dependents(self, names: Iterable[str]) -> frozenset[str]:
+        """Return all that needs one of the names, directly or not, whatever else serves."""
+        found: set[str] = set()
+        waiting = list(names)
+        while waiting:
+            more = [user for user in self.users.get(waiting.pop(), ()) if user not in found]
+            found.update(more)
+            waiting += more
+        return frozenset(found)
+
+    def lost(self, down: Collection[str]) -> frozenset[str]:
+        """Return what no longer serves when these components are down, they included."""
+        gone = set(down)
+        waiting = list(gone)
+        while waiting:
+            for user in self.users.get(waiting.pop(), ()):
+                if user not in gone and not self.needs[user].met(lambda name: name not in gone):
+                    gone.add(user)
+                    waiting.append(user)
+        return frozenset(gone)
+
+
+def lost(fmea: Fmea, modes: Iterable[str]) -> frozenset[str]:
+    """Return the components and functions that no longer serve while these modes are there."""
+    down = {fmea.modes[mode].component for mode in modes if fmea.modes[mode].takes_down}
+    return DependencyStructure.of(fmea.needs()).lost(down)
+
+
+def links_by_mode(fmea: Fmea) -> dict[str, tuple[SymptomLink, ...]]:
+    """Return what shows when a mode alone is there: its own symptoms and of what it loses."""
+    structure = DependencyStructure.of(fmea.needs())
+    of_loss = {
+        name: tuple(
+            link
+            for gone in sorted(structure.lost([name]))
+            if gone in fmea.functions
+            for link in fmea.functions[gone].symptoms
+        )
+        for name in fmea.components
+    }
+    return {
+        mode.id: (*mode.symptoms, *(of_loss[mode.component] if mode.takes_down else ()))
+        for mode in fmea.modes.values()
+    }
+
+
+def miss_probability(links: Iterable[SymptomLink]) -> float:
+    """Return how probable it is that none of the symptoms shows."""
+    share = 1.0
+    for link in links:
+        share *= 1.0 - link.detects
+    return share

@@ -9,11 +9,19 @@ from typing import Any
 import numpy as np
 
 from amberbox.core.clock import NS
-from amberbox.core.mode import Input, Result, where_known, with_hysteresis
+from amberbox.core.config import Finding
+from amberbox.core.mode import (
+    Input,
+    Result,
+    medians,
+    middles,
+    numbers_at,
+    sample_times,
+    where_known,
+    with_hysteresis,
+)
 from amberbox.core.options import option
 from amberbox.core.samples import Now
-from amberbox.core.standins import Finding
-from amberbox.core.together import medians, middles, numbers_at, sample_times
 
 ACCEPTS = ("variable",)
 COLUMNS = True
@@ -43,7 +51,7 @@ _LEAST_DROP = 0.05  # percent between the halves of a window; less is noise
 
 
 @dataclass(frozen=True, slots=True)
-class Config:
+class BatteryOptions:
     """What the inputs are when the battery is empty and full."""
 
     empty: float = option(0.0, "the inputs when the battery is empty", aliases=("lowest_voltage",))
@@ -70,12 +78,15 @@ class Config:
             yield "smoothing", "must be 0 or more"
 
 
-def history_s(config: Config) -> float:
+Config = BatteryOptions
+
+
+def history_s(config: BatteryOptions) -> float:
     """Return how far back it looks."""
     return max(config.window, config.smoothing)
 
 
-def evaluate(config: Config, inputs: Sequence[Input], now: Now) -> Mapping[str, Any]:
+def evaluate(config: BatteryOptions, inputs: Sequence[Input], now: Now) -> Mapping[str, Any]:
     """Judge the charge, of which one input that shows nonsense takes nothing away."""
     times_ns = sample_times(inputs, now, config.smoothing)
     shown = _percent(config, [numbers_at(one, times_ns) for one in inputs])
@@ -93,12 +104,12 @@ def evaluate(config: Config, inputs: Sequence[Input], now: Now) -> Mapping[str, 
     }
 
 
-def _percent(config: Config, values: Sequence[Any]) -> Any:
+def _percent(config: BatteryOptions, values: Sequence[Any]) -> Any:
     low, high = middles(np.array(values))
     return ((low + high) / 2 - config.empty) / (config.full - config.empty) * 100
 
 
-def _drain(config: Config, inputs: Sequence[Input], now: Now) -> Any:
+def _drain(config: BatteryOptions, inputs: Sequence[Input], now: Now) -> Any:
     """Return percent per second, from the middles of the older and the newer half of a window."""
     ages_ns = np.linspace(config.window * NS, 0, _POINTS).astype(np.int64)
     instants = np.atleast_1d(now) - ages_ns[:, None]
@@ -111,8 +122,8 @@ def _drain(config: Config, inputs: Sequence[Input], now: Now) -> Any:
     return (drop / apart_s).reshape(np.shape(now))[()]
 
 
-def explain(config: Config, results: Mapping[str, Any]) -> str:
-    """Say that it is low, or that it cannot be believed."""
+def explain(config: BatteryOptions, results: Mapping[str, Any]) -> str:
+    """Describe a low charge, or one that is not plausible."""
     if results["plausible"] is False:
         return "what it says is no number, or lies far below empty or above full"
     if results["ok"] is False:

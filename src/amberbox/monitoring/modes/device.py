@@ -28,17 +28,20 @@ mappings:
 
 
 @dataclass(frozen=True, slots=True)
-class Config:
+class DeviceOptions:
     """A device needs no arguments."""
 
 
-def evaluate(config: Config, inputs: Sequence[Input], now: Now) -> Mapping[str, Any]:
-    """Tell where the path was there when it was last looked for."""
+Config = DeviceOptions
+
+
+def evaluate(config: DeviceOptions, inputs: Sequence[Input], now: Now) -> Mapping[str, Any]:
+    """Return whether the path existed when it was last checked."""
     (path,) = inputs
     return {"present": where_known(path.samples.known(now), path.at(now))}
 
 
-def explain(config: Config, results: Mapping[str, Any]) -> str:
-    """Say that the path is missing."""
+def explain(config: DeviceOptions, results: Mapping[str, Any]) -> str:
+    """Describe that the path is missing."""
     missing = results["present"] is False
     return "the operating system does not show the device" if missing else ""

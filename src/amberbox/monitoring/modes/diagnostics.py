@@ -9,10 +9,10 @@ from math import inf
 from typing import Any, Literal, NamedTuple
 
 from amberbox.core.clock import NS
+from amberbox.core.config import Finding
 from amberbox.core.mode import UNKNOWN, Input, Result
 from amberbox.core.options import option
 from amberbox.core.samples import Now, Samples
-from amberbox.core.standins import Finding
 
 ACCEPTS = ("item",)
 PARTS = True
@@ -41,7 +41,7 @@ _WORDS = {"ok": OK, "warn": WARN, "warning": WARN, "error": ERROR, "stale": STAL
 
 
 @dataclass(frozen=True, slots=True)
-class Config:
+class DiagnosticsOptions:
     """Which entries are meant, and how bad they may be."""
 
     names: tuple[str, ...] = option(
@@ -63,21 +63,32 @@ class Config:
             yield "max_age", "must lie above 0"
 
 
-class Entry(NamedTuple):
+Config = DiagnosticsOptions
+
+
+class DiagnosticEntry(NamedTuple):
     """One row of the array."""
 
     level: int
     text: str
 
 
-def history_s(config: Config) -> float:
+def history_s(config: DiagnosticsOptions) -> float:
     """Return how far back it looks: publishers send arrays of their own, each at its pace."""
     return config.max_age
 
 
-def evaluate(config: Config, inputs: Sequence[Input], now: Now) -> Mapping[str, Any]:
+def evaluate(config: DiagnosticsOptions, inputs: Sequence[Input], now: Now) -> Mapping[str, Any]:
     """Take the last entry of each name, and of these the worst."""
-    entries = _newest(inputs[0], now, config.max_age)
+    item = inputs[0]
+    columns = [item.parts.get(name, Samples()) for name in ("name", "level", "message")]
+    edges = (now - round(config.max_age * NS), now)
+    first, end = (int(columns[0].times_ns.searchsorted(edge, "right")) for edge in edges)
+    behind = len(columns[0]) - first, len(columns[0]) - end
+    rows = zip(*(_cells(samples, *behind) for samples in columns), strict=True)
+    entries = {
+        name: DiagnosticEntry(_level(level), f"{name}: {text or ''}") for name, level, text in rows
+    }
     before = now - round(config.max_age * NS)
     heard = inputs[0].flow.age_s(before) <= config.max_age
     worst = max((_of(pattern, entries) for pattern in config.names), key=lambda e: e.level)
@@ -87,20 +98,10 @@ def evaluate(config: Config, inputs: Sequence[Input], now: Now) -> Mapping[str, 
     return {"ok": worst.level <= _WORDS[config.worst], "level": worst.level, "message": text}
 
 
-def _of(pattern: str, entries: Mapping[str, Entry]) -> Entry:
+def _of(pattern: str, entries: Mapping[str, DiagnosticEntry]) -> DiagnosticEntry:
     """Return the worst entry of a pattern; without any it is stale and has no text."""
     found = [entry for name, entry in entries.items() if re.search(pattern, str(name))]
-    return max(found, key=lambda entry: entry.level, default=Entry(STALE, ""))
-
-
-def _newest(item: Input, now: Now, seconds: float) -> Mapping[str, Entry]:
-    """Return the last entry of each name, of those that are not too old."""
-    columns = [item.parts.get(name, Samples()) for name in ("name", "level", "message")]
-    edges = (now - round(seconds * NS), now)
-    first, end = (int(columns[0].times_ns.searchsorted(edge, "right")) for edge in edges)
-    behind = len(columns[0]) - first, len(columns[0]) - end
-    rows = zip(*(_cells(samples, *behind) for samples in columns), strict=True)
-    return {name: Entry(_level(level), f"{name}: {text or ''}") for name, level, text in rows}
+    return max(found, key=lambda entry: entry.level, default=DiagnosticEntry(STALE, ""))
 
 
 def _cells(samples: Samples, first: int, end: int) -> Sequence[Any]:
@@ -111,11 +112,11 @@ def _cells(samples: Samples, first: int, end: int) -> Sequence[Any]:
 
 
 def _level(value: Any) -> int:
-    """Return the number of a level, which JSON may spell out; what it cannot be is an error."""
+    """Return the number of a level, which JSON may spell out; an unknown level is an error."""
     number = _WORDS.get(value.lower()) if isinstance(value, str) else value
     return int(number) if number in (OK, WARN, ERROR, STALE) else ERROR
 
 
-def explain(config: Config, results: Mapping[str, Any]) -> str:
-    """Repeat what the worst entry says."""
+def explain(config: DiagnosticsOptions, results: Mapping[str, Any]) -> str:
+    """Return the message of the worst entry."""
     return str(results["message"]) if results.get("ok") is False else ""

@@ -9,10 +9,10 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
+from amberbox.core.config import Finding
 from amberbox.core.mode import Input, Result, as_single, where_known
 from amberbox.core.options import option
 from amberbox.core.samples import Now
-from amberbox.core.standins import Finding
 
 ACCEPTS = ("variable",)
 COLUMNS = True
@@ -39,7 +39,7 @@ Plain: TypeAlias = bool | int | float | str
 
 
 @dataclass(frozen=True, slots=True)
-class Config:
+class ExpectedOptions:
     """What is well: one value, one of several, or texts that look like this."""
 
     equals: Plain | None = option(None, "the value that is well: a number, true or false, a text")
@@ -47,7 +47,7 @@ class Config:
     matches: str = option("", "a regular expression that is found in a text that is well")
 
     def check(self) -> Iterator[Finding]:
-        """Refuse what says nothing, and what is no regular expression."""
+        """Yield arguments that check nothing, and what is no regular expression."""
         if sum((self.equals is not None, bool(self.one_of), bool(self.matches))) != 1:
             yield "give one of 'equals', 'one_of', 'matches'"
         try:
@@ -61,7 +61,10 @@ class Config:
         return self.one_of if self.equals is None else (self.equals,)
 
 
-def evaluate(config: Config, inputs: Sequence[Input], now: Now) -> Mapping[str, Any]:
+Config = ExpectedOptions
+
+
+def evaluate(config: ExpectedOptions, inputs: Sequence[Input], now: Now) -> Mapping[str, Any]:
     """Compare the last value, and the name that it has, with those that are well."""
     (variable,) = inputs
     values, known = np.asarray(variable.at(now)), variable.samples.known(now)
@@ -84,14 +87,14 @@ def _text(value: Any, labels: Mapping[int, str]) -> str:
     return labels.get(value, str(value)) if isinstance(value, int) else str(value)
 
 
-def _fits(config: Config, text: str) -> bool:
+def _fits(config: ExpectedOptions, text: str) -> bool:
     if config.matches:
         return re.search(config.matches, text) is not None
     return any(text == _text(value, {}) for value in config.well)
 
 
-def explain(config: Config, results: Mapping[str, Any]) -> str:
-    """Say what the value is, and what it should be."""
+def explain(config: ExpectedOptions, results: Mapping[str, Any]) -> str:
+    """Describe what the value is, and what it should be."""
     if results["as_expected"] is not False:
         return ""
     well = " or ".join(_text(value, {}) for value in config.well)

@@ -6,13 +6,12 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from amberbox.core.config import Finding
 from amberbox.core.expression import Expression
-from amberbox.core.expression_reason import reason as condition_reason
-from amberbox.core.mode import Given, Input, Result, where_known
+from amberbox.core.expression import reason as condition_reason
+from amberbox.core.mode import Given, Input, Result, by_name, reads_of, value_of, where_known
 from amberbox.core.options import option
 from amberbox.core.samples import Now
-from amberbox.core.standins import Finding
-from amberbox.core.together import by_name, reads_of, value_of
 
 ACCEPTS = ("variable",)
 COLUMNS = True
@@ -34,11 +33,11 @@ arguments:
   condition: not (brake.closed != 0 and abs(ros_odom.twist_linear_x) > 0.05)
   number: max(abs(ros_odom.twist_linear_x) over 2s)
 """
-_MOST_SHOWN = 100  # characters: who meets a longer condition in an alarm does not read it
+_MOST_SHOWN = 100  # characters; a longer condition in an alarm is not readable
 
 
 @dataclass(frozen=True, slots=True)
-class Config:
+class ExpressionOptions:
     """What is asked; inputs of the mapping are called input_1, input_2 ..."""
 
     condition: Expression | None = option(None, "what holds on a healthy robot")
@@ -54,37 +53,40 @@ class Config:
             yield "number", "is a text, no number"
 
 
-def reads(config: Config) -> tuple[str, ...]:
+Config = ExpressionOptions
+
+
+def reads(config: ExpressionOptions) -> tuple[str, ...]:
     """Return the variables that are no inputs."""
     return reads_of(config.condition, config.number)
 
 
-def history_s(config: Config) -> float:
+def history_s(config: ExpressionOptions) -> float:
     """Return how far back it looks."""
     asked = (config.condition, config.number)
     return max(one.history_ns / 1e9 for one in asked if one is not None)
 
 
-def shortest_s(config: Config) -> float:
+def shortest_s(config: ExpressionOptions) -> float:
     """Return the shortest time that it looks back, 0 if it does not."""
     asked = (config.condition, config.number)
     spans = [one.shortest_ns for one in asked if one is not None]
     return min((span for span in spans if span is not None), default=0) / 1e9
 
 
-def timed(config: Config) -> bool:
-    """Tell whether what it asks changes as time passes."""
+def timed(config: ExpressionOptions) -> bool:
+    """Return whether its result changes as time passes."""
     asked = (config.condition, config.number)
     return any(one.needs_history for one in asked if one is not None)
 
 
-def results_of(config: Config, inputs: int, bools: int) -> tuple[Result, ...]:
-    """Return what is asked for."""
+def results_of(config: ExpressionOptions, inputs: int, bools: int) -> tuple[Result, ...]:
+    """Return the results that the options ask for."""
     asked = (config.condition, config.number)
     return tuple(r for r, one in zip(RESULTS, asked, strict=True) if one is not None)
 
 
-def evaluate(config: Config, inputs: Sequence[Input], now: Now) -> Mapping[str, Any]:
+def evaluate(config: ExpressionOptions, inputs: Sequence[Input], now: Now) -> Mapping[str, Any]:
     """Evaluate at the instants, over all that is known by then."""
     named = by_name(inputs, reads(config))
     found: dict[str, Any] = {}
@@ -96,8 +98,8 @@ def evaluate(config: Config, inputs: Sequence[Input], now: Now) -> Mapping[str, 
     return found
 
 
-def reason(config: Config, given: Given) -> str:
-    """Say which terms make the condition fail, with their values."""
+def reason(config: ExpressionOptions, given: Given) -> str:
+    """Describe which terms make the condition fail, with their values."""
     if config.condition is None:
         return ""
     named = by_name(given.inputs, reads(config))
@@ -105,7 +107,7 @@ def reason(config: Config, given: Given) -> str:
     return condition_reason(config.condition, samples, given.now_ns, expected=True)
 
 
-def explain(config: Config, results: Mapping[str, Any]) -> str:
+def explain(config: ExpressionOptions, results: Mapping[str, Any]) -> str:
     """Repeat the condition that does not hold."""
     if config.condition is None or results["holds"] is not False:
         return ""

@@ -11,13 +11,23 @@ from typing import Any
 import numpy as np
 
 from amberbox.core.clock import NS
+from amberbox.core.config import Finding
 from amberbox.core.expression import Expression, parse
-from amberbox.core.expression_windows import joined_times
-from amberbox.core.mode import FALSE, HOLD, TRUE, UNKNOWN, Input, Result
+from amberbox.core.expressions.values import joined_times
+from amberbox.core.mode import (
+    FALSE,
+    HOLD,
+    TRUE,
+    UNKNOWN,
+    Input,
+    Result,
+    by_name,
+    numbers,
+    reads_of,
+    value_of,
+)
 from amberbox.core.options import option
 from amberbox.core.samples import Now, Samples, Window, is_one
-from amberbox.core.standins import Finding
-from amberbox.core.together import by_name, numbers, reads_of, value_of
 from amberbox.core.types import IntArray
 
 ACCEPTS = ("variable", "list", "item")
@@ -48,7 +58,7 @@ _MOST_MISSING = 0.75  # of a window: two rows in it, one of them late, are enoug
 
 
 @dataclass(frozen=True, slots=True)
-class Config:
+class FrozenOptions:
     """What counts as moving, and when it should."""
 
     window: float = option(5.0, "how long it may stay the same", unit="s", aliases=["for"])
@@ -76,26 +86,42 @@ class Config:
             yield "nothing lies between 'min' and 'max'"
 
 
-def history_s(config: Config) -> float:
+Config = FrozenOptions
+
+
+def history_s(config: FrozenOptions) -> float:
     """Return how far back it looks."""
     asked = (config.should_move, config.valid)
     return config.window + max(0 if one is None else one.history_ns for one in asked) / NS
 
 
-def reads(config: Config) -> Sequence[str]:
-    """Return what says that it should move, and which rows are evidence."""
+def reads(config: FrozenOptions) -> Sequence[str]:
+    """Return the addresses of the conditions for moving and for valid rows."""
     return reads_of(config.should_move, config.valid)
 
 
-def evaluate(config: Config, inputs: Sequence[Input], now: Now) -> Mapping[str, Any]:
+def evaluate(config: FrozenOptions, inputs: Sequence[Input], now: Now) -> Mapping[str, Any]:
     """Look for movement between valid values, from the one in force when the window began on.
 
-    What moves is seen at once. It stands still where valid values came throughout the window.
+    Movement is detected at once. It stands still where valid values came throughout the window.
     """
     entry = inputs[0]
     named = by_name(inputs, reads(config))
-    samples = _numbers(config, entry, now)
-    spread = _spread(config, samples, named, now)
+    low, high = (-inf, inf) if entry.is_item else (config.min, config.max)
+    near = (entry.stamps if entry.is_item else entry.samples).within(now, config.window)
+    values = numbers(near.values)
+    bad = ~np.isfinite(values) | (values < low) | (values > high)
+    samples = near.derived(values, bad if near.null is None else bad | near.null)
+    start = now - round(config.window * NS)
+    rows = samples
+    if config.valid is not None:
+        first = int(np.min(start))  # only rows after it lie in a window
+        valid = _is_valid(config, named, np.maximum(samples.times_ns, first))
+        rows = samples.derived(samples.values, samples.null | ~valid)
+    known = samples.known(start) & _is_valid(config, named, start)
+    held = np.where(known, samples.at(start), np.nan)[()]
+    window = Window(rows, now, config.window)
+    spread = np.fmax(window.max(), held) - np.fmin(window.min(), held) + 0.0
     gap_s = _gaps_s(config, entry, samples, named, now, spread)
     seen, should = gap_s <= _MOST_MISSING * config.window, _should_move(config, named, now)
     moving = _moving(spread > config.tolerance, should, seen)
@@ -108,36 +134,13 @@ def _moving(moves: Any, should: Any, seen: Any) -> Any:
     return np.where(moves, TRUE, np.where(seen, np.where(should, FALSE, HOLD), UNKNOWN))
 
 
-def _numbers(config: Config, entry: Input, now: Now) -> Samples:
-    """Return the samples near the windows as numbers, unknown where they are impossible."""
-    low, high = (-inf, inf) if entry.is_item else (config.min, config.max)
-    near = (entry.stamps if entry.is_item else entry.samples).within(now, config.window)
-    values = numbers(near.values)
-    bad = ~np.isfinite(values) | (values < low) | (values > high)
-    return near.derived(values, bad if near.null is None else bad | near.null)
-
-
-def _is_valid(config: Config, named: Mapping[str, Input], times_ns: Now) -> Any:
-    """Tell where what was known at a time is evidence."""
+def _is_valid(config: FrozenOptions, named: Mapping[str, Input], times_ns: Now) -> Any:
+    """Return whether the values at each time are valid evidence."""
     return config.valid is None or value_of(config.valid, named, times_ns) == 1
 
 
-def _spread(config: Config, samples: Samples, named: Mapping[str, Input], now: Now) -> Any:
-    """Return greatest less least value that is evidence, NaN where none is."""
-    start = now - round(config.window * NS)
-    rows = samples
-    if config.valid is not None:
-        first = int(np.min(start))  # only rows after it lie in a window
-        valid = _is_valid(config, named, np.maximum(samples.times_ns, first))
-        rows = samples.derived(samples.values, samples.null | ~valid)
-    known = samples.known(start) & _is_valid(config, named, start)
-    held = np.where(known, samples.at(start), np.nan)[()]
-    window = Window(rows, now, config.window)
-    return np.fmax(window.max(), held) - np.fmin(window.min(), held) + 0.0
-
-
 def _gaps_s(
-    config: Config,
+    config: FrozenOptions,
     entry: Input,
     samples: Samples,
     named: Mapping[str, Input],
@@ -156,11 +159,11 @@ def _gaps_s(
 
 
 def _gap_s(
-    config: Config, entry: Input, samples: Samples, named: Mapping[str, Input], now: int
+    config: FrozenOptions, entry: Input, samples: Samples, named: Mapping[str, Input], now: int
 ) -> float:
     """Return the longest time of a window without evidence; NaN before it is full.
 
-    A message that a change filter left out says that the value still is what it was.
+    A message that a change filter left out shows that the value has not changed.
     """
     start = now - round(config.window * NS)
     heard = joined_times([entry.flow.heard_ns(start, now), _near(samples.times_ns, start, now)])
@@ -176,8 +179,8 @@ def _near(times_ns: IntArray, since_ns: int, until_ns: int) -> IntArray:
     return times_ns[max(first - 1, 0) : end]
 
 
-def _should_move(config: Config, named: Mapping[str, Input], now: Now) -> Any:
-    """Tell whether it should have moved all the time."""
+def _should_move(config: FrozenOptions, named: Mapping[str, Input], now: Now) -> Any:
+    """Return whether it should have moved all the time."""
     if config.should_move is None:
         return True
     condition = _throughout(config.should_move.text, round(config.window * NS))
@@ -189,13 +192,13 @@ def _throughout(text: str, duration_ns: int) -> Expression:
     return parse(f"({text}) for {duration_ns}ns")
 
 
-def explain(config: Config, results: Mapping[str, Any]) -> str:
-    """Say for how long it has not moved."""
+def explain(config: FrozenOptions, results: Mapping[str, Any]) -> str:
+    """Describe for how long it has not moved."""
     return f"has not moved for {config.window:g} s" if results["moving"] is False else ""
 
 
-def explain_unknown(config: Config, results: Mapping[str, Any]) -> str:
-    """Say what was not judged: the window is not full, or valid rows are missing."""
+def explain_unknown(config: FrozenOptions, results: Mapping[str, Any]) -> str:
+    """Describe what was not judged: the window is not full, or valid rows are missing."""
     gap_s = results["gap_s"]
     if np.isnan(gap_s):
         return f"not judged before it has been seen for {config.window:g} s"

@@ -10,11 +10,10 @@ from typing import Any
 import numpy as np
 
 from amberbox.core.clock import NS
-from amberbox.core.mode import Input, Result, as_single, where_known
+from amberbox.core.config import Finding
+from amberbox.core.mode import Input, Result, as_single, numbers, where_known
 from amberbox.core.options import option
 from amberbox.core.samples import Now, is_one
-from amberbox.core.standins import Finding
-from amberbox.core.together import numbers
 
 ACCEPTS = ("variable", "list")
 COLUMNS = True
@@ -45,7 +44,7 @@ arguments:
 
 
 @dataclass(frozen=True, slots=True)
-class Config:
+class GarbageOptions:
     """What is garbage beside NaN and infinity, and how much of it is well."""
 
     min: float = option(-inf, "what lies below is impossible")
@@ -67,12 +66,15 @@ class Config:
             yield "mask", "must not lie below 0"
 
 
-def history_s(config: Config) -> float:
+Config = GarbageOptions
+
+
+def history_s(config: GarbageOptions) -> float:
     """Return how far back it looks."""
     return config.window
 
 
-def evaluate(config: Config, inputs: Sequence[Input], now: Now) -> Mapping[str, Any]:
+def evaluate(config: GarbageOptions, inputs: Sequence[Input], now: Now) -> Mapping[str, Any]:
     """Count over the window, with the value that was in force when it began.
 
     It is judged when the window is full, or what is garbage is too much already: more than is
@@ -89,7 +91,7 @@ def evaluate(config: Config, inputs: Sequence[Input], now: Now) -> Mapping[str, 
     return {"clean": clean, "garbage": garbage, "share": share, "missing_s": missing_s}
 
 
-def _missing(config: Config, entry: Input, now: Now, mixed: Any) -> tuple[Any, Any]:
+def _missing(config: GarbageOptions, entry: Input, now: Now, mixed: Any) -> tuple[Any, Any]:
     """Return how long until a window is full, and how much of one has been filled (1: all).
 
     It is full where a value was in force when it began, unless nothing came for three quarters of
@@ -109,7 +111,7 @@ def _missing(config: Config, entry: Input, now: Now, mixed: Any) -> tuple[Any, A
     return missing_s[()], np.where((config.tolerated == 0) & (count > 0), 1.0, filled)[()]
 
 
-def _counted(config: Config, entry: Input, now: Now) -> tuple[Any, Any]:
+def _counted(config: GarbageOptions, entry: Input, now: Now) -> tuple[Any, Any]:
     """Return how many values there were in the windows, and how many of these are garbage."""
     near = Input(entry.name, entry.samples.within(now, config.window))
     near.parts = {name: part.within(now, config.window) for name, part in entry.parts.items()}
@@ -122,7 +124,7 @@ def _counted(config: Config, entry: Input, now: Now) -> tuple[Any, Any]:
     return total, garbage
 
 
-def _in_values(config: Config, entry: Input) -> tuple[Any, Any]:
+def _in_values(config: GarbageOptions, entry: Input) -> tuple[Any, Any]:
     """Return for each sample whether it is known (1 or 0), and whether it is garbage."""
     values, null = numbers(entry.samples.values), entry.samples.null
     low, high = min(config.min, as_single(config.min)), max(config.max, as_single(config.max))
@@ -135,7 +137,7 @@ def _in_values(config: Config, entry: Input) -> tuple[Any, Any]:
     return known.astype(np.int64), (known & ~good).astype(np.int64)
 
 
-def _in_lists(config: Config, entry: Input) -> tuple[Any, Any]:
+def _in_lists(config: GarbageOptions, entry: Input) -> tuple[Any, Any]:
     """Return for each row how long the list is, and how much of it is garbage at least."""
     columns = (entry.parts[name].column() for name in ("count", "finite", "min", "max"))
     count, finite, low, high = (np.ma.filled(column, np.nan) for column in columns)
@@ -146,22 +148,22 @@ def _in_lists(config: Config, entry: Input) -> tuple[Any, Any]:
 
 
 def _whole(numbers: Any) -> Any:
-    """Return numbers as whole ones, -1 for what is none."""
+    """Return numbers as integers, -1 for non-integers."""
     floats = numbers.astype(np.float64)
     is_whole = (np.abs(floats) < 1 << 53) & (np.trunc(floats) == floats)
     return np.where(is_whole, floats, -1).astype(np.int64)
 
 
-def explain_unknown(config: Config, results: Mapping[str, Any]) -> str:
-    """Say how long it still takes until the window is full."""
+def explain_unknown(config: GarbageOptions, results: Mapping[str, Any]) -> str:
+    """Describe how long it still takes until the window is full."""
     missing_s = results["missing_s"]
     if not missing_s > 0:
         return ""
     return f"not judged for another {missing_s:.3g} s: it takes {config.window:g} s of values"
 
 
-def explain(config: Config, results: Mapping[str, Any]) -> str:
-    """Say how much of it is garbage."""
+def explain(config: GarbageOptions, results: Mapping[str, Any]) -> str:
+    """Describe how much of it is garbage."""
     if results["clean"] is not False:
         return ""
     return f"{results['share']:.3g} % of the values of the last {config.window:g} s are garbage"

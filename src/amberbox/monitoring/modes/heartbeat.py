@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 
 from amberbox.core.clock import NS
+from amberbox.core.config import Finding
 from amberbox.core.mode import Input, Result, where_known
 from amberbox.core.options import option
 from amberbox.core.samples import Now, is_one
-from amberbox.core.standins import Finding
 
 ACCEPTS = ("item", "variable", "list")
 COLUMNS = True
@@ -44,7 +44,7 @@ arguments:
 
 
 @dataclass(frozen=True, slots=True)
-class Config:
+class HeartbeatOptions:
     """How often messages come when all is well, and when silence is a fault."""
 
     rate: float | None = option(
@@ -69,16 +69,19 @@ class Config:
 
     @property
     def least_hz(self) -> float:
-        """The lowest rate that is well; one message more or less in a window is no fault."""
+        """Return the lowest good rate, Hz; one message more or less in a window is no fault."""
         return (self.rate or 0.0) * (1 - self.tolerance / 100) - 1 / self.window
 
 
-def history_s(config: Config) -> float:
+Config = HeartbeatOptions
+
+
+def history_s(config: HeartbeatOptions) -> float:
     """Return how far back it looks."""
     return max(config.window, config.max_age)
 
 
-def evaluate(config: Config, inputs: Sequence[Input], now: Now) -> Mapping[str, Any]:
+def evaluate(config: HeartbeatOptions, inputs: Sequence[Input], now: Now) -> Mapping[str, Any]:
     """Judge the last message's age, and the rate once there has been a whole window of them."""
     (item,) = inputs
     age_s = item.age_s(now)
@@ -97,10 +100,10 @@ def evaluate(config: Config, inputs: Sequence[Input], now: Now) -> Mapping[str, 
     }
 
 
-def _is_steady(config: Config, item: Input, now: Now, enough: Any) -> Any:
-    """Tell, where there are too few, whether messages came throughout the window.
+def _is_steady(config: HeartbeatOptions, item: Input, now: Now, enough: Any) -> Any:
+    """Return, where there are too few messages, whether they came throughout the window.
 
-    What has just come back after a silence is not slow: it was silent.
+    An item that has just come back after a silence is not slow: it was silent.
     """
 
     def at(now_ns: int) -> bool:
@@ -114,8 +117,8 @@ def _is_steady(config: Config, item: Input, now: Now, enough: Any) -> Any:
     return np.array([not well and at(at_ns) for well, at_ns in zip(enough, instants, strict=True)])
 
 
-def explain(config: Config, results: Mapping[str, Any]) -> str:
-    """Say whether it is silent, too slow, or has been silent until now."""
+def explain(config: HeartbeatOptions, results: Mapping[str, Any]) -> str:
+    """Describe whether it is silent, too slow, or was silent until now."""
     age_s, rate_hz = results["age_s"], results["rate_hz"]
     if False not in (results["alive"], results["heard"], results["often_enough"]):
         return ""
@@ -129,8 +132,8 @@ def explain(config: Config, results: Mapping[str, Any]) -> str:
     return f"comes again after a silence, which counts: {rate}"
 
 
-def explain_unknown(config: Config, results: Mapping[str, Any]) -> str:
-    """Say that the rate is not judged while nothing comes, or before it was heard long enough."""
+def explain_unknown(config: HeartbeatOptions, results: Mapping[str, Any]) -> str:
+    """Describe that the rate is unknown: in silence, or before messages came long enough."""
     if results["heard"] is False:
         return "its rate is not judged while it is silent"
     return f"not judged before messages came for {config.window:g} s without a break"

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
+from amberbox.core.config import Finding
 from amberbox.core.mode import Input, Result, where_known, with_hysteresis
 from amberbox.core.options import option
 from amberbox.core.samples import Now
-from amberbox.core.standins import Finding
 
 ACCEPTS = ("probe",)
 COLUMNS = True
@@ -51,7 +51,7 @@ _PROBES = {
 
 
 @dataclass(frozen=True, slots=True)
-class Config:
+class HostOptions:
     """The limit of each figure."""
 
     cpu: float = option(95.0, "how busy the processors may be", unit="%")
@@ -70,19 +70,22 @@ class Config:
             yield "window", "must lie above 0"
 
 
-def probe_of(config: Config, text: str) -> tuple[str, str]:
+Config = HostOptions
+
+
+def probe_of(config: HostOptions, text: str) -> tuple[str, str]:
     """Read ``cpu``, ``memory``, ``swap``, ``disk PATH``, ``temperature SENSOR``."""
     word, _, rest = text.strip().partition(" ")
     kind, usual, _ = _PROBES.get(word, (word, "", ""))
     return kind, rest.strip() or usual
 
 
-def history_s(config: Config) -> float:
+def history_s(config: HostOptions) -> float:
     """Return how far back it looks."""
     return config.window
 
 
-def evaluate(config: Config, inputs: Sequence[Input], now: Now) -> Mapping[str, Any]:
+def evaluate(config: HostOptions, inputs: Sequence[Input], now: Now) -> Mapping[str, Any]:
     """Compare the mean of what the probe measured with the limit of its kind."""
     (one,) = inputs
     word = one.name.split(" ")[0]
@@ -94,7 +97,7 @@ def evaluate(config: Config, inputs: Sequence[Input], now: Now) -> Mapping[str, 
     return {"ok": where_known(told, with_hysteresis(good, bad)), "value": value}
 
 
-def _mean(config: Config, one: Input, word: str, now: Now) -> Any:
+def _mean(config: HostOptions, one: Input, word: str, now: Now) -> Any:
     """Return the mean of a probe's figure; where no sample is that new, the last one."""
     _, _, name = _PROBES.get(word, ("", "", ""))
     if name not in one.parts:
@@ -105,8 +108,8 @@ def _mean(config: Config, one: Input, word: str, now: Now) -> Any:
     return np.where(np.isnan(mean), last, mean)[()]
 
 
-def explain(config: Config, results: Mapping[str, Any]) -> str:
-    """Say how high the figure is."""
+def explain(config: HostOptions, results: Mapping[str, Any]) -> str:
+    """Describe how high the figure is."""
     if results["ok"] is not False:
         return ""
     value = results["value"]

@@ -9,11 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from amberbox.core.mode import Input, Result, where_known
+from amberbox.core.config import Finding
+from amberbox.core.mode import Input, Result, numbers_at, where_known
 from amberbox.core.options import option
 from amberbox.core.samples import Now, Samples
-from amberbox.core.standins import Finding
-from amberbox.core.together import numbers_at
 
 ACCEPTS = ("variable", "item")
 COLUMNS = True
@@ -44,7 +43,7 @@ _DIAGONAL = (0, 7, 35)  # x, y and heading in a covariance of 6 x 6
 
 
 @dataclass(frozen=True, slots=True)
-class Config:
+class LocalisationOptions:
     """How certain is certain enough."""
 
     avg_variance_threshold: float = option(0.01, "what the mean of the variances must be below")
@@ -58,8 +57,11 @@ class Config:
             yield "avg_variance_threshold", "must lie above 0"
 
 
-def evaluate(config: Config, inputs: Sequence[Input], now: Now) -> Mapping[str, Any]:
-    """Compare the mean of the variances; all zero is how ROS says that they are not known."""
+Config = LocalisationOptions
+
+
+def evaluate(config: LocalisationOptions, inputs: Sequence[Input], now: Now) -> Mapping[str, Any]:
+    """Compare the mean of the variances; in ROS all zero means that they are not known."""
     chosen = _chosen(config, inputs)
     x, y, theta = variances = [numbers_at(one, now) for one in chosen]
     mean = (x + y + theta) / 3
@@ -70,7 +72,7 @@ def evaluate(config: Config, inputs: Sequence[Input], now: Now) -> Mapping[str, 
     return {"localised": localised, "variance_x": x, "variance_y": y, "variance_theta": theta}
 
 
-def _chosen(config: Config, inputs: Sequence[Input]) -> Sequence[Input]:
+def _chosen(config: LocalisationOptions, inputs: Sequence[Input]) -> Sequence[Input]:
     """Return x, y and heading of three inputs, of a whole covariance, or of an item."""
     if len(inputs) == 1:
         parts = inputs[0].parts
@@ -79,8 +81,8 @@ def _chosen(config: Config, inputs: Sequence[Input]) -> Sequence[Input]:
     return [inputs[place] for place in _DIAGONAL] if len(inputs) == 36 else inputs
 
 
-def explain(config: Config, results: Mapping[str, Any]) -> str:
-    """Say how uncertain it is."""
+def explain(config: LocalisationOptions, results: Mapping[str, Any]) -> str:
+    """Describe how uncertain it is."""
     variances = [results[f"variance_{axis}"] for axis in ("x", "y", "theta")]
     if results["localised"] is not False:
         return ""

@@ -10,11 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from amberbox.core.mode import Input, Result, where_known
+from amberbox.core.config import Finding
+from amberbox.core.mode import Input, Result, numbers, where_known
 from amberbox.core.options import option
-from amberbox.core.samples import Now, Samples, Window
-from amberbox.core.standins import Finding
-from amberbox.core.together import numbers
+from amberbox.core.samples import Now, Window
 
 ACCEPTS = ("variable",)
 COLUMNS = True
@@ -45,7 +44,7 @@ arguments:
 
 
 @dataclass(frozen=True, slots=True)
-class Config:
+class LogPatternOptions:
     """Which lines count, and what they mean."""
 
     pattern: str = option(doc="a regular expression that is found anywhere in a line that counts")
@@ -68,12 +67,15 @@ class Config:
             yield "window", "must lie above 0"
 
 
-def history_s(config: Config) -> float:
+Config = LogPatternOptions
+
+
+def history_s(config: LogPatternOptions) -> float:
     """Return how far back it looks."""
     return config.window
 
 
-def evaluate(config: Config, inputs: Sequence[Input], now: Now) -> Mapping[str, Any]:
+def evaluate(config: LogPatternOptions, inputs: Sequence[Input], now: Now) -> Mapping[str, Any]:
     """Count the lines of the window that match."""
     text = inputs[0].samples
     flags = _matching(config, inputs)
@@ -91,28 +93,25 @@ def evaluate(config: Config, inputs: Sequence[Input], now: Now) -> Mapping[str, 
     }
 
 
-def _matching(config: Config, inputs: Sequence[Input]) -> Any:
-    """Tell for each line whether it counts; level and line are of the same message."""
+def _matching(config: LogPatternOptions, inputs: Sequence[Input]) -> Any:
+    """Return for each line whether it counts; level and line are of the same message."""
     pattern, lines = re.compile(config.pattern), inputs[0].samples
     found = [isinstance(line, str) and bool(pattern.search(line)) for line in lines.values]
     flags = np.array(found, bool)
     if len(inputs) < 2:
         return flags
-    return flags & (_levels(lines, inputs[1].samples) >= config.level)
-
-
-def _levels(lines: Samples, levels: Samples) -> Any:
-    """Return the level of each line: of several at one time the first belongs to the first."""
+    # Return the level of each line: of several at one time the first belongs to the first.
+    levels = inputs[1].samples
     times = lines.times_ns
     rank = np.arange(len(times)) - times.searchsorted(times)
     place = levels.times_ns.searchsorted(times) + rank
     at_once = np.append(levels.times_ns, -1)[np.minimum(place, len(levels))] == times
     last = levels.times_ns.searchsorted(times, "right") - 1
     place = np.where(at_once, place, last)
-    return np.append(numbers(levels.values), np.nan)[place]
+    return flags & (np.append(numbers(levels.values), np.nan)[place] >= config.level)
 
 
-def explain(config: Config, results: Mapping[str, Any]) -> str:
+def explain(config: LogPatternOptions, results: Mapping[str, Any]) -> str:
     """Quote the last bad line, or say what has not been read."""
     if results["ok"] is not False:
         return ""

@@ -8,10 +8,9 @@ from typing import Any, Literal
 
 import numpy as np
 
-from amberbox.core.mode import Input, Result, where_known
+from amberbox.core.mode import Input, Result, numbers_at, where_known
 from amberbox.core.options import option
 from amberbox.core.samples import Now, Samples
-from amberbox.core.together import numbers_at
 
 ACCEPTS = ("probe", "variable")
 COLUMNS = True
@@ -45,7 +44,7 @@ _PARTS = {
 
 
 @dataclass(frozen=True, slots=True)
-class Config:
+class NetworkOptions:
     """What the inputs are, where they are variables and no probes."""
 
     values: tuple[Literal["quality", "signal_dbm", "latency_ms", "loss_percent"], ...] = option(
@@ -53,7 +52,10 @@ class Config:
     )
 
 
-def probe_of(config: Config, text: str) -> tuple[str, str]:
+Config = NetworkOptions
+
+
+def probe_of(config: NetworkOptions, text: str) -> tuple[str, str]:
     """Read ``wifi wlan0``, ``ping HOST``, ``interface eth0``; one word is a wireless interface."""
     word, _, rest = text.strip().partition(" ")
     if word in _PROBES and rest:
@@ -61,8 +63,8 @@ def probe_of(config: Config, text: str) -> tuple[str, str]:
     return "wifi", "wlan0" if text.strip() in ("", "wifi") else text.strip()
 
 
-def evaluate(config: Config, inputs: Sequence[Input], now: Now) -> Mapping[str, Any]:
-    """Collect what the inputs tell; an input that says no number is not connected."""
+def evaluate(config: NetworkOptions, inputs: Sequence[Input], now: Now) -> Mapping[str, Any]:
+    """Collect the inputs; one without a number is not connected."""
     if config.values:
         well = [np.isfinite(numbers_at(one, now)) for one in inputs]
         figures: dict[str, Input] = dict(zip(config.values, inputs, strict=True))
@@ -83,6 +85,6 @@ def _first_with(part: str, inputs: Sequence[Input]) -> Input:
     return Input("", Samples())
 
 
-def explain(config: Config, results: Mapping[str, Any]) -> str:
-    """Say that there is no connection."""
+def explain(config: NetworkOptions, results: Mapping[str, Any]) -> str:
+    """Describe that there is no connection."""
     return "there is no connection" if results["connected"] is False else ""

@@ -9,12 +9,19 @@ from typing import Any
 
 import numpy as np
 
-from amberbox.core.expression_reason import variable_text
-from amberbox.core.mode import Given, Input, Result, as_single, where_known, with_hysteresis
+from amberbox.core.config import Finding
+from amberbox.core.expression import variable_text
+from amberbox.core.mode import (
+    Given,
+    Input,
+    Result,
+    as_single,
+    numbers,
+    where_known,
+    with_hysteresis,
+)
 from amberbox.core.options import option
 from amberbox.core.samples import Now
-from amberbox.core.standins import Finding
-from amberbox.core.together import numbers
 
 ACCEPTS = ("variable",)
 COLUMNS = True
@@ -40,7 +47,7 @@ arguments:
 
 
 @dataclass(frozen=True, slots=True)
-class Config:
+class RangeOptions:
     """The limits, which belong to the range."""
 
     min: float = option(-inf, "the least value that is well")
@@ -57,7 +64,10 @@ class Config:
             yield "nothing is within these limits"
 
 
-def evaluate(config: Config, inputs: Sequence[Input], now: Now) -> Mapping[str, Any]:
+Config = RangeOptions
+
+
+def evaluate(config: RangeOptions, inputs: Sequence[Input], now: Now) -> Mapping[str, Any]:
     """Compare the last value with the limits."""
     (variable,) = inputs
     value, known = numbers(variable.at(now))[()], variable.samples.known(now)
@@ -68,8 +78,8 @@ def evaluate(config: Config, inputs: Sequence[Input], now: Now) -> Mapping[str, 
     return {"in_range": in_range, "value": np.where(known, value, np.nan)}
 
 
-def reason(config: Config, given: Given) -> str:
-    """Say which values are outside of which limit; none within the hysteresis alone."""
+def reason(config: RangeOptions, given: Given) -> str:
+    """Describe which values are outside of which limit; none that only lie in the hysteresis."""
     low, high = min(config.min, as_single(config.min)), max(config.max, as_single(config.max))
     found = ((one.name, float(numbers(one.at(given.now_ns))[()])) for one in given.inputs)
     return "; ".join(

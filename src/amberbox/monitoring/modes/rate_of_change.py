@@ -10,12 +10,11 @@ from typing import Any
 import numpy as np
 
 from amberbox.core.clock import NS
-from amberbox.core.expression_reason import variable_text
-from amberbox.core.mode import Given, Input, Result, where_known
+from amberbox.core.config import Finding
+from amberbox.core.expression import variable_text
+from amberbox.core.mode import Given, Input, Result, numbers, where_known
 from amberbox.core.options import option
 from amberbox.core.samples import Now
-from amberbox.core.standins import Finding
-from amberbox.core.together import numbers
 
 ACCEPTS = ("variable", "list")
 COLUMNS = True
@@ -42,7 +41,7 @@ arguments:
 
 
 @dataclass(frozen=True, slots=True)
-class Config:
+class RateOfChangeOptions:
     """The limits, which are well themselves."""
 
     min: float = option(-inf, "the least change per second; below 0 it may fall")
@@ -62,16 +61,19 @@ class Config:
             yield "turn", "must lie above 0"
 
 
-def history_s(config: Config) -> float:
+Config = RateOfChangeOptions
+
+
+def history_s(config: RateOfChangeOptions) -> float:
     """Return how far back it looks."""
     return config.window
 
 
-def evaluate(config: Config, inputs: Sequence[Input], now: Now) -> Mapping[str, Any]:
+def evaluate(config: RateOfChangeOptions, inputs: Sequence[Input], now: Now) -> Mapping[str, Any]:
     """Compare the value with the one that was in force a window ago.
 
-    Over a gap of messages the change is that of the gap. Where nothing came since, that nothing
-    changed is no fault: what must change is not judged then.
+    Over a gap of messages the change is that of the gap. Where no message came since, a missing
+    change is no fault: a least rate is not judged then.
     """
     (variable,) = inputs
     rate = _rate(config, variable, now)
@@ -81,7 +83,7 @@ def evaluate(config: Config, inputs: Sequence[Input], now: Now) -> Mapping[str, 
     return {"in_limits": where_known(judged, in_limits), "rate": rate}
 
 
-def _rate(config: Config, variable: Input, now: Now) -> Any:
+def _rate(config: RateOfChangeOptions, variable: Input, now: Now) -> Any:
     """Return the change per second; NaN where it is not known."""
     before = now - round(config.window * NS)
     known = variable.samples.known(now) & variable.samples.known(before)
@@ -94,8 +96,8 @@ def _rate(config: Config, variable: Input, now: Now) -> Any:
     return np.where(known, change / np.maximum(apart_s, config.window), np.nan)
 
 
-def reason(config: Config, given: Given) -> str:
-    """Say how fast what changes, with the limit."""
+def reason(config: RateOfChangeOptions, given: Given) -> str:
+    """Describe which value changes how fast, with the limit."""
     unit = given.unit or "per second"
     found = ((one.name, float(_rate(config, one, given.now_ns))) for one in given.inputs)
     return "; ".join(
@@ -105,7 +107,7 @@ def reason(config: Config, given: Given) -> str:
     )  # fmt: skip
 
 
-def explain(config: Config, results: Mapping[str, Any]) -> str:
-    """Say how fast it changes."""
+def explain(config: RateOfChangeOptions, results: Mapping[str, Any]) -> str:
+    """Describe how fast it changes."""
     out = results["in_limits"] is False
     return f"changes by {results['rate']:.4g} per second" if out else ""

@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 
 from amberbox.core.clock import NS
+from amberbox.core.config import Finding
 from amberbox.core.expression import Expression
-from amberbox.core.mode import FALSE, Input, Result, where_known
-from amberbox.core.options import option
-from amberbox.core.samples import Now
-from amberbox.core.standins import Finding
-from amberbox.core.together import (
+from amberbox.core.mode import (
+    FALSE,
+    Input,
+    Result,
     by_name,
     finite,
     medians,
@@ -26,8 +26,11 @@ from amberbox.core.together import (
     reads_of,
     sample_times,
     value_of,
+    where_known,
     worst_of,
 )
+from amberbox.core.options import option
+from amberbox.core.samples import Now
 
 ACCEPTS = ("variable",)
 COLUMNS = True
@@ -54,7 +57,7 @@ arguments:
 
 
 @dataclass(frozen=True, slots=True)
-class Config:
+class RedundancyOptions:
     """How far a member may be off, and from what."""
 
     threshold: float = option(doc="how far a member may be off, in its own unit")
@@ -68,30 +71,33 @@ class Config:
     )
 
     def check(self) -> Iterator[Finding]:
-        """Refuse what nobody can agree within."""
+        """Yield limits within which nothing can agree."""
         if not 0 <= self.threshold < inf:
             yield "threshold", "must be 0 or more"
         if not 0 <= self.window < inf:
             yield "window", "must be 0 or more"
 
 
-def reads(config: Config) -> tuple[str, ...]:
+Config = RedundancyOptions
+
+
+def reads(config: RedundancyOptions) -> tuple[str, ...]:
     """Return the variables of the formula that are no inputs."""
     return reads_of(config.formula)
 
 
-def history_s(config: Config) -> float:
+def history_s(config: RedundancyOptions) -> float:
     """Return how far back it looks."""
     past_ns = 0 if config.formula is None else config.formula.history_ns
     return config.window + past_ns / 1e9
 
 
-def timed(config: Config) -> bool:
-    """Tell whether there is a window, which samples leave as time passes."""
+def timed(config: RedundancyOptions) -> bool:
+    """Return whether there is a window, which samples leave as time passes."""
     return history_s(config) > 0 or (config.formula is not None and config.formula.needs_history)
 
 
-def results_of(config: Config, inputs: int, bools: int) -> tuple[Result, ...]:
+def results_of(config: RedundancyOptions, inputs: int, bools: int) -> tuple[Result, ...]:
     """Return results per member first where a mapping has several bool outputs."""
     count = len(_members(config, inputs))
     each = [Result(f"member_{k}", "bool", f"member {k} agrees") for k in range(1, count + 1)]
@@ -102,7 +108,7 @@ def results_of(config: Config, inputs: int, bools: int) -> tuple[Result, ...]:
     return (*each, *offs, *RESULTS) if bools > 1 else (*RESULTS, *each, *offs)
 
 
-def evaluate(config: Config, inputs: Sequence[Input], now: Now) -> Mapping[str, Any]:
+def evaluate(config: RedundancyOptions, inputs: Sequence[Input], now: Now) -> Mapping[str, Any]:
     """Take the median distance of each member from what it should be, over a full window."""
     named = by_name(inputs, reads(config))
     windowed = timed(config)
@@ -122,12 +128,14 @@ def evaluate(config: Config, inputs: Sequence[Input], now: Now) -> Mapping[str, 
     return found
 
 
-def _members(config: Config, inputs: int) -> list[int]:
+def _members(config: RedundancyOptions, inputs: int) -> list[int]:
     named = () if config.formula is None else config.formula.addresses()
     return [place for place in range(inputs) if place_name(place) not in named]
 
 
-def _should_be(config: Config, named: Any, times_ns: Any, values: Any) -> tuple[Any, ...]:
+def _should_be(
+    config: RedundancyOptions, named: Any, times_ns: Any, values: Any
+) -> tuple[Any, ...]:
     """Return what each member should be; of two middle siblings the nearer one will count."""
     if config.formula is not None:
         return (value_of(config.formula, named, times_ns),)
@@ -135,12 +143,12 @@ def _should_be(config: Config, named: Any, times_ns: Any, values: Any) -> tuple[
     return middles(values[np.array(others, int).T])
 
 
-def _judged(config: Config, residual: Any, verdict: str, number: str) -> dict[str, Any]:
+def _judged(config: RedundancyOptions, residual: Any, verdict: str, number: str) -> dict[str, Any]:
     well = where_known(~np.isnan(residual), residual <= config.threshold)
     return {verdict: well, number: finite(residual)}
 
 
-def explain(config: Config, results: Mapping[str, Any]) -> str:
+def explain(config: RedundancyOptions, results: Mapping[str, Any]) -> str:
     """Name the members that are off, and how far."""
     verdicts = {n.removeprefix("member_"): v for n, v in results.items() if n.startswith("member_")}
     off = {k: results[f"residual_{k}"] for k, verdict in verdicts.items() if verdict == FALSE}

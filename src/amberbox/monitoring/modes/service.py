@@ -35,7 +35,7 @@ arguments:
 
 
 @dataclass(frozen=True, slots=True)
-class Config:
+class ServiceOptions:
     """What the inputs are names of."""
 
     kind: Literal["unit", "process", "container", "ros_node", "ros_topic", "ros_master", "http"] = (
@@ -43,13 +43,16 @@ class Config:
     )
 
 
-def probe_of(config: Config, text: str) -> tuple[str, str]:
-    """Return the probe that looks for it."""
+Config = ServiceOptions
+
+
+def probe_of(config: ServiceOptions, text: str) -> tuple[str, str]:
+    """Return kind and subject of the probe that checks it."""
     return ("unit_active" if config.kind == "unit" else config.kind), text
 
 
-def evaluate(config: Config, inputs: Sequence[Input], now: Now) -> Mapping[str, Any]:
-    """Repeat what was found when it was last looked for."""
+def evaluate(config: ServiceOptions, inputs: Sequence[Input], now: Now) -> Mapping[str, Any]:
+    """Return the result of the last check."""
     (one,) = inputs
     active = where_known(one.samples.known(now), one.at(now))
     if "state" not in one.parts:
@@ -59,8 +62,8 @@ def evaluate(config: Config, inputs: Sequence[Input], now: Now) -> Mapping[str, 
     return {"active": active, "state": np.where(state.samples.known(now), words, "")[()]}
 
 
-def explain(config: Config, results: Mapping[str, Any]) -> str:
-    """Say in which state it is instead."""
+def explain(config: ServiceOptions, results: Mapping[str, Any]) -> str:
+    """Describe the state it is in instead."""
     if results["active"] is not False:
         return ""
     return f"it is {results['state']}" if results["state"] else "it is not there"

@@ -8,11 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from amberbox.core.mode import Input, Result, where_known
+from amberbox.core.config import Finding
+from amberbox.core.mode import Input, Result, numbers, where_known
 from amberbox.core.options import option
 from amberbox.core.samples import Now
-from amberbox.core.standins import Finding
-from amberbox.core.together import numbers
 
 ACCEPTS = ("variable",)
 COLUMNS = True
@@ -41,7 +40,7 @@ _BITS = 63
 
 
 @dataclass(frozen=True, slots=True)
-class Bit:
+class StateBit:
     """One bit of the word."""
 
     bit: int = option(doc="number of the bit; the lowest is 0")
@@ -49,10 +48,10 @@ class Bit:
 
 
 @dataclass(frozen=True, slots=True)
-class Config:
+class StateBitsOptions:
     """Names of the bits; a number alone is a bit that is set when all is well."""
 
-    bits: Mapping[str, int | Bit] = option(doc="bits by name: `enabled: 0`")
+    bits: Mapping[str, int | StateBit] = option(doc="bits by name: `enabled: 0`")
 
     def check(self) -> Iterator[Finding]:
         """Refuse bits that no word has, and names that are taken."""
@@ -64,21 +63,24 @@ class Config:
             if name in {result.name for result in RESULTS}:
                 yield "bits", f"no bit can have the name '{name}'"
 
-    def named(self) -> list[tuple[str, Bit]]:
+    def named(self) -> list[tuple[str, StateBit]]:
         """Return each bit with its name."""
         found = self.bits.items()
-        return [(name, Bit(bit) if isinstance(bit, int) else bit) for name, bit in found]
+        return [(name, StateBit(bit) if isinstance(bit, int) else bit) for name, bit in found]
 
 
-def results_of(config: Config, inputs: int, bools: int) -> tuple[Result, ...]:
-    """Return the results that there always are, then one for each bit."""
+Config = StateBitsOptions
+
+
+def results_of(config: StateBitsOptions, inputs: int, bools: int) -> tuple[Result, ...]:
+    """Return the fixed results, then one for each bit."""
     bits = config.named()
     named = (Result(n, "bool", f"bit {bit.bit} is set", nominal=bit.nominal) for n, bit in bits)
     return (*RESULTS, *named)
 
 
-def evaluate(config: Config, inputs: Sequence[Input], now: Now) -> Mapping[str, Any]:
-    """Take the last word apart; what is no whole number has no bits."""
+def evaluate(config: StateBitsOptions, inputs: Sequence[Input], now: Now) -> Mapping[str, Any]:
+    """Split the last word into bits; a value that is no whole number has none."""
     (variable,) = inputs
     value = numbers(variable.at(now))
     known = variable.samples.known(now) & (np.abs(value) < 1 << 53) & (np.trunc(value) == value)
@@ -89,7 +91,7 @@ def evaluate(config: Config, inputs: Sequence[Input], now: Now) -> Mapping[str, 
     return {**found, "word": np.where(known, word, np.nan)}
 
 
-def explain(config: Config, results: Mapping[str, Any]) -> str:
+def explain(config: StateBitsOptions, results: Mapping[str, Any]) -> str:
     """Name the bits that are not as they should be."""
     wrong = [name for name, bit in config.named() if results[name] is (not bit.nominal)]
     return ", ".join(f"{name} is {'set' if results[name] else 'not set'}" for name in wrong)

@@ -10,11 +10,10 @@ from typing import Any
 import numpy as np
 
 from amberbox.core.clock import NS
-from amberbox.core.mode import Input, Result, where_known
+from amberbox.core.config import Finding
+from amberbox.core.mode import Input, Result, numbers, where_known
 from amberbox.core.options import option
 from amberbox.core.samples import Now
-from amberbox.core.standins import Finding
-from amberbox.core.together import numbers
 
 ACCEPTS = ("variable",)
 COLUMNS = True
@@ -39,7 +38,7 @@ arguments:
 
 
 @dataclass(frozen=True, slots=True)
-class Config:
+class WorkingCounterOptions:
     """What the counter should be, and how many bad samples are a fault."""
 
     expected: int = option(doc="the counter when every slave takes part")
@@ -56,12 +55,15 @@ class Config:
             yield "lasting", "must lie above 0"
 
 
-def history_s(config: Config) -> float:
+Config = WorkingCounterOptions
+
+
+def history_s(config: WorkingCounterOptions) -> float:
     """Return how far back it looks; what has been bad for longer is a fault anyhow."""
     return config.lasting
 
 
-def evaluate(config: Config, inputs: Sequence[Input], now: Now) -> Mapping[str, Any]:
+def evaluate(config: WorkingCounterOptions, inputs: Sequence[Input], now: Now) -> Mapping[str, Any]:
     """Look for bad samples in a row, or for one that stands, as it does with a change filter."""
     (one,) = inputs
     last = one.samples.last(now)
@@ -75,13 +77,13 @@ def evaluate(config: Config, inputs: Sequence[Input], now: Now) -> Mapping[str, 
     return {"complete": where_known(known, complete), "counter": count}
 
 
-def _as_expected(config: Config, one: Input) -> Any:
+def _as_expected(config: WorkingCounterOptions, one: Input) -> Any:
     null = one.samples.null
     return (one.samples.values == config.expected) | (False if null is None else null)
 
 
-def explain(config: Config, results: Mapping[str, Any]) -> str:
-    """Say what the counter is and what it should be."""
+def explain(config: WorkingCounterOptions, results: Mapping[str, Any]) -> str:
+    """Describe what the counter is and what it should be."""
     if results["complete"] is not False:
         return ""
     count = results["counter"]

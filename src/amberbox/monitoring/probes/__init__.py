@@ -1,1 +1,1 @@
-"""Probes, one file each; the contract is ``core.probe``."""
+"""Probes of the robot's computer and network, one file each; the contract is ``core.probe``."""

@@ -1,4 +1,4 @@
-"""What the probes of ROS 1 share: who is meant at which master, and calls that only read."""
+"""Shared parts of the ROS 1 probes: names with their master, and read-only calls of it."""
 
 from __future__ import annotations
 
@@ -6,25 +6,32 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from amberbox.blackbox.ros1.names import DEFAULT_MASTER, global_name, is_global_name, master_uri
-from amberbox.blackbox.ros1.settings import Settings
-from amberbox.blackbox.ros1.xmlrpc import Master
+from amberbox.blackbox.sources.ros1.master import (
+    DEFAULT_MASTER,
+    RosMaster,
+    SubscriberSettings,
+    global_name,
+    is_global_name,
+    master_uri,
+)
 from amberbox.core.errors import UsageError
 
 CALLER_ID = "/amberbox_probe"
-_WAIT_S = 2.0  # for one call; a look makes two at most
+_WAIT_S = 2.0  # for one call; a measurement makes two at most
 
 
-def settings_for(master: str) -> Settings:
+def settings_for(master: str) -> SubscriberSettings:
     """Return how to call a master, ``HOST``, ``HOST:PORT`` or its URI; empty is the usual one."""
     address = master or os.environ.get("ROS_MASTER_URI", "") or DEFAULT_MASTER
     try:
-        return Settings(master_uri=master_uri(address), caller_id=CALLER_ID, timeout_s=_WAIT_S)
+        return SubscriberSettings(
+            master_uri=master_uri(address), caller_id=CALLER_ID, timeout_s=_WAIT_S
+        )
     except ValueError as error:
         raise UsageError(f"'{address}' is no ROS master: {error}", "such as robot:11311") from error
 
 
-def name_and_settings(subject: str) -> tuple[str, Settings]:
+def name_and_settings(subject: str) -> tuple[str, SubscriberSettings]:
     """Split ``/name@master`` into the name and how to call the master."""
     name, _, master = subject.strip().partition("@")
     name = global_name(name)
@@ -34,9 +41,9 @@ def name_and_settings(subject: str) -> tuple[str, Settings]:
 
 
 @contextmanager
-def master_of(settings: Settings) -> Iterator[Master]:
+def master_of(settings: SubscriberSettings) -> Iterator[RosMaster]:
     """Open the connection to a master, and close it."""
-    master = Master(settings)
+    master = RosMaster(settings)
     try:
         yield master
     finally:

@@ -27,7 +27,7 @@ _DENIED = "may not be used by this user: its group (docker) may"
 
 
 def measure(subject: str) -> Measured:
-    """Ask the engine through its socket; unknown where none runs or this user may not ask."""
+    """Query the engine through its socket; unknown where none runs or access is denied."""
     own = Path(os.environ.get("XDG_RUNTIME_DIR", f"/run/user/{os.getuid()}"))
     places = (Path("/run/docker.sock"), Path("/var/run/docker.sock"))
     podman = (Path("/run/podman/podman.sock"), own / "podman" / "podman.sock")
@@ -35,7 +35,7 @@ def measure(subject: str) -> Measured:
 
 
 def ask(sockets: Iterable[Path], name: str) -> Measured:
-    """Ask each engine whose socket is there, until one knows the container."""
+    """Query each engine whose socket exists, until one knows the container."""
     there = [path for path in dict.fromkeys(map(_resolved, sockets)) if path is not None]
     if not there:
         raise AmberboxError("neither Docker nor Podman has a socket here")
@@ -54,7 +54,7 @@ def ask(sockets: Iterable[Path], name: str) -> Measured:
 
 
 def read(inspected: dict[str, Any]) -> Measured:
-    """Read what an engine says of a container."""
+    """Return the measurement from an engine's description of a container."""
     state = inspected["State"]
     health = (state.get("Health") or {}).get("Status", "")
     known = health if health not in ("", "none") else None
@@ -74,7 +74,7 @@ def _resolved(path: Path) -> Path | None:
 
 
 def _inspect(path: Path, name: str) -> dict[str, Any] | None:
-    """Return what an engine says of a container, None if it has no such one."""
+    """Return an engine's description of a container, None if it has no such one."""
     connection = _Connection(path)
     try:
         connection.request("GET", f"/containers/{quote(name, safe='')}/json")

@@ -23,7 +23,7 @@ _COUNTED = 8  # those after it (guests) are part of others
 
 
 def measure(subject: str) -> Measured:
-    """Measure over one second; ok says only that it could be measured."""
+    """Measure over one second; ``ok`` means only that it could be measured."""
     stat = Path("/proc/stat")
     before = stat.read_text()
     _core(subject, _times(before))
@@ -32,7 +32,7 @@ def measure(subject: str) -> Measured:
 
 
 def judge(subject: str, before: str, after: str, loadavg: str) -> Measured:
-    """Compare two looks at ``/proc/stat``."""
+    """Return the measurement from two readings of ``/proc/stat``."""
     first, last = _times(before), _times(after)
     core = _core(subject, first)
     spent = [b - a for a, b in zip(first[core], last[_core(subject, last)], strict=True)]

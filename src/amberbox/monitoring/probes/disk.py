@@ -23,7 +23,7 @@ PERIOD_S = 2.0
 _ESCAPED = re.compile(r"\\([0-7]{3})")
 
 
-class Mount(NamedTuple):
+class _MountPoint(NamedTuple):
     """Where a file system is mounted, and whether it is read-only itself.
 
     A service may see a disk through a mount that is read-only for it alone, which does not count.
@@ -34,7 +34,7 @@ class Mount(NamedTuple):
 
 
 def measure(subject: str) -> Measured:
-    """Measure the disk of a path; it is ok when something can still be written."""
+    """Measure the disk of a path; it is ok when it can still be written to."""
     path = Path(subject)
     if not path.is_absolute():
         raise UsageError(f"'{subject}' is no absolute path", "begin it with /")
@@ -43,8 +43,8 @@ def measure(subject: str) -> Measured:
     return judge(found, mount_of(path.resolve(), mounts))
 
 
-def judge(found: os.statvfs_result, mount: Mount) -> Measured:
-    """Read what the system says of a file system."""
+def judge(found: os.statvfs_result, mount: _MountPoint) -> Measured:
+    """Return the measurement from the statistics of a file system."""
     if not found.f_blocks:
         raise AmberboxError("there is no disk behind it")
     used = found.f_blocks - found.f_bfree
@@ -58,7 +58,7 @@ def judge(found: os.statvfs_result, mount: Mount) -> Measured:
     }
 
 
-def mount_of(path: Path, mountinfo: str) -> Mount:
+def mount_of(path: Path, mountinfo: str) -> _MountPoint:
     """Find the mount that a path lies on in ``/proc/self/mountinfo``; of equals the last one."""
     mounts = [_mount(line) for line in mountinfo.splitlines()]
     above = [mount for mount in mounts if path.is_relative_to(mount.point)]
@@ -67,10 +67,10 @@ def mount_of(path: Path, mountinfo: str) -> Mount:
     return max(reversed(above), key=lambda mount: len(mount.point.parts))
 
 
-def _mount(line: str) -> Mount:
+def _mount(line: str) -> _MountPoint:
     fields, _, of_file_system = line.partition(" - ")
     point = _ESCAPED.sub(lambda code: chr(int(code[1], 8)), fields.split()[4])
-    return Mount(Path(point), "ro" in of_file_system.split()[-1].split(","))
+    return _MountPoint(Path(point), "ro" in of_file_system.split()[-1].split(","))
 
 
 def _percent(part: int, whole: int) -> float | None:

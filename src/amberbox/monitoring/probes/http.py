@@ -22,7 +22,7 @@ _WORKS = range(200, 400)
 
 
 def measure(subject: str) -> Measured:
-    """Get the page once, without following it elsewhere; certificates are not judged."""
+    """Get the page once, without following redirects; certificates are not checked."""
     parts = urlsplit(subject)
     if parts.scheme not in ("http", "https") or not parts.hostname:
         raise UsageError(f"'{subject}' is no address", "such as http://localhost:8080/")

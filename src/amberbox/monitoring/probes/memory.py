@@ -18,7 +18,7 @@ _FIELDS = {"ram": ("MemTotal", "MemAvailable"), "swap": ("SwapTotal", "SwapFree"
 
 
 def measure(subject: str) -> Measured:
-    """Measure the memory; ok says only that it could be measured."""
+    """Measure the memory; ``ok`` means only that it could be measured."""
     return read(Path("/proc/meminfo"), subject)
 
 

@@ -22,12 +22,12 @@ _WORKS = ("up", "unknown")  # drivers without an operating state (CAN, loopback)
 
 
 def measure(subject: str) -> Measured:
-    """Look at the interface; it is ok when it is switched on and has a carrier."""
+    """Measure the interface; it is ok when it is switched on and has a carrier."""
     return read(Path("/sys/class/net"), subject)
 
 
 def read(root: Path, name: str) -> Measured:
-    """Read what ``/sys/class/net`` says of an interface."""
+    """Read the state of an interface from ``/sys/class/net``."""
     if not name or "/" in name or name.startswith("."):
         raise UsageError(f"'{name}' is no network interface", "such as eth0")
     if name not in [place.name for place in root.iterdir()]:

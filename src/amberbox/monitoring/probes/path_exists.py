@@ -12,7 +12,7 @@ SUBJECT = "an absolute path, such as /dev/front_laser; links are followed"
 
 
 def measure(subject: str) -> Measured:
-    """Look for the path; one that may not be looked at is unknown (OSError)."""
+    """Check whether the path exists; without permission it is unknown (OSError)."""
     if not subject.startswith("/"):
         raise UsageError(f"'{subject}' is no absolute path", "begin it with /")
     try:

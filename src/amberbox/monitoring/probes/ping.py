@@ -23,11 +23,11 @@ PERIOD_S = 2.0
 _COUNT = 3
 _WAIT_S = 1.0
 _PAUSE_S = 0.2
+# errors that mean no answer (TimeoutError has no number); others: not known
 _LOST = frozenset(
     {errno.ECONNREFUSED, errno.ECONNRESET, errno.ETIMEDOUT, errno.ENETUNREACH}
     | {errno.EHOSTUNREACH, errno.ENETDOWN, errno.EHOSTDOWN, None}
 )
-"""What says that nobody answers; TimeoutError has no number. Other errors: it cannot be known."""
 
 _SUBJECT = re.compile(r"(\[(?P<v6>[0-9A-Fa-f:.]+(%\w+)?)\]|(?P<host>[\w.-]+))(:(?P<port>\d+))?")
 _BARE_V6 = re.compile(r"[0-9A-Fa-f]*:[0-9A-Fa-f.]*:[0-9A-Fa-f:.]*(?:%\w+)?")
@@ -36,7 +36,7 @@ _MEAN = re.compile(r"= [\d.]+/([\d.]+)/")
 
 
 def measure(subject: str) -> Measured:
-    """Ask three times; ok when anything answers. Unknown if the name means no address."""
+    """Ping three times; ok when anything answers. Unknown if the name has no address."""
     host, port = split(subject)
     if port is not None:
         return repeated(lambda number: tcp_s(host, port))
@@ -44,7 +44,7 @@ def measure(subject: str) -> Measured:
     try:
         with _echo_socket(family) as echo:
             return repeated(lambda number: echo_s(echo, family, address, number))
-    except PermissionError:  # the system lets only the program do it
+    except PermissionError:  # the system allows only the program to do it
         return by_program(["ping"], str(address[0]))
 
 
@@ -59,7 +59,7 @@ def split(subject: str) -> tuple[str, int | None]:
 
 
 def repeated(ask: Callable[[int], float], pause_s: float = _PAUSE_S) -> Measured:
-    """Ask several times for how long it took, in seconds; OSError is a loss."""
+    """Measure the round trip several times, in seconds; an OSError is a loss."""
     times_s: list[float] = []
     error = ""
     for number in range(_COUNT):
@@ -80,14 +80,14 @@ def repeated(ask: Callable[[int], float], pause_s: float = _PAUSE_S) -> Measured
 
 
 def tcp_s(host: str, port: int) -> float:
-    """Connect and hang up; return how long it took."""
+    """Connect and close; return how long it took, in seconds."""
     begin_s = time.monotonic()
     socket.create_connection((host, port), timeout=_WAIT_S).close()
     return time.monotonic() - begin_s
 
 
 def echo_s(echo: socket.socket, family: int, address: tuple[object, ...], number: int) -> float:
-    """Send an echo request and wait for its answer; return how long it took."""
+    """Send an echo request and wait for its answer; return how long it took, in seconds."""
     request, reply = (128, 129) if family == socket.AF_INET6 else (8, 0)
     begin_s = time.monotonic()
     end_s = begin_s + _WAIT_S
@@ -101,7 +101,7 @@ def echo_s(echo: socket.socket, family: int, address: tuple[object, ...], number
 
 
 def by_program(ping: Sequence[str], address: str) -> Measured:
-    """Let the given program ``ping`` do it; raise AmberboxError if it cannot."""
+    """Measure by running the given program ``ping``; raise AmberboxError if that fails."""
     command = [*ping, "-n", "-c", str(_COUNT), "-i", f"{_PAUSE_S:g}", "-W", "1", address]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=3 * _WAIT_S)

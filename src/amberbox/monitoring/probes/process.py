@@ -31,15 +31,15 @@ _PAGE_MB = os.sysconf("SC_PAGE_SIZE") / 1e6
 _TICK_S = 1 / os.sysconf("SC_CLK_TCK")
 
 
-class Usage(NamedTuple):
-    """What a process has used so far: processor time, and memory it holds now."""
+class _ProcessUsage(NamedTuple):
+    """The usage of a process: processor time so far, and memory now."""
 
     cpu_s: float
     rss_mb: float
 
 
 def measure(subject: str) -> Measured:
-    """Look for the processes, twice, to see what they use in between."""
+    """Find the processes twice, to measure what they use in between."""
     proc = Path("/proc")
     pids = find(proc, subject)
     begin_s, before = time.monotonic(), usage(proc, pids)
@@ -48,8 +48,10 @@ def measure(subject: str) -> Measured:
     return judge(before, usage(proc, pids), time.monotonic() - begin_s)
 
 
-def judge(before: Mapping[int, Usage], after: Mapping[int, Usage], seconds: float) -> Measured:
-    """Compare two looks at the same processes; those that ended meanwhile do not count."""
+def judge(
+    before: Mapping[int, _ProcessUsage], after: Mapping[int, _ProcessUsage], seconds: float
+) -> Measured:
+    """Return the usage from two readings of the processes; those that ended do not count."""
     cpu_s = sum(now.cpu_s - before[pid].cpu_s for pid, now in after.items() if pid in before)
     return {
         "ok": bool(after),
@@ -68,27 +70,24 @@ def find(proc: Path, subject: str) -> list[int]:
         raise UsageError("no process is named", "such as rosmaster")
     hidden: list[int] = []
     own = os.getpid()
-    found = [pid for pid in _pids(proc) if pid != own and _is(proc / str(pid), subject, hidden)]
+    pids = (int(place.name) for place in proc.iterdir() if place.name.isdecimal())
+    found = [pid for pid in pids if pid != own and _is(proc / str(pid), subject, hidden)]
     if not found and (hidden or not (proc / "1").exists()):
         raise PermissionError("processes of other users are hidden (hidepid)")
     return found
 
 
-def usage(proc: Path, pids: Iterable[int]) -> dict[int, Usage]:
+def usage(proc: Path, pids: Iterable[int]) -> dict[int, _ProcessUsage]:
     """Read what processes have used; those that have ended are left out."""
-    found: dict[int, Usage] = {}
+    found: dict[int, _ProcessUsage] = {}
     for pid in pids:
         with suppress(FileNotFoundError, ProcessLookupError):
             stat = (proc / str(pid) / "stat").read_text(errors="replace")
             fields = stat.rpartition(")")[2].split()
-            if fields[0] not in "ZX":  # dead, though its parent has not taken notice yet
+            if fields[0] not in "ZX":  # dead, but not yet reaped by its parent
                 cpu_s = (int(fields[11]) + int(fields[12])) * _TICK_S
-                found[pid] = Usage(cpu_s, int(fields[21]) * _PAGE_MB)
+                found[pid] = _ProcessUsage(cpu_s, int(fields[21]) * _PAGE_MB)
     return found
-
-
-def _pids(proc: Path) -> Iterator[int]:
-    return (int(place.name) for place in proc.iterdir() if place.name.isdecimal())
 
 
 def _is(place: Path, subject: str, hidden: list[int]) -> bool:
@@ -105,7 +104,7 @@ def _is(place: Path, subject: str, hidden: list[int]) -> bool:
 
 
 def _names(words: list[str]) -> Iterator[str]:
-    """Yield the names that a process goes by: its program's, and that of the script it runs."""
+    """Yield the names of a process: that of its program, and of the script it runs."""
     program = PurePosixPath(words[0]).name
     yield program
     if any(fnmatchcase(program, runner) for runner in _RUNS_SCRIPTS):

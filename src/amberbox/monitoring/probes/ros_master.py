@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 
-from amberbox.blackbox.ros1.settings import NoAnswerError
+from amberbox.blackbox.sources.ros1.master import RosNoAnswerError
 from amberbox.core.probe import Measured
 from amberbox.monitoring.probes._ros import master_of, settings_for
 
@@ -17,13 +17,13 @@ PERIOD_S = 2.0
 
 
 def measure(subject: str) -> Measured:
-    """Ask the master for the state of the system."""
+    """Request the state of the system from the master."""
     settings = settings_for("" if subject == "default" else subject)
     begin_s = time.monotonic()
     try:
         with master_of(settings) as master:
             graph = master.graph()
-    except NoAnswerError as error:
+    except RosNoAnswerError as error:
         return {"ok": False, "error": error.what}
     latency_ms = (time.monotonic() - begin_s) * 1e3
     return {"ok": True, "latency_ms": latency_ms, "topics": len(graph.publishers)}

@@ -5,8 +5,12 @@ from __future__ import annotations
 import http.client
 from xmlrpc.client import Fault
 
-from amberbox.blackbox.ros1.settings import NoAnswerError, RefusedError, Settings
-from amberbox.blackbox.ros1.xmlrpc import Api
+from amberbox.blackbox.sources.ros1.master import (
+    RosApi,
+    RosNoAnswerError,
+    RosRefusedError,
+    SubscriberSettings,
+)
 from amberbox.core.errors import AmberboxError
 from amberbox.core.probe import Measured
 from amberbox.monitoring.probes._ros import master_of, name_and_settings
@@ -22,36 +26,31 @@ _GONE = (ConnectionRefusedError, ConnectionResetError, http.client.RemoteDisconn
 
 
 def measure(subject: str) -> Measured:
-    """Ask the master where the node is, and the node for the number of its process."""
+    """Request the node's address from the master, and the process id from the node."""
     node, settings = name_and_settings(subject)
     try:
         with master_of(settings) as master:
             uri = master.node_uri(node)
-    except RefusedError:
+    except RosRefusedError:
         return {"ok": False, "registered": False, "answers": False}
     return {"registered": True, **_call(uri, settings)}
 
 
-def _call(uri: str, settings: Settings) -> Measured:
+def _call(uri: str, settings: SubscriberSettings) -> Measured:
     try:
-        api = Api(uri, settings)
+        api = RosApi(uri, settings)
     except ValueError as error:
         raise AmberboxError(f"the master gives no address of it: {error}") from error
     try:
         api.call("getPid")
-    except RefusedError:
+    except RosRefusedError:
         return {"ok": True, "answers": True}
-    except NoAnswerError as error:
-        return _without_answer(error)
+    except RosNoAnswerError as error:
+        if isinstance(error.__cause__, Fault):
+            return {"ok": True, "answers": True}
+        if isinstance(error.__cause__, _GONE):
+            return {"ok": False, "answers": False, "error": error.what}
+        return {"ok": None, "error": error.what}
     finally:
         api.close()
     return {"ok": True, "answers": True}
-
-
-def _without_answer(error: NoAnswerError) -> Measured:
-    """Tell a node that is gone from one that has no such call, and from one out of reach."""
-    if isinstance(error.__cause__, Fault):
-        return {"ok": True, "answers": True}
-    if isinstance(error.__cause__, _GONE):
-        return {"ok": False, "answers": False, "error": error.what}
-    return {"ok": None, "error": error.what}

@@ -14,7 +14,7 @@ PERIOD_S = 2.0
 
 
 def measure(subject: str) -> Measured:
-    """Ask the master; a node that was killed counts until its name is taken again."""
+    """Query the master; a node that was killed counts until its name is taken again."""
     topic, settings = name_and_settings(subject)
     with master_of(settings) as master:
         graph = master.graph()

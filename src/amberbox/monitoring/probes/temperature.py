@@ -22,8 +22,8 @@ SUBJECT = (
 PERIOD_S = 2.0
 
 
-class Sensor(NamedTuple):
-    """One temperature, and where it gets critical (None if nobody says)."""
+class _TemperatureSensor(NamedTuple):
+    """One temperature, and its critical value (None if not known)."""
 
     name: str
     celsius: float
@@ -35,8 +35,8 @@ def measure(subject: str) -> Measured:
     return judge(list(sensors(Path("/sys/class"))), subject)
 
 
-def judge(known: list[Sensor], subject: str) -> Measured:
-    """Choose the sensor that is meant."""
+def judge(known: list[_TemperatureSensor], subject: str) -> Measured:
+    """Return the measurement of the hottest sensor of the name."""
     found = [
         sensor
         for sensor in known
@@ -55,22 +55,26 @@ def judge(known: list[Sensor], subject: str) -> Measured:
     }
 
 
-def sensors(root: Path) -> Iterator[Sensor]:
-    """Read every temperature below ``/sys/class``; those that do not answer are left out."""
+def sensors(root: Path) -> Iterator[_TemperatureSensor]:
+    """Read every temperature below ``/sys/class``; unreadable ones are left out."""
     for zone in sorted(root.glob("thermal/thermal_zone*")):
         with suppress(OSError, ValueError):
-            yield Sensor(_text(zone / "type"), _celsius(zone / "temp"), _zone_critical(zone))
+            yield _TemperatureSensor(
+                _text(zone / "type"), _celsius(zone / "temp"), _zone_critical(zone)
+            )
     for file in sorted(root.glob("hwmon/hwmon*/temp*_input")):
         with suppress(OSError, ValueError):
             yield _hwmon(file)
 
 
-def _hwmon(file: Path) -> Sensor:
+def _hwmon(file: Path) -> _TemperatureSensor:
     stem = file.name.removesuffix("_input")
     label, critical = file.with_name(f"{stem}_label"), file.with_name(f"{stem}_crit")
     part = _text(label) if label.exists() else stem
     limit = _celsius(critical) if critical.exists() else None
-    return Sensor(f"{_text(file.parent / 'name')}/{part}", _celsius(file), _plausible(limit))
+    return _TemperatureSensor(
+        f"{_text(file.parent / 'name')}/{part}", _celsius(file), _plausible(limit)
+    )
 
 
 def _zone_critical(zone: Path) -> float | None:

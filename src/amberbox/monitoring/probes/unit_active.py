@@ -22,12 +22,12 @@ _WAIT_S = 3.0
 
 
 def measure(subject: str) -> Measured:
-    """Ask systemd; needs no privileges. Unknown where systemd does not run."""
+    """Query systemd; needs no privileges. Unknown where systemd does not run."""
     return ask(["systemctl"], subject)
 
 
 def ask(systemctl: Sequence[str], subject: str) -> Measured:
-    """Ask with the given command for ``systemctl``; raise AmberboxError if it has no answer."""
+    """Query with the given command for ``systemctl``; raise AmberboxError if it fails."""
     user, _, unit = subject.rpartition("/")
     if not unit or unit.startswith("-") or user not in ("", "user"):
         raise UsageError(f"'{subject}' is no systemd unit", "such as rosbridge.service")

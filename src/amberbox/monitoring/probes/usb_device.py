@@ -18,14 +18,14 @@ SUBJECT = "VENDOR:PRODUCT, VENDOR:PRODUCT:SERIAL or SERIAL, such as 15d1:0000 (s
 
 
 def measure(subject: str) -> Measured:
-    """Look for the device among all that are connected."""
+    """Find the device among all that are connected."""
     return read(Path("/sys/bus/usb/devices"), subject)
 
 
 def read(root: Path, subject: str) -> Measured:
     """Find the devices that are meant below ``/sys/bus/usb/devices``."""
     wanted = _wanted(subject)
-    found = [place for place in sorted(root.iterdir()) if _is(place, wanted)]
+    found = [place for place in sorted(root.iterdir()) if all(_matches(place, wanted))]
     if not found:
         return {"ok": False, "count": 0}
     first = found[0]
@@ -40,17 +40,13 @@ def read(root: Path, subject: str) -> Measured:
 
 
 def _wanted(subject: str) -> dict[str, str]:
-    """Return which files of a device have to hold what."""
+    """Return the wanted content of a device's files, by file name."""
     parts = subject.strip().split(":", 2)
     if not parts[0] or (len(parts) > 1 and any(len(part) != 4 for part in parts[:2])):
         raise UsageError(f"'{subject}' is no USB device", "such as 15d1:0000, as lsusb shows it")
     if len(parts) == 1:
         return {"serial": parts[0]}
     return dict(zip(("idVendor", "idProduct", "serial"), parts, strict=False))
-
-
-def _is(place: Path, wanted: dict[str, str]) -> bool:
-    return all(_matches(place, wanted))
 
 
 def _matches(place: Path, wanted: dict[str, str]) -> Iterator[bool]:
@@ -60,7 +56,7 @@ def _matches(place: Path, wanted: dict[str, str]) -> Iterator[bool]:
 
 
 def _text(path: Path) -> str:
-    """Read a file of a device; it may have been pulled out meanwhile."""
+    """Read a file of a device, which may have been unplugged meanwhile."""
     try:
         return path.read_text(errors="replace").strip()
     except OSError:

@@ -20,19 +20,19 @@ MEASURES = {
 SUBJECT = "name of the interface, such as wlan0"
 PERIOD_S = 2.0
 
-_BEST = 70.0  # what drivers of today call the best quality
+_BEST = 70.0  # the best quality reported by present drivers
 _GET_NETWORK = 0x8B1B  # SIOCGIWESSID
 _NAME_LENGTH = 32
 
 
 def measure(subject: str) -> Measured:
-    """Look at the interface; it is ok when it is connected."""
+    """Measure the interface; it is ok when it is connected."""
     found = read(Path("/proc/net/wireless"), Path("/sys/class/net"), subject)
     return found | {"ssid": network(subject)} if found["ok"] else found
 
 
 def read(wireless: Path, interfaces: Path, name: str) -> dict[str, object]:
-    """Read ``/proc/net/wireless``; raise AmberboxError where it does not tell."""
+    """Read an interface's line of ``/proc/net/wireless``; raise AmberboxError without one."""
     if not name or "/" in name or name.startswith("."):
         raise UsageError(f"'{name}' is no network interface", "such as wlan0")
     place = interfaces / name
@@ -43,7 +43,7 @@ def read(wireless: Path, interfaces: Path, name: str) -> dict[str, object]:
     line = _line(wireless, name)
     if line is None:
         return {"ok": False, "error": f"{name} is not connected"}
-    return judge(line, is_up=_is_up(place))
+    return judge(line, is_up=(place / "operstate").read_text().strip() == "up")
 
 
 def judge(fields: list[str], *, is_up: bool) -> dict[str, object]:
@@ -58,7 +58,7 @@ def judge(fields: list[str], *, is_up: bool) -> dict[str, object]:
 
 
 def network(name: str) -> str | None:
-    """Ask the driver for the network's name; None where it does not say."""
+    """Return the network's name from the driver; None where it is not known."""
     text = ctypes.create_string_buffer(_NAME_LENGTH + 1)
     request = struct.pack("16sPHH", name.encode()[:15], ctypes.addressof(text), _NAME_LENGTH, 0)
     with suppress(OSError), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as any_socket:
@@ -73,7 +73,3 @@ def _line(wireless: Path, name: str) -> list[str] | None:
         if interface.strip() == name:
             return rest.split()
     return None
-
-
-def _is_up(place: Path) -> bool:
-    return (place / "operstate").read_text().strip() == "up"

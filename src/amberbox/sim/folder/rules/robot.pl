@@ -1,4 +1,4 @@
-% What rules find on this robot. What there is to ask: docs/rules.md
+% What rules find on this robot. What there is to ask: docs/robot/rules.md
 % 'findings:' in fmea.yaml says which failure modes an answer speaks for.
 
 % Charging has failed twice or more: something between the charger and the battery is broken.

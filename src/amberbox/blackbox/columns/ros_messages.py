@@ -1,0 +1,375 @@
+"""Unroll ROS 1 and CDR messages: by byte layout where messages share one, else one by one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from struct import Struct
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from amberbox.blackbox.columns import UnrollError
+from amberbox.blackbox.columns.arrays import (
+    concatenate,
+    numpy_type,
+    objects,
+    offsets_of,
+    ranges,
+    take,
+)
+from amberbox.blackbox.columns.ros_definition import SIZES, parse_definition
+from amberbox.blackbox.columns.ros_layout import (
+    FieldPlaces,
+    FixedPieces,
+    LayoutCache,
+    LayoutGroup,
+    ScatteredPlaces,
+    TooManyLayoutsError,
+    compile_walker,
+    is_big_endian,
+    walk_all,
+)
+from amberbox.blackbox.columns.ros_wire import (
+    ChildrenOp,
+    FixedOp,
+    NumbersOp,
+    TextOp,
+    TextsOp,
+    WirePlan,
+    WireTable,
+    flatten_definition,
+    plan,
+)
+from amberbox.core.clock import NS
+from amberbox.core.errors import UsageError
+from amberbox.core.timestamps import stamp_of
+from amberbox.core.types import Column, ColumnData, IntArray, ItemSchema, Ragged, Rows, Schema
+
+_PAIRED = ("time", "duration")
+_DTYPES = {kind: numpy_type(kind) for kind in SIZES if kind not in _PAIRED}
+_DTYPES["bool"] = np.dtype("u1")
+_WIRE = {
+    False: {kind: dtype.newbyteorder("<") for kind, dtype in _DTYPES.items()},
+    True: {kind: dtype.newbyteorder(">") for kind, dtype in _DTYPES.items()},
+}
+
+
+def build_rows(plan: WirePlan, places: FieldPlaces, count: int) -> Rows:
+    """Build all columns and child tables of ``count`` messages; stamps are not filled in."""
+    return _Builder(places, plan.cdr).table(plan.table, count)
+
+
+class _Builder:
+    def __init__(self, places: FieldPlaces, cdr: bool) -> None:
+        self.places = places
+        self.cdr = cdr
+        self.wire = _WIRE[places.big_endian]
+
+    def table(self, table: WireTable, count: int, within: FixedPieces | None = None) -> Rows:
+        """Build one table; ``within`` are its rows where they are pieces of fixed size."""
+        columns: dict[str, ColumnData] = {}
+        children: dict[str, Rows] = {}
+        for op in table.ops:
+            if isinstance(op, ChildrenOp):
+                children[op.path] = self.children(op)
+            elif isinstance(op, FixedOp):
+                pieces = self.places.pieces(op.slot, op.size) if within is None else within
+                for run in op.runs:
+                    values = self.values(run.kind, pieces, run.offset, len(run.names))
+                    columns.update(zip(run.names, values, strict=True))
+            else:
+                columns[op.name] = self.single(op)
+        return Rows(count, columns, children)
+
+    def single(self, op: TextOp | TextsOp | NumbersOp) -> ColumnData:
+        if isinstance(op, TextOp):
+            return self.places.texts(op.slot, op.slot + 1, op.wide)
+        if isinstance(op, TextsOp):
+            texts = self.places.texts(op.slot + 1, op.slot + 2, op.wide)
+            return Ragged(self.places.offsets(op.slot), texts)
+        if op.binary:
+            return objects(self.places.blobs(op.slot, op.slot + 1))
+        offsets = self.places.offsets(op.slot + 1)
+        size = SIZES[op.item]
+        spans = self.places.spans(op.slot, op.slot + 1, size)
+        if op.item in _PAIRED or op.item == "bool":
+            items = self.values(op.item, FixedPieces(spans, 0, size, int(offsets[-1])), 0, 1)[0]
+        else:
+            items = spans.view(self.wire[op.item]).astype(_DTYPES[op.item], copy=False)
+        return Ragged(offsets, items)
+
+    def children(self, op: ChildrenOp) -> Rows:
+        offsets = self.places.offsets(op.slot)
+        counts = np.diff(offsets)
+        total = int(offsets[-1])
+        within = None
+        if op.stride is not None:
+            spans = self.places.spans(op.slot + 1, op.slot, op.stride)
+            within = FixedPieces(spans, 0, op.stride, total)
+        rows = self.table(op.table, total, within)
+        parent_row = np.repeat(np.arange(len(counts), dtype=np.int64), counts)
+        index = np.arange(total, dtype=np.int64) - offsets[parent_row]
+        return Rows(total, rows.columns, rows.children, None, parent_row, index)
+
+    def values(self, kind: str, pieces: FixedPieces, offset: int, columns: int) -> NDArray[Any]:
+        """Read ``columns`` neighbouring values in each piece; one array row per column."""
+        if kind in _PAIRED:
+            return self.times(kind, pieces, offset, columns)
+        buffer, start, stride, count = pieces
+        dtype = _DTYPES[kind]
+        if not count:
+            read: NDArray[Any] = np.empty((columns, 0), dtype)
+        else:
+            wire, strides = self.wire[kind], (dtype.itemsize, stride)
+            view = np.ndarray((columns, count), wire, buffer, start + offset, strides)
+            read = view.astype(dtype, "C")
+        return np.not_equal(read, 0) if kind == "bool" else read
+
+    def times(self, kind: str, pieces: FixedPieces, offset: int, columns: int) -> IntArray:
+        """Read pairs of 32 bit: seconds are unsigned in a ROS 1 time, nanoseconds in ROS 2."""
+        buffer, start, stride, count = pieces
+        if not count:
+            return np.empty((columns, 0), np.int64)
+        wire = self.wire["uint32" if kind == "time" and not self.cdr else "int32"]
+        shape, strides = (2, columns, count), (4, 8, stride)
+        pairs = np.ndarray(shape, wire, buffer, start + offset, strides).astype(np.int64, "C")
+        times: IntArray = pairs[0]
+        times *= NS
+        times += pairs[1] & 0xFFFFFFFF if self.cdr else pairs[1]
+        return times
+
+
+def concat_rows(parts: Sequence[Rows]) -> Rows:
+    """Append tables with the same columns, in the order given."""
+    first = parts[0]
+    if len(parts) == 1:
+        return first
+    bases = np.cumsum([0] + [part.count for part in parts]).tolist()
+    return Rows(
+        bases[-1],
+        {name: concatenate([part.columns[name] for part in parts]) for name in first.columns},
+        {
+            path: concat_rows(
+                [
+                    replace(part.children[path], parent_row=_moved(part.children[path], base))
+                    for part, base in zip(parts, bases, strict=False)
+                ]
+            )
+            for path in first.children
+        },
+        _concat_ints([part.stamp_ns for part in parts]),
+        _concat_ints([part.parent_row for part in parts]),
+        _concat_ints([part.index for part in parts]),
+    )
+
+
+def _moved(child: Rows, base: int) -> IntArray | None:
+    return None if child.parent_row is None else child.parent_row + base
+
+
+def _concat_ints(parts: Sequence[IntArray | None]) -> IntArray | None:
+    arrays = [part for part in parts if part is not None]
+    return np.concatenate(arrays) if arrays else None
+
+
+def take_rows(rows: Rows, order: IntArray) -> Rows:
+    """Return rows by number; child rows follow their parents and keep their own order."""
+    return Rows(
+        len(order),
+        {name: take(column, order) for name, column in rows.columns.items()},
+        {path: _take_children(child, rows.count, order) for path, child in rows.children.items()},
+        None if rows.stamp_ns is None else rows.stamp_ns[order],
+    )
+
+
+def _take_children(child: Rows, parents: int, order: IntArray) -> Rows:
+    if child.parent_row is None or child.index is None:
+        raise ValueError("a child table without parents")
+    counts = np.bincount(child.parent_row, minlength=parents)[order]
+    starts = np.searchsorted(child.parent_row, order)
+    picked = ranges(starts, offsets_of(counts))
+    taken = take_rows(child, picked)
+    parent_row = np.repeat(np.arange(len(order), dtype=np.int64), counts)
+    return Rows(taken.count, taken.columns, taken.children, None, parent_row, child.index[picked])
+
+
+_LARGEST_JOIN = 16 << 20
+_STAMP_TYPES = frozenset(SIZES) - {"bool", "duration"} | {"string"}
+
+
+class RosUnroller:
+    """Unrolls messages of one ROS type.
+
+    With ``by_layout`` False no layouts are used; the rows are the same either way.
+    """
+
+    def __init__(
+        self, schema: Schema, cdr: bool, stamp: str | None = None, by_layout: bool = True
+    ) -> None:
+        table = flatten_definition(parse_definition(schema), schema.name, not cdr)
+        self._stamp = _stamp_column(table.schema, stamp)
+        self.schema = replace(table.schema, stamp=self._stamp.path if self._stamp else "")
+        self._plan = plan(table, cdr)
+        self._walker = compile_walker(self._plan)
+        self._layouts = LayoutCache(self._plan) if by_layout else None
+        self._quick_stamp = _stamp_reader(self._plan, self._stamp)
+
+    def rows(self, messages: Sequence[bytes]) -> Rows:
+        """Unroll a batch of messages."""
+        parts: list[Rows] = []
+        bad: list[int] = []
+        for first, portion, lengths in _portions(messages):
+            rows, misfits = self._portion(portion, lengths)
+            parts.append(rows)
+            bad += [first + misfit for misfit in misfits]
+        if bad:
+            raise UnrollError(self.schema.type, bad, len(messages))
+        return self._with_stamps(concat_rows(parts))
+
+    def stamp_ns(self, message: bytes) -> int | None:
+        """Read the message's own stamp only; None without one, if it is 0, or if damaged."""
+        if self._stamp is None:
+            return None
+        if self._quick_stamp is not None:
+            return self._quick_stamp(message)
+        try:
+            stamps = self.rows([message]).stamp_ns
+        except UnrollError:
+            return None
+        return (int(stamps[0]) or None) if stamps is not None else None
+
+    def no_stamp(self, message: bytes) -> Any:
+        """Return the value at the place of the stamp if it is not a time, else None.
+
+        A ROS time of zero means that there is no stamp.
+        """
+        if self._stamp is None or self._stamp.type == "time" or self.stamp_ns(message):
+            return None
+        try:
+            found = self.rows([message]).columns[self._stamp.name]
+        except UnrollError:
+            return None
+        return found[0].item() if isinstance(found[0], np.generic) else found[0]
+
+    def _with_stamps(self, rows: Rows) -> Rows:
+        if self._stamp is None:
+            return rows
+        stamps = rows.columns[self._stamp.name]
+        assert not isinstance(stamps, Ragged), "a list holds no stamp"
+        if self._stamp.type != "time":
+            stamps = np.array([stamp_of(value) for value in stamps.tolist()], np.int64)
+        return replace(rows, stamp_ns=stamps)
+
+    def _portion(self, messages: Sequence[bytes], lengths: list[int]) -> tuple[Rows, list[int]]:
+        if self._layouts is not None and messages:
+            try:
+                return self._by_layout(*self._layouts.group(messages, lengths))
+            except TooManyLayoutsError:
+                self._layouts = None
+        return self._one_by_one(messages)
+
+    def _by_layout(self, groups: Sequence[LayoutGroup], bad: list[int]) -> tuple[Rows, list[int]]:
+        if bad:
+            return self._nothing(), bad
+        parts = [build_rows(self._plan, group.places(), len(group.members)) for group in groups]
+        return _in_order(parts, [group.members for group in groups]), []
+
+    def _one_by_one(self, messages: Sequence[bytes]) -> tuple[Rows, list[int]]:
+        members, bad = self._by_byte_order(messages)
+        parts = []
+        for big_endian, numbers in members.items():
+            part = [messages[number] for number in numbers]
+            data, sizes = b"".join(part), [len(message) for message in part]
+            slots, misfits = walk_all(self._walker, self._plan, data, sizes, big_endian)
+            bad += [numbers[misfit] for misfit in misfits]
+            if not bad:
+                parts.append(
+                    build_rows(self._plan, ScatteredPlaces(data, slots, big_endian), len(part))
+                )
+        if bad:
+            return self._nothing(), bad
+        return _in_order(parts, [np.array(numbers, np.int64) for numbers in members.values()]), []
+
+    def _by_byte_order(self, messages: Sequence[bytes]) -> tuple[dict[bool, list[int]], list[int]]:
+        members: dict[bool, list[int]] = {}
+        bad = []
+        for number, message in enumerate(messages):
+            try:
+                members.setdefault(is_big_endian(self._plan, message), []).append(number)
+            except ValueError:
+                bad.append(number)
+        return members or {False: []}, bad
+
+    def _nothing(self) -> Rows:
+        slots: list[list[int]] = [[] for _ in range(self._plan.slots)]
+        return build_rows(self._plan, ScatteredPlaces(b"", slots, False), 0)
+
+
+def _portions(
+    messages: Sequence[bytes],
+) -> Iterator[tuple[int, Sequence[bytes], list[int]]]:
+    """Split a batch so that no join is larger than 16 MiB, or only by its last message."""
+    lengths = list(map(len, messages))
+    if sum(lengths) <= _LARGEST_JOIN:
+        yield 0, messages, lengths
+        return
+    first = size = 0
+    for end, length in enumerate(lengths, 1):
+        size += length
+        if size > _LARGEST_JOIN or end == len(lengths):
+            yield first, messages[first:end], lengths[first:end]
+            first, size = end, 0
+
+
+def _in_order(parts: Sequence[Rows], members: Sequence[IntArray]) -> Rows:
+    if len(parts) == 1:
+        return parts[0]
+    return take_rows(concat_rows(parts), np.argsort(np.concatenate(members)))
+
+
+def _stamp_column(schema: ItemSchema, stamp: str | None) -> Column | None:
+    """Find the column of the own stamp: the message's, or the one the configuration names."""
+    wanted = schema.stamp if stamp is None else stamp.strip("/").replace(".", "/")
+    if not wanted:
+        return None
+    candidates = [column for column in schema.columns if column.type in _STAMP_TYPES]
+    for column in candidates:
+        if column.path == wanted:
+            return column
+    times = [column.path for column in candidates if column.type == "time"]
+    raise UsageError(
+        f"{schema.type} has no time stamp {wanted!r}",
+        f"it has {', '.join(times)}" if times else "leave stamp empty: receipt time is used",
+    )
+
+
+def _stamp_reader(plan: WirePlan, stamp: Column | None) -> Callable[[bytes], int | None] | None:
+    """Return a reader for a stamp that lies at the same place in every message, else None."""
+    place = _fixed_place(plan, stamp.name) if stamp and stamp.type == "time" else None
+    if place is None:
+        return None
+    readers = {
+        big: Struct((">" if big else "<") + ("iI" if plan.cdr else "II")).unpack_from
+        for big in (False, True)
+    }
+
+    def read(message: bytes) -> int | None:
+        if len(message) < place + 8:
+            return None
+        seconds, rest = readers[plan.cdr and message[1] == 0](message, place)
+        return (seconds * NS + rest) or None
+
+    return read
+
+
+def _fixed_place(plan: WirePlan, name: str) -> int | None:
+    """Return the offset of a column in the first piece of a message, else None."""
+    first = plan.table.ops[0]
+    if not isinstance(first, FixedOp):
+        return None
+    for run in first.runs:
+        if name in run.names:
+            return 4 * plan.cdr + run.offset + SIZES[run.kind] * run.names.index(name)
+    return None

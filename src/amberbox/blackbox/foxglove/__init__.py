@@ -1,1 +1,0 @@
-"""A store on the Foxglove WebSocket protocol, live or played back, for viewers of that protocol."""

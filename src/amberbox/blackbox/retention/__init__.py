@@ -1,0 +1,2 @@
+"""Retention of the record: deletion by one rule, incidents, triggers, missions, and the
+maintenance process."""

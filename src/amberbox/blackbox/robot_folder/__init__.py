@@ -1,0 +1,1 @@
+"""The robot folder: ``robot.yaml`` and ``black_box.yaml`` read into checked options."""

@@ -1,0 +1,338 @@
+"""The ROS 1 subscriber as a node: polls the master and hands publishers to the subscriptions.
+
+The master is asked who publishes every ``poll_s``, in both modes. Registering adds that new
+publishers are announced at once. Asking as well costs little and heals what notifications
+cannot: a master that was restarted, or one whose three notification workers hang. Every answer
+of the node is short: a node that does not answer ties one of these workers up.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import replace
+from http import HTTPStatus
+from queue import SimpleQueue
+from socketserver import ThreadingMixIn
+from typing import Any
+from xmlrpc.server import SimpleXMLRPCRequestHandler, SimpleXMLRPCServer
+
+from amberbox.blackbox.sources.ros1.master import (
+    RosError,
+    RosMaster,
+    SubscriberSettings,
+    SystemState,
+    global_name,
+    host_and_port,
+    own_host,
+    publications,
+)
+from amberbox.blackbox.sources.ros1.subscription import (
+    PublisherHistory,
+    RosEvents,
+    TopicSubscription,
+)
+from amberbox.core.source import Sink
+from amberbox.core.tls import is_loopback
+
+MOST_BYTES = 1 << 20
+IDLE_S = 5.0
+
+Answer = tuple[int, str, Any]
+
+
+class _Handler(SimpleXMLRPCRequestHandler):
+    timeout = IDLE_S
+
+    def do_POST(self) -> None:  # noqa: N802 (the name http.server calls)
+        length = self.headers.get("content-length", "")
+        if not length.isdigit() or int(length) > MOST_BYTES:
+            self.send_error(HTTPStatus.REQUEST_ENTITY_TOO_LARGE)
+            return
+        super().do_POST()
+
+    def log_message(self, format: str, *args: Any) -> None:
+        """Log nothing: requests of other nodes are no events of the robot."""
+
+
+class _Server(ThreadingMixIn, SimpleXMLRPCServer):
+    daemon_threads = True
+    block_on_close = False
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Ignore callers that break off."""
+
+
+class NodeServer:
+    """The XML-RPC server of a subscriber that publishes nothing."""
+
+    def __init__(
+        self,
+        bind_host: str,
+        port: int,
+        master_uri: str,
+        on_update: Callable[[str, Sequence[str]], None],
+        on_shutdown: Callable[[str], None],
+    ) -> None:
+        self._master_uri = master_uri
+        self._on_update = on_update
+        self._on_shutdown = on_shutdown
+        self._server = _bound(bind_host, port)
+        self.port = int(self._server.server_address[1])
+        for name, function in self._calls().items():
+            self._server.register_function(function, name)
+        self._thread = threading.Thread(
+            target=self._server.serve_forever, args=(0.2,), name="ros-node", daemon=True
+        )
+
+    def start(self) -> None:
+        """Answer calls from now on."""
+        self._thread.start()
+
+    def close(self) -> None:
+        """Stop answering and free the port."""
+        self._server.shutdown()
+        self._server.server_close()
+
+    def _calls(self) -> dict[str, Callable[..., Answer]]:
+        return {
+            "publisherUpdate": self._publisher_update,
+            "paramUpdate": lambda caller, key, value: (1, "", 0),
+            "requestTopic": lambda caller, topic, protocols: (0, "amberbox only listens", 0),
+            "getPid": lambda caller: (1, "", os.getpid()),
+            "getMasterUri": lambda caller: (1, "", self._master_uri),
+            "getPublications": lambda caller: (1, "", []),
+            "getSubscriptions": lambda caller: (1, "", []),
+            "getBusInfo": lambda caller: (1, "", []),
+            "getBusStats": lambda caller: (1, "", [[], [], []]),
+            "shutdown": self._shutdown,
+        }
+
+    def _publisher_update(self, caller: str, topic: str, uris: Sequence[str]) -> Answer:
+        self._on_update(str(topic), [str(uri) for uri in uris])
+        return 1, "", 0
+
+    def _shutdown(self, caller: str, reason: str = "") -> Answer:
+        self._on_shutdown(str(reason))
+        return 1, "", 0
+
+
+def _bound(host: str, port: int) -> _Server:
+    """Return a server on the port of the last run if that is free, else on any."""
+    try:
+        return _Server((host, port), _Handler, logRequests=False, allow_none=True)
+    except OSError:
+        return _Server((host, 0), _Handler, logRequests=False, allow_none=True)
+
+
+LONGEST_WAIT_S = 2.0
+FAILURE_CHECK_S = 0.2
+STOP_S = 0.3
+NEVER_NS = 1  # time of the last request to the master before the first one: gaps begin with the run
+STOPPED = "the recorder stopped listening"
+NOT_FOLLOWED = frozenset({"/rosout", "/rosout_agg"})
+
+Update = tuple[str, Sequence[str]]
+
+
+class RosSubscriber:
+    """Subscribes to topics (name to configured type, empty for any) until stopped."""
+
+    def __init__(self, settings: SubscriberSettings, topics: Mapping[str, str], sink: Sink) -> None:
+        self._settings = settings
+        self._sink = sink
+        self._memory = PublisherHistory(sink)
+        self._reports = RosEvents(sink, topics)
+        self._master = RosMaster(settings)
+        self._subscriptions: dict[str, TopicSubscription] = {}
+        self._registered: set[str] = set()
+        self._unheard_since: dict[str, float] = {}
+        self._updates: SimpleQueue[Update | None] = SimpleQueue()
+        self._node: NodeServer | None = None
+        self._own_uri = ""
+        self._failures = 0
+        self._ending = threading.Event()
+        self._changing = threading.Lock()
+        self._building = threading.Lock()
+        self._asked_ns = NEVER_NS
+        self._asked_nodes: set[str] = set()
+        remembered = set(self._memory.topics()) if settings.all_topics else set()
+        for topic in topics.keys() | (remembered - NOT_FOLLOWED):
+            self._subscribe(topic)
+
+    def run(self, stop: threading.Event) -> None:
+        """Receive until ``stop`` is set; raises only errors of ours."""
+        threads = [
+            threading.Thread(target=work, name=f"ros-{name}", daemon=True)
+            for name, work in (
+                ("notices", self._take_updates),
+                ("memory", self._memory.keep_saving),
+                ("master", self._watch),
+            )
+        ]
+        try:
+            self._start_node()
+            for subscription in self._subscriptions.values():
+                subscription.connect_remembered()
+            for thread in threads:
+                thread.start()
+            while not stop.wait(FAILURE_CHECK_S):
+                self._raise_failure()
+        finally:
+            self._close(threads)
+        self._raise_failure()
+
+    def _watch(self) -> None:
+        """Poll the master until the end."""
+        try:
+            while not self._ending.is_set():
+                self._watch_master()
+                self._ending.wait(self._delay_s())
+        except Exception as error:
+            self._reports.crashed(error)
+        finally:
+            self._master.close()
+
+    def _start_node(self) -> None:
+        if self._settings.invisible:
+            return
+        host, _ = host_and_port(self._settings.master_uri)
+        bind_host = "127.0.0.1" if is_loopback(host) else ""
+        self._node = NodeServer(
+            bind_host,
+            self._memory.port,
+            self._settings.master_uri,
+            lambda topic, uris: self._updates.put((topic, uris)),
+            self._reports.shutdown_requested,
+        )
+        self._memory.use_port(self._node.port)
+        self._node.start()
+
+    def _take_updates(self) -> None:
+        """Handle the master's notices one by one, in a thread apart from the node server."""
+        while (update := self._updates.get()) is not None:
+            topic, uris = update
+            subscription = self._subscriptions.get(global_name(topic))
+            if subscription is not None:
+                try:
+                    subscription.noticed(uris)
+                except Exception as error:
+                    self._reports.crashed(error)
+
+    def _watch_master(self) -> None:
+        """Poll the master once; failed requests are repeated with the next poll."""
+        asked_ns = self._sink.now_ns()
+        try:
+            graph = self._master.graph()
+            self._reports.master_found(self._settings.master_uri)
+            self._failures = 0
+            if self._settings.all_topics:
+                for topic in graph.publishers.keys() - self._subscriptions.keys() - NOT_FOLLOWED:
+                    with self._changing:
+                        if not self._ending.is_set():
+                            self._subscribe(topic)
+            self._register(graph)
+            self._poll(asked_ns, graph)
+            self._asked_ns = asked_ns
+            if self._settings.all_topics:
+                self._ask_forgotten_nodes(graph)
+        except RosError as error:
+            self._failures += 1
+            if not self._ending.is_set():
+                self._reports.master_lost(self._settings.master_uri, error)
+
+    def _ask_forgotten_nodes(self, graph: SystemState) -> None:
+        """Request the other topics of connected nodes that the master does not list, once each."""
+        found: dict[str, set[str]] = {}
+        for topic, subscription in list(self._subscriptions.items()):
+            for uri in subscription.unlisted(graph.publishers.get(topic, ())) - self._asked_nodes:
+                self._asked_nodes.add(uri)
+                with suppress(RosError):  # its open connections go on
+                    for other in publications(uri, self._settings):
+                        found.setdefault(other, set()).add(uri)
+        for topic in found.keys() - NOT_FOLLOWED - graph.publishers.keys():
+            with self._changing:
+                if topic not in self._subscriptions and not self._ending.is_set():
+                    self._subscribe(topic)
+                    self._subscriptions[topic].listed(sorted(found[topic]))
+
+    def _subscribe(self, topic: str) -> None:
+        self._subscriptions[topic] = TopicSubscription(
+            topic, self._sink, self._memory, self._settings, self._reports, self._building,
+            self._asked_ns,
+        )  # fmt: skip
+
+    def _register(self, graph: SystemState) -> None:
+        """Register for topics where the master does not list the box."""
+        if self._node is None:
+            return
+        own = self._settings.caller_id
+        forgotten = {t for t in self._registered if own not in graph.subscribers.get(t, ())}
+        if forgotten:
+            self._reports.forgotten(forgotten)
+        for topic in forgotten:
+            self._registered.discard(topic)
+            self._subscriptions[topic].master_restarted()
+        for topic in [t for t in self._subscriptions if t not in self._registered]:
+            uris = self._master.subscribe(topic, self._node_uri(self._node))
+            self._registered.add(topic)
+            self._subscriptions[topic].listed(uris)
+
+    def _node_uri(self, node: NodeServer) -> str:
+        if not self._own_uri:
+            host = own_host(self._settings.advertise, os.environ, self._settings.master_uri)
+            self._own_uri = f"http://{host}:{node.port}/"
+        return self._own_uri
+
+    def _poll(self, asked_ns: int, graph: SystemState) -> None:
+        for topic, subscription in self._subscriptions.items():
+            nodes = graph.publishers.get(topic, ())
+            subscription.polled(asked_ns, nodes, self._master.node_uri)
+            now_s = time.monotonic()
+            since_s = self._unheard_since.setdefault(topic, now_s)
+            if nodes or subscription.peers():
+                del self._unheard_since[topic]
+            elif now_s - since_s >= self._settings.unknown_after_s:
+                self._reports.unknown_topic(topic, graph.publishers.keys() - {topic})
+
+    def _delay_s(self) -> float:
+        if not self._failures:
+            return self._settings.poll_s
+        longest_s = max(LONGEST_WAIT_S, self._settings.poll_s)
+        return min(self._settings.poll_s * 2.0 ** min(self._failures - 1, 16), longest_s)
+
+    def _raise_failure(self) -> None:
+        if self._reports.failure is not None:
+            raise self._reports.failure
+
+    def _close(self, threads: Sequence[threading.Thread]) -> None:
+        """Close the links first, so that gaps are recorded, then threads and node server."""
+        with self._changing:
+            self._ending.set()
+        self._updates.put(None)
+        self._memory.end_saving()
+        for subscription in self._subscriptions.values():
+            subscription.close(STOPPED)
+        end_s = time.monotonic() + STOP_S
+        for subscription in self._subscriptions.values():
+            subscription.join(end_s)
+        for thread in threads:
+            if thread.ident is not None:
+                thread.join(max(0.0, end_s - time.monotonic()))
+        self._memory.save()
+        if self._node is not None:
+            if not self._failures and not any(thread.is_alive() for thread in threads):
+                self._unregister(time.monotonic() + STOP_S)
+            self._node.close()
+
+    def _unregister(self, end_s: float) -> None:
+        """Unregister all topics, unless the master is slow to answer."""
+        master = RosMaster(replace(self._settings, timeout_s=STOP_S))
+        with suppress(RosError):  # a registration that stays does no harm, the next run uses it
+            for topic in sorted(self._registered):
+                if time.monotonic() < end_s:
+                    master.unsubscribe(topic, self._own_uri)
+        master.close()

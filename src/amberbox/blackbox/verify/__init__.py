@@ -1,1 +1,0 @@
-"""Tamper evidence: what of a store is as the robot left it, and what is not."""

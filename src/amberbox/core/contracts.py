@@ -1,0 +1,273 @@
+"""The contracts of plugins: what a module in a folder of plugins offers and may use.
+
+A plugin is one file; its name is the name in the YAML, its first line of text is shown to users.
+
+=====================  =========================  ========================================
+plugin                 folder                     contract
+=====================  =========================  ========================================
+source                 ``blackbox/sources``       ``core.source``
+mode of a monitor      ``monitoring/modes``       ``core.mode``; ``ModeContract`` has defaults
+probe                  ``monitoring/probes``      ``core.probe``
+publisher of statuses  ``monitoring/publishers``  ``Publisher``
+provider of evidence   ``diagnosis/evidence``     ``EvidenceProvider`` and what is named below
+=====================  =========================  ========================================
+
+The name of a provider of evidence is also that of the engine if it answers alone. It defines one
+or more of
+
+- ``needs`` and ``provide`` (``EvidenceProvider``): ``amberbox diagnose`` and the server call it for
+  an instant;
+- ``follow`` (``FollowedEvidence``): the tracker calls it as a record grows, live and in replay;
+- ``alone`` and the three texts of ``EvidenceEngine``: it can answer without the others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any, Protocol, TypeAlias, TypeVar
+
+from amberbox.core.mode import Result
+from amberbox.core.types import Batch, Diagnosis, Status, Symptom
+
+Span: TypeAlias = tuple[int, int]
+"""From and to in nanoseconds; what is at ``to`` does not belong to it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Conflict:
+    """A conflict: failure modes of which at least one is present, and why."""
+
+    faults: frozenset[str]
+    source: str
+    proof: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """A text that speaks for no failure mode; it is shown and changes no probability."""
+
+    text: str
+    source: str
+
+
+@dataclass(frozen=True, slots=True)
+class AnsweredTest:
+    """The result of a test of the FMEA, by the test's id."""
+
+    test: str
+    outcome: str
+    source: str
+
+
+EvidenceItem: TypeAlias = Symptom | Conflict | Finding | AnsweredTest
+
+
+@dataclass(frozen=True, slots=True)
+class EvidenceNeeds:
+    """The input that a provider needs: how many seconds of the record before the instant.
+
+    A provider that needs no ``symptoms`` is called first, and its finding on a symptom replaces the
+    one that was read. The others are called one by one, each with all evidence known by then.
+    """
+
+    history_s: float = 0.0
+    symptoms: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class GivenEvidence:
+    """Evidence given by a user: ``ID[=STATE]`` of symptoms, ``TEST=VALUE`` of tests."""
+
+    symptoms: Sequence[str] = ()
+    answers: Sequence[str] = ()
+
+
+NOTHING_GIVEN = GivenEvidence()
+
+
+class RecordedPast(Protocol):
+    """A part of a robot's record; spans are nanoseconds, without their end."""
+
+    @property
+    def span(self) -> Span:
+        """Return its first instant and its end, nanoseconds."""
+
+    @property
+    def recorded(self) -> tuple[Span, ...]:
+        """Return the runs of the recorder, nanoseconds."""
+
+    @property
+    def watched(self) -> tuple[Span, ...]:
+        """Return the runs of the watcher, nanoseconds."""
+
+    def rows(self, topic: str, names: Sequence[str], span: Span) -> Iterable[Mapping[str, Any]]:
+        """Yield the rows that the box itself wrote on a channel, with the time ``received``."""
+
+
+class EvidenceWindow(Protocol):
+    """One robot at one instant, as a provider of evidence may use it."""
+
+    @property
+    def at_ns(self) -> int:
+        """The instant."""
+
+    @property
+    def symptoms(self) -> Sequence[Symptom]:
+        """Return the symptoms that count already, each with its evidence."""
+
+    @property
+    def folder(self) -> Path:
+        """Return the robot folder; on a server a copy."""
+
+    @property
+    def given(self) -> GivenEvidence:
+        """Return the evidence given by the user."""
+
+    def past(self, needs: EvidenceNeeds) -> RecordedPast | None:
+        """Return the record as far back as is needed; None without a record."""
+
+    def lookups(self, needs: EvidenceNeeds) -> Sequence[Any]:
+        """Return the predicates (``prolog.machine.Virtual``) that look into that past."""
+
+
+ModelT = TypeVar("ModelT", contravariant=True)
+CaseT = TypeVar("CaseT", contravariant=True)
+
+
+class EvidenceProvider(Protocol[ModelT]):
+    """A module that adds evidence about a robot; the model is its ``Knowledge``."""
+
+    def needs(self, model: ModelT, folder: Path) -> EvidenceNeeds | None:
+        """Return the input that it needs; None where this folder has nothing for it."""
+
+    def provide(self, model: ModelT, window: EvidenceWindow) -> Iterable[EvidenceItem]:
+        """Return its evidence; raises AmberboxError if it cannot run."""
+
+
+class EvidenceFollower(Protocol):
+    """Finds symptoms as a record grows; ``items`` are the names of the items whose rows it reads.
+
+    ``troubles`` are what could not be evaluated the last time, and why. The symptoms of one that
+    ``records`` are returned to the watcher, which writes them down; those of others are written
+    already.
+    """
+
+    records: bool
+
+    @property
+    def items(self) -> frozenset[str]:
+        """Return the names of the items whose rows are read."""
+
+    @property
+    def history_s(self) -> float:
+        """Return how far back rows have to be fed again after ``resume``, in seconds."""
+
+    @property
+    def troubles(self) -> Mapping[str, str]:
+        """Return what could not be evaluated, with the reason."""
+
+    def begin(self, at_ns: int) -> list[Symptom]:
+        """Begin an epoch, in which nothing is known yet; return the symptoms that this changes."""
+
+    def feed(self, batch: Batch) -> None:
+        """Add rows of any item; log times do not decrease."""
+
+    def receive(self, found: Sequence[object]) -> None:
+        """Add findings of the monitors, in order of time: statuses, symptoms and others."""
+
+    def advance(self, after_ns: int, until_ns: int) -> list[Symptom]:
+        """Return the symptoms that change in ``(after_ns, until_ns]``, in order of time."""
+
+    def snapshot(self, until_ns: int) -> dict[str, Any] | None:
+        """Return the state needed by ``resume``, as JSON; None for none."""
+
+    def resume(self, snapshot: Mapping[str, Any], until_ns: int) -> None:
+        """Restore the state that ``snapshot`` returned."""
+
+
+class FollowedEvidence(Protocol[ModelT]):
+    """A module that finds evidence as a record grows."""
+
+    def follow(self, model: ModelT) -> EvidenceFollower:
+        """Return the follower of one robot."""
+
+
+class EvidenceEngine(Protocol[ModelT, CaseT]):
+    """A module that can answer without the others; the case is a
+    ``diagnosis.diagnose.DiagnosisContext``."""
+
+    ALONE: str
+    """What stands above an answer of its own."""
+    NOTHING: str
+    """Its answer where it finds nothing; empty for the symptoms that are not there."""
+    NO_ANSWERS: str
+    """The refusal of answers to tests; empty where they count."""
+
+    def alone(self, model: ModelT, window: EvidenceWindow, case: CaseT) -> Diagnosis | None:
+        """Return its diagnosis; None if it finds no fault."""
+
+
+_CONSTANTS = {
+    **{name: name.upper() for name in ("results", "columns", "per_input", "sees_silence", "parts")},
+    "always_timed": "TIMED",
+    "probe": "PROBE",
+}  # names in a module that are not those of the fields below
+
+
+@dataclass(frozen=True, slots=True)
+class ModeContract:
+    """A mode of a monitor: what its module defines, and defaults for what it leaves out."""
+
+    evaluate: Callable[..., Mapping[str, Any]]
+    results: Sequence[Result] = ()
+    columns: bool = False
+    per_input: bool = False
+    always_timed: bool = False
+    sees_silence: bool = False
+    parts: bool = False
+    probe: str = ""
+    timed: Callable[[Any], bool] | None = None
+    history_s: Callable[[Any], float] | None = None
+    shortest_s: Callable[[Any], float] | None = None
+    results_of: Callable[[Any, int, int], Sequence[Result]] | None = None
+    reads: Callable[[Any], Sequence[str]] | None = None
+    probe_of: Callable[[Any, str], tuple[str, str]] | None = None
+    explain: Callable[..., str] | None = None
+    reason: Callable[..., str] | None = None
+    explain_unknown: Callable[..., str] | None = None
+
+    @classmethod
+    def of(cls, module: Any) -> ModeContract:
+        """Return the contract of a module, or of any object with its names."""
+        names = {field.name: _CONSTANTS.get(field.name, field.name) for field in fields(cls)}
+        given = {field: getattr(module, name, None) for field, name in names.items()}
+        return cls(**{field: value for field, value in given.items() if value is not None})
+
+    def is_timed(self, config: Any) -> bool:
+        """Return whether its results change as time passes, without a new sample."""
+        return self.always_timed if self.timed is None else self.timed(config)
+
+    def looks_back_s(self, config: Any) -> float:
+        """Return how far back it looks, in seconds; 0 if it does not."""
+        return 0.0 if self.history_s is None else float(self.history_s(config))
+
+    def shortest_window_s(self, config: Any) -> float:
+        """Return the shortest window that it looks back over, in seconds; 0 if it has none."""
+        shortest = self.shortest_s or self.history_s
+        return 0.0 if shortest is None else float(shortest(config))
+
+    def reads_of(self, config: Any) -> Sequence[str]:
+        """Return the addresses that its arguments name."""
+        return () if self.reads is None else self.reads(config)
+
+
+class Publisher(Protocol):
+    """A message format for statuses, one file in ``monitoring/publishers``."""
+
+    def messages(self, statuses: Sequence[Status], naming: Any) -> list[dict[str, Any]]:
+        """Return the messages that carry the statuses of a robot at one time.
+
+        ``naming`` (``monitoring.plan.Naming``) has the names of components and modes.
+        """

@@ -1,0 +1,1 @@
+"""Internals of the expression language: grammar, syntax tree, values, evaluation."""

@@ -1,0 +1,356 @@
+"""Evidence, each measurement counted once, and its likelihood factors given sets of faults.
+
+Evidence is symptoms seen and not seen, conflicts, and outcomes of tests. Faults predict losses,
+symptoms and outcomes of tests.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import numpy as np
+
+from amberbox.core.errors import UsageError, did_you_mean
+from amberbox.core.types import Symptom, SymptomState
+from amberbox.diagnosis.covering.model import UNKNOWN, Floats, Model, bits, log_miss
+
+
+@dataclass(frozen=True, slots=True)
+class CheckDetection:
+    """A cause (failure mode, or function that is lost) makes a test give an outcome."""
+
+    cause: str
+    outcome: str
+    detects: float
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """A test: a symptom to read, a question, or a check by a person.
+
+    The first outcome is that of a sound robot, later ones are graver; each cause that is there
+    reaches its outcome with probability ``detects``, and the gravest that is reached is seen
+    (noisy-MAX). With no cause the first outcome comes with probability ``sure`` and the others
+    share the rest. For two outcomes ``detects`` and ``sure`` give sensitivity
+    ``1 - sure * (1 - detects)`` and specificity ``sure``.
+
+    A check that ``reads`` a symptom has the outcomes absent and present, and no detections.
+    """
+
+    id: str
+    kind: Literal["read", "question", "check"]
+    text: str
+    role: str = ""
+    cost_s: float = 0.0
+    risk: float = 0.0
+    outcomes: tuple[str, ...] = ("no", "yes")
+    sure: float = 0.99
+    detections: tuple[CheckDetection, ...] = ()
+    reads: str = ""
+
+    def __post_init__(self) -> None:
+        if len(self.outcomes) < 2:
+            raise UsageError(f"the test {self.id} has fewer than two outcomes")
+        if not 0.0 < self.sure <= 1.0:
+            raise UsageError(f"the test {self.id} is sure to {self.sure:g}, not in (0, 1]")
+        for detection in self.detections:
+            self.level(detection.outcome)
+            if not 0.0 <= detection.detects <= 1.0:
+                what = f"the test {self.id} detects {detection.cause} with {detection.detects:g}"
+                raise UsageError(f"{what}, no probability")
+
+    def level(self, outcome: str) -> int:
+        """Return how grave an outcome is, 0 for sound; raise UsageError for an unknown one."""
+        if outcome not in self.outcomes:
+            near = did_you_mean(outcome, self.outcomes)
+            what = f"the test {self.id} has no outcome '{outcome}'{near}"
+            raise UsageError(what, f"it gives {', '.join(self.outcomes)}")
+        return self.outcomes.index(outcome)
+
+    def at_most(self, level: int) -> float:
+        """Return the probability of an outcome up to this one while no cause is there."""
+        return self.sure + (1 - self.sure) * level / (len(self.outcomes) - 1)
+
+
+READ_OUTCOMES = ("absent", "present")
+
+
+def reading_check(symptom: str, cost_s: float, text: str = "") -> Check:
+    """Return the check that reads a symptom on demand."""
+    return Check(
+        f"read:{symptom}", "read", text or f"Read {symptom}.", cost_s=cost_s,
+        outcomes=READ_OUTCOMES, sure=1.0, reads=symptom,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Observation:
+    """The state of a symptom and how far it is to be trusted.
+
+    With probability ``strength`` the observation is right, else it is the toss of a coin: its
+    likelihood is ``strength * P(state | faults) + (1 - strength) / 2``.
+    """
+
+    state: SymptomState
+    strength: float = 1.0
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.strength <= 1.0:
+            raise UsageError(f"the strength of a symptom is {self.strength:g}, not in (0, 1]")
+
+
+@dataclass(frozen=True, slots=True)
+class AnsweredCheck:
+    """A test and the outcome that it gave."""
+
+    check: Check
+    outcome: str
+
+
+@dataclass(frozen=True, slots=True)
+class Evidence:
+    """The evidence: observations, conflicts and answered tests.
+
+    A conflict is a set of failure modes of which at least one is there. ``asked`` are tests
+    that were done or cannot be done: they are not proposed again. ``doubled`` are symptoms that
+    do not count, because what they were measured from has been counted. ``onsets_ns`` are when
+    present symptoms began, as far as that is known.
+    """
+
+    observations: Mapping[str, Observation] = field(default_factory=dict)
+    conflicts: tuple[frozenset[str], ...] = ()
+    answers: tuple[AnsweredCheck, ...] = ()
+    asked: frozenset[str] = frozenset()
+    doubled: tuple[str, ...] = ()
+    onsets_ns: Mapping[str, int] = field(default_factory=dict)
+
+    def with_observation(self, symptom: str, state: SymptomState) -> Evidence:
+        """Return the evidence with the state of a symptom; unknown if it cannot be determined."""
+        observations = {name: o for name, o in self.observations.items() if name != symptom}
+        return replace(self, observations=observations | {symptom: Observation(state)})
+
+
+def collect_evidence(
+    symptoms: Iterable[Symptom], conflicts: Iterable[Iterable[str]] = ()
+) -> Evidence:
+    """Collect symptoms so that one measurement counts once.
+
+    Of two observations of one symptom the stronger counts; of equally strong ones the one of state
+    present. The same holds for symptoms of different sources: one does not count when all it was
+    measured from (address and overlapping time) has been counted for another source. Symptoms of
+    the same source are different questions to the data, and all count.
+    """
+    counted: dict[str, Observation] = {}
+    spent: dict[str, list[tuple[str, int, int]]] = {}
+    doubled: list[str] = []
+    onsets_ns: dict[str, int] = {}
+    for symptom in sorted(symptoms, key=_strongest_first):
+        if symptom.state == "unknown" or symptom.strength <= 0 or symptom.id in counted:
+            continue
+        if bool(symptom.evidence) and all(
+            any(
+                source != symptom.source and from_ns <= until_ns and since_ns <= to_ns
+                for source, since_ns, until_ns in spent.get(address, ())
+            )
+            for address, from_ns, to_ns in symptom.evidence
+        ):
+            doubled.append(symptom.id)
+            continue
+        counted[symptom.id] = Observation(symptom.state, min(1.0, symptom.strength))
+        onset_ns = symptom.confirmed_ns if symptom.onset_ns is None else symptom.onset_ns
+        if symptom.state == "present" and onset_ns is not None:
+            onsets_ns[symptom.id] = onset_ns
+        for address, from_ns, to_ns in symptom.evidence:
+            spent.setdefault(address, []).append((symptom.source, from_ns, to_ns))
+    sets = tuple(frozenset(conflict) for conflict in conflicts)
+    left_out = tuple(name for name in doubled if name not in counted)
+    return Evidence(counted, sets, doubled=left_out, onsets_ns=onsets_ns)
+
+
+def _strongest_first(symptom: Symptom) -> tuple[float, bool, str, str]:
+    return (-symptom.strength, symptom.state != "present", symptom.id, symptom.source)
+
+
+Causes = Sequence[tuple[int, float]]
+
+
+@dataclass(frozen=True, slots=True)
+class LikelihoodFactor:
+    """The likelihood ``alpha + beta * q`` over causes (place, detects)."""
+
+    alpha: float
+    beta: float
+    modes: Causes
+    functions: Causes = ()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FoldedEvidence:
+    """The evidence for one model.
+
+    ``log_weight`` is per mode the logarithm of its prior odds times the chance that what is
+    surely absent does not show; ``log_loss`` that chance per lost function.
+    """
+
+    factors: tuple[LikelihoodFactor, ...]
+    log_weight: Floats
+    log_loss: Floats
+
+
+def fold_evidence(model: Model, evidence: Evidence) -> FoldedEvidence:
+    """Turn evidence into weights and factors; symptoms that the model lacks are left out."""
+    tables = model.tables
+    places, gone, factors = model.sign_places, [], []
+    for name, observation in evidence.observations.items():
+        place = places.get(name)
+        if place is None or observation.state == "unknown":
+            continue
+        if observation.state == "absent" and observation.strength == 1.0:
+            gone.append(place)
+        else:
+            factors.append(_symptom_factor(model, place, observation))
+    absent = np.zeros(len(model.signs), np.bool_)
+    absent[gone] = True
+    log_weight = tables.log_odds + tables.modes.folded(absent, len(model.mode_ids))
+    log_loss = tables.functions.folded(absent, len(model.functions))
+    if model.unknown is not None:
+        log_weight[-1] += int(absent.sum()) and absent.sum() * log_miss(model.unknown.denies)
+    factors += [_conflict(model, names) for names in evidence.conflicts]
+    for answered in evidence.answers:
+        factors += _answer(model, answered, log_weight, log_loss)
+    return FoldedEvidence(tuple(factors), log_weight, log_loss)
+
+
+def _symptom_factor(model: Model, place: int, observation: Observation) -> LikelihoodFactor:
+    trust, silent = observation.strength, 1.0 - model.signs[place].leak
+    modes = list(model.tables.modes.by_sign[place])
+    functions = model.tables.functions.by_sign[place]
+    present = observation.state == "present"
+    if model.unknown is not None:
+        shows = model.unknown.detects if present else model.unknown.denies
+        modes += [(model.mode_places[UNKNOWN], shows)] if shows else []
+    if present:
+        return LikelihoodFactor((1 + trust) / 2, -trust * silent, modes, functions)
+    return LikelihoodFactor((1 - trust) / 2, trust * silent, modes, functions)
+
+
+def _conflict(model: Model, names: frozenset[str]) -> LikelihoodFactor:
+    return LikelihoodFactor(1.0, -1.0, [(model.mode_place(name), 1.0) for name in sorted(names)])
+
+
+def _answer(
+    model: Model, answered: AnsweredCheck, log_weight: Floats, log_loss: Floats
+) -> Iterator[LikelihoodFactor]:
+    """Fold what graver outcomes would have shown, and yield the factor of the one that was seen."""
+    check, level = answered.check, answered.check.level(answered.outcome)
+    modes, functions = causes_seen(model, check)
+    for place, (at, detects) in modes:
+        if at > level:
+            log_weight[place] += log_miss(detects)
+    for place, (at, detects) in functions:
+        if at > level:
+            log_loss[place] += log_miss(detects)
+    if level == 0:
+        return
+    yield LikelihoodFactor(
+        1.0,
+        -check.at_most(level - 1) / check.at_most(level),
+        [(place, detects) for place, (at, detects) in modes if at == level],
+        [(place, detects) for place, (at, detects) in functions if at == level],
+    )
+
+
+Seers = list[tuple[int, tuple[int, float]]]
+
+
+def causes_seen(model: Model, check: Check) -> tuple[Seers, Seers]:
+    """Return the modes and the functions that a check detects, each with (level, detects)."""
+    modes: Seers = []
+    functions: Seers = []
+    for detection in check.detections:
+        seen = (check.level(detection.outcome), detection.detects)
+        if detection.cause in model.function_places:
+            functions.append((model.function_places[detection.cause], seen))
+        else:
+            modes.append((model.mode_place(detection.cause), seen))
+    return modes, functions
+
+
+@dataclass(frozen=True, slots=True)
+class Prediction:
+    """Present modes, lost functions, and their effect on symptoms.
+
+    ``misses`` is per symptom with an active cause the chance that none of them shows it; the
+    unknown mode is left to ``unknown``, as it can show anything.
+    """
+
+    modes: frozenset[int]
+    lost: frozenset[int]
+    misses: Mapping[int, float]
+    unknown: bool
+
+    def present(self, model: Model, sign: int) -> float:
+        """Return how probable it is that a symptom shows."""
+        unknown = model.unknown.detects if self.unknown and model.unknown else 0.0
+        return self._shows(model, sign, unknown)
+
+    def expected(self, model: Model, sign: int) -> float:
+        """Return the weight of a symptom's absence against the faults, 0 to 1."""
+        unknown = model.unknown.denies if self.unknown and model.unknown else 0.0
+        return self._shows(model, sign, unknown)
+
+    def _shows(self, model: Model, sign: int, unknown: float) -> float:
+        silent = (1.0 - model.signs[sign].leak) * self.misses.get(sign, 1.0)
+        return 1.0 - silent * (1.0 - unknown)
+
+
+def predict(model: Model, faults: Collection[str]) -> Prediction:
+    """Return the prediction for exactly these failure modes."""
+    tables = model.tables
+    modes = [model.mode_place(name) for name in faults if name != UNKNOWN]
+    down = 0
+    for mode in modes:
+        place = tables.component[mode]
+        down |= 1 << place if place >= 0 else 0
+    lost = frozenset(bits(tables.gates.lost(down)))
+    misses: dict[int, float] = {}
+    for links, causes in ((tables.modes, modes), (tables.functions, lost)):
+        for cause in causes:
+            for sign, detects in links.by_cause[cause]:
+                misses[sign] = misses.get(sign, 1.0) * (1.0 - detects)
+    return Prediction(frozenset(modes), lost, misses, UNKNOWN in faults)
+
+
+def outcomes(model: Model, check: Check, prediction: Prediction) -> tuple[float, ...]:
+    """Return the probability of each outcome of a check, given these faults."""
+    if check.reads:
+        present = prediction.present(model, model.sign_places[check.reads])
+        return (1.0 - present, present)
+    return outcomes_seen(check, *causes_seen(model, check), prediction)
+
+
+def outcomes_seen(
+    check: Check, modes: Seers, functions: Seers, prediction: Prediction
+) -> tuple[float, ...]:
+    """Return the outcomes' probabilities, given which causes the check sees."""
+    misses = [1.0] * len(check.outcomes)
+    for level, detects in _active(modes, functions, prediction):
+        misses[level] *= 1.0 - detects
+    graver = 1.0
+    up_to = [0.0] * len(misses)
+    for level in range(len(misses) - 1, -1, -1):
+        up_to[level] = check.at_most(level) * graver
+        graver *= misses[level]
+    below = [0.0, *up_to[:-1]]
+    return tuple(most - less for most, less in zip(up_to, below, strict=True))
+
+
+def _active(modes: Seers, functions: Seers, prediction: Prediction) -> Iterator[tuple[int, float]]:
+    for place, seen in modes:
+        if place in prediction.modes:
+            yield seen
+    for place, seen in functions:
+        if place in prediction.lost:
+            yield seen

@@ -1,0 +1,1 @@
+"""Providers of evidence: what monitors, conditions, rules, users and fault trees contribute."""

@@ -1,1 +1,0 @@
-"""What other engines find, made ready for the one answer."""

@@ -1,0 +1,1 @@
+"""Reports of a diagnosis: its explanation as text, graph, SVG and JSON."""

@@ -1,1 +1,0 @@
-"""Rules without structures, answered from the facts upwards with joins in a good order."""

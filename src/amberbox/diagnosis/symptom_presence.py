@@ -1,0 +1,361 @@
+"""How each symptom counts over time: present, remembered, absent, blocked, or not at all."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Literal, TypeAlias
+
+import msgspec
+
+from amberbox.core.clock import NS
+from amberbox.core.needs import Needs
+from amberbox.core.types import Symptom
+from amberbox.diagnosis.fmea.model import DependencyStructure, Fmea, SymptomLink
+
+
+def components_by_symptom(fmea: Fmea) -> dict[str, frozenset[str]]:
+    """Return per symptom the components whose failure modes, or whose loss, may show it."""
+    found: dict[str, set[str]] = {}
+    for mode in fmea.modes.values():
+        for link in mode.symptoms:
+            found.setdefault(link.symptom, set()).add(mode.component)
+    needs = fmea.needs()
+    for function in fmea.functions.values():
+        below = _needed(needs, function.id) if function.symptoms else frozenset()
+        for link in function.symptoms:
+            found.setdefault(link.symptom, set()).update(below)
+    return {symptom: frozenset(names) for symptom, names in found.items()}
+
+
+def _needed(needs: Mapping[str, Needs], name: str) -> frozenset[str]:
+    """Return all that something needs, directly or not."""
+    found: set[str] = set()
+    waiting = [name]
+    while waiting:
+        of = needs.get(waiting.pop())
+        more = [other for other in (of.names() if of else ()) if other not in found]
+        found.update(more)
+        waiting += more
+    return frozenset(found)
+
+
+class BlockingRules:
+    """The blocking rules of an analysis, by symptom.
+
+    ``shown_by`` are per symptom the components whose failures may show it, ``down`` per symptom
+    of a component whether something that takes the component down may show it.
+    """
+
+    def __init__(self, fmea: Fmea) -> None:
+        self._by_itself = {name for name, symptom in fmea.symptoms.items() if symptom.by_itself}
+        self._shown_by = components_by_symptom(fmea)
+        self._down = _down(fmea)
+
+    def lets_count(self, latest: Symptom, present: Collection[str]) -> bool:
+        """Return whether a symptom counts that comes while these others are present.
+
+        It does if nothing blocks it, or something that may show it, or only components that
+        still serve: all that is seen of them has causes that do not take them down. So does what
+        the analysis says to show its component by itself.
+        """
+        blocking = {label.partition("/")[0] for label in latest.blocked_by}
+        if (
+            not blocking
+            or latest.id in self._by_itself
+            or not blocking.isdisjoint(self._shown_by.get(latest.id, frozenset()))
+        ):
+            return True
+        return all(self._serves(component, present) for component in blocking)
+
+    def _serves(self, component: str, present: Collection[str]) -> bool:
+        own = self._down.get(component, {})
+        seen = [down for symptom, down in own.items() if symptom in present]
+        return bool(seen) and not any(seen)
+
+
+def _down(fmea: Fmea) -> Mapping[str, Mapping[str, bool]]:
+    """Return per component its symptoms, and whether what takes it down may show them."""
+    structure = DependencyStructure.of(fmea.needs())
+    found: dict[str, dict[str, bool]] = {}
+    for mode in fmea.modes.values():
+        lost = {mode.component, *structure.dependents([mode.component])} if mode.takes_down else ()
+        for link in mode.symptoms:
+            owner = link.symptom.replace(".", "/").partition("/")[0]
+            own = found.setdefault(owner, {})
+            own[link.symptom] = own.get(link.symptom, False) or owner in lost
+    return found
+
+
+# The state as which a symptom counts; empty if it is no evidence
+Counts: TypeAlias = Literal["present", "absent", ""]
+
+
+@dataclass(slots=True)
+class SymptomPresence:
+    """One symptom: its latest finding, and when it came and went.
+
+    ``seen`` is the finding when it came. Seen to be gone it is remembered for ``hold_ns``,
+    that is until ``until_ns``, and only ``within_ns`` later it can count as absent. While it
+    cannot be evaluated, ``left_ns`` of that are left, for ``remember_ns`` at most.
+    """
+
+    latest: Symptom
+    hold_ns: int = 0
+    within_ns: int = 0
+    remember_ns: int = 0
+    seen: Symptom | None = None
+    until_ns: int | None = None
+    left_ns: int | None = None
+
+    @property
+    def is_there(self) -> bool:
+        """Return whether it is there now."""
+        return self.seen is not None and self.until_ns is None
+
+    def take(self, latest: Symptom, at_ns: int, counts: bool = True) -> None:
+        """Process a finding at an instant; a symptom that returns while remembered never went.
+
+        ``counts`` is whether it counts if it comes now. What was there before goes on to count.
+        """
+        was_present = self.counts_present(at_ns)
+        self.latest = latest
+        if latest.state == "present" and (was_present or counts):
+            self.seen = self.seen if was_present else latest
+            self.until_ns = self.left_ns = None
+        elif was_present and self.is_absent:
+            if self.until_ns is None:
+                self.until_ns = at_ns + self.hold_ns
+            elif self.left_ns is not None:
+                self.until_ns = min(self.until_ns, at_ns + self.left_ns)
+            self.left_ns = None
+        elif was_present and latest.state != "present":
+            self._hide(at_ns)
+
+    def _hide(self, at_ns: int) -> None:
+        """Suspend forgetting for a limited time: unknown or blocked, it is not seen to be gone."""
+        if self.left_ns is None:
+            self.left_ns = self.hold_ns if self.until_ns is None else self.until_ns - at_ns
+            self.until_ns = at_ns + self.remember_ns + self.left_ns
+
+    def counts_present(self, at_ns: int) -> bool:
+        """Return whether it is there, or went so short ago that it is remembered."""
+        return self.is_there or (self.until_ns is not None and at_ns < self.until_ns)
+
+    @property
+    def is_absent(self) -> bool:
+        """Return whether it is known not to be there, whether that counts or not."""
+        return self.latest.state == "absent" and not self.latest.blocked_by
+
+    def forgotten_since_ns(self, at_ns: int) -> int | None:
+        """Return since when it is being forgotten; None while it is there, or hidden."""
+        if self.until_ns is None or (self.counts_present(at_ns) and not self._fades):
+            return None
+        return self.until_ns - self.hold_ns
+
+    @property
+    def _fades(self) -> bool:
+        return self.left_ns is None and self.is_absent
+
+    def forget(self, at_ns: int) -> None:
+        """Remember it no longer than to an instant."""
+        if self.until_ns is not None:
+            self.until_ns = min(self.until_ns, at_ns)
+
+    @property
+    def gone_ns(self) -> int | None:
+        """Return when (ns) it was seen to be gone; None while it is present or unknown."""
+        return self.latest.confirmed_ns if self.is_absent and not self.is_there else None
+
+    @property
+    def may_be_absent_ns(self) -> int:
+        """Return from when on (ns) its absence can count: ``within_ns`` after it is forgotten."""
+        return 0 if self.until_ns is None else self.until_ns + self.within_ns
+
+    @property
+    def onset_ns(self) -> int:
+        """Return its present onset, ns."""
+        seen = self.seen or self.latest
+        return _time(seen.confirmed_ns if seen.onset_ns is None else seen.onset_ns)
+
+    def shown(self, counts: Counts) -> Symptom:
+        """Return it as evidence: what does not count is unknown, or blocked."""
+        if counts == "present":
+            seen = self.seen or self.latest
+            return replace(seen, state="present", blocked_by=(), gone_ns=self.gone_ns)
+        if counts == "absent" or self.latest.blocked_by:
+            return self.latest
+        return replace(self.latest, state="unknown", gone_ns=self.gone_ns)
+
+
+class SymptomPresences:
+    """All symptoms found in this epoch, by id."""
+
+    def __init__(self, fmea: Fmea) -> None:
+        self._symptoms = fmea.symptoms
+        self._remember_ns = round(fmea.remember_s * NS)
+        self._blocking = BlockingRules(fmea)
+        self._all: dict[str, SymptomPresence] = {}
+        self._blocked: dict[str, None] = {}
+
+    def begin(self) -> None:
+        """Begin an epoch, in which nothing is known yet."""
+        self._all.clear()
+        self._blocked.clear()
+
+    def knows(self, name: str) -> bool:
+        """Return whether the analysis has a symptom."""
+        return name in self._symptoms
+
+    def take(self, latest: Symptom, at_ns: int) -> None:
+        """Process the finding of a symptom at an instant."""
+        presence = self._all.get(latest.id)
+        if presence is None:
+            presence = self._all[latest.id] = self._made(latest)
+        self._judge(presence, latest, at_ns)
+        if presence.is_there:
+            for name in list(self._blocked):
+                self._judge(self._all[name], self._all[name].latest, at_ns)
+
+    def _judge(self, presence: SymptomPresence, latest: Symptom, at_ns: int) -> None:
+        """Process a finding; a blocked one is processed again when more symptoms are present."""
+        there = [name for name, one in self if one.is_there] if latest.blocked_by else ()
+        presence.take(latest, at_ns, self._blocking.lets_count(latest, there))
+        if latest.state == "present" and not presence.is_there:
+            self._blocked[latest.id] = None
+        else:
+            self._blocked.pop(latest.id, None)
+
+    def _made(self, latest: Symptom) -> SymptomPresence:
+        """Make the presence of a symptom: how long it is remembered and may take to come."""
+        symptom = self._symptoms.get(latest.id)
+        if symptom is None:
+            return SymptomPresence(latest)
+        hold_ns, within_ns = round(symptom.hold_s * NS), round(symptom.within_s * NS)
+        return SymptomPresence(latest, hold_ns, within_ns, self._remember_ns)
+
+    def __iter__(self) -> Iterator[tuple[str, SymptomPresence]]:
+        return iter(self._all.items())
+
+    def __getitem__(self, name: str) -> SymptomPresence:
+        return self._all[name]
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._all
+
+    def onsets(self, at_ns: int) -> dict[str, int]:
+        """Return the symptoms that count as present, the analysis' own, with their onsets."""
+        return {
+            name: one.onset_ns
+            for name, one in self._all.items()
+            if self.knows(name) and one.counts_present(at_ns)
+        }
+
+    def counting(self, at_ns: int, waits_ns: Mapping[str, int]) -> dict[str, Counts]:
+        """Return what each symptom counts as at an instant.
+
+        Absence counts from the instant in ``waits_ns`` on. What the analysis does not have
+        counts only while it is there.
+        """
+        return {name: self._counts(name, one, at_ns, waits_ns) for name, one in self}
+
+    def _counts(
+        self, name: str, one: SymptomPresence, at_ns: int, waits_ns: Mapping[str, int]
+    ) -> Counts:
+        if one.counts_present(at_ns):
+            return "present"
+        since_ns = max(one.may_be_absent_ns, waits_ns.get(name, 0))
+        return "absent" if one.is_absent and self.knows(name) and at_ns >= since_ns else ""
+
+    def next_ns(self, at_ns: int, waits_ns: Mapping[str, int]) -> int | None:
+        """Return when (ns) a symptom counts otherwise without a new finding; None for never."""
+        times = (time for name, one in self for time in self._turns(name, one, waits_ns))
+        return min((time for time in times if time > at_ns), default=None)
+
+    def _turns(self, name: str, one: SymptomPresence, waits_ns: Mapping[str, int]) -> Iterator[int]:
+        if one.until_ns is not None:
+            yield one.until_ns
+        if one.is_absent:
+            yield max(one.may_be_absent_ns, waits_ns.get(name, 0))
+
+    def snapshot(self) -> dict[str, Any]:
+        """Return all of it as JSON."""
+        plain: Any = msgspec.to_builtins
+        return {
+            name: [plain(one.latest), plain(one.seen), one.until_ns, one.left_ns]
+            for name, one in self
+        }
+
+    def resume(self, snapshot: Mapping[str, Any]) -> None:
+        """Go on from what ``snapshot`` returned."""
+        self.begin()
+        for name, (latest, seen, until_ns, left_ns) in snapshot.items():
+            presence = self._all[name] = self._made(msgspec.convert(latest, Symptom))
+            presence.seen = msgspec.convert(seen, Symptom | None)
+            presence.until_ns, presence.left_ns = until_ns, left_ns
+            if presence.latest.state == "present" and not presence.is_there:
+                self._blocked[name] = None
+
+
+def _time(at_ns: int | None) -> int:
+    return 0 if at_ns is None else at_ns
+
+
+class AbsenceTimes:
+    """The causes of each symptom, and how long each may take to show it.
+
+    Causes are failure modes and lost functions. What needs a component that a mode takes down,
+    directly or not, whatever else serves, shows its symptoms for the mode.
+    """
+
+    def __init__(self, fmea: Fmea) -> None:
+        self._links = {cause: _slowest(links) for cause, links in _causes(fmea)}
+        self._causes: dict[str, list[str]] = {}
+        for cause, links in self._links.items():
+            for symptom in links:
+                self._causes.setdefault(symptom, []).append(cause)
+
+    @property
+    def shows(self) -> Mapping[str, Collection[str]]:
+        """Return the symptoms of each cause."""
+        return {cause: links.keys() for cause, links in self._links.items()}
+
+    def until_ns(self, onsets_ns: Mapping[str, int]) -> dict[str, int]:
+        """Return until when absent symptoms are to be waited for, given what is present.
+
+        Each cause of something present may have begun with the newest of what it shows: what
+        is older may have had another cause. It has ``within_s`` of each link from then on.
+        """
+        began_ns: dict[str, int] = {}
+        for symptom, onset_ns in onsets_ns.items():
+            for cause in self._causes.get(symptom, ()):
+                began_ns[cause] = max(began_ns.get(cause, onset_ns), onset_ns)
+        until_ns: dict[str, int] = {}
+        for cause, at_ns in began_ns.items():
+            for symptom, within_ns in self._links[cause].items():
+                until_ns[symptom] = max(until_ns.get(symptom, 0), at_ns + within_ns)
+        return until_ns
+
+
+def _causes(fmea: Fmea) -> Iterator[tuple[str, list[SymptomLink]]]:
+    structure = DependencyStructure.of(fmea.needs())
+    for mode in fmea.modes.values():
+        below = _shown_below(fmea, structure, mode.component) if mode.takes_down else []
+        yield mode.id, [*mode.symptoms, *below]
+    for function in fmea.functions.values():
+        if function.symptoms:
+            yield function.id, _shown_below(fmea, structure, function.id)
+
+
+def _shown_below(fmea: Fmea, structure: DependencyStructure, name: str) -> list[SymptomLink]:
+    """Return what shows when something is lost, and what may be lost with it."""
+    lost = sorted({name} | structure.dependents([name]))
+    return [link for one in lost if one in fmea.functions for link in fmea.functions[one].symptoms]
+
+
+def _slowest(links: list[SymptomLink]) -> dict[str, int]:
+    slowest: dict[str, int] = {}
+    for link in links:
+        within_ns = round(link.within_s * NS)
+        slowest[link.symptom] = max(slowest.get(link.symptom, 0), within_ns)
+    return slowest

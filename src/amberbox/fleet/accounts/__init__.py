@@ -1,1 +1,0 @@
-"""Who may do what: people, their sessions and tokens, robots and their keys. Deny by default."""

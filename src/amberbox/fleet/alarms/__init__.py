@@ -1,1 +1,0 @@
-"""Alarms: one per root, what people did about them, and who is told."""

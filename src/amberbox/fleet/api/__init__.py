@@ -1,1 +1,0 @@
-"""The HTTP API: one room's routes per file, each judged by the table of actions."""

@@ -1,1 +1,0 @@
-"""The archive: what robots have recorded, kept on the server; journals, columns, and queries."""

@@ -1,1 +1,0 @@
-"""Questions that take long or must be limited: workers with a limit of time and memory."""

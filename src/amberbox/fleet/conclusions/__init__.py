@@ -1,1 +1,0 @@
-"""What robots concluded: from the archive's columns and from the link, each record once."""

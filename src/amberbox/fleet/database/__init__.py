@@ -1,1 +1,0 @@
-"""The server's database: tables of all rooms, transactions, versions, one server per folder."""

@@ -1,1 +1,0 @@
-"""Windows of data that somebody wants from a robot, delivered when it is reachable."""

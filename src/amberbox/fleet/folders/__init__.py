@@ -1,1 +1,0 @@
-"""Robots' folders as they were, by their hash, without secrets."""

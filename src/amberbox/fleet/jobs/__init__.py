@@ -1,1 +1,0 @@
-"""Background jobs of people: extracts that are made, kept a while, and downloaded."""

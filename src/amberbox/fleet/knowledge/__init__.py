@@ -1,1 +1,0 @@
-"""What robots know, asked from outside: diagnoses, rules, fault trees, failure modes."""

@@ -1,1 +1,0 @@
-"""The server's end of the link: rows are stored once, acknowledged when durable, and shown."""

@@ -1,1 +1,0 @@
-"""The server's own figures, in the text form that Prometheus reads."""

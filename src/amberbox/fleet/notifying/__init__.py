@@ -1,1 +1,0 @@
-"""Tell people of alarms: e-mail and webhooks, each once, through an outbox that survives."""

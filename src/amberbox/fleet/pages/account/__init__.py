@@ -1,1 +1,0 @@
-"""Who one is: the first admin, signing in, one's own account."""

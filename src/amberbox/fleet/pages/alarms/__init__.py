@@ -1,1 +1,0 @@
-"""The list of alarms, and the page of one."""

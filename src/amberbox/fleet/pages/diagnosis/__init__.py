@@ -1,1 +1,0 @@
-"""The page that says what is broken, and all it rests on."""

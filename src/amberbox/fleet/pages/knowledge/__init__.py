@@ -1,1 +1,0 @@
-"""What robots know before anything breaks."""

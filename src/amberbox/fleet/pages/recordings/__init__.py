@@ -1,1 +1,0 @@
-"""What robots have recorded, what of it is here, and what is taken along."""

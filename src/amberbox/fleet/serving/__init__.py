@@ -1,1 +1,0 @@
-"""The running server: its parts, its process, TLS, the first start."""

@@ -1,1 +1,0 @@
-"""How robots are, for people to look at: cards, the tree of components, what changed when."""

@@ -1,1 +1,0 @@
-"""The level above robots: teams and the system, watched on the server."""

@@ -1,1 +1,0 @@
-"""The engine: rows in, statuses and events out, the same for live data and replays."""

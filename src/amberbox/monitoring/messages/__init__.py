@@ -1,1 +1,0 @@
-"""Statuses as messages for others: the paper's JSON, HEALTH-STATUS, DiagnosticArray."""

@@ -1,1 +1,0 @@
-"""Running probes: when they look, what comes of one that hangs, and how results are published."""

@@ -1,0 +1,1 @@
+"""Message formats in which statuses are published, one file each."""

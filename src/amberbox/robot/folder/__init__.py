@@ -1,1 +1,0 @@
-"""The robot's folder on its way to the server: without its secrets."""

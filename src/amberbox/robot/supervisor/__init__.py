@@ -1,1 +1,0 @@
-"""What ``amberbox run`` does: start the box's processes, watch over them, start them again."""

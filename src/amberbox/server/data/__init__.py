@@ -1,0 +1,4 @@
+"""Queries over recorded data.
+
+Rows, items, gaps, missions and incidents, answered by worker processes.
+"""

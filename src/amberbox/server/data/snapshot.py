@@ -1,0 +1,212 @@
+"""A snapshot of a robot's record: the archive's tables, and journals that are in no table yet."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property, lru_cache
+from pathlib import Path
+from typing import Any, TypeVar
+
+from sqlalchemy import Row, select
+
+from amberbox.blackbox.columns.flat_tables import TableSchema
+from amberbox.blackbox.columns.variables import item_named, suggest_names
+from amberbox.blackbox.store.catalogue import StoreCatalogue as StoreCatalogue
+from amberbox.blackbox.store.catalogue import item_of, journal_tables, union
+from amberbox.blackbox.store.journal_reader import JournalFile, journal_file
+from amberbox.blackbox.store.table_reader import (
+    GatheredRows,
+    RowRequest,
+    gather,
+    journal_rows,
+    within,
+)
+from amberbox.core.errors import AmberboxError, UsageError
+from amberbox.core.types import Gap
+from amberbox.server.archive.catalogue import PUT, ArchiveCatalogue, RobotStore
+from amberbox.server.archive.delta_files import ArchiveLayout
+from amberbox.server.archive.reader import ArchiveReader, Span
+from amberbox.server.database import FILE, ServerDatabase
+from amberbox.server.journals import decode
+from amberbox.server.schema import JOURNALS
+
+READ_BYTES = 64 << 20
+"""Waiting journals that a question reads; of more the answer says up to when it is complete."""
+
+NONE = (
+    "no journal of this robot has come yet: it sends one every ten minutes, or when it is asked for"
+)
+
+_ATTEMPTS = 5
+_MARGIN_NS = 60 * 10**9
+"""Corrected times of receipt may differ from those that were noted when a journal came."""
+
+Answer = TypeVar("Answer")
+
+
+@dataclass(frozen=True, slots=True)
+class WaitingJournal:
+    """A journal whose rows are in no table yet."""
+
+    source: RobotStore
+    row: Row[Any]
+    path: Path
+
+    def meets(self, span: Span) -> bool:
+        """Return whether it may hold rows of ``[from, to)`` by receive time."""
+        from_ns, to_ns = span
+        late = to_ns is not None and self.row.start_ns - _MARGIN_NS >= to_ns
+        return not late and (from_ns is None or self.row.end_ns + _MARGIN_NS >= from_ns)
+
+    @property
+    def journal(self) -> JournalFile:
+        """The description of the journal file."""
+        return journal_file(self.path, self.row.file)
+
+
+@dataclass
+class RecordSnapshot:
+    """The record of one robot; ``skipped`` are journals of the range that were not read."""
+
+    reader: ArchiveReader
+    catalogue: ArchiveCatalogue
+    waiting: Sequence[WaitingJournal]
+    skipped: list[WaitingJournal] = field(default_factory=list)
+
+    @cached_property
+    def readable(self) -> Sequence[WaitingJournal]:
+        """The newest of the waiting journals, up to the limit of bytes per query."""
+        found, size = [], 0
+        for one in sorted(self.waiting, key=lambda w: -w.row.end_ns):
+            size += one.row.bytes
+            if size <= READ_BYTES and one.path.exists():
+                found.append(one)
+        return found
+
+    @cached_property
+    def schemas(self) -> dict[str, list[TableSchema]]:
+        """The versions of each table's schema, oldest first."""
+        found = {name: list(versions) for name, versions in self.reader.schemas.items()}
+        for one in reversed(self.readable):
+            for schema in journal_tables(one.journal):
+                versions = found.setdefault(schema.item, [])
+                if schema not in versions:
+                    versions.append(schema)
+        return found
+
+    def schema(self, table: str) -> TableSchema:
+        """Return a table's columns; raises UsageError for an unknown table."""
+        versions = self.reader.schemas.get(table)
+        if versions is not None and not self.readable:
+            return union(versions)
+        name = item_named(self.schemas, table)
+        if name is None:
+            known = sorted(self.schemas)
+            hint = suggest_names(table, known) if known else NONE
+            raise UsageError(f"there is no data item {table!r}", hint)
+        return union(self.schemas[name])
+
+    @property
+    def selection(self) -> Mapping[str, Sequence[str]]:
+        """The variables configured for each item, by the newest journal."""
+        chosen = dict(self.reader.selection)
+        for one in reversed(self.readable):
+            chosen.update(decode(one.row.facts).selection)
+        return chosen
+
+    def rows(self, request: RowRequest) -> GatheredRows:
+        """Read the rows of a request, each once."""
+        found = GatheredRows()
+        for source in self.reader.sources:
+            store = self.reader.of(source, request.table, request=request)
+            one = gather(store, request)
+            found.pieces += one.pieces
+            found.gaps += one.gaps
+            found.notes += one.notes
+            if self.waiting:
+                self._add(found, source, request, _inside(store, request.table))
+        return found
+
+    def only_in_journals(self, table: str) -> Iterator[WaitingJournal]:
+        """Yield the readable journals whose rows are still missing in a table."""
+        inside = {
+            source: _inside(self.reader.of(source, table), table)
+            for source in {one.source for one in self.readable}
+        }
+        return (one for one in self.readable if one.row.file not in inside[one.source])
+
+    def _add(
+        self, found: GatheredRows, source: RobotStore, request: RowRequest, inside: set[str]
+    ) -> None:
+        span = request.span if request.by == "received" else (None, None)
+        gaps: list[Gap] = []
+        for one in self.waiting:
+            if not one.meets(span) or one.source != source or one.row.file in inside:
+                continue
+            if one not in self.readable:
+                self.skipped.append(one)
+                continue
+            journal = one.journal
+            item = item_of(journal, request.table)
+            points = self.reader.clocks(source).book.points(journal.name)
+            if item is not None:
+                journal = journal if points is None else replace(journal, clock=points)
+                rows = journal_rows(journal, item, request, span, gaps)
+                pieces = (within(piece, request.span, request.by) for piece in rows)
+                found.pieces += [piece for piece in pieces if len(piece)]
+
+    def complete_ns(self) -> int | None:
+        """Return the time (ns) up to which all data on the server are read; None without data."""
+        if self.skipped:
+            return min(int(one.row.start_ns) for one in self.skipped)
+        ends = [one.row.end_ns for one in self.waiting]
+        last = self.committed_ns()
+        return max([*ends, *([last] if last is not None else [])], default=None)
+
+    def committed_ns(self) -> int | None:
+        """Return the latest receive time (ns) in the tables, or None."""
+        robots = [source.robot for source in self.reader.sources]
+        return self.catalogue.last_ns(robots) if robots else None
+
+
+def _inside(store: StoreCatalogue, table: str) -> set[str]:
+    """Return the names of the journals whose rows are in a table."""
+    return {part.journal for segment in store.segments(table) for part in segment.parts}
+
+
+@lru_cache(maxsize=4)
+def open_catalogue(folder: Path) -> ArchiveCatalogue:
+    """Open the archive's catalogue, once per worker."""
+    return ArchiveCatalogue(ServerDatabase(folder / FILE, read_only=True))
+
+
+def with_snapshot(folder: Path, robot: str, question: Callable[[RecordSnapshot], Answer]) -> Answer:
+    """Answer from one snapshot of a robot's record; retry when files were joined meanwhile."""
+    catalogue, layout = open_catalogue(folder), ArchiveLayout(folder)
+    for _ in range(_ATTEMPTS):
+        waiting = _waiting(catalogue, layout, robot)
+        reader = ArchiveReader(layout, catalogue, catalogue.sources([robot]))
+        try:
+            return question(RecordSnapshot(reader, catalogue, waiting))
+        except FileNotFoundError:
+            continue
+    raise AmberboxError(f"the archive of {robot} changed while it was being read", "ask again")
+
+
+def _waiting(
+    catalogue: ArchiveCatalogue, layout: ArchiveLayout, robot: str
+) -> list[WaitingJournal]:
+    chosen = (
+        select(JOURNALS)
+        .where(JOURNALS.c.robot == robot, JOURNALS.c.state == PUT, JOURNALS.c.raw_gone.is_(False))
+        .order_by(JOURNALS.c.start_ns)
+    )
+    with catalogue.database.reading() as connection:
+        rows = connection.execute(chosen).all()
+    return [
+        WaitingJournal(
+            RobotStore(r.robot, r.store_id), r, layout.journal(r.robot, r.store_id, r.file)
+        )
+        for r in rows
+    ]

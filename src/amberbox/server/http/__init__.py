@@ -1,0 +1,1 @@
+"""Shared by routes of the API and pages: authentication, common parameters, and errors."""

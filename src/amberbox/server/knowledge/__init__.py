@@ -1,0 +1,1 @@
+"""Diagnoses of robots, and questions to their fault trees, failure modes and rules."""

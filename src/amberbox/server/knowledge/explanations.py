@@ -1,0 +1,310 @@
+"""Explained diagnoses: computed once by a worker, then cached; answers and causes from people."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+import threading
+from collections import OrderedDict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, TypeAlias
+
+import msgspec
+from sqlalchemy import Connection, Row, Table, select
+
+from amberbox.blackbox.journal import channels
+from amberbox.core.clock import Clock
+from amberbox.core.errors import AmberboxError
+from amberbox.core.types import Diagnosis
+from amberbox.server.archive.folder import FolderArchive
+from amberbox.server.bus import EventBus, ServerChange
+from amberbox.server.database import ServerDatabase
+from amberbox.server.knowledge.diagnoses import DiagnosisHistory, find_diagnosis, newest_diagnosis
+from amberbox.server.knowledge.questions import LIMIT_S, MEMORY_BYTES, AskDiagnosis, encode_question
+from amberbox.server.schema import ANSWER, CAUSE, REVISION, ROBOTS
+from amberbox.server.workers.pool import WorkerPool
+
+
+@dataclass(frozen=True, slots=True)
+class GivenAnswer:
+    """An answer of a person to a test: what, by whom, when."""
+
+    test: str
+    answer: str
+    who: str
+    at_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class GivenCause:
+    """The actual cause of a diagnosis as a person entered it."""
+
+    failure_mode: str
+    note: str
+    who: str
+    at_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class Revision:
+    """A diagnosis ranked anew by the server after an answer to a test."""
+
+    number: int
+    who: str
+    at_ns: int
+    body: dict[str, Any]
+
+
+def read_answers(connection: Connection, robot: str, diagnosis: str) -> list[GivenAnswer]:
+    """Return all answers given to the tests of a diagnosis, in order."""
+    rows = _rows(connection, ANSWER, robot, diagnosis)
+    return [GivenAnswer(row.test, row.answer, row.who, row.at_ns) for row in rows]
+
+
+def latest_by_test(answers: list[GivenAnswer]) -> dict[str, str]:
+    """Return the last answer to each test, by test."""
+    return {one.test: one.answer for one in answers}
+
+
+def read_causes(connection: Connection, robot: str, diagnosis: str) -> list[GivenCause]:
+    """Return the causes that people entered for a diagnosis, in order."""
+    rows = _rows(connection, CAUSE, robot, diagnosis)
+    return [GivenCause(row.failure_mode, row.note, row.who, row.at_ns) for row in rows]
+
+
+def modes_named(
+    connection: Connection, robot: str, diagnoses: Sequence[str]
+) -> dict[str, list[str]]:
+    """Return the failure modes that people entered as causes, by diagnosis, in order."""
+    chosen = select(CAUSE).where(CAUSE.c.robot == robot, CAUSE.c.diagnosis.in_(diagnoses))
+    found: dict[str, list[str]] = {one: [] for one in diagnoses}
+    for row in connection.execute(chosen.order_by(CAUSE.c.number)):
+        found[row.diagnosis].append(row.failure_mode)
+    return found
+
+
+def read_revisions(connection: Connection, robot: str, diagnosis: str) -> list[Revision]:
+    """Return the revisions that the server made of a diagnosis, in order, numbered from 1."""
+    rows = _rows(connection, REVISION, robot, diagnosis)
+    return [
+        Revision(number, row.who, row.at_ns, msgspec.json.decode(row.body))
+        for number, row in enumerate(rows, 1)
+    ]
+
+
+def keep_answer(
+    connection: Connection, robot: str, diagnosis: str, one: GivenAnswer, body: bytes,
+    also: Sequence[GivenAnswer] = (),
+) -> None:  # fmt: skip
+    """Store an answer, others given with it, and the diagnosis ranked anew (``body``, JSON)."""
+    about = {"robot": robot, "diagnosis": diagnosis, "who": one.who, "at_ns": one.at_ns}
+    rows = [{**about, "test": of.test, "answer": of.answer} for of in (one, *also)]
+    connection.execute(ANSWER.insert(), rows)
+    connection.execute(REVISION.insert(), [{**about, "body": body.decode()}])
+
+
+def keep_cause(connection: Connection, robot: str, diagnosis: str, cause: GivenCause) -> None:
+    """Store the actual cause of a diagnosis."""
+    row = {
+        "robot": robot, "diagnosis": diagnosis, "failure_mode": cause.failure_mode,
+        "note": cause.note, "who": cause.who, "at_ns": cause.at_ns,
+    }  # fmt: skip
+    connection.execute(CAUSE.insert(), [row])
+
+
+def _rows(connection: Connection, table: Table, robot: str, diagnosis: str) -> list[Row[Any]]:
+    chosen = select(table).where(table.c.robot == robot, table.c.diagnosis == diagnosis)
+    return list(connection.execute(chosen.order_by(table.c.number)))
+
+
+OP = "amberbox.server.knowledge.worker:diagnose"
+_REMEMBERED = 200
+
+Answer: TypeAlias = Mapping[str, Any]
+"""What ``POST .../diagnose`` answers."""
+Key: TypeAlias = tuple[str, str, int, str, tuple[tuple[str, str], ...]]
+
+
+def key_of(robot: str, diagnosis: Diagnosis, answers: Mapping[str, str]) -> Key:
+    """Return the key of an explanation in the cache: robot, revision of the diagnosis, answers."""
+    given = tuple(sorted(answers.items()))
+    return robot, diagnosis.id, diagnosis.revision, diagnosis.state, given
+
+
+def given_answers(database: ServerDatabase, robot: str, diagnosis: str) -> dict[str, str]:
+    """Return the last answer to each test of a diagnosis, by test."""
+    with database.reading() as connection:
+        return latest_by_test(read_answers(connection, robot, diagnosis))
+
+
+def made_answers(database: ServerDatabase, robot: str, diagnosis: str) -> list[Revision]:
+    """Return the revisions that the server made of a diagnosis."""
+    with database.reading() as connection:
+        return read_revisions(connection, robot, diagnosis)
+
+
+class Explained:
+    """A cache of explanations by revision; ``known`` never waits, threads may share it.
+
+    While ``run`` runs, each diagnosis that a robot sends is explained in advance, by the workers
+    for robots; questions of people go to other workers.
+    """
+
+    def __init__(
+        self,
+        database: ServerDatabase,
+        archive: FolderArchive,
+        bus: EventBus,
+        clock: Clock,
+        worker_pool: WorkerPool,
+        robot_worker_pool: WorkerPool,
+    ) -> None:
+        self.database = database
+        self.archive = archive
+        self._bus = bus
+        self._clock = clock
+        self._worker_pool = worker_pool
+        self._robot_worker_pool = robot_worker_pool
+        self._lock = threading.Lock()
+        self._known: OrderedDict[Key, Answer] = OrderedDict()
+        self._asked: dict[Key, asyncio.Task[Answer]] = {}
+        self._wanted: asyncio.Queue[tuple[str, str]] = asyncio.Queue()
+
+    def known(self, robot: str, diagnosis: Diagnosis, answers: Mapping[str, str]) -> Answer | None:
+        """Return the cached explanation of a revision; None if it is not there."""
+        with self._lock:
+            return self._known.get(key_of(robot, diagnosis, answers))
+
+    async def read(
+        self, robot: str, diagnosis: Diagnosis, answers: Mapping[str, str], asker: str
+    ) -> Answer:
+        """Return the explanation; concurrent callers wait for the same computation.
+
+        Raises AmberboxError where there is none, such as without the robot's folder.
+        """
+        found = self.known(robot, diagnosis, answers)
+        if found is not None:
+            return found
+        key = key_of(robot, diagnosis, answers)
+        task = self._asked.get(key)
+        if task is None:
+            task = asyncio.create_task(self._ask(key, answers, asker))
+            self._asked[key] = task
+            task.add_done_callback(partial(self._over, key))
+        return await asyncio.shield(task)
+
+    def _over(self, key: Key, task: asyncio.Task[Answer]) -> None:
+        """Forget a finished task; its exception goes to the callers that still wait for it."""
+        self._asked.pop(key, None)
+        if not task.cancelled():
+            task.exception()  # retrieved, so that asyncio does not log it without callers
+
+    async def run(self) -> None:
+        """Explain the newest diagnosis of each robot, then those that robots send, in turn."""
+        ends = [self._bus.on("diagnosis", self._note), self._bus.on("robot", self._robot)]
+        try:
+            for robot in await asyncio.to_thread(self._robots):
+                self._wanted.put_nowait((robot, ""))
+            while True:
+                robot, name = await self._wanted.get()
+                await self._prepare(robot, name)
+        finally:
+            for end in ends:
+                end()
+
+    def close(self) -> None:
+        """Empty the cache."""
+        self._known.clear()
+
+    def _note(self, change: ServerChange) -> None:
+        self._wanted.put_nowait((change.robot, str(change.data["id"])))
+
+    def _robot(self, change: ServerChange) -> None:
+        """Queue the newest diagnosis of a robot whose folder has arrived."""
+        if change.robot:
+            self._wanted.put_nowait((change.robot, ""))
+
+    def _robots(self) -> list[str]:
+        with self.database.reading() as connection:
+            return list(connection.execute(select(ROBOTS.c.robot)).scalars())
+
+    async def _prepare(self, robot: str, name: str) -> None:
+        """Explain an open diagnosis; without a name, the robot's newest one."""
+        try:
+            known = await asyncio.to_thread(self._find, robot, name)
+            if known is not None and known.last.state == "open":
+                of = robot, known.id
+                answers = await asyncio.to_thread(given_answers, self.database, *of)
+                made = await asyncio.to_thread(made_answers, self.database, *of)
+                kept = latest_answer(known, made)
+                if kept is not None:
+                    self._keep(key_of(robot, known.last, answers), kept)
+                await self.read(robot, known.last, answers, robot)
+        except AmberboxError as error:  # a page that needs it asks again, and shows the error
+            logging.getLogger(__name__).info("%s: %s", robot, error.what)
+        except Exception:  # damaged files; go on with other robots
+            logging.getLogger(__name__).exception("the diagnoses of %s cannot be read", robot)
+
+    def _find(self, robot: str, name: str) -> DiagnosisHistory | None:
+        return find_diagnosis(self, robot, name) if name else newest_diagnosis(self, robot)
+
+    async def _ask(self, key: Key, answers: Mapping[str, str], asker: str) -> Answer:
+        robot, name = key[0], key[1]
+        asked = AskDiagnosis(
+            robot=robot, now_ns=self._clock.wall_ns(), diagnosis=name, revision=key[2],
+            answers=dict(answers),
+        )  # fmt: skip
+        workers = self._robot_worker_pool if asker == robot else self._worker_pool
+        found = await workers.ask(OP, encode_question(asked), LIMIT_S, MEMORY_BYTES, asker=asker)
+        answer: Answer = json.loads(found)
+        self._keep(key, answer)
+        return answer
+
+    def _keep(self, key: Key, answer: Answer) -> None:
+        with self._lock:
+            self._known[key] = answer
+            while len(self._known) > _REMEMBERED:
+                self._known.popitem(last=False)
+        self._bus.publish(ServerChange("explained", key[0], {"answer": answer}))
+
+
+def latest_answer(known: DiagnosisHistory, made: list[Revision]) -> Answer | None:
+    """Return the server's last revision of a diagnosis if it is of the robot's newest revision."""
+    last = made[-1].body if made else None
+    same = last is not None and (last["revision"], last["state"]) == (
+        known.last.revision, known.last.state,
+    )  # fmt: skip
+    return last if same else None
+
+
+class _Diagnosis(msgspec.Struct):
+    """The id of a recorded diagnosis."""
+
+    id: str
+
+
+_DECODER = msgspec.json.Decoder(_Diagnosis)
+
+
+def publish_diagnoses(bus: EventBus) -> None:
+    """Publish a change for each diagnosis among the rows that robots send."""
+
+    def told(change: ServerChange) -> None:
+        names: dict[str, None] = {}
+        for row in change.data["rows"]:
+            if row.channel == channels.DIAGNOSIS:
+                names.update(_name(row.data))
+        for name in names:
+            bus.publish(ServerChange("diagnosis", change.robot, {"id": name}))
+
+    bus.on("rows", told)
+
+
+def _name(data: bytes) -> dict[str, None]:
+    try:
+        return {_DECODER.decode(data).id: None}
+    except msgspec.MsgspecError:
+        return {}  # not readable

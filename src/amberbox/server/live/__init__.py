@@ -1,0 +1,1 @@
+"""The live feed that pushes changes to browsers and programs over a WebSocket."""

@@ -1,0 +1,140 @@
+"""Diagnoses, failure modes and configuration folders of robots as API and pages show them."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from amberbox.core.api import DiagnosisLine
+from amberbox.core.timestamps import format_time
+from amberbox.core.types import Diagnosis
+from amberbox.diagnosis.report.serialiser import diagnosis_json, to_json
+from amberbox.server.accounts.robots import KnownRobot
+from amberbox.server.ingest.folders import KnownFolder
+from amberbox.server.knowledge.diagnoses import DiagnosisHistory
+from amberbox.server.knowledge.questions import (
+    LIMIT_S,
+    MEMORY_BYTES,
+    WORKER,
+    RobotQuestion,
+    encode_question,
+)
+from amberbox.server.services.context import Caller, Services
+
+
+async def read_fmea(
+    fleet: Services, who: Caller, robot: KnownRobot, at: str = "", config_hash: str = "",
+    exposure_h: float | None = None,
+) -> dict[str, Any]:  # fmt: skip
+    """Return the failure modes of a robot: the sheet, what matters most, what nobody sees."""
+    asked = RobotQuestion(robot=robot.id, now_ns=fleet.clock.wall_ns(), at=at,
+                       config_hash=config_hash, exposure_h=exposure_h)  # fmt: skip
+    return decode_answer(await ask_worker(fleet, who, "fmea", asked))
+
+
+async def ask_worker(fleet: Services, who: Caller, name: str, asked: RobotQuestion) -> bytes:
+    """Let a worker answer a question about a robot; return its JSON."""
+    op = f"{WORKER}:{name}"
+    return await fleet.worker_pool.ask(
+        op, encode_question(asked), LIMIT_S, MEMORY_BYTES, asker=who.person
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Folder:
+    """A folder that a robot had; ``masked`` files had secrets in them when they came."""
+
+    config_hash: str
+    received: str
+    files: int
+    bytes: int
+    masked: int
+    current: bool
+
+
+@dataclass(frozen=True, slots=True)
+class FolderList:
+    """The folders of a robot, the newest first; ``current`` is what it stated last."""
+
+    current: str
+    folders: list[Folder]
+
+
+def list_folders(fleet: Services, robot: KnownRobot) -> FolderList:
+    """List the folders that a robot had, as far as they are kept."""
+    current = fleet.folders.current(robot.id)
+    found = fleet.folders.kept(robot.id)
+    return FolderList(current, [_shown(folder, current) for folder in found])
+
+
+def _shown(folder: KnownFolder, current: str) -> Folder:
+    return Folder(
+        folder.config_hash, format_time(folder.received_ns), folder.files, folder.bytes,
+        folder.masked, folder.config_hash == current,
+    )  # fmt: skip
+
+
+def decode_answer(answer: bytes) -> dict[str, Any]:
+    """Return an answer as it is sent."""
+    found: dict[str, Any] = json.loads(answer)
+    return found
+
+
+@dataclass(frozen=True, slots=True)
+class TestAnswer:
+    """An answer that somebody gave."""
+
+    test: str
+    answer: str
+    who: str
+    at: str
+
+
+@dataclass(frozen=True, slots=True)
+class Cause:
+    """What it was, as somebody says."""
+
+    failure_mode: str
+    note: str
+    who: str
+    at: str
+
+
+@dataclass(frozen=True, slots=True)
+class ServerRevision:
+    """What the server made of it with an answer more; ``diagnosis`` is as asking gives it."""
+
+    number: int
+    who: str
+    at: str
+    diagnosis: dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class DiagnosisDetail:
+    """All of a diagnosis: what the robot said, revision by revision, and what people added."""
+
+    id: str
+    state: Literal["open", "healed"]
+    revisions: list[dict[str, Any]]
+    answers: list[TestAnswer]
+    server_revisions: list[ServerRevision]
+    causes: list[Cause]
+
+
+def diagnosis_line(one: DiagnosisHistory) -> DiagnosisLine:
+    """Return a diagnosis as a list shows it."""
+    leading = one.peak.hypotheses[:1]
+    return DiagnosisLine(
+        one.id, one.last.state, format_time(one.revisions[0].at_ns), format_time(one.last.at_ns),
+        len(one.revisions), sorted(leading[0].faults) if leading else [],
+        leading[0].probability if leading else None, one.last.config_hash,
+    )  # fmt: skip
+
+
+def revision_json(diagnosis: Diagnosis) -> dict[str, Any]:
+    """Return a revision as the robot wrote it."""
+    shown = diagnosis_json(diagnosis)
+    return {**{key: to_json(value) for key, value in shown.items()},
+            "symptoms": list(diagnosis.symptoms)}  # fmt: skip

@@ -1,0 +1,1 @@
+"""The web interface: pages with their templates, texts and browser modules."""

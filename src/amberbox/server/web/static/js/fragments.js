@@ -1,0 +1,166 @@
+// Fragments of HTML that the server renders again: fetched, and put in place of the old ones.
+// The server has escaped what is in them; scripts in them never run.
+
+import { ApiError, latestSignal, send, showError, signIn } from "./api.js";
+import { find, findAll, setTextAttribute } from "./dom.js";
+import { updateTimes } from "./time.js";
+
+const ROLES = [["thead, tbody", "rowgroup"], ["tr", "row"], ["thead th", "columnheader"], ["tbody th", "rowheader"], ["td", "cell"]];
+
+/**
+ * Fetch the nodes of a fragment. Throws ApiError.
+ * @param {string} path
+ * @param {{signal?: AbortSignal}} [options]
+ * @returns {Promise<Node[]>}
+ */
+export async function fetchNodes(path, { signal } = {}) {
+  const response = await send(path, { signal, headers: { Accept: "text/html" } });
+  if (response.redirected && new URL(response.url).pathname === "/sign-in") signIn();
+  const page = new DOMParser().parseFromString(await response.text(), "text/html");
+  if (response.ok) return [...page.body.childNodes];
+  const what = find(".problem strong", page)?.textContent ?? response.statusText;
+  throw new ApiError(what, find(".problem p", page)?.textContent ?? "", response.status);
+}
+
+/** Fetch a fragment that is one element. Throws ApiError. @returns {Promise<Element>} */
+export async function fetchFragment(path, options = {}) {
+  const nodes = await fetchNodes(path, options);
+  return document.adoptNode(nodes.find((node) => node.nodeType === Node.ELEMENT_NODE));
+}
+
+/** Write times below an element, and label the values of its tables. @param {ParentNode} root */
+export function enhance(root = document) {
+  updateTimes(root);
+  labelTables(root);
+}
+
+/**
+ * Give each value of tables the title of its column, which the style sheet shows before it where
+ * narrow screens make cards of rows. Tables with values across columns stay as they are.
+ */
+function labelTables(root) {
+  for (const table of findAll("table.table", root)) {
+    const heads = findAll("thead th", table).map(columnTitle);
+    if (heads.length > 1 && !find("[colspan], [rowspan]", table)) labelTable(table, heads);
+  }
+}
+
+/** Return the title of a column; "" where it is for screen readers only. */
+function columnTitle(head) {
+  return head.querySelector(":scope > .sr-only") ? "" : head.textContent.trim().replace(/\s+/g, " ");
+}
+
+/** Browsers forget the roles of table elements that are displayed as blocks: write them out. */
+function labelTable(table, heads) {
+  table.dataset.cards = "";
+  table.setAttribute("role", "table");
+  for (const [selector, role] of ROLES) {
+    for (const part of findAll(selector, table)) part.setAttribute("role", role);
+  }
+  for (const row of findAll("tbody tr", table)) {
+    [...row.children].forEach((cell, n) => heads[n] && setTextAttribute(cell, "data-label", heads[n]));
+  }
+}
+
+/**
+ * Replace an element by a fragment, unless they are equal; open `details` stay open, the focus
+ * stays where it was. Returns the element that is on the page now.
+ * @param {Element} old
+ * @param {Element} fresh
+ */
+export function replaceElement(old, fresh) {
+  enhance(fresh);
+  for (const details of findAll("details[id][open]", old)) {
+    find(`details[id="${CSS.escape(details.id)}"]`, fresh)?.setAttribute("open", "");
+  }
+  if (old.outerHTML === fresh.outerHTML) return old;
+  const focused = focusFinder(old);
+  old.replaceWith(fresh);
+  focused?.(fresh)?.focus({ preventScroll: true });
+  return fresh;
+}
+
+/** Replace what is inside an element; the focus stays where it was. */
+export function replaceContent(place, nodes) {
+  const focused = focusFinder(place);
+  place.replaceChildren(...nodes);
+  enhance(place);
+  if (focused) (focused(place) ?? find("[tabindex]", place) ?? place).focus({ preventScroll: true });
+}
+
+/**
+ * Return a function that fetches a fragment and puts it in place; a new call aborts the one before.
+ * Errors are shown as toasts.
+ * @param {() => Element | null} target
+ * @param {() => string} address
+ * @param {(fresh: Element) => void} placed
+ */
+export function latestFragment(target, address, placed) {
+  const nextSignal = latestSignal();
+  return async () => {
+    try {
+      const fresh = await fetchFragment(address(), { signal: nextSignal() });
+      const old = target();
+      if (old) placed(replaceElement(old, fresh));
+    } catch (error) {
+      if (error.name !== "AbortError") showError(error, null);
+    }
+  };
+}
+
+/**
+ * Return a function that refreshes a fragment: at once, then at most once in `intervalMs`. It
+ * returns whether it does so at once. `placed` is called with what came; errors are ignored.
+ * @param {() => Element | null} target
+ * @param {() => string} address
+ * @param {number} [intervalMs]
+ * @param {(fresh: Element) => void} [placed]
+ */
+export function throttledFragment(target, address, intervalMs = 1000, placed = () => {}) {
+  let timer = null;
+  let isRequested = false;
+
+  async function load() {
+    isRequested = false;
+    timer = setTimeout(afterPause, intervalMs);
+    if (!target()) return;
+    const fresh = await fetchFragment(address()).catch(() => null); // the feed tells when the server is back
+    const old = target();
+    if (fresh && old) placed(replaceElement(old, fresh));
+  }
+
+  function afterPause() {
+    timer = null;
+    if (isRequested) load();
+  }
+
+  return () => {
+    isRequested = true;
+    const isFree = timer === null;
+    if (isFree) load();
+    return isFree;
+  };
+}
+
+/**
+ * Return a function that finds the counterpart of the focused element in another root: by id, name
+ * or link, else by position. Null where the focus is not in `root`.
+ */
+function focusFinder(root) {
+  const element = document.activeElement;
+  if (!root.contains(element)) return null;
+  const selector = focusSelector(element);
+  if (selector) return (other) => find(selector, other);
+  const steps = [];
+  for (let at = element; at !== root; at = at.parentElement) steps.unshift([...at.parentElement.children].indexOf(at));
+  return (other) => steps.reduce((at, step) => at?.children[step], other);
+}
+
+function focusSelector(element) {
+  const selector = (attribute, value) => `[${attribute}="${CSS.escape(value)}"]`;
+  if (element.id) return selector("id", element.id);
+  if (element.dataset.focus) return selector("data-focus", element.dataset.focus);
+  if (element.name) return selector("name", element.name) + (element.value && element.tagName === "BUTTON" ? selector("value", element.value) : "");
+  const href = element.getAttribute("href");
+  return href ? selector("href", href) : null;
+}

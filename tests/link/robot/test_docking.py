@@ -1,0 +1,38 @@
+"""Whether the robot is in its dock, by what it records."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from amberbox.core.source import TopicOptions
+from amberbox.link.policy import DockWatcher
+from amberbox.testing.clock import wait_until
+from tests.support.manual_recorder import COUNT, ManualBox, number
+
+
+def wait_for(dock: DockWatcher, docked: bool) -> None:
+    wait_until(lambda: dock.docked is docked, f"docked={docked} {dock.problem}")
+
+
+def test_the_last_value_counts(tmp_path: Path) -> None:
+    box = ManualBox(tmp_path / "store", [TopicOptions("/count")])
+    box.hear(COUNT, number(0))
+    box.write()
+    dock = DockWatcher(tmp_path / "store", "ros_count.data > 5")
+    assert dock.docked is None
+    dock.start()
+    wait_for(dock, docked=False)
+    box.hear(COUNT, number(9))
+    box.write()
+    wait_for(dock, docked=True)
+    box.hear(COUNT, number(1))
+    box.write()
+    wait_for(dock, docked=False)
+    dock.close()
+    box.close()
+
+
+def test_nobody_knows_without_an_expression(tmp_path: Path) -> None:
+    dock = DockWatcher(tmp_path, "")
+    dock.start()
+    assert dock.docked is None

@@ -1,0 +1,106 @@
+"""A server's app on a port of the loopback, its feed at work, and people who listen."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager, suppress
+from typing import Any
+
+import msgspec
+import uvicorn
+from websockets.asyncio.client import ClientConnection, connect
+
+from amberbox.blackbox.journal import channels
+from amberbox.link.frames import LinkRow
+from amberbox.server.accounts.sessions import begin_session
+from amberbox.server.accounts.users import find_user
+from amberbox.server.bus import ServerChange
+from amberbox.server.http.auth import COOKIE
+from amberbox.testing.clock import PATIENCE_S
+from tests.server.house import URL, House
+
+
+class Stage:
+    """A house that can be listened to."""
+
+    def __init__(self, home: House, port: int) -> None:
+        self.home = home
+        self.port = port
+        self.seq = 0
+
+    def session(self, name: str) -> str:
+        """Sign somebody in."""
+        services = self.home.services
+        with services.database.begin() as connection:
+            user = find_user(connection, name)
+            now_ns = self.home.clock.wall_ns()
+            return begin_session(connection, now_ns, user.user_id, "192.0.2.1", "tests").secret
+
+    def browser(self, name: str = "", origin: str | None = URL) -> connect:
+        """Open a socket as a page does."""
+        cookie = {"Cookie": f"{COOKIE}={self.session(name)}"} if name else {}
+        return self.program({**cookie, **({"Origin": origin} if origin else {})})
+
+    def program(self, headers: dict[str, str]) -> connect:
+        """Open a socket with these headers."""
+        address = f"ws://127.0.0.1:{self.port}/api/v1/feed"
+        return connect(address, additional_headers=headers, compression=None, max_size=None)
+
+    def say(self, robot: str, channel: str, **values: Any) -> None:
+        """Let a record of a robot arrive."""
+        self.seq += 1
+        row = LinkRow("watch", 1, self.seq, channel, self.home.clock.wall_ns(),
+                  msgspec.json.encode(values))  # fmt: skip
+        told = {"store_id": "s", "rows": [row]}
+        self.home.services.bus.publish(ServerChange("rows", robot, told))
+
+    def status(self, robot: str, level: str = "ok", component: str = "laser", **more: Any) -> None:
+        """Let a status of a robot arrive."""
+        self.say(robot, channels.STATUS, component=component, level=level, **more)
+
+
+@asynccontextmanager
+async def stage(home: House) -> AsyncIterator[Stage]:
+    """Serve a house for the time of a scene."""
+    config = uvicorn.Config(home.app, port=0, lifespan="off", log_level="critical",
+                            ws="websockets-sansio", ws_per_message_deflate=False)  # fmt: skip
+    server = uvicorn.Server(config)
+    home.services.bus.attach(asyncio.get_running_loop())
+    tasks = [asyncio.create_task(home.services.feed.run()), asyncio.create_task(server.serve())]
+    try:
+        while not server.started:
+            await asyncio.sleep(0.005)
+        await asyncio.sleep(0.05)  # the feed has read what it begins with
+        yield Stage(home, server.servers[0].sockets[0].getsockname()[1])
+    finally:
+        tasks[0].cancel()
+        server.should_exit = True
+        with suppress(asyncio.CancelledError):
+            await asyncio.gather(*tasks)
+
+
+async def hear(socket: ClientConnection, kind: str) -> dict[str, Any]:
+    """Wait for a message of a kind; others are passed over."""
+    async with asyncio.timeout(PATIENCE_S):
+        while True:
+            for message in json.loads(await socket.recv()):
+                if message["kind"] == kind:
+                    found: dict[str, Any] = message
+                    return found
+
+
+async def heard_within(socket: ClientConnection, seconds: float) -> list[dict[str, Any]]:
+    """Return all messages that come within a time."""
+    found: list[dict[str, Any]] = []
+    with suppress(TimeoutError):
+        async with asyncio.timeout(seconds):
+            while True:
+                found += json.loads(await socket.recv())
+    return found
+
+
+async def ask(socket: ClientConnection, **asked: Any) -> None:
+    """Say what one wants to hear."""
+    await socket.send(json.dumps(asked))

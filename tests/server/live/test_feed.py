@@ -1,0 +1,486 @@
+"""The feed over real sockets: a snapshot, what changes, and nothing that is not for one's eyes."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+
+from amberbox.blackbox.journal import channels
+from amberbox.server.accounts.robots import regroup_robot
+from amberbox.server.accounts.sessions import revoke_sessions
+from amberbox.server.accounts.tokens import add_token
+from amberbox.server.accounts.users import find_user
+from amberbox.server.bus import ServerChange
+from amberbox.server.derived import RecordStores
+from amberbox.server.http.auth import COOKIE
+from amberbox.server.live import feed as feed_module
+from amberbox.server.live.feed import MOST_EACH
+from amberbox.server.live.listener import ChangeRing
+from amberbox.server.live.records import LONGEST, StatusRecord, decode_record
+from amberbox.testing.clock import PATIENCE_S
+from tests.server.house import URL, House, house
+from tests.server.live.listening import Stage, ask, hear, heard_within, stage
+from tests.server.state.lives import put_alarm
+
+
+@pytest.fixture
+def home(tmp_path: Path) -> Iterator[House]:
+    with house(tmp_path / "server") as found:
+        yield found
+
+
+def token(home: House, owner: str, *scopes: str) -> dict[str, str]:
+    with home.services.database.begin() as connection:
+        user = find_user(connection, owner)
+        made = add_token(connection, home.clock.wall_ns(), user, "t", scopes)
+    return {"Authorization": f"Bearer {made.text}"}
+
+
+def test_a_snapshot_then_what_changes(home: House) -> None:
+    async def scene() -> None:
+        async with stage(home) as on, on.browser("viewer") as socket:
+            await ask(socket)
+            first = await hear(socket, "snapshot")
+            assert [card["robot"] for card in first["data"]["robots"]] == [
+                "ropod_001", "ropod_002", "ropod_003"
+            ]  # fmt: skip
+            on.status("ropod_001", "error", reason="front is dead")
+            change = await hear(socket, "status")
+            assert change["robot"] == "ropod_001" and change["number"] > first["number"]
+            (laser,) = change["data"]
+            assert (laser["component"], laser["level"]) == ("laser", "error")
+            home.services.bus.publish(ServerChange("connected", "ropod_002", {}))
+            seen = await hear(socket, "presence")
+            assert (seen["robot"], seen["data"]) == ("ropod_002", {"online": True})
+
+    asyncio.run(scene())
+
+
+def test_a_status_that_is_as_before_or_late_is_no_news(home: House) -> None:
+    async def scene() -> None:
+        async with stage(home) as on, on.browser("viewer") as socket:
+            await ask(socket)
+            await hear(socket, "snapshot")
+            on.status("ropod_001", "ok", measured_ns=1)
+            await hear(socket, "status")
+            on.status("ropod_001", "ok", measured_ns=2)
+            on.seq = 0
+            on.status("ropod_001", "error")
+            assert await heard_within(socket, 0.2) == []
+
+    asyncio.run(scene())
+
+
+def test_robots_of_other_groups_never_appear(home: House) -> None:
+    async def scene() -> None:
+        async with stage(home) as on, on.browser("nurse") as socket:
+            await ask(socket, robots=["ropod_001", "ropod_003"], live={"ropod_003": ["odom/x"]})
+            first = await hear(socket, "snapshot")
+            assert [card["robot"] for card in first["data"]["robots"]] == ["ropod_001"]
+            on.status("ropod_003")
+            on.say("ropod_003", channels.EVENT, kind="x", text="y")
+            home.services.bus.publish(ServerChange("alarm", "ropod_003", {"id": "a"}))
+            put_alarm(home, 7, "ropod_001", "ropod_003")
+            home.services.bus.publish(ServerChange("alarm", "", {"id": 7}))
+            home.services.bus.publish(
+                ServerChange("live", "ropod_003", {"values": {"odom/x": (1, 1.0)}})
+            )
+            on.status("ropod_001")
+            found = await heard_within(socket, 0.4)
+            assert {message["robot"] for message in found} == {"ropod_001"}
+            assert [m["data"]["id"] for m in found if m["kind"] == "alarm"] == [7]
+            assert await _eventually_watched(home, "ropod_003") == ()
+
+    asyncio.run(scene())
+
+
+async def _eventually_watched(home: House, robot: str) -> tuple[str, ...]:
+    await asyncio.sleep(0.05)
+    return home.services.links._watched.get(robot, ())
+
+
+def test_kinds_and_robots_are_chosen(home: House) -> None:
+    async def scene() -> None:
+        async with stage(home) as on, on.browser("viewer") as socket:
+            await ask(socket, robots=["ropod_002"], kinds=["event"])
+            first = await hear(socket, "snapshot")
+            assert first["data"]["statuses"] == {}
+            on.status("ropod_002")
+            on.say("ropod_001", channels.EVENT, kind="x", text="not asked for")
+            on.say("ropod_002", channels.EVENT, kind="power", text="low")
+            (only,) = await heard_within(socket, 0.3)
+            assert only["kind"] == "event" and only["data"][0]["text"] == "low"
+
+    asyncio.run(scene())
+
+
+def test_values_alone_are_no_news_of_levels(home: House) -> None:
+    volts = {"name": "volts", "type": "float", "value": 24.0}
+
+    async def scene() -> None:
+        async with stage(home) as on, on.browser("viewer") as socket:
+            await ask(socket, kinds=["levels"])
+            assert (await hear(socket, "snapshot"))["data"]["statuses"] == {}
+            on.status("ropod_001", "warn", state="weak", reason="24 volts for 3.2 s")
+            news = await hear(socket, "levels")
+            assert news["data"] == [
+                {"component": "laser", "mode": "", "level": "warn", "state": "weak"}
+            ]
+            for reason in ("23.5 volts for 4.2 s", "22 volts for 5 s"):
+                on.status("ropod_001", "warn", state="weak", reason=reason, outputs=[volts])
+            assert await heard_within(socket, 0.2) == []
+            for more in ({"reason": "none"}, {"blocked_by": ["power"]}, {"state": "off"}):
+                on.status("ropod_001", "warn", **more)
+                assert (await hear(socket, "levels"))["robot"] == "ropod_001"
+
+    asyncio.run(scene())
+
+
+def test_who_looks_at_everything_hears_each_change_once(home: House) -> None:
+    async def scene() -> None:
+        async with stage(home) as on, on.browser("viewer") as socket:
+            await ask(socket)
+            await hear(socket, "snapshot")
+            on.status("ropod_001", "warn")
+            assert [m["kind"] for m in await heard_within(socket, 0.2)] == ["status"]
+            await ask(socket, kinds=["levels", "status"])
+            await hear(socket, "snapshot")
+            on.status("ropod_001", "error")
+            found = await heard_within(socket, 0.2)
+            assert [m["kind"] for m in found] == ["status", "levels"]
+
+    asyncio.run(scene())
+
+
+def test_who_hears_nothing_for_a_while_goes_on_without_a_hole(home: House) -> None:
+    async def scene() -> None:
+        async with stage(home) as on, on.browser("viewer") as socket:
+            await ask(socket, kinds=["levels"])
+            await hear(socket, "snapshot")
+            for value in range(30):
+                volts = {"name": "volts", "type": "float", "value": value}
+                on.status("ropod_001", outputs=[volts])
+                await asyncio.sleep(0.06)
+            kinds = {m["kind"] for m in await heard_within(socket, 0.1)}
+            assert kinds <= {"ping", "levels"} and "ping" in kinds
+            on.status("ropod_001", "error")
+            assert (await hear(socket, "levels"))["data"][0]["level"] == "error"
+
+    asyncio.run(scene())
+
+
+def test_of_jobs_only_the_owner_hears(home: House) -> None:
+    async def scene() -> None:
+        async with (
+            stage(home) as on,
+            on.browser("technician") as owner,
+            on.browser("admin") as other,
+        ):
+            for socket in (owner, other):
+                await ask(socket)
+                await hear(socket, "snapshot")
+            told = {"id": "j1", "owner": "technician"}
+            home.services.bus.publish(ServerChange("job", "ropod_001", told))
+            on.status("ropod_001")
+            assert (await hear(owner, "job"))["data"]["id"] == "j1"
+            assert {m["kind"] for m in await heard_within(other, 0.3)} == {"status"}
+
+    asyncio.run(scene())
+
+
+def test_who_may_ask_for_data_hears_of_windows_from_robots(home: House) -> None:
+    async def scene() -> None:
+        async with stage(home) as on, on.browser("viewer") as socket:
+            await ask(socket, kinds=["fetch"])
+            await hear(socket, "snapshot")
+            client = home.client("technician")
+            window = {"from": "now-1h", "to": "now-30m"}
+            made = await asyncio.to_thread(
+                client.post, "/api/v1/robots/ropod_001/fetches", json=window
+            )
+            id = made.json()["id"]
+            told = await hear(socket, "fetch")
+            assert (told["robot"], told["data"]) == ("ropod_001", {"id": id})
+            await asyncio.to_thread(client.delete, f"/api/v1/robots/ropod_001/fetches/{id}")
+            assert (await hear(socket, "fetch"))["data"] == {"id": id}
+
+    asyncio.run(scene())
+
+
+def test_a_token_hears_what_its_scopes_allow(home: House) -> None:
+    async def scene() -> None:
+        async with stage(home) as on:
+            async with on.program(token(home, "technician", "read:status")) as socket:
+                await ask(socket)
+                await hear(socket, "snapshot")
+                on.say("ropod_001", channels.EVENT, kind="x", text="y")
+                home.services.bus.publish(ServerChange("alarm", "ropod_001", {"id": "a"}))
+                on.status("ropod_001")
+                assert {m["kind"] for m in await heard_within(socket, 0.3)} == {"status"}
+            with pytest.raises(InvalidStatus):
+                await on.program(token(home, "technician", "read:data"))
+
+    asyncio.run(scene())
+
+
+def test_only_pages_of_this_server_get_in(home: House) -> None:
+    async def refused(on: Stage, headers: dict[str, str]) -> int:
+        with pytest.raises(InvalidStatus) as caught:
+            await on.program(headers)
+        return caught.value.response.status_code
+
+    async def scene() -> None:
+        async with stage(home) as on:
+            cookie = {"Cookie": f"{COOKIE}={on.session('admin')}"}
+            key = token(home, "technician", "read:status")
+            for headers in (
+                {**cookie, "Origin": "https://evil.example"},
+                {**cookie, "Origin": "null"},
+                cookie,
+                {**key, "Origin": URL},
+                {**key, **cookie},
+                {**key, **cookie, "Origin": URL},
+            ):
+                assert await refused(on, headers) == 403, headers
+            assert await refused(on, {"Origin": URL}) in (401, 403)
+            robot = f"Robot ropod_001:{home.keys['ropod_001']}"
+            assert await refused(on, {"Authorization": robot}) == 403
+            async with on.program(key) as socket:
+                await ask(socket)
+                await hear(socket, "snapshot")
+
+    asyncio.run(scene())
+
+
+def test_an_ended_session_closes_its_socket(home: House) -> None:
+    async def scene() -> None:
+        async with stage(home) as on, on.browser("viewer") as socket:
+            await ask(socket)
+            await hear(socket, "snapshot")
+            with home.services.database.begin() as connection:
+                revoke_sessions(connection, find_user(connection, "viewer").user_id)
+            home.services.bus.publish(ServerChange("account", data={"name": "viewer"}))
+            on.status("ropod_001", "error")
+            with pytest.raises(ConnectionClosed) as caught:
+                async with asyncio.timeout(PATIENCE_S):
+                    while True:
+                        await socket.recv()
+            assert caught.value.rcvd is not None and caught.value.rcvd.code == 4401
+
+    asyncio.run(scene())
+
+
+def test_a_session_that_runs_out_is_found_without_being_told(
+    home: House, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(feed_module, "CHECK_S", 0.1)
+
+    async def scene() -> None:
+        async with stage(home) as on, on.browser("viewer") as socket:
+            await ask(socket)
+            await hear(socket, "snapshot")
+            home.clock.advance(10 * 24 * 3600)
+            with pytest.raises(ConnectionClosed) as caught:
+                await hear(socket, "nothing")
+            assert caught.value.rcvd is not None and caught.value.rcvd.code == 4401
+
+    asyncio.run(scene())
+
+
+def test_a_robot_that_leaves_the_group_is_gone_from_the_next_snapshot(home: House) -> None:
+    async def scene() -> None:
+        async with stage(home) as on, on.browser("nurse") as socket:
+            await ask(socket)
+            await hear(socket, "snapshot")
+            with home.services.database.begin() as connection:
+                regroup_robot(connection, "ropod_002", ["kitchen"])
+            home.services.bus.publish(ServerChange("robot", "ropod_002"))
+            again = await hear(socket, "snapshot")
+            assert [card["robot"] for card in again["data"]["robots"]] == ["ropod_001"]
+
+    asyncio.run(scene())
+
+
+def test_who_comes_back_goes_on_where_it_was(home: House) -> None:
+    async def scene() -> None:
+        async with stage(home) as on:
+            async with on.browser("viewer") as socket:
+                await ask(socket)
+                number = (await hear(socket, "snapshot"))["number"]
+            on.status("ropod_001", "warn")
+            await asyncio.sleep(0.1)
+            async with on.browser("viewer") as socket:
+                await ask(socket, resume=number)
+                (missed,) = await heard_within(socket, 0.2)
+                assert missed["kind"] == "status"
+            for unknown in (number - 1, number + 1000, 5):
+                async with on.browser("viewer") as socket:
+                    await ask(socket, resume=unknown)
+                    (fresh,) = await heard_within(socket, 0.2)
+                    assert fresh["kind"] == "snapshot"
+
+    asyncio.run(scene())
+
+
+def test_a_slow_reader_is_told_what_it_missed_and_holds_nobody_up(
+    home: House, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("amberbox.server.live.feed.BEHIND_S", 0.3)
+
+    async def scene() -> None:
+        async with stage(home) as on, on.browser("viewer") as slow, on.browser("admin") as quick:
+            for socket in (slow, quick):
+                await ask(socket)
+                await hear(socket, "snapshot")
+            slow.transport.pause_reading()  # its window fills, then the server's buffer
+            latest = 0.0
+            for number in range(60):
+                on.status("ropod_001", "ok", reason=f"{number}" + "x" * 200_000)
+                began = asyncio.get_running_loop().time()
+                await hear(quick, "status")
+                latest = max(latest, asyncio.get_running_loop().time() - began)
+            assert latest < 1.0
+            slow.transport.resume_reading()
+            await hear(slow, "missed")
+            snapshot = await hear(slow, "snapshot")
+            assert snapshot["number"] == home.services.feed.ring.number
+
+    asyncio.run(scene())
+
+
+def test_what_cannot_be_understood_closes_the_socket(home: House) -> None:
+    async def scene() -> None:
+        many = {"live": {"ropod_001": ["x" * 600]}}
+        async with stage(home) as on:
+            for text in ("{", json.dumps({"kinds": ["laundry"]}), json.dumps(many), b"\x00"):
+                async with on.browser("viewer") as socket:
+                    await socket.send(text)
+                    with pytest.raises(ConnectionClosed) as caught:
+                        await hear(socket, "nothing")
+                    assert caught.value.rcvd is not None and caught.value.rcvd.code == 4400
+
+    asyncio.run(scene())
+
+
+def test_sockets_of_one_person_are_counted(home: House) -> None:
+    async def scene() -> None:
+        async with stage(home) as on:
+            opened = [await on.browser("viewer") for _ in range(MOST_EACH)]
+            with pytest.raises(InvalidStatus):
+                await on.browser("viewer")
+            async with on.browser("admin"):
+                pass
+            for socket in opened:
+                await socket.close()
+            await asyncio.sleep(0.05)
+            async with on.browser("viewer"):
+                pass
+
+    asyncio.run(scene())
+
+
+def test_live_values_are_asked_once_and_sent_to_those_who_look(home: House) -> None:
+    async def scene() -> None:
+        async with stage(home) as on, on.browser("viewer") as one, on.browser("admin") as other:
+            await ask(one, live={"ropod_001": ["odom/x"]})
+            await ask(other, live={"ropod_001": ["odom/y", "odom/x"]})
+            for socket in (one, other):
+                await hear(socket, "snapshot")
+            assert await _eventually_watched(home, "ropod_001") == ("odom/x", "odom/y")
+            values: dict[str, Any] = {"odom/x": (1, 1.5), "odom/y": (1, "up"), "secret": (1, 9.0)}
+            for _ in range(20):
+                home.services.bus.publish(ServerChange("live", "ropod_001", {"values": values}))
+                await asyncio.sleep(0.02)
+            found = [m for m in await heard_within(one, 0.3) if m["kind"] == "live"]
+            assert 1 <= len(found) <= 4
+            assert {name: v["value"] for name, v in found[0]["data"].items()} == {"odom/x": 1.5}
+            both = (await hear(other, "live"))["data"]
+            assert {name: v["value"] for name, v in both.items()} == {"odom/x": 1.5, "odom/y": "up"}
+            await other.close()
+            await asyncio.sleep(0.05)
+            assert await _eventually_watched(home, "ropod_001") == ("odom/x",)
+
+    asyncio.run(scene())
+
+
+def test_what_a_robot_says_cannot_break_the_feed(home: House) -> None:
+    async def scene() -> None:
+        async with stage(home) as on, on.browser("viewer") as socket:
+            await ask(socket)
+            await hear(socket, "snapshot")
+            on.say("ropod_001", channels.STATUS, component=["no", "text"])
+            on.say("ropod_001", channels.STATUS, component="big", since_ns=10**25, level="evil")
+            on.say("ropod_001", channels.STATUS, component="big", since_ns=2**63, level="evil")
+            on.say("ropod_001", channels.DIAGNOSIS, id=5)
+            on.status("ropod_001", "ok", component='"]}<script>')
+            found = [s for m in await heard_within(socket, 0.3) for s in m["data"]]
+            assert {s["component"] for s in found} == {"big", '"]}<script>'}
+            assert next(s for s in found if s["component"] == "big")["since"] is None
+
+    asyncio.run(scene())
+
+
+def test_the_ring_is_bounded_by_count_and_bytes() -> None:
+    ring = ChangeRing(1_000_000, held=10, held_bytes=10_000)
+    for number in range(50):
+        ring.add("event", "r", number, 0.0)
+    assert [delta.number for delta in ring.after(0)] == list(range(1041, 1051))
+    assert ring.holds(1040) and ring.holds(1050) and not ring.holds(1039) and not ring.holds(1051)
+    ring.add("event", "r", "x" * 9_800, 0.0)
+    assert len(list(ring.after(0))) < 4
+
+
+def test_a_robot_whose_past_cannot_be_read_ends_nothing(
+    home: House, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Damaged columns raise whatever the library that reads them thinks of."""
+    state, read = home.services.feed.state, list[str]()
+
+    def load(stores: RecordStores, robot: str) -> None:
+        read.append(robot)
+        raise KeyError(robot)
+
+    async def scene() -> None:
+        running = asyncio.create_task(state.run())
+        while len(read) < 3:
+            await asyncio.sleep(0.01)
+        running.cancel()
+        await asyncio.gather(running, return_exceptions=True)
+        assert running.cancelled()
+
+    monkeypatch.setattr(state.latest, "load", load)
+    asyncio.run(asyncio.wait_for(scene(), PATIENCE_S))
+    assert read == ["ropod_001", "ropod_002", "ropod_003"]
+
+
+def test_what_fails_in_the_feed_leaves_nothing_behind_that_goes_on(
+    home: House, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    feed = home.services.feed
+
+    async def fails() -> None:
+        raise KeyError
+
+    async def scene() -> int:
+        before = len(asyncio.all_tasks())
+        with pytest.raises(ExceptionGroup):
+            await feed.run()
+        return len(asyncio.all_tasks()) - before
+
+    monkeypatch.setattr(feed, "_lives", fails)
+    assert asyncio.run(asyncio.wait_for(scene(), PATIENCE_S)) == 0
+
+
+def test_a_record_that_is_too_long_to_look_at_is_passed_over() -> None:
+    assert (
+        decode_record(b'{"component":"x","reason":"%s"}' % (b"a" * LONGEST), StatusRecord) is None
+    )
+    assert (
+        decode_record(b'{"component":"x","reason":"%s"}' % (b"a" * 1000), StatusRecord) is not None
+    )
