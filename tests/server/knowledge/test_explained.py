@@ -65,6 +65,28 @@ def test_several_who_want_it_wait_for_the_same_one(home: House, worker: Worker) 
     assert explained.known("ropod_001", FOUND, {}) == {"id": sim.DIAGNOSIS}
 
 
+def test_nobody_waits_for_one_in_advance(
+    home: House, worker: Worker, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    explained, endless = home.services.explained, asyncio.Event()
+
+    async def wait(*_: Any, **__: Any) -> bytes:
+        await endless.wait()
+        return b"{}"
+
+    async def ask() -> object:
+        monkeypatch.setattr(home.services.robot_worker_pool, "ask", wait)
+        ahead = asyncio.create_task(explained.read("ropod_001", FOUND, {}, "ropod_001"))
+        await asyncio.sleep(0)
+        found = await asyncio.wait_for(
+            explained.read("ropod_001", FOUND, {}, "somebody"), PATIENCE_S
+        )
+        ahead.cancel()
+        return found
+
+    assert asyncio.run(ask()) == {"id": sim.DIAGNOSIS}
+
+
 def test_with_another_answer_it_is_another_question(home: House, worker: Worker) -> None:
     explained = home.services.explained
     asyncio.run(explained.read("ropod_001", FOUND, {"laser_front.lamp": "no"}, "somebody"))

@@ -88,6 +88,15 @@ def test_who_thinks_too_long_is_replaced(worker_pool: WorkerPool) -> None:
     assert worker_pool.ask_now(op("echo"), {"text": "again"}) == b"again"
 
 
+def test_a_patient_pool_waits_longer_than_the_limit(tmp_path: Path) -> None:
+    """What waits for the processor is no question that takes too long."""
+    worker_pool = WorkerPool(tmp_path, 1, program=PROGRAM, patience=200)
+    assert worker_pool.ask_now(op("echo"), {"text": "late", "wait_s": 0.5}, 0.3) == b"late"
+    with pytest.raises(LimitError, match="longer than 2 s"):
+        worker_pool.ask_now(op("spin"), {}, 0.01)
+    worker_pool.close()
+
+
 def test_who_takes_too_much_memory_is_replaced(worker_pool: WorkerPool) -> None:
     with pytest.raises(LimitError, match="more memory than 300 MB"):
         worker_pool.ask_now(op("hoard"), {}, memory_bytes=300 << 20)

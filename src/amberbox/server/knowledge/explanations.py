@@ -170,7 +170,7 @@ class Explained:
         self._robot_worker_pool = robot_worker_pool
         self._lock = threading.Lock()
         self._known: OrderedDict[Key, Answer] = OrderedDict()
-        self._asked: dict[Key, asyncio.Task[Answer]] = {}
+        self._asked: dict[tuple[Key, bool], asyncio.Task[Answer]] = {}  # whether in advance
         self._wanted: asyncio.Queue[tuple[str, str]] = asyncio.Queue()
 
     def known(self, robot: str, diagnosis: Diagnosis, answers: Mapping[str, str]) -> Answer | None:
@@ -183,22 +183,24 @@ class Explained:
     ) -> Answer:
         """Return the explanation; concurrent callers wait for the same computation.
 
+        People never wait for one in advance: its low priority may take long on a busy machine.
         Raises AmberboxError where there is none, such as without the robot's folder.
         """
         found = self.known(robot, diagnosis, answers)
         if found is not None:
             return found
         key = key_of(robot, diagnosis, answers)
-        task = self._asked.get(key)
+        shared = key, asker == robot
+        task = self._asked.get(shared)
         if task is None:
             task = asyncio.create_task(self._ask(key, answers, asker))
-            self._asked[key] = task
-            task.add_done_callback(partial(self._over, key))
+            self._asked[shared] = task
+            task.add_done_callback(partial(self._over, shared))
         return await asyncio.shield(task)
 
-    def _over(self, key: Key, task: asyncio.Task[Answer]) -> None:
+    def _over(self, shared: tuple[Key, bool], task: asyncio.Task[Answer]) -> None:
         """Forget a finished task; its exception goes to the callers that still wait for it."""
-        self._asked.pop(key, None)
+        self._asked.pop(shared, None)
         if not task.cancelled():
             task.exception()  # retrieved, so that asyncio does not log it without callers
 

@@ -109,10 +109,16 @@ _TASKS = 1000
 
 
 class WorkerProcess:
-    """A process that runs one task after another; replaced after it had to be killed."""
+    """A process that runs one task after another; replaced after it had to be killed.
 
-    def __init__(self, folder: Path, nice: int = 0, program: str = PROGRAM) -> None:
+    ``patience`` times a task's limit is how long it may take: the time it waits for others counts.
+    """
+
+    def __init__(
+        self, folder: Path, nice: int = 0, program: str = PROGRAM, patience: int = 1
+    ) -> None:
         self._command = [sys.executable, "-m", program, str(folder), str(nice)]
+        self._patience = patience
         self._process: subprocess.Popen[bytes] | None = None
         self._left = 0
 
@@ -181,7 +187,7 @@ class WorkerProcess:
         while True:
             if task.is_cancelled:
                 raise CancelledError("nobody waits for this answer any more")
-            limit_s = task.limit_s if task.step_s is None else task.step_s
+            limit_s = (task.limit_s if task.step_s is None else task.step_s) * self._patience
             if time.monotonic() > since_s + limit_s:
                 raise too_long(limit_s)
             if not poll.poll(_LOOK_S * 1000):
@@ -241,6 +247,7 @@ ANSWER_BYTES = 64 << 20
 
 _SPOOL_BYTES = 4 << 20
 _NICE = 5
+_PATIENCE = 4
 _WARM_S = 1.0
 _READY = "amberbox.server.data.worker:ready"
 
@@ -261,16 +268,17 @@ class WorkerPool:
     def for_robots(cls, folder: Path) -> WorkerPool:
         """Create a pool for what robots send, separate from the pool that answers people.
 
-        One robot occupies at most one worker.
+        One robot occupies at most one worker. On a busy machine these workers mostly wait for
+        others, so that a task may take four times its limit; its limit of CPU time stays.
         """
-        return cls(folder, nice=_NICE, at_once=1)
+        return cls(folder, nice=_NICE, at_once=1, patience=_PATIENCE)
 
     def __init__(
         self, folder: Path, count: int = 2, *, most: int = 32, each: int = 8, nice: int = 0,
-        program: str = PROGRAM, at_once: int | None = None,
+        program: str = PROGRAM, at_once: int | None = None, patience: int = 1,
     ) -> None:  # fmt: skip
         self._folder = folder
-        self._processes = [WorkerProcess(folder, nice, program) for _ in range(count)]
+        self._processes = [WorkerProcess(folder, nice, program, patience) for _ in range(count)]
         self._queue = FairQueue(most, each, at_once)
         self._threads: list[threading.Thread] = []
         self._lock = threading.Lock()
