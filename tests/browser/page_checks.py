@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 RESTART: Sequence[str] = (
     "WebSocket connection to", "ERR_CONNECTION_REFUSED", "ERR_CONNECTION_RESET",
-    "ERR_EMPTY_RESPONSE", "ERR_INCOMPLETE_CHUNKED_ENCODING",
+    "ERR_EMPTY_RESPONSE", "ERR_INCOMPLETE_CHUNKED_ENCODING", "ERR_CONTENT_LENGTH_MISMATCH",
 )  # fmt: skip
 """What a page's console may say while its server is restarted: give it as ``expects``."""
 _OWN = ("data:", "blob:", "about:")
