@@ -195,7 +195,7 @@ def _run_on_server(args: argparse.Namespace, action: str, name: str = "") -> Non
 def _server_json(alarm: AlarmLine) -> dict[str, Any]:
     """Return the published fields of an alarm in their order; the type of the client has more."""
     found = msgspec.to_builtins(alarm)
-    return dict(found)
+    return {key: found[key] for key in _SERVER_KEYS}
 
 
 def _change(fleet: Fleet, alarm: AlarmLine, action: str, args: argparse.Namespace) -> AlarmLine:
