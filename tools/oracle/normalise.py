@@ -32,6 +32,8 @@ FIELDS = (
           r"(?m)^(\w+ +(?:latency|write latency|disk \S+|file system|root file system|wear|memory|"
           r"python|versions?|clock|real-time clock|temperature|writing|sync\w*|boot\w*) .*)$",
           "<of this machine>", "what the doctor finds out about the disk and clock of the machine"),
+    Field("signing key", "*/store/key*", r"(?m)^[A-Za-z0-9+/]{40,}=*$", "<key>",
+          "each store makes a random key"),
     Field("doctor hint", "*doctor*", r"(?m)^ +hint: .*\n", "",
           "hints follow what was found on the machine"),
 )  # fmt: skip
