@@ -22,8 +22,8 @@ from amberbox.cli._arguments import (
 from amberbox.cli._output import print_grid, print_json, print_lines, print_notes, text_output
 from amberbox.cli.fmea import FOR_LOCAL_FOLDER, fmea_path, loaded
 from amberbox.client.address import is_url
-from amberbox.core.budget import Budget
 from amberbox.core.config import raise_errors
+from amberbox.core.contracts import Budget
 from amberbox.core.errors import UsageError
 from amberbox.core.timestamps import format_time
 from amberbox.diagnosis.faulttree.analysis import Analysis, Importance, NearCutSet, analyse

@@ -7,9 +7,9 @@ from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import Literal, TypeAlias, cast
 
-from amberbox.core.budget import Budget
 from amberbox.core.contracts import (
     AnsweredTest,
+    Budget,
     Conflict,
     EvidenceEngine,
     EvidenceFollower,

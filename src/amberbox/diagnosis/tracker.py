@@ -11,8 +11,8 @@ from typing import Any, Final, Literal, TypeAlias
 
 import msgspec
 
-from amberbox.core.budget import Budget
 from amberbox.core.clock import NS
+from amberbox.core.contracts import Budget
 from amberbox.core.errors import UsageError
 from amberbox.core.types import Batch, Diagnosis, FaultFacts, Symptom
 from amberbox.diagnosis.diagnose import DiagnosisId, Effort, ObservedSituation, answer, followers

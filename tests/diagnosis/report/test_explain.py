@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from amberbox.core.budget import Budget
+from amberbox.core.contracts import Budget
 from amberbox.core.types import Diagnosis, Hypothesis
 from amberbox.core.types import Test as Proposed
 from amberbox.diagnosis.covering.hypotheses import diagnose

@@ -6,9 +6,15 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from amberbox.core.budget import Budget
 from amberbox.core.config import raise_errors
-from amberbox.core.contracts import Conflict, EvidenceItem, EvidenceNeeds, EvidenceWindow, Finding
+from amberbox.core.contracts import (
+    Budget,
+    Conflict,
+    EvidenceItem,
+    EvidenceNeeds,
+    EvidenceWindow,
+    Finding,
+)
 from amberbox.core.errors import ConfigurationError, UsageError
 from amberbox.core.types import Diagnosis, Hypothesis, Symptom
 from amberbox.diagnosis.diagnose import (

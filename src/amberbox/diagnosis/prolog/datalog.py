@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from functools import cmp_to_key
 from typing import Any, TypeAlias
 
-from amberbox.core.budget import Budget
+from amberbox.core.contracts import Budget
 from amberbox.diagnosis.prolog.builtins import TESTS
 from amberbox.diagnosis.prolog.compiler import FIXED, compile_clause
 from amberbox.diagnosis.prolog.machine import (

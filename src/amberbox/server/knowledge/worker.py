@@ -24,9 +24,8 @@ from amberbox.blackbox.retention.missions import RecordedMission
 from amberbox.consult.context import RobotWindow, context_from_findings
 from amberbox.consult.folder_knowledge import DeclaredRobot, read_declared_robot
 from amberbox.consult.rule_lookups import record_predicates
-from amberbox.core.budget import Budget
 from amberbox.core.config import raise_errors
-from amberbox.core.contracts import GivenEvidence, Span
+from amberbox.core.contracts import Budget, GivenEvidence, Span
 from amberbox.core.errors import AmberboxError, UsageError
 from amberbox.core.names import component_id
 from amberbox.core.timestamps import format_time, ordered_span, parse_time
