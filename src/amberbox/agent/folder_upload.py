@@ -68,7 +68,7 @@ def masked(files: Mapping[str, bytes], known: Collection[str] = ()) -> dict[str,
         if text is None:
             continue
         found.update(_passwords(text))
-        done = _yaml(name, text, plugins, found) if _is_yaml(name) else _plain(text)
+        done = _yaml(name, text, plugins, found) if _is_yaml(name) else mask_text(text)
         if done is not None:
             texts[name] = done
     cleared = {name: _cleared(name, text, found) for name, text in texts.items()}
@@ -82,7 +82,7 @@ def _cleared(name: str, text: str, found: set[str]) -> str | None:
     for secret in sorted(found, key=len, reverse=True):
         if len(secret) >= _LEAST:
             text = text.replace(secret, WORD)
-    text = _by_form(text)
+    text = mask_by_form(text)
     return text if not _is_yaml(name) or _parsed(name, text) is not None else None
 
 
@@ -154,9 +154,9 @@ def _in_gap(text: str, start: int, end: int) -> Iterator[tuple[int, int]]:
         yield sign, start
 
 
-def _plain(text: str) -> str:
+def mask_text(text: str) -> str:
     """Mask values after a secret-sounding word: ``password: ...``, ``<token>...``."""
-    return _SAID.sub(lambda match: match[1] + _quoted_as(match[2]), _elements(text))
+    return _SAID.sub(lambda match: match[1] + mask_quoted(match[2]), _elements(text))
 
 
 def _elements(text: str) -> str:
@@ -175,12 +175,13 @@ def _elements(text: str) -> str:
     return "".join([*parts, text[at:]])
 
 
-def _quoted_as(written: str) -> str:
+def mask_quoted(written: str) -> str:
+    """Return the mask of a value in the quotes that the value was written with."""
     quote = written[0] if written[0] in "\"'" else ""
     return f"{quote}{WORD}{quote}"
 
 
-def _by_form(text: str) -> str:
+def mask_by_form(text: str) -> str:
     """Mask secrets by their form: keys, users and passwords in URLs."""
     text = _PEM.sub(WORD, text)
     text = LOOKS_LIKE_ONE.sub(WORD, text)

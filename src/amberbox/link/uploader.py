@@ -374,7 +374,7 @@ class JournalCopier:
         """Send a journal, or its rest; return the server's verdict, None if the file is gone."""
         path = self.store.journal_path(name)
         try:
-            about = _about(path)
+            about = upload_headers(path)
         except FileNotFoundError:
             return None
         proof = proof_of(self.store.path, name) or Proof()
@@ -438,7 +438,7 @@ def _lost_text(host: str, names: Sequence[str]) -> str:
     return f"{host} lacks {count} that it had confirmed: copied again ({which})"
 
 
-def _about(path: Path) -> dict[str, str]:
+def upload_headers(path: Path) -> dict[str, str]:
     """Return the headers that identify a file: its size and hash."""
     digest, size = hashlib.sha256(), 0
     with path.open("rb") as file:

@@ -144,7 +144,7 @@ def write_bag(job: ExportJob) -> None:
     conversions = {stream: _conversion(job, stream) for stream in originals.streams}
     if not any(conversions.values()):
         raise AmberboxError("none of these items can be in a ROS 1 bag", job.report.missing[0])
-    with new_file(job.path) as part, _writer(part, job.options.compression) as writer:
+    with new_file(job.path) as part, bag_writer(part, job.options.compression) as writer:
         output = _BagFile(job, writer, conversions)
         for messages in originals.blocks:
             output.write(messages)
@@ -153,7 +153,8 @@ def write_bag(job: ExportJob) -> None:
     job.report.bytes = size_of(job.path)
 
 
-def _writer(path: Path, compression: str) -> Writer:
+def bag_writer(path: Path, compression: str) -> Writer:
+    """Return a writer of a bag that keeps little of the chunks it has written."""
     from rosbags.rosbag1 import Writer as BagWriter
     from rosbags.rosbag1.writer import WriteChunk
 

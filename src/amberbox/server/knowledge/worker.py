@@ -59,7 +59,7 @@ from amberbox.monitoring.plan import Expectation, ModePlan, MonitoringPlan, meas
 from amberbox.server.archive.catalogue import ArchiveCatalogue
 from amberbox.server.archive.folder import FolderArchive
 from amberbox.server.archive.record import ArchiveRecord
-from amberbox.server.data.missions import _Stores, missions
+from amberbox.server.data.missions import OpenedStores, missions
 from amberbox.server.data.snapshot import open_catalogue
 from amberbox.server.database import ServerDatabase
 from amberbox.server.derived import MOST, derived_records
@@ -142,7 +142,7 @@ def fault_trees(folder: Path, arguments: dict[str, Any]) -> Any:
     return _trees(folder, _stores(folder), decode_question(arguments, AskTrees))
 
 
-def _trees(folder: Path, stores: _Stores, asked: AskTrees) -> dict[str, Any]:
+def _trees(folder: Path, stores: OpenedStores, asked: AskTrees) -> dict[str, Any]:
     then = evidence_at(stores, asked.robot, asked.at, asked.now_ns)
     subject, notes = folder_at(
         folder,
@@ -228,7 +228,7 @@ def rules(folder: Path, arguments: dict[str, Any]) -> Any:
     return {**about, **found.to_json(), "notes": [*notes, *told]}
 
 
-def _not_looked_at(stores: _Stores, asked: AskRules, files: Iterable[Path]) -> list[str]:
+def _not_looked_at(stores: OpenedStores, asked: AskRules, files: Iterable[Path]) -> list[str]:
     """Return notes on journals that conditions cannot read yet because no table holds them."""
     catalogue = ArchiveCatalogue(stores.database)
     waiting = sum(row.robot == asked.robot for row in catalogue.waiting())
@@ -249,12 +249,12 @@ def failure_modes(folder: Path, arguments: dict[str, Any]) -> Any:
     return sorted(subject.faults().modes)
 
 
-def _stores(folder: Path) -> _Stores:
+def _stores(folder: Path) -> OpenedStores:
     database = open_catalogue(folder).database
-    return _Stores(database, FolderArchive(folder, database))
+    return OpenedStores(database, FolderArchive(folder, database))
 
 
-def _said(stores: _Stores, asked: RobotQuestion) -> str:
+def _said(stores: OpenedStores, asked: RobotQuestion) -> str:
     """Return the hash of the folder that the watcher used at the time asked for, or empty."""
     return evidence_at(stores, asked.robot, asked.at, asked.now_ns).config_hash if asked.at else ""
 
@@ -340,7 +340,7 @@ _Run = tuple[str, int]
 
 
 def open_window(
-    stores: _Stores, robot: str, from_ns: int | None, to_ns: int | None
+    stores: OpenedStores, robot: str, from_ns: int | None, to_ns: int | None
 ) -> ServerWindow:
     """Open a window of a robot's record on the server."""
     record = stores.archive.robot(robot)
@@ -352,7 +352,7 @@ class ServerWindow(RecordWindow):
     """A window of a robot's record, read from the server's stores."""
 
     record: ArchiveRecord
-    stores: _Stores
+    stores: OpenedStores
     robot: str
 
     def rows(self, topic: str, names: Sequence[str], span: Span) -> Iterable[Mapping[str, Any]]:
@@ -435,7 +435,7 @@ def _state(expected: Expectation, value: Output, status: Status) -> SymptomState
     return "absent" if is_good or status.level == "ok" else "present"
 
 
-def answer_diagnosis(folder: Path, stores: _Stores, asked: AskDiagnosis) -> dict[str, Any]:
+def answer_diagnosis(folder: Path, stores: OpenedStores, asked: AskDiagnosis) -> dict[str, Any]:
     """Return the answer as ``amberbox diagnose --json`` gives it, with ``notes``."""
     then = _moment(stores, asked)
     subject, notes = folder_at(
@@ -459,7 +459,7 @@ def answer_diagnosis(folder: Path, stores: _Stores, asked: AskDiagnosis) -> dict
     return {**answer, "engine": asked.engine, "notes": [*then.notes, *notes, *left_out]}
 
 
-def _moment(stores: _Stores, asked: AskDiagnosis) -> EvidenceMoment:
+def _moment(stores: OpenedStores, asked: AskDiagnosis) -> EvidenceMoment:
     """Return the evidence at the time asked for.
 
     For an earlier diagnosis without a time, that is the time of its chosen or last revision.
