@@ -48,7 +48,7 @@ _QUERY = re.compile(
     rf"([?&]{secret_word_pattern(f'(?:{SOUNDS_SECRET}|key|sig)')}=)[^&\s#'\"<>]+", re.IGNORECASE
 )
 _PEM = re.compile(r"-----BEGIN [A-Z ]*PRIVATE KEY-----.*?(?:-----END [A-Z ]*-----|\Z)", re.DOTALL)
-_SAID = re.compile(
+_NAMED_VALUE = re.compile(
     rf"(\b{secret_word_pattern(SOUNDS_SECRET)}[\"']?\s*(?:[:=]|\bis\b)\s*)(\"[^\"]*\"|'[^']*'|[^\s\"'<>,;]+)",
     re.IGNORECASE,
 )
@@ -130,9 +130,9 @@ def _without_comments(text: str, known: Collection[str]) -> str:
     """Remove comments beside masked values, and those that sound secret or hold a secret."""
     for start, end in reversed(list(_comments(text))):
         line = text[text.rfind("\n", 0, start) + 1 : start]
-        said = text[start:end]
-        holds = any(s in said for s in known if len(s) >= _LEAST_IN_COMMENTS)
-        if MASK in line or holds or sounds_secret(said):
+        comment = text[start:end]
+        holds = any(s in comment for s in known if len(s) >= _LEAST_IN_COMMENTS)
+        if MASK in line or holds or sounds_secret(comment):
             before = text[:start].rstrip(" ") if line.strip() else f"{text[:start]}#"
             text = before + text[end:]
     return text
@@ -156,7 +156,7 @@ def _in_gap(text: str, start: int, end: int) -> Iterator[tuple[int, int]]:
 
 def mask_text(text: str) -> str:
     """Mask values after a secret-sounding word: ``password: ...``, ``<token>...``."""
-    return _SAID.sub(lambda match: match[1] + mask_quoted(match[2]), _elements(text))
+    return _NAMED_VALUE.sub(lambda match: match[1] + mask_quoted(match[2]), _elements(text))
 
 
 def _elements(text: str) -> str:

@@ -425,12 +425,12 @@ def run_fetch(args: argparse.Namespace) -> int:
 
 def _wait_for_fetch(fleet: Fleet, robot: str, asked: Fetch) -> Fetch:
     """Wait until a fetch is over; Ctrl-C ends the waiting, not the request."""
-    said = ""
+    shown = ""
     while not asked.is_over:
         state = f"{asked.state}, {asked.copied} of {len(asked.journals)} journals"
-        if state != said:
+        if state != shown:
             print_notes([state])
-            said = state
+            shown = state
         time.sleep(_FETCH_POLL_S)
         asked = fleet.fetched(robot, asked.id)
     return asked

@@ -402,8 +402,8 @@ def _server_tree_lines(found: Mapping[str, Any], *, importance: bool) -> Iterato
     if importance and found["importance"]:
         yield ""
         for event, factors in found["importance"].items():
-            told = (f"{k.upper()} {'-' if v is None else f'{v:.6g}'}" for k, v in factors.items())
-            yield f"{event}: {', '.join(told)}"
+            values = (f"{k.upper()} {'-' if v is None else f'{v:.6g}'}" for k, v in factors.items())
+            yield f"{event}: {', '.join(values)}"
 
 
 def _server_closest_lines(found: Mapping[str, Any], count: int) -> Iterator[str]:
@@ -413,5 +413,5 @@ def _server_closest_lines(found: Mapping[str, Any], count: int) -> Iterator[str]
         yield f"\n{effect['effect']}"
         for near in effect["closest"][:count]:
             parts = (("happened", near["happened"]), ("missing", near["missing"]))
-            told = (f"{what}: {', '.join(events)}" for what, events in parts if events)
-            yield f"  {near['probability']:.3g}  {'; '.join(told)}"
+            shown = (f"{what}: {', '.join(events)}" for what, events in parts if events)
+            yield f"  {near['probability']:.3g}  {'; '.join(shown)}"

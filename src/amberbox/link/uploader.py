@@ -107,33 +107,33 @@ class FetchRequests:
             requests = list(self._open.values())
         if again:
             self._write(requests)
-        said = manifest.read(self._store.path)
+        known = manifest.read(self._store.path)
         wanted: set[str] = set()
         for request in requests:
-            files = self._find(request, said, is_news=request.id in again)
+            files = self._find(request, known, is_news=request.id in again)
             wanted |= {name for name, _ in files}
-            if self._is_done(request, files, said):
+            if self._is_done(request, files, known):
                 self._close(request)
         self.journals = frozenset(wanted)
 
     def _find(
-        self, request: FetchRequest, said: Manifest, *, is_news: bool
+        self, request: FetchRequest, known: Manifest, *, is_news: bool
     ) -> tuple[tuple[str, int], ...]:
-        files = tuple(journals_of(self._store, request, said))
-        told = {name for name, _ in self._answered.get(request.id, ())}
-        if is_news or {name for name, _ in files} != told:
+        files = tuple(journals_of(self._store, request, known))
+        answered = {name for name, _ in self._answered.get(request.id, ())}
+        if is_news or {name for name, _ in files} != answered:
             self._answered[request.id] = files
             self._answer(FetchAnswer(request.id, files))
         return files
 
     def _is_done(
-        self, request: FetchRequest, files: tuple[tuple[str, int], ...], said: Manifest
+        self, request: FetchRequest, files: tuple[tuple[str, int], ...], known: Manifest
     ) -> bool:
         """Return whether the window has passed and all of its journals are copied or refused."""
         if request.to_ns + _MARGIN_NS > self._wall_ns() and is_locked(self._store, "main"):
             return False
         return all(
-            (name in said.confirmed and not self._lacks(name)) or self._is_settled(name)
+            (name in known.confirmed and not self._lacks(name)) or self._is_settled(name)
             for name, _ in files
         )
 
@@ -150,21 +150,21 @@ class FetchRequests:
         replace_file(self._store.path / REQUESTS_FILE, msgspec.json.encode(requests).decode())
 
 
-def journals_of(store: Store, request: FetchRequest, said: Manifest) -> Iterator[tuple[str, int]]:
+def journals_of(store: Store, request: FetchRequest, known: Manifest) -> Iterator[tuple[str, int]]:
     """Yield the journals (name and bytes) that may hold rows of a window, open ones included."""
     item = request.item.partition("__")[0]
     for writer in _WRITERS:
         for path in store.journal_files(writer):
             name = f"{path.parent.name}/{path.name}"
-            span = _span(path, name, said)
+            span = _span(path, name, known)
             meets = span is not None and span[0] <= request.to_ns and span[1] >= request.from_ns
             if meets and (not item or item in _items(path, name)):
                 yield name, size_of(path)
 
 
-def _span(path: Path, name: str, said: Manifest) -> tuple[int, int] | None:
+def _span(path: Path, name: str, known: Manifest) -> tuple[int, int] | None:
     """Return the receive times that a journal covers, with a margin; None without rows."""
-    sealed = said.sealed.get(name)
+    sealed = known.sealed.get(name)
     if sealed is not None:
         return sealed.start_ns - _MARGIN_NS, sealed.end_ns + _MARGIN_NS
     found = extent(path)

@@ -154,11 +154,11 @@ def run(
         services.demo = demo
         try:
             code = _prepared(services, new_code=new_code)
-            told = LifecycleHooks(
+            hooks = LifecycleHooks(
                 ready=lambda _: begun(StartedServer(settings, code, renewed)),
                 stopping=(lambda: None) if demo is None else demo.end,
             )
-            asyncio.run(process.serve(services, port, told))
+            asyncio.run(process.serve(services, port, hooks))
         finally:
             port.close()
             process.close(services)

@@ -182,8 +182,8 @@ def configuration(subject: ExaminedRobot, host: HostSystem) -> Iterator[DoctorFi
         yield error("configuration", "black_box.yaml names no source that can be recorded",
                     "amberbox plugins lists the sources")  # fmt: skip
         return
-    told = f"; {notes} note{'s' * (notes > 1)}: amberbox check {subject.path}" if notes else ""
-    yield ok("configuration", f"listens to {names}{told}")
+    remark = f"; {notes} note{'s' * (notes > 1)}: amberbox check {subject.path}" if notes else ""
+    yield ok("configuration", f"listens to {names}{remark}")
 
 
 def passivity(subject: ExaminedRobot, host: HostSystem) -> Iterator[DoctorFinding]:
@@ -199,11 +199,11 @@ def passivity(subject: ExaminedRobot, host: HostSystem) -> Iterator[DoctorFindin
 
 def _passive(block: SourceBlock) -> DoctorFinding:
     check = f"source {block.name}"
-    said: Any = getattr(get(SOURCES, block.plugin).load(), "PASSIVE", "")
-    if not said:
+    passivity: Any = getattr(get(SOURCES, block.plugin).load(), "PASSIVE", "")
+    if not passivity:
         hint = "ask its author; a source of Amberbox says so in PASSIVE"
         return warn(check, "does not say why it would not disturb the robot", hint)
-    return ok(check, str(said).format(config=block.config))
+    return ok(check, str(passivity).format(config=block.config))
 
 
 Check: TypeAlias = Callable[[ExaminedRobot, HostSystem], Iterable[DoctorFinding]]

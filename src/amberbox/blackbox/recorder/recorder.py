@@ -259,13 +259,13 @@ class RetentionProcess:
             return
         self._not_before = now + _PAUSE_S
         if self._process is not None:
-            self._tell(f"ended with status {self._process.returncode}")
+            self._report(f"ended with status {self._process.returncode}")
         try:
             self._process = subprocess.Popen(self._command, stdin=subprocess.DEVNULL)
         except OSError as error:
-            self._tell(f"cannot be started: {error.strerror}")
+            self._report(f"cannot be started: {error.strerror}")
 
-    def _tell(self, trouble: str) -> None:
+    def _report(self, trouble: str) -> None:
         """Emit an event once per trouble; recording goes on without segments."""
         if trouble != self._trouble:
             self._trouble = trouble

@@ -225,9 +225,9 @@ class IncidentService:
         with pin_lock(self._store):
             now = {other.id: other for other in load_all(self._store)}.get(incident.id)
             if now is not None:
-                told = incident.state if now.reasons == incident.reasons else ""
-                held = held if told else held_bytes(self._store, [now])
-                save(self._store, replace(now, told=told, bytes=held))
+                reported = incident.state if now.reasons == incident.reasons else ""
+                held = held if reported else held_bytes(self._store, [now])
+                save(self._store, replace(now, told=reported, bytes=held))
 
     def _damage(self) -> Iterator[ChannelValues]:
         for path in damaged_files(self._store):

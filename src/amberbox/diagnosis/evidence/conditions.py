@@ -81,14 +81,14 @@ class AddressColumns:
         self._by_item: dict[str, list[AddressColumn]] = {}
         self._by_mode: dict[tuple[str, str], list[tuple[str, Samples]]] = {}
         for address in addresses:
-            said = of_monitors(address)
-            if said is None:
+            monitored = of_monitors(address)
+            if monitored is None:
                 column = self.of_record[address] = AddressColumn.of(address)
                 self._by_item.setdefault(column.item, []).append(column)
             else:
-                self._add_said(address, *said)
+                self._add_monitored(address, *monitored)
 
-    def _add_said(self, address: str, component: str, mode: str, output: str = "") -> None:
+    def _add_monitored(self, address: str, component: str, mode: str, output: str = "") -> None:
         """Add an output, or where none is named a status."""
         samples = self.of_monitors[address] = Samples()
         self._by_mode.setdefault((component, mode), []).append((output, samples))

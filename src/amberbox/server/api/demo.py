@@ -74,9 +74,9 @@ def repair(demo: InDemo, fleet: Fleet, who: Who, robot: OfRobot) -> DemoView:
 def _noted(
     fleet: Services, who: Caller, demo: Demonstration, robot: str, done: tuple[str, dict[str, str]]
 ) -> DemoView:
-    action, told = done
+    action, details = done
     with fleet.database.begin() as connection:
-        who.note(connection, fleet.clock.wall_ns(), action, robot, details=told)
+        who.note(connection, fleet.clock.wall_ns(), action, robot, details=details)
     return _view(fleet, who, demo)
 
 

@@ -197,7 +197,7 @@ SETTING = "downloads"
 OP = "amberbox.server.data.worker_downloads:make"
 
 _LOOK_S = 60.0
-_TELL_S = 1.0
+_REPORT_S = 1.0
 _NICE = 10
 _MEMORY_BYTES = 2 << 30
 
@@ -282,17 +282,17 @@ class DownloadService:
         options = await asyncio.to_thread(
             self._read, lambda connection: read(connection, SETTING, Downloads)
         )
-        made, told_s = DownloadProgress(0.0), 0.0
+        made, reported_s = DownloadProgress(0.0), 0.0
 
         def receive(part: bytes) -> None:
             """Receive the worker's progress, in the pool's thread; publish it at most once a
             second.
             """
-            nonlocal made, told_s
+            nonlocal made, reported_s
             made = msgspec.json.decode(part, type=DownloadProgress)
-            if time.monotonic() - told_s < _TELL_S:
+            if time.monotonic() - reported_s < _REPORT_S:
                 return
-            told_s = time.monotonic()
+            reported_s = time.monotonic()
             with self._database.begin() as connection:
                 change(connection, job.id, only=["running"], progress=made.progress)
             self._publish(job)

@@ -121,7 +121,7 @@ def fmea(folder: Path, arguments: dict[str, Any]) -> Any:
     asked = decode_question(arguments, RobotQuestion)
     stores = _stores(folder)
     subject, notes = folder_at(
-        folder, stores.database, asked.robot, asked.config_hash, _said(stores, asked)
+        folder, stores.database, asked.robot, asked.config_hash, _watched_hash(stores, asked)
     )
     found = subject.faults()
     return {
@@ -161,7 +161,7 @@ def _trees(folder: Path, stores: OpenedStores, asked: AskTrees) -> dict[str, Any
         if one
         else effects_json(known, solved, asked.exposure_h)
     )
-    standing = _standing(then.said.diagnoses)
+    standing = _standing(then.findings.diagnoses)
     closest = closest_json(known, then.at_ns, standing, outlooks(solved, standing, _CLOSEST))
     about = {"robot": asked.robot, "config_hash": subject.folder.config_hash}
     return {
@@ -194,8 +194,8 @@ def one_tree(folder: Path, arguments: dict[str, Any]) -> Any:
     words.
     """
     asked, stores = decode_question(arguments, AskTrees), _stores(folder)
-    said = _said(stores, asked)
-    subject, _ = folder_at(folder, stores.database, asked.robot, asked.config_hash, said)
+    folder_hash = _watched_hash(stores, asked)
+    subject, _ = folder_at(folder, stores.database, asked.robot, asked.config_hash, folder_hash)
     known = subject.faults()
     every, names = _effects(known, ""), FaultNames(known)
     chosen = asked.effect or next(iter(every), "")
@@ -223,9 +223,9 @@ def rules(folder: Path, arguments: dict[str, Any]) -> Any:
     budget = Budget(steps=asked.steps or Budget().steps, is_over=_ends(asked.seconds))
     found = ask(program, asked.query, budget, asked.want or None)
     about = {"robot": asked.robot, "config_hash": subject.folder.config_hash}
-    told = [str(note) for note in program.notes]
-    told += _not_looked_at(stores, asked, subject.rules())
-    return {**about, **found.to_json(), "notes": [*notes, *told]}
+    more_notes = [str(note) for note in program.notes]
+    more_notes += _not_looked_at(stores, asked, subject.rules())
+    return {**about, **found.to_json(), "notes": [*notes, *more_notes]}
 
 
 def _not_looked_at(stores: OpenedStores, asked: AskRules, files: Iterable[Path]) -> list[str]:
@@ -244,7 +244,7 @@ def failure_modes(folder: Path, arguments: dict[str, Any]) -> Any:
     """Return the ids of all failure modes in a robot's folder at a time."""
     asked, stores = decode_question(arguments, RobotQuestion), _stores(folder)
     subject, _ = folder_at(
-        folder, stores.database, asked.robot, asked.config_hash, _said(stores, asked)
+        folder, stores.database, asked.robot, asked.config_hash, _watched_hash(stores, asked)
     )
     return sorted(subject.faults().modes)
 
@@ -254,7 +254,7 @@ def _stores(folder: Path) -> OpenedStores:
     return OpenedStores(database, FolderArchive(folder, database))
 
 
-def _said(stores: OpenedStores, asked: RobotQuestion) -> str:
+def _watched_hash(stores: OpenedStores, asked: RobotQuestion) -> str:
     """Return the hash of the folder that the watcher used at the time asked for, or empty."""
     return evidence_at(stores, asked.robot, asked.at, asked.now_ns).config_hash if asked.at else ""
 
@@ -285,22 +285,22 @@ _SHOWN = 12
 
 
 def folder_at(
-    folder: Path, database: ServerDatabase, robot: str, wanted: str, said: str
+    folder: Path, database: ServerDatabase, robot: str, wanted: str, watched: str
 ) -> tuple[DeclaredRobot, tuple[str, ...]]:
     """Return what a robot's folder declares, and notes about which folder it is.
 
-    ``wanted`` is the hash that the caller asks for, ``said`` the one that the robot's watcher used
-    at the time; without either it is the folder that the robot stated last. Raises UsageError if
-    the server has no such folder: another one would describe other monitors than those that ran.
+    ``wanted`` is the hash that the caller asks for, ``watched`` the one that the robot's watcher
+    used at the time; without either it is the folder that the robot stated last. Raises UsageError
+    if the server has no such folder: another one would describe other monitors than those that ran.
     """
-    shelf, config_hash = FolderStore(folder), wanted or said or _stated(database, robot)
+    shelf, config_hash = FolderStore(folder), wanted or watched or _stated(database, robot)
     place = shelf.place(robot, config_hash) if config_hash else None
     if place is None or not place.is_dir():
         raise _not_here(database, robot, config_hash)
     found = _read(place, robot, config_hash)
-    if not said or said == config_hash:
+    if not watched or watched == config_hash:
         return found, ()
-    return found, (f"its watcher had the folder {said[:_SHOWN]} then, not this one",)
+    return found, (f"its watcher had the folder {watched[:_SHOWN]} then, not this one",)
 
 
 @lru_cache(maxsize=4)
@@ -477,8 +477,8 @@ def _moment(stores: OpenedStores, asked: AskDiagnosis) -> EvidenceMoment:
 
 def _case(knowledge: Knowledge, subject: DeclaredRobot, then: EvidenceMoment) -> DiagnosisContext:
     """Return the context from the watcher's findings, else from its statuses alone."""
-    said = _known(knowledge, then.said)  # the CLI does not filter the watcher's symptoms
-    case = context_from_findings(knowledge, said, then.at_ns)
+    findings = _known(knowledge, then.findings)  # the CLI does not filter the watcher's symptoms
+    case = context_from_findings(knowledge, findings, then.at_ns)
     if case is not None:
         return replace(case, origin="watcher")
     symptoms = tuple(status_symptoms(subject.plan, then.statuses))
@@ -509,10 +509,10 @@ def _as_revised(case: DiagnosisContext) -> DiagnosisContext:
     return replace(case, situation=replace(case.situation, symptoms=(*there, *rest)))
 
 
-def _known(knowledge: Knowledge, said: RecordedFindings) -> RecordedFindings:
+def _known(knowledge: Knowledge, findings: RecordedFindings) -> RecordedFindings:
     """Return the findings without symptoms that this folder's FMEA does not know."""
     names = knowledge.fmea.symptoms
-    return RecordedFindings([s for s in said.symptoms if s.id in names], said.diagnoses)
+    return RecordedFindings([s for s in findings.symptoms if s.id in names], findings.diagnoses)
 
 
 def _texts(given: dict[str, Any]) -> list[str]:

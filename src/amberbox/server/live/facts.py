@@ -130,7 +130,7 @@ class FactsCache:
         arguments = {"robot": robot, "config_hash": config_hash}
         key = robot, config_hash
         try:
-            answer = self._worker_pool.ask_now(OP, arguments, _LIMIT_S, _MEMORY_BYTES, asker=robot)
+            answer = self._worker_pool.ask_now(OP, arguments, _LIMIT_S, _MEMORY_BYTES, origin=robot)
             found = msgspec.json.decode(answer, type=FolderFacts)
         except BusyError as error:
             return _unread(error)

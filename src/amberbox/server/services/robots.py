@@ -78,7 +78,7 @@ def timeline(
     inside = _by_lane(_transitions(found), component)
     behind = derived_records(stores, robot, channels.EVENT, (span[1], None), _BEHIND)
     after = _by_lane(_transitions(behind), component)
-    now = {(s.said.component, s.said.mode): s for s in standing}
+    now = {(s.record.component, s.record.mode): s for s in standing}
     lanes = sorted(
         lane for lane in {*inside, *after, *now} if not component or lane[0] == component
     )
@@ -118,18 +118,20 @@ def _transitions(found: Iterable[DerivedRecord]) -> Iterable[tuple[int, Transiti
     for entry in found:
         event = convert_record(entry.values, EventRecord)
         if event is not None and event.kind == COMPONENT_STATE:
-            said = decode_record(event.details, TransitionRecord)
-            if said is not None:
-                yield said.at_ns or entry.at_ns, said
+            transition = decode_record(event.details, TransitionRecord)
+            if transition is not None:
+                yield transition.at_ns or entry.at_ns, transition
 
 
 def _by_lane(
     transitions: Iterable[tuple[int, TransitionRecord]], component: str
 ) -> Mapping[tuple[str, str], list[tuple[int, TransitionRecord]]]:
     found: dict[tuple[str, str], list[tuple[int, TransitionRecord]]] = {}
-    for at_ns, said in transitions:
-        if not component or said.component == component:
-            found.setdefault((said.component, said.mode), []).append((at_ns, said))
+    for at_ns, transition in transitions:
+        if not component or transition.component == component:
+            found.setdefault((transition.component, transition.mode), []).append(
+                (at_ns, transition)
+            )
     return found
 
 
@@ -144,17 +146,17 @@ def _intervals(
     found: list[TimelineInterval] = []
     since_ns, condition, reason = from_ns, _before(inside, after), ""
     if condition is None:
-        if now is None or now.said.since_ns >= to_ns:
+        if now is None or now.record.since_ns >= to_ns:
             return []
-        since_ns, reason = max(from_ns, now.said.since_ns), now.said.reason
-        condition = ConditionRecord(now.said.level, now.said.state)
-    for at_ns, said in inside:
+        since_ns, reason = max(from_ns, now.record.since_ns), now.record.reason
+        condition = ConditionRecord(now.record.level, now.record.state)
+    for at_ns, transition in inside:
         cut_ns = min(max(at_ns, since_ns), to_ns)
         if cut_ns > since_ns:
             found.append(
                 TimelineInterval(since_ns, cut_ns, condition.level, condition.state, reason)
             )
-        since_ns, condition, reason = cut_ns, said.after, said.reason
+        since_ns, condition, reason = cut_ns, transition.after, transition.reason
     if to_ns > since_ns:
         found.append(TimelineInterval(since_ns, to_ns, condition.level, condition.state, reason))
     return found
@@ -163,7 +165,7 @@ def _intervals(
 def _before(
     inside: Sequence[tuple[int, TransitionRecord]], after: Sequence[tuple[int, TransitionRecord]]
 ) -> ConditionRecord | None:
-    return next((said.before for _, said in (*inside[:1], *after[:1])), None)
+    return next((transition.before for _, transition in (*inside[:1], *after[:1])), None)
 
 
 def timeline_of(found: ComponentTimeline, span: tuple[int, int]) -> Timeline:
@@ -246,7 +248,7 @@ def read_timeline(
         raise UsageError("the window ends before it begins")
     with fleet.database.reading() as connection:
         standing = retained_statuses(connection, [robot.id]).get(robot.id, [])
-    known = {one.said.component for one in standing}
+    known = {one.record.component for one in standing}
     if component and ids_ending_in(component, known):
         component = component_id(component, known)
     span = (from_ns, to_ns)
@@ -290,16 +292,16 @@ def _cards(fleet: Services, connection: Connection, robots: Sequence[KnownRobot]
 
 
 def _event(entry: DerivedRecord) -> Event | None:
-    said = convert_record(entry.values, EventRecord)
-    if said is None:
+    event = convert_record(entry.values, EventRecord)
+    if event is None:
         return None
     return Event(
         format_moment(entry.at_ns),
         format_moment(entry.server_ns),
-        said.kind,
-        said.text,
-        said.source,
-        said.details,
+        event.kind,
+        event.text,
+        event.source,
+        event.details,
         entry.store_id,
         entry.writer,
         entry.run,

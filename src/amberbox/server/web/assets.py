@@ -60,8 +60,8 @@ def _function(name: str, text: str) -> str:
     left = _LEFT.search(body)
     if left is not None:
         raise ValueError(f"{name}: this cannot be joined: {left[0]}")
-    told = ", ".join(f"{key}: () => {value}" for key, value in exports.items())
-    return f"{name!r}($out) {{ $tell($out, {{ {told} }});\n{body}\n}},\n"
+    getters = ", ".join(f"{key}: () => {value}" for key, value in exports.items())
+    return f"{name!r}($out) {{ $tell($out, {{ {getters} }});\n{body}\n}},\n"
 
 
 def _exports(name: str, text: str) -> dict[str, str]:

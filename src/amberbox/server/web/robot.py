@@ -149,7 +149,7 @@ def _ago(seconds: int) -> str:
 def _lane(robot: str, lane: Lane, names: Mapping[str, str]) -> drawing.TimelineLane:
     stretches = tuple(
         drawing.StateInterval(
-            ns_of(one.from_), ns_of(one.to), one.level, _said(one), _data(robot, one)
+            ns_of(one.from_), ns_of(one.to), one.level, _stretch_text(one), _data(robot, one)
         )
         for one in lane.stretches
     )
@@ -162,7 +162,7 @@ def _name(lane: Lane, names: Mapping[str, str]) -> str:
     return names.get(lane.component) or called(lane.component)
 
 
-def _said(one: Stretch) -> str:
+def _stretch_text(one: Stretch) -> str:
     words_ = [one.reason or readable(one.state)]
     if one.changes:
         words_.append(catalogue().text("robot.time.changes", n=one.changes))
@@ -452,7 +452,7 @@ def battery_outputs(component: Component | None, shown: str) -> BatteryOutputs |
 
 async def battery_hour(fleet: Services, who: Caller, robot: str) -> BatteryHour | None:
     """Return the battery in the last hour; None if nothing of it is recorded."""
-    ask = _Asking(fleet, who, robot)
+    ask = _WorkerQueries(fleet, who, robot)
     items = [one["name"] for one in await ask("items") if "battery" in one["name"].casefold()]
     for item in items:
         columns = (await ask("item", item=item))["columns"]
@@ -526,14 +526,14 @@ def _last_flag(numbers: Sequence[float | None]) -> bool | None:
 
 
 @dataclass(frozen=True, slots=True)
-class _Asking:
+class _WorkerQueries:
     fleet: Services
     who: Caller
     robot: str
 
     async def __call__(self, op: str, **more: str) -> Any:
         about = {"robot": self.robot, **more}
-        answer = await self.fleet.worker_pool.ask(f"{WORKER}:{op}", about, asker=self.who.person)
+        answer = await self.fleet.worker_pool.ask(f"{WORKER}:{op}", about, origin=self.who.person)
         return msgspec.json.decode(answer)
 
     async def values(
@@ -544,7 +544,7 @@ class _Asking:
         names = list(variables)
         question = RowQuery(self.robot, item, names, now_ns - BACK_NS, now_ns, points=POINTS)
         about = arguments(question)
-        answer = await self.fleet.worker_pool.ask(f"{WORKER}:query", about, asker=self.who.person)
+        answer = await self.fleet.worker_pool.ask(f"{WORKER}:query", about, origin=self.who.person)
         body = msgspec.json.decode(answer[4 + int.from_bytes(answer[:4], "little") :])
         return dict(_series(body, names))
 

@@ -149,7 +149,7 @@ class RosSubscriber:
         self._master = RosMaster(settings)
         self._subscriptions: dict[str, TopicSubscription] = {}
         self._registered: set[str] = set()
-        self._unheard_since: dict[str, float] = {}
+        self._silent_since: dict[str, float] = {}
         self._updates: SimpleQueue[Update | None] = SimpleQueue()
         self._node: NodeServer | None = None
         self._own_uri = ""
@@ -292,9 +292,9 @@ class RosSubscriber:
             nodes = graph.publishers.get(topic, ())
             subscription.polled(asked_ns, nodes, self._master.node_uri)
             now_s = time.monotonic()
-            since_s = self._unheard_since.setdefault(topic, now_s)
+            since_s = self._silent_since.setdefault(topic, now_s)
             if nodes or subscription.peers():
-                del self._unheard_since[topic]
+                del self._silent_since[topic]
             elif now_s - since_s >= self._settings.unknown_after_s:
                 self._reports.unknown_topic(topic, graph.publishers.keys() - {topic})
 
