@@ -284,7 +284,7 @@ _LEAST_COLUMNS = 24  # least width of the last column
 
 def in_short(plan: MonitoringPlan, width: int) -> list[str]:
     """Return a line for each component, with its dependencies folded below."""
-    return _in_width(short_table(plan), width, "  ")
+    return [line for entry in _entries(list(short_table(plan)), width, "  ") for line in entry]
 
 
 def in_full(plan: MonitoringPlan, width: int) -> Iterator[str]:
@@ -305,10 +305,6 @@ def _component_lines(component: ComponentPlan, width: int) -> list[str]:
     about = "" if component.modes else " (nothing monitors it)"
     line = f"  {component.id}{about}{': needs ' if needs else ''}{needs}"
     return textwrap.wrap(line, width, subsequent_indent=" " * 6, break_long_words=False)
-
-
-def _in_width(rows: Iterable[Sequence[str]], width: int, indent: str) -> list[str]:
-    return [line for entry in _entries(list(rows), width, indent) for line in entry]
 
 
 def _entries(rows: Sequence[Sequence[str]], width: int, indent: str) -> Iterator[list[str]]:

@@ -239,12 +239,12 @@ class FeedListener:
             self._new.notify_all()
 
 
-def is_status(component: str, level: str, robot: str) -> Callable[[FeedChange], bool]:
-    """Return a predicate for changes in which a component reaches a level."""
+def is_status(level: str) -> Callable[[FeedChange], bool]:
+    """Return a predicate for changes in which the broken component reaches a level."""
 
     def is_it(change: FeedChange) -> bool:
-        return (change.kind, change.robot) == ("status", robot) and any(
-            one["component"] == component and not one["mode"] and one["level"] == level
+        return (change.kind, change.robot) == ("status", ROBOT) and any(
+            one["component"] == COMPONENT and not one["mode"] and one["level"] == level
             for one in change.data
         )
 
@@ -261,15 +261,15 @@ WELL, BROKEN = 12, 9  # fieldbus working counter with all units, and with one mi
 _AROUND_NS = 5 * NS
 
 
-def download_fault_data(log: StoryLog, browser: BrowserClient, robot: str, broken_ns: int) -> None:
+def download_fault_data(log: StoryLog, browser: BrowserClient, broken_ns: int) -> None:
     """Find the fault in the recorded data, and download that view as CSV."""
     window = {
         "from": format_time(broken_ns - _AROUND_NS),
         "to": format_time(broken_ns + _AROUND_NS),
     }
-    rows = until(lambda: _rows(browser, robot, window), lambda: "the data of the fault are here")
+    rows = until(lambda: _rows(browser, ROBOT, window), lambda: "the data of the fault are here")
     log.worked(f"{rows} rows of {ITEM}.{VARIABLE} show the fault: {WELL}, then {BROKEN}")
-    asked = {"robots": [robot], "items": [ITEM], "variables": {ITEM: [VARIABLE]}, **window}
+    asked = {"robots": [ROBOT], "items": [ITEM], "variables": {ITEM: [VARIABLE]}, **window}
     number = browser.send("POST", "/downloads", {**asked, "format": "csv"})["id"]
     made = until(lambda: _made(browser, number), lambda: "the download is made")
     text = browser.fetch(f"/downloads/{number}/file").decode()
@@ -305,11 +305,11 @@ _ADMIN = ("/admin", "/admin/users", "/admin/robots", "/admin/teams", "/admin/sys
 _ASSET = re.compile(rb"(?:src|href)=\"(/static/[^\"#]+)")
 
 
-def visit_pages(log: StoryLog, people: Mapping[str, BrowserClient], robot: str, alarm: int) -> None:
+def visit_pages(log: StoryLog, people: Mapping[str, BrowserClient], alarm: int) -> None:
     """Open every kind of page with a role that may see it; raises FailedError unless it is 200."""
     visitor = BrowserClient(people["admin"].url)
     visits = [(visitor, path) for path in _OPEN]
-    visits += [(people["technician"], path.format(robot=robot, alarm=alarm)) for path in _SEEN]
+    visits += [(people["technician"], path.format(robot=ROBOT, alarm=alarm)) for path in _SEEN]
     visits += [(people["admin"], path) for path in _ADMIN]
     assets = {asset for browser, path in visits for asset in _visit(browser, path)}
     for asset in sorted(assets):
@@ -396,10 +396,10 @@ def run_story(url: str, codes: Mapping[str, str]) -> None:
         one = FaultStory(log, people["technician"], feed)
         one.go_through()
         watch_outage(log, people["technician"], feed)
-        download_fault_data(log, people["technician"], ROBOT, one.broken_ns)
+        download_fault_data(log, people["technician"], one.broken_ns)
     finally:
         feed.close()
-    visit_pages(log, people, ROBOT, one.alarm)
+    visit_pages(log, people, one.alarm)
     log.emit(f"all {log.steps} steps worked")
 
 
@@ -444,7 +444,7 @@ class FaultStory:
 
     def see_symptom(self) -> None:
         """Wait for the status of the component."""
-        self._found("symptom", self._wait(is_status(COMPONENT, "error", ROBOT)), COMPONENT)
+        self._found("symptom", self._wait(is_status("error")), COMPONENT)
 
     def see_alarm(self) -> None:
         """Wait for the alarm, with its reason."""
@@ -482,7 +482,7 @@ class FaultStory:
         """Repair the robot, and wait until it is ok again."""
         since_s = time.monotonic()
         self.browser.send("DELETE", f"/demo/{ROBOT}/fault")
-        self._wait(is_status(COMPONENT, "ok", ROBOT), since_s)
+        self._wait(is_status("ok"), since_s)
         self.log.worked(f"{ROBOT} is repaired; {COMPONENT} is well again")
 
     def _wait(self, is_it: Callable[[FeedChange], bool], since_s: float = 0.0) -> FeedChange:

@@ -123,7 +123,8 @@ class SymptomCollector:
             symptom = self._symptom(link, child_node(node, place), at, f"{owner}.{place}")
             if symptom is not None:
                 found.append(self._link(symptom, link))
-        self._report_twice(found, node, where)
+        for name in _twice(link.symptom for link in found):
+            self._problems.append(node.problem(where, f"'{name}' is there twice"))
         return tuple(link for link in found if link.detects > 0)
 
     def address(self, text: str, node: Node, where: str) -> str | None:
@@ -217,10 +218,6 @@ class SymptomCollector:
         except AmberboxError as error:
             self._problems.append(node.problem(where, error.what, error.hint))
             return None
-
-    def _report_twice(self, links: Sequence[SymptomLink], node: Node, where: str) -> None:
-        for symptom in _twice(link.symptom for link in links):
-            self._problems.append(node.problem(where, f"'{symptom}' is there twice"))
 
 
 def _first(value: float | None, other: float | None, default: float) -> float:

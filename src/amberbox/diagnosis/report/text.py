@@ -253,8 +253,11 @@ def _next(step: NextStep) -> Iterator[str]:
         yield from _paragraph("What the answers would mean:")
     shown = set[str]()
     for branch in step.answers:
-        yield from _branch(branch)
-        shown.update(_helps(branch))
+        helps = _helps(branch)
+        what = f'"{branch.answer}" ({percent(branch.probability)}): {branch.leads}'
+        then = "".join(f"; then: {remedy}" for remedy in helps)
+        yield from _item(f"{what}, {percent(branch.then)}{then}")
+        shown.update(helps)
     rest = [remedy for remedy in step.remedies if remedy not in shown]
     if step.test and rest:
         yield from _paragraph(f"What helps, once it is sure: {'; or '.join(rest)}.")
@@ -266,12 +269,6 @@ def _effort(step: NextStep) -> str:
     splits = "tells them apart" if step.splits else ""
     parts = [step.by, takes, risk, splits]
     return f"{capitalize(', '.join(part for part in parts if part))} (test {step.test})."
-
-
-def _branch(branch: AnswerBranch) -> Iterator[str]:
-    helps = "".join(f"; then: {remedy}" for remedy in _helps(branch))
-    what = f'"{branch.answer}" ({percent(branch.probability)}): {branch.leads}'
-    yield from _item(f"{what}, {percent(branch.then)}{helps}")
 
 
 def _helps(branch: AnswerBranch) -> tuple[str, ...]:

@@ -8,7 +8,6 @@ from typing import Annotated
 
 from fastapi import Depends, HTTPException, Request, Response
 from pydantic import Field
-from sqlalchemy import Connection
 
 from amberbox.server.accounts.signin import LONGEST, sign_in_by_code
 from amberbox.server.api.session import Myself, came_from, from_our_pages, myself, set_cookie
@@ -82,14 +81,10 @@ def _noted(
 
 def _view(fleet: Services, who: Caller, demo: Demonstration) -> DemoView:
     with fleet.database.reading() as connection:
-        seen = _seen(connection, who)
+        seen = {robot.id for robot in who.robots(connection)}
     broken = demo.broken()
     robots = [DemoRobot(robot, broken.get(robot, "")) for robot in demo.robots if robot in seen]
     return DemoView(robots, list(demo.faults))
-
-
-def _seen(connection: Connection, who: Caller) -> set[str]:
-    return {robot.id for robot in who.robots(connection)}
 
 
 code_routes = Routes("session")

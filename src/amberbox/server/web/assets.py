@@ -111,7 +111,10 @@ class Asset:
 @lru_cache
 def assets() -> Mapping[str, Asset]:
     """Return all assets by their path."""
-    return {path: _asset(path, data) for path, data in _contents()}
+    return {
+        path: Asset(data, gzip.compress(data, 6, mtime=0), _TYPES[Path(path).suffix])
+        for path, data in _contents()
+    }
 
 
 @lru_cache
@@ -151,10 +154,6 @@ def _styles() -> Iterator[bytes]:
     yield from ((folder / name).read_bytes() for name in _FIRST)
     yield uplot("uplot.min.css")
     yield from ((folder / name).read_bytes() for name in rest)
-
-
-def _asset(path: str, data: bytes) -> Asset:
-    return Asset(data, gzip.compress(data, 6, mtime=0), _TYPES[Path(path).suffix])
 
 
 routes = Routes(prefix="")

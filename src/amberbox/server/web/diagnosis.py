@@ -316,7 +316,12 @@ async def tree(asked: DiagnosisRequest, effect: str) -> Values:
     Only this tree is solved; the others are listed.
     """
     chosen = effect or await _lost(asked)
-    every = await asked.ask(_question(asked, chosen), "one_tree")
+    every = await asked.ask(
+        AskTrees(
+            robot=asked.robot, now_ns=asked.now_ns, at=asked.at, effect=chosen, cut_sets=CUT_SETS
+        ),
+        "one_tree",
+    )
     if every["tree"] is None:
         return {"effects": [], "chosen": "", "tree": None}
     found, shown = every["tree"], msgspec.convert(every["shape"], TreeDrawing)
@@ -358,11 +363,6 @@ def _pattern(name: str) -> tuple[str, str]:
     """Return the kind of a component and its failure, which like components have in common."""
     part, _, mode = name.partition("#")
     return part.partition("_")[0], mode
-
-
-def _question(asked: DiagnosisRequest, effect: str) -> AskTrees:
-    return AskTrees(robot=asked.robot, now_ns=asked.now_ns, at=asked.at, effect=effect,
-                    cut_sets=CUT_SETS)  # fmt: skip
 
 
 def _near(found: Mapping[str, Any]) -> Sequence[Mapping[str, Any]]:

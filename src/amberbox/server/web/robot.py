@@ -46,7 +46,6 @@ from amberbox.server.services.robots import (
     status_without_folder,
 )
 from amberbox.server.web import components
-from amberbox.server.web import components as robottree
 from amberbox.server.web.components import Show, branch_id, called, failing, groups
 from amberbox.server.web.diagnosis_card import DiagnosisCard, current_card
 from amberbox.server.web.page import PageRoutes, render
@@ -300,28 +299,28 @@ async def show_battery(request: Request, fleet: Fleet, who: Who, robot: OfRobot)
 
 
 def _show(request: Request, template: str, **shown: Any) -> Response:
-    return render(request, template, rt=robottree, **{"fill": NO_FILLS, **shown})
+    return render(request, template, rt=components, **{"fill": NO_FILLS, **shown})
 
 
 def _tree(tree: StatusTree, look: RobotQuery) -> Mapping[str, Any]:
     return {
         "tree": tree,
-        "branches": robottree.branches(tree, look.q, look.show, look.chosen),
-        "names": robottree.names(tree.components),
+        "branches": components.branches(tree, look.q, look.show, look.chosen),
+        "names": components.names(tree.components),
     }  # fmt: skip
 
 
 def _graph(tree: StatusTree) -> Mapping[str, Any]:
     label = catalogue().text("robot.graph.label", robot=tree.robot)
     return {
-        "drawn": robottree.graph(tree.components, label),
-        "lines": robottree.as_list(tree.components),
+        "drawn": components.graph(tree.components, label),
+        "lines": components.as_list(tree.components),
     }
 
 
 def _times(fleet: Services, robot: KnownRobot, look: RobotQuery, tree: StatusTree) -> TimelineView:
     found = read_timeline(fleet, robot, f"now-{look.window}", "now", points=_POINTS)
-    return times(robot.id, found, look.lanes, robottree.names(tree.components))
+    return times(robot.id, found, look.lanes, components.names(tree.components))
 
 
 def _events(fleet: Services, robot: KnownRobot, kind: str, may: bool) -> Mapping[str, Any]:
