@@ -57,37 +57,35 @@ class TimelineInterval:
     changes: int = 0
 
 
-@dataclass(frozen=True, slots=True)
-class ComponentTimeline:
-    """The lanes of a window; ``complete`` is false where there were too many events."""
-
-    complete: bool
-    lanes: Mapping[tuple[str, str], Sequence[TimelineInterval]]
-
-
 def timeline(
     stores: RecordStores,
     robot: str,
     span: tuple[int, int],
     standing: Iterable[RetainedStatus],
-    component: str = "",
-    points: int = 500,
-) -> ComponentTimeline:
-    """Return the states of components in ``[from, to)``, at most ``points`` intervals a lane."""
+    component: str,
+    points: int,
+) -> Timeline:
+    """Return the states of components in ``[from, to)``, at most ``points`` intervals a lane.
+
+    It is not ``complete`` where there were too many events.
+    """
     found = derived_records(stores, robot, channels.EVENT, span, MOST)
     inside = _by_lane(_transitions(found), component)
     behind = derived_records(stores, robot, channels.EVENT, (span[1], None), _BEHIND)
     after = _by_lane(_transitions(behind), component)
     now = {(s.record.component, s.record.mode): s for s in standing}
-    lanes = sorted(
-        lane for lane in {*inside, *after, *now} if not component or lane[0] == component
+    lanes = []
+    for key in sorted({*inside, *after, *now}):
+        intervals = _intervals(span, inside.get(key, ()), after.get(key, ()), now.get(key))
+        if intervals and component in ("", key[0]):
+            stretches = [_stretch(one) for one in shortened(intervals, span, points)]
+            lanes.append(Lane(component=key[0], mode=key[1], stretches=stretches))
+    return Timeline(
+        from_=format_time(span[0]),
+        to=format_time(span[1]),
+        complete=len(found) < MOST,
+        lanes=lanes,
     )
-    shown = {
-        lane: shortened(intervals, span, points)
-        for lane in lanes
-        if (intervals := _intervals(span, inside.get(lane, ()), after.get(lane, ()), now.get(lane)))
-    }
-    return ComponentTimeline(len(found) < MOST, shown)
 
 
 def shortened(
@@ -168,17 +166,6 @@ def _before(
     return next((transition.before for _, transition in (*inside[:1], *after[:1])), None)
 
 
-def timeline_of(found: ComponentTimeline, span: tuple[int, int]) -> Timeline:
-    """Write the times of a timeline."""
-    lanes = [
-        Lane(component=component, mode=mode, stretches=[_stretch(one) for one in stretches])
-        for (component, mode), stretches in found.lanes.items()
-    ]
-    return Timeline(
-        from_=format_time(span[0]), to=format_time(span[1]), complete=found.complete, lanes=lanes
-    )
-
-
 def _stretch(one: TimelineInterval) -> Stretch:
     return Stretch(
         from_=format_time(one.from_ns), to=format_time(one.to_ns), level=one.level,
@@ -252,7 +239,7 @@ def read_timeline(
     if component and ids_ending_in(component, known):
         component = component_id(component, known)
     span = (from_ns, to_ns)
-    return timeline_of(timeline(fleet, robot.id, span, standing, component, points), span)
+    return timeline(fleet, robot.id, span, standing, component, points)
 
 
 def list_events(

@@ -418,7 +418,6 @@ FORMATS: Sequence[DownloadFormat] = get_args(DownloadFormat)
 _NONE: list[str] = []
 _HOUR_NS = 3600 * NS
 
-TextList = Annotated[list[Annotated[str, Query(max_length=300)]], Query(max_length=200)]
 Text = Annotated[str, Query(max_length=64)]
 
 
