@@ -200,7 +200,10 @@ class _BagFile:
             try:
                 self._writer.write(connection, received_ns, conversion.convert(data))
             except _conversion_errors() as error:
-                self._note_lost(messages.streams[place], error)
+                item, text = messages.streams[place].item, str(error).partition("\n")[0]
+                report = self._job.report
+                report.miss(f"{item}: messages that do not convert to ROS 1 ({text})")
+                report.add(item, -1)
 
     def _conversion(self, stream: ItemStream) -> _BagConversion | None:
         """Return how a stream gets into the bag, also one that began after the export."""
@@ -231,11 +234,6 @@ class _BagFile:
             callerid=_CALLER,
             latching=int(stream.topic.latched),
         )
-
-    def _note_lost(self, stream: ItemStream, error: Exception) -> None:
-        text = str(error).partition("\n")[0]
-        self._job.report.miss(f"{stream.item}: messages that do not convert to ROS 1 ({text})")
-        self._job.report.add(stream.item, -1)
 
 
 def _is_like(
