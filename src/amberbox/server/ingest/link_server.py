@@ -260,9 +260,7 @@ class LinkServer:
         admission = await asyncio.wrap_future(self._writes.submit(work))
         known = self.robots.get(one.robot)
         self.robots[one.robot] = one
-        wants = is_config_hash(hello.config_hash) and self._hooks.wants_folder(
-            hello.robot, hello.config_hash
-        )
+        wants = self._wants_folder(hello)
         watch = self._watched.get(one.robot, ())
         welcome = one.end.admitted(
             admission, self._clock.wall_ns(), wants_folder=wants, watch=watch
@@ -272,6 +270,10 @@ class LinkServer:
         if known is not None:
             known.end.closed = True
             await known.socket.close()
+
+    def _wants_folder(self, hello: Hello) -> bool:
+        known = is_config_hash(hello.config_hash)
+        return known and self._hooks.wants_folder(hello.robot, hello.config_hash)
 
     def _keep(self, one: RobotConnection, deed: StoreRows) -> asyncio.Task[Sequence[ServerFrame]]:
         now_ns = self._clock.wall_ns()
