@@ -394,10 +394,10 @@ def _must_be_fresh(tree: ExpressionNode) -> Iterator[str]:
     """Yield the addresses that must be fresh: not those read only for age, count or null."""
     if isinstance(tree, AddressNode):
         yield tree.name
-    elif not isinstance(tree, AgeNode) and not _asks_whether(tree):
+    elif not isinstance(tree, AgeNode) and not _tests_presence(tree):
         for child in children(tree):
             yield from _must_be_fresh(child)
 
 
-def _asks_whether(tree: ExpressionNode) -> bool:
+def _tests_presence(tree: ExpressionNode) -> bool:
     return isinstance(tree, WindowNode | CallNode) and tree.name in ("count", "known")

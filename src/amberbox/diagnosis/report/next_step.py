@@ -59,7 +59,7 @@ def step_of(
     group, members = leading or (AmbiguityGroup((), 0.0), ())
     first_of_all = tuple(_safe_actions(names, safe))
     remedies = _remedies(names, members, safe)
-    asked = _worth_asking(knowledge, names, diagnosis, group, members)
+    asked = _best_candidate(knowledge, names, diagnosis, group, members)
     certain = _is_certain(group, members)
     if asked is None:
         rest, order = _without_test(names, diagnosis, group, members, remedies)
@@ -70,11 +70,11 @@ def step_of(
     check, first = asked.check, "; and ".join(remedies)
     same_kind = same_tests(knowledge, diagnosis, check)
     which = f"Which one is it? {merge_texts([one.text for one in same_kind])}"
-    asks = which if len(same_kind) > 1 else asked.text
-    test = ProposedAction("test", asks, check.id)
+    question = which if len(same_kind) > 1 else asked.text
+    test = ProposedAction("test", question, check.id)
     repairs = tuple(ProposedAction("repair", remedy) for remedy in remedies)
     mends_first = certain and bool(first)
-    rest = capitalize(f"{first}; or make sure before: {asks}" if mends_first else asks)
+    rest = capitalize(f"{first}; or make sure before: {question}" if mends_first else question)
     return NextStep(
         _text(safe, rest),
         check.id,
@@ -93,7 +93,7 @@ def step_of(
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
+class CandidateTest:
     """A test that may be done, in words, and what its answers would mean."""
 
     check: Check
@@ -145,10 +145,10 @@ def _may_be_false_alarm(
     return other.probability >= AS_LIKELY * group.probability
 
 
-def _worth_asking(
+def _best_candidate(
     knowledge: Knowledge, names: FaultNames, diagnosis: Diagnosis, group: AmbiguityGroup,
     members: Sequence[Hypothesis],
-) -> Asked | None:  # fmt: skip
+) -> CandidateTest | None:  # fmt: skip
     """Return the test to do next, None if none is worth it.
 
     Where a false alarm is about as likely as the leading hypotheses, it distinguishes these.
@@ -196,13 +196,13 @@ def _discriminates(knowledge: Knowledge, check: Check, members: Sequence[Hypothe
 
 def _asked(
     knowledge: Knowledge, names: FaultNames, diagnosis: Diagnosis, test: str
-) -> Asked | None:
+) -> CandidateTest | None:
     try:
         check = check_named(knowledge, test)
     except UsageError:  # a test of another engine: nothing is known of what it would give
         return None
     text = f"Find out whether this shows: {names.symptom(check.reads)}" if check.reads else ""
-    return Asked(check, text or check.text, _answers(knowledge, names, diagnosis, check))
+    return CandidateTest(check, text or check.text, _answers(knowledge, names, diagnosis, check))
 
 
 def _without_test(

@@ -232,10 +232,10 @@ def _off_the_shelf(alarm: Alarm, now_ns: int, who: str) -> Alarm:
     When its time on the shelf is over (no ``who``), a missing notification is due at once.
     """
     known = alarm.acknowledged_ns is not None
-    untold = not known and not who and is_worse(alarm.severity, alarm.told) and alarm.active
+    is_unnotified = not known and not who and is_worse(alarm.severity, alarm.told) and alarm.active
     return replace(
         alarm, state="acknowledged" if known else "open", shelved_by="", shelved_until_ns=None,
-        notify_ns=now_ns if untold else alarm.notify_ns, revision=alarm.revision + 1,
+        notify_ns=now_ns if is_unnotified else alarm.notify_ns, revision=alarm.revision + 1,
     )  # fmt: skip
 
 

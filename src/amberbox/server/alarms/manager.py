@@ -146,8 +146,8 @@ def _notify(
     setting = read(register.connection, NOTIFICATIONS, Notifications)
     robots = _robots(register, alarm.number)
     sent = queue_alarm(register.connection, AlarmNotice(alarm, robots), now_ns, setting, url)
-    untold = replace(alarm, notify_ns=None)
-    register.keep(alarm, lifecycle.notified(alarm, now_ns) if sent else (untold, []))
+    unnotified = replace(alarm, notify_ns=None)
+    register.keep(alarm, lifecycle.notified(alarm, now_ns) if sent else (unnotified, []))
 
 
 def _robots(register: AlarmRegister, number: int) -> dict[str, frozenset[str]]:

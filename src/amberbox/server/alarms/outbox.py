@@ -329,7 +329,7 @@ def _is_behind() -> ColumnElement[bool]:
     )  # fmt: skip
 
 
-def drop_untold(connection: Connection) -> None:
+def drop_undelivered(connection: Connection) -> None:
     """Mark follow-ups as failed if the messages about the alarm itself failed."""
     first = OUTBOX.alias()
     notified = exists().where(
@@ -450,7 +450,7 @@ def follow_up(
             if wait_ns > now_ns:
                 _look(connection, number, wait_ns)
                 continue
-            for about, event, robots in _untold(connection, find, to, alarm, thread):
+            for about, event, robots in _due_messages(connection, find, to, alarm, thread):
                 queue_message(
                     connection, to, DestinationNotice(about, robots, event), now_ns, setting, url
                 )
@@ -482,7 +482,7 @@ def _wait_ns(alarm: Alarm, thread: _Thread, stays_ns: int) -> int:
     return (alarm.resolved_ns or 0) + stays_ns
 
 
-def _untold(
+def _due_messages(
     connection: Connection, find: FindAlarm, to: Destination, alarm: Alarm, thread: _Thread
 ) -> Iterator[tuple[Alarm, Event, list[str]]]:
     """Yield the messages due to a destination, in order: alarm, event, robots."""
@@ -628,7 +628,7 @@ class NotificationSender:
             if not waiting and not is_digest_due(connection, now_ns):
                 return 0
         with self.database.begin() as connection:
-            drop_untold(connection)
+            drop_undelivered(connection)
             gather(connection, now_ns, setting)
             waiting = due(connection, now_ns)
         of: dict[str, list[RowMapping]] = {}
