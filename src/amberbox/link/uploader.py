@@ -85,7 +85,7 @@ class FetchRequests:
             r.id: r for r in _read_requests(store.path / REQUESTS_FILE)
         }
         self._answered: dict[str, tuple[tuple[str, int], ...]] = {}
-        self._asked_again: set[str] = set()
+        self._requested_again: set[str] = set()
         self.journals: frozenset[str] = frozenset()
         """What is to be copied whatever the rule says."""
 
@@ -95,7 +95,7 @@ class FetchRequests:
             self._open[frame.id] = FetchRequest(frame.id, frame.item, frame.from_ns, frame.to_ns)
             for old in list(self._open)[:-_MOST_REQUESTS]:
                 del self._open[old]
-            self._asked_again.add(frame.id)
+            self._requested_again.add(frame.id)
 
     def step(self) -> None:
         """Find the journals of open requests, answer, and close finished requests.
@@ -103,7 +103,7 @@ class FetchRequests:
         Raises OSError when the disk refuses the file of open requests.
         """
         with self._lock:
-            again, self._asked_again = self._asked_again, set()
+            again, self._requested_again = self._requested_again, set()
             requests = list(self._open.values())
         if again:
             self._write(requests)
@@ -139,7 +139,7 @@ class FetchRequests:
 
     def _close(self, request: FetchRequest) -> None:
         with self._lock:
-            if request.id in self._asked_again:
+            if request.id in self._requested_again:
                 return
             self._open.pop(request.id, None)
             requests = list(self._open.values())
@@ -482,15 +482,15 @@ class HoldingsCheck:
     def __init__(self, copier: JournalCopier, contact: Callable[[], int | None]) -> None:
         self._copier = copier
         self._contact = contact
-        self._asked: int | None = None
+        self._queried: int | None = None
 
     def look_again(self) -> None:
         """Ask once more, after a fetch request."""
-        self._asked = None
+        self._queried = None
 
     def may_lack(self, name: str) -> bool:
         """Return whether a confirmed journal is, or may be, missing on the server."""
-        return self._asked is None or name in self._copier.lacking
+        return self._queried is None or name in self._copier.lacking
 
     def step(self) -> None:
         """Ask once per connection which journals the server lacks.
@@ -498,19 +498,19 @@ class HoldingsCheck:
         Raises CopyError to retry later, OSError when the disk refuses the result.
         """
         contact = self._contact()
-        if contact is None or contact == self._asked:
+        if contact is None or contact == self._queried:
             return
-        self._asked = contact  # set first, since look_again may be called meanwhile
+        self._queried = contact  # set first, since look_again may be called meanwhile
         try:
             for asked in uploads.questions(uploads.journal_ranges(self._counted_on())):
-                answer = self._ask(asked)
+                answer = self._query(asked)
                 if answer is None:
                     return
                 lacking = uploads.missing_copies(asked, answer)
                 if lacking:
                     self._copier.copy_again(lacking)
         except BaseException:
-            self._asked = None
+            self._queried = None
             raise
 
     def _counted_on(self) -> Iterator[JournalCopy]:
@@ -526,7 +526,7 @@ class HoldingsCheck:
                     except FileNotFoundError:  # deleted meanwhile
                         continue
 
-    def _ask(
+    def _query(
         self, asked: Sequence[tuple[JournalRange, list[JournalCopy]]]
     ) -> HoldingsAnswer | None:
         """Ask about some ranges; None from a server that lacks this route."""

@@ -219,11 +219,11 @@ class PowerWatch:
         self._syncer.at_once(min(self._sync_s, BATTERY_SYNC_S))
         if before == "mains":
             # ask the keeper for an incident, in a thread: the disk may be slow, and power short
-            self._request = threading.Thread(target=self._ask, daemon=True)
+            self._request = threading.Thread(target=self._mark_incident, daemon=True)
             self._request.start()
         return state == "low" and before is not None
 
-    def _ask(self) -> None:
+    def _mark_incident(self) -> None:
         try:
             store.submit(self._pipeline.store, "incident", POWER_INCIDENT)
         except OSError as error:

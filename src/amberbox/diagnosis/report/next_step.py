@@ -154,7 +154,7 @@ def _best_candidate(
     Where a false alarm is about as likely as the leading hypotheses, it distinguishes these.
     """
     tests = dict.fromkeys((group.split_by, *(test.id for test in diagnosis.next_tests)))
-    found = [_asked(knowledge, names, diagnosis, name) for name in tests if name]
+    found = [_candidate(knowledge, names, diagnosis, name) for name in tests if name]
     asked = [test for test in found if test and not _is_past(names, diagnosis, members, test.check)]
     if _is_certain(group, members):
         asked = [test for test in asked if test.may_change_mind(names.faults(members[0].faults))]
@@ -194,7 +194,7 @@ def _discriminates(knowledge: Knowledge, check: Check, members: Sequence[Hypothe
     return math.fsum(abs(a - b) for a, b in zip(sound, mixed, strict=True)) / 2 >= DISCRIMINATES
 
 
-def _asked(
+def _candidate(
     knowledge: Knowledge, names: FaultNames, diagnosis: Diagnosis, test: str
 ) -> CandidateTest | None:
     try:

@@ -222,9 +222,9 @@ class DownloadService:
         self._bus = bus
         self._clock = clock
         self._pool = WorkerPool(folder, 1, nice=_NICE)
-        self._asked = asyncio.Event()
+        self._wake = asyncio.Event()
         self._now: tuple[str, WorkerTask] | None = None
-        bus.on("job", lambda change: self._asked.set())
+        bus.on("job", lambda change: self._wake.set())
 
     def path(self, job: DownloadJob) -> Path:
         """Return the path of a download's file."""
@@ -238,7 +238,7 @@ class DownloadService:
 
     async def run(self) -> None:
         """Work until cancelled."""
-        self._asked = asyncio.Event()  # belongs to this event loop
+        self._wake = asyncio.Event()  # belongs to this event loop
         await asyncio.to_thread(self._write, begin_again)
         await asyncio.to_thread(self._tidy)
         while True:
@@ -249,8 +249,8 @@ class DownloadService:
                 continue
             with suppress(TimeoutError):
                 async with asyncio.timeout(_LOOK_S):  # wait_for may swallow a cancellation
-                    await self._asked.wait()
-            self._asked.clear()
+                    await self._wake.wait()
+            self._wake.clear()
             await asyncio.to_thread(self._tidy)
 
     def close(self) -> None:

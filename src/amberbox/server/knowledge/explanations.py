@@ -170,7 +170,7 @@ class Explained:
         self._robot_worker_pool = robot_worker_pool
         self._lock = threading.Lock()
         self._known: OrderedDict[Key, Answer] = OrderedDict()
-        self._asked: dict[tuple[Key, bool], asyncio.Task[Answer]] = {}  # whether in advance
+        self._running: dict[tuple[Key, bool], asyncio.Task[Answer]] = {}  # whether in advance
         self._wanted: asyncio.Queue[tuple[str, str]] = asyncio.Queue()
 
     def known(self, robot: str, diagnosis: Diagnosis, answers: Mapping[str, str]) -> Answer | None:
@@ -191,16 +191,16 @@ class Explained:
             return found
         key = key_of(robot, diagnosis, answers)
         shared = key, origin == robot
-        task = self._asked.get(shared)
+        task = self._running.get(shared)
         if task is None:
-            task = asyncio.create_task(self._ask(key, answers, origin))
-            self._asked[shared] = task
+            task = asyncio.create_task(self._explain_in_worker(key, answers, origin))
+            self._running[shared] = task
             task.add_done_callback(partial(self._over, shared))
         return await asyncio.shield(task)
 
     def _over(self, shared: tuple[Key, bool], task: asyncio.Task[Answer]) -> None:
         """Forget a finished task; its exception goes to the callers that still wait for it."""
-        self._asked.pop(shared, None)
+        self._running.pop(shared, None)
         if not task.cancelled():
             task.exception()  # retrieved, so that asyncio does not log it without callers
 
@@ -253,7 +253,7 @@ class Explained:
     def _find(self, robot: str, name: str) -> DiagnosisHistory | None:
         return find_diagnosis(self, robot, name) if name else newest_diagnosis(self, robot)
 
-    async def _ask(self, key: Key, answers: Mapping[str, str], origin: str) -> Answer:
+    async def _explain_in_worker(self, key: Key, answers: Mapping[str, str], origin: str) -> Answer:
         robot, name = key[0], key[1]
         asked = AskDiagnosis(
             robot=robot, now_ns=self._clock.wall_ns(), diagnosis=name, revision=key[2],

@@ -121,12 +121,12 @@ class FactsCache:
         with self._lock:
             turn = self._turns.setdefault(key, threading.Lock())
         with turn:  # one thread asks, the others wait for its answer
-            found = self.at_once(robot, config_hash) or self._ask(robot, config_hash)
+            found = self.at_once(robot, config_hash) or self._read_in_worker(robot, config_hash)
         with self._lock:
             self._turns.pop(key, None)
         return found
 
-    def _ask(self, robot: str, config_hash: str) -> FolderFacts:
+    def _read_in_worker(self, robot: str, config_hash: str) -> FolderFacts:
         arguments = {"robot": robot, "config_hash": config_hash}
         key = robot, config_hash
         try:

@@ -287,7 +287,7 @@ class LiveValueRelay:
     def __init__(self, links: LiveValueSource, wanted: Callable[[], Iterable[Watch]]) -> None:
         self._links = links
         self._wanted = wanted
-        self._asked: dict[str, frozenset[str]] = {}
+        self._requested: dict[str, frozenset[str]] = {}
         self._values: dict[str, dict[str, Value]] = {}
         self._news: set[str] = set()
         self._changed = asyncio.Event()
@@ -298,7 +298,7 @@ class LiveValueRelay:
 
     def take(self, robot: str, values: Mapping[str, Value]) -> bool:
         """Store received values; return whether any of them is watched."""
-        asked = self._asked.get(robot)
+        asked = self._requested.get(robot)
         known = {name: value for name, value in values.items() if asked and name in asked}
         if known:
             self._values.setdefault(robot, {}).update(known)
@@ -328,23 +328,23 @@ class LiveValueRelay:
             union = _union(self._wanted())
             different = [
                 robot
-                for robot in {*union, *self._asked}
-                if union.get(robot, frozenset()) != self._asked.get(robot, frozenset())
+                for robot in {*union, *self._requested}
+                if union.get(robot, frozenset()) != self._requested.get(robot, frozenset())
             ]
-            self._asked = union
+            self._requested = union
             for robot in different:
                 self._forget(robot)
-            await asyncio.gather(*(self._ask(robot) for robot in different))
+            await asyncio.gather(*(self._request_samples(robot) for robot in different))
 
     def _forget(self, robot: str) -> None:
-        asked = self._asked.get(robot, frozenset())
+        asked = self._requested.get(robot, frozenset())
         kept = {n: v for n, v in self._values.get(robot, {}).items() if n in asked}
         self._values[robot] = kept
         if not asked:
             del self._values[robot]
 
-    async def _ask(self, robot: str) -> None:
-        variables = sorted(self._asked.get(robot, ()))[: limits.VARIABLES]
+    async def _request_samples(self, robot: str) -> None:
+        variables = sorted(self._requested.get(robot, ()))[: limits.VARIABLES]
         with suppress(TimeoutError):  # requested again when the robot reconnects
             async with asyncio.timeout(_PATIENCE_S):
                 await self._links.watch(robot, variables)
@@ -652,7 +652,7 @@ class FeedSession:
         self._feed = feed
         self._listener = listener
         self._socket = socket
-        self._is_asked = asyncio.Event()
+        self._has_request = asyncio.Event()
         self._may_be_old = False
         self._sent_s = time.monotonic()
 
@@ -671,7 +671,7 @@ class FeedSession:
     async def _read(self) -> None:
         """Receive subscriptions; each replaces the one before."""
         while True:
-            wait_s = None if self._is_asked.is_set() else FIRST_S
+            wait_s = None if self._has_request.is_set() else FIRST_S
             try:
                 async with asyncio.timeout(wait_s):
                     text = await self._socket.receive()
@@ -694,11 +694,11 @@ class FeedSession:
         listener.number = resume if resume is not None and self._may_be_old else ring.number
         listener.live.clear()
         self._feed.show_live(listener)
-        self._is_asked.set()
+        self._has_request.set()
         listener.wake.set()
 
     async def _write(self) -> None:
-        await self._is_asked.wait()
+        await self._has_request.wait()
         listener = self._listener
         while listener.ended is None:
             text = await self._next()

@@ -264,17 +264,17 @@ class PublisherAbsence:
     """
 
     def __init__(self, start_ns: int) -> None:
-        self._asked_ns = start_ns
+        self._queried_ns = start_ns
         self._absent_ns: dict[str, int] = {}
 
     def polled(self, asked_ns: int, nodes: Collection[str]) -> None:
         """Update with the publishers that the master listed."""
         self._absent_ns = {node: self.absent_until_ns(node) for node in nodes}
-        self._asked_ns = asked_ns
+        self._queried_ns = asked_ns
 
     def absent_until_ns(self, node: str) -> int:
         """Return the last moment at which a node is known not to have published."""
-        return self._absent_ns.get(node, self._asked_ns)
+        return self._absent_ns.get(node, self._queried_ns)
 
 
 PATIENCE = 4  # failed attempts before a publisher that does not answer is worth an event
