@@ -164,6 +164,11 @@ _ACTIONS: dict[str, Callable[..., None]] = {
 
 _SERVER_HEADER = ("id", "component", "state", "level", "severity", "opened (UTC)", "times", "who",
                   "reason", "cause")  # fmt: skip
+_SERVER_KEYS = (
+    "id", "kind", "robots", "origin", "severity", "level", "state", "active", "reason", "opened",
+    "changed", "count", "revision", "window", "cause", "diagnosis", "cleared", "late", "owner",
+    "acknowledged", "shelved", "resolved", "merged_into",
+)  # fmt: skip
 _UNRESOLVED = ("open", "acknowledged", "shelved")
 
 
