@@ -418,6 +418,7 @@ FORMATS: Sequence[DownloadFormat] = get_args(DownloadFormat)
 _NONE: list[str] = []
 _HOUR_NS = 3600 * NS
 
+TextList = Annotated[list[Annotated[str, Query(max_length=300)]], Query(max_length=200)]
 Text = Annotated[str, Query(max_length=64)]
 
 
@@ -451,9 +452,10 @@ class DownloadRow:
 
 @download_routes.get("/downloads", "data.download", each=True)
 def show_downloads(
-    request: Request, fleet: Fleet, who: Who, robot: Names = _NONE, mission: Names = _NONE,
-    item: Names = _NONE, from_: Annotated[Text, Query(alias="from")] = "", to: Text = "",
-    format: Text = "csv", after: Text = "", all: bool = False,
+    request: Request, fleet: Fleet, who: Who, robot: TextList = _NONE,
+    mission: TextList = _NONE, item: TextList = _NONE,
+    from_: Annotated[Text, Query(alias="from")] = "", to: Text = "", format: Text = "csv",
+    after: Text = "", all: bool = False,
 ) -> Response:  # fmt: skip
     """Show one's downloads, and the form for a new one."""
     options = _options(fleet)
