@@ -48,7 +48,6 @@ EVIDENCE = f"{OURS}.diagnosis.evidence"
 REASONING = tuple(
     f"{OURS}.diagnosis.{name}"
     for name in (
-        "condition_symptoms",
         "covering",
         "diagnose",
         "faulttree",

@@ -34,7 +34,7 @@ from amberbox.link.frames import (
     encode,
     from_server,
 )
-from amberbox.link.uploader import HttpTransport, _about
+from amberbox.link.uploader import HttpTransport, upload_headers
 from benchmarks.fleetload.making import BOOT, CHANGING, COMPONENTS, Recording, Sealed
 from benchmarks.fleetload.servers import Server
 
@@ -177,7 +177,10 @@ class Robot:
     def copy(self, one: Sealed) -> uploads.Verdict:
         """Copy a journal with the robot's own code for requests; blocks."""
         sending = HttpTransport(self.options, lambda: self.context)
-        address, about = uploads.address(self.recording.store.id, one.name), _about(one.path)
+        address, about = (
+            uploads.address(self.recording.store.id, one.name),
+            upload_headers(one.path),
+        )
         try:
             at, content = sending("HEAD", address, about, b"").offset, one.path.read_bytes()
             while at < len(content):

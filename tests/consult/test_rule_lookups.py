@@ -80,4 +80,4 @@ def test_intervals_say_what_single_instants_say(
 
 def test_nobody_was_well_or_ill_where_nobody_watched(tmp_path: Path) -> None:
     runs_of(tmp_path / "store", random.Random(1))
-    assert StatusLookup(RecordWindow(LocalRecord(tmp_path / "store"))).said == []
+    assert StatusLookup(RecordWindow(LocalRecord(tmp_path / "store"))).intervals == []

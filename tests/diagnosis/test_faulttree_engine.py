@@ -6,7 +6,7 @@ import itertools
 
 import pytest
 
-from amberbox.core.budget import Budget
+from amberbox.core.contracts import Budget
 from amberbox.core.errors import UsageError
 from amberbox.core.types import Diagnosis, Symptom, SymptomState
 from amberbox.diagnosis.covering.observations import predict

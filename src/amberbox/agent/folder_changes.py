@@ -152,11 +152,11 @@ class FolderWatch:
         self._judged = self._seen = self._look()
         self._question: RunningCheck | None = None
         self._due_s = self._not_before_s = -math.inf
-        self._asked = False
+        self._requested = False
 
     def ask(self) -> None:
         """Request a check now, changed or not."""
-        self._asked = True
+        self._requested = True
 
     def step(self, now_s: float) -> FolderVerdict | None:
         """Look for changes, if it is time to."""
@@ -165,8 +165,8 @@ class FolderWatch:
             if answer is not None:
                 self._question = None
             return answer
-        if self._asked:
-            self._asked = False
+        if self._requested:
+            self._requested = False
             self._begin(self._look(), now_s)
         elif now_s >= self._due_s:
             self._due_s = now_s + POLL_S

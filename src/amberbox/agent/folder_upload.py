@@ -48,7 +48,7 @@ _QUERY = re.compile(
     rf"([?&]{secret_word_pattern(f'(?:{SOUNDS_SECRET}|key|sig)')}=)[^&\s#'\"<>]+", re.IGNORECASE
 )
 _PEM = re.compile(r"-----BEGIN [A-Z ]*PRIVATE KEY-----.*?(?:-----END [A-Z ]*-----|\Z)", re.DOTALL)
-_SAID = re.compile(
+_NAMED_VALUE = re.compile(
     rf"(\b{secret_word_pattern(SOUNDS_SECRET)}[\"']?\s*(?:[:=]|\bis\b)\s*)(\"[^\"]*\"|'[^']*'|[^\s\"'<>,;]+)",
     re.IGNORECASE,
 )
@@ -68,7 +68,7 @@ def masked(files: Mapping[str, bytes], known: Collection[str] = ()) -> dict[str,
         if text is None:
             continue
         found.update(_passwords(text))
-        done = _yaml(name, text, plugins, found) if _is_yaml(name) else _plain(text)
+        done = _yaml(name, text, plugins, found) if _is_yaml(name) else mask_text(text)
         if done is not None:
             texts[name] = done
     cleared = {name: _cleared(name, text, found) for name, text in texts.items()}
@@ -82,7 +82,7 @@ def _cleared(name: str, text: str, found: set[str]) -> str | None:
     for secret in sorted(found, key=len, reverse=True):
         if len(secret) >= _LEAST:
             text = text.replace(secret, WORD)
-    text = _by_form(text)
+    text = mask_by_form(text)
     return text if not _is_yaml(name) or _parsed(name, text) is not None else None
 
 
@@ -130,9 +130,9 @@ def _without_comments(text: str, known: Collection[str]) -> str:
     """Remove comments beside masked values, and those that sound secret or hold a secret."""
     for start, end in reversed(list(_comments(text))):
         line = text[text.rfind("\n", 0, start) + 1 : start]
-        said = text[start:end]
-        holds = any(s in said for s in known if len(s) >= _LEAST_IN_COMMENTS)
-        if MASK in line or holds or sounds_secret(said):
+        comment = text[start:end]
+        holds = any(s in comment for s in known if len(s) >= _LEAST_IN_COMMENTS)
+        if MASK in line or holds or sounds_secret(comment):
             before = text[:start].rstrip(" ") if line.strip() else f"{text[:start]}#"
             text = before + text[end:]
     return text
@@ -154,9 +154,9 @@ def _in_gap(text: str, start: int, end: int) -> Iterator[tuple[int, int]]:
         yield sign, start
 
 
-def _plain(text: str) -> str:
+def mask_text(text: str) -> str:
     """Mask values after a secret-sounding word: ``password: ...``, ``<token>...``."""
-    return _SAID.sub(lambda match: match[1] + _quoted_as(match[2]), _elements(text))
+    return _NAMED_VALUE.sub(lambda match: match[1] + mask_quoted(match[2]), _elements(text))
 
 
 def _elements(text: str) -> str:
@@ -175,12 +175,13 @@ def _elements(text: str) -> str:
     return "".join([*parts, text[at:]])
 
 
-def _quoted_as(written: str) -> str:
+def mask_quoted(written: str) -> str:
+    """Return the mask of a value in the quotes that the value was written with."""
     quote = written[0] if written[0] in "\"'" else ""
     return f"{quote}{WORD}{quote}"
 
 
-def _by_form(text: str) -> str:
+def mask_by_form(text: str) -> str:
     """Mask secrets by their form: keys, users and passwords in URLs."""
     text = _PEM.sub(WORD, text)
     text = LOOKS_LIKE_ONE.sub(WORD, text)

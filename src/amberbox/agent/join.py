@@ -47,8 +47,8 @@ def with_server(text: str, values: dict[str, str], drop: Sequence[str] = ()) -> 
     for key in drop:
         text = _without(text, key)
     server = _server(text)
-    said = {key: node.value for key, node in ((server and server.mapping) or {}).items()}
-    if set(drop) & set(said) or any(said.get(key) != value for key, value in values.items()):
+    present = {key: node.value for key, node in ((server and server.mapping) or {}).items()}
+    if set(drop) & set(present) or any(present.get(key) != value for key, value in values.items()):
         lines = "".join(f"\n  {key}: {value}" for key, value in values.items())
         raise UsageError(
             f"{ROBOT_FILE} is written in a way that cannot be changed safely",

@@ -115,7 +115,7 @@ class ChildOutput:
     """Prints lines of one child: ``BURST`` at once, ``PER_S`` over time; the rest is counted."""
 
     name: str
-    say: Callable[[str], None] = print_line
+    emit: Callable[[str], None] = print_line
     error: str = ""
     """The last line that begins with ``error:``: why it has ended, most likely."""
     _rest: bytes = b""
@@ -143,7 +143,7 @@ class ChildOutput:
         if self._left_out and self._room >= 1:
             count, self._left_out = self._left_out, 0
             self._room -= 1
-            self.say(f"{self.name}: ({count} more line{'s' * (count > 1)}, left out)")
+            self.emit(f"{self.name}: ({count} more line{'s' * (count > 1)}, left out)")
 
     def _print(self, line: str) -> None:
         if line.startswith("error: "):
@@ -154,7 +154,7 @@ class ChildOutput:
             self._left_out += 1
             return
         self._room -= 1
-        self.say(f"{self.name}: {line}")
+        self.emit(f"{self.name}: {line}")
 
 
 def read_all(fd: int) -> bytes:

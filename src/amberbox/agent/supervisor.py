@@ -311,7 +311,7 @@ class ProcessSupervisor:
         self._notifier = notifier or Notifier()
         self._stops = 0
         self._reload = False
-        self._is_reload_asked = False
+        self._is_reload_requested = False
         self._stopping_since_s: float | None = None
         self._is_hurried = False
         self._began_s = clock_s()
@@ -348,7 +348,7 @@ class ProcessSupervisor:
             self._notifier.stopping("ending what runs")
         self._is_hurried = self._stops > 1
         if self._reload:
-            self._reload, self._is_reload_asked = False, True
+            self._reload, self._is_reload_requested = False, True
             self._changes.ask()
         for lifecycle in self.lifecycles:
             lifecycle.step(now_s)
@@ -413,7 +413,7 @@ class ProcessSupervisor:
 
     def _apply_verdict(self, judgement: FolderVerdict, now_s: float) -> None:
         """Apply the result of checking a changed folder."""
-        is_reload_asked, self._is_reload_asked = self._is_reload_asked, False
+        is_reload_requested, self._is_reload_requested = self._is_reload_requested, False
         for lifecycle in self.lifecycles:
             lifecycle.retry(now_s)
         if not judgement.is_right:
@@ -423,7 +423,7 @@ class ProcessSupervisor:
             text = f"the record is to lie in {judgement.store} now: stop and start for that"
             self._log.log_event("configuration_refused", text)
         else:
-            self._adopt(judgement.config_hash, now_s, with_recorder=is_reload_asked)
+            self._adopt(judgement.config_hash, now_s, with_recorder=is_reload_requested)
 
     def _adopt(self, config_hash: str, now_s: float, *, with_recorder: bool) -> None:
         """Restart the children whose configuration changed; the recorder only on a reload."""

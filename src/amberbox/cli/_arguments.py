@@ -219,7 +219,7 @@ def time_of(option: str, text: str | None, read: Callable[[str | None], int | No
 def check_time(option: str, text: str | None) -> None:
     """Raise UsageError, naming the option, for a time that no server can parse."""
     if text:
-        time_of(option, text, lambda said: parse_time(said or "", time.time_ns, lambda: 0))
+        time_of(option, text, lambda value: parse_time(value or "", time.time_ns, lambda: 0))
 
 
 def add_range(parser: argparse.ArgumentParser) -> None:

@@ -190,8 +190,8 @@ def _alarms(alarms: Sequence[AlarmChange], now_ns: int, view: StatusView) -> Ite
         yield f"{len(alarms)} {'alarm' if len(alarms) == 1 else 'alarms'}:"
     for alarm in alarms:
         times = f", {alarm.count} times" if alarm.count > 1 else ""
-        said = f" by {alarm.who}" if alarm.who else ""
+        by = f" by {alarm.who}" if alarm.who else ""
         lasts = f"for {duration_text(now_ns - alarm.opened_ns)}"
-        about = f"{alarm.severity}, {alarm.state}{said}, {lasts}{times}"
+        about = f"{alarm.severity}, {alarm.state}{by}, {lasts}{times}"
         cause = f"; because of {alarm.cause}" if alarm.cause else ""
         yield f"  {view.paint(alarm.id, alarm.level)} ({about}): {alarm.reason}{cause}"

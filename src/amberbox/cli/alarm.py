@@ -110,12 +110,12 @@ def _shelve(args: argparse.Namespace, alarm_id: str) -> None:
     duration_ns = parse_duration(args.for_)
     if duration_ns < NS:
         raise UsageError(f"--for {args.for_} is too short", "--for 2h")
-    told = f"shelved for {format_duration(duration_ns)}"
-    _request(args, alarm_id, "shelve", told, time.time_ns() + duration_ns)
+    outcome = f"shelved for {format_duration(duration_ns)}"
+    _request(args, alarm_id, "shelve", outcome, time.time_ns() + duration_ns)
 
 
 def _request(
-    args: argparse.Namespace, alarm_id: str, action: str, told: str, until_ns: int | None = None
+    args: argparse.Namespace, alarm_id: str, action: str, outcome: str, until_ns: int | None = None
 ) -> None:
     """Submit a request about an open alarm; raises UsageError if there is none."""
     alarm_id = _check(newest(args.where), alarm_id, action, args.where)
@@ -133,7 +133,7 @@ def _request(
         print_json({**values, "watched": watched})
         return
     later = "" if watched else " as soon as amberbox watch runs on this store"
-    print(f"{alarm_id} will be {told}{later}")
+    print(f"{alarm_id} will be {outcome}{later}")
 
 
 def _check(rows: Sequence[Row], name: str, action: str, where: str) -> str:
@@ -156,9 +156,9 @@ def _check(rows: Sequence[Row], name: str, action: str, where: str) -> str:
 
 _ACTIONS: dict[str, Callable[..., None]] = {
     "list": _list,
-    "ack": partial(_request, action="acknowledge", told="acknowledged"),
+    "ack": partial(_request, action="acknowledge", outcome="acknowledged"),
     "shelve": _shelve,
-    "unshelve": partial(_request, action="unshelve", told="taken from the shelf"),
+    "unshelve": partial(_request, action="unshelve", outcome="taken from the shelf"),
 }
 
 
@@ -224,10 +224,10 @@ def _alarm_named(fleet: Fleet, robot: str, name: str) -> AlarmLine:
 
 
 def _server_row(alarm: AlarmLine) -> tuple[Any, ...]:
-    said = alarm.shelved or alarm.acknowledged
+    action = alarm.shelved or alarm.acknowledged
     return (
         alarm.id, alarm.origin, _state_text(alarm), alarm.level, alarm.severity, alarm.opened[:19],
-        alarm.count, alarm.owner or (said.who if said else ""), alarm.reason, alarm.cause,
+        alarm.count, alarm.owner or (action.who if action else ""), alarm.reason, alarm.cause,
     )  # fmt: skip
 
 

@@ -297,8 +297,8 @@ def _run_command(command: Sequence[str]) -> None:
             "start 'amberbox run' with what starts services here",
         ) from None
     if done.returncode:
-        said = done.stderr.strip().splitlines() or [f"exit status {done.returncode}"]
-        raise AmberboxError(f"{shlex.join(command)}: {said[-1]}", "journalctl -xe tells more")
+        errors = done.stderr.strip().splitlines() or [f"exit status {done.returncode}"]
+        raise AmberboxError(f"{shlex.join(command)}: {errors[-1]}", "journalctl -xe tells more")
 
 
 def configure_doctor(parser: argparse.ArgumentParser) -> None:

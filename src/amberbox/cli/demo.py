@@ -52,9 +52,9 @@ def run(args: argparse.Namespace) -> int:
         return show.run(place, args.port, _seconds(args.seconds))
 
 
-def _seconds(said: float | None) -> float | None:
+def _seconds(given: float | None) -> float | None:
     """Return the length of the scripted story in seconds; None on a terminal: run until Ctrl-C."""
-    return SECONDS if said is None and not sys.stdout.isatty() else said
+    return SECONDS if given is None and not sys.stdout.isatty() else given
 
 
 @contextmanager

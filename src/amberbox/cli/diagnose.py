@@ -64,7 +64,7 @@ from amberbox.diagnosis.report.explanation import (
 from amberbox.diagnosis.report.serialiser import context_json, explain_context
 from amberbox.diagnosis.report.svg import as_svg
 from amberbox.diagnosis.report.text import as_text
-from amberbox.diagnosis.report.wording import WORTH_TELLING, date_and_clock, sentence
+from amberbox.diagnosis.report.wording import WORTH_SHOWING, date_and_clock, sentence
 from amberbox.monitoring.current_state import (
     CHANNELS,
     WRITER,
@@ -379,7 +379,7 @@ def with_members(
 
 def _robots_named(knowledge: Knowledge, groups: Sequence[ExplainedGroup]) -> list[str]:
     """Return the robots with probable faults, the most probable first."""
-    worth = (g for g in groups if g.probability >= WORTH_TELLING)
+    worth = (g for g in groups if g.probability >= WORTH_SHOWING)
     faults = (f.id for g in worth for possible in g.members for f in possible.faults)
     robots = (fault.partition("#")[0].partition(":")[0] for fault in faults)
     return [name for name in dict.fromkeys(robots) if name in knowledge.fmea.members]
@@ -403,7 +403,7 @@ def _member_diagnosis(name: str, where: str, at_ns: int) -> MemberDiagnosis:
     if not is_store(folder.store_path):
         return _member_unknown(name, where, f"{folder.store_path} is no store: nothing is recorded")
     store = open_store(folder.store_path)
-    then_ns = min(at_ns, _said_ns(store))
+    then_ns = min(at_ns, moment_ns(store))
     if at_ns - then_ns > _WATCHER_LATE_NS:
         since = f" since {date_and_clock(then_ns)}" if then_ns else ""
         return _member_unknown(name, where, f"its watcher has said nothing{since}")
@@ -419,7 +419,7 @@ def _member_diagnosis(name: str, where: str, at_ns: int) -> MemberDiagnosis:
     )
 
 
-def _said_ns(store: Store) -> int:
+def moment_ns(store: Store) -> int:
     """Return the time of the watcher's newest status (ns); 0 without one."""
     newest = newest_records(store, WRITER, {channels.STATUS}, 0.0)
     return max((record.values["measured_ns"] for record in newest), default=0)
@@ -457,8 +457,8 @@ def _run_on_server(args: argparse.Namespace) -> int:
             robot, args.at, dict(map(_symptom_given, args.symptom)),
             dict(map(_answer_given, args.answer)), engine=args.engine, exposure_h=args.exposure,
         )  # fmt: skip
-    said = found.get("explanation")
-    explanation = None if said is None else msgspec.convert(said, Explanation)
+    answer = found.get("explanation")
+    explanation = None if answer is None else msgspec.convert(answer, Explanation)
     print_notes(str(note) for note in found.get("notes", ()))
     if args.svg:
         _draw(args.svg, explanation)

@@ -112,7 +112,15 @@ def run_export(args: argparse.Namespace) -> int:
     options = ExportOptions(args.raw_text, args.compression)
     started = time.monotonic()
     with opened(args.where) as record:
-        view = _view(record, args)
+        view = View(
+            items=args.item,
+            variables=_variables(record, args.variable),
+            windows=windows(args, record),
+            by=args.by,
+            all_variables=args.all_variables,
+            received=args.received,
+            with_box=args.with_box,
+        )
         progress = progress_bar(wanted=target is not None and not args.json)
         report = export(record, view, target, form, progress, options)
     if args.json:
@@ -146,18 +154,6 @@ def chosen_form(named: str | None, target: Path | None) -> str:
         endings = ", ".join(_ENDINGS)
         raise UsageError(f"{target} does not say its format", f"add --format, or one of {endings}")
     return form
-
-
-def _view(record: Record, args: argparse.Namespace) -> View:
-    return View(
-        items=args.item,
-        variables=_variables(record, args.variable),
-        windows=windows(args, record),
-        by=args.by,
-        all_variables=args.all_variables,
-        received=args.received,
-        with_box=args.with_box,
-    )
 
 
 def _variables(record: Record, texts: Sequence[str]) -> dict[str, list[str]]:
@@ -425,12 +421,12 @@ def run_fetch(args: argparse.Namespace) -> int:
 
 def _wait_for_fetch(fleet: Fleet, robot: str, asked: Fetch) -> Fetch:
     """Wait until a fetch is over; Ctrl-C ends the waiting, not the request."""
-    said = ""
+    shown = ""
     while not asked.is_over:
         state = f"{asked.state}, {asked.copied} of {len(asked.journals)} journals"
-        if state != said:
+        if state != shown:
             print_notes([state])
-            said = state
+            shown = state
         time.sleep(_FETCH_POLL_S)
         asked = fleet.fetched(robot, asked.id)
     return asked

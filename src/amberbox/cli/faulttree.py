@@ -22,8 +22,8 @@ from amberbox.cli._arguments import (
 from amberbox.cli._output import print_grid, print_json, print_lines, print_notes, text_output
 from amberbox.cli.fmea import FOR_LOCAL_FOLDER, fmea_path, loaded
 from amberbox.client.address import is_url
-from amberbox.core.budget import Budget
 from amberbox.core.config import raise_errors
+from amberbox.core.contracts import Budget
 from amberbox.core.errors import UsageError
 from amberbox.core.timestamps import format_time
 from amberbox.diagnosis.faulttree.analysis import Analysis, Importance, NearCutSet, analyse
@@ -402,8 +402,8 @@ def _server_tree_lines(found: Mapping[str, Any], *, importance: bool) -> Iterato
     if importance and found["importance"]:
         yield ""
         for event, factors in found["importance"].items():
-            told = (f"{k.upper()} {'-' if v is None else f'{v:.6g}'}" for k, v in factors.items())
-            yield f"{event}: {', '.join(told)}"
+            values = (f"{k.upper()} {'-' if v is None else f'{v:.6g}'}" for k, v in factors.items())
+            yield f"{event}: {', '.join(values)}"
 
 
 def _server_closest_lines(found: Mapping[str, Any], count: int) -> Iterator[str]:
@@ -413,5 +413,5 @@ def _server_closest_lines(found: Mapping[str, Any], count: int) -> Iterator[str]
         yield f"\n{effect['effect']}"
         for near in effect["closest"][:count]:
             parts = (("happened", near["happened"]), ("missing", near["missing"]))
-            told = (f"{what}: {', '.join(events)}" for what, events in parts if events)
-            yield f"  {near['probability']:.3g}  {'; '.join(told)}"
+            shown = (f"{what}: {', '.join(events)}" for what, events in parts if events)
+            yield f"  {near['probability']:.3g}  {'; '.join(shown)}"

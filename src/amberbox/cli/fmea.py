@@ -140,8 +140,8 @@ def _check(
     else:
         for problem in problems:
             print(problem)
-        said = _in_words(fmea) if fmea and not wrong else _errors(problems)
-        print_lines([f"{args.where}: {said}"])
+        verdict = _in_words(fmea) if fmea and not wrong else _errors(problems)
+        print_lines([f"{args.where}: {verdict}"])
     if fmea and known is None and not args.json:
         print_notes([f"no robot folder that can be read at {args.where}: {_NOT_COMPARED}"])
     return ConfigurationError.exit_code if wrong else 0
@@ -233,8 +233,8 @@ def _coverage(
 def _coverage_lines(found: Mapping[str, Any], alike: Sequence[str]) -> Iterator[str]:
     """Yield the lines of the coverage; ``alike`` are those of indistinguishable modes."""
     total, unseen = found["modes"], found["unseen"]
-    told_apart = f"{found['distinct']} can be told apart by that"
-    yield f"{total - len(unseen)} of {total} failure modes show; {told_apart}"
+    distinct = f"{found['distinct']} can be told apart by that"
+    yield f"{total - len(unseen)} of {total} failure modes show; {distinct}"
     yield from _section("nothing shows", [f"{m}: {why}" for m, why in unseen.items()])
     weak = [f"{mode}: seen in {share:.0%} of cases" for mode, share in found["weak"].items()]
     yield from _section("show weakly", weak)

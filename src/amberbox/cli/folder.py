@@ -31,7 +31,6 @@ from amberbox.core.redaction import masked_values
 from amberbox.core.yaml_nodes import load_yaml
 from amberbox.monitoring.component_files import FOLDER as COMPONENTS
 from amberbox.monitoring.plan import (
-    ComponentPlan,
     MonitoringPlan,
     list_recovery_actions,
     monitor_of,
@@ -284,7 +283,7 @@ _LEAST_COLUMNS = 24  # least width of the last column
 
 def in_short(plan: MonitoringPlan, width: int) -> list[str]:
     """Return a line for each component, with its dependencies folded below."""
-    return _in_width(short_table(plan), width, "  ")
+    return [line for entry in _entries(list(short_table(plan)), width, "  ") for line in entry]
 
 
 def in_full(plan: MonitoringPlan, width: int) -> Iterator[str]:
@@ -295,20 +294,12 @@ def in_full(plan: MonitoringPlan, width: int) -> Iterator[str]:
     ]
     modes = iter(_entries(rows, width, "    "))
     for component in plan.components:
-        yield from _component_lines(component, width)
+        needs = needs_text(component, ", ")
+        about = "" if component.modes else " (nothing monitors it)"
+        line = f"  {component.id}{about}{': needs ' if needs else ''}{needs}"
+        yield from textwrap.wrap(line, width, subsequent_indent=" " * 6, break_long_words=False)
         for _ in component.modes:
             yield from next(modes)
-
-
-def _component_lines(component: ComponentPlan, width: int) -> list[str]:
-    needs = needs_text(component, ", ")
-    about = "" if component.modes else " (nothing monitors it)"
-    line = f"  {component.id}{about}{': needs ' if needs else ''}{needs}"
-    return textwrap.wrap(line, width, subsequent_indent=" " * 6, break_long_words=False)
-
-
-def _in_width(rows: Iterable[Sequence[str]], width: int, indent: str) -> list[str]:
-    return [line for entry in _entries(list(rows), width, indent) for line in entry]
 
 
 def _entries(rows: Sequence[Sequence[str]], width: int, indent: str) -> Iterator[list[str]]:

@@ -72,7 +72,7 @@ def drawing(record: Record, args: argparse.Namespace) -> RecordPlot:
         )
     fields = [f for f in table.fields if f.name not in ("timestamp", "received")]
     times = np.asarray(table["received" if args.by == "received" else "timestamp"])
-    gaps = _gaps(record, table.item, times)
+    gaps = gaps_in_plot(record, table.item, times)
     holes = _holes(times) if is_whole else np.empty(0, np.int64)  # thinned rows are uneven
     shown, breaks = _shown_rows(table, fields, (times, holes), gaps, args.points)
     curves = tuple(_curve(table, field, times, shown, breaks) for field in fields)
@@ -80,7 +80,8 @@ def drawing(record: Record, args: argparse.Namespace) -> RecordPlot:
     return RecordPlot(table.item, clock, args.local, curves, gaps, len(table), table.notes)
 
 
-def _gaps(record: Record, item: str, times: IntArray) -> tuple[tuple[int, int, str], ...]:
+def gaps_in_plot(record: Record, item: str, times: IntArray) -> tuple[tuple[int, int, str], ...]:
+    """Return begin, end (ns) and reason of the gaps between the first and the last time."""
     first, last = int(times.min()), int(times.max())
     known = [gap for gap in record.gaps(item, first, last + 1) if not _is_of_one(gap, times)]
     found = [(max(gap.from_ns, first), min(gap.to_ns, last), gap.reason) for gap in known]

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from types import ModuleType
 
 _EXIT = "exit status with --once or --probe: 0 all are ok, 1 something is not, or is unknown"
-_SAID_AGAIN_S = 0.2  # how soon a signal is noticed, in seconds
+_POLL_S = 0.2  # how soon a signal is noticed, in seconds
 
 _Found: TypeAlias = "queue.SimpleQueue[tuple[ProbeOrder, Row]]"
 
@@ -144,17 +144,17 @@ def _print_on(
 ) -> None:
     """Print rows as they arrive; as text only when ``ok`` or the error changes."""
     found: _Found = queue.SimpleQueue()
-    said: dict[ProbeOrder, tuple[Any, Any]] = {}
+    printed: dict[ProbeOrder, tuple[Any, Any]] = {}
     with _running(orders, lambda order, row: found.put((order, row)), extra_dirs):
         while not stop.is_set():
             try:
-                order, row = found.get(timeout=_SAID_AGAIN_S)
+                order, row = found.get(timeout=_POLL_S)
             except queue.Empty:
                 continue
             if as_json:
                 print(_line(order, row), flush=True)
-            elif said.get(order) != (row["ok"], row["error"]):
-                said[order] = row["ok"], row["error"]
+            elif printed.get(order) != (row["ok"], row["error"]):
+                printed[order] = row["ok"], row["error"]
                 print("  ".join(_cells(order, row)), flush=True)
 
 
@@ -177,7 +177,7 @@ def _publish(
 
         with _running(orders, put, extra_dirs) as runner:
             while runner.failure is None and not stop.is_set():
-                stop.wait(_SAID_AGAIN_S)
+                stop.wait(_POLL_S)
 
 
 def _line(order: ProbeOrder, row: Row) -> str:

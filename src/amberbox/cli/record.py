@@ -48,7 +48,7 @@ def run(args: argparse.Namespace) -> int:
     folder = load_folder(args.folder)
     warn_readable(folder.store_path)
     recorder = Recorder(folder)
-    recorder.pipeline.on_event = _tell
+    recorder.pipeline.on_event = print_event
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: recorder.stop.set())
     if args.duration is not None:
@@ -73,7 +73,7 @@ def run(args: argparse.Namespace) -> int:
     return 0 if is_service() else 1
 
 
-def _tell(kind: str, text: str) -> None:
+def print_event(kind: str, text: str) -> None:
     """Print an event about a problem to stderr; the record holds all events."""
     if kind not in _NO_TROUBLE:
         with suppress(OSError):  # stderr may be closed; recording goes on

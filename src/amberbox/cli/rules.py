@@ -15,8 +15,8 @@ from amberbox.cli._arguments import add_range_only, add_robot, check_time, opene
 from amberbox.cli._output import print_json, print_notes, writable
 from amberbox.client.address import is_url
 from amberbox.consult.rule_lookups import RuleTarget, rule_facts, rule_target
-from amberbox.core.budget import Budget
 from amberbox.core.config import raise_errors
+from amberbox.core.contracts import Budget
 from amberbox.core.errors import UsageError
 from amberbox.diagnosis.prolog.program import Program, export, read_rules
 from amberbox.diagnosis.prolog.query import Answers, Want, answer_text, ask

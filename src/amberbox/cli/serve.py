@@ -102,15 +102,15 @@ def _serve(args: argparse.Namespace) -> int:
     host = args.host[0] if args.host else "127.0.0.1"
     wanted = ListenOptions(host, args.port, args.public_url, tuple(args.behind_proxy))
     warn_readable(Path(args.data))
-    told = _told(Path(args.data), quiet=args.quiet)
-    start(Path(args.data).resolve(), wanted, new_code=args.new_code, begun=told)
+    report = started_reporter(Path(args.data), quiet=args.quiet)
+    start(Path(args.data).resolve(), wanted, new_code=args.new_code, begun=report)
     return 0
 
 
-def _told(folder: Path, *, quiet: bool) -> Callable[[StartedServer], None]:
+def started_reporter(folder: Path, *, quiet: bool) -> Callable[[StartedServer], None]:
     """Return a function that prints that the server answers."""
 
-    def tell(start: StartedServer) -> None:
+    def report(start: StartedServer) -> None:
         url = start.settings.public_url
         if not quiet:
             if start.renewed:
@@ -120,7 +120,7 @@ def _told(folder: Path, *, quiet: bool) -> Callable[[StartedServer], None]:
             text = start.code.text(f"{url}/setup", by_proxy=bool(start.settings.proxies))
             print(text, file=sys.stderr, flush=True)
 
-    return tell
+    return report
 
 
 def check_installed() -> None:

@@ -495,8 +495,8 @@ def _wait_on_server(args: argparse.Namespace, seconds: float) -> int:
             if wanted and not missing:
                 return 0
             if time.monotonic() >= until_s:
-                said = [waiting(board, name) for name in missing]
-                raise AmberboxError("\n".join(said) or board.silence or "nothing is known yet")
+                waited = [waiting(board, name) for name in missing]
+                raise AmberboxError("\n".join(waited) or board.silence or "nothing is known yet")
             time.sleep(min(_SERVER_WAIT_S, max(until_s - time.monotonic(), 0)))
 
 
@@ -512,18 +512,18 @@ def _status_of(
     robot: str,
     component: str,
     mode: str,
-    said: Condition,
+    condition: Condition,
     outputs: Mapping[str, object],
     silence: str,
 ) -> Status:
     """Return a status; its level is unknown where the robot is silent."""
-    measured_ns = maybe_ns(said.measured) or 0
-    since_ns = maybe_ns(said.since) or 0
-    level = "unknown" if silence else said.level
+    measured_ns = maybe_ns(condition.measured) or 0
+    since_ns = maybe_ns(condition.since) or 0
+    level = "unknown" if silence else condition.level
     made = {
         "robot": robot, "component": component, "mode": mode, "level": level,
-        "state": said.state, "outputs": outputs, "blocked_by": said.blocked_by,
-        "measured_ns": measured_ns, "since_ns": since_ns, "reason": silence or said.reason,
+        "state": condition.state, "outputs": outputs, "blocked_by": condition.blocked_by,
+        "measured_ns": measured_ns, "since_ns": since_ns, "reason": silence or condition.reason,
         "config_hash": "",
     }  # fmt: skip
     return msgspec.convert(made, Status)
@@ -531,14 +531,14 @@ def _status_of(
 
 def _alarm_of(robot: str, alarm: AlarmLine) -> AlarmChange:
     """Return an alarm in the form of a robot's record, with the server's id."""
-    said = alarm.shelved or alarm.acknowledged
+    action = alarm.shelved or alarm.acknowledged
     state = {"open": "open", "acknowledged": "acknowledged", "shelved": "shelved"}[alarm.state]
     made = {
         "robot": robot, "id": str(alarm.id), "component": alarm.origin,
         "severity": alarm.severity, "state": state, "level": alarm.level, "reason": alarm.reason,
         "opened_ns": time_ns(alarm.opened), "changed_ns": time_ns(alarm.changed),
-        "count": alarm.count, "who": said.who if said else "",
-        "until_ns": maybe_ns(said.until) if said else None, "config_hash": "",
+        "count": alarm.count, "who": action.who if action else "",
+        "until_ns": maybe_ns(action.until) if action else None, "config_hash": "",
         "cause": alarm.cause, "diagnosis": alarm.diagnosis,
     }  # fmt: skip
     return msgspec.convert(made, AlarmChange)
@@ -570,8 +570,8 @@ def _server_lines(board: CurrentState, tree: StatusTree, args: argparse.Namespac
         (f"needs {component.needs_rule}".strip(), ", ".join(needs)),
         ("recovery actions (not carried out)", ", ".join(component.recovery_actions)),
     )
-    told = [f"{what}: {text}" for what, text in facts if text]
-    if told:
+    shown = [f"{what}: {text}" for what, text in facts if text]
+    if shown:
         yield ""
-        yield from told
+        yield from shown
     yield from alarms_of(board, args.component, view)

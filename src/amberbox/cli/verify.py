@@ -7,11 +7,12 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import asdict
 
-from amberbox.blackbox.signing.findings import STATES, VerifyFinding, VerifyReport, time_text
+from amberbox.blackbox.signing.findings import STATES, VerifyFinding, VerifyReport
 from amberbox.blackbox.signing.keys import parse_public
 from amberbox.blackbox.signing.verify import verify
 from amberbox.blackbox.store.store import store_path
 from amberbox.cli._output import in_columns, print_json, print_lines, print_notes
+from amberbox.core.timestamps import maybe_time
 from amberbox.core.units import bytes_text
 
 
@@ -75,7 +76,7 @@ def _place(finding: VerifyFinding) -> str:
 
 
 def _short(time_ns: int | None) -> str:
-    text = time_text(time_ns)
+    text = maybe_time(time_ns)
     return "" if text is None else text[:23] + "Z"
 
 
@@ -87,6 +88,6 @@ def _as_json(report: VerifyReport, *, good: bool) -> dict[str, object]:
         "files": dict(report.files),
         "uncovered": dict(report.uncovered),
         "findings": [finding.to_json() for finding in report.findings],
-        "heads": [{**asdict(head), "at": time_text(head.at_ns)} for head in report.heads],
+        "heads": [{**asdict(head), "at": maybe_time(head.at_ns)} for head in report.heads],
         "notes": list(report.notes),
     }

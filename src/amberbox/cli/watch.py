@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from amberbox.monitoring.record_evaluation import MakeDiagnoser, ReplayOptions
 
 
-Say = Callable[["Finding"], None]
+EmitFinding = Callable[["Finding"], None]
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -119,14 +119,14 @@ def _live(
 
     if args.folder is not None and Path(args.where) != folder.path:
         raise UsageError("a store is watched by its robot folder", f"amberbox watch {args.folder}")
-    say = _sayer(args)
+    emit = _printer(args)
 
-    def hear(found: Sequence[Finding]) -> None:
+    def receive(found: Sequence[Finding]) -> None:
         for finding in found:
-            say(finding)
+            emit(finding)
 
     store = create_store(folder.store_path)
-    watcher = RecordWatcher(WatcherSetup(plan, store, folder, diagnoser=diagnoser), hear)
+    watcher = RecordWatcher(WatcherSetup(plan, store, folder, diagnoser=diagnoser), receive)
     if not args.quiet and not args.json:
         print(f"watching {plan.robot}: {plan_text(plan)}", flush=True)
     with _stoppable() as stop:
@@ -142,31 +142,31 @@ def _once(args: argparse.Namespace, plan: MonitoringPlan, diagnoser: MakeDiagnos
         statuses, at_ns, diagnosis = end_of_record(plan, store, diagnoser)
         if not is_locked(store, "main"):
             print_notes([f"nothing is being recorded; this is as of {shown(at_ns)}"])
-    say = _sayer(args)
+    emit = _printer(args)
     for status in statuses:
         if args.json:
-            say(status)
+            emit(status)
         elif not args.quiet:
             print(_status_line(status))
     if diagnosis is not None:
-        say(diagnosis)
+        emit(diagnosis)
     return int(any(status.level == "error" for status in statuses))
 
 
 def _replay(args: argparse.Namespace, plan: MonitoringPlan, diagnoser: MakeDiagnoser | None) -> int:
     from amberbox.monitoring.record_evaluation import replay
 
-    say = _sayer(args)
+    emit = _printer(args)
     with _record(args.where) as store, _stoppable() as stop:
         part = _part(args, store)
         if part.from_ns is not None and not args.json:
-            _tell_lead(plan, diagnoser)
+            _log_lead(plan, diagnoser)
         for finding in replay(plan, store, part, stop, diagnoser):
-            say(finding)
+            emit(finding)
     return 0
 
 
-def _tell_lead(plan: MonitoringPlan, diagnoser: MakeDiagnoser | None) -> None:
+def _log_lead(plan: MonitoringPlan, diagnoser: MakeDiagnoser | None) -> None:
     """Print how far before its range a replay begins."""
     from amberbox.monitoring.engine import Engine
     from amberbox.monitoring.record_evaluation import WARM_UP_S, DiagnosedEngine
@@ -208,7 +208,7 @@ def _speed(text: str) -> float | None:
     return speed
 
 
-def _sayer(args: argparse.Namespace) -> Say:
+def _printer(args: argparse.Namespace) -> EmitFinding:
     """Return the printer of findings: JSON as in the journal, or text about changes."""
     from amberbox.monitoring.findings import encoded
 
@@ -304,12 +304,12 @@ class FindingLines:
 
     def _once(self, at_ns: int, component: str, text: str, reason: str, hint: str = "") -> str:
         """Return a line; the same reason at one instant is printed for the first component only."""
-        said = (at_ns, component, reason)
-        if not reason or said in self._reasons:
+        line = (at_ns, component, reason)
+        if not reason or line in self._reasons:
             return f"{shown(at_ns)} {text}"
         if not any(entry[0] == at_ns for entry in self._reasons):
             self._reasons.clear()
-        self._reasons.add(said)
+        self._reasons.add(line)
         return f"{shown(at_ns)} {text}: {reason}{hint}"
 
 

@@ -58,9 +58,9 @@ def sign_in_of(url: str) -> StoredSignIn | None:
 
 def keep(url: str, entry: StoredSignIn) -> None:
     """Store a sign-in for a server."""
-    said = {"token": entry.token, "ca": f"sha256:{entry.pin}" if entry.pin else "",
+    kept = {"token": entry.token, "ca": f"sha256:{entry.pin}" if entry.pin else "",
             "authority": entry.authority}  # fmt: skip
-    _write({**_read(), url: {key: value for key, value in said.items() if value}})
+    _write({**_read(), url: {key: value for key, value in kept.items() if value}})
 
 
 def forget(url: str) -> bool:

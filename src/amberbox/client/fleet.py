@@ -45,8 +45,8 @@ def paged(
     after: Any = ""
     while True:
         asked = {**(query or {}), "limit": page, "after": after}
-        said = msgspec.json.decode(wire.get(path, asked).body)
-        found = [msgspec.convert(one, kind) for one in said]
+        answers = msgspec.json.decode(wire.get(path, asked).body)
+        found = [msgspec.convert(one, kind) for one in answers]
         yield from found
         if len(found) < page:
             return

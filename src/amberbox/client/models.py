@@ -21,7 +21,7 @@ from amberbox.core.timestamps import format_time
 from amberbox.core.types import IntArray, Missing
 
 if TYPE_CHECKING:
-    from amberbox.core.api import *  # noqa: F403
+    from amberbox.core.api import *  # noqa: F403 - old paths give every answer
 
 _EMPTY: Mapping[Any, Any] = {str: "", bool: False, int: 0, float: 0.0, tuple: ()}
 

@@ -55,10 +55,12 @@ def row_format() -> str:
 def page_of(reply: ApiReply) -> RowPage:
     """Return the page of rows in an answer."""
     table = _of_json(reply.body) if "json" in reply.headers["content-type"] else _of_arrow(reply)
-    said = (reply.headers.get(f"x-amberbox-{name}", "") for name in ("next", "kind", "complete-to"))
+    position = (
+        reply.headers.get(f"x-amberbox-{name}", "") for name in ("next", "kind", "complete-to")
+    )
     notes = msgspec.json.decode(reply.headers.get("x-amberbox-notes", "[]"), type=list[str])
-    told = tuple(dict.fromkeys((*table.notes, *notes)))
-    return RowPage(replace(table, notes=told), *said)
+    all_notes = tuple(dict.fromkeys((*table.notes, *notes)))
+    return RowPage(replace(table, notes=all_notes), *position)
 
 
 def concatenate(pages: Sequence[Table]) -> Table:
@@ -107,17 +109,17 @@ def _of_arrow(reply: ApiReply) -> Table:
 
 
 def _field(name: str, metadata: Mapping[bytes, bytes]) -> Column:
-    said = {key.decode(): value.decode() for key, value in metadata.items()}
-    labels = msgspec.json.decode(said.get("labels", "{}"), type=dict[str, str])
+    values = {key.decode(): value.decode() for key, value in metadata.items()}
+    labels = msgspec.json.decode(values.get("labels", "{}"), type=dict[str, str])
     return column_of(
-        _Column(name, said.get("path", ""), said["type"], said.get("unit", ""), labels)
+        _Column(name, values.get("path", ""), values["type"], values.get("unit", ""), labels)
     )
 
 
-def column_of(said: Any) -> Column:
+def column_of(column: Any) -> Column:
     """Return the description of a column by the server as a ``Column``."""
-    labels = {int(number): text for number, text in said.labels.items()}
-    return Column(said.name, said.path, said.type, said.unit, labels)
+    labels = {int(number): text for number, text in column.labels.items()}
+    return Column(column.name, column.path, column.type, column.unit, labels)
 
 
 def _of_json(body: bytes) -> Table:

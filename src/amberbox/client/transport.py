@@ -40,32 +40,32 @@ class ConflictError(AmberboxError):
     """The object was changed since it was read."""
 
 
-class _Said(msgspec.Struct):
+class _ServerError(msgspec.Struct):
     what: str = ""
     hint: str = ""
 
 
 class _Body(msgspec.Struct):
-    error: _Said
+    error: _ServerError
 
 
 def error_of(status: int, body: bytes, url: str) -> AmberboxError:
     """Return the exception for a server's error answer, with its address."""
-    said = _said(body) or _Said(f"it answered with status {status}")
-    what = f"{url}: {said.what}"
+    stated = error_in(body) or _ServerError(f"it answered with status {status}")
+    what = f"{url}: {stated.what}"
     if status == 401:
-        return NotSignedInError(what, said.hint or f"amberbox sign-in {url}")
+        return NotSignedInError(what, stated.hint or f"amberbox sign-in {url}")
     if status == 403:
         hint = "who made the token can make one with more scopes, or with a higher role"
-        return NotAllowedError(what, said.hint or hint)
+        return NotAllowedError(what, stated.hint or hint)
     if status == 409:
-        return ConflictError(what, said.hint or "look again, then decide")
+        return ConflictError(what, stated.hint or "look again, then decide")
     if status in (400, 404):
-        return UsageError(what, said.hint)
-    return AmberboxError(what, said.hint)
+        return UsageError(what, stated.hint)
+    return AmberboxError(what, stated.hint)
 
 
-def _said(body: bytes) -> _Said | None:
+def error_in(body: bytes) -> _ServerError | None:
     try:
         return msgspec.json.decode(body, type=_Body).error
     except msgspec.MsgspecError:
@@ -231,8 +231,8 @@ class ApiConnection:
 
 def _query(query: Query) -> str:
     """Return the query string; None and empty values are left out, lists repeat their key."""
-    said = {key: _text(value) for key, value in query.items() if value not in (None, "", [])}
-    return f"?{urlencode(said, doseq=True)}" if said else ""
+    given = {key: _text(value) for key, value in query.items() if value not in (None, "", [])}
+    return f"?{urlencode(given, doseq=True)}" if given else ""
 
 
 def _text(value: Any) -> Any:

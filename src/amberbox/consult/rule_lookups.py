@@ -269,7 +269,7 @@ def _outcomes(mission: RecordedMission) -> Iterator[str]:
 
 
 @dataclass(frozen=True, slots=True)
-class _Said:
+class _ConditionInterval:
     """The condition of a component over a span."""
 
     component: str
@@ -284,12 +284,12 @@ class StatusLookup:
     window: RecordWindow
 
     @cached_property
-    def said(self) -> list[_Said]:
+    def intervals(self) -> list[_ConditionInterval]:
         """Return conditions of components in order of time, run by run of the watcher."""
-        runs = (self.window.cut(run) for run in self._heard())
-        return [said for run in runs if run[0] < run[1] for said in self._in_run(run)]
+        runs = (self.window.cut(run) for run in self._watched())
+        return [one for run in runs if run[0] < run[1] for one in self._in_run(run)]
 
-    def _heard(self) -> Iterator[Span]:
+    def _watched(self) -> Iterator[Span]:
         """Yield the watcher's runs; each counts until its silence would be noticed.
 
         Without this no status would hold now: a watcher writes a little behind the recorder.
@@ -309,13 +309,13 @@ class StatusLookup:
 
     def _find(self, keys: Keys, word: Callable[[HealthState], str]) -> Iterator[Interval]:
         component, wanted = keys
-        found = (s for s in self.said if component is None or s.component == component)
-        for name, said, span in _joined((s.component, word(s.condition), s.span) for s in found):
-            if wanted is None or wanted == said:
+        found = (s for s in self.intervals if component is None or s.component == component)
+        for name, text, span in _joined((s.component, word(s.condition), s.span) for s in found):
+            if wanted is None or wanted == text:
                 source = LookupSource(f"watcher, {in_words(span)}", ((name, *span),))
-                yield Interval((name, said), *span, source)
+                yield Interval((name, text), *span, source)
 
-    def _in_run(self, run: Span) -> Iterator[_Said]:
+    def _in_run(self, run: Span) -> Iterator[_ConditionInterval]:
         changes = list(self._changes(run))
         now = self._first(run) | {
             change["component"]: HealthState(**change["before"]) for _, change in reversed(changes)
@@ -324,10 +324,10 @@ class StatusLookup:
         for at_ns, change in changes:
             name = change["component"]
             if since[name] < at_ns:
-                yield _Said(name, now[name], (since[name], at_ns))
+                yield _ConditionInterval(name, now[name], (since[name], at_ns))
             since[name], now[name] = at_ns, HealthState(**change["after"])
         for name, from_ns in since.items():
-            yield _Said(name, now[name], (from_ns, max(run[1], from_ns + 1)))
+            yield _ConditionInterval(name, now[name], (from_ns, max(run[1], from_ns + 1)))
 
     def _changes(self, run: Span) -> Iterator[tuple[int, Mapping[str, Any]]]:
         """Yield changes of components, with their times."""
@@ -355,10 +355,10 @@ class StatusLookup:
         return {}
 
 
-def _joined(said: Iterable[tuple[str, str, Span]]) -> Iterator[tuple[str, str, Span]]:
+def _joined(found: Iterable[tuple[str, str, Span]]) -> Iterator[tuple[str, str, Span]]:
     """Join adjacent equal conditions of a component; runs of the watcher stay apart."""
     open_: dict[str, tuple[str, Span]] = {}
-    for name, word, span in said:
+    for name, word, span in found:
         before = open_.get(name)
         if before is not None and before[0] == word and before[1][1] == span[0]:
             open_[name] = word, (before[1][0], span[1])

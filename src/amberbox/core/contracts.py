@@ -87,6 +87,28 @@ class GivenEvidence:
 NOTHING_GIVEN = GivenEvidence()
 
 
+@dataclass(frozen=True, slots=True)
+class Budget:
+    """Limits of a search; each engine uses those that it has.
+
+    ``nodes`` are the most nodes that are opened or held at a time, None for the default of the
+    engine. ``steps`` are the most steps of a rule program, ``depth`` its deepest nesting of goals.
+    A step is a goal that is run or tried again, a fact that is derived, or eight characters of a
+    text or one element of a list that a built-in predicate makes. ``is_over`` is called now and
+    then and returns True when the caller wants the search to end, since engines read no clock; the
+    default, ``bool``, never does.
+    """
+
+    nodes: int | None = None
+    is_over: Callable[[], bool] = bool
+    steps: int = 5_000_000
+    depth: int = 400_000
+
+    def most_nodes(self, default: int) -> int:
+        """Return the most nodes, given the default of the engine."""
+        return default if self.nodes is None else self.nodes
+
+
 class RecordedPast(Protocol):
     """A part of a robot's record; spans are nanoseconds, without their end."""
 

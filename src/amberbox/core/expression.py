@@ -304,8 +304,8 @@ def reason(
     and does not hold gives ``current is 0.52, below 0.3``.
     """
     terms = dict.fromkeys(_Values(samples, now_ns).terms(expression.tree, expected))
-    told = "; ".join(list(terms)[:MOST_TERMS])
-    return told if len(told) <= MOST_TERMS * _LONGEST else ""
+    text = "; ".join(list(terms)[:MOST_TERMS])
+    return text if len(text) <= MOST_TERMS * _LONGEST else ""
 
 
 def number_text(value: float) -> str:

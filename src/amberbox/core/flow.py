@@ -135,7 +135,7 @@ class Flow:
             return kept if kept > counted or counted != counted else counted
         return np.fmax(counted, kept)[()]
 
-    def heard_ns(self, since_ns: int, until_ns: int) -> IntArray:
+    def received_ns(self, since_ns: int, until_ns: int) -> IntArray:
         """Return times (ns) at which messages surely came, from the last one by ``since_ns`` on.
 
         These are the times of rows, and of counts that show a message after the last row: one that
@@ -143,28 +143,30 @@ class Flow:
         """
         rows, counts = self.rows.times_ns, self.last_ns.times_ns
         first, end = (int(rows.searchsorted(at, "right")) for at in (since_ns, until_ns))
-        heard = rows[max(first - 1, 0) : end]
-        began = int(heard[0]) if first else since_ns
+        received = rows[max(first - 1, 0) : end]
+        began = int(received[0]) if first else since_ns
         begin, stop = (int(counts.searchsorted(at, "right")) for at in (began, until_ns))
         if begin == stop:
-            return heard
+            return received
         counts, newest = counts[begin:stop], self.last_ns.values[begin:stop]
-        last = heard.searchsorted(counts, "right") - 1
-        row_ns = np.where(last >= 0, heard[last], -1) if len(heard) else np.full(len(counts), -1)
+        last = received.searchsorted(counts, "right") - 1
+        row_ns = (
+            np.where(last >= 0, received[last], -1) if len(received) else np.full(len(counts), -1)
+        )
         left_out = (newest > row_ns) & (counts - newest <= COUNTED_NS)
-        joined = np.sort(np.concatenate([heard, counts[left_out]]))
+        joined = np.sort(np.concatenate([received, counts[left_out]]))
         return joined[max(int(joined.searchsorted(since_ns, "right")) - 1, 0) :]
 
-    def longest_gap_s(self, now_ns: int, seconds: float, heard_ns: IntArray) -> float:
+    def longest_gap_s(self, now_ns: int, seconds: float, received_ns: IntArray) -> float:
         """Return the longest time (s) between messages of the last ``seconds``, and since the last.
 
-        ``heard_ns`` are those that count, of ``heard_ns()``. Counts come once a second: where a
-        filter leaves messages out, what is missing between two counts is no gap.
+        ``received_ns`` are those that count, of ``received_ns()``. Counts come once a second: where
+        a filter leaves messages out, what is missing between two counts is no gap.
         """
         start_ns = now_ns - round(seconds * NS)
-        if not len(heard_ns) or heard_ns[0] > start_ns:
-            heard_ns = np.concatenate([[start_ns], heard_ns])
-        longest_ns = int(np.diff(np.append(heard_ns, now_ns)).max())
+        if not len(received_ns) or received_ns[0] > start_ns:
+            received_ns = np.concatenate([[start_ns], received_ns])
+        longest_ns = int(np.diff(np.append(received_ns, now_ns)).max())
         spared_ns = 2 * COUNTED_NS if self.is_filtered(now_ns) else 0
         return max(0, longest_ns - spared_ns) / NS
 

@@ -259,8 +259,8 @@ def middles(values: NDArray[np.float64]) -> tuple[Any, Any]:
     What is not finite does not count; where nothing else is, the middle is NaN.
     """
     if not len(values):
-        nobody = np.full(values.shape[1:], np.nan)
-        return nobody, nobody
+        unknown = np.full(values.shape[1:], np.nan)
+        return unknown, unknown
     if np.isfinite(values).all():
         ordered = np.sort(values, axis=0)
         return ordered[(len(values) - 1) // 2], ordered[len(values) // 2]

@@ -6,7 +6,7 @@ In a file it is a list (all of them), ``{any: [...]}``, ``{all: [...]}`` or
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 
 from amberbox.core.errors import Problem, did_you_mean
@@ -53,7 +53,11 @@ class Needs:
                  for p in self.parts]  # fmt: skip
         if len(inner) == self.at_least:
             return " and ".join(inner)
-        return " or ".join(inner) if self.at_least == 1 else _of(self.at_least, inner)
+        return (
+            " or ".join(inner)
+            if self.at_least == 1
+            else f"at least {self.at_least} of {', '.join(inner)}"
+        )
 
 
 NOTHING = Needs(0, ())
@@ -116,10 +120,6 @@ def _names(needs: Needs) -> Iterator[str]:
             yield part
         else:
             yield from _names(part)
-
-
-def _of(count: int, inner: Sequence[str]) -> str:
-    return f"at least {count} of {', '.join(inner)}"
 
 
 @dataclass(frozen=True, slots=True)

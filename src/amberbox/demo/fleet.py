@@ -340,7 +340,7 @@ class LiveDemo:
             self._heal(robot)
 
     async def cycle_outages(
-        self, plan: OutagePlan, say: Callable[[str], None], begins: Callable[[], object]
+        self, plan: OutagePlan, emit: Callable[[str], None], begins: Callable[[], object]
     ) -> None:
         """Cut the connection of one robot repeatedly, once ``begins`` returns true."""
         await self.relay.begin(self._port)
@@ -349,10 +349,12 @@ class LiveDemo:
         await asyncio.sleep(plan.first_s)
         while True:
             self.relay.cut()
-            say(f"{SOMETIMES_AWAY} has no way to the server for {plan.away_s:.0f} s; it records on")
+            emit(
+                f"{SOMETIMES_AWAY} has no way to the server for {plan.away_s:.0f} s; it records on"
+            )
             await asyncio.sleep(plan.away_s)
             self.relay.mend()
-            say(f"{SOMETIMES_AWAY} has its way to the server again")
+            emit(f"{SOMETIMES_AWAY} has its way to the server again")
             await asyncio.sleep(plan.there_s)
 
     def end(self) -> None:

@@ -49,7 +49,7 @@ _LOST_AT_KILL_S = 0.15
 def run(place: Path, seconds: float) -> int:
     """Run it in an empty folder; return 0 only if every step worked."""
     demo = Demo(place, seconds)
-    steps = (demo.prepare, demo.record, demo.tell, demo.diagnose, demo.account, demo.show)
+    steps = (demo.prepare, demo.record, demo.report_status, demo.diagnose, demo.account, demo.show)
     for step in (*steps, demo.defend):
         step()
     print(f"\nEverything is in {place}. Go on with:")
@@ -89,7 +89,7 @@ class Demo:
 
     def prepare(self) -> None:
         """Make a recording that will be replayed beside the robot."""
-        say("A recording is made: a minute of a simulated robot, as fast as the machine can.")
+        title("A recording is made: a minute of a simulated robot, as fast as the machine can.")
         maker = self.place / "maker"
         sim = "seed: 3\n    speed: max\n    duration_s: 60"
         write_folder(
@@ -105,7 +105,7 @@ class Demo:
 
     def record(self) -> None:
         """Record the live robot and the recording; kill the recorder once; inject a fault."""
-        say(
+        title(
             "A simulated robot speaks ZMQ; the black box listens, and replays the recording beside."
         )
         with robot(self.truth) as (process, endpoint):
@@ -114,7 +114,7 @@ class Demo:
             box = start_box(self.folder)
             watcher = start_watcher(self.folder, self.watched)
             time.sleep(self.seconds * 0.3)
-            tell_robot(process, f"fault {FAULT}")
+            command_robot(process, f"fault {FAULT}")
             print(f"  a fault begins: {FAULT}")
             time.sleep(self.seconds * 0.2)
             box.send_signal(signal.SIGKILL)
@@ -123,7 +123,7 @@ class Demo:
             print("  the box is killed with kill -9, and started again")
             box = start_box(self.folder)
             time.sleep(self.seconds * 0.35)
-            tell_robot(process, f"fault {SLOW}")
+            command_robot(process, f"fault {SLOW}")
             print(f"  another fault begins: {SLOW}")
             wait_until(lambda: bool(self.failures()), 60.0)
             time.sleep(self.seconds * 0.1)
@@ -136,7 +136,7 @@ class Demo:
 
     def look(self) -> None:
         """Show the robot's status while it runs."""
-        say("How is the robot? Its monitors follow the record while it is written.")
+        title("How is the robot? Its monitors follow the record while it is written.")
         amberbox_verb("status", str(self.folder), expected=1)
         amberbox_verb("alarm", str(self.folder))
 
@@ -145,15 +145,15 @@ class Demo:
         lines = self.watched.read_text().splitlines()
         return [line for line in lines if SLOWED in line and "speed_right is false" in line]
 
-    def tell(self) -> None:
+    def report_status(self) -> None:
         """Show the lines of the monitors about the second fault."""
-        say("What the monitors said of the second fault, as it came:")
+        title("What the monitors said of the second fault, as it came:")
         print("\n".join(f"  {line}" for line in self.failures()))
         check(bool(self.failures()), f"the monitors saw that the motor of {SLOWED} is slow")
 
     def diagnose(self) -> None:
         """Show the diagnosis and what to do next."""
-        say("What is broken? One answer from all that was seen, by the robot's failure modes:")
+        title("What is broken? One answer from all that was seen, by the robot's failure modes:")
         amberbox_verb("diagnose", str(self.folder), expected=1)
         command = [sys.executable, "-m", "amberbox", "diagnose", str(self.folder), "--json"]
         answer = json.loads(subprocess.run(command, stdout=subprocess.PIPE, check=False).stdout)
@@ -168,7 +168,7 @@ class Demo:
 
     def account(self) -> None:
         """Compare the record with the messages that the robot has sent."""
-        say("Is anything lost? The robot's own account against the record:")
+        title("Is anything lost? The robot's own account against the record:")
         sent = sent_messages(self.truth)
         kept = kept_messages(self.folder / "store")
         gaps: dict[str, list[tuple[int, int]]] = {}
@@ -194,7 +194,7 @@ class Demo:
 
     def show(self) -> None:
         """Show the items, and the fault in a plot."""
-        say("What is in the record:")
+        title("What is in the record:")
         amberbox_verb("items", str(self.folder))
         for name in ("fault.png", "fault.html"):
             plot = self.place / name
@@ -206,12 +206,12 @@ class Demo:
 
     def defend(self) -> None:
         """Show the incident that is kept, and that a changed bit of the record is found."""
-        say("The fault was noticed: the seconds around it stay whatever else has to go.")
+        title("The fault was noticed: the seconds around it stay whatever else has to go.")
         amberbox_verb("incident", "list", str(self.folder))
         held = load_all(open_store(self.folder / "store"))
         check(any(reason.trigger == "uneven_wheels" for i in held for reason in i.reasons),
               "an incident was made by its trigger")  # fmt: skip
-        say("Is the record as the robot left it? One bit of a copy is changed as well.")
+        title("Is the record as the robot left it? One bit of a copy is changed as well.")
         amberbox_verb("verify", str(self.folder))
         forged = self.place / "forged"
         shutil.copytree(self.folder / "store", forged)
@@ -221,7 +221,7 @@ class Demo:
         check(True, "the record is intact, and the bit was found in its copy")
 
 
-def say(text: str) -> None:
+def title(text: str) -> None:
     """Announce a step."""
     print(f"\n== {text}", flush=True)
 
@@ -316,7 +316,7 @@ def robot(truth: Path) -> Iterator[tuple[subprocess.Popen[str], str]]:
         process.wait(10)
 
 
-def tell_robot(process: subprocess.Popen[str], line: str) -> None:
+def command_robot(process: subprocess.Popen[str], line: str) -> None:
     """Send the simulated robot a command."""
     assert process.stdin is not None
     process.stdin.write(line + "\n")

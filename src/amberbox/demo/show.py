@@ -86,13 +86,13 @@ class DemoRun:
 
     async def _go_on(self, url: str) -> None:
         if self.seconds is None:
-            away = self.stage.cycle_outages(_NOW_AND_THEN, say, self.stage.relay.was_used)
+            away = self.stage.cycle_outages(_NOW_AND_THEN, announce, self.stage.relay.was_used)
         else:
             off_s = self.seconds * _OF_STORY
             once = OutagePlan(off_s / 2, off_s, self.seconds)
             away = self.stage.cycle_outages(once, _be_silent, self.stage.broken)
-        told = self._welcome(url) if self.seconds is None else self._tell(url)
-        await asyncio.gather(away, told)
+        shown = self._welcome(url) if self.seconds is None else self._show_status(url)
+        await asyncio.gather(away, shown)
 
     async def _welcome(self, url: str) -> None:
         """Print sign-in links, and new ones on each Enter."""
@@ -114,7 +114,7 @@ class DemoRun:
         print("\nBreak a robot with the bar at the top of each page, and watch what follows."
               "\nEnter prints new links, Ctrl-C ends everything.\n", flush=True)  # fmt: skip
 
-    async def _tell(self, url: str) -> None:
+    async def _show_status(self, url: str) -> None:
         """Run the story as a process, then end the server."""
         codes = {str(role): self.stage.codes.make(str(role)) for role in Role}
         story = start_tied(("amberbox.demo",), stdin=subprocess.PIPE)
@@ -127,7 +127,7 @@ class DemoRun:
         os.kill(os.getpid(), signal.SIGTERM)
 
 
-def say(text: str) -> None:
+def announce(text: str) -> None:
     """Print a line at once."""
     print(text, flush=True)
 

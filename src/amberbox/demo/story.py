@@ -144,14 +144,14 @@ class StoryLog:
     began_s: float = field(default_factory=time.monotonic)
     steps: int = 0
 
-    def say(self, text: str) -> None:
+    def emit(self, text: str) -> None:
         """Print a line, with the time since the story began."""
         print(f"[{time.monotonic() - self.began_s:5.1f} s] {text}", flush=True)
 
     def worked(self, text: str) -> None:
         """Print that a step worked."""
         self.steps += 1
-        self.say(f"ok: {text}")
+        self.emit(f"ok: {text}")
 
 
 def until(find: Callable[[], T | None], what: Callable[[], str], within_s: float = PATIENCE_S) -> T:
@@ -184,7 +184,7 @@ class FeedListener:
     """Stores all changes of the feed from its creation on; ``close`` it."""
 
     def __init__(self, browser: BrowserClient) -> None:
-        self._heard: list[FeedChange] = []
+        self._received: list[FeedChange] = []
         self._new = threading.Condition()
         self._is_over = False
         self._socket = browser.feed()
@@ -212,12 +212,12 @@ class FeedListener:
     def _after(self, seen: int, end_s: float) -> list[FeedChange]:
         """Return the changes after the first ``seen``, waiting until there are any."""
         with self._new:
-            while len(self._heard) == seen:
+            while len(self._received) == seen:
                 left_s = end_s - time.monotonic()
                 if left_s <= 0 or self._is_over:
                     raise FailedError("what should follow did not come", "is the machine busy?")
                 self._new.wait(left_s)
-            return self._heard[seen:]
+            return self._received[seen:]
 
     def _listen(self) -> None:
         from websockets.exceptions import ConnectionClosed
@@ -232,20 +232,20 @@ class FeedListener:
     def _take(self, changes: Any) -> None:
         now_s = time.monotonic()
         with self._new:
-            self._heard += [
+            self._received += [
                 FeedChange(now_s, one["kind"], one.get("robot") or "", one.get("data"))
                 for one in changes
             ]
             self._new.notify_all()
 
 
-def is_status(component: str, level: str, robot: str) -> Callable[[FeedChange], bool]:
-    """Return a predicate for changes in which a component reaches a level."""
+def is_status(level: str) -> Callable[[FeedChange], bool]:
+    """Return a predicate for changes in which the broken component reaches a level."""
 
-    def is_it(heard: FeedChange) -> bool:
-        return (heard.kind, heard.robot) == ("status", robot) and any(
-            one["component"] == component and not one["mode"] and one["level"] == level
-            for one in heard.data
+    def is_it(change: FeedChange) -> bool:
+        return (change.kind, change.robot) == ("status", ROBOT) and any(
+            one["component"] == COMPONENT and not one["mode"] and one["level"] == level
+            for one in change.data
         )
 
     return is_it
@@ -253,7 +253,7 @@ def is_status(component: str, level: str, robot: str) -> Callable[[FeedChange], 
 
 def is_kind(kind: str, robot: str) -> Callable[[FeedChange], bool]:
     """Return a predicate for changes of a kind about a robot."""
-    return lambda heard: heard.kind == kind and heard.robot == robot
+    return lambda change: change.kind == kind and change.robot == robot
 
 
 ITEM, VARIABLE = "sim_bus", "working_counter"
@@ -261,22 +261,20 @@ WELL, BROKEN = 12, 9  # fieldbus working counter with all units, and with one mi
 _AROUND_NS = 5 * NS
 
 
-def download_fault_data(
-    telling: StoryLog, browser: BrowserClient, robot: str, broken_ns: int
-) -> None:
+def download_fault_data(log: StoryLog, browser: BrowserClient, broken_ns: int) -> None:
     """Find the fault in the recorded data, and download that view as CSV."""
     window = {
         "from": format_time(broken_ns - _AROUND_NS),
         "to": format_time(broken_ns + _AROUND_NS),
     }
-    rows = until(lambda: _rows(browser, robot, window), lambda: "the data of the fault are here")
-    telling.worked(f"{rows} rows of {ITEM}.{VARIABLE} show the fault: {WELL}, then {BROKEN}")
-    asked = {"robots": [robot], "items": [ITEM], "variables": {ITEM: [VARIABLE]}, **window}
+    rows = until(lambda: _rows(browser, ROBOT, window), lambda: "the data of the fault are here")
+    log.worked(f"{rows} rows of {ITEM}.{VARIABLE} show the fault: {WELL}, then {BROKEN}")
+    asked = {"robots": [ROBOT], "items": [ITEM], "variables": {ITEM: [VARIABLE]}, **window}
     number = browser.send("POST", "/downloads", {**asked, "format": "csv"})["id"]
     made = until(lambda: _made(browser, number), lambda: "the download is made")
     text = browser.fetch(f"/downloads/{number}/file").decode()
     check(f",{BROKEN}" in text and f",{WELL}" in text, "the file shows the fault as well")
-    telling.worked(f"downloaded {made['file']}: {len(text.splitlines()) - 1} rows")
+    log.worked(f"downloaded {made['file']}: {len(text.splitlines()) - 1} rows")
 
 
 def _rows(browser: BrowserClient, robot: str, window: dict[str, str]) -> int | None:
@@ -307,18 +305,16 @@ _ADMIN = ("/admin", "/admin/users", "/admin/robots", "/admin/teams", "/admin/sys
 _ASSET = re.compile(rb"(?:src|href)=\"(/static/[^\"#]+)")
 
 
-def visit_pages(
-    telling: StoryLog, people: Mapping[str, BrowserClient], robot: str, alarm: int
-) -> None:
+def visit_pages(log: StoryLog, people: Mapping[str, BrowserClient], alarm: int) -> None:
     """Open every kind of page with a role that may see it; raises FailedError unless it is 200."""
-    nobody = BrowserClient(people["admin"].url)
-    visits = [(nobody, path) for path in _OPEN]
-    visits += [(people["technician"], path.format(robot=robot, alarm=alarm)) for path in _SEEN]
+    visitor = BrowserClient(people["admin"].url)
+    visits = [(visitor, path) for path in _OPEN]
+    visits += [(people["technician"], path.format(robot=ROBOT, alarm=alarm)) for path in _SEEN]
     visits += [(people["admin"], path) for path in _ADMIN]
     assets = {asset for browser, path in visits for asset in _visit(browser, path)}
     for asset in sorted(assets):
-        check(nobody.page(asset).status == 200, f"{asset} is there")
-    telling.worked(f"{len(visits)} pages and the {len(assets)} files they are made of answer 200")
+        check(visitor.page(asset).status == 200, f"{asset} is there")
+    log.worked(f"{len(visits)} pages and the {len(assets)} files they are made of answer 200")
 
 
 def _visit(browser: BrowserClient, path: str) -> Iterator[str]:
@@ -335,27 +331,27 @@ _RATE_HZ, _MOST_OF_IT = 50, 0.8
 _LEAST_LANES = 50
 
 
-def watch_outage(telling: StoryLog, browser: BrowserClient, feed: FeedListener) -> None:
+def watch_outage(log: StoryLog, browser: BrowserClient, feed: FeedListener) -> None:
     """Wait until the robot goes offline, returns, and its records of that time arrive."""
     went = feed.wait(_is_presence(online=False), PATIENCE_S)
-    telling.worked(f"{SOMETIMES_AWAY} went offline")
+    log.worked(f"{SOMETIMES_AWAY} went offline")
     came = feed.wait(_is_presence(online=True), PATIENCE_S, went.at_s)
-    telling.worked(f"{SOMETIMES_AWAY} came back after {came.at_s - went.at_s:.0f} s")
+    log.worked(f"{SOMETIMES_AWAY} came back after {came.at_s - went.at_s:.0f} s")
     span = {"from": _time_of(went), "to": _time_of(came)}
     count = until(lambda: _lanes(browser, span), lambda: "what it found meanwhile is here")
-    telling.worked(f"{SOMETIMES_AWAY} has told how {count} parts of it were meanwhile")
+    log.worked(f"{SOMETIMES_AWAY} has told how {count} parts of it were meanwhile")
     least = round((came.at_s - went.at_s) * _RATE_HZ * _MOST_OF_IT)
     rows = until(
         lambda: _rows_of_absence(browser, span, least),
         lambda: "what was recorded meanwhile is here",
     )
-    telling.worked(f"{rows} rows of {_ITEM} of that time are here")
+    log.worked(f"{rows} rows of {_ITEM} of that time are here")
 
 
 def _is_presence(*, online: bool) -> Any:
-    def is_it(heard: FeedChange) -> bool:
-        is_his = (heard.kind, heard.robot) == ("presence", SOMETIMES_AWAY)
-        return is_his and heard.data["online"] is online
+    def is_it(change: FeedChange) -> bool:
+        is_his = (change.kind, change.robot) == ("presence", SOMETIMES_AWAY)
+        return is_his and change.data["online"] is online
 
     return is_it
 
@@ -375,9 +371,9 @@ def _rows_of_absence(browser: BrowserClient, span: dict[str, str], least: int) -
     return found if found >= least else None
 
 
-def _time_of(heard: FeedChange) -> str:
+def _time_of(change: FeedChange) -> str:
     """Return the wall time of a change; all processes share one clock here."""
-    return format_time(time.time_ns() - round((time.monotonic() - heard.at_s) * 1e9))
+    return format_time(time.time_ns() - round((time.monotonic() - change.at_s) * 1e9))
 
 
 ROBOT = "ropod_001"
@@ -392,19 +388,19 @@ _SURE = 0.9
 
 def run_story(url: str, codes: Mapping[str, str]) -> None:
     """Run all steps; ``codes`` sign each role in. Raises AmberboxError where one fails."""
-    telling = StoryLog()
+    log = StoryLog()
     people = {role: sign_in(url, code) for role, code in codes.items()}
-    telling.worked(f"{len(people)} people signed in by their links; none works a second time")
+    log.worked(f"{len(people)} people signed in by their links; none works a second time")
     feed = FeedListener(people["technician"])
     try:
-        one = FaultStory(telling, people["technician"], feed)
+        one = FaultStory(log, people["technician"], feed)
         one.go_through()
-        watch_outage(telling, people["technician"], feed)
-        download_fault_data(telling, people["technician"], ROBOT, one.broken_ns)
+        watch_outage(log, people["technician"], feed)
+        download_fault_data(log, people["technician"], one.broken_ns)
     finally:
         feed.close()
-    visit_pages(telling, people, ROBOT, one.alarm)
-    telling.say(f"all {telling.steps} steps worked")
+    visit_pages(log, people, one.alarm)
+    log.emit(f"all {log.steps} steps worked")
 
 
 def sign_in(url: str, code: str) -> BrowserClient:
@@ -419,7 +415,7 @@ def sign_in(url: str, code: str) -> BrowserClient:
 class FaultStory:
     """The story of one robot, as a technician sees it in the browser."""
 
-    telling: StoryLog
+    log: StoryLog
     browser: BrowserClient
     feed: FeedListener
     broken_s: float = 0.0
@@ -438,40 +434,40 @@ class FaultStory:
     def see_robots(self) -> None:
         """Wait until all robots are online and their monitors report ok."""
         until(self._all_well, lambda: f"all are well; but {'; '.join(self._troubles())}")
-        self.telling.worked(f"{', '.join(IDS)} are online and well")
+        self.log.worked(f"{', '.join(IDS)} are online and well")
 
     def damage(self) -> None:
         """Inject the fault."""
         self.broken_s, self.broken_ns = time.monotonic(), time.time_ns()
         self.browser.send("POST", f"/demo/{ROBOT}/fault", {"fault": FAULT})
-        self.telling.worked(f"{ROBOT} is broken: {FAULT}")
+        self.log.worked(f"{ROBOT} is broken: {FAULT}")
 
     def see_symptom(self) -> None:
         """Wait for the status of the component."""
-        self._found("symptom", self._wait(is_status(COMPONENT, "error", ROBOT)), COMPONENT)
+        self._found("symptom", self._wait(is_status("error")), COMPONENT)
 
     def see_alarm(self) -> None:
         """Wait for the alarm, with its reason."""
-        heard = self._wait(is_kind("alarm", ROBOT))
-        self.alarm = int(heard.data["id"])
+        change = self._wait(is_kind("alarm", ROBOT))
+        self.alarm = int(change.data["id"])
         alarm = self._alarm()
         check(alarm["active"] and alarm["state"] == "open", "the alarm is open")
-        self._found("alarm", heard, f"{alarm['severity']}: {alarm['reason']}")
+        self._found("alarm", change, f"{alarm['severity']}: {alarm['reason']}")
 
     def see_diagnosis(self) -> None:
         """Wait for the diagnosis and its next test."""
-        heard = self._wait(self._blames(lambda revision: CAUSE in _leading(revision)))
-        self._found("diagnosis", heard, CAUSE)
-        heard = self._wait(self._blames(lambda revision: bool(_test(revision))))
+        change = self._wait(self._blames(lambda revision: CAUSE in _leading(revision)))
+        self._found("diagnosis", change, CAUSE)
+        change = self._wait(self._blames(lambda revision: bool(_test(revision))))
         texts = filter(None, map(_test, self._revisions()))
-        self._found("next test", heard, next(texts)["text"])
+        self._found("next test", change, next(texts)["text"])
 
     def acknowledge(self) -> None:
         """Acknowledge the alarm."""
-        said = {"revision": self._alarm()["revision"], "note": "on my way"}
-        self.browser.send("POST", f"/alarms/{self.alarm}/acknowledge", said)
+        request = {"revision": self._alarm()["revision"], "note": "on my way"}
+        self.browser.send("POST", f"/alarms/{self.alarm}/acknowledge", request)
         check(self._alarm()["acknowledged"] is not None, "the alarm is acknowledged")
-        self.telling.worked(f"alarm {self.alarm} is acknowledged")
+        self.log.worked(f"alarm {self.alarm} is acknowledged")
 
     def answer(self) -> None:
         """Answer the test, which leaves one cause."""
@@ -480,20 +476,20 @@ class FaultStory:
         first = self.browser.send("POST", path, body)["hypotheses"][0]
         is_sure = first["faults"] == [CAUSE] and first["probability"] >= _SURE
         check(is_sure, f"with the answer it is {CAUSE}, and nothing else")
-        self.telling.worked(f"the plug is off: {CAUSE} ({first['probability']:.0%})")
+        self.log.worked(f"the plug is off: {CAUSE} ({first['probability']:.0%})")
 
     def repair(self) -> None:
         """Repair the robot, and wait until it is ok again."""
         since_s = time.monotonic()
         self.browser.send("DELETE", f"/demo/{ROBOT}/fault")
-        self._wait(is_status(COMPONENT, "ok", ROBOT), since_s)
-        self.telling.worked(f"{ROBOT} is repaired; {COMPONENT} is well again")
+        self._wait(is_status("ok"), since_s)
+        self.log.worked(f"{ROBOT} is repaired; {COMPONENT} is well again")
 
     def _wait(self, is_it: Callable[[FeedChange], bool], since_s: float = 0.0) -> FeedChange:
         return self.feed.wait(is_it, PATIENCE_S, since_s or self.broken_s)
 
-    def _found(self, what: str, heard: FeedChange, which: str) -> None:
-        self.telling.worked(f"{what} after {heard.at_s - self.broken_s:.1f} s: {which}")
+    def _found(self, what: str, change: FeedChange, which: str) -> None:
+        self.log.worked(f"{what} after {change.at_s - self.broken_s:.1f} s: {which}")
 
     def _all_well(self) -> bool | None:
         return None if self._troubles() else True
@@ -513,10 +509,10 @@ class FaultStory:
     def _blames(self, is_it: Callable[[Any], bool]) -> Callable[[FeedChange], bool]:
         """Return a predicate for changes with a diagnosis of the robot that matches."""
 
-        def found(heard: FeedChange) -> bool:
-            if heard.kind != "diagnosis" or heard.robot != ROBOT:
+        def found(change: FeedChange) -> bool:
+            if change.kind != "diagnosis" or change.robot != ROBOT:
                 return False
-            self.diagnosis = heard.data[-1]["id"]
+            self.diagnosis = change.data[-1]["id"]
             return any(is_it(revision) for revision in self._revisions())
 
         return found

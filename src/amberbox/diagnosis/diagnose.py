@@ -7,9 +7,9 @@ from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import Literal, TypeAlias, cast
 
-from amberbox.core.budget import Budget
 from amberbox.core.contracts import (
     AnsweredTest,
+    Budget,
     Conflict,
     EvidenceEngine,
     EvidenceFollower,
@@ -93,7 +93,7 @@ def evidence_of_situation(knowledge: Knowledge, situation: ObservedSituation) ->
 
     Raises UsageError for an answer to an unknown test, or that the test does not have.
     """
-    counting = (_asked(symptom) for symptom in situation.symptoms if not symptom.blocked_by)
+    counting = (_as_monitored(symptom) for symptom in situation.symptoms if not symptom.blocked_by)
     found = collect_evidence(counting, situation.conflicts)
     if situation.watched:
         read = frozenset(f"read:{sign.id}" for sign in knowledge.model.signs)
@@ -103,7 +103,7 @@ def evidence_of_situation(knowledge: Knowledge, situation: ObservedSituation) ->
     return found
 
 
-def _asked(symptom: Symptom) -> Symptom:
+def _as_monitored(symptom: Symptom) -> Symptom:
     """Count the FMEA's own conditions as findings of monitors: the same author wrote both.
 
     The author has given both a ``detects``, knowing that they look at the same measurement.

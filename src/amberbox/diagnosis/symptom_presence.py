@@ -176,7 +176,8 @@ class SymptomPresence:
     def onset_ns(self) -> int:
         """Return its present onset, ns."""
         seen = self.seen or self.latest
-        return _time(seen.confirmed_ns if seen.onset_ns is None else seen.onset_ns)
+        at_ns = seen.confirmed_ns if seen.onset_ns is None else seen.onset_ns
+        return 0 if at_ns is None else at_ns
 
     def shown(self, counts: Counts) -> Symptom:
         """Return it as evidence: what does not count is unknown, or blocked."""
@@ -295,10 +296,6 @@ class SymptomPresences:
             presence.until_ns, presence.left_ns = until_ns, left_ns
             if presence.latest.state == "present" and not presence.is_there:
                 self._blocked[name] = None
-
-
-def _time(at_ns: int | None) -> int:
-    return 0 if at_ns is None else at_ns
 
 
 class AbsenceTimes:

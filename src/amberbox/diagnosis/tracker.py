@@ -11,8 +11,8 @@ from typing import Any, Final, Literal, TypeAlias
 
 import msgspec
 
-from amberbox.core.budget import Budget
 from amberbox.core.clock import NS
+from amberbox.core.contracts import Budget
 from amberbox.core.errors import UsageError
 from amberbox.core.types import Batch, Diagnosis, FaultFacts, Symptom
 from amberbox.diagnosis.diagnose import DiagnosisId, Effort, ObservedSituation, answer, followers
@@ -121,10 +121,10 @@ def new_diagnosis_id(robot: str, at_ns: int, last_id: str) -> str:
 
 def needs_revision(before: Diagnosis, after: Diagnosis) -> bool:
     """Return whether an answer differs so that a revision is due."""
-    return _said(before) != _said(after) or _moved(before, after)
+    return _conclusion(before) != _conclusion(after) or _moved(before, after)
 
 
-def _said(one: Diagnosis) -> tuple[object, ...]:
+def _conclusion(one: Diagnosis) -> tuple[object, ...]:
     leading = one.hypotheses[0] if one.hypotheses else None
     why = None if leading is None else (leading.id, leading.explains, leading.unexplained)
     proposed = one.next_tests[0].id if one.next_tests else ""
@@ -252,7 +252,7 @@ class FaultTracker:
 
         Log times before and after it are not comparable.
         """
-        self._pending = [told for one in self._followers.values() for told in one.begin(at_ns)]
+        self._pending = [s for one in self._followers.values() for s in one.begin(at_ns)]
         self._presences.begin()
         self._waits_ns = {}
         self._until_ns = at_ns
@@ -278,8 +278,8 @@ class FaultTracker:
         self._pending = []
         for one in self._followers.values():
             one.receive(found)
-            told = _timed(one.advance(self._until_ns, until_ns), records=one.records)
-            (unwritten if one.records else written).append(told)
+            changes = _timed(one.advance(self._until_ns, until_ns), records=one.records)
+            (unwritten if one.records else written).append(changes)
         out: Out = []
         events = merge(*written, *unwritten, key=_when)
         for at_ns, group in groupby(events, key=_when):

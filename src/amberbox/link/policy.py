@@ -21,7 +21,7 @@ from amberbox.core.types import Batch
 from amberbox.link.robot_end import LANES, Lane
 
 _ROUTES = Path("/proc/net/route")
-_ASK_S = 2.0
+_COMMAND_S = 2.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,7 +81,11 @@ def _wireless_name(interface: str) -> str:
         return ""
     try:
         asked = subprocess.run(
-            [tool, interface, "--raw"], capture_output=True, text=True, timeout=_ASK_S, check=False
+            [tool, interface, "--raw"],
+            capture_output=True,
+            text=True,
+            timeout=_COMMAND_S,
+            check=False,
         )
     except (OSError, subprocess.TimeoutExpired):
         return ""

@@ -85,7 +85,7 @@ class FetchRequests:
             r.id: r for r in _read_requests(store.path / REQUESTS_FILE)
         }
         self._answered: dict[str, tuple[tuple[str, int], ...]] = {}
-        self._asked_again: set[str] = set()
+        self._requested_again: set[str] = set()
         self.journals: frozenset[str] = frozenset()
         """What is to be copied whatever the rule says."""
 
@@ -95,7 +95,7 @@ class FetchRequests:
             self._open[frame.id] = FetchRequest(frame.id, frame.item, frame.from_ns, frame.to_ns)
             for old in list(self._open)[:-_MOST_REQUESTS]:
                 del self._open[old]
-            self._asked_again.add(frame.id)
+            self._requested_again.add(frame.id)
 
     def step(self) -> None:
         """Find the journals of open requests, answer, and close finished requests.
@@ -103,43 +103,43 @@ class FetchRequests:
         Raises OSError when the disk refuses the file of open requests.
         """
         with self._lock:
-            again, self._asked_again = self._asked_again, set()
+            again, self._requested_again = self._requested_again, set()
             requests = list(self._open.values())
         if again:
             self._write(requests)
-        said = manifest.read(self._store.path)
+        known = manifest.read(self._store.path)
         wanted: set[str] = set()
         for request in requests:
-            files = self._find(request, said, is_news=request.id in again)
+            files = self._find(request, known, is_news=request.id in again)
             wanted |= {name for name, _ in files}
-            if self._is_done(request, files, said):
+            if self._is_done(request, files, known):
                 self._close(request)
         self.journals = frozenset(wanted)
 
     def _find(
-        self, request: FetchRequest, said: Manifest, *, is_news: bool
+        self, request: FetchRequest, known: Manifest, *, is_news: bool
     ) -> tuple[tuple[str, int], ...]:
-        files = tuple(journals_of(self._store, request, said))
-        told = {name for name, _ in self._answered.get(request.id, ())}
-        if is_news or {name for name, _ in files} != told:
+        files = tuple(journals_of(self._store, request, known))
+        answered = {name for name, _ in self._answered.get(request.id, ())}
+        if is_news or {name for name, _ in files} != answered:
             self._answered[request.id] = files
             self._answer(FetchAnswer(request.id, files))
         return files
 
     def _is_done(
-        self, request: FetchRequest, files: tuple[tuple[str, int], ...], said: Manifest
+        self, request: FetchRequest, files: tuple[tuple[str, int], ...], known: Manifest
     ) -> bool:
         """Return whether the window has passed and all of its journals are copied or refused."""
         if request.to_ns + _MARGIN_NS > self._wall_ns() and is_locked(self._store, "main"):
             return False
         return all(
-            (name in said.confirmed and not self._lacks(name)) or self._is_settled(name)
+            (name in known.confirmed and not self._lacks(name)) or self._is_settled(name)
             for name, _ in files
         )
 
     def _close(self, request: FetchRequest) -> None:
         with self._lock:
-            if request.id in self._asked_again:
+            if request.id in self._requested_again:
                 return
             self._open.pop(request.id, None)
             requests = list(self._open.values())
@@ -150,21 +150,21 @@ class FetchRequests:
         replace_file(self._store.path / REQUESTS_FILE, msgspec.json.encode(requests).decode())
 
 
-def journals_of(store: Store, request: FetchRequest, said: Manifest) -> Iterator[tuple[str, int]]:
+def journals_of(store: Store, request: FetchRequest, known: Manifest) -> Iterator[tuple[str, int]]:
     """Yield the journals (name and bytes) that may hold rows of a window, open ones included."""
     item = request.item.partition("__")[0]
     for writer in _WRITERS:
         for path in store.journal_files(writer):
             name = f"{path.parent.name}/{path.name}"
-            span = _span(path, name, said)
+            span = _span(path, name, known)
             meets = span is not None and span[0] <= request.to_ns and span[1] >= request.from_ns
             if meets and (not item or item in _items(path, name)):
                 yield name, size_of(path)
 
 
-def _span(path: Path, name: str, said: Manifest) -> tuple[int, int] | None:
+def _span(path: Path, name: str, known: Manifest) -> tuple[int, int] | None:
     """Return the receive times that a journal covers, with a margin; None without rows."""
-    sealed = said.sealed.get(name)
+    sealed = known.sealed.get(name)
     if sealed is not None:
         return sealed.start_ns - _MARGIN_NS, sealed.end_ns + _MARGIN_NS
     found = extent(path)
@@ -374,7 +374,7 @@ class JournalCopier:
         """Send a journal, or its rest; return the server's verdict, None if the file is gone."""
         path = self.store.journal_path(name)
         try:
-            about = _about(path)
+            about = upload_headers(path)
         except FileNotFoundError:
             return None
         proof = proof_of(self.store.path, name) or Proof()
@@ -438,7 +438,7 @@ def _lost_text(host: str, names: Sequence[str]) -> str:
     return f"{host} lacks {count} that it had confirmed: copied again ({which})"
 
 
-def _about(path: Path) -> dict[str, str]:
+def upload_headers(path: Path) -> dict[str, str]:
     """Return the headers that identify a file: its size and hash."""
     digest, size = hashlib.sha256(), 0
     with path.open("rb") as file:
@@ -482,15 +482,15 @@ class HoldingsCheck:
     def __init__(self, copier: JournalCopier, contact: Callable[[], int | None]) -> None:
         self._copier = copier
         self._contact = contact
-        self._asked: int | None = None
+        self._queried: int | None = None
 
     def look_again(self) -> None:
         """Ask once more, after a fetch request."""
-        self._asked = None
+        self._queried = None
 
     def may_lack(self, name: str) -> bool:
         """Return whether a confirmed journal is, or may be, missing on the server."""
-        return self._asked is None or name in self._copier.lacking
+        return self._queried is None or name in self._copier.lacking
 
     def step(self) -> None:
         """Ask once per connection which journals the server lacks.
@@ -498,19 +498,19 @@ class HoldingsCheck:
         Raises CopyError to retry later, OSError when the disk refuses the result.
         """
         contact = self._contact()
-        if contact is None or contact == self._asked:
+        if contact is None or contact == self._queried:
             return
-        self._asked = contact  # set first, since look_again may be called meanwhile
+        self._queried = contact  # set first, since look_again may be called meanwhile
         try:
             for asked in uploads.questions(uploads.journal_ranges(self._counted_on())):
-                answer = self._ask(asked)
+                answer = self._query(asked)
                 if answer is None:
                     return
                 lacking = uploads.missing_copies(asked, answer)
                 if lacking:
                     self._copier.copy_again(lacking)
         except BaseException:
-            self._asked = None
+            self._queried = None
             raise
 
     def _counted_on(self) -> Iterator[JournalCopy]:
@@ -526,7 +526,7 @@ class HoldingsCheck:
                     except FileNotFoundError:  # deleted meanwhile
                         continue
 
-    def _ask(
+    def _query(
         self, asked: Sequence[tuple[JournalRange, list[JournalCopy]]]
     ) -> HoldingsAnswer | None:
         """Ask about some ranges; None from a server that lacks this route."""

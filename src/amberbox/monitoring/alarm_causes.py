@@ -465,9 +465,9 @@ class AlarmCauses:
             return
         yield named
         if key in self._user_changes:
-            said = replace(self._named(self._user_changes[key]), changed_ns=at_ns)
-            self._user_changes[key] = said
-            yield said
+            change = replace(self._named(self._user_changes[key]), changed_ns=at_ns)
+            self._user_changes[key] = change
+            yield change
 
     def _regroup(self, now_ns: int) -> Iterator[AlarmChange]:
         """Raise and heal alarms of the diagnosis; make one alarm of those with one cause."""

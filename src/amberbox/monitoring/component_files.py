@@ -124,10 +124,10 @@ class _Files:
             return "mode"
         if keys & _OF_COMPONENTS:
             return "component"
-        self._tell_unknown(node, keys)
+        self._report_unknown(node, keys)
         return ""
 
-    def _tell_unknown(self, node: Node, keys: frozenset[str]) -> None:
+    def _report_unknown(self, node: Node, keys: frozenset[str]) -> None:
         if "config_dirs" in keys:
             what = "ignored: all files below components/ are read; robot.yaml names the robot"
             self.problems.append(node.problem("file", what, is_error=False))

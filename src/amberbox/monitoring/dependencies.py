@@ -15,7 +15,7 @@ from amberbox.core.yaml_nodes import Node
 from amberbox.monitoring.component_files import ComponentFileOptions, RecoveryOptions
 from amberbox.monitoring.plan import ComponentPlan, DependencyPlan, ModePlan
 
-NOBODY = "none"
+NO_MODE = "none"
 _KEY = "dependencies"
 
 
@@ -217,7 +217,7 @@ class _Edge:
         """Return the edge: judged by an output, a mode, the component, or not at all."""
         component = self.names.component(self.name)
         edge = DependencyPlan(self.name, self.kind, component.id if component else None)  # type: ignore[arg-type]  # kinds are keys of the file
-        if text == NOBODY:
+        if text == NO_MODE:
             self._note_missing(component, "nobody judges it")
             return replace(edge, judged=False)
         judge = self.names.judge(text)

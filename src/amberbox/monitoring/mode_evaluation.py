@@ -378,7 +378,9 @@ class MappingRun:
                     try:
                         self._evaluate_one(now, found)
                     except CRASHES as error:  # whatever it is: other modes go on
-                        self._crash(now, error, found)
+                        what = f"crashed: {type(error).__name__}: {error}"
+                        self.crashed = valid_text(what.rstrip(": "))
+                        self._emit_unknown(now, "unknown", self.crashed, found)
                         return
             elif code != self.code:
                 self._not_fresh(now, code, found)
@@ -389,10 +391,6 @@ class MappingRun:
         if not self._timed:
             return block.has_rows
         return block.is_quarter | block.has_rows if self._is_short else block.is_quarter
-
-    def _crash(self, now: int, error: BaseException, found: list[OutputChange]) -> None:
-        self.crashed = valid_text(f"crashed: {type(error).__name__}: {error}".rstrip(": "))
-        self._emit_unknown(now, "unknown", self.crashed, found)
 
     def _evaluate_one(self, now: int, found: list[OutputChange]) -> None:
         results = self._mode.evaluate(self._config, self.inputs, now)

@@ -62,7 +62,7 @@ def processor_wait_s() -> float:
         return 0.0
 
 
-class _Guard:
+class HangGuard:
     """A guard that checks now and then whether the same call is still under way."""
 
     def __init__(
@@ -112,7 +112,7 @@ def hang_guard(plan: MonitoringPlan) -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread() or not codes:
         yield
         return
-    before = signal.signal(signal.SIGALRM, _Guard(codes).check)
+    before = signal.signal(signal.SIGALRM, HangGuard(codes).check)
     signal.setitimer(signal.ITIMER_REAL, LIMIT_S / _LOOKS, LIMIT_S / _LOOKS)
     try:
         yield

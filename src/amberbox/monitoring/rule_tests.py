@@ -527,13 +527,13 @@ def single_mode_plan(
     """
     problems: list[Problem] = []
     functions = find_functions(folder)
-    bench = PlanContext(functions, InputBinder(_Told(file), functions), RobotConfig(), problems)
+    bench = PlanContext(functions, InputBinder(TestItems(file), functions), RobotConfig(), problems)
     plan = plan_mode(ModeSource(Path(mode.file), mode), bench)
     component = ComponentPlan(COMPONENT, COMPONENT, (plan,))
     return MonitoringPlan("rule_test", "", (component,)), problems
 
 
-class _Told(RecordedItems):
+class TestItems(RecordedItems):
     """The recorded items of tests, with the columns that they define."""
 
     def __init__(self, file: RuleTestFile) -> None:
@@ -632,9 +632,9 @@ def _unlike(entry: Any, found: Any, *names: str, reason: str | None = None) -> I
         expected, value = getattr(entry, name), getattr(found, name)
         if expected is not None and expected != value:
             yield f"expected {name} {expected}, got {value}"
-    said = found.reason if reason is None else reason
-    if entry.reason not in said:
-        yield f"expected a reason with '{entry.reason}', got '{said}'"
+    got = found.reason if reason is None else reason
+    if entry.reason not in got:
+        yield f"expected a reason with '{entry.reason}', got '{got}'"
 
 
 def _is_as(expected: Any, value: Output) -> bool:
@@ -739,8 +739,8 @@ def _surplus(place: Node, test: RuleTest, at_ns: int, text: str) -> Problem:
 
 def _problem(place: Node, test: RuleTest, at_s: float | None, what: str, got: str) -> Problem:
     when = "" if at_s is None else f" at {at_s:g} s"
-    told = f"{what} ({got})" if got else what
-    return place.problem(f"test '{test.test}'{when}", told)
+    text = f"{what} ({got})" if got else what
+    return place.problem(f"test '{test.test}'{when}", text)
 
 
 def _seconds(at_ns: int) -> float:

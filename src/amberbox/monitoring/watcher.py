@@ -192,7 +192,7 @@ class RecordWatcher:
         self._is_sound = True
         """Everything that was evaluated is written down."""
         self._silent: list[Status] = []
-        self._noted_s = self._asked_s = watch.clock_s()
+        self._noted_s = self._requests_read_s = watch.clock_s()
         self._measured: list[tuple[ProbeOrder, Mapping[str, Any]]] = []
         self._measured_lock = threading.Lock()
         options = () if watch.folder is None else watch.folder.robot.monitoring.publish
@@ -365,9 +365,13 @@ class RecordWatcher:
     def _carry_out_requests(self) -> None:
         """Carry out requests about alarms, and write a checkpoint at once."""
         place, now_s = self._evaluation.place, self._watch.clock_s()
-        if place is None or self._evaluation.is_behind or now_s - self._asked_s < _REQUESTS_S:
+        if (
+            place is None
+            or self._evaluation.is_behind
+            or now_s - self._requests_read_s < _REQUESTS_S
+        ):
             return
-        self._asked_s = now_s
+        self._requests_read_s = now_s
         for request in pending(self._watch.store):
             if request.kind != KIND:
                 continue

@@ -56,10 +56,10 @@ def client_address(peer: str, forwarded: Sequence[str], proxies: Sequence[Networ
     if found is None or not is_trusted(found, proxies):
         return peer if found is None else str(found)
     for entry in reversed(",".join(forwarded).split(",")):
-        said = read(entry)
-        if said is None:
+        address = read(entry)
+        if address is None:
             break
-        found = said
+        found = address
         if not is_trusted(found, proxies):
             break
     return str(found)

@@ -67,8 +67,8 @@ async def refuse(
 
     ``code`` is for programs: it distinguishes errors of the same status.
     """
-    said = {"what": what, "hint": hint, **({"code": code} if code else {})}
-    body = json.dumps({"error": said}).encode()
+    error = {"what": what, "hint": hint, **({"code": code} if code else {})}
+    body = json.dumps({"error": error}).encode()
     prefix = "websocket." if scope["type"] == "websocket" else ""
     about = [(b"content-type", b"application/json"), (b"content-length", b"%d" % len(body)), *more]
     start = {"type": f"{prefix}http.response.start", "status": status, "headers": about}
@@ -193,8 +193,8 @@ class BodyLimits:
             await self._app(scope, receive, send)
             return
         limit = self._limit(scope)
-        said = headers_of(scope).get("content-length", "0")
-        if not _is_at_most(said, limit.most):
+        length = headers_of(scope).get("content-length", "0")
+        if not _is_at_most(length, limit.most):
             what = f"a body has at most {limit.most} bytes here"
             await refuse(scope, send, 413, what, more=[(b"connection", b"close")])
             return
@@ -207,12 +207,12 @@ class BodyLimits:
         return self._usual
 
 
-def _is_at_most(said: str, most: int) -> bool:
+def _is_at_most(length: str, most: int) -> bool:
     """Return whether a client's number is at most ``most``; one of thousands of digits is not
     parsed.
     """
-    digits = said.lstrip("0") or "0"
-    return said.isascii() and said.isdecimal() and len(digits) < 19 and int(digits) <= most
+    digits = length.lstrip("0") or "0"
+    return length.isascii() and length.isdecimal() and len(digits) < 19 and int(digits) <= most
 
 
 class _Counted:

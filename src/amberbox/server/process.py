@@ -207,8 +207,8 @@ def _keep(
         key = JournalKey(incoming.robot, incoming.store_id, incoming.journal, incoming.sha256)
         archive.put(key, path, is_checked=result.signed)  # sealed and signed: all of it holds
         state = "verified"
-    told = {"store_id": incoming.store_id, "journal": incoming.journal, "state": state}
-    bus.publish(ServerChange("journal", incoming.robot, told))
+    details = {"store_id": incoming.store_id, "journal": incoming.journal, "state": state}
+    bus.publish(ServerChange("journal", incoming.robot, details))
 
 
 # Time limit in seconds from connecting, or from a request's first byte, to the end of its headers
@@ -309,13 +309,13 @@ def listen(settings: ServerSettings) -> socket.socket:
 
 
 async def serve(
-    services: Services, port: socket.socket, told: LifecycleHooks | None = None
+    services: Services, port: socket.socket, hooks: LifecycleHooks | None = None
 ) -> None:
     """Serve until SIGTERM or Ctrl-C; then close links with Bye, and stop within seconds.
 
     Raises DatabaseDamagedError, after the same shutdown, when the database turns out damaged.
     """
-    told, stop, notifier = told or LifecycleHooks(), asyncio.Event(), Notifier()
+    hooks, stop, notifier = hooks or LifecycleHooks(), asyncio.Event(), Notifier()
     app = wrapped(services)
     server = _Server(_config(app, services.settings))
     services.bus.attach(asyncio.get_running_loop())
@@ -329,14 +329,14 @@ async def serve(
         await _until_started(server, answering)
         gc.freeze()  # objects from the start stay: the collector need not scan them each time
         gc.enable()
-        told.ready(int(port.getsockname()[1]))
+        hooks.ready(int(port.getsockname()[1]))
         notifier.ready()
         ends = [answering, stopping, damaged]
         await asyncio.wait(ends, return_when=asyncio.FIRST_COMPLETED)
     finally:
-        told.stopping()
+        hooks.stopping()
         notifier.stopping("ending connections")
-        await say_goodbye(services.links)
+        await send_goodbye(services.links)
         server.should_exit = True
         await asyncio.wait([answering])
         for worker_pool in (services.worker_pool, services.robot_worker_pool):
@@ -357,7 +357,7 @@ async def _until_damaged(database: ServerDatabase) -> None:
         await asyncio.sleep(_LOOK_S)
 
 
-async def say_goodbye(links: LinkServer) -> None:
+async def send_goodbye(links: LinkServer) -> None:
     """Send Bye to all robots, so that they reconnect soon, and close their sockets."""
     everyone = list(links.robots.values())
     goodbyes = [links.send(one.robot, Bye("the server stops")) for one in everyone]

@@ -54,7 +54,11 @@ class ServerLock:
                 f"{folder} is in use by a server: {holder}",
                 "stop that one first, or give this one a folder of its own with --data",
             ) from None
-        held = {"pid": os.getpid(), "host": socket.gethostname(), "since": _since(clock)}
+        held = {
+            "pid": os.getpid(),
+            "host": socket.gethostname(),
+            "since": format_time(clock.wall_ns()).partition(".")[0] + "Z",
+        }
         self._file.seek(0)
         self._file.truncate()
         self._file.write(json.dumps(held) + "\n")
@@ -72,10 +76,6 @@ def _opened(path: Path) -> IO[str]:
         raise AmberboxError(
             f"cannot write {path}: {error.strerror}", "name a folder that the server may write"
         ) from error
-
-
-def _since(clock: Clock) -> str:
-    return format_time(clock.wall_ns()).partition(".")[0] + "Z"
 
 
 def _holder(file: IO[str]) -> str:
@@ -154,11 +154,11 @@ def run(
         services.demo = demo
         try:
             code = _prepared(services, new_code=new_code)
-            told = LifecycleHooks(
+            hooks = LifecycleHooks(
                 ready=lambda _: begun(StartedServer(settings, code, renewed)),
                 stopping=(lambda: None) if demo is None else demo.end,
             )
-            asyncio.run(process.serve(services, port, told))
+            asyncio.run(process.serve(services, port, hooks))
         finally:
             port.close()
             process.close(services)

@@ -320,8 +320,8 @@ def statuses(store: Path | None) -> list[Status]:
     if store is None or not is_store(store):
         return []
     found = newest_records(open_store(store), WATCHER, {channels.STATUS}, _LOOKBACK_S)
-    told = (status_of(record.values) for record in found)
-    newest = {(status.component, status.mode): status for status in told}
+    reported = (status_of(record.values) for record in found)
+    newest = {(status.component, status.mode): status for status in reported}
     return [newest[key] for key in sorted(newest)]
 
 
@@ -333,9 +333,9 @@ def diagnoses(store: Path | None) -> list[DiagnosisHistory]:
     return sorted(found, key=lambda one: (-one.last.at_ns, one.id))
 
 
-def _by_id(said: Iterable[Diagnosis]) -> list[DiagnosisHistory]:
+def _by_id(diagnoses: Iterable[Diagnosis]) -> list[DiagnosisHistory]:
     by_id: dict[str, dict[tuple[int, str], Diagnosis]] = {}
-    for diagnosis in said:
+    for diagnosis in diagnoses:
         revisions = by_id.setdefault(diagnosis.id, {})
         revisions.setdefault((diagnosis.revision, diagnosis.state), diagnosis)
     return [DiagnosisHistory(name, tuple(revisions.values())) for name, revisions in by_id.items()]

@@ -215,9 +215,12 @@ class Robot:
             lasers = [self.laser_front, self.laser_rear]
             self.localisation.step(pose, self.odometry.pose, lasers, self.now_ns)
         if self.host.is_working("task_executor"):
-            self._work(dt)
+            estimate, gauge = self.localisation.estimate, self.battery.gauge
+            self.executor.step(dt, self.now_s, estimate, 100.0 * gauge)
         if self.host.is_working("navigation"):
-            self._navigate()
+            self.navigation.look(self.laser_front.last, self.now_ns)
+            self.navigation.step(self.localisation.estimate)
+            self._command, self._command_ns = self.navigation.command, self.now_ns
         self._free(dt)
 
     def _scan(self) -> None:
@@ -227,15 +230,6 @@ class Robot:
         for (name, laser), view in zip(lasers.items(), views, strict=True):
             if self.host.is_working(name):
                 laser.turn(view, self.now_ns, self.base.has_cart and laser is self.laser_rear)
-
-    def _work(self, dt: float) -> None:
-        estimate = self.localisation.estimate
-        self.executor.step(dt, self.now_s, estimate, 100.0 * self.battery.gauge)
-
-    def _navigate(self) -> None:
-        self.navigation.look(self.laser_front.last, self.now_ns)
-        self.navigation.step(self.localisation.estimate)
-        self._command, self._command_ns = self.navigation.command, self.now_ns
 
     def _free(self, dt: float) -> None:
         """Move a robot that has stood against an obstacle for a while back to the corridor."""

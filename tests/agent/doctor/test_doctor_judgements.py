@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from amberbox.agent.doctor.checkup import OPTIONAL, judged_clock, judged_packages, judged_power
 from amberbox.agent.doctor.disk import (
     BlockDevice,
     judged_disk,
@@ -24,7 +25,6 @@ from amberbox.agent.doctor.processes import (
     why_only_events,
 )
 from amberbox.agent.doctor.subject import DoctorFinding, MountPoint, Traffic, in_time, mount_of
-from amberbox.agent.doctor.system import OPTIONAL, judged_clock, judged_packages, judged_power
 from amberbox.blackbox.journal.tail import JournalHead
 from amberbox.blackbox.robot_folder.robot_yaml import StoreOptions
 from amberbox.blackbox.store.store import create_store

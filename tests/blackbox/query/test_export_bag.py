@@ -169,10 +169,10 @@ def test_messages_that_do_not_convert_are_counted_out(tmp_path: Path) -> None:
 
 def test_a_written_chunk_is_forgotten(tmp_path: Path) -> None:
     """rosbags keeps time and place of every message until the end; we keep their number."""
-    from amberbox.blackbox.query.export import _writer
+    from amberbox.blackbox.query.export import bag_writer
 
     kind = Kind("std_msgs/msg/String")
-    with _writer(tmp_path / "out.bag", "none") as writer:
+    with bag_writer(tmp_path / "out.bag", "none") as writer:
         writer.chunk_threshold = 1000
         connection = writer.add_connection("/text", kind.name, typestore=ROS1)
         for number in range(200):

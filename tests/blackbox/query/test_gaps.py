@@ -12,7 +12,7 @@ import amberbox
 from amberbox.blackbox.store import segment_builder as segments
 from amberbox.blackbox.store.journal_reader import journals
 from amberbox.cli.main import main
-from amberbox.cli.plot import _gaps as gaps_drawn
+from amberbox.cli.plot import gaps_in_plot as gaps_drawn
 from amberbox.core.clock import NS
 from amberbox.core.errors import UsageError
 from amberbox.core.types import Gap

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from amberbox.blackbox.journal import channels
-from amberbox.blackbox.query.gaps import _as_known_now
+from amberbox.blackbox.query.gaps import corrected_gap
 from amberbox.blackbox.query.record import LocalRecord
 from amberbox.blackbox.signing.signatures import seal_journals
 from amberbox.blackbox.store.catalogue import read_catalogue
@@ -352,7 +352,7 @@ def test_gaps_found_earlier_are_moved_with_the_rows(
     assert book.known_now_ns(1, then) == now
     assert book.known_now_ns(2, then) == then
     gap = Gap("main", 1, then, then + NS, "deleted: test")
-    moved = _as_known_now(gap, read_catalogue(store))
+    moved = corrected_gap(gap, read_catalogue(store))
     assert moved.from_ns == now
     assert moved.to_ns - moved.from_ns == pytest.approx(NS, abs=MS)
 

@@ -5,7 +5,7 @@ from itertools import pairwise
 
 import pytest
 
-from amberbox.core.budget import Budget
+from amberbox.core.contracts import Budget
 from amberbox.core.needs import all_of, any_of
 from amberbox.diagnosis.covering.hypotheses import NO_FAULT, RankedHypotheses, diagnose
 from amberbox.diagnosis.covering.model import (

@@ -5,7 +5,7 @@ from itertools import pairwise
 
 import pytest
 
-from amberbox.core.budget import Budget
+from amberbox.core.contracts import Budget
 from amberbox.diagnosis.covering.hypotheses import diagnose
 from tests.diagnosis.covering.brute import named, posterior, restricted
 from tests.diagnosis.covering.small_models import random_evidence, random_model

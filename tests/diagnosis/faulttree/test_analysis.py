@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from amberbox.core.budget import Budget
+from amberbox.core.contracts import Budget
 from amberbox.core.errors import AmberboxError
 from amberbox.diagnosis.faulttree.analysis import CutSetCloseness, analyse, closest
 from amberbox.diagnosis.faulttree.open_psa import read_mef

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from amberbox.core.budget import Budget
+from amberbox.core.contracts import Budget
 from amberbox.diagnosis.prolog.program import Program
 from amberbox.diagnosis.prolog.query import ask
 from amberbox.diagnosis.prolog.syntax import read_goal

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from amberbox.core.budget import Budget
+from amberbox.core.contracts import Budget
 from amberbox.core.errors import ConfigurationError
 from amberbox.diagnosis.prolog.program import read_rules, read_text
 from amberbox.diagnosis.prolog.query import Answers, answer_text, ask

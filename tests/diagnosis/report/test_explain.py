@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from amberbox.core.budget import Budget
+from amberbox.core.contracts import Budget
 from amberbox.core.types import Diagnosis, Hypothesis
 from amberbox.core.types import Test as Proposed
 from amberbox.diagnosis.covering.hypotheses import diagnose
@@ -15,7 +15,7 @@ from amberbox.diagnosis.diagnose import (
     check_named,
     evidence_of_situation,
 )
-from amberbox.diagnosis.report.explain import ANSWERS, NOBODY_KNOWS, NOTHING, explain
+from amberbox.diagnosis.report.explain import ANSWERS, NOTHING, UNKNOWN_USE, explain
 from tests.diagnosis.report.robot import (
     BLIND,
     ENCODER,
@@ -135,7 +135,7 @@ def test_something_graver_that_may_be_is_warned_of() -> None:
 def test_what_the_fmea_does_not_know() -> None:
     told = explained(*ODD)
     assert told.headline.startswith("Something that the FMEA does not know is broken.")
-    assert (told.use.severity, told.use.text) == ("", NOBODY_KNOWS)
+    assert (told.use.severity, told.use.text) == ("", UNKNOWN_USE)
 
 
 @pytest.mark.parametrize("looks_like", [0.03, 0.0])
@@ -223,7 +223,7 @@ def test_nothing_explains_it() -> None:
     told = explain(made, knowledge(), ())
     assert told.broken is None and told.headline.lower() == f"{NOTHING}."
     assert [seen.id for seen in told.unexplained] == ["a/b/c"]
-    assert told.use.text == NOBODY_KNOWS
+    assert told.use.text == UNKNOWN_USE
 
 
 def test_faults_and_tests_of_others_are_called_by_their_ids() -> None:
@@ -235,7 +235,7 @@ def test_faults_and_tests_of_others_are_called_by_their_ids() -> None:
     told = explain(made, knowledge(), ())
     assert told.headline.startswith("Arm: bent hard.")
     assert any("proof: rule 7" in line for line in told.details)
-    assert told.next.test == "" and told.use.text == NOBODY_KNOWS
+    assert told.next.test == "" and told.use.text == UNKNOWN_USE
 
 
 def test_details_have_every_hypothesis_with_its_criticality() -> None:

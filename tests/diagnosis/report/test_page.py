@@ -6,7 +6,7 @@ import re
 
 from amberbox.core.units import CONFIDENCE_WORDS
 from amberbox.diagnosis.report.causal_graph import CAUSES, SYMPTOMS
-from amberbox.diagnosis.report.explain import ANSWERS, COVERED, NOBODY_KNOWS
+from amberbox.diagnosis.report.explain import ANSWERS, COVERED, UNKNOWN_USE
 from amberbox.diagnosis.report.text import SURE_ENOUGH
 from tests.diagnosis.report.page import BLOCK, PAGE, outputs, written
 
@@ -29,7 +29,7 @@ def test_severities_and_limits_are_on_the_page() -> None:
     page = " ".join(PAGE.read_text(encoding="utf-8").split())
     for severity, words in ANSWERS.items():
         assert f"| {severity or 'nothing is lost'} | {words} |" in page
-    assert f"| nobody knows | {NOBODY_KNOWS} |" in page
+    assert f"| nobody knows | {UNKNOWN_USE} |" in page
     assert f"at most {CAUSES} causes and {SYMPTOMS} symptoms" in page
     assert f"{COVERED:.0%}".replace("%", " %") in page
     assert f"at least {SURE_ENOUGH:.0%}".replace("%", " %") in page

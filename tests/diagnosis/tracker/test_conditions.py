@@ -10,7 +10,7 @@ import pytest
 
 from amberbox.core.clock import NS
 from amberbox.core.types import Batch, Column, ItemSchema, Ragged, Symptom
-from amberbox.diagnosis.condition_symptoms import AddressColumns, ConditionTracker
+from amberbox.diagnosis.evidence.conditions import AddressColumns, ConditionTracker
 from tests.diagnosis.tracker.robot import T0_NS, knowledge, rows, seconds, status
 
 TEXT = """\

@@ -181,5 +181,5 @@ def test_a_count_tells_of_messages_that_a_filter_left_out() -> None:
     flow = one_input(times_s=[0.0], values=[1.0]).flow
     counts = np.array([at_s(second) for second in (1, 2, 3)])
     flow.last_ns.extend(counts, counts - NS // 10)
-    assert (flow.heard_ns(at_s(0), at_s(2.5)) - at_s(0)).tolist() == [0, NS, 2 * NS]
+    assert (flow.received_ns(at_s(0), at_s(2.5)) - at_s(0)).tolist() == [0, NS, 2 * NS]
     assert flow.is_filtered(at_s(2.5)) and not flow.is_filtered(at_s(60))

@@ -6,7 +6,7 @@ import pytest
 
 from amberbox.core.clock import SystemClock
 from amberbox.core.errors import UsageError
-from amberbox.monitoring.probes.clock import _Timex, judge, measure
+from amberbox.monitoring.probes.clock import KernelClock, judge, measure
 
 
 def test_this_computer_agrees_with_the_recorders_own_look() -> None:
@@ -26,7 +26,7 @@ def test_this_computer_agrees_with_the_recorders_own_look() -> None:
     ],
 )
 def test_what_the_kernel_says_is_read(state: int, status: int, ok: bool, offset_ms: float) -> None:
-    found = judge(state, _Timex(offset=-1_500_000, max_error=250_000, status=status))
+    found = judge(state, KernelClock(offset=-1_500_000, max_error=250_000, status=status))
     assert found["ok"] is ok
     assert found["offset_ms"] == pytest.approx(offset_ms)
     assert found["max_error_ms"] == pytest.approx(250)

@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from amberbox.core.errors import AmberboxError, UsageError
-from amberbox.monitoring.probes.disk import _MountPoint, judge, measure, mount_of
+from amberbox.monitoring.probes.disk import FileSystemMount, judge, measure, mount_of
 
-DATA = _MountPoint(Path("/data"), read_only=False)
+DATA = FileSystemMount(Path("/data"), read_only=False)
 MOUNTINFO = """\
 22 1 8:2 / / rw,relatime shared:1 - ext4 /dev/sda2 rw,errors=remount-ro
 23 22 8:3 / /data rw,noatime shared:2 - ext4 /dev/sda3 ro,errors=remount-ro

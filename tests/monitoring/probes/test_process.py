@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from amberbox.core.errors import UsageError
-from amberbox.monitoring.probes.process import _ProcessUsage, find, judge, measure, usage
+from amberbox.monitoring.probes.process import ProcessUsage, find, judge, measure, usage
 from amberbox.testing.clock import wait_until
 
 PROC = Path("/proc")
@@ -81,8 +81,8 @@ def test_a_process_that_is_dead_but_not_buried_does_not_count(start: Start) -> N
 
 
 def test_what_is_used_is_the_difference_of_two_looks() -> None:
-    before = {1: _ProcessUsage(10.0, 5.0), 2: _ProcessUsage(1.0, 1.0)}
-    after = {1: _ProcessUsage(10.25, 6.0), 3: _ProcessUsage(0.5, 2.0)}
+    before = {1: ProcessUsage(10.0, 5.0), 2: ProcessUsage(1.0, 1.0)}
+    after = {1: ProcessUsage(10.25, 6.0), 3: ProcessUsage(0.5, 2.0)}
     assert judge(before, after, 0.5) == {
         "ok": True,
         "count": 2,
@@ -96,7 +96,7 @@ def test_a_name_with_brackets_and_spaces_is_read(tmp_path: Path) -> None:
     (tmp_path / "7").mkdir()
     (tmp_path / "7" / "stat").write_text(f"7 (a) Z (b) {numbers}\n")
     tick, page = os.sysconf("SC_CLK_TCK"), os.sysconf("SC_PAGE_SIZE")
-    assert usage(tmp_path, [7, 8]) == {7: _ProcessUsage(200 / tick, page * 1000 / 1e6)}
+    assert usage(tmp_path, [7, 8]) == {7: ProcessUsage(200 / tick, page * 1000 / 1e6)}
 
 
 def test_where_others_are_hidden_a_missing_process_is_unknown(tmp_path: Path) -> None:

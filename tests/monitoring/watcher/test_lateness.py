@@ -21,7 +21,7 @@ from amberbox.monitoring.current_state import (
     read_heartbeat,
     write_heartbeat,
 )
-from amberbox.monitoring.record_evaluation import HangError, RecordEvaluation, _Guard
+from amberbox.monitoring.record_evaluation import HangError, HangGuard, RecordEvaluation
 from amberbox.testing.clock import ManualClock
 from tests.monitoring.watcher.stand import Stand, values_of, written
 
@@ -142,7 +142,7 @@ def test_one_look_that_finds_nothing_is_no_silence(
 def test_waiting_for_a_processor_is_no_hang() -> None:
     frame = _frame()
     now, waited = [0.0], [0.0]
-    guard = _Guard(frozenset([_frame.__code__]), lambda: now[0], lambda: waited[0])
+    guard = HangGuard(frozenset([_frame.__code__]), lambda: now[0], lambda: waited[0])
     for _ in range(50):
         now[0] += 0.4
         waited[0] += 0.39

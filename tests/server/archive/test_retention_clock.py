@@ -166,7 +166,7 @@ def test_a_synchronised_clock_that_robots_share_confirms_itself(
     off(clock, 14)
     says = {"right": clock.wall, "wrong": clock.wall - 14 * DAY_NS, "1970": 5 * NS}
     for number, one in enumerate(robots):
-        archive.ages.hear(f"r{number}", says[one])
+        archive.ages.compare_wall(f"r{number}", says[one])
     archive.ages.look()
     looks(archive.ages, clock, AGREED_NS / NS / 3600 - 0.5)
     assert archive.ages.read().jump == "ahead"
@@ -193,7 +193,7 @@ def test_no_evidence_confirms_nothing(
     off(clock, 32)
     clock.is_synchronised = is_synchronised
     if is_synchronised:
-        archive.ages.hear("r1", right_ns)
+        archive.ages.compare_wall("r1", right_ns)
     looks(archive.ages, clock, 50)
     assert archive.ages.read().jump == "ahead"
     assert archive.retain(_RULE) == 0

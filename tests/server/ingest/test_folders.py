@@ -121,7 +121,7 @@ def test_secrets_that_a_robot_let_through_are_masked(home: House) -> None:
 def test_what_robots_send_is_read_by_workers_of_its_own(home: House) -> None:
     """People's questions never wait behind it: nothing of it is put where these are answered."""
     for_people: list[str] = []
-    home.services.worker_pool.submit = lambda task: for_people.append(task.op)  # type: ignore[method-assign]
+    home.services.worker_pool.submit = lambda task: for_people.append(task.op)  # type: ignore[method-assign]  # a pool that only notes
     kept = home.services.folders
     assert kept.keep("ropod_001", A, pack({"robot.yaml": b"id: ropod_001\n"}))
     assert home.services.feed.state.facts.read("ropod_001", A).model == ""

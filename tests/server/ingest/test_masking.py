@@ -11,10 +11,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from amberbox.agent.folder_upload import WORD, _by_form, _plain, _quoted_as
+from amberbox.agent.folder_upload import WORD, mask_by_form, mask_quoted, mask_text
 from amberbox.core.redaction import MASK, SOUNDS_SECRET, redact, secrets_by_name
 from amberbox.core.yaml_nodes import parse_yaml
-from amberbox.server.ingest.worker import _by_lines
+from amberbox.server.ingest.worker import mask_lines
 from tests.fuzzing import examples, fuzz
 
 LINES = re.compile(
@@ -52,7 +52,7 @@ def lines_of_before(text: str) -> str:
 @given(TEXTS)
 @settings(max_examples=examples(400), deadline=None)
 def test_the_server_masks_what_it_masked(text: str) -> None:
-    assert _by_lines(text) == lines_of_before(text)
+    assert mask_lines(text) == lines_of_before(text)
 
 
 @fuzz
@@ -60,8 +60,8 @@ def test_the_server_masks_what_it_masked(text: str) -> None:
 @settings(max_examples=examples(400), deadline=None)
 def test_a_robot_masks_what_it_masked(text: str) -> None:
     before = ELEMENT.sub(rf"\1{WORD}\2", text)
-    assert _plain(text) == SAID.sub(lambda match: match[1] + _quoted_as(match[2]), before)
-    assert _by_form(text) == USER.sub(rf"\1{MASK}@", QUERY.sub(rf"\1{WORD}", text))
+    assert mask_text(text) == SAID.sub(lambda match: match[1] + mask_quoted(match[2]), before)
+    assert mask_by_form(text) == USER.sub(rf"\1{MASK}@", QUERY.sub(rf"\1{WORD}", text))
 
 
 @pytest.mark.parametrize(
@@ -74,7 +74,7 @@ def test_a_robot_masks_what_it_masked(text: str) -> None:
     ],
 )
 def test_keys_and_values_may_stand_apart(text: str, masked: str) -> None:
-    assert _by_lines(text) == masked == lines_of_before(text)
+    assert mask_lines(text) == masked == lines_of_before(text)
 
 
 def test_values_in_yaml_are_replaced_where_they_stand() -> None:

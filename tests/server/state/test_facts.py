@@ -38,7 +38,7 @@ class Desk:
     def wants(self, robot: str, config_hash: str) -> bool:
         return config_hash == "unknown"
 
-    def ask_now(self, op: str, arguments: Mapping[str, Any], *limits: float, asker: str) -> bytes:
+    def ask_now(self, op: str, arguments: Mapping[str, Any], *limits: float, origin: str) -> bytes:
         self.asked += 1
         answer = self.answers.pop(0)
         if isinstance(answer, AmberboxError):

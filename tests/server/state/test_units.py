@@ -7,7 +7,7 @@ from pathlib import Path
 from amberbox import sim
 from amberbox.blackbox.robot_folder.folder import load_folder
 from amberbox.monitoring.plan_loader import load_plan
-from amberbox.server.live.worker import _outputs
+from amberbox.server.live.worker import output_facts
 
 MODE = """\
 name: heartbeat
@@ -34,5 +34,5 @@ def test_a_unit_is_declared_or_the_monitors_own(tmp_path: Path) -> None:
     plan, problems = load_plan(load_folder(tmp_path))
     assert [problem for problem in problems if problem.is_error] == []
     (component,) = plan.components
-    units = {output.name: output.unit for output in _outputs(component, "heartbeat")}
+    units = {output.name: output.unit for output in output_facts(component, "heartbeat")}
     assert units == {"alive": "", "rate_hz": "Hz", "silence": "ticks"}

@@ -262,6 +262,13 @@ def test_downloads_are_ones_own(home: House) -> None:
     assert "No download yet" in text_of(home.client("nurse"), "/downloads?all=true")
 
 
+def test_the_form_of_downloads_takes_long_names(home: House) -> None:
+    client = home.client("technician")
+    for name in ("item", "mission"):
+        assert client.get("/downloads", params={name: "x" * 300}, headers=HTML).status_code == 200
+        assert client.get("/downloads", params={name: "x" * 301}, headers=HTML).status_code != 200
+
+
 def test_the_form_begins_with_what_the_address_says(home: House) -> None:
     page = home.client("technician").get(
         "/downloads", headers=HTML,

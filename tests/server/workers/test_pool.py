@@ -120,13 +120,13 @@ def test_one_of_many_keeps_one_worker_at_most(tmp_path: Path) -> None:
         worker_pool.submit(question)
     for number in range(3):
         assert (
-            worker_pool.ask_now(op("echo"), {"text": str(number)}, asker="good") == b"%d" % number
+            worker_pool.ask_now(op("echo"), {"text": str(number)}, origin="good") == b"%d" % number
         )
     assert [question.done.running() for question in mine] == [True, False, False]
     mine[0].cancel()  # the next one of them has its turn then
     with pytest.raises(CancelledError):
         mine[0].done.result()
-    assert worker_pool.ask_now(op("echo"), {"text": "still"}, asker="good") == b"still"
+    assert worker_pool.ask_now(op("echo"), {"text": "still"}, origin="good") == b"still"
     worker_pool.close()
     assert all(question.done.done() for question in mine)
 
@@ -168,7 +168,7 @@ def test_who_goes_away_stops_the_worker(worker_pool: WorkerPool) -> None:
 def test_too_many_questions_are_refused(worker_pool: WorkerPool) -> None:
     async def crowd() -> list[Any]:
         slow = [
-            worker_pool.ask(op("echo"), {"text": "", "wait_s": 0.2}, asker=f"user:{n}")
+            worker_pool.ask(op("echo"), {"text": "", "wait_s": 0.2}, origin=f"user:{n}")
             for n in range(12)
         ]
         return await asyncio.gather(*slow, return_exceptions=True)
@@ -191,10 +191,10 @@ def test_one_asker_cannot_fill_the_queue() -> None:
 
 def test_askers_take_turns() -> None:
     waiting = FairQueue(most=99, each=99)
-    for asker in "aaabbc":
-        waiting.add(_question(asker))
+    for origin in "aaabbc":
+        waiting.add(_question(origin))
     taken = [waiting.take() for _ in range(6)]
-    assert "".join(one.asker for one in taken if one) == "abcaba"
+    assert "".join(one.origin for one in taken if one) == "abcaba"
 
 
 def test_closing_lets_go_of_those_who_wait(tmp_path: Path) -> None:
@@ -257,5 +257,5 @@ def test_many_threads_ask_at_once(worker_pool: WorkerPool) -> None:
     assert sorted(found) == [b"0", b"1", b"2", b"3"]
 
 
-def _question(asker: str, operation: str = f"{MODULE}:echo") -> WorkerTask:
-    return WorkerTask(operation, {"text": ""}, lambda part: None, 20.0, 1 << 30, asker)
+def _question(origin: str, operation: str = f"{MODULE}:echo") -> WorkerTask:
+    return WorkerTask(operation, {"text": ""}, lambda part: None, 20.0, 1 << 30, origin)

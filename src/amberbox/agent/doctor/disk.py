@@ -245,10 +245,10 @@ def read_disk(folder: Path) -> BlockDevice:
 
 def _kind(folder: Path) -> str:
     try:
-        told = (folder / "device" / "type").read_text().strip()
+        kind = (folder / "device" / "type").read_text().strip()
     except OSError:
-        told = ""
-    return {"SD": "SD card", "MMC": "eMMC"}.get(told, "disk")
+        kind = ""
+    return {"SD": "SD card", "MMC": "eMMC"}.get(kind, "disk")
 
 
 def _numbers(path: Path) -> list[int]:

@@ -385,8 +385,8 @@ def _for_viewers(shape: Shape) -> dict[str, Any]:
     plain = viewer_form(full)
     if plain is None or plain["type"] != "object":  # they ask for an object, whatever comes
         plain = {"type": "object", "properties": {}}
-    tells_all = _to_json(_nullable(plain, table=True), table=True) == full
-    return plain if tells_all else plain | {SHAPE_KEY: full}
+    is_complete = _to_json(_nullable(plain, table=True), table=True) == full
+    return plain if is_complete else plain | {SHAPE_KEY: full}
 
 
 def _to_json(shape: Shape, table: bool = False) -> dict[str, Any]:

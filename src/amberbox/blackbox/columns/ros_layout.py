@@ -354,17 +354,14 @@ class EvenPlaces:
         return texts
 
     def _column(self, start: int, end: int, wide: bool) -> str | list[str]:
-        if self._constant(start, end):
+        block = self._block(start, end - start)
+        if (block == block[0]).all():
             return self._text(0, start, end, wide)
         return [self._text(message, start, end, wide) for message in range(self.count)]
 
     def _text(self, message: int, start: int, end: int, wide: bool) -> str:
         base = message * self.size
         return decode_text(self.data[base + start : base + end], wide, self.big_endian)
-
-    def _constant(self, start: int, end: int) -> bool:
-        block = self._block(start, end - start)
-        return bool((block == block[0]).all())
 
     def _block(self, start: int, length: int) -> Bytes:
         """View the same bytes of all messages, one row each."""

@@ -270,8 +270,8 @@ def format_grid(
         texts = [not number and not least_widths for number in numeric]
         fitted = fit_columns(least_widths or widths, texts, room.width)
         text = _fitted(header, table, numeric, fitted, with_header=with_header)
-        is_told = with_header and fitted.hides
-        return f"{text}\n{room.note(len(fitted.columns), len(header))}" if is_told else text
+        is_noted = with_header and fitted.hides
+        return f"{text}\n{room.note(len(fitted.columns), len(header))}" if is_noted else text
     if least_widths:
         widths = [max(pair) for pair in zip(widths, least_widths, strict=True)]
     return _laid_out(header, table, numeric, widths, with_header=with_header)

@@ -428,11 +428,11 @@ def is_record(size: int, kind: int) -> bool:
     return size > 0 and ord("A") <= kind <= ord("Z")
 
 
-def next_record(block: bytes, start: int, subscriptions: Mapping[int, UlogSubscription]) -> int:
+def next_record(block: bytes, subscriptions: Mapping[int, UlogSubscription]) -> int:
     """Return where records continue after damage: at a sync mark, or at data of a known number."""
-    sync = block.find(SYNC, start)
+    sync = block.find(SYNC)
     stop = len(block) if sync < 0 else sync
-    at = block.find(b"D", start + 2, stop)
+    at = block.find(b"D", 2, stop)
     while at >= 0:
         if _begins_data(block, at - 2, subscriptions):
             return at - 2
@@ -602,7 +602,7 @@ def _skip_damage(log: _Log, at: int, stop: int) -> int:
     found = at + 1
     while found < stop:
         block = log.file.read(found, min(_BLOCK, stop - found))
-        place = next_record(block, 0, log.state.subscriptions)
+        place = next_record(block, log.state.subscriptions)
         if place < len(block):
             found += place
             break

@@ -144,7 +144,7 @@ def write_bag(job: ExportJob) -> None:
     conversions = {stream: _conversion(job, stream) for stream in originals.streams}
     if not any(conversions.values()):
         raise AmberboxError("none of these items can be in a ROS 1 bag", job.report.missing[0])
-    with new_file(job.path) as part, _writer(part, job.options.compression) as writer:
+    with new_file(job.path) as part, bag_writer(part, job.options.compression) as writer:
         output = _BagFile(job, writer, conversions)
         for messages in originals.blocks:
             output.write(messages)
@@ -153,7 +153,8 @@ def write_bag(job: ExportJob) -> None:
     job.report.bytes = size_of(job.path)
 
 
-def _writer(path: Path, compression: str) -> Writer:
+def bag_writer(path: Path, compression: str) -> Writer:
+    """Return a writer of a bag that keeps little of the chunks it has written."""
     from rosbags.rosbag1 import Writer as BagWriter
     from rosbags.rosbag1.writer import WriteChunk
 
@@ -199,7 +200,10 @@ class _BagFile:
             try:
                 self._writer.write(connection, received_ns, conversion.convert(data))
             except _conversion_errors() as error:
-                self._note_lost(messages.streams[place], error)
+                item, text = messages.streams[place].item, str(error).partition("\n")[0]
+                report = self._job.report
+                report.miss(f"{item}: messages that do not convert to ROS 1 ({text})")
+                report.add(item, -1)
 
     def _conversion(self, stream: ItemStream) -> _BagConversion | None:
         """Return how a stream gets into the bag, also one that began after the export."""
@@ -230,11 +234,6 @@ class _BagFile:
             callerid=_CALLER,
             latching=int(stream.topic.latched),
         )
-
-    def _note_lost(self, stream: ItemStream, error: Exception) -> None:
-        text = str(error).partition("\n")[0]
-        self._job.report.miss(f"{stream.item}: messages that do not convert to ROS 1 ({text})")
-        self._job.report.add(stream.item, -1)
 
 
 def _is_like(

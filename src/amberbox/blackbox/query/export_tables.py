@@ -310,7 +310,8 @@ def json_rows(table: Table) -> Iterator[list[bytes]]:
         columns = [_values(name, part.columns[name]) for name in names]
         rows = [dict(zip(names, row, strict=True)) for row in zip(*columns, strict=True)]
         for name in names:
-            _leave_out(rows, name, part.columns[name])
+            for row in np.flatnonzero(null_mask(part.columns[name])).tolist():
+                del rows[row][name]
         yield [msgspec.json.encode(row) for row in rows]
 
 
@@ -320,11 +321,6 @@ def _values(name: str, column: ColumnData) -> Sequence[Any]:
     seconds, rest = np.divmod(column, NS)
     pairs = zip(seconds.tolist(), rest.tolist(), strict=True)
     return [{"sec": sec, "nsec": nsec} for sec, nsec in pairs]
-
-
-def _leave_out(rows: list[dict[str, Any]], name: str, column: ColumnData) -> None:
-    for row in np.flatnonzero(null_mask(column)).tolist():
-        del rows[row][name]
 
 
 @dataclass(frozen=True)

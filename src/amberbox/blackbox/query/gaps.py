@@ -44,7 +44,7 @@ def gaps(catalogue: StoreCatalogue, item: str | None, span: TimeSpan) -> list[Ga
 
 def recorded_and_known(catalogue: StoreCatalogue, then: Iterable[Gap]) -> list[Gap]:
     """Return the recorded gaps and others whose times are as they were known ``then``."""
-    return [*_recorded(catalogue), *(_as_known_now(gap, catalogue) for gap in then)]
+    return [*_recorded(catalogue), *(corrected_gap(gap, catalogue) for gap in then)]
 
 
 def joined_gaps_in(found: Sequence[Gap], item: str | None, span: TimeSpan) -> list[Gap]:
@@ -53,7 +53,7 @@ def joined_gaps_in(found: Sequence[Gap], item: str | None, span: TimeSpan) -> li
     return sorted(kept, key=lambda gap: (gap.from_ns, gap.to_ns, gap.item))
 
 
-def _as_known_now(gap: Gap, catalogue: StoreCatalogue) -> Gap:
+def corrected_gap(gap: Gap, catalogue: StoreCatalogue) -> Gap:
     """Return a gap with times corrected by the present knowledge of the clocks."""
     from_ns, to_ns = (
         catalogue.book.known_now_ns(gap.run, time_ns) for time_ns in (gap.from_ns, gap.to_ns)

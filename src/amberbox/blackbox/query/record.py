@@ -171,15 +171,15 @@ class LocalRecord(Record):
 
     def items(self) -> list[ItemInfo]:
         """See ``Record``."""
-        return self._ask(overview)
+        return self._with_catalogue(overview)
 
     def has_item(self, item: str) -> bool:
         """See ``Record``."""
-        return self._ask(lambda catalogue: item in catalogue.schemas)
+        return self._with_catalogue(lambda catalogue: item in catalogue.schemas)
 
     def variables(self, item: str) -> ItemSchema:
         """See ``Record``."""
-        schema = self._ask(lambda catalogue: catalogue.schema(item))
+        schema = self._with_catalogue(lambda catalogue: catalogue.schema(item))
         return ItemSchema(schema.type, schema.columns, {}, schema.stamp)
 
     def query(
@@ -199,16 +199,16 @@ class LocalRecord(Record):
                 missions, lambda start, end: self.query(item, variables, start, end, by, points)
             )
         span = self.span_ns(from_, to)
-        return self._ask(lambda c: query_tables(c, item, variables, span, by, points))
+        return self._with_catalogue(lambda c: query_tables(c, item, variables, span, by, points))
 
     def last_ns(self) -> int | None:
         """See ``Record``."""
-        return self._ask(gap_list.last_received_ns)
+        return self._with_catalogue(gap_list.last_received_ns)
 
     def gaps(self, item: str | None = None, from_: Time = None, to: Time = None) -> list[Gap]:
         """See ``Record``."""
         span = self.span_ns(from_, to)
-        return self._ask(lambda catalogue: gap_list.gaps(catalogue, item, span))
+        return self._with_catalogue(lambda catalogue: gap_list.gaps(catalogue, item, span))
 
     def missions(
         self, name: str | None = None, *, failed: bool = False, last: int | None = None
@@ -224,15 +224,15 @@ class LocalRecord(Record):
 
     def clock(self) -> ClockBook:
         """See ``Record``."""
-        return self._ask(lambda catalogue: catalogue.book)
+        return self._with_catalogue(lambda catalogue: catalogue.book)
 
     def sql(self, statement: str) -> Table:
         """See ``Record``."""
         from amberbox.blackbox.query.sql import run_sql
 
-        return self._ask(lambda catalogue: run_sql(catalogue, statement))
+        return self._with_catalogue(lambda catalogue: run_sql(catalogue, statement))
 
-    def _ask(self, question: Callable[[StoreCatalogue], Answer]) -> Answer:
+    def _with_catalogue(self, question: Callable[[StoreCatalogue], Answer]) -> Answer:
         return query_catalogue(self.path, question, with_segments=can_build())
 
 

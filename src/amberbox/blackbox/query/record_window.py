@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -83,11 +83,13 @@ class RecordWindow:
         return self.record.missions()
 
     def _runs(self, writers: Collection[str]) -> tuple[Span, ...]:
-        return tuple(query_catalogue(self.record.path, _of(writers), with_segments=can_build()))
-
-
-def _of(writers: Collection[str]) -> Callable[[StoreCatalogue], list[Span]]:
-    return lambda catalogue: _spans(catalogue, writers)
+        return tuple(
+            query_catalogue(
+                self.record.path,
+                lambda catalogue: _spans(catalogue, writers),
+                with_segments=can_build(),
+            )
+        )
 
 
 def _spans(catalogue: StoreCatalogue, writers: Collection[str]) -> list[Span]:

@@ -67,7 +67,7 @@ class RunJournals:
     ) -> None:
         self._make = make
         self._preamble_of = preamble
-        self._tell = emit
+        self._emit = emit
         self._make_room = make_room
         self._writers: dict[str, JournalWriter] = {"main": make("main")}
         self._pending: dict[str, list[JournalRow]] = {}
@@ -98,7 +98,7 @@ class RunJournals:
             stream.channel = self._channel(stream)
         stamp_ns = stream.stamp_ns(data)
         if stamp_ns is None:
-            report_bad_stamp(stream, data, self._tell)
+            report_bad_stamp(stream, data, self._emit)
         row = (stream.channel, received_ns, stamp_ns or received_ns, data)
         self._pending.setdefault(stream.item.writer, []).append(row)
 
@@ -118,11 +118,11 @@ class RunJournals:
             text = error.strerror or str(error)
             if text != self.disk_error:
                 self.disk_error = text
-                self._tell("disk", f"the disk does not take data: {text}")
+                self._emit("disk", f"the disk does not take data: {text}")
             return False
         if self.disk_error:
             self.disk_error = ""
-            self._tell("disk", "the disk takes data again")
+            self._emit("disk", "the disk takes data again")
         return True
 
     def _write_pending(self, now_ns: int) -> dict[str, OSError]:

@@ -219,11 +219,11 @@ class PowerWatch:
         self._syncer.at_once(min(self._sync_s, BATTERY_SYNC_S))
         if before == "mains":
             # ask the keeper for an incident, in a thread: the disk may be slow, and power short
-            self._request = threading.Thread(target=self._ask, daemon=True)
+            self._request = threading.Thread(target=self._mark_incident, daemon=True)
             self._request.start()
         return state == "low" and before is not None
 
-    def _ask(self) -> None:
+    def _mark_incident(self) -> None:
         try:
             store.submit(self._pipeline.store, "incident", POWER_INCIDENT)
         except OSError as error:
@@ -259,13 +259,13 @@ class RetentionProcess:
             return
         self._not_before = now + _PAUSE_S
         if self._process is not None:
-            self._tell(f"ended with status {self._process.returncode}")
+            self._report(f"ended with status {self._process.returncode}")
         try:
             self._process = subprocess.Popen(self._command, stdin=subprocess.DEVNULL)
         except OSError as error:
-            self._tell(f"cannot be started: {error.strerror}")
+            self._report(f"cannot be started: {error.strerror}")
 
-    def _tell(self, trouble: str) -> None:
+    def _report(self, trouble: str) -> None:
         """Emit an event once per trouble; recording goes on without segments."""
         if trouble != self._trouble:
             self._trouble = trouble

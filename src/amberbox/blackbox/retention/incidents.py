@@ -152,29 +152,31 @@ class IncidentService:
         """Log the firings that were not logged yet."""
         self._write(list(self._refusals.due(all_of_them=True)))
 
-    def fire(self, wish: PinRequest, hold_off_s: float = _HOLD_OFF_S) -> StoredIncident | None:
+    def fire(self, request: PinRequest, hold_off_s: float = _HOLD_OFF_S) -> StoredIncident | None:
         """Pin a window for a trigger, unless it fires too often; None if nothing was pinned."""
         known = load_all(self._store)
-        if wish.key and incident_of_firing(known, wish.key):
-            return incident_of_firing(known, wish.key)
-        why = self._too_often(wish, hold_off_s, known)
-        done = PinRefusal(why) if why else self._pinned(wish)
+        if request.key and incident_of_firing(known, request.key):
+            return incident_of_firing(known, request.key)
+        why = self._too_often(request, hold_off_s, known)
+        done = PinRefusal(why) if why else self._pinned(request)
         if isinstance(done, PinRefusal):
-            self._write(list(self._refusals.note(wish.trigger, done.reason, wish.reason)))
+            self._write(list(self._refusals.note(request.trigger, done.reason, request.reason)))
             return None
         self._register(done)
         return done
 
-    def _pinned(self, wish: PinRequest) -> StoredIncident | PinRefusal:
-        return with_reserve(self._store, lambda: pin(self._store, wish, self._options))
+    def _pinned(self, request: PinRequest) -> StoredIncident | PinRefusal:
+        return with_reserve(self._store, lambda: pin(self._store, request, self._options))
 
-    def _too_often(self, wish: PinRequest, hold_off_s: float, known: list[StoredIncident]) -> str:
-        timeline = look_back(self._store, 0, wish.at) if wish.trigger else None
+    def _too_often(
+        self, request: PinRequest, hold_off_s: float, known: list[StoredIncident]
+    ) -> str:
+        timeline = look_back(self._store, 0, request.at) if request.trigger else None
         if timeline is None:
             return ""
-        at_ns = timeline.received_ns(wish.at or timeline.end)
+        at_ns = timeline.received_ns(request.at or timeline.end)
         per_hour = self._options.incidents_per_hour
-        return refused_by_rate(wish.trigger, at_ns, hold_off_s, known, per_hour)
+        return refused_by_rate(request.trigger, at_ns, hold_off_s, known, per_hour)
 
     def _grant(self, request: StoreRequest) -> None:
         values = request.values
@@ -225,9 +227,9 @@ class IncidentService:
         with pin_lock(self._store):
             now = {other.id: other for other in load_all(self._store)}.get(incident.id)
             if now is not None:
-                told = incident.state if now.reasons == incident.reasons else ""
-                held = held if told else held_bytes(self._store, [now])
-                save(self._store, replace(now, told=told, bytes=held))
+                reported = incident.state if now.reasons == incident.reasons else ""
+                held = held if reported else held_bytes(self._store, [now])
+                save(self._store, replace(now, told=reported, bytes=held))
 
     def _damage(self) -> Iterator[ChannelValues]:
         for path in damaged_files(self._store):
@@ -475,7 +477,7 @@ class Triggers:
                 self._since_ns = self._start_ns(part, is_last=part is parts[-1])
                 self._run = part.run
             fired = self._firings(part)
-            self._pending += [(_wish(t, firing, part), t.hold_off_s) for t, firing in fired]
+            self._pending += [(_pin_request(t, firing, part), t.hold_off_s) for t, firing in fired]
             self._unlogged += self._troubles(part)
         fired_any = bool(self._pending)
         self._settle()
@@ -584,9 +586,9 @@ def _until(watch: _Watch, part: RunSlice) -> int:
     return min(part.until_ns, max(part.watched_ns, part.until_ns - _PATIENCE_NS))
 
 
-def _refused(wish: PinRequest, error: UsageError) -> ChannelValues:
-    text = f"{wish.trigger} fired and nothing was pinned: {error.what}"
-    return event("incident_refused", text, wish.trigger, trigger=wish.trigger, why=error.what)
+def _refused(request: PinRequest, error: UsageError) -> ChannelValues:
+    text = f"{request.trigger} fired and nothing was pinned: {error.what}"
+    return event("incident_refused", text, request.trigger, trigger=request.trigger, why=error.what)
 
 
 def _off(trigger: Trigger, why: str) -> ChannelValues:
@@ -599,7 +601,7 @@ def _first_line(text: str) -> str:
     return text.partition("\n")[0]
 
 
-def _wish(trigger: Trigger, firing: Firing, part: RunSlice) -> PinRequest:
+def _pin_request(trigger: Trigger, firing: Firing, part: RunSlice) -> PinRequest:
     at = part.moment(firing.at_ns)
     reason = trigger.reason or firing.detail or trigger.when or f"silence of {trigger.silence}"
     key = f"{trigger.name}@{at.run}:{at.log_ns}"

@@ -603,7 +603,7 @@ def start(
         raise UsageError(f"there is a mission '{mission_id}' already", "choose another id")
     chosen = mission_id or id_of(name, time.time_ns())
     values = {"name": name, "id": chosen, "parameters": dict(parameters or {}), "who": who}
-    return _ask(store, {"action": "start", **values}, chosen, patience_s)
+    return _request(store, {"action": "start", **values}, chosen, patience_s)
 
 
 def end(
@@ -630,10 +630,10 @@ def end(
         )
     chosen = wanted[-1].id
     values = {"id": chosen, "outcome": outcome, "failed": failed, "who": who}
-    return _ask(store, {"action": "end", **values}, chosen, patience_s)
+    return _request(store, {"action": "end", **values}, chosen, patience_s)
 
 
-def _ask(
+def _request(
     store: Store, values: dict[str, Any], mission_id: str, patience_s: float
 ) -> RecordedMission:
     """Submit a request, wait until it is done, and return the mission."""

@@ -13,7 +13,7 @@ import numpy as np
 from amberbox.blackbox.journal.scan import ChunkPlace, scan
 from amberbox.blackbox.store.clocks import ClockTable
 from amberbox.blackbox.store.journal_reader import describe
-from amberbox.core.timestamps import format_time
+from amberbox.core.timestamps import maybe_time
 
 FindingState = Literal["intact", "damaged", "altered", "missing", "unsigned"]
 # Worst first
@@ -49,8 +49,8 @@ class VerifyFinding:
             "chunk": self.chunk,
             "from_byte": self.from_byte,
             "to_byte": self.to_byte,
-            "from": time_text(self.from_ns),
-            "to": time_text(self.to_ns),
+            "from": maybe_time(self.from_ns),
+            "to": maybe_time(self.to_ns),
             "text": self.text,
         }
 
@@ -109,11 +109,6 @@ class FindingCollector:
 def worst(states: set[FindingState]) -> FindingState:
     """Return the worst of some states; intact when there is none."""
     return next((state for state in STATES if state in states), "intact")
-
-
-def time_text(time_ns: int | None) -> str | None:
-    """Write a time as RFC 3339, if it is known."""
-    return None if time_ns is None else format_time(time_ns)
 
 
 # Errors that reading a tampered file may raise

@@ -145,9 +145,9 @@ def displaced_link(data: Buffer, after: int) -> tuple[int, int] | None:
     """Find the first link behind ``after`` that is not where it states: (offset, stated)."""
     for match in _LINK.finditer(data, after):
         found = metadata_at(data, match.start())
-        said = found.values.get("to", "") if found is not None else ""
-        if said.isdecimal() and int(said) != match.start():
-            return match.start(), int(said)
+        stated = found.values.get("to", "") if found is not None else ""
+        if stated.isdecimal() and int(stated) != match.start():
+            return match.start(), int(stated)
     return None
 
 
@@ -601,7 +601,7 @@ class _Checking:
                 HashedBlock(sealed.tail_from, sealed.bytes, sealed.tail, self.before, tail=True)
             )
 
-    def _moved(self, offset: int, said: int) -> VerifyFinding:
+    def _moved(self, offset: int, stated: int) -> VerifyFinding:
         """Return the finding on a link that is not at its place: what happened before it."""
         first = self.before.next_seq if self.before is not None else self._first_seq()
         link = metadata_at(self.data, offset)
@@ -609,8 +609,8 @@ class _Checking:
         if next_seq - first > count_messages(self.data, self.target.identity, self.at, offset):
             text = f"messages between positions {first} and {next_seq} were taken out"
             return self.places.finding("missing", text, self.at, offset)
-        text = f"the content was changed: it is {abs(offset - said)} bytes "
-        text += "longer" if offset > said else "shorter"
+        text = f"the content was changed: it is {abs(offset - stated)} bytes "
+        text += "longer" if offset > stated else "shorter"
         return self.places.finding("altered", text, self.at, offset)
 
     def _first_seq(self) -> int:

@@ -14,7 +14,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from amberbox.blackbox.journal.chunk import open_buffer
-from amberbox.blackbox.signing.findings import BAD, FindingState, VerifyFinding, time_text
+from amberbox.blackbox.signing.findings import BAD, FindingState, VerifyFinding
 from amberbox.blackbox.signing.journal_check import (
     FIRST_CHAIN,
     CheckedJournal,
@@ -41,6 +41,7 @@ from amberbox.blackbox.store.manifest_entries import (
 )
 from amberbox.blackbox.store.store import FOLDERS, run_and_number
 from amberbox.core.errors import AmberboxError, UsageError
+from amberbox.core.timestamps import maybe_time
 
 
 @dataclass(frozen=True, slots=True)
@@ -296,7 +297,7 @@ def _unsigned_claims(lines: CheckedManifest, signed_up_to: int) -> Iterator[Veri
 
 
 def _manifest_end(count: int, at_ns: int | None) -> VerifyFinding:
-    when = f" at {time_text(at_ns)}" if at_ns is not None else ""
+    when = f" at {maybe_time(at_ns)}" if at_ns is not None else ""
     return VerifyFinding("unsigned", mf.NAME, f"ends unsigned{when}: {count} lines", from_ns=at_ns)
 
 
@@ -314,7 +315,7 @@ def _journal_end(
     first, covered = open_ends[0]
     at_ns = first.places.end_ns(covered) if covered else first.places.start_ns()
     size = sum(checked.size - to for checked, to in open_ends)
-    text = f"ends unsigned at {time_text(at_ns)}: " if at_ns is not None else "is unsigned: "
+    text = f"ends unsigned at {maybe_time(at_ns)}: " if at_ns is not None else "is unsigned: "
     text += f"{size} bytes in {len(open_ends)} files are vouched for by their own chain only"
     if first.torn:
         text += f"; the last {first.torn} bytes are no whole record (a crash or power cut)"

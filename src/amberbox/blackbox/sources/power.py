@@ -154,7 +154,7 @@ class Nut:
         self._deadline = time.monotonic() + _PATIENCE_S
         try:
             if not self._ups:
-                lines = self._ask("LIST UPS")
+                lines = self._request("LIST UPS")
                 names = [
                     words[1] for words in map(_words, lines) if len(words) > 1 and words[0] == "UPS"
                 ]
@@ -162,7 +162,7 @@ class Nut:
                     has = f"{len(names)} UPS ({', '.join(names)})" if names else "no UPS"
                     raise UnreadableError(f"upsd has {has}; name one with 'ups:'")
                 self._ups = names[0]
-            return reading(dict(_variables(self._ask(f"LIST VAR {self._ups}"))))
+            return reading(dict(_variables(self._request(f"LIST VAR {self._ups}"))))
         except OSError as error:
             self.close()
             host, port = self._address
@@ -175,7 +175,7 @@ class Nut:
             self._link.close()
             self._link = None
 
-    def _ask(self, question: str) -> list[str]:
+    def _request(self, question: str) -> list[str]:
         """Return the lines between ``BEGIN`` and ``END`` of an answer."""
         if self._link is None:
             self._link = socket.create_connection(self._address, self._left_s())

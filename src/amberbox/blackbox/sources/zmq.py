@@ -97,7 +97,7 @@ UNNAMED = "message"  # topic of messages in one frame that name none
 
 MOST_REMEMBERED = 1000  # topics of a publisher that are restored at the start of the next run
 
-_NEVER_HEARD = "publisher not connected yet"
+_PUBLISHER_MISSING = "publisher not connected yet"
 _RUN_START_NS = 1
 # wait before a new connection, as ZeroMQ closes one for good at bytes it cannot parse
 _GIVEN_UP_S = (0.5, 30.0)
@@ -319,7 +319,7 @@ class _Link:
                 self.continuities[topic.name.encode()] = found
         for name in () if self.options else self.known_topics.topics(self.endpoint):
             self.seen[name] = None
-            self.sink.link_down(name, self.endpoint, _NEVER_HEARD, _RUN_START_NS)
+            self.sink.link_down(name, self.endpoint, _PUBLISHER_MISSING, _RUN_START_NS)
 
     def connect(self, context: Any, config: ZmqOptions) -> None:
         """Subscribe; returns at once, whether the publisher is there or not."""

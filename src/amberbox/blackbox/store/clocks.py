@@ -253,7 +253,7 @@ class ClockBook:
         ]
         ordered = sorted(self.boots.values(), key=lambda boot: boot.runs)
         for before, after in pairwise(ordered):
-            if _end_ns(before) > sum(after.points[0]) and False in _flags(before, after):
+            if sum(before.points[-1]) > sum(after.points[0]) and False in _flags(before, after):
                 found.append(
                     f"{_listed(after.runs)} came after {_listed(before.runs)}, "
                     "but by their clocks they began before these ended"
@@ -356,10 +356,6 @@ def _even(points: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
 
 def _flags(*boots: BootWallClock) -> list[bool | None]:
     return [boot.synchronised for boot in boots]
-
-
-def _end_ns(boot: BootWallClock) -> int:
-    return sum(boot.points[-1])
 
 
 def _listed(runs: Sequence[int]) -> str:

@@ -256,7 +256,6 @@ class _Reader:
         self._last: tuple[Manifest, Manifest] | None = None
 
     def read(self) -> Manifest:
-
         known, last = self.lines.read(), self._last
         if last is None or last[0] is not known:
             self._last = last = known, restored(self._store, known)

@@ -203,9 +203,9 @@ def _age_column(tree: AgeNode, where: Instants) -> Values:
 
 def _window_column(tree: WindowNode, where: Instants) -> Values:
     _require_time(tree, where.has_time)
-    found = where.windows.get(tree.saying)
+    found = where.windows.get(tree.text)
     if found is None:
-        found = where.windows[tree.saying] = _reduced(tree, where)
+        found = where.windows[tree.text] = _reduced(tree, where)
     return found
 
 
@@ -484,9 +484,9 @@ def _age_at(tree: AgeNode, kinds: Kinds) -> tuple[At, Kind]:
 def _window_at(tree: WindowNode, kinds: Kinds) -> tuple[At, Kind]:
     def window(view: InstantView) -> Any:
         _require_time(tree, view.has_time)
-        if tree.saying not in view.windows:
-            view.windows[tree.saying] = worked_out(view)
-        return view.windows[tree.saying]
+        if tree.text not in view.windows:
+            view.windows[tree.text] = worked_out(view)
+        return view.windows[tree.text]
 
     def worked_out(view: InstantView) -> Any:
         clock = None if tree.is_nested else _one_clock([view.tracks[name] for name in tree.reads])

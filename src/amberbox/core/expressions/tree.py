@@ -114,9 +114,9 @@ class WindowNode(ExpressionNode):
         return needs_history(self.inner)
 
     @cached_property
-    def saying(self) -> str:
+    def text(self) -> str:
         """Return its text without its place: equal for equal windows."""
-        return _saying(self)
+        return _text_of(self)
 
 
 @dataclass(frozen=True)
@@ -242,14 +242,14 @@ def needs_history(tree: ExpressionNode) -> bool:
     return any(isinstance(part, WindowNode | HeldNode | AgeNode) for part in walk(tree))
 
 
-def _saying(value: object) -> str:
+def _text_of(value: object) -> str:
     """Return a part as text, without its place."""
     if isinstance(value, tuple):
-        return f"({','.join(map(_saying, value))})"
+        return f"({','.join(map(_text_of, value))})"
     if not isinstance(value, ExpressionNode):
         return repr(value)
     parts = (getattr(value, one.name) for one in dataclasses.fields(value) if one.name != "at")
-    return f"{type(value).__name__}({','.join(map(_saying, parts))})"
+    return f"{type(value).__name__}({','.join(map(_text_of, parts))})"
 
 
 def addresses_of(tree: ExpressionNode) -> tuple[str, ...]:

@@ -10,8 +10,8 @@ import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from amberbox.core.budget import Budget
 from amberbox.core.clock import NS
+from amberbox.core.contracts import Budget
 from amberbox.core.types import AmbiguityGroup, Hypothesis
 from amberbox.diagnosis.covering.model import UNKNOWN, Model
 from amberbox.diagnosis.covering.observations import (

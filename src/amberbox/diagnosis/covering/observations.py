@@ -77,10 +77,10 @@ class Check:
 READ_OUTCOMES = ("absent", "present")
 
 
-def reading_check(symptom: str, cost_s: float, text: str = "") -> Check:
+def reading_check(symptom: str, cost_s: float) -> Check:
     """Return the check that reads a symptom on demand."""
     return Check(
-        f"read:{symptom}", "read", text or f"Read {symptom}.", cost_s=cost_s,
+        f"read:{symptom}", "read", f"Read {symptom}.", cost_s=cost_s,
         outcomes=READ_OUTCOMES, sure=1.0, reads=symptom,
     )  # fmt: skip
 

@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from amberbox.core.budget import Budget
+from amberbox.core.contracts import Budget
 from amberbox.diagnosis.covering.model import Floats, FunctionGates, Ints, ModelTables, bits
 from amberbox.diagnosis.covering.observations import FoldedEvidence, LikelihoodFactor
 

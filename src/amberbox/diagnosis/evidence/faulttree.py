@@ -6,8 +6,7 @@ import heapq
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 
-from amberbox.core.budget import Budget
-from amberbox.core.contracts import EvidenceWindow
+from amberbox.core.contracts import Budget, EvidenceWindow
 from amberbox.core.types import AmbiguityGroup, Diagnosis, Hypothesis
 from amberbox.diagnosis.covering.hypotheses import (
     KnownSymptoms,

@@ -6,9 +6,15 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from amberbox.core.budget import Budget
 from amberbox.core.config import raise_errors
-from amberbox.core.contracts import Conflict, EvidenceItem, EvidenceNeeds, EvidenceWindow, Finding
+from amberbox.core.contracts import (
+    Budget,
+    Conflict,
+    EvidenceItem,
+    EvidenceNeeds,
+    EvidenceWindow,
+    Finding,
+)
 from amberbox.core.errors import ConfigurationError, UsageError
 from amberbox.core.types import Diagnosis, Hypothesis, Symptom
 from amberbox.diagnosis.diagnose import (
@@ -135,14 +141,14 @@ def seen_facts(symptoms: Iterable[Symptom], fmea: Fmea) -> Iterator[tuple[Fact, 
 
     A symptom whose component is blocked by a dependency is unknown.
     """
-    told = {}
+    stated = {}
     for symptom in symptoms:
         state = "unknown" if symptom.blocked_by else symptom.state
-        told[symptom.id] = (state, symptom.id), measured(symptom)
+        stated[symptom.id] = (state, symptom.id), measured(symptom)
     unknown: dict[str, tuple[Fact, Measured]] = {
-        name: (("unknown", name), ()) for name in fmea.symptoms if name not in told
+        name: (("unknown", name), ()) for name in fmea.symptoms if name not in stated
     }
-    yield from (told | unknown).values()
+    yield from (stated | unknown).values()
 
 
 SOURCE = "rules"

@@ -15,8 +15,8 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-from amberbox.core.budget import Budget
 from amberbox.core.config import raise_errors
+from amberbox.core.contracts import Budget
 from amberbox.core.errors import AmberboxError
 from amberbox.core.types import Diagnosis
 from amberbox.diagnosis.faulttree.decision_diagrams import (

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
-from amberbox.core.budget import Budget
+from amberbox.core.contracts import Budget
 from amberbox.diagnosis.faulttree.graph import (
     FALSE,
     TRUE,

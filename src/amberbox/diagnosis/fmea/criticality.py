@@ -222,12 +222,12 @@ def _ambiguous_modes(
         tests = dict.fromkeys(result.test for m in modes for result in fmea.modes[m].tests)
         key = tuple((test, given.get(test, fmea.tests[test].outcomes[0])) for test in tests)
         answers.setdefault(key, []).append(mode)
-    useful = _telling(list(answers)) if len(answers) > 1 else ()
+    useful = _useful_keys(list(answers)) if len(answers) > 1 else ()
     left = tuple(tuple(group) for group in answers.values() if len(group) > 1)
     return AmbiguousModes(tuple(modes), tuple(sorted(signature)), useful, left)
 
 
-def _telling(keys: Sequence[tuple[tuple[str, str], ...]]) -> tuple[str, ...]:
+def _useful_keys(keys: Sequence[tuple[tuple[str, str], ...]]) -> tuple[str, ...]:
     """Return the tests whose answers differ between the keys."""
     answers: dict[str, set[str]] = {}
     for key in keys:

@@ -216,17 +216,16 @@ def closest_json(
                 "effect": outlook.analysis.tree.top,
                 **description(fmea, outlook.analysis),
                 "truncated_at": outlook.analysis.truncated_at,
-                "closest": [_near(near) for near in outlook.near],
+                "closest": [
+                    {
+                        "probability": near.probability,
+                        "happened": list(near.happened),
+                        "missing": list(near.missing),
+                        "events": dict(near.events),
+                    }
+                    for near in outlook.near
+                ],
             }
             for outlook in found
         ],
-    }
-
-
-def _near(near: NearCutSet) -> dict[str, Any]:
-    return {
-        "probability": near.probability,
-        "happened": list(near.happened),
-        "missing": list(near.missing),
-        "events": dict(near.events),
     }

@@ -176,8 +176,8 @@ def text_of(fmea: Fmea, symptom: str) -> str:
     """Return the text of a symptom that is a finding; empty for any other."""
     for of in fmea.findings:
         if _is_of(of, symptom):
-            said = f"rule {symptom.removeprefix('rule:')}" if of.goal else f"finding {symptom}"
-            return f"{of.description} ({said})" if of.description else said
+            origin = f"rule {symptom.removeprefix('rule:')}" if of.goal else f"finding {symptom}"
+            return f"{of.description} ({origin})" if of.description else origin
     return ""
 
 

@@ -123,7 +123,8 @@ class SymptomCollector:
             symptom = self._symptom(link, child_node(node, place), at, f"{owner}.{place}")
             if symptom is not None:
                 found.append(self._link(symptom, link))
-        self._tell_twice(found, node, where)
+        for name in _twice(link.symptom for link in found):
+            self._problems.append(node.problem(where, f"'{name}' is there twice"))
         return tuple(link for link in found if link.detects > 0)
 
     def address(self, text: str, node: Node, where: str) -> str | None:
@@ -217,10 +218,6 @@ class SymptomCollector:
         except AmberboxError as error:
             self._problems.append(node.problem(where, error.what, error.hint))
             return None
-
-    def _tell_twice(self, links: Sequence[SymptomLink], node: Node, where: str) -> None:
-        for symptom in _twice(link.symptom for link in links):
-            self._problems.append(node.problem(where, f"'{symptom}' is there twice"))
 
 
 def _first(value: float | None, other: float | None, default: float) -> float:
@@ -524,7 +521,7 @@ def _not_analysed(fmea: Fmea, sheet: ParsedFmea, known: FmeaReferences) -> Itera
     """Yield notes on components of the folder without an entry in the file."""
     needed = {name: user for user, of in fmea.needs().items() for name in of.names()}
     read = [a for of in fmea.symptoms.values() if of.condition for a in of.condition.addresses()]
-    symptoms = {said[0] for name in (*fmea.symptoms, *read) if (said := of_monitors(name))}
+    symptoms = {of_mode[0] for name in (*fmea.symptoms, *read) if (of_mode := of_monitors(name))}
     hint = f"give it failure_modes under 'types' of {sheet.root.file}"
     for name in sheet.folder:
         user = needed.get(name, "")

@@ -178,14 +178,14 @@ class _Content:
         """Add one line."""
         item, name = derive_id(row.get("Item", "")), derive_id(row.get("Failure mode", ""))
         if not row.get("Item") or not row.get("Failure mode"):
-            self._tell(line, "Item", "a line needs an item and a failure mode")
+            self._report(line, "Item", "a line needs an item and a failure mode")
             return
         component = self._types.setdefault(item, {"failure_modes": {}})
         description = row.get("Item description") or (row["Item"] if row["Item"] != item else "")
         if description:
             component.setdefault("description", description)
         if name in component["failure_modes"]:
-            self._tell(line, "Failure mode", f"{item} has '{row['Failure mode']}' twice")
+            self._report(line, "Failure mode", f"{item} has '{row['Failure mode']}' twice")
             return
         _take_ranks(row)
         component["failure_modes"][name] = dict(self._mode(row, name, line))
@@ -201,7 +201,7 @@ class _Content:
             yield "severity", word
         elif word:
             near = did_you_mean(word, SEVERITIES)
-            self._tell(line, "Severity", f"'{word}' is none of {', '.join(SEVERITIES)}{near}")
+            self._report(line, "Severity", f"'{word}' is none of {', '.join(SEVERITIES)}{near}")
         yield from self._chance(row, line)
         effects = {"local": row.get("Local effect", "")}
         yield from _given(effects=dict(_given(**effects)))
@@ -211,8 +211,8 @@ class _Content:
         if addresses:
             yield "symptoms", addresses
         else:
-            said = [row.get("Undetected because", ""), *others]
-            yield "unobservable", "; ".join(filter(None, said)) or "the sheet names no monitor"
+            reasons = [row.get("Undetected because", ""), *others]
+            yield "unobservable", "; ".join(filter(None, reasons)) or "the sheet names no monitor"
         yield from _given(make_safe=row.get("Make safe", ""), remedy=row.get("Action", ""))
 
     def _classes(self, row: Row, line: int) -> list[str]:
@@ -221,7 +221,7 @@ class _Content:
             try:
                 found.append(resolve(word))
             except ValueError as error:
-                self._tell(line, "Class", str(error), is_error=False)
+                self._report(line, "Class", str(error), is_error=False)
         return found
 
     def _chance(self, row: Row, line: int) -> Iterator[tuple[str, Any]]:
@@ -235,7 +235,7 @@ class _Content:
         ranks = {name: int(n) for key, name in _RANKS.items() if (n := numbers[key]) is not None}
         yield from _given(ranks=ranks)
         if all(numbers[key] is None for key in ("Rate (1/h)", "Probability", "O")):
-            self._tell(line, "O", "how probable is it? give O, Rate (1/h) or Probability")
+            self._report(line, "O", "how probable is it? give O, Rate (1/h) or Probability")
 
     def _number(self, row: Row, key: str, line: int) -> float | None:
         text = row.get(key, "")
@@ -246,10 +246,10 @@ class _Content:
         except ValueError:
             number = math.nan
         if not math.isfinite(number):
-            self._tell(line, key, f"'{text}' is no number")
+            self._report(line, key, f"'{text}' is no number")
             return None
         if key in _RANKS and number != int(number):
-            self._tell(line, key, f"{text} is no whole number")
+            self._report(line, key, f"{text} is no whole number")
             return None
         return number
 
@@ -259,7 +259,7 @@ class _Content:
         if ratio is None or rate is None:
             return rate
         if not 0 <= ratio <= 1:
-            self._tell(line, "Ratio", f"{ratio:g} is no share from 0 to 1")
+            self._report(line, "Ratio", f"{ratio:g} is no share from 0 to 1")
         return rate * ratio
 
     def _use(self, item: str, row: Row) -> None:
@@ -273,7 +273,7 @@ class _Content:
                 users.append(item)
         self._system.update(derive_id(word) for word in end)
 
-    def _tell(self, line: int, where: str, what: str, *, is_error: bool = True) -> None:
+    def _report(self, line: int, where: str, what: str, *, is_error: bool = True) -> None:
         self._problems.append(Problem(self._file, line, where, what, is_error=is_error))
 
     def text(self) -> str:
@@ -290,7 +290,7 @@ class _Content:
         if any("o" in m.get("ranks", {}) and not known & m.keys() for m in modes):
             content = {"scales": {"occurrence": _OCCURRENCE}, **content}
             what = "O is taken for failures per hour in powers of ten: put your own into 'scales'"
-            self._tell(1, "O", what, is_error=False)
+            self._report(1, "O", what, is_error=False)
         content |= {"functions": functions} if functions else {}
         text: str = yaml.safe_dump(content, sort_keys=False, allow_unicode=True, width=100)
         return text

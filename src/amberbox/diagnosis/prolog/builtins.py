@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+import math
+import operator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import cmp_to_key, partial
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -13,6 +15,7 @@ from amberbox.diagnosis.prolog.terms import (
     Key,
     Real,
     RuleFault,
+    Slot,
     Struct,
     Term,
     TextTerm,
@@ -28,6 +31,8 @@ from amberbox.diagnosis.prolog.terms import (
     make,
     make_list,
     once_each,
+    python_number,
+    show_key,
     split_list,
     undo,
     variant,
@@ -35,16 +40,6 @@ from amberbox.diagnosis.prolog.terms import (
 
 if TYPE_CHECKING:
     from amberbox.diagnosis.prolog.machine import PrologMachine
-
-
-import math
-import operator
-from collections.abc import Sequence
-
-from amberbox.diagnosis.prolog.terms import (
-    Slot,
-    show_key,
-)
 
 Number = int | Real
 _MOST_BITS = 13_000
@@ -172,11 +167,6 @@ def _smaller(a: Number, b: Number) -> Number:
 def _float_of(a: Number, b: Number) -> Number:
     """Return that of two equal numbers that is a float, if one is."""
     return a if isinstance(a, Real) else b
-
-
-def python_number(number: Number) -> int | float:
-    """Return Python's own number, which compares by value."""
-    return float(number) if isinstance(number, Real) else number
 
 
 CONSTANTS: Mapping[str, Number] = {

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from functools import cmp_to_key
 from typing import Any, TypeAlias
 
-from amberbox.core.budget import Budget
+from amberbox.core.contracts import Budget
 from amberbox.diagnosis.prolog.builtins import TESTS
 from amberbox.diagnosis.prolog.compiler import FIXED, compile_clause
 from amberbox.diagnosis.prolog.machine import (
@@ -333,7 +333,9 @@ def _ordered(
         if delta is not None and not steps:
             best, relation = delta
         else:
-            best = min(open_literals, key=lambda lit: _cost(lit, relations[lit.key], done))
+            best = min(
+                open_literals, key=lambda lit: relations[lit.key].per_key(_known_columns(lit, done))
+            )
             relation = relations[best.key]
         open_literals.remove(best)
         step = _step(best, relation, done)
@@ -344,10 +346,6 @@ def _ordered(
             step.filters.append(_filter(entry[0], relations, done))
         steps.append(step)
     return steps
-
-
-def _cost(literal: Literal, relation: DatalogRelation, done: set[int]) -> float:
-    return relation.per_key(_known_columns(literal, done))
 
 
 def _known_columns(literal: Literal, done: set[int]) -> Columns:

@@ -11,7 +11,7 @@ from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Seq
 from dataclasses import dataclass, field
 from typing import Any, Literal, NamedTuple, TypeAlias
 
-from amberbox.core.budget import Budget as Budget
+from amberbox.core.contracts import Budget as Budget
 from amberbox.diagnosis.prolog.syntax import Names, anonymous, write
 from amberbox.diagnosis.prolog.terms import (
     TOO_DEEP,

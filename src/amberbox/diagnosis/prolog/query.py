@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 from functools import cmp_to_key
 from typing import Any, Literal, TypeAlias
 
-from amberbox.core.budget import Budget
 from amberbox.core.config import raise_errors
+from amberbox.core.contracts import Budget
 from amberbox.core.errors import Problem
 from amberbox.diagnosis.prolog import datalog
 from amberbox.diagnosis.prolog.compiler import FIXED, compile_goal

@@ -438,7 +438,9 @@ def _simple(a: Term, b: Term) -> int:
     if rank != _rank(b):
         return -1 if rank < _rank(b) else 1
     if isinstance(a, int | Real) and isinstance(b, int | Real):
-        return _sign(_value(a), _value(b)) or _sign(isinstance(a, int), isinstance(b, int))
+        return _sign(python_number(a), python_number(b)) or _sign(
+            isinstance(a, int), isinstance(b, int)
+        )
     if isinstance(a, TextTerm) and isinstance(b, TextTerm):
         return _sign(a.value, b.value)
     if isinstance(a, Var) and isinstance(b, Var):
@@ -446,7 +448,8 @@ def _simple(a: Term, b: Term) -> int:
     return _sign(str(a), str(b))
 
 
-def _value(number: int | Real) -> int | float:
+def python_number(number: int | Real) -> int | float:
+    """Return Python's own number, which compares by value."""
     return float(number) if isinstance(number, Real) else number
 
 

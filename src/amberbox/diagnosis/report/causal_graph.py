@@ -22,7 +22,7 @@ from amberbox.diagnosis.report.explanation import (
 from amberbox.diagnosis.report.wording import (
     FALSE_ALARM,
     NS,
-    WORTH_TELLING,
+    WORTH_SHOWING,
     FaultNames,
     clock,
     sort_modes,
@@ -216,7 +216,7 @@ Groups = Sequence[tuple[AmbiguityGroup, Sequence[Hypothesis]]]
 def build_causal_graph(descriptions: SymptomDescriptions, groups: Groups) -> CausalGraph:
     """Return the boxes and arrows of the leading groups; at most 12 causes and 30 symptoms."""
     leading = list(groups[0][1]) if groups else []
-    others = (members for group, members in groups[1:] if group.probability >= WORTH_TELLING)
+    others = (members for group, members in groups[1:] if group.probability >= WORTH_SHOWING)
     hypotheses = [*leading, *(hypothesis for members in others for hypothesis in members)]
     marks = _marks(leading, hypotheses)
     causes, symptoms = _causes(hypotheses), _in_time(descriptions, marks)

@@ -281,7 +281,7 @@ ANSWERS: dict[Severity, str] = {
     "critical": "no, it cannot go on with what it does",
     "fatal": "no, it must stop and stay stopped",
 }
-NOBODY_KNOWS = "nobody can tell: what is broken is not known; watch it, and stop it when in doubt"
+UNKNOWN_USE = "nobody can tell: what is broken is not known; watch it, and stop it when in doubt"
 WORTH_A_WORD = 0.05  # how probable something graver must be to be warned of
 
 
@@ -295,7 +295,7 @@ def usability(
     severity = worst_severity(_severity(paths, hypothesis) for hypothesis in members)
     faults = {fault for hypothesis in members for fault in hypothesis.faults}
     if not members or faults - paths.names.fmea.modes.keys():
-        text = NOBODY_KNOWS if severity in ("", "warning", "urgent") else ANSWERS[severity]
+        text = UNKNOWN_USE if severity in ("", "warning", "urgent") else ANSWERS[severity]
     else:
         text = ANSWERS[severity]
     differ = len({_severity(paths, hypothesis) for hypothesis in members}) > 1
@@ -337,8 +337,8 @@ def _gone(paths: CausalPaths, hypothesis: Hypothesis) -> Iterable[str]:
     Of modes that take their component down, effects name all that may suffer, spares or not.
     """
     modes = (paths.names.fmea.modes.get(fault) for fault in sorted(hypothesis.faults))
-    said = [name for m in modes if m and not m.takes_down for name in m.effects.system]
-    return (*paths.losses(hypothesis.faults).lost, *said)
+    named = [name for m in modes if m and not m.takes_down for name in m.effects.system]
+    return (*paths.losses(hypothesis.faults).lost, *named)
 
 
 def _careful(

@@ -34,7 +34,7 @@ from amberbox.diagnosis.report.wording import (
 ALMOST_CERTAIN = CONFIDENCE_WORDS[0][0]
 AS_LIKELY = 0.5  # from this share of what leads on, a false alarm counts as about as likely
 # How much the chances of answers must differ for a test to distinguish fault and false alarm
-TELLS_APART = 0.3
+DISCRIMINATES = 0.3
 NO_FAULT_STEP = "nothing for now; if it comes back, note what the robot was doing"
 NO_TEST_STEP = "no test in the FMEA tells more"
 FALSE_ALARM_STEP = "a false alarm is about as likely, and no test in the FMEA tells which it is"
@@ -57,9 +57,9 @@ def step_of(
     ids = leading_ids(diagnosis.groups, diagnosis.hypotheses)
     safe = safety_actions(names.fmea, diagnosis.hypotheses, ids, names.cleared)
     group, members = leading or (AmbiguityGroup((), 0.0), ())
-    first_of_all = tuple(_told(names, safe))
+    first_of_all = tuple(_safe_actions(names, safe))
     remedies = _remedies(names, members, safe)
-    asked = _worth_asking(knowledge, names, diagnosis, group, members)
+    asked = _best_candidate(knowledge, names, diagnosis, group, members)
     certain = _is_certain(group, members)
     if asked is None:
         rest, order = _without_test(names, diagnosis, group, members, remedies)
@@ -70,11 +70,11 @@ def step_of(
     check, first = asked.check, "; and ".join(remedies)
     same_kind = same_tests(knowledge, diagnosis, check)
     which = f"Which one is it? {merge_texts([one.text for one in same_kind])}"
-    asks = which if len(same_kind) > 1 else asked.text
-    test = ProposedAction("test", asks, check.id)
+    question = which if len(same_kind) > 1 else asked.text
+    test = ProposedAction("test", question, check.id)
     repairs = tuple(ProposedAction("repair", remedy) for remedy in remedies)
     mends_first = certain and bool(first)
-    rest = capitalize(f"{first}; or make sure before: {asks}" if mends_first else asks)
+    rest = capitalize(f"{first}; or make sure before: {question}" if mends_first else question)
     return NextStep(
         _text(safe, rest),
         check.id,
@@ -93,7 +93,7 @@ def step_of(
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
+class CandidateTest:
     """A test that may be done, in words, and what its answers would mean."""
 
     check: Check
@@ -123,7 +123,7 @@ def _text(safe: Sequence[MakeSafeAction], rest: str) -> str:
     return f"First, make it safe: {'; '.join(action.text for action in safe)}. Then: {rest}"
 
 
-def _told(names: FaultNames, safe: Sequence[MakeSafeAction]) -> Iterator[ProposedAction]:
+def _safe_actions(names: FaultNames, safe: Sequence[MakeSafeAction]) -> Iterator[ProposedAction]:
     """Yield the make-safe actions with their failure modes, the most probable first."""
     for one in safe:
         causes = join_with_or([names.mode(fault) for fault in one.faults], 2)
@@ -145,21 +145,21 @@ def _may_be_false_alarm(
     return other.probability >= AS_LIKELY * group.probability
 
 
-def _worth_asking(
+def _best_candidate(
     knowledge: Knowledge, names: FaultNames, diagnosis: Diagnosis, group: AmbiguityGroup,
     members: Sequence[Hypothesis],
-) -> Asked | None:  # fmt: skip
+) -> CandidateTest | None:  # fmt: skip
     """Return the test to do next, None if none is worth it.
 
     Where a false alarm is about as likely as the leading hypotheses, it distinguishes these.
     """
     tests = dict.fromkeys((group.split_by, *(test.id for test in diagnosis.next_tests)))
-    found = [_asked(knowledge, names, diagnosis, name) for name in tests if name]
+    found = [_candidate(knowledge, names, diagnosis, name) for name in tests if name]
     asked = [test for test in found if test and not _is_past(names, diagnosis, members, test.check)]
     if _is_certain(group, members):
         asked = [test for test in asked if test.may_change_mind(names.faults(members[0].faults))]
     if _may_be_false_alarm(diagnosis, group, members):
-        asked.sort(key=lambda test: not _tells_apart(knowledge, test.check, members))
+        asked.sort(key=lambda test: not _discriminates(knowledge, test.check, members))
     return asked[0] if asked else None
 
 
@@ -178,7 +178,7 @@ def _seen_by(diagnosis: Diagnosis, check: Check) -> set[str]:
     return listed & {detection.cause for detection in check.detections}
 
 
-def _tells_apart(knowledge: Knowledge, check: Check, members: Sequence[Hypothesis]) -> bool:
+def _discriminates(knowledge: Knowledge, check: Check, members: Sequence[Hypothesis]) -> bool:
     """Return whether a test distinguishes the leading hypotheses from a false alarm."""
     model = knowledge.model
     sound = outcomes(model, check, predict(model, frozenset()))
@@ -191,18 +191,18 @@ def _tells_apart(knowledge: Knowledge, check: Check, members: Sequence[Hypothesi
         math.fsum(h.probability * row[k] for h, row in zip(known, rows, strict=True)) / total
         for k in range(len(sound))
     ]
-    return math.fsum(abs(a - b) for a, b in zip(sound, mixed, strict=True)) / 2 >= TELLS_APART
+    return math.fsum(abs(a - b) for a, b in zip(sound, mixed, strict=True)) / 2 >= DISCRIMINATES
 
 
-def _asked(
+def _candidate(
     knowledge: Knowledge, names: FaultNames, diagnosis: Diagnosis, test: str
-) -> Asked | None:
+) -> CandidateTest | None:
     try:
         check = check_named(knowledge, test)
     except UsageError:  # a test of another engine: nothing is known of what it would give
         return None
     text = f"Find out whether this shows: {names.symptom(check.reads)}" if check.reads else ""
-    return Asked(check, text or check.text, _answers(knowledge, names, diagnosis, check))
+    return CandidateTest(check, text or check.text, _answers(knowledge, names, diagnosis, check))
 
 
 def _without_test(
@@ -245,11 +245,11 @@ def _remedies(
 
     Of what is made ``safe`` first only what mends it.
     """
-    told = {fault for action in safe for fault in action.faults}
+    covered = {fault for action in safe for fault in action.faults}
     found = dict.fromkeys(fault for h in members for fault in sort_modes(h.faults))
     modes = ((fault, names.fmea.modes.get(fault)) for fault in found)
     texts = (
-        (repair_action(mode) if fault in told else mode.remedy) for fault, mode in modes if mode
+        (repair_action(mode) if fault in covered else mode.remedy) for fault, mode in modes if mode
     )
     return tuple(dict.fromkeys(text for text in texts if text))
 

@@ -8,7 +8,7 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from amberbox.core.timestamps import format_time
+from amberbox.core.timestamps import format_time, maybe_time
 from amberbox.core.types import AmbiguityGroup, Diagnosis, Hypothesis, Symptom, Test
 from amberbox.diagnosis.diagnose import DiagnosisContext, evidence_of_situation
 from amberbox.diagnosis.knowledge import Knowledge
@@ -44,9 +44,9 @@ def symptoms_json(symptoms: Sequence[Symptom], counted: Collection[str]) -> list
         {
             "id": symptom.id,
             "state": symptom.state,
-            "onset": _time(symptom.onset_ns),
-            "confirmed": _time(symptom.confirmed_ns),
-            "gone": _time(symptom.gone_ns),
+            "onset": maybe_time(symptom.onset_ns),
+            "confirmed": maybe_time(symptom.confirmed_ns),
+            "gone": maybe_time(symptom.gone_ns),
             "reason": symptom.reason,
             "source": symptom.source,
             "blocked_by": list(symptom.blocked_by),
@@ -112,10 +112,6 @@ def _test(test: Test) -> dict[str, Any]:
 def _order(symptom: Symptom) -> tuple[int, int, str]:
     rank = ("present", "absent", "unknown").index(symptom.state)
     return rank, symptom.onset_ns or 0, symptom.id
-
-
-def _time(at_ns: int | None) -> str | None:
-    return None if at_ns is None else format_time(at_ns)
 
 
 _NONE = "none"  # the state of a robot of which there is no diagnosis

@@ -21,7 +21,7 @@ from amberbox.diagnosis.report.explanation import (
     SeenSymptom,
 )
 from amberbox.diagnosis.report.wording import (
-    WORTH_TELLING,
+    WORTH_SHOWING,
     capitalize,
     clock,
     date_and_clock,
@@ -99,10 +99,10 @@ def _first_paragraph(explanation: Explanation) -> str:
     """Return in a few sentences what is broken, whether the robot can be used, what to do."""
     if explanation.state == "healed":
         return explanation.headline
-    said = (f"{m.name} says: {m.text}" for m in explanation.members if m.state == "open")
+    members = (f"{m.name} says: {m.text}" for m in explanation.members if m.state == "open")
     use = f"Can the robot be used? {sentence(explanation.use.text)}"
     next_step = f"Next: {sentence(explanation.next.text)}"
-    return " ".join((explanation.headline, *said, use, next_step))
+    return " ".join((explanation.headline, *members, use, next_step))
 
 
 def _sections(explanation: Explanation) -> Iterator[tuple[str, list[str]]]:
@@ -225,7 +225,7 @@ def _against(explanation: Explanation) -> Iterator[str]:
 
 
 def _others(others: Sequence[ExplainedGroup]) -> Iterator[str]:
-    worth = [group for group in others if group.probability >= WORTH_TELLING]
+    worth = [group for group in others if group.probability >= WORTH_SHOWING]
     for group in worth:
         yield from _item(f"{percent(group.probability)}: {group.text}")
     if not worth:
@@ -251,11 +251,14 @@ def _next(step: NextStep) -> Iterator[str]:
     if step.test:
         yield _line(_effort(step), "  ")
         yield from _paragraph("What the answers would mean:")
-    told = set[str]()
+    shown = set[str]()
     for branch in step.answers:
-        yield from _branch(branch)
-        told.update(_helps(branch))
-    rest = [remedy for remedy in step.remedies if remedy not in told]
+        helps = _helps(branch)
+        what = f'"{branch.answer}" ({percent(branch.probability)}): {branch.leads}'
+        then = "".join(f"; then: {remedy}" for remedy in helps)
+        yield from _item(f"{what}, {percent(branch.then)}{then}")
+        shown.update(helps)
+    rest = [remedy for remedy in step.remedies if remedy not in shown]
     if step.test and rest:
         yield from _paragraph(f"What helps, once it is sure: {'; or '.join(rest)}.")
 
@@ -266,12 +269,6 @@ def _effort(step: NextStep) -> str:
     splits = "tells them apart" if step.splits else ""
     parts = [step.by, takes, risk, splits]
     return f"{capitalize(', '.join(part for part in parts if part))} (test {step.test})."
-
-
-def _branch(branch: AnswerBranch) -> Iterator[str]:
-    helps = "".join(f"; then: {remedy}" for remedy in _helps(branch))
-    what = f'"{branch.answer}" ({percent(branch.probability)}): {branch.leads}'
-    yield from _item(f"{what}, {percent(branch.then)}{helps}")
 
 
 def _helps(branch: AnswerBranch) -> tuple[str, ...]:

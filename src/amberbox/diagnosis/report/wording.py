@@ -19,7 +19,7 @@ from amberbox.diagnosis.report.explanation import ExplainedFault, Possibility
 
 NS = 1_000_000_000
 
-WORTH_TELLING = 0.005  # from which probability on another possibility is shown
+WORTH_SHOWING = 0.005  # from which probability on another possibility is shown
 
 MANY = ("no", "one", "two", "three", "four", "five", "six")
 
@@ -214,10 +214,10 @@ class FaultNames:
     def symptom(self, symptom_id: str, reason: str = "") -> str:
         """Return what is seen when a symptom is there; ``reason`` is a value and its limit."""
         symptom = self.fmea.symptoms.get(symptom_id)
-        told = symptom.description if symptom is not None else ""
-        told = told or finding_text(self.fmea, symptom_id)
-        if told:
-            return f"{told} ({reason})" if reason else told
+        text = symptom.description if symptom is not None else ""
+        text = text or finding_text(self.fmea, symptom_id)
+        if text:
+            return f"{text} ({reason})" if reason else text
         parts = symptom_id.split("/")
         if len(parts) == 3 and reason:
             return f"{self.component(parts[0])}: {reason}"

@@ -90,9 +90,9 @@ def evaluate(config: DiagnosticsOptions, inputs: Sequence[Input], now: Now) -> M
         name: DiagnosticEntry(_level(level), f"{name}: {text or ''}") for name, level, text in rows
     }
     before = now - round(config.max_age * NS)
-    heard = inputs[0].flow.age_s(before) <= config.max_age
+    received = inputs[0].flow.age_s(before) <= config.max_age
     worst = max((_of(pattern, entries) for pattern in config.names), key=lambda e: e.level)
-    if worst.level == STALE and not worst.text and not heard:
+    if worst.level == STALE and not worst.text and not received:
         return {"ok": UNKNOWN}
     text = worst.text or f"no entry for {config.max_age:g} s"
     return {"ok": worst.level <= _WORDS[config.worst], "level": worst.level, "message": text}

@@ -166,12 +166,14 @@ def _gap_s(
     A message that a change filter left out shows that the value has not changed.
     """
     start = now - round(config.window * NS)
-    heard = joined_times([entry.flow.heard_ns(start, now), _near(samples.times_ns, start, now)])
-    heard = _near(heard, start, now)
-    if not len(heard) or heard[0] > start:
+    received = joined_times(
+        [entry.flow.received_ns(start, now), _near(samples.times_ns, start, now)]
+    )
+    received = _near(received, start, now)
+    if not len(received) or received[0] > start:
         return nan
-    good = samples.known(heard) & _is_valid(config, named, np.maximum(heard, start))
-    return entry.flow.longest_gap_s(now, config.window, heard[good])
+    good = samples.known(received) & _is_valid(config, named, np.maximum(received, start))
+    return entry.flow.longest_gap_s(now, config.window, received[good])
 
 
 def _near(times_ns: IntArray, since_ns: int, until_ns: int) -> IntArray:

@@ -85,17 +85,17 @@ def evaluate(config: HeartbeatOptions, inputs: Sequence[Input], now: Now) -> Map
     """Judge the last message's age, and the rate once there has been a whole window of them."""
     (item,) = inputs
     age_s = item.age_s(now)
-    heard = np.isfinite(age_s)
+    received = np.isfinite(age_s)
     whole = item.flow.reaches_back(now, config.window)
     rate_hz = np.where(whole, item.rate_hz(now, config.window), np.nan)
-    told = heard | item.flow.listened(now, config.window)
+    known = received | item.flow.listened(now, config.window)
     comes, enough = age_s <= config.max_age, ~(rate_hz < config.least_hz)
     judged = comes & whole & (enough | _is_steady(config, item, now, enough))
     return {
-        "alive": where_known(told, comes & enough),
+        "alive": where_known(known, comes & enough),
         "rate_hz": rate_hz,
-        "age_s": np.where(heard, age_s, np.nan),
-        "heard": where_known(told, comes),
+        "age_s": np.where(received, age_s, np.nan),
+        "heard": where_known(known, comes),
         "often_enough": where_known(judged, enough),
     }
 
@@ -108,8 +108,8 @@ def _is_steady(config: HeartbeatOptions, item: Input, now: Now, enough: Any) -> 
 
     def at(now_ns: int) -> bool:
         since_ns = now_ns - round(config.window * NS)
-        heard_ns = item.flow.heard_ns(since_ns, now_ns)
-        return item.flow.longest_gap_s(now_ns, config.window, heard_ns) <= config.window / 2
+        received_ns = item.flow.received_ns(since_ns, now_ns)
+        return item.flow.longest_gap_s(now_ns, config.window, received_ns) <= config.window / 2
 
     if is_one(now):
         return not enough and at(int(now))

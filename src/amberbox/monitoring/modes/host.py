@@ -93,8 +93,8 @@ def evaluate(config: HostOptions, inputs: Sequence[Input], now: Now) -> Mapping[
     value, limit = _mean(config, one, word, now), getattr(config, word, inf)
     good = works & (value <= limit - config.hysteresis)
     bad = ~works | (value > limit)
-    told = known & (~works | np.isfinite(value))
-    return {"ok": where_known(told, with_hysteresis(good, bad)), "value": value}
+    measured = known & (~works | np.isfinite(value))
+    return {"ok": where_known(measured, with_hysteresis(good, bad)), "value": value}
 
 
 def _mean(config: HostOptions, one: Input, word: str, now: Now) -> Any:

@@ -66,9 +66,9 @@ def evaluate(config: LocalisationOptions, inputs: Sequence[Input], now: Now) -> 
     x, y, theta = variances = [numbers_at(one, now) for one in chosen]
     mean = (x + y + theta) / 3
     sane = np.min(variances, axis=0) >= 0
-    told = np.logical_and.reduce([one.samples.known(now) for one in chosen])
-    told &= np.max(np.abs(variances), axis=0) != 0
-    localised = where_known(told, sane & (mean < config.avg_variance_threshold))
+    known = np.logical_and.reduce([one.samples.known(now) for one in chosen])
+    known &= np.max(np.abs(variances), axis=0) != 0
+    localised = where_known(known, sane & (mean < config.avg_variance_threshold))
     return {"localised": localised, "variance_x": x, "variance_y": y, "variance_theta": theta}
 
 

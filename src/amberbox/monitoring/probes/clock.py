@@ -19,7 +19,7 @@ _TIME_ERROR = 5
 _UNSYNCHRONISED, _NANOSECONDS = 0x40, 0x2000  # STA_UNSYNC, STA_NANO
 
 
-class _Timex(ctypes.Structure):
+class KernelClock(ctypes.Structure):
     """The beginning of the kernel's ``struct timex``, with room for the rest."""
 
     _fields_ = (
@@ -37,7 +37,7 @@ def measure(subject: str) -> Measured:
     """Read the state of the kernel's clock; nothing is set."""
     if subject not in ("", "system"):
         raise UsageError(f"there is no clock '{subject}'", "known: system")
-    found = _Timex()
+    found = KernelClock()
     libc = ctypes.CDLL(None, use_errno=True)
     state = int(libc.adjtimex(ctypes.byref(found)))
     if state < 0:
@@ -46,7 +46,7 @@ def measure(subject: str) -> Measured:
     return judge(state, found)
 
 
-def judge(state: int, found: _Timex) -> Measured:
+def judge(state: int, found: KernelClock) -> Measured:
     """Return the measurement from the state of the kernel's clock."""
     to_ms = 1e-6 if found.status & _NANOSECONDS else 1e-3
     return {

@@ -23,7 +23,7 @@ PERIOD_S = 2.0
 _ESCAPED = re.compile(r"\\([0-7]{3})")
 
 
-class _MountPoint(NamedTuple):
+class FileSystemMount(NamedTuple):
     """Where a file system is mounted, and whether it is read-only itself.
 
     A service may see a disk through a mount that is read-only for it alone, which does not count.
@@ -43,7 +43,7 @@ def measure(subject: str) -> Measured:
     return judge(found, mount_of(path.resolve(), mounts))
 
 
-def judge(found: os.statvfs_result, mount: _MountPoint) -> Measured:
+def judge(found: os.statvfs_result, mount: FileSystemMount) -> Measured:
     """Return the measurement from the statistics of a file system."""
     if not found.f_blocks:
         raise AmberboxError("there is no disk behind it")
@@ -58,7 +58,7 @@ def judge(found: os.statvfs_result, mount: _MountPoint) -> Measured:
     }
 
 
-def mount_of(path: Path, mountinfo: str) -> _MountPoint:
+def mount_of(path: Path, mountinfo: str) -> FileSystemMount:
     """Find the mount that a path lies on in ``/proc/self/mountinfo``; of equals the last one."""
     mounts = [_mount(line) for line in mountinfo.splitlines()]
     above = [mount for mount in mounts if path.is_relative_to(mount.point)]
@@ -67,10 +67,10 @@ def mount_of(path: Path, mountinfo: str) -> _MountPoint:
     return max(reversed(above), key=lambda mount: len(mount.point.parts))
 
 
-def _mount(line: str) -> _MountPoint:
+def _mount(line: str) -> FileSystemMount:
     fields, _, of_file_system = line.partition(" - ")
     point = _ESCAPED.sub(lambda code: chr(int(code[1], 8)), fields.split()[4])
-    return _MountPoint(Path(point), "ro" in of_file_system.split()[-1].split(","))
+    return FileSystemMount(Path(point), "ro" in of_file_system.split()[-1].split(","))
 
 
 def _percent(part: int, whole: int) -> float | None:

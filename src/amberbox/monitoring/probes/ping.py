@@ -40,7 +40,7 @@ def measure(subject: str) -> Measured:
     host, port = split(subject)
     if port is not None:
         return repeated(lambda number: tcp_s(host, port))
-    family, address = _address(host)
+    family, _, _, _, address = socket.getaddrinfo(host, None, type=socket.SOCK_DGRAM)[0]
     try:
         with _echo_socket(family) as echo:
             return repeated(lambda number: echo_s(echo, family, address, number))
@@ -124,11 +124,6 @@ def read(loss_percent: float, mean: re.Match[str] | None) -> Measured:
         "latency_ms": float(mean[1]) if mean else None,
         "loss_percent": loss_percent,
     }
-
-
-def _address(host: str) -> tuple[int, tuple[object, ...]]:
-    family, _, _, _, address = socket.getaddrinfo(host, None, type=socket.SOCK_DGRAM)[0]
-    return family, address
 
 
 def _echo_socket(family: int) -> socket.socket:

@@ -31,7 +31,7 @@ _PAGE_MB = os.sysconf("SC_PAGE_SIZE") / 1e6
 _TICK_S = 1 / os.sysconf("SC_CLK_TCK")
 
 
-class _ProcessUsage(NamedTuple):
+class ProcessUsage(NamedTuple):
     """The usage of a process: processor time so far, and memory now."""
 
     cpu_s: float
@@ -49,7 +49,7 @@ def measure(subject: str) -> Measured:
 
 
 def judge(
-    before: Mapping[int, _ProcessUsage], after: Mapping[int, _ProcessUsage], seconds: float
+    before: Mapping[int, ProcessUsage], after: Mapping[int, ProcessUsage], seconds: float
 ) -> Measured:
     """Return the usage from two readings of the processes; those that ended do not count."""
     cpu_s = sum(now.cpu_s - before[pid].cpu_s for pid, now in after.items() if pid in before)
@@ -77,16 +77,16 @@ def find(proc: Path, subject: str) -> list[int]:
     return found
 
 
-def usage(proc: Path, pids: Iterable[int]) -> dict[int, _ProcessUsage]:
+def usage(proc: Path, pids: Iterable[int]) -> dict[int, ProcessUsage]:
     """Read what processes have used; those that have ended are left out."""
-    found: dict[int, _ProcessUsage] = {}
+    found: dict[int, ProcessUsage] = {}
     for pid in pids:
         with suppress(FileNotFoundError, ProcessLookupError):
             stat = (proc / str(pid) / "stat").read_text(errors="replace")
             fields = stat.rpartition(")")[2].split()
             if fields[0] not in "ZX":  # dead, but not yet reaped by its parent
                 cpu_s = (int(fields[11]) + int(fields[12])) * _TICK_S
-                found[pid] = _ProcessUsage(cpu_s, int(fields[21]) * _PAGE_MB)
+                found[pid] = ProcessUsage(cpu_s, int(fields[21]) * _PAGE_MB)
     return found
 
 

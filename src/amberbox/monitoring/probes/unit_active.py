@@ -16,7 +16,7 @@ MEASURES = {
 SUBJECT = "name of the unit, such as rosbridge.service or rosbridge; user/NAME for a user's unit"
 PERIOD_S = 2.0
 
-_ASKED = "LoadState,ActiveState,SubState,NRestarts"
+_PROPERTIES = "LoadState,ActiveState,SubState,NRestarts"
 _ACTIVE = ("active", "reloading", "refreshing")
 _WAIT_S = 3.0
 
@@ -32,7 +32,7 @@ def ask(systemctl: Sequence[str], subject: str) -> Measured:
     if not unit or unit.startswith("-") or user not in ("", "user"):
         raise UsageError(f"'{subject}' is no systemd unit", "such as rosbridge.service")
     whose = ["--user"] if user else []
-    command = [*systemctl, *whose, "show", "--no-pager", f"--property={_ASKED}", "--", unit]
+    command = [*systemctl, *whose, "show", "--no-pager", f"--property={_PROPERTIES}", "--", unit]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=_WAIT_S)
     except subprocess.TimeoutExpired as error:

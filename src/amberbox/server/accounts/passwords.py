@@ -201,7 +201,7 @@ class Passwords:
         self._slots = threading.BoundedSemaphore(_AT_ONCE)
         self._queue = threading.BoundedSemaphore(_AT_ONCE + _WAITING)
         self._threads = ThreadPoolExecutor(_AT_ONCE + _WAITING, "passwords")
-        self._nobody = self.hash("the password of nobody")
+        self._no_account = self.hash("the password of nobody")
 
     def hash(self, password: str) -> str:
         """Return the hash of a password, which includes the cost and a new salt."""
@@ -218,7 +218,7 @@ class Passwords:
             raise TooManyError("too many people log in at once", "try again in a few seconds")
         try:
             with self._slots:
-                return self._matches(held or self._nobody, password) and held is not None
+                return self._matches(held or self._no_account, password) and held is not None
         finally:
             self._queue.release()
 

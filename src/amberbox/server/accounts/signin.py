@@ -117,8 +117,8 @@ def change_password(
         attempt_was_right(connection, now_ns, user.user_id, account, caller.address)
         set_password(connection, now_ns, account, new_hash)
         revoked = revoke_tokens(connection, now_ns, user.user_id) if with_tokens else 0
-        told = {"tokens_revoked": str(revoked)} if with_tokens else {}
-        append(connection, now_ns, _entry(account, caller, CHANGE, "ok", **told))
+        details = {"tokens_revoked": str(revoked)} if with_tokens else {}
+        append(connection, now_ns, _entry(account, caller, CHANGE, "ok", **details))
         return begin_session(connection, now_ns, user.user_id, caller.address, caller.agent)
 
 
@@ -230,8 +230,8 @@ def sign_in_by_code(
             session = begin_session(
                 connection, now_ns, user.user_id, caller.address, caller.agent, before=caller.before
             )
-            told = {"session": session.session_id, "by": "code"}
-            entry = AuditEntry(f"user:{name}", caller.address, LOGIN, name, details=told)
+            details = {"session": session.session_id, "by": "code"}
+            entry = AuditEntry(f"user:{name}", caller.address, LOGIN, name, details=details)
             append(connection, now_ns, entry)
             return user, session
         append(

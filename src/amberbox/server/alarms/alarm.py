@@ -209,21 +209,21 @@ class AlarmExplanation:
 
 def explanation_of(robot: str, answer: Mapping[str, Any]) -> AlarmExplanation | None:
     """Return the explanation in an answer of ``POST .../diagnose``; None if it has none."""
-    told = answer.get("explanation")
-    if told is None:
+    explanation = answer.get("explanation")
+    if explanation is None:
         return None
-    broken, severity = told["broken"], told["use"]["severity"]
+    broken, severity = explanation["broken"], explanation["use"]["severity"]
     members = broken["members"] if broken else ()
     causes = [
         LeadingCause(_cut(one["text"]), kind_of(ids), ids)
         for one in members[:_MOST]
         for ids in ([fault["id"] for fault in one["faults"]],)
     ]
-    groups = [*([broken] if broken else ()), *told["others"]]
+    groups = [*([broken] if broken else ()), *explanation["others"]]
     faults = [f for group in groups for one in group["members"] for f in one["faults"]]
     names = {fault["id"]: _cut(fault["text"]) for fault in faults[:_MOST]}
     effect: Severity | Literal[""] = severity if severity in SEVERITIES else ""
-    words = Words(causes, told["sure"]["probability"], names)
+    words = Words(causes, explanation["sure"]["probability"], names)
     return AlarmExplanation(robot, answer["id"], answer["revision"], effect, words)
 
 

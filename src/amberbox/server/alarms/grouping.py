@@ -30,19 +30,20 @@ _MOST = 100
 """Names in a list of what blocks something; more are not of use to anybody."""
 
 
-def note_blocked(register: AlarmRegister, report: AlarmReport, told: Transition) -> None:
+def note_blocked(register: AlarmRegister, report: AlarmReport, transition: Transition) -> None:
     """Store a transition of a component, unless a later one is stored."""
-    if told.mode:
+    if transition.mode:
         return
-    component = told.component[:128]
+    component = transition.component[:128]
     known = register.blocked(report.robot).get(component)
     same = known is not None and known["store_id"] == report.store_id
     if known is not None and same and (report.run, report.seq) <= (known["run"], known["seq"]):
         return
     register.keep_blocked({
-        "robot": report.robot, "component": component, "level": told.after.level,
-        "blocked_by": json.dumps([name[:128] for name in told.blocked_by[:_MOST]]),
-        "reason": told.reason, "since_ns": min(max(told.at_ns + report.offset_ns, 0), 1 << 62),
+        "robot": report.robot, "component": component, "level": transition.after.level,
+        "blocked_by": json.dumps([name[:128] for name in transition.blocked_by[:_MOST]]),
+        "reason": transition.reason,
+        "since_ns": min(max(transition.at_ns + report.offset_ns, 0), 1 << 62),
         "store_id": report.store_id, "run": report.run, "seq": report.seq,
     })  # fmt: skip
 
@@ -161,19 +162,19 @@ _NAMED = 100
 
 
 def apply_reports(
-    register: AlarmRegister, told: Iterable[AlarmReport], now_ns: int, settings: AlarmSettings
+    register: AlarmRegister, reported: Iterable[AlarmReport], now_ns: int, settings: AlarmSettings
 ) -> set[int]:
     """Apply reports in order; return the numbers of the alarms that changed."""
     robots: set[str] = set()
-    for report in told:
+    for report in reported:
         robots.add(report.robot)
-        if isinstance(report.told, AlarmChange):
-            _take_alarm(register, report, report.told, now_ns, settings)
-        elif isinstance(report.told, Diagnosis):
-            _take_diagnosis(register, report.robot, report.told, now_ns, settings)
-            _join(register, report.robot, report.told.id, now_ns, settings)
+        if isinstance(report.content, AlarmChange):
+            _take_alarm(register, report, report.content, now_ns, settings)
+        elif isinstance(report.content, Diagnosis):
+            _take_diagnosis(register, report.robot, report.content, now_ns, settings)
+            _join(register, report.robot, report.content.id, now_ns, settings)
         else:
-            note_blocked(register, report, report.told)
+            note_blocked(register, report, report.content)
     for robot in robots:
         show_consequences(register, robot)
     return register.touched
@@ -182,40 +183,40 @@ def apply_reports(
 def _take_alarm(
     register: AlarmRegister,
     report: AlarmReport,
-    told: AlarmChange,
+    change: AlarmChange,
     now_ns: int,
     settings: AlarmSettings,
 ) -> None:
-    known = register.part(report.robot, told.id)
-    if known is not None and not _is_newer(report, told, known):
+    known = register.part(report.robot, change.id)
+    if known is not None and not _is_newer(report, change, known):
         return
-    part = _part_of(report, told, 0 if known is None else known.alarm)
+    part = _part_of(report, change, 0 if known is None else known.alarm)
     if known is None:
         part = _housed(register, report, part, now_ns, settings)
     register.keep_part(part)
     _judge(register, part.alarm, now_ns, settings, late=report.late)
-    if not part.active and told.reason.startswith(FOLLOWS):
-        _follow(register, part, told.reason.removeprefix(FOLLOWS), now_ns, settings)
+    if not part.active and change.reason.startswith(FOLLOWS):
+        _follow(register, part, change.reason.removeprefix(FOLLOWS), now_ns, settings)
     elif part.diagnosis and part.active:
         _join(register, report.robot, part.diagnosis, now_ns, settings)
 
 
-def _is_newer(report: AlarmReport, told: AlarmChange, known: AlarmPart) -> bool:
+def _is_newer(report: AlarmReport, change: AlarmChange, known: AlarmPart) -> bool:
     """Return whether a report is newer than the known part.
 
     Positions decide within one store, times of change between different stores.
     """
     if report.store_id == known.store_id:
         return (report.run, report.seq) > (known.run, known.seq)
-    return _time(told.changed_ns + report.offset_ns) >= known.changed_ns
+    return _time(change.changed_ns + report.offset_ns) >= known.changed_ns
 
 
-def _part_of(report: AlarmReport, told: AlarmChange, alarm: int) -> AlarmPart:
+def _part_of(report: AlarmReport, change: AlarmChange, alarm: int) -> AlarmPart:
     return AlarmPart(
-        report.robot, told.id[:128], alarm, told.component[:128], told.severity, told.level,
-        told.reason, told.cause, told.diagnosis, told.state != "healed",
-        _time(told.opened_ns + report.offset_ns), _time(told.changed_ns + report.offset_ns),
-        _time(told.count), report.store_id, report.run, report.seq,
+        report.robot, change.id[:128], alarm, change.component[:128], change.severity, change.level,
+        change.reason, change.cause, change.diagnosis, change.state != "healed",
+        _time(change.opened_ns + report.offset_ns), _time(change.changed_ns + report.offset_ns),
+        _time(change.count), report.store_id, report.run, report.seq,
     )  # fmt: skip
 
 
@@ -336,14 +337,14 @@ def _merge(
 
 
 def apply_explanation(
-    register: AlarmRegister, told: AlarmExplanation, now_ns: int, settings: AlarmSettings
+    register: AlarmRegister, explanation: AlarmExplanation, now_ns: int, settings: AlarmSettings
 ) -> None:
     """Store the explanation of a diagnosis, and apply it to the alarms that hold this revision."""
-    text = encode_words(told.words)
-    register.keep_words(told.robot, told.diagnosis[:128], told.effect, text)
-    for alarm in _explained_by(register, told.robot, told.diagnosis):
-        if alarm.revised == told.revision:
-            step = lifecycle.explained(alarm, told.effect, text, now_ns, settings)
+    text = encode_words(explanation.words)
+    register.keep_words(explanation.robot, explanation.diagnosis[:128], explanation.effect, text)
+    for alarm in _explained_by(register, explanation.robot, explanation.diagnosis):
+        if alarm.revised == explanation.revision:
+            step = lifecycle.explained(alarm, explanation.effect, text, now_ns, settings)
             register.keep(alarm, step)
 
 

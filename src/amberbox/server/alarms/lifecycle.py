@@ -41,7 +41,7 @@ def updated_by_parts(
     count = max(1, sum(part.count for part in root))
     came_back = count > alarm.count or (bool(lasting) and not alarm.active)
     alarm, entries = _reopened(alarm, now_ns, settings) if came_back and lasting else (alarm, [])
-    heard = worst([alarm.severity, *(part.severity for part in lasting)])
+    severity = worst([alarm.severity, *(part.severity for part in lasting)])
     changed = replace(
         alarm, count=max(count, alarm.count), reason=latest.reason, active=bool(lasting),
         level=max((part.level for part in lasting or root), key=lambda level: RANK[level]),
@@ -54,7 +54,7 @@ def updated_by_parts(
     if changed.cause != alarm.cause:
         entries = [*entries, HistoryEntry(now_ns, "cause", changed.cause)]
         changed = replace(changed, revision=changed.revision + 1)
-    worse, more = worsened(changed, changed.effect or heard, now_ns, settings)
+    worse, more = worsened(changed, changed.effect or severity, now_ns, settings)
     return worse, [*entries, *more]
 
 
@@ -83,8 +83,8 @@ def explained(
 
     The severity goes down only if the explanation is likely.
     """
-    told = decode_words(words)
-    if effect and not (told and told.is_likely):
+    decoded = decode_words(words)
+    if effect and not (decoded and decoded.is_likely):
         effect = worst([alarm.severity, effect])
     changed = replace(alarm, effect=effect, words=words)
     if not effect or effect == alarm.severity:
@@ -166,16 +166,16 @@ def merged(keep: Alarm, gone: Alarm, origin: str, now_ns: int) -> tuple[Step, St
 
     It takes the owner of the other if it has none.
     """
-    told = keep.told if not is_worse(gone.told, keep.told) else gone.told
+    notified = keep.told if not is_worse(gone.told, keep.told) else gone.told
     effect = keep.effect or gone.effect
     severity = effect or worst([keep.severity, gone.severity])
     one = replace(
-        keep, origin=origin, severity=severity, effect=effect, told=told,
+        keep, origin=origin, severity=severity, effect=effect, told=notified,
         owner=keep.owner or gone.owner,
         opened_ns=min(keep.opened_ns, gone.opened_ns), late=keep.late and gone.late,
         revision=keep.revision + 1,
     )  # fmt: skip
-    if not keep.told and told and not is_worse(severity, told):
+    if not keep.told and notified and not is_worse(severity, notified):
         one = replace(one, notify_ns=None)
     other = replace(
         gone, state="resolved", active=False, resolved_ns=now_ns, resolution=MERGED,
@@ -232,10 +232,10 @@ def _off_the_shelf(alarm: Alarm, now_ns: int, who: str) -> Alarm:
     When its time on the shelf is over (no ``who``), a missing notification is due at once.
     """
     known = alarm.acknowledged_ns is not None
-    untold = not known and not who and is_worse(alarm.severity, alarm.told) and alarm.active
+    is_unnotified = not known and not who and is_worse(alarm.severity, alarm.told) and alarm.active
     return replace(
         alarm, state="acknowledged" if known else "open", shelved_by="", shelved_until_ns=None,
-        notify_ns=now_ns if untold else alarm.notify_ns, revision=alarm.revision + 1,
+        notify_ns=now_ns if is_unnotified else alarm.notify_ns, revision=alarm.revision + 1,
     )  # fmt: skip
 
 

@@ -62,9 +62,9 @@ class LateReports:
 
     until: dict[str, int] = field(default_factory=dict)
 
-    def note(self, told: Iterable[AlarmReport], now_ns: int) -> None:
+    def note(self, reported: Iterable[AlarmReport], now_ns: int) -> None:
         """Note which robots sent late reports."""
-        for report in told:
+        for report in reported:
             if report.late:
                 self.until[report.robot] = now_ns
 
@@ -90,7 +90,7 @@ def move_times(connection: Connection, now_ns: int, step_ns: int) -> None:
 def is_due(connection: Connection, now_ns: int, settings: AlarmSettings) -> bool:
     """Return whether an alarm has a change or a notification due now."""
     over = and_(ALARM.c.state != "resolved", _is_over(now_ns, settings))
-    chosen = select(ALARM.c.number).where(or_(over, _is_to_be_told(now_ns, settings))).limit(1)
+    chosen = select(ALARM.c.number).where(or_(over, _is_due(now_ns, settings))).limit(1)
     return connection.execute(chosen).first() is not None or outbox.is_followup_due(
         connection, now_ns
     )
@@ -101,7 +101,7 @@ def _is_over(now_ns: int, settings: AlarmSettings) -> ColumnElement[bool]:
     return or_(ALARM.c.cleared_ns <= quiet_ns, ALARM.c.shelved_until_ns <= now_ns)
 
 
-def _is_to_be_told(now_ns: int, settings: AlarmSettings) -> ColumnElement[bool]:
+def _is_due(now_ns: int, settings: AlarmSettings) -> ColumnElement[bool]:
     """Return the condition for a due notification.
 
     A time too far ahead was set by a wrong clock and counts as due.
@@ -117,15 +117,15 @@ def apply_due_changes(
     """Apply all changes and queue all notifications that are due now."""
     for alarm in register.alarms(ALARM.c.state != "resolved", _is_over(now_ns, settings)):
         register.keep(alarm, lifecycle.settled(alarm, now_ns, settings))
-    for alarm in register.alarms(_is_to_be_told(now_ns, settings))[:_AT_ONCE]:
-        _tell(register, late, alarm, now_ns, settings, url)
+    for alarm in register.alarms(_is_due(now_ns, settings))[:_AT_ONCE]:
+        _notify(register, late, alarm, now_ns, settings, url)
     if outbox.is_followup_due(register.connection, now_ns):
         setting = read(register.connection, NOTIFICATIONS, Notifications)
         stays_ns = settings.ns("reopen_s")
         outbox.follow_up(register.connection, register.alarm, now_ns, stays_ns, setting, url)
 
 
-def _tell(
+def _notify(
     register: AlarmRegister,
     late: LateReports,
     alarm: Alarm,
@@ -146,8 +146,8 @@ def _tell(
     setting = read(register.connection, NOTIFICATIONS, Notifications)
     robots = _robots(register, alarm.number)
     sent = queue_alarm(register.connection, AlarmNotice(alarm, robots), now_ns, setting, url)
-    untold = replace(alarm, notify_ns=None)
-    register.keep(alarm, lifecycle.notified(alarm, now_ns) if sent else (untold, []))
+    unnotified = replace(alarm, notify_ns=None)
+    register.keep(alarm, lifecycle.notified(alarm, now_ns) if sent else (unnotified, []))
 
 
 def _robots(register: AlarmRegister, number: int) -> dict[str, frozenset[str]]:
@@ -294,15 +294,15 @@ class Alarms:
             settings = read(connection, NAME, AlarmSettings)
             register = AlarmRegister(connection)
             known = boxes.offsets(connection, rows, self._offsets)
-            told = list(reports(rows, known, settings.ns("late_s")))
-            apply_reports(register, told, now_ns, settings)
+            found_reports = list(reports(rows, known, settings.ns("late_s")))
+            apply_reports(register, found_reports, now_ns, settings)
             for one in news:
                 if isinstance(one, AlarmExplanation):
                     apply_explanation(register, one, now_ns, settings)
             end_absences(register, back, now_ns)
             if rows:
                 boxes.mark(connection, max(one.received_ns for one in rows))
-        self._late.note(told, now_ns)
+        self._late.note(found_reports, now_ns)
         self._move(news)
         return register.touched
 

@@ -160,9 +160,9 @@ def open_offline_alarms(
             and not is_excused(statuses[name], settings.excused)
         ]  # fmt: skip
         if missing:
-            told = {name: statuses[name] for name in missing}
+            chosen = {name: statuses[name] for name in missing}
             since = {name: now_ns - (boot_ns - absence.away[name]) for name in missing}
-            _open(register, since, robots, told, now_ns, settings)
+            _open(register, since, robots, chosen, now_ns, settings)
 
 
 def _after_ns(robot: KnownRobot, settings: AlarmSettings) -> int:

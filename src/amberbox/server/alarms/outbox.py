@@ -169,47 +169,48 @@ class DestinationNotice:
 
 
 def queue_alarm(
-    connection: Connection, told: AlarmNotice, now_ns: int, setting: Notifications, url: str
+    connection: Connection, notice: AlarmNotice, now_ns: int, setting: Notifications, url: str
 ) -> int:
     """Add a message about an alarm to the outbox per destination that wants it; return how many."""
-    wanted = [(one, names) for one in setting.destinations() if (names := _seen(one, told))]
+    wanted = [(one, names) for one in setting.destinations() if (names := _seen(one, notice))]
     for one, names in wanted:
-        queue_message(connection, one, DestinationNotice(told.alarm, names), now_ns, setting, url)
+        queue_message(connection, one, DestinationNotice(notice.alarm, names), now_ns, setting, url)
     return len(wanted)
 
 
-def _seen(one: Destination, told: AlarmNotice) -> list[str]:
+def _seen(one: Destination, notice: AlarmNotice) -> list[str]:
     """Return the robots of an alarm that a destination is to be notified about."""
-    if is_worse(one.least, told.alarm.severity):
+    if is_worse(one.least, notice.alarm.severity):
         return []
     groups = frozenset(one.groups)
-    return [name for name, of in sorted(told.robots.items()) if not groups or groups & of]
+    return [name for name, of in sorted(notice.robots.items()) if not groups or groups & of]
 
 
 def queue_message(
     connection: Connection,
     one: Destination,
-    told: DestinationNotice,
+    notice: DestinationNotice,
     now_ns: int,
     setting: Notifications,
     url: str,
 ) -> None:
     """Add one message to the outbox; hold it in quiet hours, and when there are many."""
-    alarm = told.alarm
+    alarm = notice.alarm
     quiet_ns = None if one.quiet is None else one.quiet.until_ns(now_ns)
     if quiet_ns is not None and one.quiet and not is_worse(one.quiet.but, alarm.severity):
         quiet_ns = None
     many = _recent(connection, one.name, now_ns, setting) >= setting.digest_above
-    behind = told.event != "opened" and _is_held(connection, one.name, alarm.number)
+    behind = notice.event != "opened" and _is_held(connection, one.name, alarm.number)
     held = quiet_ns is not None or many or behind
     key = secrets.token_hex(16)
-    data = data_of(alarm, told.robots, url, told.event)
+    data = data_of(alarm, notice.robots, url, notice.event)
     data["dedup_key"] = _first_key(connection, one.name, alarm.number) or key
     connection.execute(OUTBOX.insert(), [{
         "key": key, "destination": one.name,
-        "kind": "alarm" if told.event == "opened" else told.event,
+        "kind": "alarm" if notice.event == "opened" else notice.event,
         "alarm": alarm.number, "severity": alarm.severity, "state": "held" if held else "waiting",
-        "subject": subject_of(alarm, told.event), "body": body_of(alarm, url, now_ns, told.event),
+        "subject": subject_of(alarm, notice.event),
+        "body": body_of(alarm, url, now_ns, notice.event),
         "data": json.dumps(data), "created_ns": now_ns,
         "due_ns": quiet_ns or now_ns + (_GATHER_NS if many else 0), "tries": 0, "trouble": "",
         "sent_ns": None,
@@ -328,15 +329,15 @@ def _is_behind() -> ColumnElement[bool]:
     )  # fmt: skip
 
 
-def drop_untold(connection: Connection) -> None:
+def drop_undelivered(connection: Connection) -> None:
     """Mark follow-ups as failed if the messages about the alarm itself failed."""
     first = OUTBOX.alias()
-    told = exists().where(
+    notified = exists().where(
         first.c.alarm == OUTBOX.c.alarm, first.c.destination == OUTBOX.c.destination,
         first.c.kind == "alarm", first.c.state != "failed",
     )  # fmt: skip
     follows = OUTBOX.c.kind.in_(("acknowledged", "resolved"))
-    gone = update(OUTBOX).where(OUTBOX.c.state.in_(("waiting", "held")), follows, ~told)
+    gone = update(OUTBOX).where(OUTBOX.c.state.in_(("waiting", "held")), follows, ~notified)
     connection.execute(gone.values(state="failed", trouble="the alarm itself did not arrive"))
 
 
@@ -449,7 +450,7 @@ def follow_up(
             if wait_ns > now_ns:
                 _look(connection, number, wait_ns)
                 continue
-            for about, event, robots in _untold(connection, find, to, alarm, thread):
+            for about, event, robots in _due_messages(connection, find, to, alarm, thread):
                 queue_message(
                     connection, to, DestinationNotice(about, robots, event), now_ns, setting, url
                 )
@@ -481,7 +482,7 @@ def _wait_ns(alarm: Alarm, thread: _Thread, stays_ns: int) -> int:
     return (alarm.resolved_ns or 0) + stays_ns
 
 
-def _untold(
+def _due_messages(
     connection: Connection, find: FindAlarm, to: Destination, alarm: Alarm, thread: _Thread
 ) -> Iterator[tuple[Alarm, Event, list[str]]]:
     """Yield the messages due to a destination, in order: alarm, event, robots."""
@@ -627,7 +628,7 @@ class NotificationSender:
             if not waiting and not is_digest_due(connection, now_ns):
                 return 0
         with self.database.begin() as connection:
-            drop_untold(connection)
+            drop_undelivered(connection)
             gather(connection, now_ns, setting)
             waiting = due(connection, now_ns)
         of: dict[str, list[RowMapping]] = {}

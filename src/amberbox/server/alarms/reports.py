@@ -43,7 +43,7 @@ class AlarmReport:
     store_id: str
     run: int
     seq: int
-    told: ReportContent
+    content: ReportContent
     offset_ns: int
     late: bool
 
@@ -66,20 +66,20 @@ def reports(rows: Iterable[ReceivedRow], offsets: Offsets, late_ns: int) -> Iter
     robot has caught up, and never if it is over by then.
     """
     for one in sorted(rows, key=_order):
-        told = _told(one.row)
-        if told is None:
+        content = content_of(one.row)
+        if content is None:
             continue
         row = one.row
         offset_ns = offsets.get((one.robot, one.store_id, row.writer, row.run))
         late = offset_ns is None or one.received_ns - row.log_ns - offset_ns > late_ns
-        yield AlarmReport(one.robot, one.store_id, row.run, row.seq, told, offset_ns or 0, late)
+        yield AlarmReport(one.robot, one.store_id, row.run, row.seq, content, offset_ns or 0, late)
 
 
 def _order(one: ReceivedRow) -> tuple[str, str, str, int, int]:
     return (one.robot, one.store_id, one.row.writer, one.row.run, one.row.seq)
 
 
-def _told(row: LinkRow) -> ReportContent | None:
+def content_of(row: LinkRow) -> ReportContent | None:
     """Decode a row; None for an invalid one, which is stored all the same."""
     try:
         found = finding(row.channel, msgspec.json.decode(row.data))
@@ -159,11 +159,11 @@ def mark(connection: Connection, received_ns: int) -> None:
 
 
 def offsets(
-    connection: Connection, rows: Iterable[ReceivedRow], said: dict[tuple[str, str], int]
+    connection: Connection, rows: Iterable[ReceivedRow], stated: dict[tuple[str, str], int]
 ) -> Offsets:
     """Return the server's clock minus the robot's (ns) for the runs of some rows, None if unknown.
 
-    An offset that the link measured in a boot counts more than ``said``, the one from the robot's
+    An offset that the link measured in a boot counts more than ``stated``, the one from the robot's
     hello. A robot that was never linked, such as a team watched by the server, has offset 0.
     """
     runs = {(one.robot, one.store_id, one.row.writer, one.row.run) for one in rows}
@@ -175,7 +175,10 @@ def offsets(
         (row.robot, short_boot_id(row.boot_id)): row.offset_ns
         for row in connection.execute(select(BOOT).where(BOOT.c.robot.in_(robots)))
     }
-    known = {**{(robot, short_boot_id(boot)): by for (robot, boot), by in said.items()}, **measured}
+    known = {
+        **{(robot, short_boot_id(boot)): by for (robot, boot), by in stated.items()},
+        **measured,
+    }
     return {
         run: known.get((run[0], boots.get(run, "")[:8] or now[run[0]])) if run[0] in now else 0
         for run in runs

@@ -142,8 +142,8 @@ class AlarmRegister:
 
     def keep_words(self, robot: str, diagnosis: str, effect: str, words: str) -> None:
         """Store the effect and the explanation of a diagnosis, if its row exists."""
-        told = update(ROOTS).where(ROOTS.c.robot == robot, ROOTS.c.diagnosis == diagnosis)
-        self.connection.execute(told.values(effect=effect, words=words))
+        changed = update(ROOTS).where(ROOTS.c.robot == robot, ROOTS.c.diagnosis == diagnosis)
+        self.connection.execute(changed.values(effect=effect, words=words))
 
     def blocked(self, robot: str) -> dict[str, RowMapping]:
         """Return the last transition of each component of a robot, by component."""

@@ -169,7 +169,7 @@ def _do(
         if revision is not None and revision != alarm.revision:
             raise HTTPException(409, "somebody changed the alarm meanwhile: look at it again")
         if user:
-            _refuse_nobody(connection, user)
+            _refuse_unknown(connection, user)
         changed = AlarmRegister(connection).keep(alarm, step(alarm, name, now_ns))
         who.note(connection, now_ns, f"alarms.{action}", str(alarm.number), details=details)
         page = alarm_page(connection, who, changed)
@@ -177,7 +177,7 @@ def _do(
     return page
 
 
-def _refuse_nobody(connection: Connection, name: str) -> None:
+def _refuse_unknown(connection: Connection, name: str) -> None:
     """Refuse a name that nobody has, without saying which there are."""
     try:
         find_user(connection, name)

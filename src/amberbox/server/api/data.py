@@ -57,7 +57,7 @@ query_routes = Routes("data")
 @routes.get("/robots/{robot}/items", "items.read")
 def list_items(fleet: Fleet, who: Who, robot: OfRobot) -> list[Item]:
     """List the data items of a robot that the server has messages of, the box's own at the end."""
-    answer = fleet.worker_pool.ask_now(f"{WORKER}:items", {"robot": robot.id}, asker=who.person)
+    answer = fleet.worker_pool.ask_now(f"{WORKER}:items", {"robot": robot.id}, origin=who.person)
     return msgspec.json.decode(answer, type=list[Item])
 
 
@@ -65,7 +65,7 @@ def list_items(fleet: Fleet, who: Who, robot: OfRobot) -> list[Item]:
 def read_item(fleet: Fleet, who: Who, robot: OfRobot, item: ItemName) -> ItemDetail:
     """Describe a data item: columns with types, units and labels, over all its versions."""
     answer = fleet.worker_pool.ask_now(
-        f"{WORKER}:item", {"robot": robot.id, "item": item}, asker=who.person
+        f"{WORKER}:item", {"robot": robot.id, "item": item}, origin=who.person
     )
     found = msgspec.json.decode(answer, type=ItemDetail | None)
     if found is None:
@@ -145,15 +145,15 @@ async def read_rows(
     The headers ``X-Amberbox-Next`` and ``X-Amberbox-Complete-To`` say what the fields ``next`` and
     ``complete_to`` say in JSON.
     """
-    work = fleet.worker_pool.ask_file(f"{WORKER}:query", arguments(about), asker=who.person)
+    work = fleet.worker_pool.ask_file(f"{WORKER}:query", arguments(about), origin=who.person)
     file = await cancel_on_disconnect(request, work)
-    said = msgspec.json.decode(file.read(int.from_bytes(file.read(4), "little")))
+    about_rows = msgspec.json.decode(file.read(int.from_bytes(file.read(4), "little")))
     headers = {"X-Content-Type-Options": "nosniff", "Cache-Control": "no-store"}
     for name in ("rows", "kind", "next", "complete_to"):
-        if said[name] is not None:
-            headers[f"X-Amberbox-{name.replace('_', '-').title()}"] = str(said[name])
-    if said["notes"]:  # as much as a header takes
-        headers["X-Amberbox-Notes"] = json.dumps([str(n)[:300] for n in said["notes"][:10]])
+        if about_rows[name] is not None:
+            headers[f"X-Amberbox-{name.replace('_', '-').title()}"] = str(about_rows[name])
+    if about_rows["notes"]:  # as much as a header takes
+        headers["X-Amberbox-Notes"] = json.dumps([str(n)[:300] for n in about_rows["notes"][:10]])
     if about.form != "json":
         name = f"{about.robot}-{about.item}.{_ENDINGS[about.form]}".replace(":", "_")
         headers["Content-Disposition"] = f'attachment; filename="{name}"'
@@ -188,6 +188,6 @@ def read_statistics(
     span = robot_span_ns(fleet, robot.id, from_, to)
     question = RowQuery(robot.id, item, _names(variables), *span, bins=bins)
     answer = fleet.worker_pool.ask_now(
-        f"{WORKER}:statistics", arguments(question), asker=who.person
+        f"{WORKER}:statistics", arguments(question), origin=who.person
     )
     return msgspec.json.decode(answer, type=Summaries)

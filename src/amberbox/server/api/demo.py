@@ -8,7 +8,6 @@ from typing import Annotated
 
 from fastapi import Depends, HTTPException, Request, Response
 from pydantic import Field
-from sqlalchemy import Connection
 
 from amberbox.server.accounts.signin import LONGEST, sign_in_by_code
 from amberbox.server.api.session import Myself, came_from, from_our_pages, myself, set_cookie
@@ -74,22 +73,18 @@ def repair(demo: InDemo, fleet: Fleet, who: Who, robot: OfRobot) -> DemoView:
 def _noted(
     fleet: Services, who: Caller, demo: Demonstration, robot: str, done: tuple[str, dict[str, str]]
 ) -> DemoView:
-    action, told = done
+    action, details = done
     with fleet.database.begin() as connection:
-        who.note(connection, fleet.clock.wall_ns(), action, robot, details=told)
+        who.note(connection, fleet.clock.wall_ns(), action, robot, details=details)
     return _view(fleet, who, demo)
 
 
 def _view(fleet: Services, who: Caller, demo: Demonstration) -> DemoView:
     with fleet.database.reading() as connection:
-        seen = _seen(connection, who)
+        seen = {robot.id for robot in who.robots(connection)}
     broken = demo.broken()
     robots = [DemoRobot(robot, broken.get(robot, "")) for robot in demo.robots if robot in seen]
     return DemoView(robots, list(demo.faults))
-
-
-def _seen(connection: Connection, who: Caller) -> set[str]:
-    return {robot.id for robot in who.robots(connection)}
 
 
 code_routes = Routes("session")

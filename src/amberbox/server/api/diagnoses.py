@@ -114,13 +114,13 @@ def read_diagnosis(robot: OfRobot, diagnosis: Name, fleet: Fleet) -> DiagnosisDe
     known = _known(fleet, robot, diagnosis)
     with fleet.database.reading() as connection:
         given = explanations.read_answers(connection, robot.id, diagnosis)
-        said = explanations.read_causes(connection, robot.id, diagnosis)
+        causes = explanations.read_causes(connection, robot.id, diagnosis)
         made = explanations.read_revisions(connection, robot.id, diagnosis)
     return DiagnosisDetail(
         known.id, known.last.state, [revision_json(revision) for revision in known.revisions],
         [TestAnswer(a.test, a.answer, a.who, format_time(a.at_ns)) for a in given],
         [ServerRevision(r.number, r.who, format_time(r.at_ns), r.body) for r in made],
-        [Cause(c.failure_mode, c.note, c.who, format_time(c.at_ns)) for c in said],
+        [Cause(c.failure_mode, c.note, c.who, format_time(c.at_ns)) for c in causes],
     )  # fmt: skip
 
 
@@ -152,7 +152,7 @@ async def answer_test(
     for _ in range(_TRIES):
         before = await asyncio.to_thread(_given, fleet, robot.id, diagnosis)
         asked = AskDiagnosis(robot=robot.id, now_ns=fleet.clock.wall_ns(), diagnosis=diagnosis,
-                             answers={**before, **_said(body)})  # fmt: skip
+                             answers={**before, **words_of(body)})  # fmt: skip
         answer = await ask_worker(fleet, who, "diagnose", asked)
         kept = await asyncio.to_thread(
             _keep_answer, fleet, who, robot.id, diagnosis, body, before, answer
@@ -179,7 +179,7 @@ async def say_cause(
     return Cause(cause.failure_mode, cause.note, cause.who, format_time(cause.at_ns))
 
 
-def _said(body: NewAnswer) -> dict[str, str]:
+def words_of(body: NewAnswer) -> dict[str, str]:
     """Return all that is answered at once."""
     return {body.test: body.answer, **{t: a for t, a in body.also.items() if t != body.test}}
 
@@ -218,7 +218,8 @@ def _keep_answer(
     """Keep an answer and what follows; False if somebody else has answered since ``before``."""
     now_ns, person = fleet.clock.wall_ns(), who.person
     given, *also = [
-        explanations.GivenAnswer(test, word, person, now_ns) for test, word in _said(body).items()
+        explanations.GivenAnswer(test, word, person, now_ns)
+        for test, word in words_of(body).items()
     ]
     with fleet.database.begin() as connection:
         if (

@@ -119,12 +119,12 @@ def describe_routes(
     found: dict[str, list[RouteDescription]] = {}
     for routes in all_routes:
         for (method, path), rule in routes.rules.items():
-            said = _said(openapi, method, path)
-            if said is None and method != "SOCKET":
+            described = operation_at(openapi, method, path)
+            if described is None and method != "SOCKET":
                 continue  # a page for people
             tag = next(iter(routes.router.tags), "other")
-            made = _socket(routes, path, rule, url) if said is None else _operation(
-                openapi, method, path, said, rule, url
+            made = _socket(routes, path, rule, url) if described is None else _operation(
+                openapi, method, path, described, rule, url
             )  # fmt: skip
             found.setdefault(str(tag), []).append(made)
     return [
@@ -133,7 +133,7 @@ def describe_routes(
     ]
 
 
-def _said(openapi: Mapping[str, Any], method: str, path: str) -> dict[str, Any] | None:
+def operation_at(openapi: Mapping[str, Any], method: str, path: str) -> dict[str, Any] | None:
     """Return what OpenAPI says of a route; it leaves out that a part of a path may have slashes."""
     found: dict[str, Any] | None = (
         openapi["paths"].get(path.replace(":path}", "}"), {}).get(method.lower())
@@ -158,20 +158,20 @@ def _operation(
     openapi: Mapping[str, Any],
     method: str,
     path: str,
-    said: Mapping[str, Any],
+    described: Mapping[str, Any],
     rule: RouteRule,
     url: str,
 ) -> RouteDescription:
-    body = _body(openapi, said)
+    body = _body(openapi, described)
     return RouteDescription(
         method,
         path,
         _anchor(method, path),
-        str(said.get("description") or said.get("summary", "")),
+        str(described.get("description") or described.get("summary", "")),
         who_may(rule),
-        [_parameter(openapi, one) for one in said.get("parameters", ())],
+        [_parameter(openapi, one) for one in described.get("parameters", ())],
         body,
-        list(_answers(openapi, said["responses"])),
+        list(_answers(openapi, described["responses"])),
         _call(method, path, url, body, rule),
     )
 
@@ -186,13 +186,15 @@ def _socket(routes: Routes, path: str, rule: RouteRule, url: str) -> RouteDescri
     )
 
 
-def _parameter(openapi: Mapping[str, Any], said: Mapping[str, Any]) -> RouteParameter:
-    schema = said.get("schema", {})
-    about = str(said.get("description", ""))
+def _parameter(openapi: Mapping[str, Any], described: Mapping[str, Any]) -> RouteParameter:
+    schema = described.get("schema", {})
+    about = str(described.get("description", ""))
     if "default" in schema and schema["default"] not in ("", None, []):
         about = f"{about}; {schema['default']} unless given".removeprefix("; ")
-    required = bool(said.get("required"))
-    return RouteParameter(said["name"], said["in"], _type(openapi, schema), required, about)
+    required = bool(described.get("required"))
+    return RouteParameter(
+        described["name"], described["in"], _type(openapi, schema), required, about
+    )
 
 
 def _type(openapi: Mapping[str, Any], schema: Mapping[str, Any]) -> str:
@@ -205,8 +207,8 @@ def _type(openapi: Mapping[str, Any], schema: Mapping[str, Any]) -> str:
     return f"{kind} {low}..{high}" if low is not None and high is not None else kind
 
 
-def _body(openapi: Mapping[str, Any], said: Mapping[str, Any]) -> str:
-    content = said.get("requestBody", {}).get("content", {})
+def _body(openapi: Mapping[str, Any], described: Mapping[str, Any]) -> str:
+    content = described.get("requestBody", {}).get("content", {})
     for media, form in content.items():
         if media == "application/json":
             return json.dumps(example(openapi, form.get("schema", {})), indent=2)
@@ -215,13 +217,13 @@ def _body(openapi: Mapping[str, Any], said: Mapping[str, Any]) -> str:
 
 
 def _answers(openapi: Mapping[str, Any], responses: Mapping[str, Any]) -> Iterable[RouteAnswer]:
-    for status, said in responses.items():
+    for status, described in responses.items():
         if int(status) in PROBLEMS:
             continue
-        content = said.get("content", {})
+        content = described.get("content", {})
         schema = content.get("application/json", {}).get("schema")
         shown = "" if schema is None else json.dumps(example(openapi, schema), indent=2)
-        yield RouteAnswer(status, str(said.get("description", "")), ", ".join(content), shown)
+        yield RouteAnswer(status, str(described.get("description", "")), ", ".join(content), shown)
 
 
 def _call(method: str, path: str, url: str, body: str, rule: RouteRule) -> str:
@@ -250,9 +252,9 @@ def openapi_of(app: FastAPI, rules: Mapping[tuple[str, str], RouteRule]) -> dict
     found = app.openapi()
     found.setdefault("components", {})["securitySchemes"] = _SCHEMES
     for (method, path), rule in rules.items():
-        said = _said(found, method, path)
-        if said is not None:
-            said.update(_extras(rule))
+        described = operation_at(found, method, path)
+        if described is not None:
+            described.update(_extras(rule))
     return found
 
 
@@ -321,7 +323,7 @@ def _page(app: FastAPI, services: Services) -> str:
     )  # fmt: skip
     found = openapi_of(app, _rules(app))
     listed = describe_routes(found, app.state.routes, services.settings.public_url)
-    problems = {status: said["description"] for status, said in PROBLEMS.items()}
+    problems = {status: described["description"] for status, described in PROBLEMS.items()}
     return environment.get_template("docs_page.html").render(
         rooms=listed, problems=problems, version=app.version
     )

@@ -71,7 +71,7 @@ def _checked(fleet: Services, who: Caller, robot: str, found: Sequence[Kept]) ->
         if one.integrity in ("intact", "unsigned")
     ]
     arguments = {"robot": robot, "journals": named}
-    answer = fleet.worker_pool.ask_now(f"{WORKER}:altered", arguments, asker=who.person)
+    answer = fleet.worker_pool.ask_now(f"{WORKER}:altered", arguments, origin=who.person)
     altered = set(msgspec.json.decode(answer, type=list[str]))
     return [
         replace(one, integrity="altered") if f"{one.store_id}/{one.journal}" in altered else one

@@ -240,8 +240,8 @@ def enrol(fleet: Fleet, who: Who, new: NewRobot) -> EnrolledRobot:
         now_ns = fleet.clock.wall_ns()
         secret = registry.add_robot(connection, now_ns, new.robot, new.groups)
         enrolled = _enrolled(fleet, new.robot, secret)
-        told = {"groups": new.groups, "key_id": secret.id}
-        who.note(connection, now_ns, "robots.add", new.robot, details=told)
+        details = {"groups": new.groups, "key_id": secret.id}
+        who.note(connection, now_ns, "robots.add", new.robot, details=details)
     fleet.bus.publish(ServerChange("robot", new.robot))
     return enrolled
 
@@ -285,8 +285,8 @@ def replace_key(fleet: Fleet, who: Who, robot: OfRobot, new: NewKey | None = Non
         now_ns = fleet.clock.wall_ns()
         secret = registry.rotate_key(connection, now_ns, robot.id, overlap_h * _HOUR_NS)
         enrolled = _enrolled(fleet, robot.id, secret)
-        told = {"key_id": secret.id, "overlap_h": overlap_h}
-        who.note(connection, now_ns, "robots.key", robot.id, details=told)
+        details = {"key_id": secret.id, "overlap_h": overlap_h}
+        who.note(connection, now_ns, "robots.key", robot.id, details=details)
     fleet.bus.publish(ServerChange("robot", robot.id))
     return enrolled
 
@@ -306,9 +306,9 @@ def decide_key(fleet: Fleet, who: Who, robot: OfRobot, decision: KeyDecision) ->
     with fleet.database.begin() as connection:
         now_ns, key = fleet.clock.wall_ns(), decision.public_key
         journals = link_state.decide(connection, now_ns, robot.id, key, confirm=decision.confirm)
-        told = {"public_key": key, "journals": journals}
+        details = {"public_key": key, "journals": journals}
         action = f"robots.signing_key.{'confirm' if decision.confirm else 'refuse'}"
-        who.note(connection, now_ns, action, robot.id, details=told)
+        who.note(connection, now_ns, action, robot.id, details=details)
     fleet.bus.publish(ServerChange("robot", robot.id))
     return DecidedKey(journals)
 
@@ -333,8 +333,8 @@ def _revoke(fleet: Services, who: Caller, robot: str, key: str) -> RevokedKeys:
         now_ns = fleet.clock.wall_ns()
         revoked = registry.revoke_keys(connection, now_ns, robot, key)
         if revoked:
-            told = {"key_id": key or "all", "revoked": revoked}
-            who.note(connection, now_ns, "robots.key.revoke", robot, details=told)
+            details = {"key_id": key or "all", "revoked": revoked}
+            who.note(connection, now_ns, "robots.key.revoke", robot, details=details)
     fleet.bus.publish(ServerChange("robot", robot))
     return RevokedKeys(revoked)
 

@@ -103,8 +103,8 @@ def confirm_clock(fleet: Fleet, who: Who, right: RightTime) -> ServerClock:
         if abs(now_ns - read_ns) > SLACK_NS:
             raise HTTPException(409, f"the server's clock says {format_time(now_ns)} by now")
         held = ages.confirm(connection, str(who.principal))
-        told = {"jump": held.jump, "by_s": round(held.ahead_ns / NS)}
-        who.note(connection, now_ns, "clock.confirm", details=told)
+        details = {"jump": held.jump, "by_s": round(held.ahead_ns / NS)}
+        who.note(connection, now_ns, "clock.confirm", details=details)
     return server_clock(ages.read())
 
 
@@ -140,8 +140,8 @@ def change_setting(fleet: Fleet, who: Who, name: Named, value: Annotated[Any, Bo
         new = settings.parsed(restore_secrets(value, before), setting.kind)
         setting.refuse(new)
         settings.write(connection, now_ns, name, new)
-        told = {"before": mask_secrets(before), "after": mask_secrets(msgspec.to_builtins(new))}
-        who.note(connection, now_ns, "settings.change", name, details=told)
+        details = {"before": mask_secrets(before), "after": mask_secrets(msgspec.to_builtins(new))}
+        who.note(connection, now_ns, "settings.change", name, details=details)
         return setting_line(connection, name, setting)
 
 

@@ -160,8 +160,8 @@ def revoke_others(who: Who, fleet: Fleet) -> EndedSessions:
     with fleet.database.begin() as connection:
         user = find_user(connection, who.principal.id)
         count = revoke_sessions(connection, user.user_id, but=who.session_id)
-        told = {"ended": count}
-        who.note(connection, fleet.clock.wall_ns(), "session.revoke", "others", details=told)
+        details = {"ended": count}
+        who.note(connection, fleet.clock.wall_ns(), "session.revoke", "others", details=details)
     fleet.bus.publish(ServerChange("account", data={"name": who.principal.id}))
     return EndedSessions(count)
 

@@ -83,8 +83,8 @@ def add_person(fleet: Fleet, who: Who, new: NewPerson) -> OneTimePassword:
         users.add_user(
             connection, now_ns, new.name, new.role, hashed, groups=new.groups, must_change=True
         )
-        told = {"role": new.role, "groups": new.groups}
-        who.note(connection, now_ns, "users.add", new.name, details=told)
+        details = {"role": new.role, "groups": new.groups}
+        who.note(connection, now_ns, "users.add", new.name, details=details)
     fleet.bus.publish(ServerChange("account", data={"name": new.name}))
     return OneTimePassword(new.name, password)
 
@@ -260,8 +260,8 @@ def make(fleet: Fleet, who: Who, new: NewToken) -> MadeToken:
         secret = tokens.add_token(
             connection, now_ns, owner, new.name, new.scopes, lasts_ns, groups=new.groups
         )
-        told = {"name": new.name, "scopes": new.scopes, "days": new.days, "groups": new.groups}
-        who.note(connection, now_ns, "tokens.make", secret.id, details=told)
+        details = {"name": new.name, "scopes": new.scopes, "days": new.days, "groups": new.groups}
+        who.note(connection, now_ns, "tokens.make", secret.id, details=details)
     return MadeToken(secret.id, secret.text, format_time(now_ns + lasts_ns))
 
 

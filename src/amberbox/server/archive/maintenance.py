@@ -280,7 +280,7 @@ class ArchiveMaintenance:
     def _on_connected(self, change: ServerChange) -> None:
         hello = change.data.get("hello")
         if isinstance(hello, Hello):
-            self._ages.hear(change.robot, hello.wall_ns)
+            self._ages.compare_wall(change.robot, hello.wall_ns)
         if getattr(change.data.get("admission"), "conflicts", ()):
             self._woken.set()
 

@@ -311,13 +311,13 @@ def gathered(
     for source in reader.sources:
         catalogue = reader.of(source, request.table, request=request, level=level)
         one = gather(catalogue, request)
-        found.pieces += [_told(p, source.robot) if many else p for p in one.pieces]
+        found.pieces += [named_by_robot(p, source.robot) if many else p for p in one.pieces]
         found.gaps += one.gaps
         found.notes += one.notes
     return found
 
 
-def _told(piece: FlatTable, robot: str) -> FlatTable:
+def named_by_robot(piece: FlatTable, robot: str) -> FlatTable:
     if piece.schema.column("robot") is not None:
         return piece
     columns = {"robot": np.full(len(piece), robot, object), **piece.columns}

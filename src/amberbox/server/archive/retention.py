@@ -121,7 +121,7 @@ class RetentionClock:
         self._since: tuple[Jump, int] | None = None
         self._agreed: tuple[int, int] | None = None
 
-    def hear(self, robot: str, wall_ns: int) -> None:
+    def compare_wall(self, robot: str, wall_ns: int) -> None:
         """Note the present time of a robot's clock."""
         self._robots[robot] = wall_ns - self._clock.boot_ns()
 
@@ -148,15 +148,15 @@ class RetentionClock:
         """
         with self._database.reading() as connection:
             mark, found = _mark(connection), self._reading(connection)
-        told, evidence = self._told(found, mark), self._evidence(found)
+        jump, evidence = self._lasting_jump(found, mark), self._evidence(found)
         is_due = mark.boot_id != found.boot_id or found.boot_ns - mark.boot_ns >= _WRITE_NS
-        if not (is_due or evidence or told != mark.told):
+        if not (is_due or evidence or jump != mark.told):
             return found
         with self._database.begin() as connection:
             if evidence:
                 self.confirm(connection, evidence)
                 return self._reading(connection)
-            return self._go_on(connection, told)
+            return self._go_on(connection, jump)
 
     def confirm(self, connection: Connection, by: str) -> ClockComparison:
         """Confirm wall time, and log it as an event; return the comparison before.
@@ -185,10 +185,10 @@ class RetentionClock:
             known_ns = wall_ns
         return ClockComparison(wall_ns, known_ns, boot_id, boot_ns, is_same and mark.agreed)
 
-    def _go_on(self, connection: Connection, told: Jump) -> ClockComparison:
+    def _go_on(self, connection: Connection, jump: Jump) -> ClockComparison:
         """Write the confirmed time as of now, and log a jump or its end."""
         mark, found = _mark(connection), self._reading(connection)
-        if told and told != mark.told:
+        if jump and jump != mark.told:
             text = f"{found.text}: see /admin/health, or amberbox serve clock"
             log_event(connection, "", found.wall_ns, "clock_jumped", text)
         elif mark.told and not found.jump:
@@ -196,11 +196,11 @@ class RetentionClock:
             log_event(connection, "", found.wall_ns, "clock_agrees", text)
         at_ns = found.known_ns if found.jump else found.wall_ns
         agreed = not found.jump or found.was_set
-        mark = ConfirmedTime(at_ns, found.boot_id, found.boot_ns, agreed, told)
+        mark = ConfirmedTime(at_ns, found.boot_id, found.boot_ns, agreed, jump)
         settings.write(connection, found.wall_ns, OPTION, mark)
         return found
 
-    def _told(self, found: ClockComparison, mark: ConfirmedTime) -> Jump:
+    def _lasting_jump(self, found: ClockComparison, mark: ConfirmedTime) -> Jump:
         """Return the jump to log, once it has lasted; short ones after a start are ignored."""
         if self._since is None or self._since[0] != found.jump:
             self._since = found.jump, found.boot_ns
@@ -414,9 +414,9 @@ def _events(connection: Connection, rules: Sequence[Retention], now_ns: int) -> 
 
 def _history(connection: Connection, rules: Sequence[Retention], now_ns: int) -> Iterator[int]:
     """Yield the history of alarms that were resolved too long ago for all of their robots."""
-    told = exists().where(HISTORY.c.alarm == ALARM.c.number)
+    recorded = exists().where(HISTORY.c.alarm == ALARM.c.number)
     resolved = select(ALARM.c.number, ALARM.c.resolved_ns).where(
-        ALARM.c.state == "resolved", ALARM.c.resolved_ns.is_not(None), told
+        ALARM.c.state == "resolved", ALARM.c.resolved_ns.is_not(None), recorded
     )
     for alarm, resolved_ns in connection.execute(resolved).all():
         about = select(ALARM_ROBOT.c.robot).where(ALARM_ROBOT.c.alarm == alarm)

@@ -197,7 +197,7 @@ SETTING = "downloads"
 OP = "amberbox.server.data.worker_downloads:make"
 
 _LOOK_S = 60.0
-_TELL_S = 1.0
+_REPORT_S = 1.0
 _NICE = 10
 _MEMORY_BYTES = 2 << 30
 
@@ -222,9 +222,9 @@ class DownloadService:
         self._bus = bus
         self._clock = clock
         self._pool = WorkerPool(folder, 1, nice=_NICE)
-        self._asked = asyncio.Event()
+        self._wake = asyncio.Event()
         self._now: tuple[str, WorkerTask] | None = None
-        bus.on("job", lambda change: self._asked.set())
+        bus.on("job", lambda change: self._wake.set())
 
     def path(self, job: DownloadJob) -> Path:
         """Return the path of a download's file."""
@@ -238,7 +238,7 @@ class DownloadService:
 
     async def run(self) -> None:
         """Work until cancelled."""
-        self._asked = asyncio.Event()  # belongs to this event loop
+        self._wake = asyncio.Event()  # belongs to this event loop
         await asyncio.to_thread(self._write, begin_again)
         await asyncio.to_thread(self._tidy)
         while True:
@@ -249,8 +249,8 @@ class DownloadService:
                 continue
             with suppress(TimeoutError):
                 async with asyncio.timeout(_LOOK_S):  # wait_for may swallow a cancellation
-                    await self._asked.wait()
-            self._asked.clear()
+                    await self._wake.wait()
+            self._wake.clear()
             await asyncio.to_thread(self._tidy)
 
     def close(self) -> None:
@@ -282,17 +282,17 @@ class DownloadService:
         options = await asyncio.to_thread(
             self._read, lambda connection: read(connection, SETTING, Downloads)
         )
-        made, told_s = DownloadProgress(0.0), 0.0
+        made, reported_s = DownloadProgress(0.0), 0.0
 
         def receive(part: bytes) -> None:
             """Receive the worker's progress, in the pool's thread; publish it at most once a
             second.
             """
-            nonlocal made, told_s
+            nonlocal made, reported_s
             made = msgspec.json.decode(part, type=DownloadProgress)
-            if time.monotonic() - told_s < _TELL_S:
+            if time.monotonic() - reported_s < _REPORT_S:
                 return
-            told_s = time.monotonic()
+            reported_s = time.monotonic()
             with self._database.begin() as connection:
                 change(connection, job.id, only=["running"], progress=made.progress)
             self._publish(job)

@@ -23,7 +23,7 @@ from amberbox.server.derived import MOST, DerivedRecord, derived_records
 
 
 @dataclass(frozen=True, slots=True)
-class _Stores:
+class OpenedStores:
     """The database and archive for ``derived_records``."""
 
     database: ServerDatabase
@@ -69,7 +69,7 @@ def _from_ns(values: Mapping[str, Any]) -> int:
 
 def _entries(folder: Path, robot: str, channel: str) -> list[DerivedRecord]:
     catalogue = open_catalogue(folder)
-    stores = _Stores(catalogue.database, FolderArchive(folder, catalogue.database))
+    stores = OpenedStores(catalogue.database, FolderArchive(folder, catalogue.database))
     return derived_records(stores, robot, channel, limit=MOST, newest=True)
 
 

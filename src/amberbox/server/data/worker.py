@@ -120,9 +120,9 @@ def _without_columns(look: RecordSnapshot, named: Collection[str]) -> Iterator[d
                 if fact.reason.startswith((KEPT_RAW, UNDECODABLE)):
                     found.setdefault(fact.item, []).append(fact)
     for one in look.readable:
-        told: list[Gap] = []
-        with_columns(one.journal, told.append)
-        for gap in told:
+        without: list[Gap] = []
+        with_columns(one.journal, without.append)
+        for gap in without:
             found.setdefault(gap.item, []).append(gap)
         topics |= {stream.item: stream.topic for stream in one.journal.streams.values()}
     for item in found.keys() - set(named):
@@ -177,9 +177,9 @@ def statistics_json(look: RecordSnapshot, asked: RowQuery) -> dict[str, Any]:
         asked.robot, asked.item, names, asked.from_ns, asked.to_ns, "received", MOST_ROWS
     )
     answer = rows(look, every)
-    said = about_json(answer.about)
+    about = about_json(answer.about)
     found = [_of_rows(answer.table, column, asked.bins) for column in numbers]
-    return {"exact": True, "complete_to": said["complete_to"], "variables": found}
+    return {"exact": True, "complete_to": about["complete_to"], "variables": found}
 
 
 def _of_rows(table: Table, column: Column, bins: int | None) -> dict[str, Any]:

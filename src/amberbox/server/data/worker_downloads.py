@@ -139,7 +139,7 @@ class DownloadBuild:
             raise LimitError("the server's disk is nearly full", "make room, then ask again")
 
 
-_TELL_S = 0.5
+_REPORT_S = 0.5
 
 
 def write_journals(workshop: DownloadBuild, piece: RecordRange) -> Iterator[float]:
@@ -207,7 +207,7 @@ def _exported(workshop: DownloadBuild, record: Record, view: View, target: Path)
     work = threading.Thread(target=run, name="export", daemon=True)
     work.start()
     while work.is_alive():
-        work.join(_TELL_S)
+        work.join(_REPORT_S)
         yield done[0]
         workshop.check(list(target.parent.glob(f"{target.name}*")))
     (found,) = outcome
@@ -383,8 +383,8 @@ def _contents(workshop: DownloadBuild, asked_ns: int) -> bytes:
     for name in ("from_ns", "to_ns"):
         moment = asked.pop(name)
         asked[name.removesuffix("_ns")] = None if moment is None else format_time(moment)
-    said = {"asked": asked, "asked_at": format_time(asked_ns), "files": files}
-    return msgspec.json.format(msgspec.json.encode({**said, "notes": workshop.notes}), indent=2)
+    contents = {"asked": asked, "asked_at": format_time(asked_ns), "files": files}
+    return msgspec.json.format(msgspec.json.encode({**contents, "notes": workshop.notes}), indent=2)
 
 
 _WRITE: Mapping[str, Callable[[DownloadBuild, RecordRange], Iterator[float]]] = {
@@ -410,16 +410,16 @@ def make(folder: Path, arguments: Mapping[str, Any]) -> Iterator[bytes]:
     chosen = list(record_ranges(folder, wanted, workshop.note))
     for number, piece in enumerate(chosen):
         for share in _WRITE[wanted.format](workshop, piece):
-            yield _told(_MADE * (number + share) / len(chosen))
+            yield progress_line(_MADE * (number + share) / len(chosen))
     if not workshop.entries:
         first = f": {workshop.notes[0]}" if workshop.notes else ""
         raise UsageError(f"there is nothing of this on the server{first}", "see the list of gaps")
     made: list[Path] = []
     for share in pack(workshop, arguments["asked_ns"], made):
-        yield _told(_MADE + (1 - _MADE) * share)
+        yield progress_line(_MADE + (1 - _MADE) * share)
     (file,) = made
-    yield _told(1.0, file=file.name, bytes=file.stat().st_size, notes=workshop.notes[:100])
+    yield progress_line(1.0, file=file.name, bytes=file.stat().st_size, notes=workshop.notes[:100])
 
 
-def _told(progress: float, **more: Any) -> bytes:
+def progress_line(progress: float, **more: Any) -> bytes:
     return msgspec.json.encode({"progress": round(progress, 4), **more})

@@ -181,12 +181,12 @@ def _stretch(
 ) -> SvgElement:
     level = _level(stretch)
     x, wide = axis.place(stretch.start), axis.length(stretch.start, stretch.to, TIMELINE_LEAST)
-    said = words.level(level)
-    about = f"{said}: {stretch.text}" if stretch.text else said
+    level_word = words.level(level)
+    about = f"{level_word}: {stretch.text}" if stretch.text else level_word
     part = group(
         title(about),
         _bar(level, name, middle, x=x, width=wide),
-        _word(said, stretch, axis, middle) if level != "ok" else None,
+        _word(level_word, stretch, axis, middle) if level != "ok" else None,
         class_=f"stretch state-{level}",
         data_from=stretch.start,
         data_to=stretch.to,
@@ -202,15 +202,17 @@ def _bar(level: str, name: str, middle: float, **place: Value) -> SvgElement:
     return element("rect", class_=shape, y=middle - high / 2, height=high, rx=3, fill=fill, **place)
 
 
-def _word(said: str, stretch: StateInterval, axis: TimeAxis, middle: float) -> SvgElement | None:
+def _word(
+    text_of_level: str, stretch: StateInterval, axis: TimeAxis, middle: float
+) -> SvgElement | None:
     """Return the word in an interval, if it fits at the smallest width; else None."""
     room = (axis.share(stretch.to) - axis.share(stretch.start)) * NARROWEST
-    long = width(said, SMALL) + 12
+    long = width(text_of_level, SMALL) + 12
     if long > room:
         return None
     x = axis.place(max(stretch.start, axis.start))
     back = element("rect", class_="word-back", x=4, y=middle - 7, width=long - 6, height=14, rx=3)
-    text = element("text", said, x=7, y=middle + 4, class_="word")
+    text = element("text", text_of_level, x=7, y=middle + 4, class_="word")
     return element("svg", back, text, x=x, overflow="visible")
 
 
@@ -296,11 +298,11 @@ def _coverage_patterns(name: str) -> SvgElement:
 def _coverage_stretch(
     stretch: CoverageInterval, axis: TimeAxis, name: str, words: DrawingTexts
 ) -> SvgElement:
-    said = _coverage_word(stretch.kind, words)
+    kind_word = _coverage_word(stretch.kind, words)
     place = axis.place(stretch.start)
     wide = axis.length(stretch.start, stretch.to, LEAST)
     part = group(
-        title(f"{said}: {stretch.text}" if stretch.text else said),
+        title(f"{kind_word}: {stretch.text}" if stretch.text else kind_word),
         _coverage_bar(stretch.kind, name, x=place, width=wide),
         class_="stretch",
         data_from=stretch.start,
@@ -463,9 +465,9 @@ def _cell(
     names = matrix.rows[row], matrix.columns[column]
     cell = matrix.cells.get(names, MatrixCell(0))
     worth = criticality_zone(row, column, len(matrix.rows), len(matrix.columns))
-    said = f"{words.modes.format(n=cell.count)}: {names[0]}, {names[1]}"
+    text = f"{words.modes.format(n=cell.count)}: {names[0]}, {names[1]}"
     part = group(
-        title(said),
+        title(text),
         box(0, 0, CELL, 6, class_="box"),
         element(
             "text", str(cell.count) if cell.count else "·", x=CELL[0] / 2, y=CELL[1] / 2 + 6,

@@ -164,12 +164,12 @@ def _edge(edge: EffectEdge, route: LinkRoute, strong: bool) -> SvgElement:
 def _node(
     node: EffectNode, corner: tuple[float, float], strong: Collection[str], words: DrawingTexts
 ) -> SvgElement:
-    said = _said(node, words)
-    parts = (node.text, said, node.small)
+    shown = _shown_text(node, words)
+    parts = (node.text, shown, node.small)
     card = group(
         title(". ".join(part for part in parts if part)),
         box(0, 0, (WIDE, _high(node)), class_="box"),
-        *_inside(node, said),
+        *_inside(node, shown),
         at=corner,
         class_=classes("node", node.kind, node.state, "strong" if node.id in strong else ""),
         data_id=node.id,
@@ -177,7 +177,7 @@ def _node(
     return linked(node.href, card)
 
 
-def _said(node: EffectNode, words: DrawingTexts) -> str:
+def _shown_text(node: EffectNode, words: DrawingTexts) -> str:
     """Return the text of a box: probability of a cause, or state of a symptom."""
     if node.probability is not None:
         return percent(node.probability)
@@ -202,26 +202,26 @@ def _high(node: EffectNode) -> float:
     return HIGH + LINE * (len(_lines(node)) - 1)
 
 
-def _inside(node: EffectNode, said: str) -> Iterator[SvgElement]:
+def _inside(node: EffectNode, shown: str) -> Iterator[SvgElement]:
     left, high = _left(node), _high(node)
     if node.kind == "symptom":
         yield _sign(node.state, high)
     for place, line in enumerate(_lines(node)):
         yield element("text", line, x=left, y=22 + LINE * place, class_="name")
     if node.probability is not None:
-        yield from _share(node.probability, said, high)
+        yield from _share(node.probability, shown, high)
         return
     below = (left, high - 14)
-    yield lettering(said or node.small, below, WIDE - left - 10, SMALL, class_="small")
+    yield lettering(shown or node.small, below, WIDE - left - 10, SMALL, class_="small")
 
 
-def _share(probability: float, said: str, high: float) -> Iterator[SvgElement]:
+def _share(probability: float, shown: str, high: float) -> Iterator[SvgElement]:
     """Yield a bar for a probability, and its text."""
     long = WIDE - 2 * TEXT - 76
     full = min(1.0, max(0.0, probability)) * long
     yield box(TEXT, high - 20.5, (long, 6), 3, class_="share-all")
     yield box(TEXT, high - 20.5, (full, 6), 3, class_="share")
-    yield element("text", said, x=WIDE - TEXT, y=high - 13.5, class_="small end")
+    yield element("text", shown, x=WIDE - TEXT, y=high - 13.5, class_="small end")
 
 
 # Outline and sign: disc with a tick, diamond, crossed ring, box with a question mark
@@ -251,7 +251,7 @@ def _headings(
     nodes: Iterable[EffectNode], layout: GraphLayout, words: DrawingTexts
 ) -> Iterator[SvgElement]:
     """Yield a heading above the first column of each kind."""
-    said = {"cause": words.may_be_broken, "lost": words.fails, "symptom": words.seen}
+    headings = {"cause": words.may_be_broken, "lost": words.fails, "symptom": words.seen}
     firsts: dict[str, float] = {}
     for node in nodes:
         x = layout.corners[node.id][0]
@@ -260,7 +260,7 @@ def _headings(
     for kind, x in firsts.items():
         if x not in taken:
             taken.add(x)
-            yield element("text", said[kind], x=MARGIN + x, y=MARGIN + 8, class_="heading")
+            yield element("text", headings[kind], x=MARGIN + x, y=MARGIN + 8, class_="heading")
 
 
 def _left_out(

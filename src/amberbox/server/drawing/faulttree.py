@@ -467,22 +467,22 @@ def _item(item: PlacedBranch, scene: _Scene) -> SvgElement:
         event = scene.tree.events[item.branch.id]
         cut = item.branch.id in scene.holds
         about = [event.label, event.id, probability_text(event.probability)]
-        said = probability_text(event.probability)
+        below = probability_text(event.probability)
         if cut:
             about.append(scene.words.in_cut_set)
-        return _leaf(item, event.kind, event, about, said, strong=cut)
+        return _leaf(item, event.kind, event, about, below, strong=cut)
     gate = scene.tree.gates[item.branch.id]
-    said = scene.words.transfer
+    below = scene.words.transfer
     if item.branch.kind == "cut":
-        said = scene.words.below.format(n=count_below(scene.tree, gate.id))
-    about = [gate.label, gate.id, said]
-    return _leaf(item, "transfer", gate, about, said, strong=gate.id in scene.holds)
+        below = scene.words.below.format(n=count_below(scene.tree, gate.id))
+    about = [gate.label, gate.id, below]
+    return _leaf(item, "transfer", gate, about, below, strong=gate.id in scene.holds)
 
 
 def _gate(item: PlacedBranch, gate: GateBox, scene: _Scene) -> SvgElement:
     strong = gate.id in scene.holds
     number = probability_text(gate.probability)
-    kind = _said(gate, scene.words)
+    kind = _gate_word(gate, scene.words)
     about = [part for part in (gate.label, gate.id, kind, number) if part]
     card = group(
         title(". ".join(dict.fromkeys(about))),
@@ -526,7 +526,7 @@ def _symbol(gate: GateBox) -> Iterator[SvgElement]:
     yield group(*parts, at=(0, BOX + 8))
 
 
-def _said(gate: GateBox, words: DrawingTexts) -> str:
+def _gate_word(gate: GateBox, words: DrawingTexts) -> str:
     known = {
         "and": words.gate_and,
         "or": words.gate_or,
@@ -545,13 +545,13 @@ def _leaf(
     sign: str,
     of: GateBox | EventBox,
     about: list[str],
-    said: str,
+    small: str,
     *,
     strong: bool,
 ) -> SvgElement:
     row = item.style == "row"
     text = of.label or of.id
-    inside = _beside_sign(text, said) if row else _below_sign(text, said)
+    inside = _beside_sign(text, small) if row else _below_sign(text, small)
     leaf = group(
         title(". ".join(dict.fromkeys(part for part in about if part))),
         _sign(sign, row=row),
@@ -563,23 +563,23 @@ def _leaf(
     return linked(of.href, leaf)
 
 
-def _beside_sign(text: str, said: str) -> Iterator[SvgElement]:
+def _beside_sign(text: str, small: str) -> Iterator[SvgElement]:
     left, most = 34.0, ROW[0] - TRUNK - 8 - 34
     lines = broken(text, most, 3)
-    first = 4.5 - 8 * (len(lines) - 1) - (5.5 if said else 0)
+    first = 4.5 - 8 * (len(lines) - 1) - (5.5 if small else 0)
     for place, line in enumerate(lines):
         yield element("text", line, x=left, y=first + 16 * place)
-    if said:
-        yield lettering(said, (left, first + 16 * len(lines) - 2), most, SMALL, class_="small")
+    if small:
+        yield lettering(small, (left, first + 16 * len(lines) - 2), most, SMALL, class_="small")
 
 
-def _below_sign(text: str, said: str) -> Iterator[SvgElement]:
+def _below_sign(text: str, small: str) -> Iterator[SvgElement]:
     lines = broken(text, LEAF[0] - 6, 4)
     for place, line in enumerate(lines):
         yield element("text", line, x=0, y=50 + 16 * place, class_="middle")
-    if said:
+    if small:
         y = 50 + 16 * len(lines) - 1
-        yield element("text", said, x=0, y=y, class_="small middle")
+        yield element("text", small, x=0, y=y, class_="small middle")
 
 
 def _sign(sign: str, *, row: bool) -> SvgElement:

@@ -226,8 +226,8 @@ def _edge(
 ) -> SvgElement:
     (start, end), kind, over = line
     bad = all(components[name].level in ("error", "stale") for name in (start, end))
-    said = words.needs if kind != "part-of" else words.part_of
-    about = f"{components[start].name} {said} {components[end].name}"
+    relation = words.needs if kind != "part-of" else words.part_of
+    about = f"{components[start].name} {relation} {components[end].name}"
     about += f" ({words.more_fine.format(n=over)})" if over else ""
     about += f" ({words.circle})" if route.broken else ""
     return group(
@@ -290,8 +290,8 @@ def _samples(
 ) -> Iterator[LegendSample]:
     """Yield the entries of the legend: only kinds of lines that are drawn."""
     kinds = {kind for _, kind, _ in lines}
-    said = {"needs": words.needs, "part-of": words.part_of, "indirect": words.indirect}
-    for kind, word in said.items():
+    relations = {"needs": words.needs, "part-of": words.part_of, "indirect": words.indirect}
+    for kind, word in relations.items():
         if kind in kinds:
             yield LegendSample(kind, word, arrow=kind != "part-of")
     if any(route.broken for route in layout.routes):

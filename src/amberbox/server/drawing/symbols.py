@@ -45,12 +45,12 @@ def level_icon(level: str, place: tuple[float, float]) -> SvgElement:
     )
 
 
-def arrow_head(place: tuple[float, float], turn: Turn, class_: str = "tip") -> SvgElement:
+def arrow_head(place: tuple[float, float], turn: Turn) -> SvgElement:
     """Return the head of an arrow with its tip at ``place``."""
     x, y = place
     paths = {0: "l-8-4v8z", 90: "l-4-8h8z", 180: "l8-4v8z", 270: "l-4 8h8z"}
     start = element("path", d=f"M{x:.6g} {y:.6g}{paths[turn]}")
-    return SvgElement("path", (("class", class_), *start.attributes))
+    return SvgElement("path", (("class", "tip"), *start.attributes))
 
 
 def hatching(id_: str, kind: str, step: float = 7) -> SvgElement:

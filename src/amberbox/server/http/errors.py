@@ -94,11 +94,15 @@ def error(
     status: int, what: str, hint: str = "", headers: Any = None, code: str = ""
 ) -> JSONResponse:
     """Return an error as a response; ``code`` distinguishes errors of the same status."""
-    said = {"what": _sayable(what), "hint": _sayable(hint), **({"code": code} if code else {})}
-    return JSONResponse({"error": said}, status, headers)
+    content = {
+        "what": _encodable(what),
+        "hint": _encodable(hint),
+        **({"code": code} if code else {}),
+    }
+    return JSONResponse({"error": content}, status, headers)
 
 
-def _sayable(text: str) -> str:
+def _encodable(text: str) -> str:
     """Replace surrogates, which JSON can contain and UTF-8 cannot encode."""
     return text.encode("utf-8", "replace").decode("utf-8")
 

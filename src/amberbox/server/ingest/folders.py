@@ -177,7 +177,9 @@ class FolderService:
         if len(packed) > PACKED_BYTES:
             raise FolderError(f"a packed folder has at most {PACKED_BYTES} bytes")
         arguments = {"robot": robot, "config_hash": config_hash, "data": packed}
-        answer = self._worker_pool.ask_now(KEEP_OP, arguments, _LIMIT_S, _MEMORY_BYTES, asker=robot)
+        answer = self._worker_pool.ask_now(
+            KEEP_OP, arguments, _LIMIT_S, _MEMORY_BYTES, origin=robot
+        )
         kept = msgspec.msgpack.decode(answer, type=FolderContents)
         with self._lock:
             self._enter(robot, config_hash, kept)

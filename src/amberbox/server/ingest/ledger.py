@@ -175,7 +175,9 @@ class _Ledgers:
             known: dict[int, LinkRow] = {}
             if min(rows) < store.end_of(*run):
                 self.write()  # rows of this transaction count as well
-                known = _held_rows(self.connection, batch.keys, run, min(rows), max(rows))
+                held = ROW.c.seq.between(min(rows), max(rows))
+                chosen = select(ROW).where(_of(ROW, batch.keys, run), held)
+                known = {found.seq: _row(found) for found in self.connection.execute(chosen)}
             contradicting += [rows[n] for n, row in known.items() if n in rows and rows[n] != row]
             committed = self.committed[*batch.keys, *run]
             new += [
@@ -310,13 +312,6 @@ _RUN_ROW, _COMMITTED_ROWS = _select_run(RUN), _select_run(COMMITTED)
 
 def _place(run: RunKey) -> dict[str, Any]:
     return {f"of_{name}": value for name, value in zip(_RUN_KEY, run, strict=True)}
-
-
-def _held_rows(
-    connection: Connection, keys: Keys, run: tuple[str, int], first: int, last: int
-) -> dict[int, LinkRow]:
-    where = and_(_of(ROW, keys, run), ROW.c.seq.between(first, last))
-    return {found.seq: _row(found) for found in connection.execute(select(ROW).where(where))}
 
 
 def _conflict_text(why: str, found: Sequence[RowConflict], moved: int) -> str:

@@ -86,8 +86,8 @@ def _check_definitions(channels: Mapping[int, McapChannel], schemas: Mapping[int
     for channel in channels.values():
         item = channel.metadata.get("item", "")
         if item and not has_item_form(item):
-            said = ascii(item[:60])
-            raise ContentError(f"it names an item {said}: letters, digits and _ make a name")
+            shown = ascii(item[:60])
+            raise ContentError(f"it names an item {shown}: letters, digits and _ make a name")
 
 
 def _check_sizes(data: bytes | memoryview, places: list[ChunkPlace]) -> None:

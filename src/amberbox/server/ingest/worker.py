@@ -40,7 +40,7 @@ def _masked(name: str, data: bytes) -> bytes:
     text = data.decode("utf-8", "surrogateescape")
     text = _LOGIN.sub(rf"\1:{MASK}@", _KEY_BLOCK.sub(MASK, text))
     read = _read(name, text)
-    return (_by_lines(text) if read is None else read).encode("utf-8", "surrogateescape")
+    return (mask_lines(text) if read is None else read).encode("utf-8", "surrogateescape")
 
 
 def _read(name: str, text: str) -> str | None:
@@ -52,7 +52,7 @@ def _read(name: str, text: str) -> str | None:
     return None if node is None or problems else redact(text, secrets_by_name(node))
 
 
-def _by_lines(text: str) -> str:
+def mask_lines(text: str) -> str:
     """Mask values after a secret-sounding key at the start of a line, or on the lines after it.
 
     Linear in the length of the text, blank lines and words of any length included.

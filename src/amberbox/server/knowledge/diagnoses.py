@@ -35,7 +35,7 @@ class EvidenceMoment:
 
     at_ns: int
     config_hash: str = ""
-    said: RecordedFindings = field(default_factory=RecordedFindings)
+    findings: RecordedFindings = field(default_factory=RecordedFindings)
     statuses: Sequence[Status] = ()
     notes: tuple[str, ...] = ()
 
@@ -66,7 +66,7 @@ def evidence_at(
         notes = ()
     statuses = _statuses(stores, robot, at_ns)
     config_hash = str(before.values.get("config_hash", ""))
-    return EvidenceMoment(at_ns, config_hash, _said(stores, robot, at_ns), statuses, notes)
+    return EvidenceMoment(at_ns, config_hash, _findings_at(stores, robot, at_ns), statuses, notes)
 
 
 def _newest(stores: RecordStores, robot: str, to_ns: int | None) -> DerivedRecord | None:
@@ -80,11 +80,11 @@ def _statuses(stores: RecordStores, robot: str, at_ns: int) -> list[Status]:
     """Return the last status of each component and mode at an instant."""
     span = at_ns - _STATUS_NS, at_ns + _LATE_NS
     found = derived_records(stores, robot, channels.STATUS, span, _STATUSES, newest=True)
-    told = (status for status in findings(found, Status) if status.measured_ns <= at_ns)
-    return list({(status.component, status.mode): status for status in told}.values())
+    recorded = (status for status in findings(found, Status) if status.measured_ns <= at_ns)
+    return list({(status.component, status.mode): status for status in recorded}.values())
 
 
-def _said(stores: RecordStores, robot: str, at_ns: int) -> RecordedFindings:
+def _findings_at(stores: RecordStores, robot: str, at_ns: int) -> RecordedFindings:
     """Return symptoms and diagnoses up to an instant, in the order in which they were recorded."""
     span = None, at_ns + _FOUND_LATE_NS
     symptoms = derived_records(stores, robot, channels.SYMPTOM, span, _SYMPTOMS, newest=True)
@@ -98,9 +98,9 @@ def _said(stores: RecordStores, robot: str, at_ns: int) -> RecordedFindings:
 def findings(found: Sequence[DerivedRecord], kind: type[FindingT]) -> Iterator[FindingT]:
     """Yield findings decoded from records, with corrected times; unreadable ones are left out."""
     for entry in found:
-        said = finding(entry.channel, entry.values)
-        if isinstance(said, kind):  # else of another version or type
-            yield _moved(said, entry.at_ns - entry.log_ns)
+        decoded = finding(entry.channel, entry.values)
+        if isinstance(decoded, kind):  # else of another version or type
+            yield _moved(decoded, entry.at_ns - entry.log_ns)
 
 
 def _moved(finding: FindingT, by_ns: int) -> FindingT:
@@ -235,17 +235,17 @@ def symptom_intervals(
 
     A symptom without a report that it is absent counts as still present.
     """
-    told = list(revisions)
-    names = {name for one in told for name in one.symptoms}
-    since_ns = min((one.at_ns for one in told), default=0) - _BEFORE_NS
+    known = list(revisions)
+    names = {name for one in known for name in one.symptoms}
+    since_ns = min((one.at_ns for one in known), default=0) - _BEFORE_NS
     span = since_ns, None
-    said = (
+    records = (
         derived_records(stores, robot, channels.SYMPTOM, span, _HOLDING_MOST, newest=True)
         if names
         else []
     )
     found: dict[str, SymptomInterval] = {}
-    for symptom in findings(said, Symptom):
+    for symptom in findings(records, Symptom):
         if symptom.id in names:
             hold = next_interval(found.get(symptom.id), symptom)
             found.update({symptom.id: hold} if hold is not None else {})
@@ -263,11 +263,13 @@ def gone_since(
     return max(known)
 
 
-def next_interval(before: SymptomInterval | None, told: ReportedSymptom) -> SymptomInterval | None:
+def next_interval(
+    before: SymptomInterval | None, symptom: ReportedSymptom
+) -> SymptomInterval | None:
     """Return the interval of a symptom after one more report on it."""
-    at_ns = told.confirmed_ns or told.onset_ns or 0
-    if told.state == "present" and (before is None or before.to_ns is not None):
-        return SymptomInterval(told.onset_ns or at_ns)
-    if told.state == "absent" and before is not None and before.to_ns is None:
+    at_ns = symptom.confirmed_ns or symptom.onset_ns or 0
+    if symptom.state == "present" and (before is None or before.to_ns is not None):
+        return SymptomInterval(symptom.onset_ns or at_ns)
+    if symptom.state == "absent" and before is not None and before.to_ns is None:
         return replace(before, to_ns=max(at_ns, before.from_ns))
     return before

@@ -170,7 +170,7 @@ class Explained:
         self._robot_worker_pool = robot_worker_pool
         self._lock = threading.Lock()
         self._known: OrderedDict[Key, Answer] = OrderedDict()
-        self._asked: dict[tuple[Key, bool], asyncio.Task[Answer]] = {}  # whether in advance
+        self._running: dict[tuple[Key, bool], asyncio.Task[Answer]] = {}  # whether in advance
         self._wanted: asyncio.Queue[tuple[str, str]] = asyncio.Queue()
 
     def known(self, robot: str, diagnosis: Diagnosis, answers: Mapping[str, str]) -> Answer | None:
@@ -179,7 +179,7 @@ class Explained:
             return self._known.get(key_of(robot, diagnosis, answers))
 
     async def read(
-        self, robot: str, diagnosis: Diagnosis, answers: Mapping[str, str], asker: str
+        self, robot: str, diagnosis: Diagnosis, answers: Mapping[str, str], origin: str
     ) -> Answer:
         """Return the explanation; concurrent callers wait for the same computation.
 
@@ -190,17 +190,17 @@ class Explained:
         if found is not None:
             return found
         key = key_of(robot, diagnosis, answers)
-        shared = key, asker == robot
-        task = self._asked.get(shared)
+        shared = key, origin == robot
+        task = self._running.get(shared)
         if task is None:
-            task = asyncio.create_task(self._ask(key, answers, asker))
-            self._asked[shared] = task
+            task = asyncio.create_task(self._explain_in_worker(key, answers, origin))
+            self._running[shared] = task
             task.add_done_callback(partial(self._over, shared))
         return await asyncio.shield(task)
 
     def _over(self, shared: tuple[Key, bool], task: asyncio.Task[Answer]) -> None:
         """Forget a finished task; its exception goes to the callers that still wait for it."""
-        self._asked.pop(shared, None)
+        self._running.pop(shared, None)
         if not task.cancelled():
             task.exception()  # retrieved, so that asyncio does not log it without callers
 
@@ -253,14 +253,14 @@ class Explained:
     def _find(self, robot: str, name: str) -> DiagnosisHistory | None:
         return find_diagnosis(self, robot, name) if name else newest_diagnosis(self, robot)
 
-    async def _ask(self, key: Key, answers: Mapping[str, str], asker: str) -> Answer:
+    async def _explain_in_worker(self, key: Key, answers: Mapping[str, str], origin: str) -> Answer:
         robot, name = key[0], key[1]
         asked = AskDiagnosis(
             robot=robot, now_ns=self._clock.wall_ns(), diagnosis=name, revision=key[2],
             answers=dict(answers),
         )  # fmt: skip
-        workers = self._robot_worker_pool if asker == robot else self._worker_pool
-        found = await workers.ask(OP, encode_question(asked), LIMIT_S, MEMORY_BYTES, asker=asker)
+        workers = self._robot_worker_pool if origin == robot else self._worker_pool
+        found = await workers.ask(OP, encode_question(asked), LIMIT_S, MEMORY_BYTES, origin=origin)
         answer: Answer = json.loads(found)
         self._keep(key, answer)
         return answer
@@ -294,7 +294,7 @@ _DECODER = msgspec.json.Decoder(_Diagnosis)
 def publish_diagnoses(bus: EventBus) -> None:
     """Publish a change for each diagnosis among the rows that robots send."""
 
-    def told(change: ServerChange) -> None:
+    def on_rows(change: ServerChange) -> None:
         names: dict[str, None] = {}
         for row in change.data["rows"]:
             if row.channel == channels.DIAGNOSIS:
@@ -302,7 +302,7 @@ def publish_diagnoses(bus: EventBus) -> None:
         for name in names:
             bus.publish(ServerChange("diagnosis", change.robot, {"id": name}))
 
-    bus.on("rows", told)
+    bus.on("rows", on_rows)
 
 
 def _name(data: bytes) -> dict[str, None]:

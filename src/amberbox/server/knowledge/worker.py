@@ -24,9 +24,8 @@ from amberbox.blackbox.retention.missions import RecordedMission
 from amberbox.consult.context import RobotWindow, context_from_findings
 from amberbox.consult.folder_knowledge import DeclaredRobot, read_declared_robot
 from amberbox.consult.rule_lookups import record_predicates
-from amberbox.core.budget import Budget
 from amberbox.core.config import raise_errors
-from amberbox.core.contracts import GivenEvidence, Span
+from amberbox.core.contracts import Budget, GivenEvidence, Span
 from amberbox.core.errors import AmberboxError, UsageError
 from amberbox.core.names import component_id
 from amberbox.core.timestamps import format_time, ordered_span, parse_time
@@ -60,7 +59,7 @@ from amberbox.monitoring.plan import Expectation, ModePlan, MonitoringPlan, meas
 from amberbox.server.archive.catalogue import ArchiveCatalogue
 from amberbox.server.archive.folder import FolderArchive
 from amberbox.server.archive.record import ArchiveRecord
-from amberbox.server.data.missions import _Stores, missions
+from amberbox.server.data.missions import OpenedStores, missions
 from amberbox.server.data.snapshot import open_catalogue
 from amberbox.server.database import ServerDatabase
 from amberbox.server.derived import MOST, derived_records
@@ -122,7 +121,7 @@ def fmea(folder: Path, arguments: dict[str, Any]) -> Any:
     asked = decode_question(arguments, RobotQuestion)
     stores = _stores(folder)
     subject, notes = folder_at(
-        folder, stores.database, asked.robot, asked.config_hash, _said(stores, asked)
+        folder, stores.database, asked.robot, asked.config_hash, _watched_hash(stores, asked)
     )
     found = subject.faults()
     return {
@@ -143,7 +142,7 @@ def fault_trees(folder: Path, arguments: dict[str, Any]) -> Any:
     return _trees(folder, _stores(folder), decode_question(arguments, AskTrees))
 
 
-def _trees(folder: Path, stores: _Stores, asked: AskTrees) -> dict[str, Any]:
+def _trees(folder: Path, stores: OpenedStores, asked: AskTrees) -> dict[str, Any]:
     then = evidence_at(stores, asked.robot, asked.at, asked.now_ns)
     subject, notes = folder_at(
         folder,
@@ -162,7 +161,7 @@ def _trees(folder: Path, stores: _Stores, asked: AskTrees) -> dict[str, Any]:
         if one
         else effects_json(known, solved, asked.exposure_h)
     )
-    standing = _standing(then.said.diagnoses)
+    standing = _standing(then.findings.diagnoses)
     closest = closest_json(known, then.at_ns, standing, outlooks(solved, standing, _CLOSEST))
     about = {"robot": asked.robot, "config_hash": subject.folder.config_hash}
     return {
@@ -195,8 +194,8 @@ def one_tree(folder: Path, arguments: dict[str, Any]) -> Any:
     words.
     """
     asked, stores = decode_question(arguments, AskTrees), _stores(folder)
-    said = _said(stores, asked)
-    subject, _ = folder_at(folder, stores.database, asked.robot, asked.config_hash, said)
+    folder_hash = _watched_hash(stores, asked)
+    subject, _ = folder_at(folder, stores.database, asked.robot, asked.config_hash, folder_hash)
     known = subject.faults()
     every, names = _effects(known, ""), FaultNames(known)
     chosen = asked.effect or next(iter(every), "")
@@ -224,12 +223,12 @@ def rules(folder: Path, arguments: dict[str, Any]) -> Any:
     budget = Budget(steps=asked.steps or Budget().steps, is_over=_ends(asked.seconds))
     found = ask(program, asked.query, budget, asked.want or None)
     about = {"robot": asked.robot, "config_hash": subject.folder.config_hash}
-    told = [str(note) for note in program.notes]
-    told += _not_looked_at(stores, asked, subject.rules())
-    return {**about, **found.to_json(), "notes": [*notes, *told]}
+    more_notes = [str(note) for note in program.notes]
+    more_notes += _not_looked_at(stores, asked, subject.rules())
+    return {**about, **found.to_json(), "notes": [*notes, *more_notes]}
 
 
-def _not_looked_at(stores: _Stores, asked: AskRules, files: Iterable[Path]) -> list[str]:
+def _not_looked_at(stores: OpenedStores, asked: AskRules, files: Iterable[Path]) -> list[str]:
     """Return notes on journals that conditions cannot read yet because no table holds them."""
     catalogue = ArchiveCatalogue(stores.database)
     waiting = sum(row.robot == asked.robot for row in catalogue.waiting())
@@ -245,17 +244,17 @@ def failure_modes(folder: Path, arguments: dict[str, Any]) -> Any:
     """Return the ids of all failure modes in a robot's folder at a time."""
     asked, stores = decode_question(arguments, RobotQuestion), _stores(folder)
     subject, _ = folder_at(
-        folder, stores.database, asked.robot, asked.config_hash, _said(stores, asked)
+        folder, stores.database, asked.robot, asked.config_hash, _watched_hash(stores, asked)
     )
     return sorted(subject.faults().modes)
 
 
-def _stores(folder: Path) -> _Stores:
+def _stores(folder: Path) -> OpenedStores:
     database = open_catalogue(folder).database
-    return _Stores(database, FolderArchive(folder, database))
+    return OpenedStores(database, FolderArchive(folder, database))
 
 
-def _said(stores: _Stores, asked: RobotQuestion) -> str:
+def _watched_hash(stores: OpenedStores, asked: RobotQuestion) -> str:
     """Return the hash of the folder that the watcher used at the time asked for, or empty."""
     return evidence_at(stores, asked.robot, asked.at, asked.now_ns).config_hash if asked.at else ""
 
@@ -286,22 +285,22 @@ _SHOWN = 12
 
 
 def folder_at(
-    folder: Path, database: ServerDatabase, robot: str, wanted: str, said: str
+    folder: Path, database: ServerDatabase, robot: str, wanted: str, watched: str
 ) -> tuple[DeclaredRobot, tuple[str, ...]]:
     """Return what a robot's folder declares, and notes about which folder it is.
 
-    ``wanted`` is the hash that the caller asks for, ``said`` the one that the robot's watcher used
-    at the time; without either it is the folder that the robot stated last. Raises UsageError if
-    the server has no such folder: another one would describe other monitors than those that ran.
+    ``wanted`` is the hash that the caller asks for, ``watched`` the one that the robot's watcher
+    used at the time; without either it is the folder that the robot stated last. Raises UsageError
+    if the server has no such folder: another one would describe other monitors than those that ran.
     """
-    shelf, config_hash = FolderStore(folder), wanted or said or _stated(database, robot)
+    shelf, config_hash = FolderStore(folder), wanted or watched or _stated(database, robot)
     place = shelf.place(robot, config_hash) if config_hash else None
     if place is None or not place.is_dir():
         raise _not_here(database, robot, config_hash)
     found = _read(place, robot, config_hash)
-    if not said or said == config_hash:
+    if not watched or watched == config_hash:
         return found, ()
-    return found, (f"its watcher had the folder {said[:_SHOWN]} then, not this one",)
+    return found, (f"its watcher had the folder {watched[:_SHOWN]} then, not this one",)
 
 
 @lru_cache(maxsize=4)
@@ -341,7 +340,7 @@ _Run = tuple[str, int]
 
 
 def open_window(
-    stores: _Stores, robot: str, from_ns: int | None, to_ns: int | None
+    stores: OpenedStores, robot: str, from_ns: int | None, to_ns: int | None
 ) -> ServerWindow:
     """Open a window of a robot's record on the server."""
     record = stores.archive.robot(robot)
@@ -353,7 +352,7 @@ class ServerWindow(RecordWindow):
     """A window of a robot's record, read from the server's stores."""
 
     record: ArchiveRecord
-    stores: _Stores
+    stores: OpenedStores
     robot: str
 
     def rows(self, topic: str, names: Sequence[str], span: Span) -> Iterable[Mapping[str, Any]]:
@@ -436,7 +435,7 @@ def _state(expected: Expectation, value: Output, status: Status) -> SymptomState
     return "absent" if is_good or status.level == "ok" else "present"
 
 
-def answer_diagnosis(folder: Path, stores: _Stores, asked: AskDiagnosis) -> dict[str, Any]:
+def answer_diagnosis(folder: Path, stores: OpenedStores, asked: AskDiagnosis) -> dict[str, Any]:
     """Return the answer as ``amberbox diagnose --json`` gives it, with ``notes``."""
     then = _moment(stores, asked)
     subject, notes = folder_at(
@@ -460,7 +459,7 @@ def answer_diagnosis(folder: Path, stores: _Stores, asked: AskDiagnosis) -> dict
     return {**answer, "engine": asked.engine, "notes": [*then.notes, *notes, *left_out]}
 
 
-def _moment(stores: _Stores, asked: AskDiagnosis) -> EvidenceMoment:
+def _moment(stores: OpenedStores, asked: AskDiagnosis) -> EvidenceMoment:
     """Return the evidence at the time asked for.
 
     For an earlier diagnosis without a time, that is the time of its chosen or last revision.
@@ -478,8 +477,8 @@ def _moment(stores: _Stores, asked: AskDiagnosis) -> EvidenceMoment:
 
 def _case(knowledge: Knowledge, subject: DeclaredRobot, then: EvidenceMoment) -> DiagnosisContext:
     """Return the context from the watcher's findings, else from its statuses alone."""
-    said = _known(knowledge, then.said)  # the CLI does not filter the watcher's symptoms
-    case = context_from_findings(knowledge, said, then.at_ns)
+    findings = _known(knowledge, then.findings)  # the CLI does not filter the watcher's symptoms
+    case = context_from_findings(knowledge, findings, then.at_ns)
     if case is not None:
         return replace(case, origin="watcher")
     symptoms = tuple(status_symptoms(subject.plan, then.statuses))
@@ -510,10 +509,10 @@ def _as_revised(case: DiagnosisContext) -> DiagnosisContext:
     return replace(case, situation=replace(case.situation, symptoms=(*there, *rest)))
 
 
-def _known(knowledge: Knowledge, said: RecordedFindings) -> RecordedFindings:
+def _known(knowledge: Knowledge, findings: RecordedFindings) -> RecordedFindings:
     """Return the findings without symptoms that this folder's FMEA does not know."""
     names = knowledge.fmea.symptoms
-    return RecordedFindings([s for s in said.symptoms if s.id in names], said.diagnoses)
+    return RecordedFindings([s for s in findings.symptoms if s.id in names], findings.diagnoses)
 
 
 def _texts(given: dict[str, Any]) -> list[str]:

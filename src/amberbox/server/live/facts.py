@@ -121,16 +121,16 @@ class FactsCache:
         with self._lock:
             turn = self._turns.setdefault(key, threading.Lock())
         with turn:  # one thread asks, the others wait for its answer
-            found = self.at_once(robot, config_hash) or self._ask(robot, config_hash)
+            found = self.at_once(robot, config_hash) or self._read_in_worker(robot, config_hash)
         with self._lock:
             self._turns.pop(key, None)
         return found
 
-    def _ask(self, robot: str, config_hash: str) -> FolderFacts:
+    def _read_in_worker(self, robot: str, config_hash: str) -> FolderFacts:
         arguments = {"robot": robot, "config_hash": config_hash}
         key = robot, config_hash
         try:
-            answer = self._worker_pool.ask_now(OP, arguments, _LIMIT_S, _MEMORY_BYTES, asker=robot)
+            answer = self._worker_pool.ask_now(OP, arguments, _LIMIT_S, _MEMORY_BYTES, origin=robot)
             found = msgspec.json.decode(answer, type=FolderFacts)
         except BusyError as error:
             return _unread(error)

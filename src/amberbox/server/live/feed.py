@@ -84,15 +84,15 @@ class _KnownStatus:
     standing: RetainedStatus
 
     @property
-    def said(self) -> StatusRecord:
-        return self.standing.said
+    def record(self) -> StatusRecord:
+        return self.standing.record
 
 
 @dataclass(frozen=True, slots=True)
 class StatusChange:
     """A changed status; ``is_news``: more than its values has changed."""
 
-    said: StatusRecord
+    record: StatusRecord
     is_news: bool
 
 
@@ -101,20 +101,20 @@ class RetainedStatuses:
 
     def __init__(self) -> None:
         self._known: dict[str, dict[tuple[str, str], _KnownStatus]] = {}
-        self._heard_ns: dict[str, int] = {}
+        self._seen_ns: dict[str, int] = {}
 
     def load(self, connection: Connection) -> None:
         """Load the statuses from the database."""
         for row in connection.execute(select(STATUS)):
-            said = decode_record(row.data, StatusRecord)
-            if said is not None:
-                standing = RetainedStatus(said, row.log_ns, row.received_ns)
+            record = decode_record(row.data, StatusRecord)
+            if record is not None:
+                standing = RetainedStatus(record, row.log_ns, row.received_ns)
                 self._enter(row.robot, _KnownStatus(row.store_id, row.run, row.seq, standing))
-                self._heard_ns[row.robot] = max(self._heard_ns.get(row.robot, 0), row.received_ns)
+                self._seen_ns[row.robot] = max(self._seen_ns.get(row.robot, 0), row.received_ns)
 
-    def unheard(self, since_ns: int) -> frozenset[str]:
+    def silent(self, since_ns: int) -> frozenset[str]:
         """Return the robots whose watchers have sent statuses, but none since a time (ns)."""
-        return frozenset(name for name, at_ns in self._heard_ns.items() if at_ns < since_ns)
+        return frozenset(name for name, at_ns in self._seen_ns.items() if at_ns < since_ns)
 
     def standing(self, robot: str) -> Mapping[tuple[str, str], RetainedStatus]:
         """Return the last status of each component and mode of a robot."""
@@ -128,24 +128,26 @@ class RetainedStatuses:
         """
         found: dict[tuple[str, str], StatusChange] = {}
         for row in rows:
-            said = decode_record(row.data, StatusRecord) if row.channel == channels.STATUS else None
-            if said is None:
+            record = (
+                decode_record(row.data, StatusRecord) if row.channel == channels.STATUS else None
+            )
+            if record is None:
                 continue
-            self._heard_ns[robot] = now_ns
-            key = said.component, said.mode
+            self._seen_ns[robot] = now_ns
+            key = record.component, record.mode
             before = self._known.get(robot, {}).get(key)
             if before is not None and _is_late(before, store_id, row):
                 continue
-            standing = RetainedStatus(said, row.log_ns, now_ns)
+            standing = RetainedStatus(record, row.log_ns, now_ns)
             self._enter(robot, _KnownStatus(store_id, row.run, row.seq, standing))
-            if before is None or not _is_same(before.said, said):
-                is_news = before is None or not _is_alike(before.said, said)
-                found[key] = StatusChange(said, is_news or (key in found and found[key].is_news))
+            if before is None or not _is_same(before.record, record):
+                is_news = before is None or not _is_alike(before.record, record)
+                found[key] = StatusChange(record, is_news or (key in found and found[key].is_news))
         return found
 
     def _enter(self, robot: str, known: _KnownStatus) -> None:
         statuses = self._known.setdefault(robot, {})
-        key = known.said.component, known.said.mode
+        key = known.record.component, known.record.mode
         if key in statuses or len(statuses) < _MOST:
             statuses[key] = known
 
@@ -182,27 +184,27 @@ def statuses_data(
     newest: dict[tuple[str, str], StatusRecord] = {}
     news: set[tuple[str, str]] = set()
     for some in changed:
-        newest.update((key, one.said) for key, one in some.items())
+        newest.update((key, one.record) for key, one in some.items())
         news.update(key for key, one in some.items() if one.is_news)
-    yield "status", [status_data(said) for said in newest.values()]
+    yield "status", [status_data(record) for record in newest.values()]
     if news:
         yield "levels", [level_data(newest[key]) for key in newest if key in news]
 
 
-def level_data(said: StatusRecord) -> Mapping[str, Any]:
+def level_data(record: StatusRecord) -> Mapping[str, Any]:
     """Return a status without its values, in the form of the feed."""
-    return {"component": said.component, "mode": said.mode, "level": said.level,
-            "state": said.state}  # fmt: skip
+    return {"component": record.component, "mode": record.mode, "level": record.level,
+            "state": record.state}  # fmt: skip
 
 
 def event_data(rows: Sequence[LinkRow]) -> list[Mapping[str, Any]]:
     """Return the events among rows, in the form of the feed."""
     found: list[Mapping[str, Any]] = []
     for row in rows:
-        said = decode_record(row.data, EventRecord) if row.channel == channels.EVENT else None
-        if said is not None:
+        event = decode_record(row.data, EventRecord) if row.channel == channels.EVENT else None
+        if event is not None:
             at = format_moment(row.log_ns)
-            found.append({"at": at, "kind": said.kind, "text": said.text, "source": said.source})
+            found.append({"at": at, "kind": event.kind, "text": event.text, "source": event.source})
     return found
 
 
@@ -210,16 +212,16 @@ def diagnosis_data(rows: Sequence[LinkRow]) -> list[Mapping[str, Any]]:
     """Return the newest revision of each diagnosis among rows, in the form of the feed."""
     found: dict[str, Mapping[str, Any]] = {}
     for row in rows:
-        said = (
+        diagnosis = (
             decode_record(row.data, DiagnosisRecord) if row.channel == channels.DIAGNOSIS else None
         )
-        if said is not None:
-            first = said.hypotheses[0] if said.hypotheses else None
-            found[said.id] = {
-                "id": said.id,
-                "revision": said.revision,
-                "state": said.state,
-                "at": format_moment(said.at_ns),
+        if diagnosis is not None:
+            first = diagnosis.hypotheses[0] if diagnosis.hypotheses else None
+            found[diagnosis.id] = {
+                "id": diagnosis.id,
+                "revision": diagnosis.revision,
+                "state": diagnosis.state,
+                "at": format_moment(diagnosis.at_ns),
                 "faults": first.faults if first else [],
                 "probability": first.probability if first else 0.0,
             }
@@ -234,7 +236,7 @@ class SilenceMonitor:
 
     def __init__(self) -> None:
         self._silent: frozenset[str] = frozenset()
-        self._unheard: frozenset[str] = frozenset()
+        self._silent_watchers: frozenset[str] = frozenset()
 
     def news(
         self, robots: Mapping[str, RobotConnection]
@@ -254,13 +256,13 @@ class SilenceMonitor:
                 yield name, {"online": True}
 
     def watchers(
-        self, robots: Mapping[str, RobotConnection], unheard: frozenset[str]
+        self, robots: Mapping[str, RobotConnection], silent: frozenset[str]
     ) -> Iterator[tuple[str, Mapping[str, Any]]]:
         """Yield connected robots whose watchers became silent, or send again.
 
         Their status then changes, even if no row has arrived.
         """
-        changed, self._unheard = self._unheard ^ unheard, unheard
+        changed, self._silent_watchers = self._silent_watchers ^ silent, silent
         for name in sorted(changed & robots.keys()):
             if not robots[name].is_silent:
                 yield name, {"online": True}
@@ -285,7 +287,7 @@ class LiveValueRelay:
     def __init__(self, links: LiveValueSource, wanted: Callable[[], Iterable[Watch]]) -> None:
         self._links = links
         self._wanted = wanted
-        self._asked: dict[str, frozenset[str]] = {}
+        self._requested: dict[str, frozenset[str]] = {}
         self._values: dict[str, dict[str, Value]] = {}
         self._news: set[str] = set()
         self._changed = asyncio.Event()
@@ -296,7 +298,7 @@ class LiveValueRelay:
 
     def take(self, robot: str, values: Mapping[str, Value]) -> bool:
         """Store received values; return whether any of them is watched."""
-        asked = self._asked.get(robot)
+        asked = self._requested.get(robot)
         known = {name: value for name, value in values.items() if asked and name in asked}
         if known:
             self._values.setdefault(robot, {}).update(known)
@@ -326,23 +328,23 @@ class LiveValueRelay:
             union = _union(self._wanted())
             different = [
                 robot
-                for robot in {*union, *self._asked}
-                if union.get(robot, frozenset()) != self._asked.get(robot, frozenset())
+                for robot in {*union, *self._requested}
+                if union.get(robot, frozenset()) != self._requested.get(robot, frozenset())
             ]
-            self._asked = union
+            self._requested = union
             for robot in different:
                 self._forget(robot)
-            await asyncio.gather(*(self._ask(robot) for robot in different))
+            await asyncio.gather(*(self._request_samples(robot) for robot in different))
 
     def _forget(self, robot: str) -> None:
-        asked = self._asked.get(robot, frozenset())
+        asked = self._requested.get(robot, frozenset())
         kept = {n: v for n, v in self._values.get(robot, {}).items() if n in asked}
         self._values[robot] = kept
         if not asked:
             del self._values[robot]
 
-    async def _ask(self, robot: str) -> None:
-        variables = sorted(self._asked.get(robot, ()))[: limits.VARIABLES]
+    async def _request_samples(self, robot: str) -> None:
+        variables = sorted(self._requested.get(robot, ()))[: limits.VARIABLES]
         with suppress(TimeoutError):  # requested again when the robot reconnects
             async with asyncio.timeout(_PATIENCE_S):
                 await self._links.watch(robot, variables)
@@ -401,7 +403,7 @@ class Feed:
     async def run(self) -> None:
         """Publish changes from the event bus until cancelled."""
         await asyncio.to_thread(self._load)
-        ends = [self._bus.on(kind, work) for kind, work in self._hears()]
+        ends = [self._bus.on(kind, work) for kind, work in self._subscriptions()]
         works = (self.state.run(), self.live.run(), self._checks(), self._lives(),
                  self._silences(), self._ages())  # fmt: skip
         try:
@@ -418,7 +420,7 @@ class Feed:
             listener.end(1001, "the server stops")
 
     @property
-    def told(self) -> int:
+    def published(self) -> int:
         """Return how many changes were published since the start."""
         return self.ring.number - self._first
 
@@ -440,7 +442,7 @@ class Feed:
         """Store a change and wake its listeners."""
         self._wake([self.ring.add(kind, robot, data, time.monotonic(), owner)])
 
-    def _hears(self) -> Iterator[tuple[Any, Callable[[ServerChange], None]]]:
+    def _subscriptions(self) -> Iterator[tuple[Any, Callable[[ServerChange], None]]]:
         yield "rows", self._rows
         yield "live", self._values
         yield "connected", lambda c: self.add("presence", c.robot, {"online": True})
@@ -487,7 +489,7 @@ class Feed:
     def _wake(self, deltas: Sequence[Delta]) -> None:
         """Wake the listeners of these changes; the others skip them at their next ping."""
         for listener in self.listeners:
-            if any(map(listener.filter.hears, deltas)):
+            if any(map(listener.filter.matches, deltas)):
                 listener.wake.set()
 
     def _alarm(self, change: ServerChange) -> None:
@@ -529,10 +531,10 @@ class Feed:
         """Publish robots that miss heartbeats while their link holds, and silent watchers."""
         while True:
             await asyncio.sleep(_SILENCE_S)
-            unheard = self._memory.unheard(self._clock.wall_ns() - SILENT_NS)
+            silent = self._memory.silent(self._clock.wall_ns() - SILENT_NS)
             for robot, data in (
                 *self._silence.news(self._links.robots),
-                *self._silence.watchers(self._links.robots, unheard),
+                *self._silence.watchers(self._links.robots, silent),
             ):
                 self.add("presence", robot, data)
 
@@ -541,8 +543,8 @@ class Feed:
         while True:
             await asyncio.sleep(AGES_S)
             repeated, self._repeated = self._repeated, set()
-            heard = {robot for one in self.listeners for robot in one.robots_of("ages")}
-            wanted = sorted(repeated & heard)
+            shown = {robot for one in self.listeners for robot in one.robots_of("ages")}
+            wanted = sorted(repeated & shown)
             offsets = await asyncio.to_thread(self._offsets, wanted) if wanted else {}
             now_ns = self._clock.wall_ns()
             for robot in wanted:
@@ -597,7 +599,7 @@ class Feed:
         if self._joined_at != self.ring.number:
             self._joined, self._joined_at = {}, self.ring.number
         texts, size, number = [], 0, listener.number
-        chosen = {delta.number for delta in deltas if listener.filter.hears(delta)}
+        chosen = {delta.number for delta in deltas if listener.filter.matches(delta)}
         for delta in deltas:
             if size and delta.number in chosen and size + len(delta.text) > most:
                 break
@@ -650,7 +652,7 @@ class FeedSession:
         self._feed = feed
         self._listener = listener
         self._socket = socket
-        self._is_asked = asyncio.Event()
+        self._has_request = asyncio.Event()
         self._may_be_old = False
         self._sent_s = time.monotonic()
 
@@ -669,7 +671,7 @@ class FeedSession:
     async def _read(self) -> None:
         """Receive subscriptions; each replaces the one before."""
         while True:
-            wait_s = None if self._is_asked.is_set() else FIRST_S
+            wait_s = None if self._has_request.is_set() else FIRST_S
             try:
                 async with asyncio.timeout(wait_s):
                     text = await self._socket.receive()
@@ -692,11 +694,11 @@ class FeedSession:
         listener.number = resume if resume is not None and self._may_be_old else ring.number
         listener.live.clear()
         self._feed.show_live(listener)
-        self._is_asked.set()
+        self._has_request.set()
         listener.wake.set()
 
     async def _write(self) -> None:
-        await self._is_asked.wait()
+        await self._has_request.wait()
         listener = self._listener
         while listener.ended is None:
             text = await self._next()

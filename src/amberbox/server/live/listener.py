@@ -192,7 +192,7 @@ class FeedFilter:
     def __post_init__(self) -> None:
         object.__setattr__(self, "robots", dict(self.reach))
 
-    def hears(self, delta: Delta) -> bool:
+    def matches(self, delta: Delta) -> bool:
         """Return whether a change passes: a job only for its owner."""
         robots = self.robots.get(delta.kind)
         if robots is None:

@@ -169,18 +169,18 @@ def _second(seconds: int) -> str:
     return format_time(seconds * NS).partition(".")[0]
 
 
-def status_data(said: StatusRecord) -> Mapping[str, Any]:
+def status_data(record: StatusRecord) -> Mapping[str, Any]:
     """Return a status in the form of API and feed; times by the robot's clock."""
     return {
-        "component": said.component,
-        "mode": said.mode,
-        "level": said.level,
-        "state": said.state,
-        "reason": said.reason,
-        "blocked_by": said.blocked_by,
-        "measured": format_moment(said.measured_ns),
-        "since": format_moment(said.since_ns),
-        "outputs": {output.name: output.shown for output in said.outputs},
+        "component": record.component,
+        "mode": record.mode,
+        "level": record.level,
+        "state": record.state,
+        "reason": record.reason,
+        "blocked_by": record.blocked_by,
+        "measured": format_moment(record.measured_ns),
+        "since": format_moment(record.since_ns),
+        "outputs": {output.name: output.shown for output in record.outputs},
     }
 
 
@@ -194,7 +194,7 @@ _ROUND_NS = 5 * NS
 class RetainedStatus:
     """A status, and when it was written (robot's clock) and received (server's clock)."""
 
-    said: StatusRecord
+    record: StatusRecord
     log_ns: int
     received_ns: int
 
@@ -213,7 +213,9 @@ class ServerNow:
         robot. Only the delay of the link compares two clocks, by their offset.
         """
         since_ns = max(self.now_ns - status.received_ns, 0)
-        robot_ns = max(status.log_ns - status.said.measured_ns, 0) if status.said.measured_ns else 0
+        robot_ns = (
+            max(status.log_ns - status.record.measured_ns, 0) if status.record.measured_ns else 0
+        )
         way_ns = 0
         if self.offset_ns is not None:
             way_ns = max(status.received_ns - status.log_ns - self.offset_ns, 0)
@@ -233,9 +235,9 @@ def retained_statuses(
         wanted = wanted.where(STATUS.c.robot.in_(robots))
     found: dict[str, list[RetainedStatus]] = {}
     for row in connection.execute(wanted):
-        said = decode_record(row.data, StatusRecord)
-        if said is not None:
-            one = RetainedStatus(said, row.log_ns, row.received_ns)
+        record = decode_record(row.data, StatusRecord)
+        if record is not None:
+            one = RetainedStatus(record, row.log_ns, row.received_ns)
             found.setdefault(row.robot, []).append(one)
     return {robot: _watched(statuses) for robot, statuses in found.items()}
 
@@ -292,13 +294,13 @@ def silence(
         return overload_text(delay_s)
     if monitoring != "silent":
         return ""
-    unheard_ns = when.now_ns - max(status.received_ns for status in statuses)
-    if unheard_ns > SILENT_NS:
-        return f"its watcher has said nothing for {duration_text(unheard_ns)}"
+    silent_ns = when.now_ns - max(status.received_ns for status in statuses)
+    if silent_ns > SILENT_NS:
+        return f"its watcher has said nothing for {duration_text(silent_ns)}"
     return f"what it says is {duration_text(_newest_ns(statuses, when))} old"
 
 
 def _newest_ns(statuses: Sequence[RetainedStatus], when: ServerNow) -> int:
     """Return the time since the last status, or its age if that is more (ns)."""
-    unheard_ns = when.now_ns - max(status.received_ns for status in statuses)
-    return max(unheard_ns, min(when.age_ns(status) for status in statuses))
+    silent_ns = when.now_ns - max(status.received_ns for status in statuses)
+    return max(silent_ns, min(when.age_ns(status) for status in statuses))

@@ -113,7 +113,7 @@ _KINDS: Mapping[str, type[msgspec.Struct]] = {
 class RecentRecords:
     """The last records of each mission, diagnosis and symptom, the newest at the end."""
 
-    said: dict[str, dict[str, Any]] = field(
+    records: dict[str, dict[str, Any]] = field(
         default_factory=lambda: {channel: {} for channel in _KINDS}
     )
     holds: dict[str, SymptomInterval] = field(default_factory=dict)
@@ -125,7 +125,7 @@ class RecentRecords:
         """Add a record."""
         found: Any = decode_record(data, _KINDS[channel])
         if found is not None:
-            known = self.said[channel]
+            known = self.records[channel]
             known.pop(found.id, None)
             known[found.id] = found
             if len(known) > _KEPT:
@@ -133,10 +133,10 @@ class RecentRecords:
             if channel == channels.SYMPTOM:
                 self._hold(found)
 
-    def _hold(self, told: SymptomRecord) -> None:
-        hold = next_interval(self.holds.pop(told.id, None), told)
+    def _hold(self, symptom: SymptomRecord) -> None:
+        hold = next_interval(self.holds.pop(symptom.id, None), symptom)
         if hold is not None:
-            self.holds[told.id] = hold
+            self.holds[symptom.id] = hold
             if len(self.holds) > _KEPT:
                 del self.holds[next(iter(self.holds))]
 
@@ -151,13 +151,13 @@ class RecentRecords:
     @property
     def mission(self) -> MissionRecord | None:
         """Return the mission that the robot is on, or None."""
-        lasting = [m for m in self.said[channels.MISSION].values() if m.to_ns is None]
+        lasting = [m for m in self.records[channels.MISSION].values() if m.to_ns is None]
         return lasting[-1] if lasting else None
 
     @property
     def diagnosis(self) -> DiagnosisRecord | None:
         """Return the newest diagnosis of the robot if it is open, else None."""
-        known: list[DiagnosisRecord] = list(self.said[channels.DIAGNOSIS].values())
+        known: list[DiagnosisRecord] = list(self.records[channels.DIAGNOSIS].values())
         newest = min(known, key=lambda one: (-one.at_ns, one.id), default=None)
         return newest if newest is not None and newest.state == "open" else None
 
@@ -318,16 +318,16 @@ class RobotStatuses:
 def level_of(statuses: Sequence[RetainedStatus]) -> Level:
     """Return the worst level of the components; any other text is ``unknown``."""
     return components_level(
-        (one.said.known_level, one.said.state) for one in statuses if not one.said.mode
+        (one.record.known_level, one.record.state) for one in statuses if not one.record.mode
     )
 
 
 def worst_of(statuses: Sequence[RetainedStatus]) -> StatusRecord | None:
     """Return the worst status of a component; of equally bad ones, one that is not blocked."""
     components = (
-        one.said for one in statuses if not one.said.mode and one.said.state != NOT_MONITORED
+        one.record for one in statuses if not one.record.mode and one.record.state != NOT_MONITORED
     )
-    return max(components, key=lambda said: (said.rank, not said.blocked_by), default=None)
+    return max(components, key=lambda record: (record.rank, not record.blocked_by), default=None)
 
 
 def cause_of(bad: StatusRecord | None) -> str:
@@ -352,5 +352,5 @@ def _contact(presence: RobotPresence | None, link: RobotConnection | None) -> Co
 
 
 def _as_of(statuses: Sequence[RetainedStatus], when: ServerNow) -> str | None:
-    newest_ns = max((one.said.measured_ns for one in statuses), default=0)
+    newest_ns = max((one.record.measured_ns for one in statuses), default=0)
     return when.at(newest_ns)

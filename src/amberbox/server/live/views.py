@@ -64,10 +64,10 @@ def status_tree(known: AssessedRobot, facts: FolderFacts) -> StatusTree:
     """Return the tree of declared components with statuses; undeclared ones are at the end."""
     by_name: dict[str, list[RetainedStatus]] = {}
     for status in known.statuses:
-        by_name.setdefault(status.said.component, []).append(status)
+        by_name.setdefault(status.record.component, []).append(status)
     planned = {component.id for component in facts.components}
     extra = [ComponentFacts(name, name) for name in by_name if name not in planned]
-    levels = {(s.said.component, s.said.mode): s.said.level for s in known.statuses}
+    levels = {(s.record.component, s.record.mode): s.record.level for s in known.statuses}
     components = [
         _component(one, by_name.get(one.id, ()), levels, known.when)
         for one in (*facts.components, *extra)
@@ -86,7 +86,7 @@ def _component(
     levels: Mapping[tuple[str, str], str],
     when: ServerNow,
 ) -> Component:
-    own = next((status for status in statuses if not status.said.mode), None)
+    own = next((status for status in statuses if not status.record.mode), None)
     needs = [
         Need(need.name, need.component, levels.get((need.component, need.mode), "unknown"))
         for need in facts.needs
@@ -94,31 +94,33 @@ def _component(
     return Component(
         facts.id, facts.name, facts.depth, facts.description, facts.part_of, needs, facts.rule,
         facts.recovery_actions, None if own is None else _condition(own, when),
-        [_mode(status, facts, when) for status in statuses if status.said.mode],
+        [_mode(status, facts, when) for status in statuses if status.record.mode],
     )  # fmt: skip
 
 
 def _condition(status: RetainedStatus, when: ServerNow) -> Condition:
-    said = status.said
-    for_s = max(said.measured_ns - said.since_ns, 0) / NS if said.since_ns else 0.0
+    record = status.record
+    for_s = max(record.measured_ns - record.since_ns, 0) / NS if record.since_ns else 0.0
     return Condition(
-        said.level, said.state, said.reason, said.blocked_by, when.at(said.measured_ns),
-        when.at(said.since_ns), round(when.age_ns(status) / NS, 3), round(for_s, 3),
+        record.level, record.state, record.reason, record.blocked_by, when.at(record.measured_ns),
+        when.at(record.since_ns), round(when.age_ns(status) / NS, 3), round(for_s, 3),
     )  # fmt: skip
 
 
 def _mode(status: RetainedStatus, facts: ComponentFacts, when: ServerNow) -> Mode:
-    mode = status.said.mode
+    mode = status.record.mode
     planned = {output.name: output for output in facts.outputs.get(mode, ())}
-    outputs = [_output(said, planned.get(said.name, _NOTHING)) for said in status.said.outputs]
+    outputs = [
+        _output(record, planned.get(record.name, _NOTHING)) for record in status.record.outputs
+    ]
     return Mode(mode, facts.names.get(mode, mode), _condition(status, when), outputs)
 
 
-def _output(said: OutputRecord, facts: OutputFacts) -> Output:
+def _output(output: OutputRecord, facts: OutputFacts) -> Output:
     return Output(
-        said.name,
-        said.type,
-        said.shown,
+        output.name,
+        output.type,
+        output.shown,
         facts.expected,
         facts.severity,
         facts.description,
@@ -162,7 +164,7 @@ class CardBuilder:
         config_hash = presence.config_hash if presence else ""
         facts = self.facts.known(robot.id, config_hash)
         last_seen = link.last_seen_ns if link else presence.last_seen_ns if presence else None
-        levels = Counter(one.said.level for one in known.statuses if not one.said.mode)
+        levels = Counter(one.record.level for one in known.statuses if not one.record.mode)
         return Card(
             robot.id, sorted(robot.groups), facts.model if facts else "",
             robot.disabled_ns is not None, link is not None, format_moment(last_seen),
@@ -187,8 +189,8 @@ def _battery(statuses: Sequence[RetainedStatus]) -> Battery | None:
     outputs = [
         output
         for status in statuses
-        if "battery" in status.said.component.casefold()
-        for output in status.said.outputs
+        if "battery" in status.record.component.casefold()
+        for output in status.record.outputs
         if output.value is not None and output.type in ("int", "float")
     ]
     for word in _CHARGES:
@@ -272,7 +274,7 @@ class FleetState:
         when = {robot: ServerNow(now_ns, offsets.get(robot)) for robot in robots}
         statuses = {
             robot: [
-                {**status_data(one.said), "age_s": round(when[robot].age_ns(one) / NS, 2)}
+                {**status_data(one.record), "age_s": round(when[robot].age_ns(one) / NS, 2)}
                 for one in found[robot]
             ]
             for robot in sorted(robots if with_statuses else ())
@@ -286,9 +288,9 @@ class FleetState:
     def _explained(self, change: ServerChange) -> None:
         """Store the severity of an explained diagnosis' effect."""
         answer = change.data["answer"]
-        told = answer.get("explanation")
-        if told and answer.get("id"):
-            severity = told["use"]["severity"]
+        explanation = answer.get("explanation")
+        if explanation and answer.get("id"):
+            severity = explanation["use"]["severity"]
             self.latest.explain(change.robot, answer["id"], answer["revision"], severity)
 
     def _robot(self, change: ServerChange) -> None:

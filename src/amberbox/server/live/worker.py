@@ -29,7 +29,7 @@ def _components(plan: MonitoringPlan) -> Iterator[ComponentFacts]:
         yield ComponentFacts(
             component.id, component.name, branch.depth, component.description, component.part_of,
             "" if component.needs is None else str(component.needs), list(_needs(component)),
-            {mode.id: list(_outputs(component, mode.id)) for mode in component.modes},
+            {mode.id: list(output_facts(component, mode.id)) for mode in component.modes},
             {mode.id: mode.name for mode in component.modes}, list(component.recovery_actions),
         )  # fmt: skip
 
@@ -40,7 +40,8 @@ def _needs(component: ComponentPlan) -> Iterator[NeedFacts]:
         yield NeedFacts(edge.name, (edge.component or "") if judged else "", edge.mode)
 
 
-def _outputs(component: ComponentPlan, mode: str) -> Iterator[OutputFacts]:
+def output_facts(component: ComponentPlan, mode: str) -> Iterator[OutputFacts]:
+    """Yield what the folder states of the outputs of a mode."""
     for plan in component.modes:
         for mapping in plan.mappings if plan.id == mode else ():
             for output in mapping.outputs:

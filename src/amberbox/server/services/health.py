@@ -196,7 +196,7 @@ def _disk(folder: Path) -> Iterator[MetricFamily]:
 def _feed(services: Services) -> Iterator[MetricFamily]:
     feed = services.feed
     yield gauge("amberbox_feed_subscribers", "Sockets that hear of changes.", len(feed.listeners))
-    yield counter("amberbox_feed_changes_total", "Changes told since the start.", feed.told)
+    yield counter("amberbox_feed_changes_total", "Changes told since the start.", feed.published)
 
 
 def process() -> Iterator[MetricFamily]:
@@ -225,14 +225,14 @@ def find_troubles(services: Services) -> list[str]:
     files = sum(lately.values())
     what = "1 file was" if files == 1 else f"{files} files were"
     whose = ", ".join(sorted(lately))
-    said = [f"{what} damaged and set aside in the last 24 hours, of {whose}"] if files else []
+    damage = [f"{what} damaged and set aside in the last 24 hours, of {whose}"] if files else []
     if notified.has_lost_secrets:
-        said.append(f"secrets of notifications cannot be read: {LOST_HINT}")
-    said += [
+        damage.append(f"secrets of notifications cannot be read: {LOST_HINT}")
+    damage += [
         f"{key.robot} signs with another key than before, which waits for an admin: /admin/robots"
         for key in waiting
     ]
-    return [*services.keeping.troubles(), *said, *refused]
+    return [*services.keeping.troubles(), *damage, *refused]
 
 
 def _refused(connection: Connection, since_ns: int) -> list[str]:

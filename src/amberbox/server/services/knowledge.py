@@ -37,7 +37,7 @@ async def ask_worker(fleet: Services, who: Caller, name: str, asked: RobotQuesti
     """Let a worker answer a question about a robot; return its JSON."""
     op = f"{WORKER}:{name}"
     return await fleet.worker_pool.ask(
-        op, encode_question(asked), LIMIT_S, MEMORY_BYTES, asker=who.person
+        op, encode_question(asked), LIMIT_S, MEMORY_BYTES, origin=who.person
     )
 
 

@@ -55,7 +55,7 @@ def list_missions(
 
 def known_missions(fleet: Services, who: Caller, robot: str) -> list[KnownMission]:
     """Return the missions of a robot, its own and those that were begun here."""
-    answer = fleet.worker_pool.ask_now(f"{WORKER}:missions", {"robot": robot}, asker=who.person)
+    answer = fleet.worker_pool.ask_now(f"{WORKER}:missions", {"robot": robot}, origin=who.person)
     return msgspec.msgpack.decode(answer, type=list[KnownMission])
 
 
@@ -103,13 +103,17 @@ def list_incidents(
 ) -> list[Incident]:  # fmt: skip
     """List the incidents of a robot that meet a range of time, newest first."""
     from_ns, to_ns = robot_span_ns(fleet, robot.id, from_, to)
-    answer = fleet.worker_pool.ask_now(f"{WORKER}:incidents", {"robot": robot.id}, asker=who.person)
-    told = [_of_robot(values) for values in msgspec.json.decode(answer)]
+    answer = fleet.worker_pool.ask_now(
+        f"{WORKER}:incidents", {"robot": robot.id}, origin=who.person
+    )
+    incidents = [_of_robot(values) for values in msgspec.json.decode(answer)]
     with fleet.database.reading() as connection:
-        told += [marked_incident(one) for one in server_annotations.incidents(connection, robot.id)]
+        incidents += [
+            marked_incident(one) for one in server_annotations.incidents(connection, robot.id)
+        ]
     low, high = (None if ns is None else format_time(ns) for ns in (from_ns, to_ns))
     found = [
-        one for one in told
+        one for one in incidents
         if (low is None or one.to > low) and (high is None or one.from_ < high)
     ]  # fmt: skip
     found.sort(key=lambda one: (one.from_, one.id), reverse=True)
@@ -148,7 +152,7 @@ def list_gaps(
     """List what is missing of a robot's record and why, in order of time."""
     span = robot_span_ns(fleet, robot.id, from_, to)
     question = RowQuery(robot.id, item, None, *span, limit=limit)
-    answer = fleet.worker_pool.ask_now(f"{WORKER}:gaps", arguments(question), asker=who.person)
+    answer = fleet.worker_pool.ask_now(f"{WORKER}:gaps", arguments(question), origin=who.person)
     return _GAPS.validate_json(answer)
 
 

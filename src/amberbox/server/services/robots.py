@@ -1,8 +1,9 @@
-"""Events and timelines of robots as API and pages show them."""
+"""Statuses, timelines and events of robots as API and pages show them."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 from sqlalchemy import Connection
 
@@ -12,40 +13,160 @@ from amberbox.core.clock import NS
 from amberbox.core.errors import UsageError
 from amberbox.core.names import component_id, ids_ending_in
 from amberbox.core.timestamps import format_time, ordered_span
+from amberbox.monitoring.findings import COMPONENT_STATE
 from amberbox.server.accounts.robots import KnownRobot
-from amberbox.server.derived import DerivedRecord, derived_records
+from amberbox.server.derived import MOST, DerivedRecord, RecordStores, derived_records
 from amberbox.server.ingest.link_state import presences
 from amberbox.server.live import links
-from amberbox.server.live import timeline as states
 from amberbox.server.live.facts import FolderFacts
 from amberbox.server.live.records import (
+    ConditionRecord,
     EventRecord,
+    RetainedStatus,
+    TransitionRecord,
     convert_record,
+    decode_record,
     format_moment,
+    rank_of,
     retained_statuses,
 )
 from amberbox.server.live.status import AssessedRobot
-from amberbox.server.live.timeline import timeline
 from amberbox.server.live.views import status_tree
 from amberbox.server.services.context import Caller, Services, query_time_ns
 
+# Number of events after the window in which the first changes of components are searched
+_BEHIND = 2000
 _HOUR_NS = 3600 * NS
 _SEARCHED = 20_000
 """Events that are looked through for those of one kind."""
 
 
-def timeline_of(found: states.ComponentTimeline, span: tuple[int, int]) -> Timeline:
-    """Write the times of a timeline."""
-    lanes = [
-        Lane(component=component, mode=mode, stretches=[_stretch(one) for one in stretches])
-        for (component, mode), stretches in found.lanes.items()
-    ]
+@dataclass(frozen=True, slots=True)
+class TimelineInterval:
+    """An interval with one level and state, by the robot's clock.
+
+    ``changes`` counts the changes within it where short intervals were joined: then ``level`` and
+    ``state`` are the worst of them.
+    """
+
+    from_ns: int
+    to_ns: int
+    level: str
+    state: str
+    reason: str = ""
+    changes: int = 0
+
+
+def timeline(
+    stores: RecordStores,
+    robot: str,
+    span: tuple[int, int],
+    standing: Iterable[RetainedStatus],
+    component: str,
+    points: int,
+) -> Timeline:
+    """Return the states of components in ``[from, to)``, at most ``points`` intervals a lane.
+
+    It is not ``complete`` where there were too many events.
+    """
+    found = derived_records(stores, robot, channels.EVENT, span, MOST)
+    inside = _by_lane(_transitions(found), component)
+    behind = derived_records(stores, robot, channels.EVENT, (span[1], None), _BEHIND)
+    after = _by_lane(_transitions(behind), component)
+    now = {(s.record.component, s.record.mode): s for s in standing}
+    lanes = []
+    for key in sorted({*inside, *after, *now}):
+        intervals = _intervals(span, inside.get(key, ()), after.get(key, ()), now.get(key))
+        if intervals and component in ("", key[0]):
+            stretches = [_stretch(one) for one in shortened(intervals, span, points)]
+            lanes.append(Lane(component=key[0], mode=key[1], stretches=stretches))
     return Timeline(
-        from_=format_time(span[0]), to=format_time(span[1]), complete=found.complete, lanes=lanes
+        from_=format_time(span[0]),
+        to=format_time(span[1]),
+        complete=len(found) < MOST,
+        lanes=lanes,
     )
 
 
-def _stretch(one: states.TimelineInterval) -> Stretch:
+def shortened(
+    intervals: Sequence[TimelineInterval], span: tuple[int, int], points: int
+) -> Sequence[TimelineInterval]:
+    """Join intervals that are too short to be visible; the worst of them is shown."""
+    if len(intervals) <= points:
+        return intervals
+    step_ns = max((span[1] - span[0]) * 2 // points, 1)
+    found: list[TimelineInterval] = []
+    for interval in intervals:
+        last = found[-1] if found else None
+        if last is not None and interval.to_ns - last.from_ns <= step_ns:
+            found[-1] = _joined(last, interval)
+        else:
+            found.append(interval)
+    return found
+
+
+def _joined(one: TimelineInterval, other: TimelineInterval) -> TimelineInterval:
+    worst = max(one, other, key=lambda s: rank_of(s.level))
+    return replace(
+        worst, from_ns=one.from_ns, to_ns=other.to_ns, changes=one.changes + other.changes + 1
+    )
+
+
+def _transitions(found: Iterable[DerivedRecord]) -> Iterable[tuple[int, TransitionRecord]]:
+    for entry in found:
+        event = convert_record(entry.values, EventRecord)
+        if event is not None and event.kind == COMPONENT_STATE:
+            transition = decode_record(event.details, TransitionRecord)
+            if transition is not None:
+                yield transition.at_ns or entry.at_ns, transition
+
+
+def _by_lane(
+    transitions: Iterable[tuple[int, TransitionRecord]], component: str
+) -> Mapping[tuple[str, str], list[tuple[int, TransitionRecord]]]:
+    found: dict[tuple[str, str], list[tuple[int, TransitionRecord]]] = {}
+    for at_ns, transition in transitions:
+        if not component or transition.component == component:
+            found.setdefault((transition.component, transition.mode), []).append(
+                (at_ns, transition)
+            )
+    return found
+
+
+def _intervals(
+    span: tuple[int, int],
+    inside: Sequence[tuple[int, TransitionRecord]],
+    after: Sequence[tuple[int, TransitionRecord]],
+    now: RetainedStatus | None,
+) -> list[TimelineInterval]:
+    """Return the intervals between the changes; the first has the state before the first change."""
+    from_ns, to_ns = span
+    found: list[TimelineInterval] = []
+    since_ns, condition, reason = from_ns, _before(inside, after), ""
+    if condition is None:
+        if now is None or now.record.since_ns >= to_ns:
+            return []
+        since_ns, reason = max(from_ns, now.record.since_ns), now.record.reason
+        condition = ConditionRecord(now.record.level, now.record.state)
+    for at_ns, transition in inside:
+        cut_ns = min(max(at_ns, since_ns), to_ns)
+        if cut_ns > since_ns:
+            found.append(
+                TimelineInterval(since_ns, cut_ns, condition.level, condition.state, reason)
+            )
+        since_ns, condition, reason = cut_ns, transition.after, transition.reason
+    if to_ns > since_ns:
+        found.append(TimelineInterval(since_ns, to_ns, condition.level, condition.state, reason))
+    return found
+
+
+def _before(
+    inside: Sequence[tuple[int, TransitionRecord]], after: Sequence[tuple[int, TransitionRecord]]
+) -> ConditionRecord | None:
+    return next((transition.before for _, transition in (*inside[:1], *after[:1])), None)
+
+
+def _stretch(one: TimelineInterval) -> Stretch:
     return Stretch(
         from_=format_time(one.from_ns), to=format_time(one.to_ns), level=one.level,
         state=one.state, reason=one.reason, changes=one.changes,
@@ -114,11 +235,11 @@ def read_timeline(
         raise UsageError("the window ends before it begins")
     with fleet.database.reading() as connection:
         standing = retained_statuses(connection, [robot.id]).get(robot.id, [])
-    known = {one.said.component for one in standing}
+    known = {one.record.component for one in standing}
     if component and ids_ending_in(component, known):
         component = component_id(component, known)
     span = (from_ns, to_ns)
-    return timeline_of(timeline(fleet, robot.id, span, standing, component, points), span)
+    return timeline(fleet, robot.id, span, standing, component, points)
 
 
 def list_events(
@@ -158,16 +279,16 @@ def _cards(fleet: Services, connection: Connection, robots: Sequence[KnownRobot]
 
 
 def _event(entry: DerivedRecord) -> Event | None:
-    said = convert_record(entry.values, EventRecord)
-    if said is None:
+    event = convert_record(entry.values, EventRecord)
+    if event is None:
         return None
     return Event(
         format_moment(entry.at_ns),
         format_moment(entry.server_ns),
-        said.kind,
-        said.text,
-        said.source,
-        said.details,
+        event.kind,
+        event.text,
+        event.source,
+        event.details,
         entry.store_id,
         entry.writer,
         entry.run,

@@ -126,8 +126,8 @@ async def make(request: Request, fleet: Fleet) -> Response:
     try:
         await _made(request, fleet, form, needs_code=situation["needs_code"])
     except AmberboxError as error:
-        said = {**known, "problem": error.what, "hint": error.hint}
-        answer = await asyncio.to_thread(_page, request, fleet, status_of(error), **said)
+        shown = {**known, "problem": error.what, "hint": error.hint}
+        answer = await asyncio.to_thread(_page, request, fleet, status_of(error), **shown)
         if isinstance(error, MustWaitError):
             answer.headers["Retry-After"] = str(error.seconds)
         return answer

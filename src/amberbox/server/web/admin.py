@@ -122,11 +122,11 @@ Name = Annotated[Literal["retention", "notifications", "alarms", "downloads"], P
 @routes.get("/admin/settings/{setting}", "settings.write")
 def show_settings(request: Request, fleet: Fleet, who: Who, setting: Name) -> Response:
     """Show a setting as a form; for notifications also the last messages."""
-    tells = setting == "notifications"
-    messages = list_notifications(fleet, None, 0, 0, _LISTED) if tells else []
+    notifies = setting == "notifications"
+    messages = list_notifications(fleet, None, 0, 0, _LISTED) if notifies else []
     return render(
         request, "admin/setting.html", setting=asdict(read_setting(fleet, setting)),
-        messages=messages, destinations=_settings_destinations(fleet) if tells else [],
+        messages=messages, destinations=_settings_destinations(fleet) if notifies else [],
     )  # fmt: skip
 
 

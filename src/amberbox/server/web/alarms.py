@@ -225,7 +225,7 @@ class AlarmLinks:
 class AlarmDetails:
     """One alarm in detail. ``people`` are those it can be assigned to, if the caller may change it.
 
-    ``told`` counts the notifications. ``others``: the caller may not change it because it also
+    ``notified`` counts the notifications. ``others``: the caller may not change it because it also
     concerns robots of others.
     """
 
@@ -233,7 +233,7 @@ class AlarmDetails:
     others: bool
     events: Sequence[AlarmHistoryLine]
     messages: Sequence[Notification]
-    told: int
+    notified: int
     people: Sequence[str]
     me: str
 
@@ -264,14 +264,16 @@ def alarm_details(fleet: Services, who: Caller, number: int) -> AlarmDetails:
         about = store.robots_of(connection, [number])[number]
         mine = _names(connection, who, "alarms.write")
         people = _people(connection, [row["robot"] for row in about])
-        told = _told(connection, number)
+        notified = notified_count(connection, number)
     may = _may(who, about, mine)
     others = not may and any(row["robot"] in mine for row in about)
     item = _of_line(words, page.alarm, rows, may=may)
-    history = [one for one in page.history if told or one.what != "notified"]
-    said = list(events(history, words, page.alarm))
+    history = [one for one in page.history if notified or one.what != "notified"]
+    lines = list(events(history, words, page.alarm))
     given_to = people if may else []
-    return AlarmDetails(item, others, said, _messages(fleet, who, number), told, given_to, _me(who))
+    return AlarmDetails(
+        item, others, lines, _messages(fleet, who, number), notified, given_to, _me(who)
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -404,7 +406,7 @@ def _people(connection: Connection, about: Sequence[str]) -> list[str]:
     ]  # fmt: skip
 
 
-def _told(connection: Connection, number: int) -> int:
+def notified_count(connection: Connection, number: int) -> int:
     """Count the messages about an alarm."""
     counted = select(func.count()).where(OUTBOX.c.alarm == number)
     return int(connection.execute(counted).scalar_one())
@@ -573,12 +575,12 @@ class AlarmTexts:
         """Return the cause by the diagnosis, in words; empty if it is not known."""
         if line.explained is None or not line.explained.causes:
             return self.plain(line, line.cause) if line.cause else ""
-        said = line.explained
+        explained = line.explained
         kinds = {kind: catalogue().text(f"diagnosis.card.{kind}") for kind in _NO_FAULTS}
-        names = [kinds.get(one.kind) or capitalize(one.text) for one in said.causes]
-        word = sure_word(len(names), said.probability)
+        names = [kinds.get(one.kind) or capitalize(one.text) for one in explained.causes]
+        word = sure_word(len(names), explained.probability)
         return catalogue().text("alarms.cause_sure", name=_either(names), word=word,
-                                share=percent(said.probability))  # fmt: skip
+                                share=percent(explained.probability))  # fmt: skip
 
     def plain(self, line: AlarmLine, cause: str) -> str:
         """Return a cause as the robot reported it, with component and failure mode in words."""
@@ -588,15 +590,15 @@ class AlarmTexts:
             text = known.get(found[0])
             return text or f"{self.part(robot, found[1])}: {found[2].replace('_', ' ')}"
 
-        told = _FAULT.sub(named, cause).replace(
+        shown = _FAULT.sub(named, cause).replace(
             _UNDESCRIBED, catalogue().text("alarms.cause_other")
         )
-        sure = _SURE.search(told)
+        sure = _SURE.search(shown)
         if sure is None:
-            return capitalize(told)
+            return capitalize(shown)
         count = cause.count(" or ") + 1
         word = sure_word(count, 1.0 if sure[1] in _LIKELY else 0.0)
-        return capitalize(f"{told[: sure.start()]} ({word})")
+        return capitalize(f"{shown[: sure.start()]} ({word})")
 
 
 def sure_word(count: int, probability: float) -> str:
@@ -638,7 +640,7 @@ def events(
 ) -> Iterator[AlarmHistoryLine]:
     """Yield the history of an alarm in words, newest first."""
     for one in reversed(history):
-        text, until = _said(one, words, line)
+        text, until = _happening_text(one, words, line)
         yield AlarmHistoryLine(one.at, one.who, _what(one), text, until)
 
 
@@ -654,7 +656,7 @@ def _what(one: Happening) -> str:
     return texts.get(own) or texts.get(key) or one.what
 
 
-def _said(one: Happening, words: AlarmTexts, line: AlarmLine) -> tuple[str, str]:
+def _happening_text(one: Happening, words: AlarmTexts, line: AlarmLine) -> tuple[str, str]:
     """Return the text of a line of the history, and until when an alarm is shelved."""
     text = catalogue().text
     shelved, worse = _SHELVED.fullmatch(one.text), _WORSE.fullmatch(one.text)

@@ -60,8 +60,8 @@ def _function(name: str, text: str) -> str:
     left = _LEFT.search(body)
     if left is not None:
         raise ValueError(f"{name}: this cannot be joined: {left[0]}")
-    told = ", ".join(f"{key}: () => {value}" for key, value in exports.items())
-    return f"{name!r}($out) {{ $tell($out, {{ {told} }});\n{body}\n}},\n"
+    getters = ", ".join(f"{key}: () => {value}" for key, value in exports.items())
+    return f"{name!r}($out) {{ $tell($out, {{ {getters} }});\n{body}\n}},\n"
 
 
 def _exports(name: str, text: str) -> dict[str, str]:
@@ -111,7 +111,10 @@ class Asset:
 @lru_cache
 def assets() -> Mapping[str, Asset]:
     """Return all assets by their path."""
-    return {path: _asset(path, data) for path, data in _contents()}
+    return {
+        path: Asset(data, gzip.compress(data, 6, mtime=0), _TYPES[Path(path).suffix])
+        for path, data in _contents()
+    }
 
 
 @lru_cache
@@ -151,10 +154,6 @@ def _styles() -> Iterator[bytes]:
     yield from ((folder / name).read_bytes() for name in _FIRST)
     yield uplot("uplot.min.css")
     yield from ((folder / name).read_bytes() for name in rest)
-
-
-def _asset(path: str, data: bytes) -> Asset:
-    return Asset(data, gzip.compress(data, 6, mtime=0), _TYPES[Path(path).suffix])
 
 
 routes = Routes(prefix="")

@@ -24,7 +24,7 @@ _UNITS: Mapping[str, str] = {
     "cm": "cm", "rad": "rad", "deg": "°", "rpm": "rpm", "kb": "kB", "mb": "MB", "gb": "GB",
     "bytes": "B", "dbm": "dBm", "newton": "N", "nm": "Nm", "kg": "kg",
 }  # fmt: skip
-_TELLING = ("voltage", "newton")
+_UNIT_NAMES = ("voltage", "newton")
 """What says more of an output than the unit behind its value does."""
 _LONG_S = 120.0
 """From here on a duration is told in two units."""
@@ -81,9 +81,9 @@ def value_type(output: Output) -> str:
 def label(output: Output) -> str:
     """Return the name of an output in words, without the unit that follows its value."""
     rest, _, last = output.name.rpartition("_")
-    said = _unit(output)
-    is_said = said and said == guessed_unit(output.name) and last.casefold() not in _TELLING
-    return readable(rest if rest and is_said else output.name)
+    unit = _unit(output)
+    is_named = unit and unit == guessed_unit(output.name) and last.casefold() not in _UNIT_NAMES
+    return readable(rest if rest and is_named else output.name)
 
 
 def guessed_unit(name: str) -> str:
@@ -136,8 +136,8 @@ def is_met(output: Output) -> bool:
 
 def failing(mode: Mode, output: Output) -> bool:
     """Return whether an output is a reason why its mode is not ok."""
-    said = mode.condition
-    return said.level != "ok" and (said.state == output.name or not is_met(output))
+    condition = mode.condition
+    return condition.level != "ok" and (condition.state == output.name or not is_met(output))
 
 
 def is_healing(mode: Mode, output: Output) -> bool:
@@ -152,22 +152,22 @@ def text(output: Output) -> str:
     expected = _parsed(output)
     low = _shown(output, expected.low)
     if expected.high:
-        return _said("range", low=low, high=_shown(output, expected.high))
+        return _relation_text("range", low=low, high=_shown(output, expected.high))
     word = _WORDS.get(expected.relation)
-    return _said(word, value=low) if word else low
+    return _relation_text(word, value=low) if word else low
 
 
-def _said(word: str, **said: str) -> str:
-    return catalogue().text(f"robot.tree.relation.{word}", **said)
+def _relation_text(word: str, **values: str) -> str:
+    return catalogue().text(f"robot.tree.relation.{word}", **values)
 
 
 def _parsed(output: Output) -> _Expected:
-    said = output.expected
-    low, to, high = said.partition(" to ")
+    text = output.expected
+    low, to, high = text.partition(" to ")
     if to and output.type in _NUMBERS and not isinstance(output.value, str):
         return _Expected("within", low, high)
-    first, _, rest = said.partition(" ")
-    return _Expected(first, rest) if rest and first in _WORDS else _Expected("==", said)
+    first, _, rest = text.partition(" ")
+    return _Expected(first, rest) if rest and first in _WORDS else _Expected("==", text)
 
 
 def _shown(output: Output, text: str) -> str:
@@ -264,8 +264,12 @@ def level_of(component: Component) -> str:
 
 def is_root(component: Component) -> bool:
     """Return whether a component is not well, and nothing that it needs blocks it."""
-    said = component.condition
-    return said is not None and said.level in ("error", "warn", "stale") and not said.blocked_by
+    condition = component.condition
+    return (
+        condition is not None
+        and condition.level in ("error", "warn", "stale")
+        and not condition.blocked_by
+    )
 
 
 def span_text(seconds: float) -> str:
@@ -359,11 +363,11 @@ def as_list(components: Sequence[Component]) -> list[ComponentRow]:
 
 
 def _box(one: Component) -> Box:
-    said = one.condition
-    state = readable(said.state) if said and said.level != "ok" else ""
+    condition = one.condition
+    state = readable(condition.state) if condition and condition.level != "ok" else ""
     return Box(
         one.component, called(one.component, one.name), level_of(one), state,
-        said.reason if said else "", f"#{branch_id(one.component)}", is_root(one),
+        condition.reason if condition else "", f"#{branch_id(one.component)}", is_root(one),
     )  # fmt: skip
 
 

@@ -68,7 +68,7 @@ def coverage(fleet: Services, who: Caller, robot: str) -> DataCoverage:
         return DataCoverage(None, None, (), ())
     held = _spans(o for o in journals if o.state in _HELD and o.integrity != "deleted")
     question = arguments(RowQuery(robot, "", limit=_GAPS))
-    answer = fleet.worker_pool.ask_now(f"{WORKER}:gaps", question, asker=who.person)
+    answer = fleet.worker_pool.ask_now(f"{WORKER}:gaps", question, origin=who.person)
     gaps: list[dict[str, Any]] = msgspec.json.decode(answer)["gaps"]
     starts, ends = (_seconds([gap[name] for gap in gaps]) for name in ("from", "to"))
     reasons, kinds = ([gap[name] for gap in gaps] for name in ("reason", "kind"))
@@ -229,7 +229,9 @@ def show(request: Request, robot: OfRobot, fleet: Fleet, who: Who) -> Response:
 @routes.get("/robots/{robot}/data/variables", "items.read")
 def list_variables(robot: OfRobot, fleet: Fleet, who: Who) -> Response:
     """Return all items with their columns, as JSON."""
-    answer = fleet.worker_pool.ask_now(f"{WORKER}:described", {"robot": robot.id}, asker=who.person)
+    answer = fleet.worker_pool.ask_now(
+        f"{WORKER}:described", {"robot": robot.id}, origin=who.person
+    )
     return Response(answer, media_type="application/json")
 
 

@@ -185,10 +185,14 @@ async def cause(asked: DiagnosisRequest) -> Values:
 
 
 def _candidates(answer: Answer) -> Iterator[Candidate]:
-    told, robot = answer["explanation"], str(answer["robot"])
+    explanation, robot = answer["explanation"], str(answer["robot"])
     hypotheses = {entry["id"]: entry for entry in answer["hypotheses"]}
     seen = _seen(answer)
-    groups = [told["broken"], *told["others"]] if told["broken"] else told["others"]
+    groups = (
+        [explanation["broken"], *explanation["others"]]
+        if explanation["broken"]
+        else explanation["others"]
+    )
     for place, group in enumerate(groups):
         for member in group["members"]:
             entry = hypotheses.get(member["id"], {})
@@ -198,7 +202,7 @@ def _candidates(answer: Answer) -> Iterator[Candidate]:
             )
             yield Candidate(
                 capitalize(member["text"]), percent(member["probability"]),
-                place == 0 and bool(told["broken"]),
+                place == 0 and bool(explanation["broken"]),
                 [fault["cause"] for fault in member["faults"] if fault["cause"]],
                 [fault["remedy"] for fault in member["faults"] if fault["remedy"]],
                 for_, against, open_, [fault["id"] for fault in member["faults"]], member["proof"],
@@ -207,10 +211,15 @@ def _candidates(answer: Answer) -> Iterator[Candidate]:
 
 def _seen(answer: Answer) -> dict[str, Answer]:
     """Return the details of each symptom, by its id."""
-    told = answer["explanation"]
-    nodes = told["graph"]["nodes"]
+    explanation = answer["explanation"]
+    nodes = explanation["graph"]["nodes"]
     found = {n["id"].removeprefix("symptom:"): n for n in nodes if n["kind"] == "symptom"}
-    whole = (*told["because"], *told["unexplained"], *told["against"], *told["blocked"])
+    whole = (
+        *explanation["because"],
+        *explanation["unexplained"],
+        *explanation["against"],
+        *explanation["blocked"],
+    )
     return {**found, **{entry["id"]: entry for entry in whole}}
 
 
@@ -274,8 +283,8 @@ def remarks(seen: DiagnosisView) -> Values:
 def _history(asked: DiagnosisRequest, seen: DiagnosisView) -> Values:
     found = read_diagnoses(asked.fleet, asked.robot)[:SHOWN]
     with asked.fleet.database.reading() as connection:
-        said = explanations.modes_named(connection, asked.robot, [one.id for one in found])
-    lines = [{"line": diagnosis_line(one), "causes": said[one.id]} for one in found]
+        causes = explanations.modes_named(connection, asked.robot, [one.id for one in found])
+    lines = [{"line": diagnosis_line(one), "causes": causes[one.id]} for one in found]
     return {"lines": lines, "seen": seen, "revisions": _revisions(seen.known), **remarks(seen)}
 
 
@@ -307,7 +316,12 @@ async def tree(asked: DiagnosisRequest, effect: str) -> Values:
     Only this tree is solved; the others are listed.
     """
     chosen = effect or await _lost(asked)
-    every = await asked.ask(_question(asked, chosen), "one_tree")
+    every = await asked.ask(
+        AskTrees(
+            robot=asked.robot, now_ns=asked.now_ns, at=asked.at, effect=chosen, cut_sets=CUT_SETS
+        ),
+        "one_tree",
+    )
     if every["tree"] is None:
         return {"effects": [], "chosen": "", "tree": None}
     found, shown = every["tree"], msgspec.convert(every["shape"], TreeDrawing)
@@ -349,11 +363,6 @@ def _pattern(name: str) -> tuple[str, str]:
     """Return the kind of a component and its failure, which like components have in common."""
     part, _, mode = name.partition("#")
     return part.partition("_")[0], mode
-
-
-def _question(asked: DiagnosisRequest, effect: str) -> AskTrees:
-    return AskTrees(robot=asked.robot, now_ns=asked.now_ns, at=asked.at, effect=effect,
-                    cut_sets=CUT_SETS)  # fmt: skip
 
 
 def _near(found: Mapping[str, Any]) -> Sequence[Mapping[str, Any]]:
@@ -508,7 +517,7 @@ def _failed(entry: Answer, depth: int) -> Iterator[ProofLine]:
 routes = PageRoutes()
 
 TABS = ("others", "effects", "tree", "rules", "whatif", "history", "cause")
-ASKING = ("rules", "whatif")
+WORKER_TABS = ("rules", "whatif")
 """Tabs in which one asks the robot's knowledge something: for operators, as over the API."""
 
 Id = Annotated[str, Query(pattern=r"^[A-Za-z0-9_.:#-]{0,128}$")]
@@ -529,7 +538,7 @@ def show(
     now, seen = current_status(fleet, robot), look(fleet, robot.id, diagnosis)
     card, shown = read_card(fleet, robot), card_now(fleet, seen, now)
     may = who.may("diagnoses.write", robot)
-    tabs = [name for name in TABS if may or name not in ASKING]
+    tabs = [name for name in TABS if may or name not in WORKER_TABS]
     lacks = missing(fleet, robot.id, card.last_seen is not None) if not seen.stands else ""
     return render(
         request, "diagnosis/diagnosis.html", card=card, seen=seen, shown=shown, at=at, lacks=lacks,

@@ -289,28 +289,29 @@ def card_of(answer: Answer, until_ns: int | None = None) -> DiagnosisCard:
 
     ``until_ns``: links do not include data after this.
     """
-    told, robot = answer["explanation"], str(answer["robot"])
-    if told is None:
+    explanation, robot = answer["explanation"], str(answer["robot"])
+    if explanation is None:
         return nothing_broken(robot, answer["at"], answer.get("notes", ()))
-    causes = tuple(_as_one(_told_causes(told["broken"])))
-    probability = told["sure"]["probability"]
-    seen = [reason_of(robot, one, until_ns) for one in told["because"]]
-    beside = [reason_of(robot, one, until_ns) for one in told["unexplained"]]
+    causes = tuple(_as_one(_causes_of(explanation["broken"])))
+    probability = explanation["sure"]["probability"]
+    seen = [reason_of(robot, one, until_ns) for one in explanation["because"]]
+    beside = [reason_of(robot, one, until_ns) for one in explanation["unexplained"]]
     seen += [replace(one, beside=bool(seen)) for one in beside]
     cleared = [
         Cleared(one["id"], capitalize(one["text"]), maybe_time(one["gone_ns"]))
-        for one in told.get("cleared", ())
+        for one in explanation.get("cleared", ())
     ]
     return DiagnosisCard(
         robot, answer["state"], answer["at"], answer["id"], answer["revision"], causes,
         _sure(causes, probability), percent(probability) if causes else "",
-        severity=told["use"]["severity"], use=sentence(told["use"]["text"]),
-        lost=tuple(lost["text"] for lost in told["use"]["lost"]),
-        careful=sentence(told["use"]["careful"]),
-        next=_told_next(told["next"], answer["next_tests"]),
-        answers=answer.get("answers"), names=names_in(told), notes=tuple(answer.get("notes", ())),
-        cleared=cleared, steady=frozenset(_steady(told["broken"])),
-        helps={fault["id"]: fault["remedy"] for fault in _faults(told["broken"])},
+        severity=explanation["use"]["severity"], use=sentence(explanation["use"]["text"]),
+        lost=tuple(lost["text"] for lost in explanation["use"]["lost"]),
+        careful=sentence(explanation["use"]["careful"]),
+        next=_next_of(explanation["next"], answer["next_tests"]),
+        answers=answer.get("answers"), names=names_in(explanation),
+        notes=tuple(answer.get("notes", ())),
+        cleared=cleared, steady=frozenset(_steady(explanation["broken"])),
+        helps={fault["id"]: fault["remedy"] for fault in _faults(explanation["broken"])},
         shares=[(frozenset(h["faults"]), h["probability"]) for h in answer["hypotheses"]],
     ).having(seen)  # fmt: skip
 
@@ -345,13 +346,13 @@ def plain_card_of(revision: Answer) -> DiagnosisCard:
     )
 
 
-def names_in(told: Answer) -> dict[str, str]:
+def names_in(explanation: Answer) -> dict[str, str]:
     """Return the names of the failure modes in an explanation, by id."""
-    groups = [told["broken"], *told["others"]]
+    groups = [explanation["broken"], *explanation["others"]]
     return {fault["id"]: fault["text"] for group in groups for fault in _faults(group)}
 
 
-def _told_causes(broken: Answer | None) -> Iterator[CardCause]:
+def _causes_of(broken: Answer | None) -> Iterator[CardCause]:
     for member in broken["members"] if broken else ():
         ids = [fault["id"] for fault in member["faults"]]
         comes_from = "; ".join(fault["cause"] for fault in member["faults"] if fault["cause"])
@@ -439,11 +440,11 @@ def choices_of(test: Answer, step: Answer | None = None) -> tuple[Choice, ...]:
     if step is None:
         plain = [Choice(value, percent(chance)) for value, chance in test["outcomes"].items()]
         return _in_order(plain)
-    told = [
+    choices = [
         Choice(b["answer"], percent(b["probability"]), b["leads"], percent(b["then"]))
         for b in step["answers"]
     ]
-    return _in_order(told)
+    return _in_order(choices)
 
 
 def _which(instances: Sequence[Answer]) -> tuple[Choice, ...]:
@@ -459,7 +460,7 @@ def _which(instances: Sequence[Answer]) -> tuple[Choice, ...]:
     return (*found, none)
 
 
-def _told_next(step: Answer, tests: Sequence[Answer]) -> CardNextStep:
+def _next_of(step: Answer, tests: Sequence[Answer]) -> CardNextStep:
     test = next((test for test in tests if test["id"] == step["test"]), None)
     safe = step.get("make_safe", ())
     return CardNextStep(

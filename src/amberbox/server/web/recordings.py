@@ -146,8 +146,8 @@ def _questions() -> Iterator[Select[Any]]:
     yield select(INCIDENT.c.robot, count, func.max(INCIDENT.c.released_ns))
     yield select(FETCH.c.robot, count, func.max(FETCH.c.ended_ns), _states(FETCH.c.state),
                  func.sum(func.length(FETCH.c.files)))  # fmt: skip
-    told = ROW.c.channel.in_((channels.MISSION, channels.INCIDENT))
-    yield select(ROW.c.robot, count, func.max(ROW.c.log_ns)).where(told)
+    is_derived = ROW.c.channel.in_((channels.MISSION, channels.INCIDENT))
+    yield select(ROW.c.robot, count, func.max(ROW.c.log_ns)).where(is_derived)
 
 
 def _states(column: Any) -> Any:
@@ -309,14 +309,14 @@ def _total(lines: Sequence[RecordingsRow]) -> HeldRecordings:
 
 def _drawn(seen: CoverageBar, robot: str, window: Window) -> Mapping[str, Any]:
     label = catalogue().text("recordings.cover.label", robot=robot)
-    told = [_told(one) for one in seen.stretches]
-    bar = coverage(told, seen.axis, label=label, name=f"cover-{robot}", words=drawing_words())
+    drawn = [_described(one) for one in seen.stretches]
+    bar = coverage(drawn, seen.axis, label=label, name=f"cover-{robot}", words=drawing_words())
     recorded = any(one.kind == "recorded" for one in seen.stretches)
     return {"cover": seen, "bar": bar, "recorded": recorded, "window": window,
             "parts": parts(seen.stretches, _LISTED)}  # fmt: skip
 
 
-def _told(one: CoverageInterval) -> CoverageInterval:
+def _described(one: CoverageInterval) -> CoverageInterval:
     """Return an interval whose text also has its times, for the tooltip."""
     when = catalogue().text("recordings.cover.when", start=_utc(one.start), to=_utc(one.to))
     return CoverageInterval(one.start, one.to, one.kind, f"{one.text} {when}".strip())
@@ -452,9 +452,10 @@ class DownloadRow:
 
 @download_routes.get("/downloads", "data.download", each=True)
 def show_downloads(
-    request: Request, fleet: Fleet, who: Who, robot: Names = _NONE, mission: Names = _NONE,
-    item: Names = _NONE, from_: Annotated[Text, Query(alias="from")] = "", to: Text = "",
-    format: Text = "csv", after: Text = "", all: bool = False,
+    request: Request, fleet: Fleet, who: Who, robot: TextList = _NONE,
+    mission: TextList = _NONE, item: TextList = _NONE,
+    from_: Annotated[Text, Query(alias="from")] = "", to: Text = "", format: Text = "csv",
+    after: Text = "", all: bool = False,
 ) -> Response:  # fmt: skip
     """Show one's downloads, and the form for a new one."""
     options = _options(fleet)

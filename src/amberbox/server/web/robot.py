@@ -46,7 +46,6 @@ from amberbox.server.services.robots import (
     status_without_folder,
 )
 from amberbox.server.web import components
-from amberbox.server.web import components as robottree
 from amberbox.server.web.components import Show, branch_id, called, failing, groups
 from amberbox.server.web.diagnosis_card import DiagnosisCard, current_card
 from amberbox.server.web.page import PageRoutes, render
@@ -149,7 +148,7 @@ def _ago(seconds: int) -> str:
 def _lane(robot: str, lane: Lane, names: Mapping[str, str]) -> drawing.TimelineLane:
     stretches = tuple(
         drawing.StateInterval(
-            ns_of(one.from_), ns_of(one.to), one.level, _said(one), _data(robot, one)
+            ns_of(one.from_), ns_of(one.to), one.level, _stretch_text(one), _data(robot, one)
         )
         for one in lane.stretches
     )
@@ -162,7 +161,7 @@ def _name(lane: Lane, names: Mapping[str, str]) -> str:
     return names.get(lane.component) or called(lane.component)
 
 
-def _said(one: Stretch) -> str:
+def _stretch_text(one: Stretch) -> str:
     words_ = [one.reason or readable(one.state)]
     if one.changes:
         words_.append(catalogue().text("robot.time.changes", n=one.changes))
@@ -300,28 +299,28 @@ async def show_battery(request: Request, fleet: Fleet, who: Who, robot: OfRobot)
 
 
 def _show(request: Request, template: str, **shown: Any) -> Response:
-    return render(request, template, rt=robottree, **{"fill": NO_FILLS, **shown})
+    return render(request, template, rt=components, **{"fill": NO_FILLS, **shown})
 
 
 def _tree(tree: StatusTree, look: RobotQuery) -> Mapping[str, Any]:
     return {
         "tree": tree,
-        "branches": robottree.branches(tree, look.q, look.show, look.chosen),
-        "names": robottree.names(tree.components),
+        "branches": components.branches(tree, look.q, look.show, look.chosen),
+        "names": components.names(tree.components),
     }  # fmt: skip
 
 
 def _graph(tree: StatusTree) -> Mapping[str, Any]:
     label = catalogue().text("robot.graph.label", robot=tree.robot)
     return {
-        "drawn": robottree.graph(tree.components, label),
-        "lines": robottree.as_list(tree.components),
+        "drawn": components.graph(tree.components, label),
+        "lines": components.as_list(tree.components),
     }
 
 
 def _times(fleet: Services, robot: KnownRobot, look: RobotQuery, tree: StatusTree) -> TimelineView:
     found = read_timeline(fleet, robot, f"now-{look.window}", "now", points=_POINTS)
-    return times(robot.id, found, look.lanes, robottree.names(tree.components))
+    return times(robot.id, found, look.lanes, components.names(tree.components))
 
 
 def _events(fleet: Services, robot: KnownRobot, kind: str, may: bool) -> Mapping[str, Any]:
@@ -452,7 +451,7 @@ def battery_outputs(component: Component | None, shown: str) -> BatteryOutputs |
 
 async def battery_hour(fleet: Services, who: Caller, robot: str) -> BatteryHour | None:
     """Return the battery in the last hour; None if nothing of it is recorded."""
-    ask = _Asking(fleet, who, robot)
+    ask = _WorkerQueries(fleet, who, robot)
     items = [one["name"] for one in await ask("items") if "battery" in one["name"].casefold()]
     for item in items:
         columns = (await ask("item", item=item))["columns"]
@@ -526,14 +525,14 @@ def _last_flag(numbers: Sequence[float | None]) -> bool | None:
 
 
 @dataclass(frozen=True, slots=True)
-class _Asking:
+class _WorkerQueries:
     fleet: Services
     who: Caller
     robot: str
 
     async def __call__(self, op: str, **more: str) -> Any:
         about = {"robot": self.robot, **more}
-        answer = await self.fleet.worker_pool.ask(f"{WORKER}:{op}", about, asker=self.who.person)
+        answer = await self.fleet.worker_pool.ask(f"{WORKER}:{op}", about, origin=self.who.person)
         return msgspec.json.decode(answer)
 
     async def values(
@@ -544,7 +543,7 @@ class _Asking:
         names = list(variables)
         question = RowQuery(self.robot, item, names, now_ns - BACK_NS, now_ns, points=POINTS)
         about = arguments(question)
-        answer = await self.fleet.worker_pool.ask(f"{WORKER}:query", about, asker=self.who.person)
+        answer = await self.fleet.worker_pool.ask(f"{WORKER}:query", about, origin=self.who.person)
         body = msgspec.json.decode(answer[4 + int.from_bytes(answer[:4], "little") :])
         return dict(_series(body, names))
 

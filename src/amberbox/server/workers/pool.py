@@ -36,9 +36,9 @@ _HINT = "ask again in a moment"
 
 
 class FairQueue:
-    """A task queue with round-robin between askers, so that many tasks of one do not block others.
+    """A task queue with round-robin between origins, so that many tasks of one do not block others.
 
-    ``at_once`` limits the running tasks per asker, so that others find a free worker.
+    ``at_once`` limits the running tasks per origin, so that others find a free worker.
     """
 
     def __init__(self, most: int, each: int, at_once: int | None = None) -> None:
@@ -46,57 +46,57 @@ class FairQueue:
         self._each = each
         self._at_once = at_once
         self._at_work: Counter[str] = Counter()
-        self._askers: OrderedDict[str, deque[WorkerTask]] = OrderedDict()
+        self._origins: OrderedDict[str, deque[WorkerTask]] = OrderedDict()
         self._changed = threading.Condition()
         self._closed = False
 
     def add(self, task: WorkerTask) -> None:
         """Add a task. Raises BusyError when the queue is full."""
         with self._changed:
-            mine = self._askers.get(task.asker, ())
-            if self._closed or sum(map(len, self._askers.values())) >= self._most:
+            mine = self._origins.get(task.origin, ())
+            if self._closed or sum(map(len, self._origins.values())) >= self._most:
                 raise BusyError("the server has too many questions to answer", _HINT)
-            if task.asker and len(mine) >= self._each:
+            if task.origin and len(mine) >= self._each:
                 raise BusyError(f"{len(mine)} of your questions wait already", _HINT)
-            self._askers.setdefault(task.asker, deque()).append(task)
+            self._origins.setdefault(task.origin, deque()).append(task)
             self._changed.notify()
 
     def take(self) -> WorkerTask | None:
-        """Wait for the next task: the oldest of the asker who waits longest; None when closed.
+        """Wait for the next task: the oldest of the origin that waits longest; None when closed.
 
         Call ``done`` with it when it has ended.
         """
         with self._changed:
             self._changed.wait_for(lambda: self._closed or self._next() is not None)
-            asker = self._next()
-            if self._closed or asker is None:
+            origin = self._next()
+            if self._closed or origin is None:
                 return None
-            mine = self._askers.pop(asker)
+            mine = self._origins.pop(origin)
             task = mine.popleft()
             if mine:
-                self._askers[asker] = mine
-            self._at_work[asker] += 1
+                self._origins[origin] = mine
+            self._at_work[origin] += 1
             return task
 
     def done(self, task: WorkerTask) -> None:
         """Note that a task has ended."""
         with self._changed:
-            self._at_work[task.asker] -= 1
+            self._at_work[task.origin] -= 1
             self._at_work += Counter()  # drops zero counts
             self._changed.notify()
 
     def _next(self) -> str | None:
-        """Return the asker whose turn it is, or None."""
+        """Return the origin whose turn it is, or None."""
         most = self._at_once
-        free = (one for one in self._askers if most is None or self._at_work[one] < most)
+        free = (one for one in self._origins if most is None or self._at_work[one] < most)
         return next(free, None)
 
     def close(self) -> list[WorkerTask]:
         """Close the queue, which releases waiting workers; return the remaining tasks."""
         with self._changed:
             self._closed = True
-            left = [task for mine in self._askers.values() for task in mine]
-            self._askers.clear()
+            left = [task for mine in self._origins.values() for task in mine]
+            self._origins.clear()
             self._changed.notify_all()
             return left
 
@@ -258,10 +258,10 @@ class WorkerPool:
     ``op`` is ``"module:function"`` of a function ``(folder, arguments) -> bytes | Iterator[bytes]``
     in a module ``amberbox.server.*.worker*``; ``arguments`` are serialisable by msgpack. All
     methods raise the function's UsageError and AmberboxError, LimitError beyond the limits,
-    BusyError when too many wait. ``asker`` is the origin of the task: askers take turns.
+    BusyError when too many wait. ``origin`` is who the task is for: origins take turns.
 
     At most ``most`` tasks wait: fewer than the server has threads that answer people, or those
-    could all wait. ``each`` limits the waiting tasks of one asker, ``at_once`` its running ones.
+    could all wait. ``each`` limits the waiting tasks of one origin, ``at_once`` its running ones.
     """
 
     @classmethod
@@ -334,28 +334,28 @@ class WorkerPool:
 
     async def ask(
         self, op: str, arguments: Mapping[str, Any], limit_s: float = LIMIT_S,
-        memory_bytes: int = MEMORY_BYTES, *, asker: str = "",
+        memory_bytes: int = MEMORY_BYTES, *, origin: str = "",
     ) -> bytes:  # fmt: skip
         """Return the answer; cancellation stops the worker that runs it."""
         answer = bytearray()
         sink = partial(_append, answer)
-        await self._wait(WorkerTask(op, arguments, sink, limit_s, memory_bytes, asker))
+        await self._wait(WorkerTask(op, arguments, sink, limit_s, memory_bytes, origin))
         return bytes(answer)
 
     def ask_now(
         self, op: str, arguments: Mapping[str, Any], limit_s: float = LIMIT_S,
-        memory_bytes: int = MEMORY_BYTES, *, asker: str = "",
+        memory_bytes: int = MEMORY_BYTES, *, origin: str = "",
     ) -> bytes:  # fmt: skip
         """Return the answer; blocks the calling thread."""
         answer = bytearray()
-        task = WorkerTask(op, arguments, partial(_append, answer), limit_s, memory_bytes, asker)
+        task = WorkerTask(op, arguments, partial(_append, answer), limit_s, memory_bytes, origin)
         self.submit(task)
         task.done.result()
         return bytes(answer)
 
     async def ask_file(
         self, op: str, arguments: Mapping[str, Any], limit_s: float = LIMIT_S,
-        memory_bytes: int = MEMORY_BYTES, *, asker: str = "", most_bytes: int = 1 << 30,
+        memory_bytes: int = MEMORY_BYTES, *, origin: str = "", most_bytes: int = 1 << 30,
     ) -> IO[bytes]:  # fmt: skip
         """Return a long answer as a temporary file, deleted when it is closed.
 
@@ -371,7 +371,7 @@ class WorkerPool:
             file.write(part)
 
         try:
-            await self._wait(WorkerTask(op, arguments, write, limit_s, memory_bytes, asker))
+            await self._wait(WorkerTask(op, arguments, write, limit_s, memory_bytes, origin))
         except BaseException:
             file.close()
             raise
@@ -382,7 +382,7 @@ class WorkerPool:
         """Start the workers soon after the server, so that the first query need not wait."""
         await asyncio.sleep(_WARM_S)
         count = len(self._processes)
-        ready = (self.ask(_READY, {}, asker=f"warm-{number}") for number in range(count))
+        ready = (self.ask(_READY, {}, origin=f"warm-{number}") for number in range(count))
         await asyncio.gather(*ready, return_exceptions=True)
         await asyncio.Event().wait()
 

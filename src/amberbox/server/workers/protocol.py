@@ -84,8 +84,8 @@ class WorkerTask:
     """A task: ``op`` is ``module:function``; ``arguments`` are serialisable by msgpack.
 
     ``limit_s`` counts from the start of the task; with ``step_s``, which the sink may change, from
-    the last part. ``asker`` is for the fair queue. ``exit_code`` is that of a worker that died over
-    it.
+    the last part. ``origin`` is for the fair queue. ``exit_code`` is that of a worker that died
+    over it.
     """
 
     op: str
@@ -93,7 +93,7 @@ class WorkerTask:
     sink: Sink
     limit_s: float
     memory_bytes: int
-    asker: str = ""
+    origin: str = ""
     step_s: float | None = None
     exit_code: int | None = None
     done: Future[None] = field(default_factory=Future)

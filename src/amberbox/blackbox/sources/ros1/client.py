@@ -149,7 +149,7 @@ class RosSubscriber:
         self._master = RosMaster(settings)
         self._subscriptions: dict[str, TopicSubscription] = {}
         self._registered: set[str] = set()
-        self._unheard_since: dict[str, float] = {}
+        self._silent_since: dict[str, float] = {}
         self._updates: SimpleQueue[Update | None] = SimpleQueue()
         self._node: NodeServer | None = None
         self._own_uri = ""
@@ -157,8 +157,8 @@ class RosSubscriber:
         self._ending = threading.Event()
         self._changing = threading.Lock()
         self._building = threading.Lock()
-        self._asked_ns = NEVER_NS
-        self._asked_nodes: set[str] = set()
+        self._queried_ns = NEVER_NS
+        self._queried_nodes: set[str] = set()
         remembered = set(self._memory.topics()) if settings.all_topics else set()
         for topic in topics.keys() | (remembered - NOT_FOLLOWED):
             self._subscribe(topic)
@@ -236,20 +236,20 @@ class RosSubscriber:
                             self._subscribe(topic)
             self._register(graph)
             self._poll(asked_ns, graph)
-            self._asked_ns = asked_ns
+            self._queried_ns = asked_ns
             if self._settings.all_topics:
-                self._ask_forgotten_nodes(graph)
+                self._query_forgotten_nodes(graph)
         except RosError as error:
             self._failures += 1
             if not self._ending.is_set():
                 self._reports.master_lost(self._settings.master_uri, error)
 
-    def _ask_forgotten_nodes(self, graph: SystemState) -> None:
+    def _query_forgotten_nodes(self, graph: SystemState) -> None:
         """Request the other topics of connected nodes that the master does not list, once each."""
         found: dict[str, set[str]] = {}
         for topic, subscription in list(self._subscriptions.items()):
-            for uri in subscription.unlisted(graph.publishers.get(topic, ())) - self._asked_nodes:
-                self._asked_nodes.add(uri)
+            for uri in subscription.unlisted(graph.publishers.get(topic, ())) - self._queried_nodes:
+                self._queried_nodes.add(uri)
                 with suppress(RosError):  # its open connections go on
                     for other in publications(uri, self._settings):
                         found.setdefault(other, set()).add(uri)
@@ -262,7 +262,7 @@ class RosSubscriber:
     def _subscribe(self, topic: str) -> None:
         self._subscriptions[topic] = TopicSubscription(
             topic, self._sink, self._memory, self._settings, self._reports, self._building,
-            self._asked_ns,
+            self._queried_ns,
         )  # fmt: skip
 
     def _register(self, graph: SystemState) -> None:
@@ -292,9 +292,9 @@ class RosSubscriber:
             nodes = graph.publishers.get(topic, ())
             subscription.polled(asked_ns, nodes, self._master.node_uri)
             now_s = time.monotonic()
-            since_s = self._unheard_since.setdefault(topic, now_s)
+            since_s = self._silent_since.setdefault(topic, now_s)
             if nodes or subscription.peers():
-                del self._unheard_since[topic]
+                del self._silent_since[topic]
             elif now_s - since_s >= self._settings.unknown_after_s:
                 self._reports.unknown_topic(topic, graph.publishers.keys() - {topic})
 

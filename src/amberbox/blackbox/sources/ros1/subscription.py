@@ -264,17 +264,17 @@ class PublisherAbsence:
     """
 
     def __init__(self, start_ns: int) -> None:
-        self._asked_ns = start_ns
+        self._queried_ns = start_ns
         self._absent_ns: dict[str, int] = {}
 
     def polled(self, asked_ns: int, nodes: Collection[str]) -> None:
         """Update with the publishers that the master listed."""
         self._absent_ns = {node: self.absent_until_ns(node) for node in nodes}
-        self._asked_ns = asked_ns
+        self._queried_ns = asked_ns
 
     def absent_until_ns(self, node: str) -> int:
         """Return the last moment at which a node is known not to have published."""
-        return self._absent_ns.get(node, self._asked_ns)
+        return self._absent_ns.get(node, self._queried_ns)
 
 
 PATIENCE = 4  # failed attempts before a publisher that does not answer is worth an event
@@ -308,7 +308,7 @@ class RosEvents:
     def clear(self, *key: str) -> bool:
         """Allow troubles with this prefix of keys to be reported again; return whether any was."""
         with self._lock:
-            old = {said for said in self._reported if said[: len(key)] == key}
+            old = {reported for reported in self._reported if reported[: len(key)] == key}
             self._reported -= old
         return bool(old)
 
@@ -416,7 +416,7 @@ class TopicSubscription:
         self.absence = PublisherAbsence(since_ns)
         self._since_ns = since_ns
         self._nodes = {uri: node for node, uri in memory.nodes(topic).items()}
-        self._unheard = set(self._nodes.values())
+        self._silent = set(self._nodes.values())
         self._missing: set[str] = set()
         self._sink = sink
         self._memory = memory
@@ -564,7 +564,7 @@ class TopicSubscription:
             self._nodes[link.uri] = link.peer
             since_ns = self._absent_until_ns(link.peer)
             self._missing.discard(link.peer)
-            self._unheard.discard(link.peer)
+            self._silent.discard(link.peer)
             self._sink.link_up(self.topic, link.peer, since_ns)
         is_known = self._memory.knows(self.topic, link.peer, link.uri)
         self._memory.remember(self.topic, link.peer, link.uri)
@@ -633,7 +633,7 @@ class TopicSubscription:
 
     def _absent_until_ns(self, node: str) -> int:
         """Return since when a node may have published without a connection."""
-        if node in self._unheard:
+        if node in self._silent:
             return self._since_ns
         return self.absence.absent_until_ns(node)
 

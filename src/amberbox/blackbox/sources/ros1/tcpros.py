@@ -396,7 +396,7 @@ class PublisherLink:
             return f"malformed data: {error.what}", self._now_ns()
         except OSError as error:
             self._count_use(reader)
-            return f"connection lost: {error.strerror}", self._last_heard_ns(reader)
+            return f"connection lost: {error.strerror}", self._last_received_ns(reader)
         self._count_use(reader)
         return ENDED, self._now_ns()
 
@@ -404,7 +404,7 @@ class PublisherLink:
         if reader.has_read:
             self.failures = 0
 
-    def _last_heard_ns(self, reader: ConnectionReader) -> int:
+    def _last_received_ns(self, reader: ConnectionReader) -> int:
         """Return when the peer was last known to be alive, by data or keep-alive answers."""
         silence_ns = round((self._settings.dead_after_s + 1) * NS)
         return max(reader.last_ns, self._now_ns() - silence_ns)
