@@ -1,4 +1,4 @@
-"""Run all checks, one after the other; a failing check is reported and the rest runs."""
+"""Run all checks one after the other; a check that raises an error is reported, and the others run."""
 
 from __future__ import annotations
 

@@ -33,7 +33,7 @@ def clock(subject: ExaminedRobot, host: HostSystem) -> Iterator[DoctorFinding]:
 
 
 def judged_clock(synchronised: bool | None, daemon: str) -> DoctorFinding:
-    """Judge the kernel's synchronisation state and the running time daemon."""
+    """Check the kernel's synchronisation state and the running time daemon."""
     if synchronised:
         return ok("clock", f"synchronised ({daemon or 'by a program that is not known here'})")
     hint = "the record can be compared with other clocks only once this one is set"
@@ -66,7 +66,7 @@ def power(subject: ExaminedRobot, host: HostSystem) -> Iterator[DoctorFinding]:
 
 
 def judged_power(watching: list[str], known: list[str]) -> DoctorFinding:
-    """Judge the blocks that monitor power, and the supplies that the kernel knows."""
+    """Check the blocks that monitor power against the supplies known to the kernel."""
     if watching:
         return ok("power", f"watched by {', '.join(watching)}")
     if known:

@@ -154,9 +154,9 @@ def _observe_array(shape: Shape, value: list[Any], depth: int) -> None:
 
 
 def column_kind(shape: Shape) -> str:
-    """Return the kind of a place: a column type, ``nested``, ``children``, or '' for nothing.
+    """Return the kind of a place: a column type, ``nested``, ``children``, or '' for no column.
 
-    Columns of mixed kinds are ``text``: strings as they are, everything else as JSON.
+    Columns of mixed kinds are ``text``: strings unchanged, all other values as JSON.
     """
     kinds = shape.values()
     if len(kinds) != 1:

@@ -60,7 +60,9 @@ OnDamage = Callable[[int, int, str], None]  # called with offset, length and rea
 
 
 class BagRecord(NamedTuple):
-    """A record's header fields and the place of its data; ``end`` may lie behind the file's."""
+    """A record's header fields and the offset of its data; ``end`` may be beyond the end of the
+    file.
+    """
 
     offset: int
     operation: int

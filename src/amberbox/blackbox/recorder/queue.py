@@ -1,7 +1,8 @@
 """The recorder's queue, and the streams and items whose messages pass through it.
 
-The queue is bounded and never blocks a live source; every drop is counted. A batch is filtered by
-the rate limit; then schemas are inferred from the rest; then unchanged messages are dropped.
+The queue is bounded and never blocks a live source; every drop is counted. A batch first passes the
+rate limit; then schemas are inferred from the remaining messages; then unchanged messages are
+dropped.
 """
 
 from __future__ import annotations
@@ -363,7 +364,7 @@ class MessageQueue:
             self._queue.append((stream, data, received_ns))
 
     def _is_full_for(self, size: int) -> bool:
-        """Return whether there is no room; an empty queue accepts one message of any size."""
+        """Return whether the queue is full; an empty queue accepts one message of any size."""
         used = self._bytes + self._waiting_bytes
         return used > 0 and used + size > self.limit_bytes
 

@@ -266,7 +266,7 @@ class RetentionProcess:
             self._tell(f"cannot be started: {error.strerror}")
 
     def _tell(self, trouble: str) -> None:
-        """Emit an event once per trouble; recording goes on without segments."""
+        """Emit an event once per problem; recording continues without segments."""
         if trouble != self._trouble:
             self._trouble = trouble
             text = f"the keeper {trouble}; it is started again every {_PAUSE_S:.0f} s"
