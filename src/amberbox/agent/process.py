@@ -112,7 +112,9 @@ def print_line(text: str) -> None:
 
 @dataclass
 class ChildOutput:
-    """Prints lines of one child: ``BURST`` at once, ``PER_S`` over time; further lines are counted."""
+    """Prints lines of one child: ``BURST`` at once, ``PER_S`` over time; further lines
+    are counted.
+    """
 
     name: str
     say: Callable[[str], None] = print_line

@@ -47,14 +47,14 @@ _DIAGNOSED: Final = "a diagnosis is open"
 
 @dataclass(frozen=True, slots=True)
 class Observed:
-    """What is known of a robot, of which ``judge`` makes its status.
+    """The facts about a robot from which ``judge`` derives its status.
 
-    ``level`` is the worst of its components, ``reason`` what is worst. ``alarm`` is the highest
-    severity of the alarms that last, ``alarm_reason`` what that one is about; alarms that tell of
-    its absence are none of them. ``diagnosed``: a diagnosis is open and something of what it
-    explains is still seen; ``effect`` is what that leaves of the robot, as far as it is worked
-    out. ``as_of`` is when the newest of this was measured, as text (RFC 3339). ``delay_s`` is how
-    late overloaded monitoring evaluates.
+    ``level`` is the worst of its components, ``reason`` that of the worst one. ``alarm`` is the
+    highest severity of the active alarms, ``alarm_reason`` the reason of that one; alarms about its
+    absence do not count. ``diagnosed``: a diagnosis is open and at least one of its symptoms is
+    still present; ``effect`` is its effect on the robot, as far as it is known. ``as_of`` is when
+    the newest of these was measured, as text (RFC 3339). ``delay_s`` is the delay of overloaded
+    monitoring.
     """
 
     contact: Contact = "online"
@@ -76,12 +76,12 @@ class Observed:
 
 @dataclass(frozen=True, slots=True)
 class RobotStatus:
-    """How a robot is as a whole.
+    """The status of a robot as a whole.
 
-    ``level`` is ``unknown`` where nothing is known of now; then ``last_level`` is what it was when
-    it was last heard of, at ``as_of``. ``severity`` is what it could still do at ``as_of``, empty
-    where nothing keeps it from its work. ``text`` says all of this in a sentence, ``reason`` what
-    is worst. ``rank`` puts robots in order: the higher, the worse.
+    ``level`` is ``unknown`` if the present state is not known; then ``last_level`` is the level
+    when the robot was last connected, at ``as_of``. ``severity`` is what it could still do at
+    ``as_of``, empty if nothing limits it. ``text`` describes all of this in a sentence, ``reason``
+    is that of the worst component. ``rank`` is used to sort robots: the higher, the worse.
     """
 
     level: Level
@@ -129,9 +129,10 @@ def worst(levels: Iterable[Level]) -> Level:
 
 
 def components_level(components: Iterable[tuple[Level, str]]) -> Level:
-    """Return the worst level of components, each with its state; what has no monitor is left out.
+    """Return the worst level of components, each with its state; those without a monitor are left
+    out.
 
-    It is ``unknown`` where nothing is monitored.
+    It is ``unknown`` if nothing is monitored.
     """
     return worst(level for level, state in components if state != NOT_MONITORED)
 

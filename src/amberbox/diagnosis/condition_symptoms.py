@@ -38,9 +38,10 @@ from amberbox.diagnosis.fmea.model import Fmea
 
 @dataclass(slots=True)
 class AddressColumn:
-    """One address and its samples; ``index`` is the place in a list, None if it is none.
+    """One address and its samples; ``index`` is the index in a list, None if it is not a list
+    element.
 
-    Rows up to ``held_ns`` are held already: after ``resume`` they come again.
+    Rows up to ``held_ns`` are stored already: after ``resume`` they are delivered again.
     """
 
     item: str
@@ -57,7 +58,7 @@ class AddressColumn:
         return cls(item, name, int(place.rstrip("]")) if bracket else None)
 
     def extend(self, times_ns: IntArray, values: Any) -> None:
-        """Append values, without those that are held already."""
+        """Append values, without those that are stored already."""
         if self.held_ns is not None and len(times_ns) and times_ns[0] <= self.held_ns:
             new = times_ns > self.held_ns
             times_ns, values = times_ns[new], values[new]
@@ -88,7 +89,7 @@ class AddressColumns:
 
     @property
     def items(self) -> frozenset[str]:
-        """Names of the items whose rows are read; child tables come with the item above them."""
+        """Names of the items whose rows are read; child tables are read with their parent item."""
         return frozenset(name for item in self._by_item for name in with_parents(item))
 
     def samples(self) -> dict[str, Samples]:
@@ -156,12 +157,12 @@ def _pairs(samples: Samples) -> list[list[Any]]:
 QUARTER_NS = NS // 4
 """Conditions are looked at at multiples of this."""
 FRESH_NS = 5 * NS
-"""What is older is not known."""
+"""Older values count as unknown."""
 _MARGIN_NS = NS
 _BLOCK_NS = 30 * NS
 """So much of the record is looked at together."""
 _FEW = 2
-"""Up to so many instants are evaluated one by one."""
+"""Up to this number of instants are evaluated one by one."""
 _FORGET_NS = 2 * NS
 _WRONG = (ExpressionError, ValueError, TypeError)
 """What values of a type that a condition cannot use make of it."""

@@ -1,4 +1,6 @@
-"""Run all checks one after the other; a check that raises an error is reported, and the others run."""
+"""Run all checks one after the other; a check that raises an error is reported, and the
+others run.
+"""
 
 from __future__ import annotations
 

@@ -299,7 +299,9 @@ class UlogReader:
         self._subscriptions, self._last_us = self.state.subscriptions, self.state.last_us
 
     def read(self, block: bytes) -> tuple[int, bool]:
-        """Read the complete records of a block; return the bytes read, and whether there is damage."""
+        """Read the complete records of a block; return the bytes read, and whether there
+        is damage.
+        """
         at, end = 0, len(block)
         while at + 3 <= end:
             size, kind = HEAD(block, at)

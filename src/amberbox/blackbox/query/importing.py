@@ -49,7 +49,9 @@ _WRITERS = (*(writer for writer in FOLDERS if writer != "main"), "main")
 
 @dataclass(frozen=True, slots=True)
 class StagedStore(Store):
-    """A store with new journals in a separate folder, but the names, locks and runs of the store."""
+    """A store with new journals in a separate folder, but the names, locks and runs of
+    the store.
+    """
 
     def folder(self, writer: str) -> Path:
         """Return the folder of a writer's journal until the import is complete."""

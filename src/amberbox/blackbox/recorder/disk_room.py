@@ -48,7 +48,9 @@ class DiskRoom:
         return self._wanted_bytes // 8
 
     def begin(self) -> None:
-        """Allocate the reserve, unless the previous run released it or there is too little space."""
+        """Allocate the reserve, unless the previous run released it or there is too
+        little space.
+        """
         self.release_if_tight()
         self.update()
         short = self._wanted_bytes - (self._size() or 0)

@@ -580,7 +580,7 @@ class Triggers:
 
 
 def _until(watch: _Watch, part: RunSlice) -> int:
-    """Return up to when a trigger can be evaluated: the watcher writes slightly later than others."""
+    """Return up to when a trigger can be evaluated: the watcher writes slightly later."""
     if part.watched_ns is None or not watch.reads_watch:
         return part.until_ns
     return min(part.until_ns, max(part.watched_ns, part.until_ns - _PATIENCE_NS))

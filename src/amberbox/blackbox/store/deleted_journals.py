@@ -1,4 +1,4 @@
-"""Rows of journals whose file is gone, out of segments, in the order they came."""
+"""Rows of journals whose file was deleted, read from segments in their original order."""
 
 from __future__ import annotations
 
@@ -254,7 +254,7 @@ def gone_journals(known: Manifest, writer: str) -> list[DeletedJournal]:
 
 
 def _gone(known: Manifest, writer: str) -> Iterator[DeletedJournal]:
-    """Yield a writer's journals by the manifest; the best known version of each comes last."""
+    """Yield a writer's journals by the manifest; the best known version of each is the last one."""
     for sealed in known.sealed.values():
         if sealed.writer == writer:
             yield _of_file(sealed.journal, sealed, LOST)

@@ -1,6 +1,7 @@
-"""The box's own records: the newest ones, or all on some channels as they come.
+"""The box's own records: the newest ones, or all new ones on some channels.
 
-A journal is read from its end back and no further; of old files only those that hold any.
+A journal is read backwards from its end, as far as needed; of old files only those with such
+records.
 """
 
 from __future__ import annotations

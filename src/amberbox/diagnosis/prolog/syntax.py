@@ -121,7 +121,7 @@ class _Writer:
         return (glued or last is not None) and _would_join(before, text)
 
     def _parts(self, term: Term, most: int) -> list[_Open]:
-        """Return what a term is written as."""
+        """Return the parts of a term's written form."""
         term = deref(term)
         if isinstance(term, Struct):
             return self._struct(term, most)
@@ -359,7 +359,7 @@ _CLOSING = frozenset(")]},|")
 
 @dataclass(slots=True)
 class Sentence:
-    """A term up to its dot: the names of its variables, how often each stands there."""
+    """A term up to its dot: the names of its variables, and how often each occurs."""
 
     term: Term
     at: int
@@ -518,7 +518,7 @@ class _Reader:
         return Struct("{}", (inner,)) if token.value == "{" else inner
 
     def _argument(self) -> Term:
-        """Read what stands between the commas of a structure or a list."""
+        """Read an argument between the commas of a structure or a list."""
         outside, self.in_argument = self.in_argument, True
         term = self.term(1200)
         self.in_argument = outside
