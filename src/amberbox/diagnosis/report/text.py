@@ -47,7 +47,7 @@ def group_by_reasons(
 
 
 def reasons(seen: SeenSymptom, broken: ExplainedGroup | None) -> tuple[str, ...]:
-    """Return why a symptom follows: directly, or by what is lost on the way."""
+    """Return why a symptom follows from the cause: directly, or by lost functions."""
     faults = {
         fault.id: fault.text for m in (broken.members if broken else ()) for fault in m.faults
     }

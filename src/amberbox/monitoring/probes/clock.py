@@ -20,7 +20,7 @@ _UNSYNCHRONISED, _NANOSECONDS = 0x40, 0x2000  # STA_UNSYNC, STA_NANO
 
 
 class _Timex(ctypes.Structure):
-    """The beginning of the kernel's ``struct timex``, with room for the rest."""
+    """The beginning of the kernel's ``struct timex``, with padding for the remaining fields."""
 
     _fields_ = (
         ("modes", ctypes.c_uint),

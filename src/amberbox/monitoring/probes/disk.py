@@ -59,7 +59,7 @@ def judge(found: os.statvfs_result, mount: _MountPoint) -> Measured:
 
 
 def mount_of(path: Path, mountinfo: str) -> _MountPoint:
-    """Find the mount that a path lies on in ``/proc/self/mountinfo``; of equals the last one."""
+    """Find the mount of a path in ``/proc/self/mountinfo``; of several equal ones the last."""
     mounts = [_mount(line) for line in mountinfo.splitlines()]
     above = [mount for mount in mounts if path.is_relative_to(mount.point)]
     if not above:

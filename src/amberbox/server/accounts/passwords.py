@@ -68,10 +68,12 @@ LONGEST = 256
 _FEWEST_DIFFERENT = 6
 _FEWEST_LEFT = 4
 _FEWEST_GUESSES = 1e8
-"""So many attempts a password has to stand: zxcvbn calls that safely unguessable."""
+"""Least number of guesses that a password has to withstand: zxcvbn calls that safely
+unguessable.
+"""
 _LOOKED_AT = 32
 _MOST_SIGNS = 12
-"""Beyond so many characters, and so many different digits and signs, zxcvbn takes seconds."""
+"""Beyond this number of characters, or of different digits and signs, zxcvbn takes seconds."""
 _COMMON = (
     "|password|passwort|kennwort|contrasena|motdepasse|qwertyuiop|qwertzuiop|asdfghjkl|yxcvbnm"
     "|zxcvbnm|azertyuiop|qwerty|qwertz|azerty|letmein|welcome|willkommen|iloveyou|administrator|admin"
@@ -143,7 +145,7 @@ def _left(text: str, name: str) -> str:
 
 
 def _plain(text: str) -> str:
-    """Replace digits and signs by the letters they stand for; drop years and a tail of digits."""
+    """Replace digits and signs by the letters they stand for; drop years and trailing digits."""
     return re.sub(rf"{_YEAR}|[\d\W]+$", "", text).translate(_LEET)
 
 
