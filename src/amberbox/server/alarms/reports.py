@@ -89,9 +89,9 @@ def _told(row: LinkRow) -> ReportContent | None:
 
 
 _MARGIN_NS: Final = 10_000_000_000
-"""So much of what came before the last mark is looked at again: it may have been on its way."""
+"""Overlap before the last mark that is read again: its rows may have been in transit."""
 _AT_ONCE: Final = 100
-"""News in one transaction: others want to write, too."""
+"""Maximum number of reports in one transaction, so that other writers are not blocked."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,8 +163,9 @@ def offsets(
 ) -> Offsets:
     """Return the server's clock minus the robot's (ns) for the runs of some rows, None if unknown.
 
-    An offset that the link measured in a boot counts more than ``said``, the one from the robot's
-    hello. A robot that was never linked, such as a team watched by the server, has offset 0.
+    An offset that the link measured in a boot takes precedence over ``said``, the one from the
+    robot's hello. A robot that was never linked, such as a team watched by the server, has offset
+    0.
     """
     runs = {(one.robot, one.store_id, one.row.writer, one.row.run) for one in rows}
     boots = _boots(connection, runs)

@@ -178,7 +178,7 @@ def _do(
 
 
 def _refuse_nobody(connection: Connection, name: str) -> None:
-    """Refuse a name that nobody has, without saying which there are."""
+    """Refuse a name that no account has, without revealing existing names."""
     try:
         find_user(connection, name)
     except UsageError:

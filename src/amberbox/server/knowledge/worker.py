@@ -139,7 +139,9 @@ def fmea(folder: Path, arguments: dict[str, Any]) -> Any:
 
 @json_operation
 def fault_trees(folder: Path, arguments: dict[str, Any]) -> Any:
-    """Return the fault trees of all functions, or one with its cut sets and those closest now."""
+    """Return the fault trees of all functions, or one with its cut sets and those closest to
+    complete.
+    """
     return _trees(folder, _stores(folder), decode_question(arguments, AskTrees))
 
 
@@ -256,7 +258,7 @@ def _stores(folder: Path) -> _Stores:
 
 
 def _said(stores: _Stores, asked: RobotQuestion) -> str:
-    """Return the hash of the folder that the watcher used at the time asked for, or empty."""
+    """Return the hash of the folder that the watcher used at the requested time, or empty."""
     return evidence_at(stores, asked.robot, asked.at, asked.now_ns).config_hash if asked.at else ""
 
 
@@ -288,9 +290,9 @@ _SHOWN = 12
 def folder_at(
     folder: Path, database: ServerDatabase, robot: str, wanted: str, said: str
 ) -> tuple[DeclaredRobot, tuple[str, ...]]:
-    """Return what a robot's folder declares, and notes about which folder it is.
+    """Return the contents of a robot's folder, and notes about its version.
 
-    ``wanted`` is the hash that the caller asks for, ``said`` the one that the robot's watcher used
+    ``wanted`` is the hash that the caller requests, ``said`` the one that the robot's watcher used
     at the time; without either it is the folder that the robot stated last. Raises UsageError if
     the server has no such folder: another one would describe other monitors than those that ran.
     """
@@ -461,7 +463,7 @@ def answer_diagnosis(folder: Path, stores: _Stores, asked: AskDiagnosis) -> dict
 
 
 def _moment(stores: _Stores, asked: AskDiagnosis) -> EvidenceMoment:
-    """Return the evidence at the time asked for.
+    """Return the evidence at the requested time.
 
     For an earlier diagnosis without a time, that is the time of its chosen or last revision.
     """
@@ -511,7 +513,7 @@ def _as_revised(case: DiagnosisContext) -> DiagnosisContext:
 
 
 def _known(knowledge: Knowledge, said: RecordedFindings) -> RecordedFindings:
-    """Return the findings without symptoms that this folder's FMEA does not know."""
+    """Return the findings without symptoms that are not in this folder's FMEA."""
     names = knowledge.fmea.symptoms
     return RecordedFindings([s for s in said.symptoms if s.id in names], said.diagnoses)
 

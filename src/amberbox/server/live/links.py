@@ -1,6 +1,4 @@
-"""What is known of a robot's link and files: stores, clocks, signed heads, events, damaged
-files.
-"""
+"""State of a robot's link and files: stores, clocks, signed heads, events, damaged files."""
 
 from __future__ import annotations
 
@@ -21,7 +19,9 @@ _BOOTS = 50
 
 @dataclass(frozen=True, slots=True)
 class Store:
-    """A store of a robot; ``cursor`` is run and number up to which each writer is held for good."""
+    """A store of a robot; ``cursor`` is run and number up to which each writer's rows are durably
+    stored.
+    """
 
     store_id: str
     first_seen: str | None
@@ -41,7 +41,7 @@ class BootClock:
 
 @dataclass(frozen=True, slots=True)
 class SignedHead:
-    """A robot's signed statement of how far its record reached, as it came."""
+    """A robot's signed statement of the end of its record, unchanged."""
 
     store_id: str
     sha256: str
@@ -61,7 +61,7 @@ class LinkEvent:
 
 @dataclass(frozen=True, slots=True)
 class Link:
-    """A robot's link. ``aside`` counts rows that are kept apart, by reason."""
+    """A robot's link. ``aside`` counts rows that are stored separately, by reason."""
 
     robot: str
     online: bool
@@ -149,7 +149,9 @@ NEW_NS: Final = 24 * 3600 * NS
 
 @dataclass(frozen=True, slots=True)
 class DamagedFiles:
-    """How many files of a robot are set aside as damaged; ``new`` of them came lately."""
+    """Number of files of a robot that are set aside as damaged; ``new`` of them arrived
+    recently.
+    """
 
     count: int = 0
     new: int = 0

@@ -43,7 +43,7 @@ class TimelineInterval:
 
 @dataclass(frozen=True, slots=True)
 class ComponentTimeline:
-    """The lanes of a window; ``complete`` is false where there were too many events."""
+    """The lanes of a window; ``complete`` is false if there were too many events."""
 
     complete: bool
     lanes: Mapping[Lane, Sequence[TimelineInterval]]

@@ -1,6 +1,4 @@
-"""Health and metrics of the server itself: what is wrong with it, and figures in Prometheus' text
-format.
-"""
+"""Health and metrics of the server itself: its problems, and metrics in Prometheus' text format."""
 
 from __future__ import annotations
 
@@ -236,7 +234,7 @@ def find_troubles(services: Services) -> list[str]:
 
 
 def _refused(connection: Connection, since_ns: int) -> list[str]:
-    """Say of which journals no rows could be made lately: robot, file and what to do."""
+    """Return texts on journals that could not be converted recently: robot, file and remedy."""
     chosen = select(EVENT.c.robot, EVENT.c.text).where(EVENT.c.kind == KIND)
     newest = chosen.where(EVENT.c.at_ns >= since_ns).order_by(EVENT.c.at_ns.desc()).limit(_SHOWN)
     return [f"{row.robot}: {row.text}" for row in connection.execute(newest)]
@@ -244,17 +242,17 @@ def _refused(connection: Connection, since_ns: int) -> list[str]:
 
 @dataclass(frozen=True, slots=True)
 class Health:
-    """Whether the server answers; ``poor``: it does, and needs somebody soon."""
+    """Whether the server answers; ``poor``: it does, but needs attention soon."""
 
     status: Literal["ok", "poor", "bad"]
 
 
 @dataclass(frozen=True, slots=True)
 class ServerClock:
-    """The server's clock beside the confirmed time, by which recordings grow old.
+    """The server's clock beside the confirmed time, by which the age of recordings counts.
 
     ``jump``: ``ahead`` or ``behind``, nothing is deleted because of ``by_s`` until it is confirmed;
-    empty where both agree. ``text`` says so.
+    empty if both agree. ``text`` describes this.
     """
 
     time: str
@@ -266,7 +264,7 @@ class ServerClock:
 
 @dataclass(frozen=True, slots=True)
 class FileProblem:
-    """What is wrong in a file of a folder."""
+    """A problem in a file of a folder."""
 
     file: str
     line: int
@@ -292,7 +290,7 @@ class SystemComponent:
 
 @dataclass(frozen=True, slots=True)
 class SystemFolder:
-    """A team, or the system: whether it is watched, and what its watcher says."""
+    """A team, or the system: whether it is monitored, and the results of its watcher."""
 
     name: str
     state: str
@@ -338,7 +336,7 @@ def read_health(fleet: Services) -> Health:
 
 
 def server_clock(found: ClockComparison) -> ServerClock:
-    """Return the clock as it is shown."""
+    """Return the clock in its published form."""
     return ServerClock(
         format_time(found.wall_ns), format_time(found.age_ns), found.jump,
         found.ahead_ns / NS if found.jump else 0.0, found.text,

@@ -27,7 +27,7 @@ async def read_fmea(
     fleet: Services, who: Caller, robot: KnownRobot, at: str = "", config_hash: str = "",
     exposure_h: float | None = None,
 ) -> dict[str, Any]:  # fmt: skip
-    """Return the failure modes of a robot: the sheet, what matters most, what nobody sees."""
+    """Return the failure modes of a robot: the sheet, criticality, and undetected faults."""
     asked = RobotQuestion(robot=robot.id, now_ns=fleet.clock.wall_ns(), at=at,
                        config_hash=config_hash, exposure_h=exposure_h)  # fmt: skip
     return decode_answer(await ask_worker(fleet, who, "fmea", asked))
@@ -43,7 +43,7 @@ async def ask_worker(fleet: Services, who: Caller, name: str, asked: RobotQuesti
 
 @dataclass(frozen=True, slots=True)
 class Folder:
-    """A folder that a robot had; ``masked`` files had secrets in them when they came."""
+    """A version of a robot's folder; ``masked`` files contained secrets when they arrived."""
 
     config_hash: str
     received: str
@@ -62,7 +62,7 @@ class FolderList:
 
 
 def list_folders(fleet: Services, robot: KnownRobot) -> FolderList:
-    """List the folders that a robot had, as far as they are kept."""
+    """List the stored versions of a robot's folder."""
     current = fleet.folders.current(robot.id)
     found = fleet.folders.kept(robot.id)
     return FolderList(current, [_shown(folder, current) for folder in found])
@@ -76,7 +76,7 @@ def _shown(folder: KnownFolder, current: str) -> Folder:
 
 
 def decode_answer(answer: bytes) -> dict[str, Any]:
-    """Return an answer as it is sent."""
+    """Return an answer in its published form."""
     found: dict[str, Any] = json.loads(answer)
     return found
 
@@ -93,7 +93,7 @@ class TestAnswer:
 
 @dataclass(frozen=True, slots=True)
 class Cause:
-    """What it was, as somebody says."""
+    """The cause of a fault, as a person entered it."""
 
     failure_mode: str
     note: str
@@ -103,7 +103,9 @@ class Cause:
 
 @dataclass(frozen=True, slots=True)
 class ServerRevision:
-    """What the server made of it with an answer more; ``diagnosis`` is as asking gives it."""
+    """A diagnosis with a new ranking after an answer; ``diagnosis`` has the form of a
+    computed one.
+    """
 
     number: int
     who: str
@@ -113,7 +115,7 @@ class ServerRevision:
 
 @dataclass(frozen=True, slots=True)
 class DiagnosisDetail:
-    """All of a diagnosis: what the robot said, revision by revision, and what people added."""
+    """A diagnosis: the robot's revisions, and the entries of people."""
 
     id: str
     state: Literal["open", "healed"]
