@@ -76,12 +76,12 @@ class Observed:
 
 @dataclass(frozen=True, slots=True)
 class RobotStatus:
-    """The status of a robot as a whole.
+    """How a robot is as a whole.
 
-    ``level`` is ``unknown`` if the present state is not known; then ``last_level`` is the level
-    when the robot was last connected, at ``as_of``. ``severity`` is what it could still do at
-    ``as_of``, empty if nothing limits it. ``text`` describes all of this in a sentence, ``reason``
-    is that of the worst component. ``rank`` is used to sort robots: the higher, the worse.
+    ``level`` is ``unknown`` where nothing is known of now; then ``last_level`` is what it was when
+    it was last heard of, at ``as_of``. ``severity`` is what it could still do at ``as_of``, empty
+    where nothing keeps it from its work. ``text`` says all of this in a sentence, ``reason`` what
+    is worst. ``rank`` puts robots in order: the higher, the worse.
     """
 
     level: Level

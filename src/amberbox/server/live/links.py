@@ -19,9 +19,7 @@ _BOOTS = 50
 
 @dataclass(frozen=True, slots=True)
 class Store:
-    """A store of a robot; ``cursor`` is run and number up to which each writer's rows are durably
-    stored.
-    """
+    """A store of a robot; ``cursor`` is run and number up to which each writer is held for good."""
 
     store_id: str
     first_seen: str | None
@@ -41,7 +39,7 @@ class BootClock:
 
 @dataclass(frozen=True, slots=True)
 class SignedHead:
-    """A robot's signed statement of the end of its record, unchanged."""
+    """A robot's signed statement of how far its record reached, as it came."""
 
     store_id: str
     sha256: str
@@ -61,7 +59,7 @@ class LinkEvent:
 
 @dataclass(frozen=True, slots=True)
 class Link:
-    """A robot's link. ``aside`` counts rows that are stored separately, by reason."""
+    """A robot's link. ``aside`` counts rows that are kept apart, by reason."""
 
     robot: str
     online: bool

@@ -90,10 +90,9 @@ NotificationState = Literal["waiting", "held", "sent", "failed", "digested"]
 
 @dataclass(frozen=True, slots=True)
 class Notification:
-    """A message to one destination; ``trouble`` is why it was not delivered, ``due`` the next
-    attempt.
+    """A message to one destination; ``trouble`` is why it has not arrived, ``due`` when next.
 
-    Those that are ``held`` are sent in one digest, after which they are ``digested``.
+    Those that are ``held`` come in one digest, after which they are ``digested``.
     """
 
     number: int

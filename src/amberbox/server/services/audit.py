@@ -42,7 +42,7 @@ def read_head(fleet: Services) -> AuditHead:
 
 @dataclass(frozen=True, slots=True)
 class AuditHead:
-    """The head of the log. Stored elsewhere, ``text`` proves all rows up to there."""
+    """How far the log goes. Noted elsewhere, ``text`` proves all rows up to there."""
 
     seq: int
     hash: str

@@ -242,17 +242,17 @@ def _refused(connection: Connection, since_ns: int) -> list[str]:
 
 @dataclass(frozen=True, slots=True)
 class Health:
-    """Whether the server answers; ``poor``: it does, but needs attention soon."""
+    """Whether the server answers; ``poor``: it does, and needs somebody soon."""
 
     status: Literal["ok", "poor", "bad"]
 
 
 @dataclass(frozen=True, slots=True)
 class ServerClock:
-    """The server's clock beside the confirmed time, by which the age of recordings counts.
+    """The server's clock beside the confirmed time, by which recordings grow old.
 
     ``jump``: ``ahead`` or ``behind``, nothing is deleted because of ``by_s`` until it is confirmed;
-    empty if both agree. ``text`` describes this.
+    empty where both agree. ``text`` says so.
     """
 
     time: str
@@ -264,7 +264,7 @@ class ServerClock:
 
 @dataclass(frozen=True, slots=True)
 class FileProblem:
-    """A problem in a file of a folder."""
+    """What is wrong in a file of a folder."""
 
     file: str
     line: int
@@ -290,7 +290,7 @@ class SystemComponent:
 
 @dataclass(frozen=True, slots=True)
 class SystemFolder:
-    """A team, or the system: whether it is monitored, and the results of its watcher."""
+    """A team, or the system: whether it is watched, and what its watcher says."""
 
     name: str
     state: str

@@ -43,7 +43,7 @@ async def ask_worker(fleet: Services, who: Caller, name: str, asked: RobotQuesti
 
 @dataclass(frozen=True, slots=True)
 class Folder:
-    """A version of a robot's folder; ``masked`` files contained secrets when they arrived."""
+    """A folder that a robot had; ``masked`` files had secrets in them when they came."""
 
     config_hash: str
     received: str
@@ -93,7 +93,7 @@ class TestAnswer:
 
 @dataclass(frozen=True, slots=True)
 class Cause:
-    """The cause of a fault, as a person entered it."""
+    """What it was, as somebody says."""
 
     failure_mode: str
     note: str
@@ -103,9 +103,7 @@ class Cause:
 
 @dataclass(frozen=True, slots=True)
 class ServerRevision:
-    """A diagnosis with a new ranking after an answer; ``diagnosis`` has the form of a
-    computed one.
-    """
+    """What the server made of it with an answer more; ``diagnosis`` is as asking gives it."""
 
     number: int
     who: str
@@ -115,7 +113,7 @@ class ServerRevision:
 
 @dataclass(frozen=True, slots=True)
 class DiagnosisDetail:
-    """A diagnosis: the robot's revisions, and the entries of people."""
+    """All of a diagnosis: what the robot said, revision by revision, and what people added."""
 
     id: str
     state: Literal["open", "healed"]

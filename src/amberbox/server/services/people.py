@@ -79,7 +79,7 @@ def describe_groups(connection: Connection, names: list[str]) -> list[Group]:
 
 @dataclass(frozen=True, slots=True)
 class Token:
-    """A token in a list: its secret begins with ``prefix`` and is never shown again."""
+    """A token as it is listed: its secret begins with ``prefix`` and is never shown again."""
 
     id: str
     name: str
