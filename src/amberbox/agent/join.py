@@ -217,7 +217,7 @@ def _text_of(folder: Path) -> str:
 
 
 def _tried(folder: RobotFolder, line: JoinLine, clock: Clock) -> tuple[bool, tuple[str, ...]]:
-    """Connect once; return whether that worked, and lines for the user."""
+    """Connect once; return whether it succeeded, and lines for the user."""
     options = LinkOptions(line.url, line.robot, line.key, line.ca, config_hash=folder.config_hash)
     store = create_store(folder.store_path)
     try:

@@ -150,7 +150,7 @@ class ChildLifecycle:
         return self.state == "running"
 
     def want(self, now_s: float) -> None:
-        """Start it if it is off."""
+        """Start it if it does not run."""
         if self.state == "off":
             self.state, self._due_s = "waiting", now_s
 

@@ -286,7 +286,7 @@ class LayoutBox:
 
 @dataclass(frozen=True, slots=True)
 class LayoutGaps:
-    """How much is left between ranks, and between boxes of one rank."""
+    """The space between ranks, and between boxes of one rank."""
 
     ranks: float = 64
     boxes: float = 16
@@ -471,7 +471,7 @@ def _points(items: Sequence[int], spots: Mapping[int, _Spot], port: float) -> li
 
 
 def _loop(spot: _Spot) -> list[Point]:
-    """Return the line of a box to itself: out at its far end and back beside."""
+    """Return the line from a box to itself: out at its far end and back at its side."""
     return [(spot.far, spot.middle + spot.size / 4), (spot.far, spot.middle - spot.size / 4)]
 
 

@@ -226,7 +226,9 @@ class _Reader:
 
 
 def _merged(node: Node) -> Iterator[tuple[str, Node]]:
-    """Yield what ``<<: *base`` or ``<<: [*a, *b]`` brings in; of several the first one counts."""
+    """Yield the keys merged by ``<<: *base`` or ``<<: [*a, *b]``; of several the first one
+    counts.
+    """
     for part in reversed(node.items or (node,)):
         yield from (part.mapping or {}).items()
 

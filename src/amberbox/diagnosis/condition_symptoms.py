@@ -155,7 +155,7 @@ def _pairs(samples: Samples) -> list[list[Any]]:
 
 
 QUARTER_NS = NS // 4
-"""Conditions are looked at at multiples of this."""
+"""Conditions are evaluated at multiples of this."""
 FRESH_NS = 5 * NS
 """Older values count as unknown."""
 _MARGIN_NS = NS

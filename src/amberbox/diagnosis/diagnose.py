@@ -89,9 +89,9 @@ def measured(symptom: Symptom) -> Measured:
 
 
 def evidence_of_situation(knowledge: Knowledge, situation: ObservedSituation) -> Evidence:
-    """Return the evidence that counts of a situation.
+    """Return the evidence of a situation that counts.
 
-    Raises UsageError for an answer to an unknown test, or that the test does not have.
+    Raises UsageError for an answer to an unknown test, or an unknown answer.
     """
     counting = (_asked(symptom) for symptom in situation.symptoms if not symptom.blocked_by)
     found = collect_evidence(counting, situation.conflicts)

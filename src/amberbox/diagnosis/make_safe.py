@@ -28,9 +28,10 @@ _CLAUSE_ENDS = re.compile(r"\s*[;,.]\s+")
 
 @dataclass(frozen=True, slots=True)
 class MakeSafeAction:
-    """An action before every test, in the FMEA's words, with the failure modes it is against.
+    """An action before every test, as worded in the FMEA.
 
-    ``faults`` are failure modes, ``probability`` that of the most probable of the worst.
+    ``faults`` are the failure modes it protects against, ``probability`` that of the most probable
+    of the worst.
     """
 
     text: str

@@ -135,7 +135,9 @@ class SymptomPresence:
             self._hide(at_ns)
 
     def _hide(self, at_ns: int) -> None:
-        """Suspend forgetting for a limited time: unknown or blocked, it is not seen to be gone."""
+        """Suspend the hold time for a limited time: an unknown or blocked symptom is not observed
+        as gone.
+        """
         if self.left_ns is None:
             self.left_ns = self.hold_ns if self.until_ns is None else self.until_ns - at_ns
             self.until_ns = at_ns + self.remember_ns + self.left_ns
@@ -162,7 +164,7 @@ class SymptomPresence:
         return self.left_ns is None and self.is_absent
 
     def forget(self, at_ns: int) -> None:
-        """Remember it no longer than to an instant."""
+        """Limit the time for which it is remembered to an instant."""
         if self.until_ns is not None:
             self.until_ns = min(self.until_ns, at_ns)
 
@@ -352,7 +354,7 @@ def _causes(fmea: Fmea) -> Iterator[tuple[str, list[SymptomLink]]]:
 
 
 def _shown_below(fmea: Fmea, structure: DependencyStructure, name: str) -> list[SymptomLink]:
-    """Return what shows when something is lost, and what may be lost with it."""
+    """Return the symptoms of a loss, and those of other losses that may follow from it."""
     lost = sorted({name} | structure.dependents([name]))
     return [link for one in lost if one in fmea.functions for link in fmea.functions[one].symptoms]
 

@@ -81,7 +81,7 @@ Upto = Annotated[dict[Name, JournalPosition], Meta(max_length=8)]
 
 
 class FrameError(ValueError):
-    """Invalid data instead of a frame: damaged, too large, or of another protocol."""
+    """Data that are not a valid frame: damaged, too large, or of another protocol."""
 
 
 class LinkRow(Struct, frozen=True, array_like=True):

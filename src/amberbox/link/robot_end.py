@@ -34,7 +34,7 @@ class OutOfStepError(Exception):
 
 @dataclass(slots=True)
 class _Reading:
-    """How far a writer was read: its backlog, and its new rows."""
+    """The reading position of a writer: its backlog, and its new rows."""
 
     backlog_at: JournalPosition
     join: JournalPosition

@@ -158,7 +158,9 @@ class LeadingAnswer:
         return faults_text(share, self.probability) if share else ""
 
     def is_one(self, share: CauseSets) -> bool:
-        """Return whether alarms with these causes are one: all failure modes known and likely."""
+        """Return whether alarms with these causes are merged: all failure modes known and
+        likely.
+        """
         known = bool(share) and all(
             faults and all(fault in self.facts for fault in faults) for faults in share
         )
@@ -268,7 +270,7 @@ class DiagnosedAlarms:
         return {"alarms": self._alarms.snapshot(now_ns), "due_ns": self._due_ns, "had": had}
 
     def resume(self, snapshot_values: Mapping[str, Any]) -> None:
-        """Go on from what ``snapshot`` returned."""
+        """Continue from the values that ``snapshot`` returned."""
         self._alarms.resume(snapshot_values["alarms"])
         self._due_ns, self._had = dict(snapshot_values["due_ns"]), set(snapshot_values["had"])
 

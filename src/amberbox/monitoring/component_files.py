@@ -223,7 +223,7 @@ class OutputOptions:
 
 @dataclass(frozen=True)
 class MappingOptions:
-    """Inputs of a mode and the outputs that are made of them."""
+    """Inputs of a mode, and the outputs made from them."""
 
     inputs: Sequence[str] = option((), "items, variables, topics, or subjects of probes")
     outputs: Sequence[OutputOptions] = option((), "what is found out")

@@ -191,7 +191,7 @@ class DiagnosedEngine:
         self.states = engine.states
         """The engine's states of components and their alarms."""
         self.items = engine.items
-        """Names of the items that are wanted from the record."""
+        """Names of the items that are read from the record."""
         self.history_s = engine.history_s
         """How far monitors and conditions look back."""
         facts: Mapping[str, FaultFacts] = {}

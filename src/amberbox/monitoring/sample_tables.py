@@ -86,7 +86,7 @@ class SampleTable:
     whole: dict[str, Samples] | None = None
     """All columns, where they are wanted."""
     labels: dict[str, dict[int, str]] = field(default_factory=dict)
-    """Names that the message gives values of the columns that are read."""
+    """Names of values, as defined by the message, for the columns that are read."""
     keep_ns: int = NS
     is_list: bool = False
     """Whether it is a list of structures within the messages of another item."""

@@ -431,7 +431,7 @@ def from_schema(schema: Schema) -> Shape:
 
 
 def is_exact_schema(document: Any) -> bool:
-    """Return whether a document is one of ``to_schema``, or of a reserved channel."""
+    """Return whether a document was made by ``to_schema``, or is that of a reserved channel."""
     return isinstance(document, dict) and document.get("$comment") == EXACT_COMMENT
 
 

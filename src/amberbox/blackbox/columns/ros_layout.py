@@ -302,7 +302,7 @@ class ScatteredPlaces:
 
 @dataclass(frozen=True, slots=True)
 class EvenPlaces:
-    """Places of ``count`` messages of ``size`` bytes that share one layout (``slots``).
+    """Positions of the fields of ``count`` messages of ``size`` bytes with one layout (``slots``).
 
     ``texts_of_all`` are the strings of each slot of starts when they are equal in all messages.
     """

@@ -215,7 +215,7 @@ class ColumnAddress(NamedTuple):
 
     @property
     def address(self) -> str:
-        """Return it as text."""
+        """Return the address as text."""
         return f"{self.item}.{self.variable}" + ("" if self.number is None else f"[{self.number}]")
 
 

@@ -283,7 +283,7 @@ class UlogState:
 
 @dataclass
 class UlogReader:
-    """Reads records from a known state on and collects their content."""
+    """Reads records from a given position on and collects their content."""
 
     topics: UlogTopics
     formats: dict[str, Any]

@@ -32,7 +32,7 @@ _KEYS = {
 
 
 class TableCatalogue(Protocol):
-    """The tables that a query chooses from: a catalogue of one store, or of several."""
+    """The tables available to a query: a catalogue of one store, or of several."""
 
     def schema(self, table: str) -> TableSchema:
         """Return a table's columns; raises UsageError for an unknown table."""

@@ -240,7 +240,7 @@ def change_filtered(kept: list[StreamMessage], emit: EmitEvent) -> list[StreamMe
 
 
 def _infer(stream: TopicStream, messages: Sequence[bytes], now_ns: int, emit: EmitEvent) -> None:
-    """Widen a stream's schema to fit all these messages; a wider schema is an event."""
+    """Widen a stream's schema so that it fits all these messages; emit an event if it is wider."""
     topic, item = stream.topic, stream.item
     if item.versions >= MOST_VERSIONS:
         return

@@ -1,7 +1,8 @@
-"""Delete the units that the rule chose: tombstones first and durable, then the files.
+"""Delete the units chosen by the rule: tombstones are written and synced before the files are
+deleted.
 
 The box's own records of a journal that is deleted before it has columns are copied to a kept
-journal; deletions are logged as summed-up events. Making room runs in a thread of its own.
+journal; deletions are logged as summarised events. Space is freed in a thread of its own.
 ``JournalInventory`` describes a store's sealed journals, from which units of the rule are made.
 """
 

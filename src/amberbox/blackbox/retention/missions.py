@@ -674,7 +674,7 @@ def with_keeper_lock(store: Store, work: Callable[[MissionService], object]) -> 
 
 
 def write(store: Store, missions: list[RecordedMission]) -> None:
-    """Write down missions that were found later; raises AmberboxError while a keeper runs."""
+    """Write missions that were detected later; raises AmberboxError while a keeper runs."""
 
     def add(keeper: MissionService) -> None:
         for mission in missions:

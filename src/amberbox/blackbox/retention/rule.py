@@ -22,7 +22,7 @@ TOO_OLD = "older than its lifetime"
 
 
 class Pin(Protocol):
-    """A stretch of the record that stays: an incident."""
+    """A pinned section of the record: an incident."""
 
     def holds_received(self, run: int, from_ns: int, to_ns: int) -> bool:
         """Return whether it meets rows of a run that were received in ``[from, to]``."""

@@ -290,7 +290,7 @@ PIN_LOCK_FILE = "lock.pins"
 
 @contextmanager
 def pin_lock(store: Store) -> Iterator[None]:
-    """Hold the lock for pinning and deleting; its holder reads the pins anew before deleting.
+    """Hold the lock for pinning and deleting; its holder reads the pins again before deleting.
 
     Waits for the other holder, which keeps it for a few files at most.
     """

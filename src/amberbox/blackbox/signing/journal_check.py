@@ -225,7 +225,7 @@ _PROFILES = ("", "ros1", "ros2")
 
 @dataclass(frozen=True, slots=True)
 class JournalIdentity:
-    """The expected start of a journal file; ``chains`` are the links it may go on from."""
+    """The expected start of a journal file; ``chains`` are the links it may continue from."""
 
     store_id: str
     writer: str

@@ -158,7 +158,7 @@ def _children(top: FlatTable, taken: Sequence[FlatTable]) -> dict[str, FlatTable
 
 
 def _batch(flat: FlatTable, below: Mapping[str, FlatTable]) -> Batch:
-    """Build a batch with the child tables among ``below`` that hang directly on it."""
+    """Build a batch with its direct child tables among ``below``."""
     name, schema = flat.schema.item, flat.schema
     direct = [n for n in below if n.startswith(f"{name}__") and not _between(name, n, below)]
     children = {n.removeprefix(f"{name}__"): _batch(below[n], below) for n in direct}
@@ -363,7 +363,7 @@ def _window(
 
 
 def _known_gaps(known: Manifest, of: SequenceRange, items: Collection[str] | None) -> Iterator[Gap]:
-    """Yield gaps of undecodable and damaged rows, as found when the segments were built."""
+    """Yield gaps of undecodable and damaged rows that were found when the segments were built."""
     journal, sealed = known.journals.get(of.journal), known.sealed.get(of.journal)
     for gap in journal.gaps if journal is not None else ():
         if items is None or gap.item in items:

@@ -661,7 +661,7 @@ def confirm(store: Store, journals: Sequence[str], by: str) -> None:
 
 
 def unconfirm(store: Store, journals: Sequence[str], by: str) -> None:
-    """Enter that the server ``by`` lacks journals that were confirmed, such as after a restore.
+    """Record that the server ``by`` lacks journals that were confirmed, such as after a restore.
 
     They are then deleted no earlier than others, and are copied again.
     """

@@ -36,7 +36,7 @@ MALFORMED = (msgspec.MsgspecError, ValueError, KeyError, TypeError, AttributeErr
 
 @dataclass(slots=True)
 class RepairBudget:
-    """How many more bytes may be hashed in search of flipped bits: some seconds in all."""
+    """Number of bytes that may still be hashed in search of flipped bits: some seconds in all."""
 
     bytes: int = 2_000_000_000
 

@@ -58,7 +58,7 @@ def _reaches(found: list[WrittenRecord], lookback_s: float) -> bool:
 
 
 def _of_file(path: Path, channels: Collection[str], lookback_s: float) -> list[WrittenRecord]:
-    """Read a file's end, more and more of it until that is enough."""
+    """Read increasing parts of a file's end until there are enough records."""
     with open_buffer(path) as data:
         size = _FIRST_BYTES
         while True:

@@ -80,7 +80,7 @@ def median(ages: Sequence[IntArray]) -> int | None:
 
 
 def bounds_of(flat: FlatTable) -> tuple[int, ...]:
-    """Return least and most of ``seq``, log time and stamp, in this order."""
+    """Return the least and greatest ``seq``, log time and stamp, in this order."""
     keys = (flat.seq, flat.log_time_ns, flat.timestamp_ns)
     return tuple(int(edge) for key in keys for edge in (key.min(), key.max()))
 

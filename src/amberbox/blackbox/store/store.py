@@ -153,9 +153,9 @@ def _witnesses(path: Path) -> Counter[str]:
 
 
 def open_to_write(path: Path) -> Store:
-    """Open an existing store; first correct its identity where all its files name another.
+    """Open an existing store; first correct its identity if all its files have another one.
 
-    Raises what ``open_store`` does.
+    Raises the errors of ``open_store``.
     """
     stated, witnesses = stated_id(path), _witnesses(path)
     found, count = witnesses.most_common(1)[0] if witnesses else ("", 0)

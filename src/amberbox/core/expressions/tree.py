@@ -115,7 +115,7 @@ class WindowNode(ExpressionNode):
 
     @cached_property
     def saying(self) -> str:
-        """Return its text without its place: equal for equal windows."""
+        """Return its text without its position: equal for equal windows."""
         return _saying(self)
 
 
@@ -183,7 +183,7 @@ def kind_of_value(value: object) -> Kind:
 
 
 def children(tree: ExpressionNode) -> Iterator[ExpressionNode]:
-    """Yield the parts right below, in order."""
+    """Yield the direct children, in order."""
     for field in dataclasses.fields(tree):
         value = getattr(tree, field.name)
         for part in value if isinstance(value, tuple) else (value,):

@@ -87,10 +87,10 @@ def reading_check(symptom: str, cost_s: float, text: str = "") -> Check:
 
 @dataclass(frozen=True, slots=True)
 class Observation:
-    """The state of a symptom and how far it is to be trusted.
+    """The state of a symptom and the trust in it.
 
-    With probability ``strength`` the observation is right, else it is the toss of a coin: its
-    likelihood is ``strength * P(state | faults) + (1 - strength) / 2``.
+    With probability ``strength`` the observation is right, else it is random with probability 1/2:
+    its likelihood is ``strength * P(state | faults) + (1 - strength) / 2``.
     """
 
     state: SymptomState

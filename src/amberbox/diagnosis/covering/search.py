@@ -614,7 +614,9 @@ class SearchResult:
 
 @dataclass(slots=True)
 class _Sum:
-    """A sum of exponentials, relative to a reference; exact at the end, running meanwhile."""
+    """A sum of exponentials, relative to a reference; it is updated continuously, and exact at the
+    end.
+    """
 
     reference: float
     terms: list[float] = field(default_factory=list)

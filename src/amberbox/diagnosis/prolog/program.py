@@ -333,7 +333,7 @@ def _unlinked(head: Term, body: Term, names: Mapping[Var, str]) -> Iterator[Rule
 
 
 def _is_choice(body: Term) -> bool:
-    """Return whether the body as a whole is a choice, whose branches need not be linked."""
+    """Return whether a body is a choice as a whole; its branches need not share variables."""
     body = deref(body)
     return isinstance(body, Struct) and body.name in (";", "->")
 

@@ -70,7 +70,7 @@ def _quote(text: str, sign: str) -> str:
 
 
 class _Glued(NamedTuple):
-    """An operator: a blank parts it from a neighbour with which it would become one word."""
+    """An operator that needs a blank before a neighbour with which it would form one token."""
 
     text: str
     is_prefix: bool = False
@@ -237,7 +237,9 @@ Sort: TypeAlias = Literal["name", "quoted", "var", "value", "punct", "stop", "en
 
 
 class RuleToken(NamedTuple):
-    """One word: its sort, its text or value, its place, and what touches it."""
+    """One token: its sort, its text or value, its position, and whether it touches its
+    neighbours.
+    """
 
     sort: Sort
     value: Term

@@ -275,7 +275,7 @@ def _branch(branch: AnswerBranch) -> Iterator[str]:
 
 
 def _helps(branch: AnswerBranch) -> tuple[str, ...]:
-    """Return the remedy if the answer makes sure enough that it is the right one."""
+    """Return the remedy if the answer makes it certain enough that it is the right one."""
     return (branch.remedy,) if branch.remedy and branch.then >= SURE_ENOUGH else ()
 
 

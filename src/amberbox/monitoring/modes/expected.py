@@ -79,7 +79,7 @@ def evaluate(config: ExpectedOptions, inputs: Sequence[Input], now: Now) -> Mapp
 
 
 def _text(value: Any, labels: Mapping[int, str]) -> str:
-    """Return the name of a value, else how one would write it."""
+    """Return the name of a value, else its written form."""
     if isinstance(value, float) and value.is_integer() and abs(value) < 1e15:
         value = int(value)
     if isinstance(value, bool):

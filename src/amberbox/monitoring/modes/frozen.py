@@ -59,7 +59,7 @@ _MOST_MISSING = 0.75  # of a window: two rows in it, one of them late, are enoug
 
 @dataclass(frozen=True, slots=True)
 class FrozenOptions:
-    """What counts as moving, and when it should."""
+    """The criteria for a changing value, and the condition under which it should change."""
 
     window: float = option(5.0, "how long it may stay the same", unit="s", aliases=["for"])
     should_move: Expression | None = option(

@@ -58,7 +58,7 @@ arguments:
 
 @dataclass(frozen=True, slots=True)
 class RedundancyOptions:
-    """How far a member may be off, and from what."""
+    """The permitted deviation of a member, and its expected value."""
 
     threshold: float = option(doc="how far a member may be off, in its own unit")
     window: float = option(

@@ -121,7 +121,9 @@ def weakness(password: str, name: str = "") -> str | None:
 
 
 def _is_guessed(text: str, name: str) -> bool:
-    """Return whether both the beginning and the end take few guesses, as zxcvbn estimates them."""
+    """Return whether both the beginning and the end can be found with few guesses, by zxcvbn's
+    estimate.
+    """
     from zxcvbn import zxcvbn  # its import reads lists of words
 
     known = [*_COMMON.split("|")[1:], *_parts(name.casefold())]

@@ -68,7 +68,9 @@ def is_excused(statuses: Statuses, excuses: Iterable[Excuse]) -> bool:
 
 
 def shared_by(robots: Mapping[str, Statuses], shared: Iterable[Shared]) -> str:
-    """Return what all robots have in common, such as ``access point ap-3``; empty for nothing."""
+    """Return a property that all robots share, such as ``access point ap-3``; empty if there is
+    none.
+    """
     for one in shared:
         values = [set(map(str, _values(statuses, one.output))) for statuses in robots.values()]
         common = set.intersection(*values) - {"", "None"} if values else set()

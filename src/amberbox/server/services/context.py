@@ -87,7 +87,7 @@ class Services:
     upload_service: UploadService
     folders: FolderService
     worker_pool: WorkerPool
-    """Answers people."""
+    """Workers for the requests of people and programs."""
     robot_worker_pool: WorkerPool
     """Unpacks and reads data of robots, and explains diagnoses in advance."""
     explained: Explained

@@ -31,7 +31,7 @@ from amberbox.server.web.page import PageRoutes, render
 _GAPS = 20_000
 _JOURNALS = 1_000_000
 _STEPS = 800
-"""Stretches nearer to each other than this share of all time are drawn as one."""
+"""Intervals closer to each other than this share of all time are drawn as one."""
 _HELD = ("in_columns", "waiting")
 
 

@@ -226,7 +226,7 @@ class DiagnosisCard:
         return sentence("; and ".join(dict.fromkeys(texts)))
 
     def _sure_of(self, causes: Sequence[CardCause], over: Mapping[str, str]) -> DiagnosisCard:
-        """Return it with the probability of the one remaining cause, alone or with others."""
+        """Return the card with the probability of the one remaining cause, alone or with others."""
         if len(causes) != 1 or not causes[0].parts:
             return self
         left = {id_ for id_, _ in causes[0].parts} - over.keys()
