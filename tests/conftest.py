@@ -28,7 +28,7 @@ elif os.environ.get("AMBERBOX_CI", "") not in ("", "0"):
 
 
 def in_ci() -> bool:
-    """Tell whether a skipped test is to fail the run (``AMBERBOX_CI=1``)."""
+    """Return whether a skipped test has to fail the run (``AMBERBOX_CI=1``)."""
     return os.environ.get("AMBERBOX_CI", "") not in ("", "0")
 
 
@@ -67,7 +67,9 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
 
 
 def pytest_collection_finish(session: pytest.Session) -> None:
-    """Do not look through all that was imported again and again: that takes a sixth of the time."""
+    """Exclude imported modules from garbage collection, which takes a sixth of the time
+    otherwise.
+    """
     gc.collect()
     gc.freeze()
     gc.set_threshold(50_000, 20, 100)
@@ -83,7 +85,7 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 
 
 class Skips:
-    """Notes what is skipped, wherever it ran: reports of other processes come here as well."""
+    """Counts skipped tests, also those of other processes."""
 
     def __init__(self) -> None:
         self.found: list[tuple[str, str]] = []

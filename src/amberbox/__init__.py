@@ -15,7 +15,7 @@ sys.meta_path.append(Moved())
 
 
 def __getattr__(name: str) -> Any:
-    """Import the rest when it is first used: ``import amberbox`` alone stays cheap."""
+    """Import a public name when it is first used, so that ``import amberbox`` alone stays fast."""
     if name == "open":
         from amberbox.client.opening import open as open_record
 

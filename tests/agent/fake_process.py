@@ -12,7 +12,7 @@ from amberbox.agent.process import ChildProcess
 
 @dataclass
 class FakeProcess:
-    """Does nothing by itself; ``obeys`` decides whether it ends when it is asked to."""
+    """A process that does nothing; ``obeys`` decides whether it ends when it is stopped."""
 
     pid: int
     obeys: bool = True
@@ -51,7 +51,7 @@ class FakeProcess:
 
 @dataclass
 class FakeLauncher:
-    """Starts puppets, or fails to; keeps them all, and what was told."""
+    """Starts fake processes, or fails to; keeps all of them, and the commands given."""
 
     started: list[FakeProcess] = field(default_factory=list)
     names: list[str] = field(default_factory=list)

@@ -1,4 +1,4 @@
-"""What is asked about a folder, and what is made of the answer."""
+"""The check of a robot folder: its command, and how its result is used."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ OTHER_KEY = "abr_0123456789ab_" + "K" * 43
 
 @pytest.fixture(scope="module")
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[int, str]]:
-    """A server on loopback that knows r1: its port, and r1's key."""
+    """A server on loopback with the robot r1: its port, and r1's key."""
     services = process.make_services(
         tmp_path_factory.mktemp("server"), ServerSettings("http://127.0.0.1")
     )

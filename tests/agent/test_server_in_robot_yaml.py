@@ -1,4 +1,4 @@
-"""The server comes into robot.yaml, and nothing else in it changes."""
+"""Adding the server to robot.yaml changes nothing else in it."""
 
 from __future__ import annotations
 

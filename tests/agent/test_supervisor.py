@@ -38,7 +38,7 @@ class Answer:
 
 @dataclass
 class SupervisorBench:
-    """A supervisor of puppets, its clock, and what would be said about its folder."""
+    """A supervisor of fake processes, its clock, and the result of checking its folder."""
 
     folder: Path
     launcher: FakeLauncher = field(default_factory=FakeLauncher)

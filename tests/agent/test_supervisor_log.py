@@ -1,4 +1,4 @@
-"""What is to be written down reaches the disk, also one that refuses for a while."""
+"""Events of the supervisor reach the disk, even one that refuses writes for a while."""
 
 from __future__ import annotations
 

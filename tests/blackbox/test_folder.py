@@ -35,7 +35,7 @@ def errors(place: Path) -> str:
 
 
 def marks(path: Path, mark: str) -> dict[int, str]:
-    """Return what the comments ``mark words`` say about their lines."""
+    """Return the texts of the comments ``mark words`` by line."""
     lines = path.read_text(encoding="utf-8").splitlines()
     return {i: line.split(mark)[1] for i, line in enumerate(lines, 1) if mark in line}
 

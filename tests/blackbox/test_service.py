@@ -1,4 +1,6 @@
-"""The recorder tells systemd that it is ready, alive, stopping, and nothing without systemd."""
+"""The recorder notifies systemd that it is ready, alive or stopping, and sends nothing
+without it.
+"""
 
 from __future__ import annotations
 

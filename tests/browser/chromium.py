@@ -1,4 +1,4 @@
-"""Debian's Chromium, driven by Playwright; tests that want it skip where one of them is missing."""
+"""Debian's Chromium, driven by Playwright; tests that need it skip where one of them is missing."""
 
 from __future__ import annotations
 

@@ -54,7 +54,7 @@ _OPEN: pytest.StashKey[ExitStack] = pytest.StashKey()
 
 
 class PageAs(Protocol):
-    """Opens pages of somebody, of nobody without a name; ``at`` is another server's address."""
+    """Opens pages as a person, or signed out without a name; ``at`` is another server's address."""
 
     watched: list[Watched]
 
@@ -68,7 +68,7 @@ class PageAs(Protocol):
 def pytest_runtest_teardown(
     item: pytest.Item, nextitem: pytest.Item | None
 ) -> Generator[None, None, None]:
-    """End browser and server behind the last test here: Playwright's loop would be in the way."""
+    """End browser and server after the last test of pages: Playwright's loop would block others."""
     yield
     if nextitem is None or _HERE not in nextitem.path.parents:
         item.config.stash.setdefault(_OPEN, ExitStack()).close()

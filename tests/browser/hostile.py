@@ -1,4 +1,4 @@
-"""Names and texts that must come out as text, wherever a page shows them."""
+"""Names and texts that must be escaped wherever a page shows them."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ OUTPUT = SCRIPT
 MODEL = f"Ropod 2 {MARKUP}"
 """What the folder of ``ropod_002`` calls its model."""
 ITEM = "hostile"
-"""A data item of ``ropod_001`` whose variables stand at the paths ``FIELDS``, with ``TEXTS``."""
+"""A data item of ``ropod_001`` with variables at the paths ``FIELDS`` that hold ``TEXTS``."""
 FIELDS: Sequence[str] = (MARKUP.replace('"', ""), BACKWARDS)
 TEXTS: Sequence[str] = (MARKUP, SCRIPT, TEMPLATE, BACKWARDS)
 MISSION = f"transport {MARKUP}"

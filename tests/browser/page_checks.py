@@ -19,7 +19,9 @@ RESTART: Sequence[str] = (
     "WebSocket connection to", "ERR_CONNECTION_REFUSED", "ERR_CONNECTION_RESET",
     "ERR_EMPTY_RESPONSE", "ERR_INCOMPLETE_CHUNKED_ENCODING", "ERR_CONTENT_LENGTH_MISMATCH",
 )  # fmt: skip
-"""What a page's console may say while its server is restarted: give it as ``expects``."""
+"""Console messages of a page that are expected while its server restarts: give it as
+``expects``.
+"""
 _OWN = ("data:", "blob:", "about:")
 
 

@@ -62,12 +62,12 @@ def open_plots(
 
 
 def settle(page: Page) -> None:
-    """Wait until everything that the window shows has come."""
+    """Wait until everything in the window is loaded."""
     page.wait_for_function("() => window.stack.now().settled")
 
 
 def now(page: Page) -> dict[str, Any]:
-    """What the plots show: window, cursor, and of each variable what was drawn."""
+    """The state of the plots: window, cursor, and the points drawn of each variable."""
     found: dict[str, Any] = page.evaluate(
         """() => {
             const { from, to, cursor, traces } = window.stack.now();

@@ -21,7 +21,7 @@ MINUTE_NS = 60 * NS
 BEGIN_NS = -55 * MINUTE_NS
 """All times of this record are given from now on backwards."""
 GAP_NS = (-30 * MINUTE_NS, -27 * MINUTE_NS)
-"""Nothing of ``ros_ropod_odom`` is there in between; the record says why."""
+"""A gap of ``ros_ropod_odom``, with its reason in the record."""
 LOST = "lost: the queue was full"
 SPIKE_NS, SPIKE = -40 * MINUTE_NS, 99.0
 """One sample of ``ros_ropod_odom.twist_linear_x`` is this."""
@@ -60,7 +60,7 @@ _REMARKS = ("", "turning", "waits for the lift")
 
 @dataclass(frozen=True)
 class _Raw:
-    """Messages of one topic as they stand in a journal."""
+    """Messages of one topic as stored in a journal."""
 
     item: str
     topic: Topic
@@ -154,7 +154,7 @@ def _write_raw(run: FakeRun, raw: _Raw) -> None:
 
 
 def _missions(now_ns: int) -> list[dict[str, Any]]:
-    """Return missions as they began and ended; the last one goes on."""
+    """Return missions with their begin and end; the last one is active."""
     said = (
         ("transport-1", "transport", -50, -38, "succeeded"),
         ("transport-2", hostile.MISSION, -33, -20, "failed"),

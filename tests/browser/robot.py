@@ -1,4 +1,4 @@
-"""Robots that are linked with a real store and the robot's own client, and do what tests say."""
+"""Robots that are linked with a real store and the robot's own client, controlled by tests."""
 
 from __future__ import annotations
 
@@ -30,18 +30,18 @@ Row = tuple[str, bytes]
 
 
 class Robot:
-    """One robot: what its watcher finds goes into its journal, and over the link from there.
+    """One robot: findings of its watcher are written to its journal, and sent over the link.
 
-    While it is there it says all its statuses again each second, as watchers do.
+    While it is connected it repeats all its statuses each second, as watchers do.
     """
 
     def __init__(self, store: Path, clock: RobotClock, options: LinkOptions) -> None:
         self.name = options.robot
         self.clock = clock
         self.repeats = True
-        """Turn this off for a robot whose link holds, while its watcher says nothing."""
+        """False for a robot whose link holds, while its watcher is silent."""
         self.statuses: dict[tuple[str, str], Status] = {}
-        """What stands of each component and mode."""
+        """The present status of each component and mode."""
         self._options = options
         self._store = create_store(store)
         self._lock = WriterLock(self._store, "watch")
@@ -61,7 +61,7 @@ class Robot:
         self, component: str, level: Level = "ok", state: str = "", *, mode: str = "",
         reason: str = "", blocked_by: tuple[str, ...] = (), **outputs: Output,
     ) -> Status:  # fmt: skip
-        """Say how a component (or one of its modes) is from now on; return that."""
+        """Set the status of a component (or one of its modes) from now on; return it."""
         now_ns = self.clock.wall_ns()
         found = Status(
             self.name, component, mode, level, state or ("nominal" if level == "ok" else level),
@@ -84,7 +84,7 @@ class Robot:
         ))  # fmt: skip
 
     def say(self, *found: Finding) -> None:
-        """Write findings down; statuses among them stand from now on."""
+        """Write findings; statuses among them are valid from now on."""
         with self._saying:
             for one in found:
                 if isinstance(one, Status):
@@ -100,14 +100,14 @@ class Robot:
         self._journal.write([(channel, values)])
 
     def repeat(self) -> None:
-        """Say all statuses once more, measured now."""
+        """Repeat all statuses, measured now."""
         with self._saying:
             now_ns = self.clock.wall_ns()
             rows = [encoded(replace(s, measured_ns=now_ns)) for s in self.statuses.values()]
             self._journal.append([EncodedRecord(channel, data) for channel, data in rows])
 
     def measure(self, item: FakeItem, **values: Any) -> None:
-        """Record a message now: who looks at its variables live sees them."""
+        """Record a message now; it also updates the live values of its variables."""
         self._record = self._record or FakeRun(self._store.path, boot=self.clock.boot)
         now_ns = self.clock.wall_ns()
         self._record.write([(now_ns, item, msgspec.json.encode(values))])
@@ -125,7 +125,7 @@ class Robot:
         assert started.wait(_END_S)
 
     def silence(self) -> None:
-        """Stand still, as a computer does that hangs: the connection stays, nothing comes."""
+        """Freeze, as a computer does that hangs: the connection stays, nothing is sent."""
         assert self._loop is not None
         self._awake.clear()
         self._loop.call_soon_threadsafe(self._awake.wait)
@@ -135,7 +135,7 @@ class Robot:
         self._awake.set()
 
     def leave(self) -> None:
-        """Disconnect in good order; what it finds meanwhile it says when it comes again."""
+        """Disconnect cleanly; findings of the meantime are sent after ``come``."""
         if self._thread is None or self._loop is None:
             return
         self._awake.set()
@@ -145,7 +145,7 @@ class Robot:
         self._thread = self._loop = None
 
     def close(self) -> None:
-        """Leave for good."""
+        """Disconnect permanently."""
         self.leave()
         self._journal.close()
         self._lock.release()
@@ -180,7 +180,7 @@ _UP_NS = 6 * 3600 * NS
 
 @dataclass
 class RobotClock:
-    """Goes as real time does; ``ago_ns`` is how far in the past it stands."""
+    """Runs at real speed; ``ago_ns`` is how far in the past it is."""
 
     boot: str
     ago_ns: int = 0

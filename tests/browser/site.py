@@ -65,20 +65,20 @@ class Site:
         self.robots[robot].change(component, level, more.pop("state", level), **more)
 
     def session(self, name: str) -> str:
-        """Begin a session of somebody; return the value of the cookie."""
+        """Begin a session of a person; return the value of the cookie."""
         with self.database.begin() as connection:
             user = find_user(connection, name)
             began = begin_session(connection, time.time_ns(), user.user_id, "127.0.0.1", "tests")
         return began.secret
 
     def token(self, name: str, *scopes: str) -> str:
-        """Make a token of somebody."""
+        """Make a token of a person."""
         with self.database.begin() as connection:
             user = find_user(connection, name)
             return add_token(connection, time.time_ns(), user, "tests", scopes).text
 
     def ask(self, path: str, name: str = "admin") -> Any:
-        """Ask the API as somebody; return what it answers."""
+        """Call the API as a person; return the answer."""
         headers = {"Cookie": f"{COOKIE}={self.session(name)}"}
         request = urllib.request.Request(f"{self.url}/api/v1{path}", headers=headers)
         with urllib.request.urlopen(request, timeout=PATIENCE_S) as answer:
@@ -116,7 +116,7 @@ class Site:
         self.start()
 
     def is_online(self, *robots: str) -> bool:
-        """Tell whether the server says of all these robots that they are here and well known."""
+        """Return whether the server shows all these robots as online with a known status."""
         cards = {card["robot"]: card for card in self.ask("/robots")}
         return all(cards[r]["online"] and cards[r]["level"] != "unknown" for r in robots)
 
@@ -141,7 +141,7 @@ class Site:
 
 @contextmanager
 def made(folder: Path) -> Iterator[Site]:
-    """Fill a server's folder, start it, let the robots come; end all of it afterwards."""
+    """Fill a server's folder, start it, connect the robots; end all of it afterwards."""
     now_ns = time.time_ns()
     (folder / "server").mkdir(parents=True)
     home = House(folder / "server", FastAPI(), now_ns)  # nobody asks this one
@@ -163,7 +163,7 @@ def made(folder: Path) -> Iterator[Site]:
 
 @contextmanager
 def fresh(folder: Path) -> Iterator[Site]:
-    """Start a server that nobody has set up yet; end it afterwards."""
+    """Start a server without any account; end it afterwards."""
     (folder / "server").mkdir(parents=True)
     site = Site(folder, free_port(), time.time_ns(), {})
     try:
@@ -197,7 +197,7 @@ def _hand_in(home: House, robot: Recorded, paths: Iterable[Path]) -> None:
 
 
 def _away(home: House, folder: Path, now_ns: int) -> None:
-    """Let ``ropod_003`` have been here, and have much to say when it comes again."""
+    """Let ``ropod_003`` have been connected before, with a backlog to send."""
     other = Recorded("ropod_003", folder)
     other.record(0, files=1, at_ns=now_ns - AWAY_NS - MINUTE_NS)
     other.hand_in_all(home.services.archive)
@@ -254,7 +254,7 @@ def _let_happen(site: Site, boot: str) -> None:
 
 
 def _let_come(site: Site) -> None:
-    """Let the robots connect, and wait until the server knows what they have to say."""
+    """Connect the robots, and wait until the server has received their records."""
     for robot in site.robots.values():
         robot.come()
     wait_until(lambda: site.is_online(*site.robots), "the robots are here")

@@ -1,4 +1,4 @@
-"""What the watchers of the robots said in the last hour, and say now."""
+"""Findings of the robots' watchers in the last hour, and now."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def past(robot: Robot) -> None:
 
 
 def all_well(robot: Robot) -> None:
-    """Say that all components work, with the outputs of some modes."""
+    """Set all components to ok, with the outputs of some modes."""
     for component in COMPONENTS:
         robot.status(component)
     robot.status("laser_front", mode="heartbeat", alive=True, rate_hz=10.0)
@@ -96,7 +96,7 @@ def alarm(robot: str, at_ns: int, of: Diagnosis) -> AlarmChange:
 
 
 def hostile_past(robot: Robot) -> None:
-    """Say of a robot that is well things that must be shown as text."""
+    """Write findings with hostile texts for a healthy robot."""
     robot.clock.ago_ns = 20 * MINUTE_NS
     all_well(robot)
     robot.status(hostile.COMPONENT, "warn", "odd", reason=hostile.SCRIPT)

@@ -35,7 +35,7 @@ GRIPPER, ARM = 901, 902
 
 
 def put_in(site: Site, number: int, origin: str, severity: Any = "warning") -> None:
-    """Let there be an alarm of ``ropod_002``; nobody is told of it."""
+    """Insert an alarm of ``ropod_002``, without notifications."""
     now_ns = time.time_ns() - 60 * NS
     alarm = Alarm(number, "robot", "ropod_002", origin, severity, "warn", hostile.MARKUP,
                   now_ns, now_ns)  # fmt: skip

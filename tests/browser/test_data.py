@@ -47,7 +47,7 @@ def stamp(site: Site, minutes: float) -> str:
 
 
 def test_plots_wait_for_the_script_that_draws_them(page_as: PageAs) -> None:
-    """On a slow line everything else comes first; the page must not use it before it is there."""
+    """On a slow connection the script is loaded last; the page must not use it before."""
     page = page_as("viewer")
     held: list[Route] = []
     page.route("**/vendor/uplot.js", lambda route: held.append(route))

@@ -1,4 +1,4 @@
-"""The page of a diagnosis in a browser: a test is answered, details looked at, the cause said."""
+"""The page of a diagnosis in a browser: answering a test, opening details, entering the cause."""
 
 from __future__ import annotations
 

@@ -50,7 +50,7 @@ LOOKS = [("light", 1440), ("dark", 390)]
 
 
 def is_page(path: str) -> bool:
-    """Tell a page from parts of pages and what is taken along."""
+    """Return whether a path is a page, not a fragment or a download."""
     parts = ("/pieces/", "/static/", "/help/")
     return not path.startswith(parts) and "." not in path and path.count("/") < 4
 
@@ -95,7 +95,7 @@ def test_what_a_viewer_is_led_to_a_viewer_may_see(site: Site) -> None:
 
 
 def links(site: Site, name: str, paths: Iterable[str]) -> Mapping[str, str]:
-    """Return where pages lead on this server, and on which page that stands."""
+    """Return the links of pages on this server, each with the page that contains it."""
     found: dict[str, str] = {}
     for path in paths:
         for href in re.findall(r'<a [^>]*href="(/[^"#]*)', got(site, name, path)[1]):
@@ -104,7 +104,7 @@ def links(site: Site, name: str, paths: Iterable[str]) -> Mapping[str, str]:
 
 
 def got(site: Site, name: str, path: str) -> tuple[int, str]:
-    """Ask for a page as somebody; return the status and what it says."""
+    """Request a page as a person; return the status and the text."""
     headers = {"Cookie": f"{COOKIE}={site.session(name)}", "Accept": "text/html"}
     request = urllib.request.Request(site.url + path, headers=headers)
     try:

@@ -1,4 +1,4 @@
-"""The ground that tests of pages stand on: a page opens, what goes wrong in it is noticed."""
+"""The fixtures of page tests: a page opens, and errors in it are detected."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def test_the_page_of_the_api(page_as: PageAs, width: int, theme: str) -> None:
 
 @pytest.fixture(scope="module")
 def empty(browser: object, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
-    """A server that nobody has set up."""
+    """A server without any account."""
     with fresh(tmp_path_factory.mktemp("fresh")) as found:
         yield found
 
@@ -70,7 +70,7 @@ def test_somebody_sets_the_server_up(page_as: PageAs, empty: Site) -> None:
 
 
 def heard(page: Page, watched: Watched) -> int:
-    """Let the browser say what it has to say; return how many lines that are by now."""
+    """Process the browser's pending messages; return the number of lines so far."""
     page.wait_for_timeout(20)
     return len(watched.heard)
 
@@ -93,7 +93,7 @@ def test_what_goes_wrong_in_a_page_is_noticed(page_as: PageAs, site: Site) -> No
 
 @contextmanager
 def stranger() -> Iterator[tuple[str, list[str]]]:
-    """Serve as somebody else; give the address, and what was asked."""
+    """Serve a foreign site; yield its address, and the requests to it."""
     asked: list[str] = []
 
     class Handler(BaseHTTPRequestHandler):
@@ -125,7 +125,7 @@ def test_nobody_but_the_site_is_reached(page_as: PageAs) -> None:
 
 
 def card(site: Site, robot: str) -> dict[str, Any]:
-    """Return what the server says of a robot."""
+    """Return the server's card of a robot."""
     found: dict[str, Any] = site.ask(f"/robots/{robot}")
     return found
 

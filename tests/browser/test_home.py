@@ -1,4 +1,4 @@
-"""The first page in a browser: all robots at a glance, as they are now."""
+"""The first page in a browser: the present state of all robots."""
 
 import re
 

@@ -1,4 +1,4 @@
-"""What robots know, in a browser."""
+"""The pages of robots' FMEA and rules in a browser."""
 
 import re
 

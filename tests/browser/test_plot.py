@@ -1,4 +1,4 @@
-"""Plots: what is drawn, zooming, the cursor, what stands around them, live values."""
+"""Plots: drawn points, zooming, the cursor, markers and gaps, live values."""
 
 from __future__ import annotations
 

@@ -44,7 +44,7 @@ EXPECTED: tuple[tuple[str, str, bool | float | str | None], ...] = (
 
 @pytest.fixture
 def robot(site: Site) -> Iterator[Site]:
-    """Put right again what a test lets ``ropod_001`` say and do."""
+    """Restore the state of ``ropod_001`` after a test."""
     yield site
     one = site.robots["ropod_001"]
     one.wake()
@@ -228,7 +228,7 @@ def test_the_number_of_open_alarms_can_be_read_at_any_severity(page_as: PageAs, 
 
 
 class Line:
-    """The feed of a page, which can be cut; behind a cut everything begins anew."""
+    """The feed of a page, which can be cut; after a cut the page starts a new one."""
 
     def __init__(self, page: Page) -> None:
         self._is_cut = False

@@ -43,15 +43,15 @@ ROBOT = "ropod_001"
 PHONE = 390
 FEW = 3
 PATIENCE_S = 5 * clock.PATIENCE_S
-"""A box with its watcher and a server start and judge while other tests run beside them."""
+"""A box with its watcher and a server start and evaluate while other tests run beside them."""
 _BURN = "while True: pass"
 
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """A fault of the simulator; ``safe`` is what the first step says while it is active.
+    """A fault of the simulator; ``safe`` is the text of the first step while it is active.
 
-    ``shows`` are components that may be blamed besides its own and what depends on that.
+    ``shows`` are components that may be named besides its own and its dependents.
     """
 
     name: str
@@ -90,12 +90,12 @@ SEEN = """() => {
     step: all("#dx-card .dx-step").map(plain)[0] ?? "",
   };
 }"""
-"""What a page shows: all that this test knows of its markup."""
+"""The contents of a page: the only part of this test that depends on its markup."""
 
 
 @dataclass(frozen=True, slots=True)
 class Said:
-    """What the API says of the robot at one moment."""
+    """The API's answers about the robot at one moment."""
 
     card: Mapping[str, Any]
     levels: Mapping[str, str]
@@ -168,7 +168,7 @@ def blamable(site: Site, faults: Sequence[Fault]) -> set[str]:
 
 
 def contradictions(pages: Sequence[Page], site: Site) -> list[str]:
-    """Return in what the pages and the API do not agree; asked twice, as time goes on."""
+    """Return the contradictions between the pages and the API; read twice, as time passes."""
     before = said(site)
     seen = [page.evaluate(SEEN) for page in pages]
     after = said(site)
@@ -199,7 +199,7 @@ def _disagreements(shown: Mapping[str, Any], api: Said) -> Iterator[str]:
 
 
 class Day:
-    """The robot page and the page of its diagnosis, and what is broken by now."""
+    """The robot page and the page of its diagnosis, and the faults injected so far."""
 
     def __init__(self, site: Site, robot: SimulatedRobot, pages: Sequence[Page]) -> None:
         self.site, self.robot, self.pages = site, robot, pages
@@ -220,13 +220,13 @@ class Day:
         self.look()
 
     def repair(self, fault: Fault) -> None:
-        """Repair a fault, and look at the pages."""
+        """Repair a fault, and check the pages."""
         self.robot.order(f"heal {fault.name}")
         self.broken.remove(fault)
         self.look()
 
     def look(self) -> None:
-        """See that pages agree, that nothing healthy is blamed, and that safe steps come first."""
+        """Check that pages agree, that nothing healthy is named, and that safe steps come first."""
         self.wait(lambda: not contradictions(self.pages, self.site), "all agree")
         allowed = blamable(self.site, self.ever)
         new = [alarm for alarm in said(self.site).alarms if alarm["id"] not in self.before]
@@ -250,7 +250,7 @@ class Day:
             self.pages[0].wait_for_timeout(100)
 
     def _shows(self, concerned: set[str], known: Mapping[int, int]) -> bool:
-        """Tell whether an alarm is new that is about it, and the page of the robot has it."""
+        """Return whether there is a new alarm about it, and the robot's page shows it."""
         new = [
             alarm for alarm in said(self.site).active
             if alarm["origin"] in concerned and alarm["count"] > known.get(alarm["id"], 0)
@@ -264,7 +264,7 @@ class Day:
 
 
 def is_well(site: Site) -> bool:
-    """Tell whether all components of the robot have been judged, and are well."""
+    """Return whether all components of the robot have been evaluated, and are ok."""
     found = said(site)
     return found.card["level"] == "ok" and len(found.levels) > 15 and not found.active
 

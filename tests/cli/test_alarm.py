@@ -1,4 +1,4 @@
-"""The verb alarm: what the watcher wrote is listed, what a person says is left for it."""
+"""The verb alarm: lists the watcher's alarms, and leaves a person's requests for it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``amberbox check`` judges failure modes and rules with what the verbs of these say, once."""
+"""``amberbox check`` reports the problems of failure modes and rules like their own verbs, once."""
 
 from __future__ import annotations
 

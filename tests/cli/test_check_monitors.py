@@ -1,4 +1,4 @@
-"""``amberbox check`` judges component and mode files, and shows what would be monitored."""
+"""``amberbox check`` checks component and mode files, and shows what would be monitored."""
 
 from __future__ import annotations
 

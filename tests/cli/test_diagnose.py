@@ -1,4 +1,4 @@
-"""The verb diagnose without a watcher: what somebody says, and what a record shows."""
+"""The verb diagnose without a watcher: with given symptoms, and with those of a record."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def found(
 
 
 def refused(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> str:
-    """Diagnose in a way that is wrong, and return what is said of it."""
+    """Diagnose with wrong arguments, and return the error message."""
     capsys.readouterr()
     assert main(["diagnose", *map(str, arguments)]) == 2
     return capsys.readouterr().err
@@ -223,7 +223,7 @@ FINDINGS = 'findings:\n  - {rule: old(M), maps_to: ["<M>#short"], detects: 0.9, 
 
 @pytest.fixture
 def ruled(folder: Path) -> Path:
-    """Make a robot folder with a rule that speaks for a failure mode."""
+    """Make a robot folder with a rule that indicates a failure mode."""
     (folder / "rules").mkdir()
     (folder / "rules" / "age.pl").write_text(RULES)
     (folder / "fmea.yaml").write_text(FMEA + FINDINGS)

@@ -1,4 +1,4 @@
-"""The diagnosis of a team: which robot cannot do its part, and what the robot says itself."""
+"""The diagnosis of a team: the robot with a lost function, and that robot's own diagnosis."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def opened_ns(robot: Path) -> int:
 def said(
     robot: Path, at_ns: int, symptom: str = "first/works/works"
 ) -> tuple[MemberDiagnosis, ...]:
-    """Return what the robots say in a team's diagnosis of an instant."""
+    """Return the robots' own diagnoses in a team's diagnosis of an instant."""
     team = robot.parent / "team"
     team.mkdir(exist_ok=True)
     (team / "fmea.yaml").write_text(TEAM)

@@ -1,4 +1,4 @@
-"""The verb diagnose beside a watcher: what its journal says, then and now; each revision."""
+"""The verb diagnose beside a watcher: from its journal, at any time; each revision."""
 
 from __future__ import annotations
 

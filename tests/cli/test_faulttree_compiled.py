@@ -40,7 +40,7 @@ def printed(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> dict[
 
 
 def refused(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> str:
-    """Run the verb in a way that is wrong, and return what is said of it."""
+    """Run the verb with wrong arguments, and return the error message."""
     capsys.readouterr()
     assert main(["faulttree", *map(str, arguments)]) == 2
     return capsys.readouterr().err

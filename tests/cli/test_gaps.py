@@ -1,4 +1,4 @@
-"""``gaps`` and ``events``: what is missing and what happened, readable without a query."""
+"""``gaps`` and ``events``: missing data and events, readable without a query."""
 
 from __future__ import annotations
 

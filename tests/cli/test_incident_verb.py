@@ -28,7 +28,7 @@ from tests.support.processes import command, wait_for
 
 @pytest.fixture
 def robot(tmp_path: Path) -> Iterator[Path]:
-    """A robot folder with 10 s of record; its recorder goes on."""
+    """A robot folder with 10 s of record; its recorder continues."""
     (tmp_path / "robot.yaml").write_text('id: r\nsoftware_version: "1.2"\nstore: {quota: 1 GB}\n')
     (tmp_path / "black_box.yaml").write_text("- sim:\n    topics: [{name: odom}]\n")
     topics = [TopicOptions("/count", keep="ring")]

@@ -42,7 +42,7 @@ def service(folder: Path) -> Service:
 
 
 def sections(text: str) -> dict[str, dict[str, str]]:
-    """Read a unit as systemd does, as far as ours goes."""
+    """Parse a unit file like systemd, as far as Amberbox's units need it."""
     found: dict[str, dict[str, str]] = {}
     for line in text.splitlines():
         if line.startswith("["):

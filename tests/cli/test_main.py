@@ -187,7 +187,7 @@ print(ended)
 
 
 def test_ctrl_c_while_modules_load_ends_quietly() -> None:
-    """Wherever it comes between the first import and the last: 130, and no traceback."""
+    """At any time between the first import and the last: exit status 130, and no traceback."""
     places = [1, 2, 5, 20, 60, 120, 180, 240]
     done = subprocess.run(
         [sys.executable, "-c", INTERRUPTED, *map(str, places)], capture_output=True, text=True
@@ -214,7 +214,7 @@ def test_an_error_that_a_library_makes_of_ctrl_c_is_no_defect(
 
 
 def test_ctrl_c_is_ignored_where_the_process_was_told_to() -> None:
-    """A job that a script starts in the background ignores SIGINT, and goes on doing so."""
+    """A job that a script starts in the background ignores SIGINT."""
     code = (
         "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN); import sys; "
         "from amberbox.__main__ import main; sys.argv[1:] = ['--version']; main(); "

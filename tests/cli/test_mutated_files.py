@@ -58,7 +58,7 @@ monitoring: {stale_after: 3 s}
 
 
 class Shipped(NamedTuple):
-    """A file, and what reads its text and returns what is wrong."""
+    """A file, and the function that reads its text and returns the problems."""
 
     name: str
     text: str
@@ -121,7 +121,7 @@ def _files(paths: list[Path], read: Callable[[Node, list[Problem]], object]) -> 
 
 
 def _scalars(text: str) -> list[tuple[int, int]]:
-    """Return where each key and value stands that is one word."""
+    """Return the position of each key and value that is a single word."""
     tokens = yaml.scan(text, Loader=yaml.BaseLoader)
     return [
         (t.start_mark.index, t.end_mark.index) for t in tokens if isinstance(t, yaml.ScalarToken)

@@ -1,4 +1,4 @@
-"""``amberbox new``: what it writes passes the check, and nothing is written over."""
+"""``amberbox new``: its files pass the check, and existing files are not overwritten."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``amberbox plugins``: sources, modes and probes, what they lack, and all their keys."""
+"""``amberbox plugins``: sources, modes and probes, their missing packages, and all their keys."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``amberbox probe``: one look, a list, rows as they come, and publishing for a box elsewhere."""
+"""``amberbox probe``: one measurement, a list, periodic rows, and publishing for a remote box."""
 
 from __future__ import annotations
 

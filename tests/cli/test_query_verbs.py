@@ -255,7 +255,7 @@ def test_sql_prints_what_is_asked(store: str, capsys: pytest.CaptureFixture[str]
 
 
 class Terminal(io.StringIO):
-    """Text as somebody sees it in a terminal."""
+    """A stream that is a terminal."""
 
     def isatty(self) -> bool:
         return True
@@ -322,7 +322,7 @@ def test_a_range_that_ends_before_it_begins_is_refused(
 def test_a_time_for_a_server_names_its_option(
     line: str, option: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """It is read here first: nothing is asked of the server."""
+    """The time is checked by the client: no request is sent to the server."""
     assert main(line.replace("URL", "https://fleet.invalid/robots/r1").split()) == 2
     assert f"error: {option}: not a time: 'noon'" in capsys.readouterr().err
 

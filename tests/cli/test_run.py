@@ -46,7 +46,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 class Box:
-    """Runs ``amberbox run``; its children are known by what it writes down."""
+    """Runs ``amberbox run``; its children are identified by ``run.json``."""
 
     def __init__(self, folder: Path) -> None:
         self.folder, self.log = folder, folder.parent / "log"
@@ -63,7 +63,9 @@ class Box:
         return dict(state["children"].get(name, {})) if own else {}
 
     def wait_for(self, name: str, state: str = "running", other_than: int | None = None) -> int:
-        """Wait until a child is as said, and another one than before; return its process."""
+        """Wait until a child has a state, and another process id than before; return its
+        process.
+        """
 
         def is_there() -> bool:
             child = self.child(name)

@@ -1,4 +1,4 @@
-"""``amberbox serve`` as a process: a robot joins it over TLS, and nothing it told is lost."""
+"""``amberbox serve`` as a process: a robot joins it over TLS, and none of its rows is lost."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Server:
         self, path: str, method: str = "GET", body: bytes | None = None,
         headers: Mapping[str, str] | None = None,
     ) -> tuple[int, bytes, Mapping[str, str]]:  # fmt: skip
-        """Send one request; raises OSError while nobody answers."""
+        """Send one request; raises OSError while the server does not answer."""
         if self.context is None:
             client = http.client.HTTPConnection("127.0.0.1", self.port, timeout=PATIENCE_S)
         else:
@@ -81,7 +81,7 @@ class Server:
         raise AssertionError("it does not answer")
 
     def stop(self) -> tuple[int, str]:
-        """End it as systemd does; return its status and what it said."""
+        """End it as systemd does; return its status and output."""
         self.process.send_signal(signal.SIGTERM)
         _, said = self.process.communicate(timeout=PATIENCE_S)
         return self.process.returncode, said
@@ -100,7 +100,7 @@ def started(data: Path, *words: object, context: ssl.SSLContext | None = None) -
 
 @pytest.fixture(scope="module")
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
-    """A server with TLS of its own, listening beyond loopback, set up by somebody on it."""
+    """A server with its own TLS certificate, listening on all interfaces, with its first admin."""
     data = tmp_path_factory.mktemp("serve") / "data"
     assert main(["serve", "cert", "--data", str(data), "--host", "localhost"]) == 0
     context = ssl.create_default_context(cafile=str(data / "tls" / "ca.pem"))

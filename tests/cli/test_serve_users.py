@@ -102,7 +102,7 @@ def test_it_is_asked_twice_on_a_terminal(
 def test_a_robot_that_joins_too_early_hears_it_and_the_server_goes_on(
     data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """While it runs: a robot joins before there is an admin, then somebody is made one."""
+    """While it runs: a robot joins before there is an admin, then an admin is added."""
     data.mkdir()
     data.chmod(0o755)
     server = started(data)

@@ -1,4 +1,4 @@
-"""The verb status: what is known now, in words, as JSON, as messages; and waiting for it."""
+"""The verb status: the present state in words, as JSON, as messages; and waiting for it."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def store(tmp_path: Path) -> Path:
 
 
 def say(store: Path, *findings: Finding, ago_s: float = 0) -> None:
-    """Write what a watcher says, some time ago."""
+    """Write findings of a watcher with a time in the past."""
     run = FakeRun(store, "watch")
     for finding in findings:
         channel, values = record_of(finding)

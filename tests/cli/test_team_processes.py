@@ -62,7 +62,7 @@ arguments: {{max_age: 1 s}}
 
 
 class Page(BaseHTTPRequestHandler):
-    """A page that says nothing, but answers."""
+    """A page with an empty answer."""
 
     def do_GET(self) -> None:
         self.send_response(200)
@@ -101,7 +101,7 @@ def running(folders: Sequence[Path]) -> Iterator[None]:
 
 
 def start(verb: str, folder: Path) -> subprocess.Popen[bytes]:
-    """Begin to run a verb; what it prints goes to a file beside the folder."""
+    """Start a verb; its output goes to a file beside the folder."""
     with folder.with_name(f"{folder.name}.{verb}").open("w") as file:
         return subprocess.Popen(command(verb, folder), stdout=file, stderr=file)
 
@@ -144,7 +144,7 @@ def wait_for(folder: Path, is_it: Callable[[Diagnosis], bool]) -> None:
 
 
 def names(fault: str) -> Callable[[Diagnosis], bool]:
-    """Tell of diagnoses that stand whether they name one fault, and that alone."""
+    """Return a function that checks whether a diagnosis names exactly one fault."""
     return lambda found: found.state == "open" and found.hypotheses[0].faults == {fault}
 
 

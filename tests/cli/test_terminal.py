@@ -19,7 +19,7 @@ from tests.fuzzing import examples, fuzz
 
 
 class Terminal(io.StringIO):
-    """A stream that says it is a terminal."""
+    """A stream that claims to be a terminal."""
 
     def isatty(self) -> bool:
         return True
@@ -71,7 +71,7 @@ def robot(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ],
 )  # fmt: skip
 def test_lines_fit_the_terminal(robot: Path, monkeypatch: pytest.MonkeyPatch, line: str) -> None:
-    """Texts are folded, tables cut; in a pipe lines are as long as they are."""
+    """Texts are wrapped, tables cut; in a pipe lines keep their length."""
     monkeypatch.setenv("COLUMNS", "60")
     monkeypatch.setenv("NO_COLOR", "1")
     terminal, pipe = Terminal(), io.StringIO()

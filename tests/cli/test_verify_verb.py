@@ -1,4 +1,4 @@
-"""``amberbox verify``: what it prints, and how it ends."""
+"""``amberbox verify``: its output and exit status."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The verb watch: live, once, over what is recorded; what it prints, and how it ends."""
+"""The verb watch: live, once, as a replay; its output and exit status."""
 
 from __future__ import annotations
 
@@ -163,7 +163,7 @@ def test_wrong_usage_is_said(folder: Path, capsys: pytest.CaptureFixture[str]) -
 
 
 class Recording:
-    """A recorder at work in a thread, on the machine's own clock."""
+    """A running recorder in a thread, with the machine's own clock."""
 
     def __init__(self, folder: Path) -> None:
         from amberbox.blackbox.recorder.pipeline import PipelineOptions

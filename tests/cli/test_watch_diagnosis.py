@@ -1,4 +1,4 @@
-"""Watching with the failure modes of a folder: what is printed, what is written, also killed."""
+"""Watching with the failure modes of a folder: output and records, also after a kill."""
 
 from __future__ import annotations
 
@@ -115,7 +115,7 @@ def test_errors_in_the_failure_modes_stop_nothing_but_the_diagnosis(
 
 
 def test_the_failure_modes_are_part_of_the_configuration(diagnosed: Path) -> None:
-    """Other ones are other monitors to the watcher: it begins anew with them."""
+    """With other failure modes the watcher starts from the beginning, as with other monitors."""
     before = load_folder(diagnosed).config_hash
     (diagnosed / "fmea.yaml").write_text(FMEA + "# changed\n")
     assert load_folder(diagnosed).config_hash != before

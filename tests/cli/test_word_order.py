@@ -42,7 +42,7 @@ FORMS: Sequence[tuple[str, str, list[str]]] = [
 
 
 def request(verb: str, line: str, where: str) -> dict[str, Any]:
-    """Return what a command line asks for."""
+    """Return the parsed arguments of a command line."""
     parser = argparse.ArgumentParser(prog=f"amberbox {verb}")
     VERBS[verb].configure(parser)
     parsed = vars(parser.parse_args([where if w == "WHERE" else w for w in line.split()]))

@@ -1,4 +1,4 @@
-"""One server for all tests of the client, and nobody's sign-ins but theirs."""
+"""One server for all tests of the client, and a file of sign-ins for these tests only."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A server of its own for the client's tests: a process, with what a robot recorded and said."""
+"""A server for the client's tests: a process, with the record and the findings of a robot."""
 
 from __future__ import annotations
 

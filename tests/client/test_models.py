@@ -1,4 +1,4 @@
-"""The client's models against what the server says of itself: each field is there, and fits."""
+"""The client's models and the server's OpenAPI: each field exists, and the types match."""
 
 from __future__ import annotations
 
@@ -45,7 +45,9 @@ def test_the_server_says_what_the_client_reads(served: Schema, kind: type[Answer
 
 
 def misfit(said: Schema, served: Schema, own: Schema, expected: Schema) -> str:
-    """Say what the server may answer that the client does not take; empty for nothing."""
+    """Return the part of a server's answer that the client does not accept; empty if there
+    is none.
+    """
     taken = alternatives(own, expected)
     for one in alternatives(said, served):
         reasons = [_misfit(one, served, other, expected) for other in taken]

@@ -1,4 +1,4 @@
-"""Verbs with a robot's page as WHERE say what they say of the robot's own store."""
+"""Verbs with a robot's page as WHERE give the same as with the robot's own store."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""What an older version left behind, unpacked; and the program as users call it.
+"""Folders written by an older version, unpacked; and the program as users call it.
 
-Nothing here names a module of the package: what is kept compatible is seen from outside.
+No module of the package is imported here: compatibility is checked from outside.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ FIXTURES = Path(__file__).parents[1] / "fixtures" / "ef939a5"
 
 @cache
 def expected() -> dict[str, Any]:
-    """Return what the old version itself said of its folders."""
+    """Return the older version's output for its folders."""
     data = lzma.decompress((FIXTURES / "expected.json.xz").read_bytes())
     found: dict[str, Any] = json.loads(data)
     return found
@@ -52,7 +52,7 @@ def unpacked(name: str, folder: Path) -> Path:
 
 @dataclass(frozen=True)
 class Said:
-    """What a command line said."""
+    """The output of a command line."""
 
     status: int
     out: str
@@ -101,7 +101,7 @@ def digest(found: list[list[str]]) -> str:
 
 @dataclass
 class Person:
-    """Somebody who asks the server over its API."""
+    """A person who calls the server's API."""
 
     url: str
     csrf: str = ""
@@ -118,7 +118,7 @@ class Person:
     def send(
         self, method: str, path: str, data: bytes | None, headers: Mapping[str, str]
     ) -> tuple[int, Any]:
-        """Send a request as it is; return status and answer."""
+        """Send a request unchanged; return status and answer."""
         asked = Request(self.url + path, data, dict(headers), method=method)
         try:
             with self.opener.open(asked) as answer:
@@ -157,7 +157,7 @@ def serving(data: Path) -> Iterator[str]:
 
 
 class Relay:
-    """Passes connections on to a port, and keeps what robots sent."""
+    """Forwards connections to a port, and stores the data that robots sent."""
 
     def __init__(self, port: int) -> None:
         self._to = port
@@ -205,7 +205,9 @@ def _pass(source: socket.socket, sink: socket.socket, kept: bytearray) -> None:
 
 
 def lacks(was: Any, now: Any, where: str = "") -> list[str]:
-    """Return what was said once and is not said now; keys that are new do not count."""
+    """Return the values that were in the older output and are missing now; new keys do not
+    count.
+    """
     if isinstance(was, Mapping) and isinstance(now, Mapping):
         return [
             text for key in was

@@ -1,4 +1,4 @@
-"""Names that people and programs outside know Amberbox by, as they show themselves today."""
+"""Present names of Amberbox that people and programs use from outside."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def _options(text: str) -> str:
 
 
 def plugins() -> Names:
-    """Return each plugin with the keys it knows."""
+    """Return each plugin with its keys."""
     found = {}
     for one in json.loads(amberbox("plugins", "--json").out):
         said = amberbox("plugins", one["name"], "--kind", one["kind"], "--json").json()
@@ -153,7 +153,7 @@ def channels(where: Path) -> Names:
 
 
 def files(folder: Path) -> Names:
-    """Return the names of files and folders, without what is a number in them."""
+    """Return the names of files and folders, without their numbers."""
     found = set()
     for path in folder.rglob("*"):
         name = str(path.relative_to(folder))

@@ -1,4 +1,4 @@
-"""What the documentation tells people to import stays where it is, whatever moves underneath."""
+"""Import paths in the documentation keep working, whatever is moved."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ NO_MODULE = {
 
 
 def listed() -> list[tuple[str, list[str]]]:
-    """Return modules with their names, as they are listed."""
+    """Return the listed modules with their names."""
     lines = (line.partition("#")[0].strip() for line in LISTED.read_text().splitlines())
     found = []
     for line in filter(None, lines):
@@ -33,7 +33,7 @@ def listed() -> list[tuple[str, list[str]]]:
 
 
 def resolved(dotted: str) -> Any:
-    """Return a module, or what is in one: the longest beginning that can be imported counts."""
+    """Return a module, or an attribute of one: the longest importable beginning counts."""
     try:
         return import_module(dotted)
     except ModuleNotFoundError as error:

@@ -1,6 +1,6 @@
 """Names that people, scripts and stored data use do not disappear and do not change.
 
-``frozen_names.txt`` is written by hand: what is new is added there, and then it stays.
+``frozen_names.txt`` is written by hand: new names are added, and none is removed.
 """
 
 from __future__ import annotations
@@ -93,7 +93,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_what_the_box_records_of_itself(recorded: Path, tmp_path: Path) -> None:
-    """All channels in what an older version recorded, most of them in what is recorded now."""
+    """All channels in the older version's record, most of them in a present one."""
     compare("channels", names.channels(unpacked("linked", tmp_path) / "linked"), also_new=False)
     now = names.channels(recorded)
     for name in frozen()["channels of every run"]:
@@ -174,7 +174,7 @@ def test_plugins_of_other_packages_are_found(
 
 
 def test_the_unit_that_was_installed_still_starts(tmp_path: Path) -> None:
-    """Units lie on other people's computers: what they call has to stay."""
+    """Units are on other people's computers: the commands in them have to stay."""
     folder = unpacked("killed", tmp_path) / "killed"
     unit = amberbox("install-service", folder).out
     for line in frozen()["unit"]:

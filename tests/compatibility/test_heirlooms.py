@@ -1,6 +1,6 @@
-"""What an older version wrote opens, says what it said then, and goes on where it ended.
+"""Folders of an older version open, give the same answers, and are continued.
 
-See ``tests/fixtures/ef939a5/README.md`` for what was left behind and how.
+``tests/fixtures/ef939a5/README.md`` describes these folders and how they were made.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def test_a_record_says_what_it_said_then(robot: str, tmp_path: Path) -> None:
 
 
 def test_a_watcher_goes_on_from_the_checkpoint_of_the_old_one(tmp_path: Path) -> None:
-    """The old watcher was killed before the recorder: what it had not said yet is said now."""
+    """The old watcher was killed before the recorder: its missing findings are written now."""
     folder = unpacked("killed", tmp_path) / "killed"
     was = {name: then["rows"] for name, then in expected()["resumed"].items()}
     assert len(concluded(folder, "amberbox_status")) < len(was["amberbox_status"])
@@ -74,7 +74,7 @@ def test_a_watcher_goes_on_from_the_checkpoint_of_the_old_one(tmp_path: Path) ->
 
 
 def concluded(folder: Path, name: str) -> list[list[str]]:
-    """Return what was concluded of the record, without when it was and how it is just now."""
+    """Return the conclusions from a record, without times and without the present state."""
     columns, found = rows(folder, name)
     if "live_only" in columns:
         found = [row for row in found if row[columns.index("live_only")] != "true"]
@@ -151,7 +151,7 @@ def test_people_of_the_old_server_sign_in(server: str) -> None:
 
 
 def test_the_link_goes_on_and_so_does_the_upload_that_was_cut(place: Path, server: str) -> None:
-    """Last of all: from here on the server knows more than the old one did."""
+    """Run last: from here on the server has more data than the old one."""
     folder, data = place / "linked", place / "server"
     store = folder / "store"
     (part,) = data.glob("incoming/linked/*/*.part")

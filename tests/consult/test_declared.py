@@ -1,4 +1,4 @@
-"""Copies of robots' folders: what they declare is read, what would run or lies elsewhere is not."""
+"""Copies of robots' folders: declarative files are read; code and files elsewhere are not."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What component files say that components need counts for the failure modes."""
+"""Needs in component files count for the failure modes."""
 
 from __future__ import annotations
 

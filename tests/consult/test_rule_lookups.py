@@ -1,4 +1,6 @@
-"""When conditions held: the same as a look at single instants, however time is cut into blocks."""
+"""Times at which conditions held: equal to evaluating single instants, for any division into
+blocks.
+"""
 
 from __future__ import annotations
 

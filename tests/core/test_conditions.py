@@ -1,4 +1,4 @@
-"""Conditions over a growing record: the same edges however the rows come."""
+"""Conditions over a growing record: the same edges for any batches of rows."""
 
 from __future__ import annotations
 

@@ -57,7 +57,7 @@ class Everything:
     topic: Sequence[Wheel] = option(())
 
     def check(self) -> Iterator[str | tuple[str, str]]:
-        """What is wrong with the values together."""
+        """Yield problems of the values in combination."""
         if self.count < 0:
             yield "count", "must not be below 0"
         if self.name == self.keep:
@@ -306,7 +306,7 @@ def test_what_json_says_is_read_as_it_is(value: Any) -> None:
 
 @dataclass(frozen=True)
 class Rates:
-    """Values that are judged together."""
+    """Values that are checked in combination."""
 
     write_s: float = option(0.1, "")
     sync_s: float = option(1.0, "")

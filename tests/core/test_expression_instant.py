@@ -93,7 +93,7 @@ def recordings(draw: Any) -> dict[str, Samples]:
 
 
 def bits(value: Any) -> Any:
-    """Tell values apart by type and bits; any NaN is the same as any other."""
+    """Return a key of type and bits of a value; all NaN are equal."""
     if isinstance(value, float):
         return "nan" if value != value else struct.pack("d", value)
     return type(value).__name__, value

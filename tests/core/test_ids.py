@@ -1,4 +1,4 @@
-"""Ids are what the pattern says, and every name has one."""
+"""Ids match their pattern, and every name has one."""
 
 from __future__ import annotations
 

@@ -111,7 +111,7 @@ def test_top_down_ranks_lie_below_each_other() -> None:
 
 
 def test_unlinked_boxes_stand_below() -> None:
-    """Put what is linked to nothing in rows below the rest."""
+    """Boxes without links are in rows below all others."""
     boxes = [LayoutBox(name, 300, 40) for name in "abcdef"]
     layout = layered(boxes, [("a", "b")])
     assert [layout.corners[name][1] for name in "cdef"] == [72, 72, 128, 128]
@@ -138,7 +138,7 @@ def test_nothing_is_drawn_of_nothing() -> None:
 
 
 def test_ranks_follow_the_longest_path() -> None:
-    """Stand after all that leads there; a source stands near to what it leads to."""
+    """A box is after all boxes that lead there; a source is close to its target."""
     assert ranks(5, [(0, 1), (1, 2), (0, 2), (2, 3), (4, 3)]) == [0, 1, 2, 3, 2]
 
 

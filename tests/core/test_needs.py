@@ -1,4 +1,4 @@
-"""Needs: read from files, met or not, circles; wrong ones are told with their line."""
+"""Needs: read from files, met or not, cycles; wrong ones are reported with their line."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The one status of a robot: what it is made of, its order, its sentence."""
+"""The one status of a robot: its inputs, its order, its sentence."""
 
 from __future__ import annotations
 

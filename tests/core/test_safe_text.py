@@ -1,4 +1,4 @@
-"""Text of others does nothing but show what is in it."""
+"""Foreign text has no effect beyond showing its characters."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is known of a variable over time does not depend on how it came or how it is asked."""
+"""Results over samples do not depend on the batches or on the order of queries."""
 
 from __future__ import annotations
 

@@ -25,7 +25,7 @@ FAULT = "imu_stuck"
 
 @dataclass
 class Pretended:
-    """A demonstration without processes: it notes what is asked of it."""
+    """A demonstration without processes that records its calls."""
 
     codes: SignInCodes
     robots: Sequence[str] = tuple(ROBOTS)

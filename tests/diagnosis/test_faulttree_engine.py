@@ -1,4 +1,4 @@
-"""Diagnosis by fault trees: explanations without a fault too many, ranked by what is known."""
+"""Diagnosis by fault trees: minimal explanations, ranked by the evidence."""
 
 from __future__ import annotations
 

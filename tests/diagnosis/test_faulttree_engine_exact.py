@@ -43,7 +43,7 @@ def with_symptoms(draw: st.DrawFn) -> Fmea:
 
 
 def active(fmea: Fmea, faults: frozenset[str]) -> Iterator[SymptomLink]:
-    """Yield the links of what is there and of what is lost."""
+    """Yield the symptom links of present faults and of lost functions."""
     gone = lost(fmea, faults)
     for name in faults:
         yield from fmea.modes[name].symptoms
@@ -52,7 +52,9 @@ def active(fmea: Fmea, faults: frozenset[str]) -> Iterator[SymptomLink]:
 
 
 def weight(fmea: Fmea, states: Mapping[str, SymptomState], faults: frozenset[str]) -> float:
-    """Return prior times likelihood of present and absent symptoms, as the page says."""
+    """Return prior times likelihood of present and absent symptoms, by the formula in the
+    documentation.
+    """
     silent = dict.fromkeys(SYMPTOMS, 1.0)
     for link in active(fmea, faults):
         silent[link.symptom] *= 1.0 - link.detects

@@ -1,4 +1,4 @@
-"""What makes safe comes before every test, and a test before what is mended in vain."""
+"""Actions that make the robot safe come before every test, and tests before uncertain repairs."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ SWITCH_OFF = "switch off, let it cool outside"
 
 @cache
 def knowledge() -> Knowledge:
-    """Return what is known of the simulated robot."""
+    """Return the knowledge of the simulated robot."""
     return read_declared_robot(sim.FOLDER, "ropod_001", sim.HASH).knowledge()
 
 

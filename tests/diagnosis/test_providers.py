@@ -1,4 +1,4 @@
-"""Providers of evidence: found by file name, asked alike, and one list of engines for all."""
+"""Providers of evidence: found by file name, called in the same way, with one list of engines."""
 
 from __future__ import annotations
 

@@ -68,7 +68,7 @@ def test_all_names_every_extra_but_the_test_one() -> None:
 
 
 def test_what_we_import_is_what_we_declare() -> None:
-    """At the top of a module only what is always installed, in functions also the extras."""
+    """At module level only required packages are imported, in functions also those of extras."""
     always = set(map(_package, PROJECT["project"]["dependencies"]))
     sometimes = always | {_package(text) for extra in _extras("all") for text in EXTRAS[extra]}
     sometimes |= {"pandas", "polars"}  # users who ask for their tables have them
@@ -123,7 +123,7 @@ def test_the_wheel_holds_licence_and_program(wheel: zipfile.ZipFile) -> None:
 
 
 def test_every_module_imports_with_none_of_the_optional_packages() -> None:
-    """Recording runs with none of them installed; who needs one asks for it when used."""
+    """Recording needs none of them; a package is imported where it is used."""
     program = f"""
 import importlib, pkgutil, sys
 for name in {OPTIONAL}:

@@ -1,4 +1,4 @@
-"""The technician's trial judges by the access log, and by what the page says and no more."""
+"""The simulated technician uses only the access log and the visible text of pages."""
 
 from __future__ import annotations
 

@@ -62,20 +62,22 @@ class Run:
 
     boot: str
     rows: list[LinkRow | None] = field(default_factory=list)
-    """None stands for a row that does not go over the link."""
+    """None stands for a row that is not sent over the link."""
     durable: int = 0
 
 
 @dataclass
 class Disk:
-    """What is on the robot's card; the counter of runs survives everything but an old image."""
+    """The contents of the robot's card; the counter of runs survives everything except an old
+    image.
+    """
 
     store_id: str
     runs: dict[str, dict[int, Run]] = field(default_factory=lambda: {w: {} for w in WRITERS})
     counter: int = 0
 
     def rows(self) -> dict[tuple[str, str, int, int], LinkRow]:
-        """Return everything that goes over the link, by position."""
+        """Return everything that is sent over the link, by position."""
         return {
             (self.store_id, writer, number, row.seq): row
             for writer, runs in self.runs.items()
@@ -128,12 +130,12 @@ class Robot:
                 run.durable = len(run.rows)
 
     def kill(self) -> None:
-        """End as after ``kill -9``: what was written stays."""
+        """End as after ``kill -9``: written data stay."""
         self.sync()
         self.start(new_boot=False)
 
     def cut_power(self) -> None:
-        """Take from each run some of what is not durable."""
+        """Remove from each run some of its unsynced rows."""
         for runs in self.disk.runs.values():
             for run in runs.values():
                 del run.rows[self.chance.randint(run.durable, len(run.rows)) :]
@@ -185,7 +187,7 @@ class Robot:
 
 @dataclass
 class Connection:
-    """Both ends and what is on its way between them."""
+    """Both ends and the frames in transit between them."""
 
     robot_end: RobotEnd
     server_end: ServerEnd
@@ -212,7 +214,7 @@ class World:
         self.acked: dict[str, dict[str, JournalPosition]] = {}
 
     def connect(self) -> None:
-        """Connect anew; what is on its way of the connection before may still arrive."""
+        """Connect again; frames of the connection before may still arrive."""
         self.drop()
         reaches = self.robot.reaches()
         one = Connection(RobotEnd(), ServerEnd("r1"))
@@ -226,7 +228,7 @@ class World:
         self.connection = one
 
     def drop(self) -> None:
-        """Lose the connection; the server does not hear of it."""
+        """Lose the connection; the server does not notice."""
         if self.connection is not None:
             self.late.append(self.connection)
             self.connection = None
@@ -263,7 +265,7 @@ class World:
             self.arrive(one, one.up.pop(min(at, len(one.up) - 1)))
 
     def arrive(self, one: Connection, data: bytes) -> None:
-        """Take bytes at the server's end, whatever they are."""
+        """Deliver any bytes to the server's end."""
         try:
             frame = from_robot(data)
         except FrameError:
@@ -289,7 +291,7 @@ class World:
                 return
 
     def _note_acked(self, one: Connection) -> None:
-        """What is acknowledged is durable on the robot: always, or the claim is worth nothing."""
+        """Check that acknowledged rows are durable on the robot."""
         acked = self.acked.setdefault(self.robot.disk.store_id, {})
         for writer, at in one.robot_end.cursor.items():
             reach = self.robot.reaches()[writer]
@@ -346,7 +348,9 @@ class World:
         raise AssertionError("it never caught up")
 
     def judge(self) -> None:
-        """Compare what the server holds with what the robot holds, and with what ever came."""
+        """Compare the rows that the server holds with the robot's, and with all rows ever
+        received.
+        """
         store_id = self.robot.disk.store_id
         mine = {key: row for key, row in self.ledger.rows.items() if key[0] == store_id}
         assert mine == self.robot.disk.rows()

@@ -25,7 +25,7 @@ Key = tuple[str, str, int, int]
 
 @dataclass(slots=True)
 class _Store:
-    """What is held of one store."""
+    """The held rows of one store."""
 
     cursor: dict[str, JournalPosition] = field(default_factory=dict)
     upto: dict[str, JournalPosition] = field(default_factory=dict)
@@ -42,7 +42,7 @@ class MemoryLedger:
         self._stores: dict[str, _Store] = {}
 
     def admit(self, hello: Hello) -> LinkAdmission:
-        """Begin a new epoch: whatever comes in an older one is refused from now on."""
+        """Begin a new epoch: frames of an older one are refused from now on."""
         self.epoch += 1
         is_new = hello.store_id not in self._stores
         store = self._stores.setdefault(hello.store_id, _Store())

@@ -1,4 +1,4 @@
-"""Folders on their way: what travels, what is refused."""
+"""The transfer of folders: which files are sent, which are refused."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from amberbox.link.folders import FolderError, pack, travels, unpack
 
 
 def _packed(files: object) -> bytes:
-    """Pack anything, as somebody would who means harm."""
+    """Pack any content, as an attacker would."""
     return zstandard.ZstdCompressor().compress(msgspec.msgpack.encode(files))
 
 

@@ -1,4 +1,6 @@
-"""Digests of stretches find exactly the journals that a server lacks, whatever both ends hold."""
+"""Digests of ranges find exactly the journals that a server lacks, for any holdings of
+both ends.
+"""
 
 from __future__ import annotations
 

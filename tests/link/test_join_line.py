@@ -1,4 +1,4 @@
-"""The line that a robot is given comes back as it was, or is refused without repeating the key."""
+"""A robot's join line is parsed without loss, or refused without repeating the key."""
 
 from __future__ import annotations
 

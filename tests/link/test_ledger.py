@@ -47,7 +47,7 @@ class DatabaseLedger:
 
 
 class LinkMachine(RuleBasedStateMachine):
-    """Everything that can happen to a robot, a server and what is on its way between them."""
+    """All events that can happen to a robot, a server and the frames between them."""
 
     with_database: ClassVar[bool] = False
 
@@ -131,7 +131,7 @@ class LinkMachine(RuleBasedStateMachine):
 
     @rule(rounds=st.integers(1, 4), counts=st.integers(0, 8), durable=st.booleans())
     def talk(self, rounds: int, counts: int, durable: bool) -> None:
-        """Let time pass in which all works; what is written stays provisional for a while."""
+        """Let time pass without faults; new rows stay provisional for a while."""
         if self.world.connection is None:
             self.world.connect()
         for _ in range(rounds):
@@ -148,7 +148,7 @@ class LinkMachine(RuleBasedStateMachine):
     @precondition(lambda self: self.world.connection is not None)
     @rule()
     def kill_recorder(self) -> None:
-        """What writes the journal begins anew; the link goes on."""
+        """Restart the recorder; the link continues."""
         self.world.robot.kill()
 
     @rule()

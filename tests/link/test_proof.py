@@ -22,7 +22,9 @@ SIGNED = ManifestSignature("00", 1, "00", "00")
 
 
 def test_what_was_deleted_unconfirmed_goes_along_wherever_it_stands(tmp_path: Path) -> None:
-    """A robot that was away deletes after signatures, and behind seals of what it deletes next."""
+    """A robot that was offline deletes after signatures, and after seals of journals it deletes
+    next.
+    """
     confirmed = replace(GONE, run=7, confirmed=True)
     entries: list[SealedJournal | Tombstone | ManifestSignature] = [
         GONE,

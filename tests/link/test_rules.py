@@ -1,4 +1,4 @@
-"""Small rules of the link: frames, waits, clocks, bandwidth, and who may say what when."""
+"""Rules of the link: frames, waits, clocks, bandwidth, and the order of frames."""
 
 from __future__ import annotations
 

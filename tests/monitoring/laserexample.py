@@ -1,4 +1,6 @@
-"""The paper's laser, recorded and watched as users do, while device and driver come and go."""
+"""The paper's laser, recorded and monitored with the real commands, while device and
+driver fail.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,7 @@ DEVICE, HEARTBEAT = "laser_device_monitor", "laser_heartbeat_monitor"
 
 @dataclass(frozen=True)
 class Laser:
-    """A robot folder of the example with a device of its own; what its watcher says of it."""
+    """A robot folder of the example with a device of its own, and the statuses of its watcher."""
 
     folder: Path
     device: Path
@@ -44,7 +46,7 @@ class Laser:
         wait_until(lambda: self.levels().items() >= wanted.items(), f"{levels}")
 
     def messages(self) -> dict[str, Any]:
-        """Return what the paper's messages say, by the monitor's name."""
+        """Return the paper's messages, by the monitor's name."""
         words = command("status", self.folder, "--format", "paper")
         shown = subprocess.run(words, capture_output=True, text=True, check=False)
         found = [json.loads(line) for line in shown.stdout.splitlines()]
@@ -104,7 +106,7 @@ EXPECTED = [
     "nominal -> front_laser_working",
     "front_laser_working -> nominal",
 ]
-"""What the component goes through, once it is initialised."""
+"""The transitions of the component after its initialisation."""
 
 
 def _replace(path: Path, old: str, new: str) -> None:

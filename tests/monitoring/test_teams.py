@@ -94,7 +94,7 @@ def watching(folder: Path) -> Iterator[None]:
 
 @dataclass
 class Level1:
-    """What is running of one folder."""
+    """The running processes of one folder."""
 
     folder: Path
     watch: ExitStack = field(default_factory=ExitStack)
@@ -168,7 +168,7 @@ def test_watcher_publishes_as_robot_yaml_says(world: Path) -> None:
 
 
 def hear(socket: Any, alive: bool | None) -> None:
-    """Take messages until the base is said to be alive, or that nothing is known of it."""
+    """Receive messages until the base has the given state, or until it is unknown."""
     wanted = {
         "robotId": "ropod_001",
         "monitorName": "base_heartbeat_monitor",

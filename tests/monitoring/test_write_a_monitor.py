@@ -1,4 +1,4 @@
-"""The page on writing a monitor works as it stands: its files are written, its commands run."""
+"""The page on writing a monitor works unchanged: its files are written, its commands run."""
 
 from __future__ import annotations
 

@@ -47,7 +47,7 @@ def text(value: str) -> bytes:
 
 
 class State(NamedTuple):
-    """What the server says about its playback."""
+    """The server's report on its playback."""
 
     status: int
     at_ns: int

@@ -40,7 +40,7 @@ def _configure(connection: Any, record: object) -> None:
 
 
 class House:
-    """A server without a network: ``client(name)`` is somebody who is signed in."""
+    """A server without a network: ``client(name)`` is a signed-in person."""
 
     def __init__(self, folder: Path, app: FastAPI | None = None, start_ns: int = START_NS) -> None:
         self.clock = ManualClock(start_ns)
@@ -68,7 +68,7 @@ class House:
             add_user(connection, now_ns, "nurse", Role.TECHNICIAN, hashed, groups=["ward"])
 
     def client(self, name: str = "", **options: Any) -> TestClient:
-        """Return a client of somebody who is signed in; of nobody without a name."""
+        """Return a client of a signed-in person; without a name one that is signed out."""
         client = TestClient(self.app, base_url=URL, raise_server_exceptions=False, **options)
         if name:
             with self.services.database.begin() as connection:
@@ -81,7 +81,7 @@ class House:
         return client
 
     def token_client(self, owner: str = "technician", *scopes: str) -> TestClient:
-        """Return a client with a token of somebody; of all scopes if none is named."""
+        """Return a client with a token of a person; with all scopes if none is named."""
         with self.services.database.begin() as connection:
             user = find_user(connection, owner)
             token = add_token(connection, self.clock.wall_ns(), user, "test", scopes or SCOPES)

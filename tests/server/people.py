@@ -1,4 +1,4 @@
-"""The principals that ``roles.yaml`` speaks of, as clients that ask the server."""
+"""The principals in ``roles.yaml``, as clients of the server."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from amberbox.server.http.auth import COOKIE, CSRF_HEADER
 from tests.server.house import PASSWORD, URL, House
 
 VICTIM = "somebody"
-"""Whom admins change in tests, so that nobody who asks is changed meanwhile."""
+"""The account that admins change in tests, so that no calling account is changed meanwhile."""
 
 _PEOPLE: Mapping[str, tuple[Role, Collection[str] | None]] = {
     "ward_admin": (Role.ADMIN, ["ward"]),

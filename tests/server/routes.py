@@ -1,4 +1,4 @@
-"""The routes and sockets that an app really answers: asked of the app, not of who made it."""
+"""The routes and sockets of an app, read from the app itself."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ SOCKET = "SOCKET"
 
 
 def all_routes(app: Any) -> set[tuple[str, str]]:
-    """Return method and path of each; ``HEAD`` is not told apart where ``GET`` is answered."""
+    """Return method and path of each; ``HEAD`` is left out if ``GET`` is answered."""
     found = set(_walk(app.routes, ""))
     return {one for one in found if one[0] != "HEAD" or ("GET", one[1]) not in found}
 

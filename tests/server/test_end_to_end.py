@@ -1,4 +1,4 @@
-"""Robots, bad networks, a server; all of them killed at random: what was written is there, once."""
+"""Robots, bad networks, a server, all killed at random: all written rows are there, once."""
 
 from __future__ import annotations
 

@@ -34,7 +34,7 @@ BOUNDS = {
 
 
 def rows(page: Path) -> dict[str, str]:
-    """Return the table of bounds: what has one, and which."""
+    """Return the bounds in the table, by resource."""
     _, _, text = page.read_text().partition("## What has an end")
     table = [line.strip("| ") for line in text.partition("\n## ")[0].splitlines() if "|" in line]
     return {what: bound for what, _, bound in (line.partition(" | ") for line in table)}

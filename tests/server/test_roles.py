@@ -35,7 +35,7 @@ PATH: Mapping[str, str] = {
     "config_hash": "ab" * 32,
     "store_id": "12345678-1234-1234-1234-123456789012",
 }
-"""What stands in paths; all else is the name of nothing."""
+"""Values of parameters in paths; other parameters get an unknown name."""
 
 
 @dataclass(frozen=True)

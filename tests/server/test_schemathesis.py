@@ -1,4 +1,4 @@
-"""Every route with what its description allows and what it does not: no 5xx, nothing undeclared.
+"""Every route with valid and invalid input by its description: no 5xx, nothing undeclared.
 
 ``API_EXAMPLES=200`` (``make soak``) tries more of each than ``make test`` has time for.
 """
@@ -45,7 +45,7 @@ SETTINGS = settings(
     suppress_health_check=list(HealthCheck),
 )
 KNOWN: Mapping[str, str] = {"robot": "ropod_001", "name": VICTIM, "item": "odom"}
-"""What is really there, so that not every example ends with 404."""
+"""Existing names, so that not every example ends with 404."""
 ADMINS = ("/users", "/groups", "/settings", "/audit", "/key", "/api/v1/robots")
 OPERATIONS = sorted(
     (method, path.replace(":path}", "}"))
@@ -141,7 +141,7 @@ def _ask(home: House, client: TestClient, case: Any, principal: str) -> Any:
 def test_answers_are_as_described_one_after_another(
     home: House, schema: Any, client: TestClient
 ) -> None:
-    """What one route made is asked of the others: their links follow from the description."""
+    """Results of one route are used as input of others: their links follow from the description."""
     machine: Any = schema.as_state_machine()
 
     class Visitor(machine):  # type: ignore[misc]  # made at run time

@@ -65,7 +65,7 @@ def alarms(findings: Sequence[Finding]) -> dict[str, float]:
 
 
 def failures(findings: Sequence[Finding]) -> Iterator[Transition]:
-    """Yield the transitions to what is not well."""
+    """Yield the transitions to levels that are not ok."""
     for finding in findings:
         if isinstance(finding, Transition) and finding.after.level in ("warn", "error", "stale"):
             yield finding

@@ -85,7 +85,9 @@ def _shows(nominal: NDArray[Any], faulty: NDArray[Any]) -> bool:
 
 
 def _has_other_spread(nominal: NDArray[Any], faulty: NDArray[Any]) -> bool:
-    """Tell a signal that swings much more or less; 50 values know their spread to 10 %."""
+    """Return whether a signal varies much more or less; with 50 values the spread is known
+    to 10 %.
+    """
     if nominal.ndim > 1 or min(len(nominal), len(faulty)) < 50:
         return False
     before, after = nominal.std(), faulty.std()

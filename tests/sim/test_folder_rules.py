@@ -1,4 +1,4 @@
-"""The rules that come with the simulated robot's folder."""
+"""The rules in the simulated robot's folder."""
 
 from __future__ import annotations
 

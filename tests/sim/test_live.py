@@ -22,7 +22,7 @@ from amberbox.testing.clock import PATIENCE_S
 
 
 class _Wire:
-    """Keeps what was sent, and how much of the truth stood in the file by then."""
+    """Stores the sent messages, and the size of the truth file at that time."""
 
     def __init__(self, truth: Path | None = None) -> None:
         self.sent: list[list[bytes]] = []

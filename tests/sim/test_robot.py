@@ -1,4 +1,4 @@
-"""The simulated robot: deterministic, plausible, typed, and silent about what is wrong with it."""
+"""The simulated robot: deterministic, plausible, typed, and without any text that names a fault."""
 
 from __future__ import annotations
 
@@ -264,7 +264,7 @@ def test_nothing_published_names_a_fault() -> None:
 
 
 def _telling(fault_id: str, component: str) -> str:
-    """Return what of a fault's id says more than where it is."""
+    """Return the words of a fault's id without those of its component."""
     return fault_id.removeprefix(f"{component}_")
 
 

@@ -1,4 +1,4 @@
-"""What is recorded of the simulated robot: columns with units, codes with names."""
+"""The record of the simulated robot: columns with units, codes with names."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The ``sim`` source: configuration, speeds, times and what it hands to the sink."""
+"""The ``sim`` source: configuration, speeds, times and messages."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def test_a_limited_speed_is_kept_and_stamps_by_the_box() -> None:
 
 
 class _Clock(threading.Event):
-    """A clock that only goes on while somebody waits."""
+    """A clock that advances only while a thread waits."""
 
     def __init__(self) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""docs/start/simulator.md says what the simulator does: its tables are those of the code."""
+"""docs/start/simulator.md matches the simulator: its tables are those of the code."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """A recorder without threads, driven by hand, and random histories of a store for property tests.
 
-Messages are given by hand, and time passes when told to. A history has runs, pauses, crashes,
-keepers and deletion; nobody tampers with it.
+Messages are given by hand, and time is moved by hand. A history has runs, pauses, crashes, keepers
+and deletion, but no tampering.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ class ManualBox:
             self.sink.message(stream, message, self.sink.now_ns())
 
     def write(self, after_s: float = WRITE_S) -> None:
-        """Let time pass, then write what was heard."""
+        """Let time pass, then write the received messages."""
         self.clock.advance(after_s)
         self.pipeline.tick()
 
@@ -97,7 +97,7 @@ def recording(folder: Path) -> Iterator[Recorder]:
 
 
 def raw_messages(store: Path, topic: str, *, repeated: bool = False) -> list[bytes]:
-    """Return the messages of a topic as they stand in the journals, file after file."""
+    """Return the messages of a topic as stored in the journals, file after file."""
     found: list[bytes] = []
     for journal in journal_reader.journals(store):
         wanted = {
@@ -141,7 +141,7 @@ _QUOTA_BYTES = 600_000
 
 @dataclass
 class History:
-    """A store and its random life; ``events`` says what happened, for a failing test."""
+    """A store and its random history; ``events`` lists the steps, for a failing test."""
 
     path: Path
     seed: int

@@ -19,7 +19,7 @@ T = TypeVar("T")
 
 
 def free_port() -> int:
-    """Return a TCP port of this computer that nobody listens at."""
+    """Return a free TCP port of this computer."""
     with socket.create_server((LOOPBACK, 0)) as probe:
         return int(probe.getsockname()[1])
 

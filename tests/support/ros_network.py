@@ -60,12 +60,12 @@ class RosMaster:
         _stop(self._server)
 
     def register(self, topic: str, node: str, uri: str) -> None:
-        """Add a publisher and tell the subscribers."""
+        """Add a publisher and notify the subscribers."""
         self.publishers.setdefault(topic, {})[node] = uri
         self._announce(topic)
 
     def unregister(self, topic: str, node: str) -> None:
-        """Remove a publisher and tell the subscribers."""
+        """Remove a publisher and notify the subscribers."""
         self.publishers.get(topic, {}).pop(node, None)
         self._announce(topic)
 
@@ -148,7 +148,7 @@ class RosPublisher:
         self.send(topic, b"".join(_LENGTH.pack(len(m)) + m for m in messages))
 
     def send(self, topic: str, data: bytes) -> None:
-        """Send bytes as they are."""
+        """Send bytes unchanged."""
         for connection in list(self.topics[topic].connections):
             connection.sendall(data)
 

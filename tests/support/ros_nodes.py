@@ -1,4 +1,6 @@
-"""Runs a real ROS 1 master and nodes as child processes, and judges a record by their truth."""
+"""Runs a real ROS 1 master and nodes as child processes, and compares a record with their truth
+files.
+"""
 
 from __future__ import annotations
 
@@ -60,7 +62,7 @@ class Processes:
         return process
 
     def output(self, command: Sequence[str], port: int) -> str:
-        """Run a ROS tool to its end and return what it prints."""
+        """Run a ROS tool to its end and return its output."""
         return subprocess.run(
             command, env=ros_environment(port), capture_output=True, text=True, check=True
         ).stdout
@@ -115,7 +117,7 @@ def end(process: subprocess.Popen[bytes], number: int = signal.SIGTERM) -> None:
 
 
 def answers(port: int) -> bool:
-    """Tell whether a ROS master answers on a local port."""
+    """Return whether a ROS master answers on a local port."""
     try:
         system_state(port)
     except (OSError, xmlrpc.client.Error):
@@ -124,7 +126,7 @@ def answers(port: int) -> bool:
 
 
 def system_state(port: int) -> Any:
-    """Return publishers, subscribers and services as the master knows them."""
+    """Return publishers, subscribers and services from the master."""
     proxy: Any = xmlrpc.client.ServerProxy(f"http://127.0.0.1:{port}")
     return proxy.getSystemState("/test")[2]
 
@@ -146,7 +148,7 @@ def read_truth(path: Path) -> list[dict[str, Any]]:
 
 
 def published(paths: Iterable[Path]) -> dict[str, list[Published]]:
-    """Return what robots published, per topic and in order."""
+    """Return the messages that robots published, per topic and in order."""
     topics: dict[str, list[Published]] = {}
     for entry in (entry for path in paths for entry in read_truth(path)):
         if entry["k"] == "pub":
@@ -211,7 +213,7 @@ class Verdict:
 
     @property
     def is_right(self) -> bool:
-        """Tell whether all is recorded once and in order, or lies in a gap."""
+        """Return whether all messages are recorded once and in order, or are in a gap."""
         return not (self.unexplained or self.unknown or self.repeated) and self.in_order
 
 
@@ -221,7 +223,7 @@ def judge(
     gaps: Sequence[Interval],
     tolerance_s: float = 0.2,
 ) -> Verdict:
-    """Compare the recorded bodies of one topic with what was published."""
+    """Compare the recorded messages of one topic with the published ones."""
     order = {message.body: at for at, message in enumerate(truth)}
     places = [order[body] for body in bodies if body in order]
     got = set(bodies)

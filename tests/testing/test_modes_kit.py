@@ -1,4 +1,4 @@
-"""The contract kit for modes accepts what is right, and tells each thing that is wrong."""
+"""The contract kit for modes accepts right modes, and reports each error."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def upright(config: Config, inputs: Sequence[Input], now: Now) -> Mapping[str, A
 
 
 def tilt(**changes: Any) -> ModuleType:
-    """Make a mode that is right apart from what is changed; None takes a name away."""
+    """Make a mode that is right except for the changes; None removes a name."""
     module = ModuleType("tilt", "Tilt: the robot stands on its wheels.")
     right = {
         "Config": Config,

@@ -1,4 +1,4 @@
-"""The faulty proxy: the same faults for the same seed, and frames mangled as asked."""
+"""The faulty proxy: the same faults for the same seed, and the requested faults in frames."""
 
 from __future__ import annotations
 

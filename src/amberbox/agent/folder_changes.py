@@ -88,7 +88,7 @@ class FolderCheck:
         )  # fmt: skip
 
     def answer(self, now_s: float) -> FolderVerdict | None:
-        """Return the result once it is there; a check that takes too long fails."""
+        """Return the result of the check, None while it runs; a check that takes too long fails."""
         if self._process.poll() is None:
             if now_s < self._until_s:
                 return None
@@ -136,7 +136,7 @@ class RunningCheck(Protocol):
     """A running check."""
 
     def answer(self, now_s: float) -> FolderVerdict | None:
-        """Return the result once it is there."""
+        """Return the result of the check, None while it runs."""
 
     def close(self) -> None:
         """Cancel it."""
@@ -159,7 +159,7 @@ class FolderWatch:
         self._requested = True
 
     def step(self, now_s: float) -> FolderVerdict | None:
-        """Look for changes, if it is time to."""
+        """Check for changes, if the polling interval has passed."""
         if self._question is not None:
             answer = self._question.answer(now_s)
             if answer is not None:

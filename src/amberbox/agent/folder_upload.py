@@ -127,7 +127,7 @@ def _outermost(nodes: Iterable[Node]) -> list[Node]:
 
 
 def _without_comments(text: str, known: Collection[str]) -> str:
-    """Remove comments beside masked values, and those that sound secret or hold a secret."""
+    """Remove comments beside masked values, and those that suggest or contain a secret."""
     for start, end in reversed(list(_comments(text))):
         line = text[text.rfind("\n", 0, start) + 1 : start]
         comment = text[start:end]

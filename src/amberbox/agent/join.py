@@ -1,6 +1,6 @@
 """Join a server: check its line, write it into the robot folder, and try the connection.
 
-``robot.yaml`` keeps its comments and its order; the key lies beside it.
+``robot.yaml`` keeps its comments and its order; the key is in a file beside it.
 """
 
 from __future__ import annotations
@@ -133,10 +133,10 @@ class HelloResult:
 async def try_hello(
     options: LinkOptions, store: Store, context: ssl.SSLContext | None, clock: Clock
 ) -> HelloResult:
-    """Connect, say Hello, and close the connection.
+    """Connect, send Hello, and close the connection.
 
     Raises LinkRefusedError when the server refuses this robot, LinkDownError when it cannot be
-    reached or is no Amberbox server.
+    reached or is not an Amberbox server.
     """
     line = await dial(options, context)
     try:
@@ -217,7 +217,7 @@ def _text_of(folder: Path) -> str:
 
 
 def _tried(folder: RobotFolder, line: JoinLine, clock: Clock) -> tuple[bool, tuple[str, ...]]:
-    """Connect once; return whether that worked, and lines for the user."""
+    """Connect once; return whether it succeeded, and lines for the user."""
     options = LinkOptions(line.url, line.robot, line.key, line.ca, config_hash=folder.config_hash)
     store = create_store(folder.store_path)
     try:

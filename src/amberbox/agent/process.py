@@ -78,7 +78,7 @@ def amberbox_command(*arguments: str) -> list[str]:
 
 
 def is_wanted(child: ChildProcess, folder: Path) -> bool:
-    """Return whether a folder, as it is now, has work for a child."""
+    """Return whether the present configuration of a folder needs a child."""
     if child.name == LINK:
         return has_server(folder)
     return child.name != WATCH or has_components(folder)
@@ -112,7 +112,9 @@ def print_line(text: str) -> None:
 
 @dataclass
 class ChildOutput:
-    """Prints lines of one child: ``BURST`` at once, ``PER_S`` over time; the rest is counted."""
+    """Prints lines of one child: ``BURST`` at once, ``PER_S`` over time; further lines
+    are counted.
+    """
 
     name: str
     emit: Callable[[str], None] = print_line
@@ -242,7 +244,7 @@ class Process(Protocol):
         """Return the last line of its output that began with ``error:``."""
 
     def close(self) -> None:
-        """Read the rest of the output, and close everything."""
+        """Read the remaining output, and close everything."""
 
 
 Launch = Callable[[ChildProcess], Process]
@@ -251,7 +253,7 @@ Launch = Callable[[ChildProcess], Process]
 class RealProcess:
     """Runs a child's command and prints its output.
 
-    A child never blocks on its output: what is not read in time is lost to the log.
+    A child never blocks on its output: lines that are not read in time are lost.
     """
 
     def __init__(self, child: ChildProcess, store_id: str, output: ChildOutput) -> None:
@@ -298,7 +300,7 @@ class RealProcess:
         return self._child_output.error
 
     def close(self) -> None:
-        """Read the rest of the output, and close everything."""
+        """Read the remaining output, and close everything."""
         self._read_output()
         self._child_output.end(time.monotonic())
         for fd in (self._output, self._watched):

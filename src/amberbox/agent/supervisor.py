@@ -129,7 +129,7 @@ class ChildLifecycle:
     state: State = "off"
     status: str = ""  # as reported by the child
     trouble: str = ""
-    """Why it was ended last, if that was not asked for."""
+    """Why it was ended last, if not by a normal stop."""
     restarts: int = 0
     _process: Process | None = None
     _due_s: float = 0.0
@@ -150,7 +150,7 @@ class ChildLifecycle:
         return self.state == "running"
 
     def want(self, now_s: float) -> None:
-        """Start it if it is off."""
+        """Start it if it does not run."""
         if self.state == "off":
             self.state, self._due_s = "waiting", now_s
 
@@ -171,7 +171,7 @@ class ChildLifecycle:
             self._due_s, self._refusal = now_s, ""
 
     def step(self, now_s: float) -> None:
-        """Do what is due now."""
+        """Carry out the steps that are due."""
         if self._process is None:
             if self.state in ("waiting", "refused") and now_s >= self._due_s:
                 self._start(now_s)
@@ -280,10 +280,10 @@ class SupervisedBox:
 
 
 class ProcessSupervisor:
-    """Runs the processes of one robot folder; ``turn`` does what is due, ``run`` loops until the
-    end.
+    """Runs the processes of one robot folder; ``turn`` carries out the steps that are due, ``run``
+    loops until the end.
 
-    Raises UsageError if another supervisor has the store.
+    Raises UsageError if another supervisor holds the store.
     """
 
     def __init__(
@@ -322,7 +322,7 @@ class ProcessSupervisor:
         self._stops += 1
 
     def reload(self) -> None:
-        """Apply the folder as it is now, also to the recorder."""
+        """Apply the present configuration of the folder, also to the recorder."""
         self._reload = True
 
     @property
@@ -341,7 +341,7 @@ class ProcessSupervisor:
             self.close()
 
     def turn(self) -> None:
-        """Do what is due now."""
+        """Carry out the steps that are due."""
         now_s = self._clock_s()
         if self._stops and self._stopping_since_s is None:
             self._stopping_since_s = now_s

@@ -40,7 +40,7 @@ def print_listing(
     found: Sequence[T], document: Callable[[T], Any], header: Sequence[str],
     row: Callable[[T], Sequence[Any]], nothing: str, *, as_json: bool,
 ) -> None:  # fmt: skip
-    """Print results as JSON or as a table; ``nothing`` is printed where there are none."""
+    """Print results as JSON or as a table; ``nothing`` is printed if there are none."""
     if as_json:
         print_json(list(map(document, found)))
     elif found:
@@ -112,7 +112,7 @@ def terminal_width() -> int | None:
 
 
 def print_lines(lines: Iterable[str]) -> None:
-    """Print lines of text; in a terminal, those that are too long are folded."""
+    """Print lines of text; in a terminal, lines that are too long are wrapped."""
     width = terminal_width()
     for text in lines:
         for line in text.split("\n"):

@@ -26,9 +26,9 @@ _DOTS = "..."
 
 @dataclass(frozen=True, slots=True)
 class StatusView:
-    """How statuses are shown: plan, colours, and width in columns (None: no limit).
+    """Settings of the display of statuses: plan, colours, and width in columns (None: no limit).
 
-    ``branches`` is the tree to use where there is no plan.
+    ``branches`` is the tree to use without a plan.
     """
 
     plan: MonitoringPlan | None = None
@@ -176,7 +176,7 @@ def _expected(plan: OutputPlan | None) -> str:
 
 
 def _need(board: CurrentState, edge: DependencyPlan, view: StatusView) -> str:
-    """Return a dependency's name and the level of the component or mode that judges it."""
+    """Return a dependency's name and the level of the component or mode that gives its state."""
     judge = (edge.component, edge.mode) if edge.judged and not edge.problem else None
     status = next((s for s in board.statuses if (s.component, s.mode) == judge), None)
     if status is None or status.state == "not_monitored":

@@ -394,7 +394,9 @@ def _member(name: str, where: str, at_ns: int) -> MemberDiagnosis:
 
 
 def _member_diagnosis(name: str, where: str, at_ns: int) -> MemberDiagnosis:
-    """Return what a robot's watcher had written up to an instant of the same clock."""
+    """Return the diagnosis that a robot's watcher had written up to an instant of the
+    same clock.
+    """
     folder = load_folder(Path(where))
     plan, _ = load_plan(folder)
     knowledge, _ = load_knowledge(folder, plan)

@@ -118,7 +118,7 @@ def run_new(args: argparse.Namespace) -> int:
 
 
 def _files_of_source(folder: Path) -> dict[str, str]:
-    """Return the files that come with a source, such as its monitors, by their paths."""
+    """Return the files that belong to a source, such as its monitors, by their paths."""
     kinds = {".yaml", ".pl"}
     paths = sorted(path for path in folder.rglob("*") if path.suffix in kinds and path.is_file())
     return {path.relative_to(folder).as_posix(): path.read_text(encoding="utf-8") for path in paths}

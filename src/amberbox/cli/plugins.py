@@ -91,7 +91,7 @@ def _show(name: str, kinds: Sequence[str], as_json: bool) -> int:
 
 
 def _one(name: str, kinds: Sequence[str]) -> tuple[str, Plugin]:
-    """Return the plugin with a name; raise UsageError if there is none, or several."""
+    """Return the plugin with a name; raise UsageError if there is none, or if several have it."""
     known = {kind: KINDS[kind].plugins() for kind in kinds}
     found = [(kind, plugins[name]) for kind, plugins in known.items() if name in plugins]
     if len(found) > 1:

@@ -203,7 +203,7 @@ def _make_certificate(folder: Path, names: Sequence[str]) -> int:
 
 
 def _enrol_robot(folder: Path, robot: str, groups: Sequence[str], line_file: Path | None) -> int:
-    """Register a robot, and new groups; print the line to paste on the robot.
+    """Register a robot, and new groups; print its join line.
 
     With ``line_file`` the line is written there instead, readable for this user only.
     """
@@ -373,7 +373,7 @@ def _make_account(
 ) -> int:
     """Add an account; the first one is the admin that the server waits for.
 
-    The password is asked for, read from standard input, or generated (``one_time``): then it is
+    The password is prompted for, read from standard input, or generated (``one_time``): then it is
     printed, and has to be changed at the first login. It is never an argument, which other users
     could see.
     """

@@ -120,9 +120,9 @@ def _run_on_server(args: argparse.Namespace) -> int:
 
 
 def _of_fleet(args: argparse.Namespace) -> int | None:
-    """Print the status of each robot of a server; None where a single robot is chosen.
+    """Print the status of each robot of a server; None if a single robot is chosen.
 
-    A server with one robot stands for that robot, in full.
+    If the server has only one robot, that robot is shown in full.
     """
     from amberbox.client.fleet import Fleet
 

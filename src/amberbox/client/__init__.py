@@ -1,1 +1,1 @@
-"""The client of a server: typed queries over its API, and a robot's record there as a Record."""
+"""The client of a server: typed queries over its API, and a robot's record on it as a Record."""

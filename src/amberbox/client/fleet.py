@@ -183,7 +183,7 @@ def _take(
 
 By = Literal["received", "timestamp"]
 ROWS = 200_000
-"""Rows of one answer; more come in several."""
+"""Maximum number of rows of one answer; more rows are requested in several answers."""
 _Answer = TypeVar("_Answer")
 
 
@@ -352,7 +352,7 @@ class Fleet(AlarmCalls):
         return [*paged(self.wire, path, models.Incident, lambda i: i.id, _span(from_, to))]
 
     def mark_incident(self, robot: str, from_: Time, to: Time, reason: str) -> models.Incident:
-        """Pin a window: the server keeps what it has or gets of it until it is released."""
+        """Pin a window: the server keeps all data of it until the incident is released."""
         body = {**_span(from_, to), "reason": reason}
         return self._send("POST", f"{_of(robot)}/incidents", models.Incident, body)
 
@@ -450,7 +450,7 @@ class Fleet(AlarmCalls):
         return self._send("POST", f"{_of(robot)}/diagnose", dict[str, Any], body)
 
     def answer(self, robot: str, diagnosis: str, test: str, answer: str) -> dict[str, Any]:
-        """Store the answer to a test; return the diagnosis ranked anew."""
+        """Store the answer to a test; return the diagnosis with the new ranking."""
         path = f"{_of(robot)}/diagnoses/{quote(diagnosis, safe='')}/answers"
         return self._send("POST", path, dict[str, Any], {"test": test, "answer": answer})
 
@@ -482,7 +482,7 @@ class Fleet(AlarmCalls):
         self, robots: Sequence[str] | None = None, kinds: Sequence[str] | None = None,
         live: Mapping[str, Sequence[str]] | None = None,
     ) -> Iterator[Change]:  # fmt: skip
-        """Yield changes as they come, a snapshot first (``transport.follow``); needs websockets."""
+        """Yield changes, beginning with a snapshot (``transport.follow``); needs websockets."""
         from amberbox.client.transport import follow
 
         return follow(self.wire, robots, kinds, live)

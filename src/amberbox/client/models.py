@@ -101,7 +101,7 @@ def maybe_ns(text: str | None) -> int | None:
 
 
 def time_text(moment: Time) -> str:
-    """Return a time as a parameter of a request: empty for None, a text as it is."""
+    """Return a time as a parameter of a request: empty for None, a text unchanged."""
     if moment is None:
         return ""
     return moment if isinstance(moment, str) else format_time(moment)

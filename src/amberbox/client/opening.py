@@ -19,7 +19,7 @@ def open(where: str | Path) -> Record:
     """Open a record for reading: a robot folder, a store, a recording, or a robot on a server.
 
     A robot on a server is an address such as ``https://fleet.example:8443/robots/ropod_001``.
-    Raises UsageError when there is none of these at ``where``.
+    Raises UsageError when ``where`` is none of these.
     """
     if is_url(where):
         return open_remote(where)
@@ -37,7 +37,7 @@ def open_remote(where: str) -> RemoteRecord:
 
 
 def robot_at(where: str) -> tuple[Fleet, str]:
-    """Return the server and the robot of an address; without a robot, the only one there.
+    """Return the server and the robot of an address; without a robot, the server's only one.
 
     Raises UsageError when the server has none, or several.
     """

@@ -27,9 +27,9 @@ _SQL_HINT = (
     "amberbox sql DIR"
 )
 NOT_YET = "not on the server yet"
-"""Why there is a gap where the robot has something that was not copied."""
+"""Reason of a gap whose data are still on the robot."""
 DRAWN_ROWS = 200_000
-"""Rows that are drawn as they are; of more, the server thins them out."""
+"""Largest number of rows that are drawn unchanged; the server thins out more rows."""
 
 
 @dataclass(frozen=True)

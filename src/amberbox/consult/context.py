@@ -136,7 +136,7 @@ def context_from_journal(knowledge: Knowledge, store: Store, at_ns: int) -> Diag
 def context_from_findings(
     knowledge: Knowledge, findings: RecordedFindings, at_ns: int
 ) -> DiagnosisContext | None:
-    """Return the context that findings up to an instant make; None if there is no symptom."""
+    """Return the context made from the findings up to an instant; None if there is no symptom."""
     if not findings.symptoms:
         return None
     recorded = _RecordedFaults()
@@ -151,7 +151,7 @@ def context_from_findings(
 def _from_deleted_files(
     last_diagnosis: Diagnosis | None, symptoms: Iterable[Symptom]
 ) -> Iterator[Symptom]:
-    """Yield the symptoms of an open diagnosis whose findings are in deleted files alone.
+    """Yield the symptoms of an open diagnosis whose findings are only in deleted files.
 
     There is no later finding, so they are still present.
     """
@@ -179,8 +179,8 @@ def situation_at(
 class RobotWindow:
     """The ``EvidenceWindow`` of a robot at an instant (``core.contracts``).
 
-    ``open_past`` opens a part of the record, by its first and last instant; None where there is
-    none. It goes back as far as a provider needs, and at least ``lookback_ns``.
+    ``open_past`` opens a part of the record, by its first and last instant; None without a record.
+    The window reaches back as far as a provider needs, and at least ``lookback_ns``.
     """
 
     context: DiagnosisContext
@@ -207,6 +207,6 @@ class RobotWindow:
         return self.open_past(self.at_ns - back_ns, self.at_ns + 1)
 
     def lookups(self, needs: EvidenceNeeds) -> Sequence[Virtual]:
-        """Return the predicates of rules that look into that past."""
+        """Return the predicates of rules that query that part of the record."""
         past = self.past(needs)
         return () if past is None else record_predicates(past)

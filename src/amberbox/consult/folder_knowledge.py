@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 
 def fmea_references(folder: RobotFolder, plan: MonitoringPlan | None = None) -> FmeaReferences:
-    """Return the outputs of a folder's monitors, what its components need, what is recorded."""
+    """Return the outputs of a folder's monitors, its components' needs, and the recorded items."""
     plan = plan or load_plan(folder)[0]
     known, variables = declared_references(folder, plan), _variables(RecordedItems(folder))
     return (
@@ -54,7 +54,7 @@ def declared_references(folder: RobotFolder, plan: MonitoringPlan) -> FmeaRefere
 
 
 def _variables(recorded: RecordedItems) -> list[str] | None:
-    """Return the addresses of all variables to come; None if some are not known before."""
+    """Return the addresses of all variables that will be recorded; None if some are unknown."""
     schemas = {item.name: recorded.schema(item) for item in recorded.items}
     if recorded.open or None in schemas.values():
         return None
@@ -80,9 +80,9 @@ def plan_references(plan: MonitoringPlan) -> FmeaReferences:
 
 
 def _needs(component: ComponentPlan, ids: Mapping[str, str]) -> Needs:
-    """Return the needs of a component, as component ids; names of no component are left out.
+    """Return the needs of a component as component ids; names that are no component are left out.
 
-    A component that is judged by another component's monitor is needed all the same.
+    A dependency whose state another component's monitor gives is included.
     """
     by_name: dict[str, list[str]] = {}
     for edge in component.dependencies:
@@ -110,7 +110,8 @@ _SHOWN = 3
 
 @dataclass(frozen=True, slots=True)
 class DeclaredRobot:
-    """A copy of a robot's folder: its monitors, as far as they are known here, and its faults.
+    """A copy of a robot's folder: its monitors, as far as they are known here, and its failure
+    modes.
 
     ``problems`` are those of ``fmea.yaml``; with an error there are no failure modes.
     """
@@ -122,7 +123,7 @@ class DeclaredRobot:
     problems: Sequence[Problem]
 
     def faults(self) -> Fmea:
-        """Return the failure modes; raises UsageError where there are none."""
+        """Return the failure modes; raises UsageError if there are none."""
         if self.fmea is not None:
             return self.fmea
         errors = [problem for problem in self.problems if problem.is_error]
@@ -145,7 +146,7 @@ class DeclaredRobot:
 
 
 def read_declared_robot(place: Path, robot: str, config_hash: str) -> DeclaredRobot:
-    """Read a copy of a robot's folder: only declarations, and only what is below it."""
+    """Read a copy of a robot's folder: only declarative files, and only files inside it."""
     with only_below(place):
         folder, plan = read_declared_plan(place, robot, config_hash)
         known = declared_references(folder, plan)

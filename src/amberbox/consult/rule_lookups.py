@@ -47,7 +47,7 @@ from amberbox.monitoring.findings import COMPONENT_STATE, HealthState
 
 _BLOCK_NS = 900 * NS
 _MOST_BLOCKS = 16
-"""So many blocks that are wanted together are read together."""
+"""Number of adjacent blocks that are read together."""
 _LOOKBACKS_NS = (60 * NS, 3600 * NS)
 """So far back the value at the beginning is sought, before the whole run is."""
 _HINT = "give both times in a goal before it (mission(M, failed, From, To)), or --from T --to T"
@@ -65,7 +65,7 @@ class _Read:
 
 @dataclass(frozen=True)
 class _Question:
-    """A condition, what it reads, and what is known of it by blocks of time."""
+    """A condition, the variables it reads, and its known intervals by blocks of time."""
 
     when: Expression
     reads: tuple[_Read, ...]
@@ -73,16 +73,16 @@ class _Question:
 
 
 class ConditionLookup:
-    """Looks up when conditions held; results are cached."""
+    """Looks up when conditions were true; results are cached."""
 
     def __init__(self, window: RecordWindow) -> None:
         self._window = window
         self._questions: dict[str, _Question] = {}
 
     def find(self, keys: Keys, span: Span | None) -> Iterator[Interval]:
-        """Yield the intervals in which a condition held, in order of time.
+        """Yield the intervals in which a condition was true, in order of time.
 
-        Raises RuleFault for what is no condition, and for all of a long record.
+        Raises RuleFault for an invalid condition, and for a query over the whole of a long record.
         """
         (given,) = keys
         question = self._question(given)
@@ -215,7 +215,7 @@ def _days(length_ns: int) -> str:
 LASTS = "lasts"
 FAILED = "failed"
 _FIRST_NS = (3 * NS, 60 * NS)
-"""All statuses are written every second; the first of a run may come later."""
+"""Statuses are written every second; the first of a run may be later."""
 
 
 @dataclass(frozen=True)
@@ -411,7 +411,7 @@ def rule_target(where: str) -> RuleTarget:
 
 
 def record_predicates(window: RecordWindow) -> list[Virtual]:
-    """Return the predicates that look into a record."""
+    """Return the predicates that query a record."""
     missions, statuses, conditions = (
         MissionLookup(window),
         StatusLookup(window),

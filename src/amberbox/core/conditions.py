@@ -139,7 +139,7 @@ def _tick_blocks(
 def rising_edges(values: Any, was_true: bool) -> tuple[Any, bool]:
     """Return where a condition becomes true, and whether it is true at the end.
 
-    Where it is unknown its last known value counts. Raises UsageError for what is no condition.
+    Where it is unknown, its last known value counts. Raises UsageError if it is not a condition.
     """
     null = _null(values)
     if np.ma.getdata(values).dtype != bool and not null.all():
@@ -174,7 +174,9 @@ class WatchedCondition:
 
 @dataclass(frozen=True, slots=True)
 class RisingEdge:
-    """A condition has become true; ``values`` are what it captures at that instant."""
+    """An instant at which a condition became true; ``values`` are those captured at that
+    instant.
+    """
 
     name: str
     at_ns: int
@@ -314,7 +316,7 @@ class _AddressSeries:
         self._values: list[Any] = []
 
     def add(self, batch: Batch, times_ns: IntArray) -> None:
-        """Add the values of a batch; a variable that it does not have is unknown there."""
+        """Add the values of a batch; a variable that the batch does not have is unknown."""
         column = batch.columns.get(self.variable, np.full(len(times_ns), None, object))
         index = self._index
         values = values_of(column, 0) if index is None else element_of(column, index, 0)
@@ -323,7 +325,9 @@ class _AddressSeries:
         self._miss(batch, times_ns)
 
     def _miss(self, batch: Batch, times_ns: IntArray) -> None:
-        """Raise UsageError if the item has come for a while, and never with this variable."""
+        """Raise UsageError if messages of the item have been received for a while without this
+        variable.
+        """
         self._has_come = self._has_come or self.variable in batch.columns
         if self._has_come or not len(times_ns):
             return

@@ -69,7 +69,7 @@ def check_findings(built: Any) -> Iterator[Finding]:
 def certain_findings(
     cls: type[Any], values: Mapping[str, Any], unread: Mapping[str, Sequence[Any]]
 ) -> list[Finding]:
-    """Return the problems of ``values`` that remain with every stand-in of an ``unread`` field."""
+    """Return the problems of ``values`` that remain for every stand-in of an ``unread`` field."""
     count = max(map(len, unread.values()), default=1)
     sets = [{name: some[n % len(some)] for name, some in unread.items()} for n in range(count)]
     first, *others = [_found(cls, {**values, **some}) for some in sets]
@@ -142,7 +142,7 @@ def build(
 
 
 def raise_errors(problems: Sequence[Problem]) -> None:
-    """Raise ConfigurationError if there is an error among the problems."""
+    """Raise ConfigurationError if any of the problems is an error."""
     if any(problem.is_error for problem in problems):
         raise ConfigurationError(problems)
 
@@ -177,7 +177,7 @@ class _Marks:
     secret: bool = False
     doc: str = ""
     expected: str = ""
-    """What a union expects as a whole, while its members are tried."""
+    """The value that a union expects as a whole, while its members are tried."""
 
     def show(self, node: Node) -> str:
         """Return a wrong value as text for a message; secrets are masked."""
@@ -299,9 +299,9 @@ def _value(ctx: _Context, kind: Any, node: Node, where: str, marks: _Marks) -> A
 
 
 def _union(ctx: _Context, kind: Any, node: Node, where: str, marks: _Marks) -> Any:
-    """Take the first member that fits: one of exactly this type before one that converts.
+    """Convert to the first member that fits: one of exactly this type before one that converts.
 
-    Where none fits, report what is wrong for the member of the same shape: mapping, list or word.
+    If none fits, report the problem for the member of the same shape: mapping, list or scalar.
     """
     members = [member for member in get_args(kind) if member is not types.NoneType]
     if node.value is None and len(members) < len(get_args(kind)):

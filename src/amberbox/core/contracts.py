@@ -32,7 +32,7 @@ from amberbox.core.mode import Result
 from amberbox.core.types import Batch, Diagnosis, Status, Symptom
 
 Span: TypeAlias = tuple[int, int]
-"""From and to in nanoseconds; what is at ``to`` does not belong to it."""
+"""From and to in nanoseconds; ``to`` itself is not part of the span."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +46,7 @@ class Conflict:
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """A text that speaks for no failure mode; it is shown and changes no probability."""
+    """A text that is evidence for no failure mode; it is shown and changes no probability."""
 
     text: str
     source: str
@@ -151,7 +151,7 @@ class EvidenceWindow(Protocol):
         """Return the record as far back as is needed; None without a record."""
 
     def lookups(self, needs: EvidenceNeeds) -> Sequence[Any]:
-        """Return the predicates (``prolog.machine.Virtual``) that look into that past."""
+        """Return the predicates (``prolog.machine.Virtual``) that query that part of the record."""
 
 
 ModelT = TypeVar("ModelT", contravariant=True)
@@ -221,9 +221,9 @@ class EvidenceEngine(Protocol[ModelT, CaseT]):
     ``diagnosis.diagnose.DiagnosisContext``."""
 
     ALONE: str
-    """What stands above an answer of its own."""
+    """Text above the answer of this provider alone."""
     NOTHING: str
-    """Its answer where it finds nothing; empty for the symptoms that are not there."""
+    """Its answer if it finds nothing; empty to list the absent symptoms."""
     NO_ANSWERS: str
     """The refusal of answers to tests; empty where they count."""
 

@@ -72,7 +72,7 @@ class ExpressionError(UsageError):
 
 @dataclass(frozen=True)
 class Expression:
-    """An expression that has been read; ``text`` is what was written."""
+    """A parsed expression; ``text`` is its source."""
 
     text: str
     tree: ExpressionNode = field(repr=False, hash=False)
@@ -107,7 +107,7 @@ class Expression:
 
     @cached_property
     def history_ns(self) -> int:
-        """Return how far it looks back, nanoseconds: series need this and one sample more."""
+        """Return how far it looks back in nanoseconds: series need this and one more sample."""
         return history_ns(self.tree)
 
     @property
@@ -373,7 +373,7 @@ class _Values:
 
 
 def _is_guard(tree: ExpressionNode) -> bool:
-    """Return whether a part only checks that there are samples enough."""
+    """Return whether a part only checks that there are enough samples."""
     operands = tree.operands if isinstance(tree, ComparisonNode) else ()
     return any(isinstance(part, WindowNode) and part.name == "count" for part in operands)
 

@@ -15,10 +15,10 @@ _LONGEST_NAME = 255
 
 
 def below(folder: Path, *names: str) -> Path:
-    """Join names, also untrusted ones, to a path that lies below a folder.
+    """Join names, also untrusted ones, to a path inside a folder.
 
-    Each may have several parts (``a/b``). Raises AmberboxError for a name that would lead
-    elsewhere (``..``, an absolute path) or that no file can have.
+    Each may have several parts (``a/b``). Raises AmberboxError for a name that would lead elsewhere
+    (``..``, an absolute path) or that no file can have.
     """
     for name in names:
         if not all(map(_is_file_name, name.split("/"))):

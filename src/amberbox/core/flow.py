@@ -1,7 +1,7 @@
 """Arrival of an item's messages before any filter: last time, rate, stalls of the recorder.
 
-What was received during such a stall has late stamps or is lost, so absence, rates and jumps prove
-nothing there.
+Messages received during a stall have late stamps or are lost, so that absence, rates and jumps are
+no evidence for that time.
 """
 
 from __future__ import annotations
@@ -106,7 +106,7 @@ class Flow:
     stalls: Stalls = field(default_factory=Stalls)
     """When the recorder was held up: time that does not count for silence and rates."""
     began_ns: int | None = None
-    """When listening began, as far as the record tells; no message can be known from before."""
+    """Beginning of the record of this item, if known; earlier messages cannot be known."""
 
     def last_received_ns(self, now: Now) -> Any:
         """Return when the last message known at ``now`` was received, ns; -1 before the first."""
@@ -126,8 +126,8 @@ class Flow:
     def rate_hz(self, now: Now, seconds: float) -> Any:
         """Return messages received per second over the last ``seconds``, silence included.
 
-        A shorter time is used where less is known; NaN before anything is. Where a robot runs
-        faster than the box writes, counts come late, and the rows are used.
+        A shorter time is used if less is known; NaN before anything is known. If a robot is
+        recorded faster than real time, counts are late, and the rows are used.
         """
         counted = _rate(self.received, now, seconds, self.stalls)
         kept = _rate(self.rows, now, seconds, self.stalls)
@@ -179,7 +179,7 @@ class Flow:
         return bool(self.last_ns.values[last] > row_ns)
 
     def reaches_back(self, now: Now, seconds: float) -> Any:
-        """Return whether a message had come ``seconds`` ago already."""
+        """Return whether a message had already been received ``seconds`` ago."""
         before = now - round(seconds * NS)
         return (self.received.last(before) >= 0) | (self.rows.last(before) >= 0)
 
@@ -190,9 +190,10 @@ class Flow:
         return now - self.began_ns >= round(seconds * NS)
 
     def lost(self, now: Now) -> Any:
-        """Return whether a publisher is known to be lost, and nothing has come since for a second.
+        """Return whether a publisher is known to be lost, and no message was received since for a
+        second.
 
-        Of several publishers of an item one may be lost while the others go on.
+        Of several publishers of an item one may be lost while the others continue.
         """
         since_ns = _held(self.gap_from_ns, now, self.gap_from_ns.values, NONE_OPEN)
         happened = (since_ns != NONE_OPEN) & (since_ns <= now - NS)

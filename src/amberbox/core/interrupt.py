@@ -7,7 +7,8 @@ from types import FrameType
 
 
 class Interrupt:
-    """Handles SIGINT: leaves at once while modules load, raises KeyboardInterrupt afterwards.
+    """Handles SIGINT: ends the process at once while modules load, raises KeyboardInterrupt
+    afterwards.
 
     ``came`` is true once it was raised, even if a library turned it into another error.
     """

@@ -57,8 +57,9 @@ def ranks(
 ) -> list[int]:
     """Return the rank of each box: one after the last box that leads to it.
 
-    ``links`` have no circle. Boxes of ``last`` without a link out stand in the last rank; others
-    with more links out than in stand as near to what they lead to as they can, but not ``first``.
+    ``links`` have no cycle. Boxes of ``last`` without an outgoing link are in the last rank; other
+    boxes with more outgoing than incoming links are as close to their targets as possible, except
+    those of ``first``.
     """
     outgoing: list[list[int]] = [[] for _ in range(count)]
     waiting = [0] * count
@@ -133,7 +134,7 @@ def crossings(order: Order, below: Near, count: int) -> int:
 
 
 def _by_walk(ranks: Order, below: Near) -> Order:
-    """Return the ranks in the order of a walk in depth: what belongs together comes together."""
+    """Return the ranks in the order of a depth-first walk, so that connected boxes are adjacent."""
     rank_of = {item: rank for rank, items in enumerate(ranks) for item in items}
     order: Order = [[] for _ in ranks]
     seen: set[int] = set()
@@ -285,7 +286,7 @@ class LayoutBox:
 
 @dataclass(frozen=True, slots=True)
 class LayoutGaps:
-    """How much is left between ranks, and between boxes of one rank."""
+    """The space between ranks, and between boxes of one rank."""
 
     ranks: float = 64
     boxes: float = 16
@@ -320,9 +321,9 @@ def layered(
 ) -> GraphLayout:  # fmt: skip
     """Lay out boxes and the links between them, left to right or top down.
 
-    Boxes of ``first`` to which nothing leads stand in the first rank, those of ``last`` from which
-    nothing leads in the last. Boxes without a link stand in rows after all others.
-    Raises KeyError for a link to a box that there is not.
+    Boxes of ``first`` without an incoming link are in the first rank, boxes of ``last`` without an
+    outgoing link in the last. Boxes without any link are in rows after all others. Raises KeyError
+    for a link to an unknown box.
     """
     joined = {name for link in links for name in link}.union(first, last)
     main = [box for box in boxes if box.id in joined]
@@ -401,7 +402,7 @@ def neighbours(
 
 @dataclass(frozen=True, slots=True)
 class _Spot:
-    """Where an item stands: along the ranks from ``near`` to ``far``, across in the middle.
+    """Position of an item: from ``near`` to ``far`` along the ranks, and its centre across them.
 
     ``edge`` is where its rank ends.
     """
@@ -470,12 +471,12 @@ def _points(items: Sequence[int], spots: Mapping[int, _Spot], port: float) -> li
 
 
 def _loop(spot: _Spot) -> list[Point]:
-    """Return the line of a box to itself: out at its far end and back beside."""
+    """Return the line from a box to itself: out at its far end and back at its side."""
     return [(spot.far, spot.middle + spot.size / 4), (spot.far, spot.middle - spot.size / 4)]
 
 
 def _ports(plan: _Plan, spots: Mapping[int, _Spot]) -> list[float]:
-    """Return where each line enters its box: beside each other, in the order they come."""
+    """Return where each line enters its box: side by side, in the order of their origins."""
     into: dict[int, list[int]] = {}
     for place, items in enumerate(plan.passes):
         into.setdefault(items[-1], []).append(place)

@@ -86,11 +86,11 @@ class Result:
 
 @dataclass(slots=True, eq=False)
 class Input:
-    """One input of a mode, evaluated at the instants asked for.
+    """One input of a mode, evaluated at the requested instants.
 
-    ``name`` is its text in the mode file. For a ``list`` the values are the mean of what is
-    finite in each row, and ``parts`` has ``count finite min max mean`` of each; for a probe they
-    are its ``ok``, and ``parts`` are all that it measures. An ``item`` has no values of its own:
+    ``name`` is its text in the mode file. For a ``list`` the values are the mean of the finite
+    elements of each row, and ``parts`` has ``count finite min max mean`` of each; for a probe they
+    are its ``ok``, and ``parts`` are all of its measurements. An ``item`` has no values of its own:
     ``samples`` are then ``flow.rows``, the count of its rows.
     """
 
@@ -131,9 +131,9 @@ class Input:
 
 @dataclass(frozen=True, slots=True)
 class Given:
-    """What a mode evaluated when its results were bad, for its reason.
+    """The values that a mode evaluated when its results were bad, for its reason.
 
-    ``inputs`` are those it was called with, ``unit`` is that of its numbers, empty if not known.
+    ``inputs`` are those it was called with, ``unit`` is that of its numbers, empty if unknown.
     """
 
     inputs: Sequence[Input]
@@ -156,14 +156,14 @@ class Evaluate(Protocol):
     """The ``evaluate`` function of a mode."""
 
     def __call__(self, config: Any, inputs: Sequence[Input], now: Now) -> Mapping[str, Any]:
-        """Return the results by name at ``now``; what is left out is unknown."""
+        """Return the results by name at ``now``; results that are left out are unknown."""
 
 
 @cache
 def as_single(number: float) -> float:
     """Return a number rounded to float32: most messages hold 0.1 as 0.10000000149.
 
-    Compare with both where a value may lie right on a limit.
+    Compare with both values if a number may be exactly at a limit.
     """
     with np.errstate(over="ignore"):
         rounded = float(np.float32(number))
@@ -198,7 +198,9 @@ def reads_of(*expressions: Expression | None) -> tuple[str, ...]:
 
 
 def by_name(inputs: Sequence[Input], reads: Sequence[str]) -> dict[str, Input]:
-    """Return the inputs of a mode by name: those of the mapping by place, then what it reads."""
+    """Return the inputs of a mode by name: those of the mapping by position, then those of
+    ``reads``.
+    """
     own = len(inputs) - len(reads)
     names = [*(place_name(place) for place in range(own)), *reads]
     return dict(zip(names, inputs, strict=True))
@@ -254,9 +256,9 @@ def numbers(values: Any) -> NDArray[np.float64]:
 
 
 def middles(values: NDArray[np.float64]) -> tuple[Any, Any]:
-    """Return the two middle numbers over the first axis, which are one where it is odd.
+    """Return the two middle numbers over the first axis, which are the same if the count is odd.
 
-    What is not finite does not count; where nothing else is, the middle is NaN.
+    Numbers that are not finite do not count; if there are no others, the middle is NaN.
     """
     if not len(values):
         unknown = np.full(values.shape[1:], np.nan)
@@ -302,7 +304,9 @@ def _median(rows: NDArray[np.float64]) -> Any:
 
 
 def worst_of(values: NDArray[np.float64], limit: float) -> Any:
-    """Return the greatest number; NaN where something is unknown and all the rest within limits."""
+    """Return the greatest number; NaN if something is unknown and all other numbers are within
+    limits.
+    """
     greatest = np.fmax.reduce(values)
     unknown = np.isnan(values).any(axis=0) & (greatest <= limit)
     return np.where(unknown, np.nan, greatest)[()]

@@ -63,7 +63,7 @@ class Moved(MetaPathFinder, InspectLoader):
     def find_spec(
         self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
     ) -> ModuleSpec | None:
-        """Return the spec of an alias; None for what was never a documented module."""
+        """Return the spec of an alias; None for a name that was never a documented module."""
         name = fullname.removeprefix(_OURS)
         if name == fullname or name not in MOVED.keys() | _PACKAGES:
             return None

@@ -32,8 +32,8 @@ _KNOWN = {**dict(zip(_SPELLINGS[::2], _SPELLINGS[1::2], strict=True)), "ъ": "",
 def to_latin(text: str) -> str:
     """Write every letter and digit in ASCII: é as e, ж as zh, ب as beh, 温 as u6e29.
 
-    Letters of alphabets without a table here are spelled by their Unicode names, ideographs by
-    their numbers. What is no letter or digit stays.
+    Letters of alphabets without a table are spelled by their Unicode names, ideographs by their
+    numbers. Other characters are not changed.
     """
     if text.isascii():
         return text
@@ -137,7 +137,7 @@ def child_name(table: str, path: str) -> str:
 def shortened(name: str, longest: int = _LONGEST, text: str = "") -> str:
     """Cut a long name of an item, so that it can be the name of a file or of a database column.
 
-    What was cut ends in 8 hex digits of the SHA-256 of the text, or of the whole name.
+    A cut name ends in 8 hex digits of the SHA-256 of the text, or of the whole name.
     """
     if len(name) <= longest:
         return name
@@ -213,9 +213,9 @@ _SHOWN = 4
 
 
 def full_id(name: str, known: Collection[str], kind: str, *, hint: str = "") -> str:
-    """Return the id that a name is, or is the end of: ``stuck`` is ``fan/motor#stuck``.
+    """Return the id that equals a name or ends with it: ``stuck`` is ``fan/motor#stuck``.
 
-    Raises UsageError when there is none, or when it is the end of several.
+    Raises UsageError when there is none, or when there are several.
     """
     if name in known:
         return name
@@ -232,8 +232,8 @@ def component_id(
 ) -> str:
     """Return the id of a component by its id, its title, or its last words.
 
-    ``front`` is ``laser_front`` where no other id ends so. ``titles`` are those of ids.
-    Raises UsageError when there is none, or several are meant.
+    ``front`` is ``laser_front`` if no other id has this ending. ``titles`` are those of ids. Raises
+    UsageError when there is no such component, or more than one.
     """
     if name in known:
         return name
@@ -268,6 +268,6 @@ def _one(name: str, found: list[str], known: Collection[str], kind: str, hint: s
 
 
 def some_names(names: Sequence[str], most: int) -> str:
-    """Return names joined with commas, and how many more there are than ``most``."""
+    """Return at most ``most`` names joined with commas, and the number of further names."""
     more = f" and {len(names) - most} more" if len(names) > most else ""
     return ", ".join(names[:most]) + more

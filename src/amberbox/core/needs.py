@@ -18,7 +18,7 @@ _HINT = "write a list of names, {any: [...]}, {all: [...]} or {at_least: 2, of: 
 
 @dataclass(frozen=True, slots=True)
 class Needs:
-    """At least so many of the parts must be up; a part is a name or needs of its own.
+    """Needs that are met when at least a number of parts are up; a part is a name or nested needs.
 
     ``Needs(0, ())`` needs nothing and is always met.
     """
@@ -27,7 +27,7 @@ class Needs:
     parts: tuple[Needs | str, ...]
 
     def met(self, is_up: Callable[[str], bool]) -> bool:
-        """Return whether they are met, given what is up."""
+        """Return whether they are met; ``is_up`` states whether a name is up."""
         up = sum(is_up(p) if isinstance(p, str) else p.met(is_up) for p in self.parts)
         return up >= self.at_least
 
@@ -74,14 +74,14 @@ def any_of(*parts: Needs | str) -> Needs:
 
 
 def at_least(count: int, *parts: Needs | str) -> Needs:
-    """Return needs that are met when so many parts are up."""
+    """Return needs that are met when at least ``count`` parts are up."""
     return Needs(count, parts)
 
 
 def parse_needs(
     node: Node, problems: list[Problem], where: str, *, may_be_empty: bool = False
 ) -> Needs | None:
-    """Read needs from a file; None, and what is wrong in ``problems``, if they are no needs.
+    """Read needs from a file; if they are invalid return None and add the reason to ``problems``.
 
     ``may_be_empty`` allows the empty list: nothing is needed.
     """
@@ -91,7 +91,7 @@ def parse_needs(
 
 
 def cycles(needs: Mapping[str, Needs]) -> Iterator[tuple[str, ...]]:
-    """Yield each circle found: the names on the way, the first of them follows the last again.
+    """Yield each cycle found: its names in order; the last one needs the first again.
 
     At least one is found if there is any; depth first, without recursion.
     """
@@ -183,6 +183,6 @@ class _Reader:
         return node.text
 
     def _fail(self, node: Node, where: str, what: str, hint: str = "") -> Needs | None:
-        """Report what is wrong; always returns None."""
+        """Report a problem; always returns None."""
         self.problems.append(node.problem(where, what, hint))
         return None

@@ -50,7 +50,7 @@ class TokenBucket:
             return max(0.0, -self._tokens / self.rate)
 
     def take_one(self, now_s: float) -> float:
-        """Take a token if there is one; return 0, or the seconds until there is."""
+        """Take a token if one is available; return 0, or the seconds until there is one."""
         with self._lock:
             self._fill(now_s)
             if self._tokens < 1.0:

@@ -30,7 +30,7 @@ class Plugin:
     path: Path | None = None
 
     def load(self) -> ModuleType:
-        """Import the plugin; raise AmberboxError if it, or a library it needs, is not there."""
+        """Import the plugin; raise AmberboxError if it, or a library it needs, is missing."""
         try:
             return importlib.import_module(self.target) if self.target else self._load_file()
         except ImportError as error:
@@ -72,7 +72,7 @@ def find(
 def get(
     package: str, name: str, extra_dirs: Sequence[Path] = (), defines: Collection[str] = ()
 ) -> Plugin:
-    """Return one plugin; raise UsageError with the nearest name if there is none."""
+    """Return one plugin; raise UsageError with the most similar name if there is none."""
     known = find(package, extra_dirs, defines)
     if name not in known:
         kind = package.rpartition(".")[2].removesuffix("s")
@@ -82,7 +82,7 @@ def get(
 
 
 def missing_packages(plugin: Plugin) -> list[str]:
-    """Return the packages that a plugin's file imports, at any place, and that are not there."""
+    """Return the packages that a plugin's file imports anywhere and that are not installed."""
     if plugin.path is None:
         return []
     tree = _parsed(plugin.path.read_text(encoding="utf-8", errors="replace"))
@@ -92,7 +92,7 @@ def missing_packages(plugin: Plugin) -> list[str]:
 
 
 def install_hint(name: str) -> str:
-    """Return how to install what a plugin needs, if there is an extra of its name."""
+    """Return how to install the packages that a plugin needs, if there is an extra of its name."""
     extras = metadata("amberbox").get_all("Provides-Extra") or ()
     return f"pip install 'amberbox[{name}]'" if name in extras else ""
 

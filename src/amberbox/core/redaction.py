@@ -56,7 +56,7 @@ def secrets(cls: type[Any], node: Node) -> Iterator[Node]:
 
 
 def secrets_by_name(node: Node, key: str = "") -> Iterator[Node]:
-    """Yield values whose key sounds secret, for blocks of which no class is known."""
+    """Yield values whose key suggests a secret, for blocks without a known class."""
     if sounds_secret(key):
         yield node
         return

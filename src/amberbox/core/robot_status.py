@@ -47,14 +47,14 @@ _DIAGNOSED: Final = "a diagnosis is open"
 
 @dataclass(frozen=True, slots=True)
 class Observed:
-    """What is known of a robot, of which ``judge`` makes its status.
+    """The facts about a robot from which ``judge`` derives its status.
 
-    ``level`` is the worst of its components, ``reason`` what is worst. ``alarm`` is the highest
-    severity of the alarms that last, ``alarm_reason`` what that one is about; alarms that tell of
-    its absence are none of them. ``diagnosed``: a diagnosis is open and something of what it
-    explains is still seen; ``effect`` is what that leaves of the robot, as far as it is worked
-    out. ``as_of`` is when the newest of this was measured, as text (RFC 3339). ``delay_s`` is how
-    late overloaded monitoring evaluates.
+    ``level`` is the worst of its components, ``reason`` that of the worst one. ``alarm`` is the
+    highest severity of the active alarms, ``alarm_reason`` the reason of that one; alarms about its
+    absence do not count. ``diagnosed``: a diagnosis is open and at least one of its symptoms is
+    still present; ``effect`` is its effect on the robot, as far as it is known. ``as_of`` is when
+    the newest of these was measured, as text (RFC 3339). ``delay_s`` is the delay of overloaded
+    monitoring.
     """
 
     contact: Contact = "online"
@@ -129,9 +129,10 @@ def worst(levels: Iterable[Level]) -> Level:
 
 
 def components_level(components: Iterable[tuple[Level, str]]) -> Level:
-    """Return the worst level of components, each with its state; what has no monitor is left out.
+    """Return the worst level of components, each with its state; those without a monitor are left
+    out.
 
-    It is ``unknown`` where nothing is monitored.
+    It is ``unknown`` if nothing is monitored.
     """
     return worst(level for level, state in components if state != NOT_MONITORED)
 

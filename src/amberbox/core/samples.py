@@ -30,10 +30,10 @@ def is_one(now: Now) -> bool:
 
 
 class Samples:
-    """Samples of one variable in order of time; old ones are forgotten on demand.
+    """Samples of one variable in order of time; old ones are dropped on request.
 
-    Numbers are held as int64 or float64 whatever their column had, so that what is computed of
-    them does not depend on it, and nothing runs over.
+    Numbers are stored as int64 or float64 whatever the type of their column, so that results
+    computed from them do not depend on it and never overflow.
     """
 
     __slots__ = ("_end", "_null", "_start", "_times", "_values")
@@ -97,7 +97,9 @@ class Samples:
         self._end += count
 
     def _takes_as_they_are(self, values: NDArray[Any], count: int) -> bool:
-        """Return whether these are known floats that there is room for, as nearly always."""
+        """Return whether these are known floats that fit without conversion, as in nearly all
+        cases.
+        """
         return (
             type(values) is np.ndarray
             and values.dtype == _FLOAT == self._values.dtype
@@ -140,7 +142,7 @@ class Samples:
         self._null = None
 
     def last(self, now: Now) -> Any:
-        """Return the place of the last sample at or before ``now``, -1 where there is none."""
+        """Return the index of the last sample at or before ``now``, -1 if there is none."""
         return self.times_ns.searchsorted(now, "right") - 1
 
     def at(self, now: Now) -> Any:
@@ -165,7 +167,7 @@ class Samples:
         return self._end > self._start and bool(self._times[self._end - 1] <= now)
 
     def since_ns(self, now: Now) -> Any:
-        """Return the time of the last sample at or before ``now``; only where there is one."""
+        """Return the time of the last sample at or before ``now``; there has to be one."""
         times = self.times_ns if len(self) else np.zeros(1, np.int64)
         return times[self.last(now)]
 

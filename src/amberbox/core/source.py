@@ -42,7 +42,7 @@ class ChangeOptions:
     heartbeat_s: float = option(5.0, "keep a message at least this often", unit="s")
 
     def check(self) -> Iterator[tuple[str, str]]:
-        """Yield what is wrong with the values."""
+        """Yield each invalid value, and the reason."""
         numbers = {"absolute": self.absolute, "relative": self.relative}
         numbers |= {"heartbeat_s": self.heartbeat_s}
         numbers |= {f"bands.{name}": width for name, width in self.bands.items()}
@@ -66,7 +66,7 @@ class TopicOptions:
     stamp: str | None = option(None, "path of the own time stamp; '' for none")
 
     def check(self) -> Iterator[tuple[str, str]]:
-        """Yield what is wrong with the values."""
+        """Yield each invalid value, and the reason."""
         if self.max_frequency is not None and self.max_frequency <= 0:
             yield "max_frequency", "must be above 0"
 

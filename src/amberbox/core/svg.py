@@ -34,7 +34,7 @@ _BREAKS = re.compile(r"(?<=[/_#.+\-])")
 def escape_text(text: str) -> str:
     """Return text escaped for XML; characters that XML forbids become a question mark.
 
-    What a text hides is written out.
+    Invisible characters are written as escapes.
     """
     return escape(escape_hidden(_FORBIDDEN.sub("\ufffd", text)))
 
@@ -98,7 +98,7 @@ class SvgElement:
     children: tuple[SvgElement | str, ...] = ()
 
     def __html__(self) -> str:
-        """Return the markup, so that a template inserts it as it is."""
+        """Return the markup, so that a template inserts it without escaping."""
         return str(self)
 
     def __str__(self) -> str:
@@ -168,7 +168,7 @@ def root(
 
 
 def fluid(kind: str, high: float, label: str, parts: Iterable[Child]) -> SvgElement:
-    """Return a drawing as wide as there is room; its parts stand at percentages."""
+    """Return a drawing as wide as the available space; positions of its parts are percentages."""
     return root(kind, (0, high), label, parts, width="100%", viewBox=None)
 
 
@@ -181,7 +181,7 @@ def group(
 
 
 def linked(href: str, part: SvgElement) -> SvgElement:
-    """Return the part as a link, or as it is without an address."""
+    """Return the part as a link; unchanged without an address."""
     return element("a", part, href=href) if href else part
 
 
@@ -202,7 +202,7 @@ def fitted(text: str, most: float, size: float = SIZE, *, bold: bool = False) ->
 
 
 def broken(text: str, most: float, lines: int, *, bold: bool = False) -> list[str]:
-    """Return the text in at most so many lines, the last one shortened if it is more."""
+    """Return the text in at most ``lines`` lines, the last one shortened if necessary."""
     found = wrap_text(text, most, SIZE, bold=bold)
     if len(found) <= lines:
         return found

@@ -31,7 +31,7 @@ class PinError(AmberboxError):
 def fingerprint(pem: bytes) -> str:
     """Return the SHA-256 of the first certificate of a PEM file, 64 hex digits.
 
-    Raises ValueError when there is none in it.
+    Raises ValueError when it contains no certificate.
     """
     found = _PEM.search(pem)
     if found is None:

@@ -15,14 +15,16 @@ IntArray: TypeAlias = NDArray[np.int64]
 
 @dataclass(frozen=True, slots=True)
 class Missing:
-    """Marks a field of an API answer that older servers do not send, and what it is then."""
+    """Marks a field of an API answer that older servers do not send, with its value in
+    that case.
+    """
 
     default: Any = None
 
 
 _T = TypeVar("_T")
 Later: TypeAlias = Annotated[_T, Missing()]
-"""A field that older servers do not send: the client takes it as None, zero or empty then."""
+"""A field that older servers do not send: for the client it is then None, zero or empty."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +57,7 @@ class Topic:
 class Ragged:
     """A list column: row ``i`` is ``values[offsets[i]:offsets[i + 1]]``.
 
-    ``offsets`` has one entry more than there are rows.
+    ``offsets`` has one more entry than there are rows.
     """
 
     offsets: IntArray
@@ -76,7 +78,7 @@ ColumnData: TypeAlias = "NDArray[Any] | Ragged"
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """A flat column: its name, where it stands in the message, and what it holds.
+    """A flat column: its name, its path in the message, and its type.
 
     ``type`` is one of bool, int8..int64, uint8..uint64, float32, float64, string, binary, time,
     duration, or ``list<...>`` of one of these. ``labels`` are the message's constants for it.
@@ -104,7 +106,7 @@ class ItemSchema:
 
 
 class Position(NamedTuple):
-    """Where a record stands: ``seq`` counts without holes within a writer's run."""
+    """The position of a record: ``seq`` counts without holes within a writer's run."""
 
     store_id: str
     writer: str
@@ -124,13 +126,15 @@ class WriterCursor:
     ahead: Mapping[str, int] = field(default_factory=dict)
 
     def has_read(self, run: int, seq: int, item: str) -> bool:
-        """Return whether a row lies before this cursor."""
+        """Return whether a row is before this cursor."""
         return (run, seq) < (self.run, max(self.seq, self.ahead.get(item, 0)))
 
 
 @dataclass(frozen=True, slots=True)
 class Cursor:
-    """Where a follower stands in each writer's journal; text and back without loss."""
+    """The position of a follower in each writer's journal; converts to text and back
+    without loss.
+    """
 
     store_id: str = ""
     writers: Mapping[str, WriterCursor] = field(default_factory=dict)
@@ -169,7 +173,7 @@ class Batch:
     """Rows of one item, one schema, one writer's run, in ``seq`` order.
 
     ``timestamp_ns`` is the item's own stamp, else ``received_ns`` (the paper's rule);
-    ``received_ns`` is the corrected time of receipt, ``log_time_ns`` as it was written down.
+    ``received_ns`` is the corrected time of receipt, ``log_time_ns`` the time in the journal.
     """
 
     item: str
@@ -197,10 +201,11 @@ class Batch:
 
 @dataclass(frozen=True, slots=True)
 class Gap:
-    """A range of the record that is not there, and why.
+    """A missing range of the record, with the reason.
 
-    ``item`` is empty when the whole writer is meant; ``count`` is None when nobody can know.
-    ``peer`` names the publisher that was not heard, whose topic others may have published.
+    ``item`` is empty if all items of the writer are missing; ``count`` is None if it is unknown.
+    ``peer`` names the publisher whose messages are missing; messages of other publishers of the
+    topic may have been received.
     """
 
     writer: str
@@ -238,12 +243,13 @@ Output: TypeAlias = "bool | int | float | str | None"
 
 @dataclass(frozen=True, slots=True)
 class Status:
-    """What the monitors say of one mode of a component, or of the component (``mode`` empty).
+    """The result of the monitors for one mode of a component, or for the component (``mode``
+    empty).
 
     ``state`` is ``nominal``, ``not_initialised``, ``not_monitored``, or the name of a fault state.
-    ``blocked_by`` names the nearest dependencies that are not ok. ``measured_ns`` is the instant
-    of the record it is about, ``since_ns`` when level and state became what they are.
-    ``live_only`` marks what a replay cannot see, such as that the recorder was dead.
+    ``blocked_by`` names the nearest dependencies that are not ok. ``measured_ns`` is the evaluated
+    instant of the record, ``since_ns`` when the present level and state began. ``live_only`` marks
+    results that a replay cannot reproduce, such as that the recorder was dead.
     """
 
     robot: str
@@ -264,7 +270,7 @@ SymptomState: TypeAlias = Literal["present", "absent", "unknown"]
 
 
 class FaultFacts(NamedTuple):
-    """What is known of a failure mode: what the robot can still do, which symptoms it may show."""
+    """Facts about a failure mode: its severity, and the symptoms it may show."""
 
     severity: Literal["warning", "urgent", "critical", "fatal"]
     shows: frozenset[str]
@@ -272,14 +278,14 @@ class FaultFacts(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Symptom:
-    """One observation that speaks for or against faults.
+    """One observation that is evidence for or against faults.
 
     ``id`` is the address of a monitor's output (``component/mode/output``) or
-    ``detector.finding.item[.variable]``; ``source`` says who found it, ``strength`` is the share
-    of it that counts (1: all). ``evidence`` names what was measured: address, from and to.
-    ``blocked_by`` names what its component depends on and is not ok: then it is no evidence.
-    ``reason`` says the value that was measured and its limit, where that is known. ``gone_ns`` is
-    when it was seen to be gone, of one that is remembered: it goes on to count for a while.
+    ``detector.finding.item[.variable]``; ``source`` names the kind of provider, ``strength`` is the
+    trust in the observation (1: full). ``evidence`` names the measured data: address, from and to.
+    ``blocked_by`` names dependencies of its component that are not ok: then it is no evidence.
+    ``reason`` gives the measured value and its limit, if known. ``gone_ns`` is when a symptom
+    disappeared that is still remembered: it continues to count for a while.
     """
 
     id: str
@@ -300,9 +306,9 @@ UNKNOWN_FAULT: Final = "unknown#other"  # stands for every failure mode that is 
 
 @dataclass(frozen=True, slots=True)
 class Hypothesis:
-    """A set of failure modes (``component#mode``) that may be what is broken.
+    """A set of failure modes (``component#mode``) as a possible cause.
 
-    ``ambiguity`` are the ids of hypotheses that no symptom tells from this one.
+    ``ambiguity`` are the ids of hypotheses that no symptom distinguishes from this one.
     """
 
     id: str
@@ -318,9 +324,9 @@ class Hypothesis:
 
 @dataclass(frozen=True, slots=True)
 class Test:
-    """Something that can be looked at, asked or done to learn more.
+    """A reading, question, check or experiment that gives more information.
 
-    ``gain_bits`` is the information expected from it, ``outcomes`` how probable each answer is.
+    ``gain_bits`` is the expected information, ``outcomes`` the probability of each answer.
     """
 
     id: str
@@ -335,10 +341,10 @@ class Test:
 
 @dataclass(frozen=True, slots=True)
 class AmbiguityGroup:
-    """Hypotheses that nothing known tells apart, by id, the most probable first.
+    """Hypotheses that the evidence cannot distinguish, by id, the most probable first.
 
-    ``wider`` are sets that only add faults to a member without a trace. ``split_by`` is the id of
-    the test that tells the members apart best, empty if there is none or only one member.
+    ``wider`` are sets that only add faults without any symptom to a member. ``split_by`` is the id
+    of the test that distinguishes the members best, empty if there is none or only one member.
     """
 
     members: tuple[str, ...]
@@ -349,14 +355,14 @@ class AmbiguityGroup:
 
 @dataclass(frozen=True, slots=True)
 class Diagnosis:
-    """The one answer: hypotheses from likely to unlikely, and what to do next.
+    """A diagnosis: hypotheses from likely to unlikely, and the next tests.
 
-    ``mass_covered`` is the probability of all hypotheses that were looked at; ``incomplete`` says
-    which budget ended the search, empty if none did. ``findings`` are what nothing maps to a
-    failure mode. ``symptoms`` are those that were present, in order of onset; once all have
-    healed its last revision says so in ``state`` and keeps the last answer. ``live_only`` marks
-    a record that a replay does not have: said again in a new file, or ended by a restart.
-    ``make_safe`` is what has to be done before any of ``next_tests``, by the FMEA.
+    ``mass_covered`` is the probability of all enumerated hypotheses; ``incomplete`` names the
+    budget that ended the search, empty if none did. ``findings`` are results that belong to no
+    failure mode. ``symptoms`` are the present ones, in order of onset; once all have healed the
+    last revision has the ``state`` healed and keeps the last answer. ``live_only`` marks a record
+    that a replay does not reproduce: repeated in a new file, or ended by a restart. ``make_safe``
+    are the actions of the FMEA that are needed before any of ``next_tests``.
     """
 
     id: str
@@ -381,5 +387,7 @@ class Diagnosis:
         return tuple(by_id[name] for name in group.members if name in by_id)
 
     def leading(self) -> tuple[Hypothesis, ...]:
-        """Return the most probable hypothesis, and those that nothing known tells from it."""
+        """Return the most probable hypothesis, and those that the evidence cannot distinguish from
+        it.
+        """
         return self.members(self.groups[0]) if self.groups else self.hypotheses[:1]

@@ -102,7 +102,9 @@ def confidence_word(probability: float) -> str:
 
 
 def percent(probability: float) -> str:
-    """Write a probability in whole percent; what is not quite sure is never 0 or 100 %."""
+    """Write a probability in whole percent; a probability below 1 is never 100 %, one above 0 never
+    0.
+    """
     if probability >= 0.995:
         return "over 99 %"
     return "under 1 %" if probability < 0.005 else f"{probability:.0%}".replace("%", " %")

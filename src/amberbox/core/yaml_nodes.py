@@ -78,9 +78,9 @@ class Node:
 
 @contextmanager
 def only_below(folder: Path) -> Iterator[None]:
-    """Read no YAML file but those below a folder and our own, whatever these files name.
+    """Allow reading only YAML files inside a folder and our own, whatever these files refer to.
 
-    For folders from elsewhere: files outside are reported as unreadable.
+    Used for folders of other machines: files outside are reported as unreadable.
     """
     token = _FENCE.set(folder.resolve())
     try:
@@ -90,7 +90,7 @@ def only_below(folder: Path) -> Iterator[None]:
 
 
 def load_yaml(path: Path, problems: list[Problem], name: str = "") -> Node | None:
-    """Read a YAML file; add what is wrong with it to ``problems``.
+    """Read a YAML file; add its errors to ``problems``.
 
     ``name`` is the file's name in messages. Returns None if the file cannot be read at all.
     """
@@ -226,7 +226,9 @@ class _Reader:
 
 
 def _merged(node: Node) -> Iterator[tuple[str, Node]]:
-    """Yield what ``<<: *base`` or ``<<: [*a, *b]`` brings in; of several the first one counts."""
+    """Yield the keys merged by ``<<: *base`` or ``<<: [*a, *b]``; of several the first one
+    counts.
+    """
     for part in reversed(node.items or (node,)):
         yield from (part.mapping or {}).items()
 

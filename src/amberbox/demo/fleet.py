@@ -128,7 +128,7 @@ class SimulatedRobot:
             self._box = start_tied(("amberbox", "run", str(place.folder)), output=file)
 
     def order(self, line: str) -> None:
-        """Send the simulator an order: ``fault NAME``, ``heal NAME``."""
+        """Send the simulator a command: ``fault NAME``, ``heal NAME``."""
         with self.place.orders.open("a", encoding="utf-8") as file:
             file.write(f"{line}\n")
 

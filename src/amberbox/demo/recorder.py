@@ -234,7 +234,7 @@ def check(fine: bool, text: str) -> None:
 
 
 def write_folder(folder: Path, name: str, blocks: str, more: str = "") -> None:
-    """Write a robot folder; ``more`` goes into its ``robot.yaml``."""
+    """Write a robot folder; ``more`` is added to its ``robot.yaml``."""
     folder.mkdir(exist_ok=True)
     (folder / "robot.yaml").write_text(f"id: {name}\n{more}")
     (folder / "black_box.yaml").write_text(blocks)
@@ -267,7 +267,7 @@ def amberbox_verb(*arguments: str, expected: int = 0) -> None:
 
 
 def start_box(folder: Path) -> subprocess.Popen[bytes]:
-    """Start recording and wait until the first journal is there."""
+    """Start recording and wait until the first journal exists."""
     before = journals(folder)
     command = [sys.executable, "-m", "amberbox", "record", str(folder), "--quiet"]
     box = subprocess.Popen(command, start_new_session=True)

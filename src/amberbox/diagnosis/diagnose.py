@@ -39,12 +39,12 @@ from amberbox.diagnosis.make_safe import with_safety_actions
 class ObservedSituation:
     """The evidence at an instant.
 
-    A symptom that is unknown, or blocked by something that its component depends on, is no
-    evidence. ``answers`` are the outcomes of tests, by the test's id (``cannot check`` is one).
-    ``conflicts`` are sets of failure modes of which other engines proved that at least one is
-    there. ``watched``: the symptoms come from a watcher, which reads them all as soon as they can
-    be read: reading them is no test. ``findings`` are texts of other engines' findings that
-    indicate no failure mode.
+    A symptom that is unknown, or blocked by a dependency of its component, is no evidence.
+    ``answers`` are the outcomes of tests, by the test's id (``cannot check`` is one). ``conflicts``
+    are sets of failure modes of which other engines proved that at least one is present.
+    ``watched``: the symptoms come from a watcher, which reads all of them as soon as possible, so
+    that reading a symptom is not proposed as a test. ``findings`` are texts of other engines'
+    findings that indicate no failure mode.
     """
 
     symptoms: tuple[Symptom, ...] = ()
@@ -54,7 +54,7 @@ class ObservedSituation:
     findings: tuple[str, ...] = ()
 
     def present(self) -> tuple[Symptom, ...]:
-        """Return the symptoms that are there and count, in order of onset."""
+        """Return the symptoms that are present and count, in order of onset."""
         there = (s for s in self.symptoms if s.state == "present" and not s.blocked_by)
         return tuple(sorted(there, key=lambda s: (s.onset_ns or 0, s.id)))
 
@@ -89,9 +89,9 @@ def measured(symptom: Symptom) -> Measured:
 
 
 def evidence_of_situation(knowledge: Knowledge, situation: ObservedSituation) -> Evidence:
-    """Return the evidence that counts of a situation.
+    """Return the evidence of a situation that counts.
 
-    Raises UsageError for an answer to an unknown test, or that the test does not have.
+    Raises UsageError for an answer to an unknown test, or an unknown answer.
     """
     counting = (_as_monitored(symptom) for symptom in situation.symptoms if not symptom.blocked_by)
     found = collect_evidence(counting, situation.conflicts)
@@ -106,7 +106,7 @@ def evidence_of_situation(knowledge: Knowledge, situation: ObservedSituation) ->
 def _as_monitored(symptom: Symptom) -> Symptom:
     """Count the FMEA's own conditions as findings of monitors: the same author wrote both.
 
-    The author has given both a ``detects``, knowing that they look at the same measurement.
+    The author of the file has given both a ``detects``, knowing that they use the same measurement.
     """
     return replace(symptom, source="monitor") if symptom.source == "condition" else symptom
 
@@ -152,7 +152,7 @@ def answer(
 ) -> Diagnosis:
     """Return the diagnosis of a situation: a pure function of its arguments.
 
-    Raises UsageError for answers and conflicts that name what the knowledge does not have.
+    Raises UsageError for answers and conflicts with names that the knowledge does not have.
     """
     known = evidence_of_situation(knowledge, situation)
     found = diagnose(
@@ -206,8 +206,8 @@ Origin: TypeAlias = Literal["watcher", "record", "given", "status"]
 class DiagnosisContext:
     """The evidence at an instant, and the last revision of a diagnosis up to then, if any.
 
-    ``seen`` are the symptoms of that diagnosis as they were; they need not be there any more.
-    ``has_more``: there is more evidence than that diagnosis was made of.
+    ``seen`` are the symptoms of that diagnosis at its time; they need not be present any more.
+    ``has_more``: there is more evidence than that diagnosis used.
     """
 
     at_ns: int
@@ -228,9 +228,9 @@ class DiagnosisContext:
         return None if self.is_over else self.last_diagnosis
 
     def with_observations(self, items: Sequence[EvidenceItem]) -> DiagnosisContext:
-        """Return the context with the user's evidence, which replaces what was read.
+        """Return the context with the user's evidence, which replaces the symptoms that were read.
 
-        Answers alone, once a diagnosis is over, are about what it was.
+        If only answers are given after a diagnosis is over, they apply to that diagnosis.
         """
         stated = {item.id: item for item in items if isinstance(item, Symptom)}
         answers = {item.test: item.outcome for item in items if isinstance(item, AnsweredTest)}
@@ -265,9 +265,9 @@ class DiagnosisContext:
 
 
 def diagnose_context(knowledge: Knowledge, context: DiagnosisContext) -> Diagnosis | None:
-    """Return the diagnosis of a context; None where nothing indicates a fault.
+    """Return the diagnosis of a context; None if nothing indicates a fault.
 
-    The last diagnosis stays as it is where nothing more is known.
+    The last diagnosis is returned unchanged if there is no further evidence.
     """
     if context.last_diagnosis is not None and not context.has_more:
         return context.last_diagnosis
@@ -291,7 +291,9 @@ def diagnosis_id_of(knowledge: Knowledge, context: DiagnosisContext) -> Diagnosi
 
 
 def is_fault_indicated(context: DiagnosisContext, diagnosis: Diagnosis | None) -> bool:
-    """Return whether something is wrong: a symptom is there, or a fault leads."""
+    """Return whether there is a fault: a symptom is present, or the leading hypothesis
+    has a fault.
+    """
     if diagnosis is None or diagnosis.state == "healed":
         return False
     leading = diagnosis.hypotheses[:1]
@@ -308,7 +310,7 @@ OpenWindow: TypeAlias = Callable[[DiagnosisContext], EvidenceWindow]
 
 @cache
 def engine_names() -> tuple[str, ...]:
-    """Return the names of all engines: the covering one, then those that also give evidence."""
+    """Return the names of all engines: covering, then the providers that can answer alone."""
     both = find(EVIDENCE, defines=("provide", "alone"))
     return tuple(dict.fromkeys((COVERING, *both, *find(EVIDENCE, defines=("alone",)))))
 

@@ -1,4 +1,4 @@
-"""The FMEA of a robot and what is compiled from it once for the engines."""
+"""The FMEA of a robot, and the model that the engines use, compiled from it once."""
 
 from __future__ import annotations
 
@@ -73,10 +73,10 @@ def compile_checks(fmea: Fmea) -> tuple[Check, ...]:
 
 @dataclass(frozen=True)
 class Knowledge:
-    """The FMEA of a robot and what is compiled from it.
+    """The FMEA of a robot, and the model and tests compiled from it.
 
-    ``exposure_h`` is the time since all was known to be well, hours; None for the file's value.
-    ``config_hash`` is that of the folder it comes from.
+    ``exposure_h`` is the time since all components were known to work, in hours; None for the
+    file's value. ``config_hash`` is that of the folder it comes from.
     """
 
     robot: str
@@ -90,9 +90,9 @@ class Knowledge:
         return compile_model(self.fmea, self.exposure_h)
 
     def facts(self, shows: Mapping[str, Collection[str]]) -> Mapping[str, FaultFacts]:
-        """Return the severity of each failure mode, by itself, beside the symptoms it shows.
+        """Return the severity of each failure mode alone, and the symptoms it shows.
 
-        It is the gravest of its own and of the system functions that are lost with it.
+        It is the worst of its own and of the system functions that are lost with it.
         """
         functions = {name: self.fmea.functions[name] for name in self.fmea.system_functions()}
         structure = DependencyStructure.of(self.fmea.needs())

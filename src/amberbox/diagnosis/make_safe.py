@@ -28,9 +28,10 @@ _CLAUSE_ENDS = re.compile(r"\s*[;,.]\s+")
 
 @dataclass(frozen=True, slots=True)
 class MakeSafeAction:
-    """An action before every test, in the FMEA's words, with the failure modes it is against.
+    """An action before every test, as worded in the FMEA.
 
-    ``faults`` are failure modes, ``probability`` that of the most probable of the worst.
+    ``faults`` are the failure modes it protects against, ``probability`` that of the most probable
+    of the worst.
     """
 
     text: str
@@ -65,8 +66,8 @@ def safety_actions(
 ) -> tuple[MakeSafeAction, ...]:
     """Return the actions against credible causes, the worst and most probable first.
 
-    ``leading`` are the ids of the hypotheses that lead, ``cleared`` failure modes of which nothing
-    shows any more; what is fatal is made safe all the same, until it is ruled out.
+    ``leading`` are the ids of the leading hypotheses, ``cleared`` failure modes whose symptoms have
+    all gone; fatal ones among these are still made safe until they are ruled out.
     """
     first = {fault for h in hypotheses if h.id in leading for fault in h.faults}
     found: dict[str, list[tuple[int, float, str]]] = {}

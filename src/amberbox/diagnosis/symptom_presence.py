@@ -53,11 +53,11 @@ class BlockingRules:
         self._down = _down(fmea)
 
     def lets_count(self, latest: Symptom, present: Collection[str]) -> bool:
-        """Return whether a symptom counts that comes while these others are present.
+        """Return whether a symptom counts that appears while these others are present.
 
-        It does if nothing blocks it, or something that may show it, or only components that
-        still serve: all that is seen of them has causes that do not take them down. So does what
-        the analysis says to show its component by itself.
+        It does if nothing blocks it, or a component that can cause it, or only components that
+        still serve: all of their symptoms have causes that do not take them down. It also does if
+        the FMEA marks it as evidence about its own component.
         """
         blocking = {label.partition("/")[0] for label in latest.blocked_by}
         if (
@@ -75,7 +75,7 @@ class BlockingRules:
 
 
 def _down(fmea: Fmea) -> Mapping[str, Mapping[str, bool]]:
-    """Return per component its symptoms, and whether what takes it down may show them."""
+    """Return per component its symptoms, and whether faults that take it down can cause them."""
     structure = DependencyStructure.of(fmea.needs())
     found: dict[str, dict[str, bool]] = {}
     for mode in fmea.modes.values():
@@ -93,11 +93,11 @@ Counts: TypeAlias = Literal["present", "absent", ""]
 
 @dataclass(slots=True)
 class SymptomPresence:
-    """One symptom: its latest finding, and when it came and went.
+    """One symptom: its latest finding, and when it appeared and disappeared.
 
-    ``seen`` is the finding when it came. Seen to be gone it is remembered for ``hold_ns``,
-    that is until ``until_ns``, and only ``within_ns`` later it can count as absent. While it
-    cannot be evaluated, ``left_ns`` of that are left, for ``remember_ns`` at most.
+    ``seen`` is the finding when it appeared. After it is observed to be gone it is remembered for
+    ``hold_ns``, that is until ``until_ns``, and only ``within_ns`` later it can count as absent.
+    While it cannot be evaluated, ``left_ns`` of that time remain, for ``remember_ns`` at most.
     """
 
     latest: Symptom
@@ -110,13 +110,15 @@ class SymptomPresence:
 
     @property
     def is_there(self) -> bool:
-        """Return whether it is there now."""
+        """Return whether the symptom is present now."""
         return self.seen is not None and self.until_ns is None
 
     def take(self, latest: Symptom, at_ns: int, counts: bool = True) -> None:
-        """Process a finding at an instant; a symptom that returns while remembered never went.
+        """Process a finding at an instant; a symptom that returns while remembered counts as
+        uninterrupted.
 
-        ``counts`` is whether it counts if it comes now. What was there before goes on to count.
+        ``counts`` is whether it counts if it appears now. A symptom that was present before
+        continues to count.
         """
         was_present = self.counts_present(at_ns)
         self.latest = latest
@@ -133,22 +135,26 @@ class SymptomPresence:
             self._hide(at_ns)
 
     def _hide(self, at_ns: int) -> None:
-        """Suspend forgetting for a limited time: unknown or blocked, it is not seen to be gone."""
+        """Suspend the hold time for a limited time: an unknown or blocked symptom is not observed
+        as gone.
+        """
         if self.left_ns is None:
             self.left_ns = self.hold_ns if self.until_ns is None else self.until_ns - at_ns
             self.until_ns = at_ns + self.remember_ns + self.left_ns
 
     def counts_present(self, at_ns: int) -> bool:
-        """Return whether it is there, or went so short ago that it is remembered."""
+        """Return whether it is present, or disappeared so recently that it is remembered."""
         return self.is_there or (self.until_ns is not None and at_ns < self.until_ns)
 
     @property
     def is_absent(self) -> bool:
-        """Return whether it is known not to be there, whether that counts or not."""
+        """Return whether it is known to be absent, whether or not the absence counts."""
         return self.latest.state == "absent" and not self.latest.blocked_by
 
     def forgotten_since_ns(self, at_ns: int) -> int | None:
-        """Return since when it is being forgotten; None while it is there, or hidden."""
+        """Return when the hold time of a gone symptom began; None while it is present or
+        unknown.
+        """
         if self.until_ns is None or (self.counts_present(at_ns) and not self._fades):
             return None
         return self.until_ns - self.hold_ns
@@ -158,7 +164,7 @@ class SymptomPresence:
         return self.left_ns is None and self.is_absent
 
     def forget(self, at_ns: int) -> None:
-        """Remember it no longer than to an instant."""
+        """Limit the time for which it is remembered to an instant."""
         if self.until_ns is not None:
             self.until_ns = min(self.until_ns, at_ns)
 
@@ -228,7 +234,7 @@ class SymptomPresences:
             self._blocked.pop(latest.id, None)
 
     def _made(self, latest: Symptom) -> SymptomPresence:
-        """Make the presence of a symptom: how long it is remembered and may take to come."""
+        """Create the presence of a symptom, with its hold time and its longest delay."""
         symptom = self._symptoms.get(latest.id)
         if symptom is None:
             return SymptomPresence(latest)
@@ -255,8 +261,8 @@ class SymptomPresences:
     def counting(self, at_ns: int, waits_ns: Mapping[str, int]) -> dict[str, Counts]:
         """Return what each symptom counts as at an instant.
 
-        Absence counts from the instant in ``waits_ns`` on. What the analysis does not have
-        counts only while it is there.
+        Absence counts from the instant in ``waits_ns`` on. Symptoms that are not in the FMEA count
+        only while they are present.
         """
         return {name: self._counts(name, one, at_ns, waits_ns) for name, one in self}
 
@@ -299,10 +305,10 @@ class SymptomPresences:
 
 
 class AbsenceTimes:
-    """The causes of each symptom, and how long each may take to show it.
+    """The causes of each symptom, and the longest delay of each.
 
-    Causes are failure modes and lost functions. What needs a component that a mode takes down,
-    directly or not, whatever else serves, shows its symptoms for the mode.
+    Causes are failure modes and lost functions. Functions that need a component that a mode takes
+    down, directly or not, count as effects of the mode, regardless of redundancy.
     """
 
     def __init__(self, fmea: Fmea) -> None:
@@ -318,10 +324,10 @@ class AbsenceTimes:
         return {cause: links.keys() for cause, links in self._links.items()}
 
     def until_ns(self, onsets_ns: Mapping[str, int]) -> dict[str, int]:
-        """Return until when absent symptoms are to be waited for, given what is present.
+        """Return until when to wait for absent symptoms, given the present ones.
 
-        Each cause of something present may have begun with the newest of what it shows: what
-        is older may have had another cause. It has ``within_s`` of each link from then on.
+        Each cause of a present symptom may have begun with the newest of its symptoms: an older one
+        may have had another cause. From then on it has ``within_s`` of each link.
         """
         began_ns: dict[str, int] = {}
         for symptom, onset_ns in onsets_ns.items():
@@ -345,7 +351,7 @@ def _causes(fmea: Fmea) -> Iterator[tuple[str, list[SymptomLink]]]:
 
 
 def _shown_below(fmea: Fmea, structure: DependencyStructure, name: str) -> list[SymptomLink]:
-    """Return what shows when something is lost, and what may be lost with it."""
+    """Return the symptoms of a loss, and those of other losses that may follow from it."""
     lost = sorted({name} | structure.dependents([name]))
     return [link for one in lost if one in fmea.functions for link in fmea.functions[one].symptoms]
 

@@ -59,8 +59,8 @@ class OpenDiagnosis:
     def take_evidence(self, counting: Mapping[str, Counts], *, fading: bool = False) -> News:
         """Update the evidence that counts now; return what is new in it.
 
-        ``more``: something shows, or an absence begins to count. ``less``: something that showed
-        counts no longer; while other symptoms are ``fading``, also if it counts as absent.
+        ``more``: a symptom appeared, or an absence begins to count. ``less``: a symptom no longer
+        counts; while other symptoms are ``fading``, also if it counts as absent.
         """
         evidence: dict[str, Counts] = {name: counts for name, counts in counting.items() if counts}
         changed = {name for name, counts in evidence.items() if self.evidence.get(name) != counts}
@@ -133,7 +133,7 @@ def _conclusion(one: Diagnosis) -> tuple[object, ...]:
 
 
 def _moved(before: Diagnosis, after: Diagnosis) -> bool:
-    """Return whether likely hypotheses stand in another order, or with another probability."""
+    """Return whether likely hypotheses have changed their order or their probability."""
     was = {one.id: one.probability for one in before.hypotheses}
     now = {one.id: one.probability for one in after.hypotheses}
     likely = {name for shares in (was, now) for name, share in shares.items() if share >= LIKELY}
@@ -154,11 +154,11 @@ class RepairDetection:
     def ends_ns(
         self, faults: Iterable[str], had: Collection[str], presences: SymptomPresences, at_ns: int
     ) -> dict[str, int]:
-        """Return when symptoms end to count since all causes they have among faults are over.
+        """Return when symptoms stop counting because all of their causes among ``faults`` are over.
 
-        A failure mode is over when everything that it has shown (of the symptoms that the
-        diagnosis ``had``) has been seen to be gone for as long as the shortest ``hold_s`` among
-        it. Symptoms that are there, or unknown, have no end.
+        A failure mode is over when all its symptoms (of those that the diagnosis ``had``) have been
+        observed to be gone for as long as the shortest ``hold_s`` among them. Symptoms that are
+        present, or unknown, have no end.
         """
         ends_ns: dict[str, int] = {}
         for fault in faults:
@@ -194,7 +194,7 @@ class RepairDetection:
 
 
 def _over_ns(shown: Collection[SymptomPresence], at_ns: int) -> int:
-    """Return when the cause of symptoms is over; NEVER_NS while one is there, or hidden."""
+    """Return when the cause of symptoms is over; NEVER_NS while one is present, or unknown."""
     gone_ns = [one.forgotten_since_ns(at_ns) for one in shown]
     if not shown or None in gone_ns:
         return NEVER_NS
@@ -239,7 +239,7 @@ class FaultTracker:
 
     @property
     def facts(self) -> Mapping[str, FaultFacts]:
-        """What is known of failure modes: the gravest of what each costs, what it may show."""
+        """Facts about failure modes: the severity of each, and its possible symptoms."""
         return self.knowledge.facts(self._waits.shows)
 
     @property
@@ -270,8 +270,8 @@ class FaultTracker:
     def advance(self, found: Sequence[object], until_ns: int) -> list[Symptom | Diagnosis]:
         """Return the findings up to an instant, for which the record must be complete.
 
-        ``found`` are the monitors' findings since the last ``advance``, in order of time: statuses
-        and symptoms of them count. The symptoms returned are those that no monitor found.
+        ``found`` are the monitors' findings since the last ``advance``, in order of time: their
+        statuses and symptoms are used. The symptoms returned are those that no monitor found.
         """
         written: list[list[Event]] = []
         unwritten = [_timed(self._pending, records=True)]
@@ -333,7 +333,9 @@ class FaultTracker:
             self._look(at_ns, out)
 
     def _look_before(self, before_ns: int, out: Out) -> None:
-        """Evaluate at each instant before a time at which the evidence changes by itself."""
+        """Evaluate at each instant before ``before_ns`` at which the evidence changes without new
+        findings.
+        """
         while self._due_ns is not None and self._due_ns < before_ns:
             self._look(self._due_ns, out)
 

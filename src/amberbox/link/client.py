@@ -342,7 +342,7 @@ class LinkSession:
         )  # fmt: skip
 
     async def _send_heads(self) -> None:
-        """Send the signed statement of heads, when there is a new one."""
+        """Send the signed heads, when there are new ones."""
         try:
             heads = (self._client.store.path / HEADS).read_bytes()
         except OSError:
@@ -462,7 +462,7 @@ class LinkClient:
         self.answers: deque[FetchAnswer] = deque()
         """Answers to fetch requests; they wait for a connection."""
         self.announced_key = ""
-        """The public key that the server was told: it verifies journals with it."""
+        """The public key that was sent to the server, which verifies journals with it."""
         self._dial = dialer
         self._backoff = backoff or Backoff()
         self._reaches = ReachReader(store)

@@ -95,7 +95,7 @@ _SCHEMES = {"https": "wss", "http": "ws", "wss": "wss", "ws": "ws"}
 
 
 class LinkDownError(Exception):
-    """There is no connection, or no longer; trying again may help."""
+    """There is no connection, or it was lost; trying again may help."""
 
 
 class LinkRefusedError(LinkDownError):
@@ -181,8 +181,8 @@ async def dial(options: LinkOptions, context: ssl.SSLContext | None) -> LinkConn
 async def greet(line: LinkConnection, hello: Hello) -> Welcome:
     """Send Hello and return the server's welcome.
 
-    Raises LinkRefusedError when the server refuses the robot for good, LinkDownError when it does
-    so for now, or sends another frame or none in time; FrameError for invalid data.
+    Raises LinkRefusedError when the server refuses the robot permanently, LinkDownError when it
+    does so temporarily, or sends another frame or none in time; FrameError for invalid data.
     """
     await line.send(encode(hello))
     answer = from_server(await _soon(line.receive()))
@@ -194,7 +194,7 @@ async def greet(line: LinkConnection, hello: Hello) -> Welcome:
 
 
 async def _soon(waiting: Awaitable[bytes]) -> bytes:
-    """Wait for an answer; raises LinkDownError when none comes for too long."""
+    """Wait for an answer; raises LinkDownError when none arrives in time."""
     try:
         async with asyncio.timeout(limits.SILENT_S):
             return await waiting

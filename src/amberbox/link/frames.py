@@ -59,7 +59,7 @@ class WriterReach(msgspec.Struct, frozen=True, array_like=True):
     runs: tuple[RunEnd, ...] = ()
 
     def problem(self) -> str:
-        """Return what is contradictory in it; empty where nothing is."""
+        """Return the contradiction in it; empty if there is none."""
         if min(*self.oldest, *self.end, *self.durable) < 0:
             return "a position below 0"
         numbers = [run.run for run in self.runs]
@@ -81,7 +81,7 @@ Upto = Annotated[dict[Name, JournalPosition], Meta(max_length=8)]
 
 
 class FrameError(ValueError):
-    """Invalid data instead of a frame: damaged, too large, or of another protocol."""
+    """Data that are not a valid frame: damaged, too large, or of another protocol."""
 
 
 class LinkRow(Struct, frozen=True, array_like=True):

@@ -42,7 +42,7 @@ _DIGEST = re.compile(r"[0-9a-f]{64}")
 
 @dataclass(frozen=True, slots=True)
 class JoinLine:
-    """What a robot needs to connect.
+    """The data a robot needs to connect.
 
     ``url`` is the server's address, ``https://host:port/path``; plain ``http`` on this machine
     only. ``ca`` is the SHA-256 of the certificate authority, 64 hex digits, or empty for a server

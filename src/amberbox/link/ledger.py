@@ -19,7 +19,7 @@ OTHER: ConflictReason = "other_history"
 
 @dataclass(frozen=True, slots=True)
 class HeldRun:
-    """What a server holds of one run of a writer: the boot that wrote it, and the run's end."""
+    """A server's data of one run of a writer: the boot that wrote it, and the end of its rows."""
 
     run: int
     boot: str
@@ -44,7 +44,8 @@ def find_conflicts(
     *,
     is_hello: bool,
 ) -> Iterator[RowConflict]:
-    """Yield the conflicts between what a server holds of a writer and what the robot states.
+    """Yield the conflicts between the rows that a server holds of a writer and the robot's
+    statement.
 
     Only at Hello no rows are in transit, so that runs being written are compared too. A run of
     another boot, a run that the robot never had, or an end before one stated as durable mean
@@ -83,14 +84,18 @@ def advance_cursor(
     upto: Mapping[str, JournalPosition],
     reaches: Mapping[str, WriterReach],
 ) -> dict[str, JournalPosition]:
-    """Return the cursor, advanced to what was received and is durable on the robot; never back."""
+    """Return the cursor, advanced to rows that were received and are durable on the robot; never
+    back.
+    """
     moved = {w: min(at, reaches[w].durable) for w, at in upto.items() if w in reaches}
     return {w: max(at, moved.get(w, START)) for w, at in {**moved, **cursor}.items()}
 
 
 @dataclass(slots=True)
 class StoreLedger:
-    """What a server holds of one store; ``received`` is how far rows arrived in this epoch."""
+    """A server's data of one store; ``received`` is the position up to which rows arrived in this
+    epoch.
+    """
 
     cursor: Cursor = field(default_factory=dict)
     received: Cursor = field(default_factory=dict)

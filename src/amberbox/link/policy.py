@@ -113,7 +113,7 @@ class DockWatcher:
         self._stop = threading.Event()
         self.docked: bool | None = None
         self.problem = ""
-        """Why the expression cannot be judged."""
+        """Why the expression cannot be evaluated."""
 
     def start(self) -> None:
         """Start the thread, if there is an expression."""

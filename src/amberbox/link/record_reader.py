@@ -196,7 +196,7 @@ class LiveValues:
             ).start()
 
     def take(self) -> dict[str, Value]:
-        """Return what is new since the last call: the latest value of each variable."""
+        """Return the latest value of each variable that has changed since the last call."""
         with self._lock:
             found, self._latest = self._latest, {}
         return found

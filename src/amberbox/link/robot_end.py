@@ -29,12 +29,12 @@ _OVERHEAD = 48
 
 
 class OutOfStepError(Exception):
-    """The server acknowledged what was never sent; the robot has to reconnect."""
+    """The server acknowledged frames that were never sent; the robot has to reconnect."""
 
 
 @dataclass(slots=True)
 class _Reading:
-    """How far a writer was read: its backlog, and its new rows."""
+    """The reading position of a writer: its backlog, and its new rows."""
 
     backlog_at: JournalPosition
     join: JournalPosition
@@ -108,10 +108,11 @@ class RobotEnd:
         *,
         bare: bool = True,
     ) -> RowsFrame | None:
-        """Return the next frame to send, with the most urgent rows; None if there is nothing.
+        """Return the next frame to send, with the most urgent rows; None if there is nothing to
+        send.
 
-        A frame has at least one row, whatever ``most_bytes`` is; or none, with ``bare``, where only
-        the sent positions are new.
+        A frame has at least one row, even if it exceeds ``most_bytes``; or none, with ``bare``, if
+        only the sent positions are new.
         """
         if not self.window_open:
             return None

@@ -87,7 +87,7 @@ class FetchRequests:
         self._answered: dict[str, tuple[tuple[str, int], ...]] = {}
         self._requested_again: set[str] = set()
         self.journals: frozenset[str] = frozenset()
-        """What is to be copied whatever the rule says."""
+        """Journals to copy regardless of the rule for copying."""
 
     def add(self, frame: FetchFrame) -> None:
         """Add a request; it is answered at the next step."""
@@ -289,7 +289,7 @@ class JournalCopier:
     backlog_bytes: int = 0
     """How much is to be copied, as of the last step."""
     lacking: set[str] = field(default_factory=set)
-    """Journals that were confirmed and that the server lacks, as it said since."""
+    """Confirmed journals that the server has since stated to lack."""
     quarantined: set[str] = field(default_factory=set)
     """Journals that the server was sent and does not take."""
     _refused: set[str] = field(default_factory=set)
@@ -514,7 +514,7 @@ class HoldingsCheck:
             raise
 
     def _counted_on(self) -> Iterator[JournalCopy]:
-        """Yield the journals here that the server has confirmed or refused."""
+        """Yield the robot's journals that the server has confirmed or refused."""
         copier = self._copier
         confirmed = manifest.read(copier.store.path).confirmed - copier.lacking
         for writer in FOLDERS:
@@ -550,7 +550,7 @@ POLL_S = 2.0
 
 @dataclass(slots=True)
 class CopyLoop:
-    """Copies what is due; ``before`` is called first each time, for other uploads by HTTP.
+    """Copies pending journals; ``before`` is called first each time, for other uploads by HTTP.
 
     ``may_copy`` returns whether anything may be copied now.
     """

@@ -47,11 +47,11 @@ _DIGEST = re.compile(r"[0-9a-f]{64}")
 
 
 class Proof(Struct, frozen=True):
-    """What the robot's manifest states about a journal: its lines from the seal to a signature.
+    """The lines of the robot's manifest about a journal, from its seal to a signature.
 
     Without a seal (journals of the ring, which only an incident keeps) there are no lines. ``gone``
-    are the lines of all deletions before a server had the data, wherever they are: what was deleted
-    while the robot was away follows seals of journals that never arrive.
+    are the lines of all deletions before a server had the data, wherever they are: deletions while
+    the robot was offline follow seals of journals that never arrive.
     """
 
     lines: str = ""
@@ -128,7 +128,7 @@ def proofs_of(store: Path, journals: Sequence[str]) -> dict[str, Proof]:
 
 
 def _gone(lines: Sequence[bytes]) -> list[bytes]:
-    """Return the lines of unconfirmed deletions, the newest when there are very many."""
+    """Return the lines of unconfirmed deletions, only the newest if there are very many."""
     found = [n for n in lines if b',"kind":"gone",' in n and b'"confirmed":false' in n]
     return [line for line in found[-_MOST_GONE:] if decode(line) is not None]
 
@@ -206,7 +206,7 @@ _Number = Annotated[int, Meta(ge=0, lt=10**12)]
 
 
 class JournalCopy(NamedTuple):
-    """A journal as both ends know it: name, bytes, and whether it was found valid."""
+    """A journal as identified by both ends: name, bytes, and whether it was found valid."""
 
     name: str
     bytes: int
@@ -224,7 +224,7 @@ class JournalRange(Struct, frozen=True, array_like=True):
 
 
 class HoldingsQuestion(Struct, frozen=True):
-    """What a robot counts on the server to hold of one store."""
+    """The files of one store that a robot assumes the server to hold."""
 
     stretches: Annotated[list[JournalRange], Meta(max_length=MOST_RANGES)]
 
@@ -234,7 +234,7 @@ Listed = tuple[int, int, bool]
 
 
 class HoldingsAnswer(Struct, frozen=True):
-    """What is held in the ranges that differ, by their index in the question."""
+    """The files that the server holds in the ranges that differ, by their index in the question."""
 
     differing: dict[int, list[Listed]]
 

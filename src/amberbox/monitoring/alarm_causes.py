@@ -86,9 +86,9 @@ _COMPONENT_END = re.compile(r"[/#.]")
 
 
 class RaisedCause(NamedTuple):
-    """A leading cause by itself: one of some failure modes, named after the first.
+    """A leading cause for an alarm: one or several failure modes, named after the first.
 
-    ``is_credible``: it is likely, or possible where the robot must not go on.
+    ``is_credible``: it is likely, or possible if the robot must not continue.
     """
 
     faults: tuple[str, ...]
@@ -126,10 +126,11 @@ class LeadingAnswer:
         )
 
     def share(self, component: str) -> CauseSets:
-        """Return the causes of a component's alarm; empty if it is not concerned.
+        """Return the causes of a component's alarm; empty if the diagnosis does not concern it.
 
-        Concerned are components that have failed, those whose symptoms are explained, and what
-        blocks these. The failures of a component itself come before those that it shows only.
+        It concerns components that have failed, those whose symptoms are explained, and those that
+        block these. The failures of a component itself come before failures of others that it
+        shows.
         """
         found = (self._of(hypothesis, component) for hypothesis in self.members)
         return tuple(dict.fromkeys(faults for faults in found if faults is not None))
@@ -157,7 +158,9 @@ class LeadingAnswer:
         return faults_text(share, self.probability) if share else ""
 
     def is_one(self, share: CauseSets) -> bool:
-        """Return whether alarms with these causes are one: all failure modes known and likely."""
+        """Return whether alarms with these causes are merged: all failure modes known and
+        likely.
+        """
         known = bool(share) and all(
             faults and all(fault in self.facts for fault in faults) for faults in share
         )
@@ -199,7 +202,7 @@ _WELL: Final = OwnState("ok", "nominal", "", "warning")
 
 
 class DiagnosedAlarms:
-    """Alarms by failure mode: call ``update`` wherever diagnosis or alarms have changed.
+    """Alarms by failure mode: call ``update`` whenever diagnosis or alarms have changed.
 
     A cause gets an alarm once, here or from a monitor, and no other until the diagnosis has dropped
     the cause.
@@ -262,12 +265,12 @@ class DiagnosedAlarms:
         return [_public(c) for c in self._alarms.command(action, alarm_id, who, at_ns, until_ns)]
 
     def snapshot(self, now_ns: int) -> dict[str, Any]:
-        """Return what has to be known to go on, as JSON."""
+        """Return the state that is needed to continue, as JSON."""
         had = sorted(self._had)
         return {"alarms": self._alarms.snapshot(now_ns), "due_ns": self._due_ns, "had": had}
 
     def resume(self, snapshot_values: Mapping[str, Any]) -> None:
-        """Go on from what ``snapshot`` returned."""
+        """Continue from the values that ``snapshot`` returned."""
         self._alarms.resume(snapshot_values["alarms"])
         self._due_ns, self._had = dict(snapshot_values["due_ns"]), set(snapshot_values["had"])
 
@@ -289,10 +292,10 @@ class AlarmCauses:
     """Adds causes to alarms, and emits an alarm again when a diagnosis changes its cause.
 
     The causes depend only on the findings in their order. A person's actions on an alarm, which a
-    replay does not know, are kept apart and emitted again after it. Where ``facts`` of failure
-    modes are known, alarms with one cause are one: the others are its ``_parts`` (which by which).
-    An alarm that opens while others last is held back for a moment, until the diagnosis knows what
-    it belongs to.
+    replay does not know, are stored separately and emitted again after it. If ``facts`` of failure
+    modes are known, alarms with the same cause are merged: the others are its ``_parts`` (alarm id
+    by merged alarm). An alarm that opens while others are active is held back for a moment, until
+    the diagnosis knows its cause.
     """
 
     facts: Mapping[str, FaultFacts] = field(default_factory=dict)
@@ -509,7 +512,9 @@ class AlarmCauses:
         return roots
 
     def _order(self, key: str, failed: set[str]) -> tuple[bool, bool, int, str]:
-        """Order alarms with one cause: first of what has failed, then those emitted already."""
+        """Return the order of alarms with one cause: of failed components first, then those emitted
+        already.
+        """
         alarm = self._alarms[key]
         return alarm.component not in failed, key in self._parts, alarm.opened_ns, key
 
@@ -524,7 +529,7 @@ class AlarmCauses:
                 yield from self._emit_again(key, replace(alarm, also=also), now_ns)
 
     def snapshot(self) -> dict[str, Any]:
-        """Return what has to be known to go on, as JSON."""
+        """Return the state that is needed to continue, as JSON."""
         return {
             "diagnosis": None if self.diagnosis is None else diagnosis_values(self.diagnosis),
             "blamed": self._now.blocked,

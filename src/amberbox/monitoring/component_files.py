@@ -1,8 +1,8 @@
-"""Component and mode files: where they are, their keys, and the monitor function they name.
+"""Component and mode files: their paths, their keys, and the monitor function they name.
 
-``read_tree`` finds the files below ``components/``; the option classes are their keys (the
-paper's listings 4 and 5); ``find_functions`` and ``function_of`` resolve ``monitor:`` to a mode
-or probe that is shipped or stands in the robot folder.
+``read_tree`` finds the files below ``components/``; the option classes are their keys (the paper's
+listings 4 and 5); ``find_functions`` and ``function_of`` resolve ``monitor:`` to a mode or probe of
+Amberbox or of the robot folder.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ class ComponentTree:
 
 
 def read_tree(folder: Path, problems: list[Problem]) -> ComponentTree:
-    """Read all YAML files below ``folder``; what is wrong with them goes to ``problems``."""
+    """Read all YAML files below ``folder``; their errors are added to ``problems``."""
     files = _Files(folder, problems)
     paths = list(_paths(folder))
     kinds = {path: files.kind(path) for path in paths}
@@ -109,7 +109,7 @@ class _Files:
     _nodes: dict[Path, Node | None] = field(default_factory=dict)
 
     def node(self, path: Path) -> Node | None:
-        """Return what is in a file; None if its syntax is wrong."""
+        """Return the contents of a file; None if its syntax is wrong."""
         if path not in self._nodes:
             self._nodes[path] = load_yaml(path, self.problems)
         return self._nodes[path]
@@ -178,13 +178,13 @@ def legacy_note(path: str) -> str | None:
 
 @dataclass(frozen=True)
 class FlappingOptions:
-    """When an output that comes and goes is called flapping."""
+    """The limits from which changes of an output count as flapping."""
 
     changes: int = option(6, "more changes than this")
     within: float = option(60.0, "in this time", unit="s")
 
     def check(self) -> Iterator[tuple[str, str]]:
-        """Yield what is wrong with the values."""
+        """Yield each invalid value, and the reason."""
         for key in ("changes", "within"):
             if getattr(self, key) <= 0:
                 yield key, "must be above 0"
@@ -192,7 +192,7 @@ class FlappingOptions:
 
 @dataclass(frozen=True)
 class OutputOptions:
-    """One output of a mode: what it is, what it should be, and what it means if it is not."""
+    """One output of a mode: its name and type, its expected value, and its severity."""
 
     name: str = option(doc="name of the output")
     type: OutputType = option(doc="what its values are")
@@ -211,7 +211,7 @@ class OutputOptions:
     hint: str = option("", "what to do if it is not as expected")
 
     def check(self) -> Iterator[tuple[str, str]]:
-        """Yield what is wrong with the values."""
+        """Yield each invalid value, and the reason."""
         if not self.name.strip() or any(sign in self.name.strip() for sign in "/ \t:#"):
             yield "name", f"'{self.name}' cannot be part of an address: leave out blanks and / : #"
         if self.name.strip() in STATES:
@@ -223,7 +223,7 @@ class OutputOptions:
 
 @dataclass(frozen=True)
 class MappingOptions:
-    """Inputs of a mode and the outputs that are made of them."""
+    """Inputs of a mode, and the outputs made from them."""
 
     inputs: Sequence[str] = option((), "items, variables, topics, or subjects of probes")
     outputs: Sequence[OutputOptions] = option((), "what is found out")
@@ -244,7 +244,7 @@ class ModeFileOptions:
     )
 
     def check(self) -> Iterator[tuple[str, str]]:
-        """Yield what is wrong with the values."""
+        """Yield each invalid value, and the reason."""
         for name in self.states:
             if name in STATES:
                 yield "states", f"'{name}' is a state of its own: give the fault another name"
@@ -254,7 +254,7 @@ class ModeFileOptions:
 
 @dataclass(frozen=True)
 class DependencyMonitorOptions:
-    """Which monitor says whether a dependency works, by dependency; ``none`` for nobody."""
+    """The monitor that gives the state of a dependency, by dependency; ``none`` for no monitor."""
 
     heartbeat: Mapping[str, str] = option({}, "COMPONENT/MODE that says whether it is alive")
     functional: Mapping[str, str] = option({}, "COMPONENT/MODE that says whether it works")
@@ -276,14 +276,16 @@ class ComponentFileOptions:
     policy: Policy = option("all", "how many of its modes must be ok: all, any or majority")
 
     def check(self) -> Iterator[tuple[str, str]]:
-        """Yield what is wrong with the values."""
+        """Yield each invalid value, and the reason."""
         if not self.component_name.strip():
             yield "component_name", "must not be empty"
 
 
 @dataclass(frozen=True)
 class RecoveryOptions:
-    """One entry of ``recovery_config.yaml``: what the predecessor restarted, and when."""
+    """One entry of ``recovery_config.yaml``: the restarts of the predecessor, and their
+    conditions.
+    """
 
     monitor: str = option(doc="COMPONENT/MODE that tells the fault")
     monitored_parameter: str = option("", "output of it")
@@ -304,7 +306,7 @@ _NEEDED = ("Config", "ACCEPTS", "RESULTS", "evaluate")
 
 @dataclass(frozen=True)
 class MonitorFunctions:
-    """The monitors and probes that are there."""
+    """The available monitors and probes."""
 
     modes: Mapping[str, plugins.Plugin]
     probes: Collection[str]
@@ -326,7 +328,7 @@ class MonitorFunctions:
 
 
 def find_functions(folder: Path, *, own: bool = True) -> MonitorFunctions:
-    """Find the monitors and probes: those that come with Amberbox, then the folder's own.
+    """Find the monitors and probes: those of Amberbox, then the folder's own.
 
     Without ``own``, Python files of the folder are not read.
     """

@@ -76,7 +76,7 @@ class OutputState:
 
     @property
     def value(self) -> Output:
-        """Return its last value, if that is a bool or a text: numbers come with each status."""
+        """Return its last value if it is a bool or a text; numbers are sent with each status."""
         return self._value if self._discrete else None
 
     @property
@@ -222,10 +222,10 @@ _NO_OUTPUTS = "it has no outputs"
 
 
 class ModeState:
-    """A mode as it stands. ``number`` is its place in ``plan.modes()``.
+    """The state of a mode. ``number`` is its index in ``plan.modes()``.
 
-    ``emitted`` is the condition after the last transition; ``awaited`` is true from the
-    beginning of an epoch until something is known. One that does not run stays unknown.
+    ``emitted`` is the condition after the last transition; ``awaited`` is true from the beginning
+    of an epoch until something is known. A mode that does not run stays unknown.
     """
 
     __slots__ = (
@@ -391,14 +391,14 @@ def blocker(label: str, words: str, reason: str, faulty: bool, waits: Sequence[B
 
 @dataclass(frozen=True, slots=True)
 class JudgedByMode:
-    """A dependency that is judged by one of its modes, or by one output."""
+    """A dependency whose state one of its modes gives, or one output."""
 
     label: str
     mode: ModeState
     output: OutputState | None
 
     def blocking(self) -> tuple[Blocker, ...]:
-        """Return what it blocks with: nothing if it is ok."""
+        """Return its blockers: nothing if it is ok."""
         level = self.mode.level if self.output is None else self.output.level
         if level in FUNCTIONAL:
             return ()
@@ -411,7 +411,7 @@ PassedBlockers: TypeAlias = Callable[[int], Sequence[Blocker]]
 
 @dataclass(slots=True)
 class DependencyJudges:
-    """The judges of dependencies that are all needed: components (by place), and modes."""
+    """The required dependencies: components (by index), and modes."""
 
     components: list[int] = field(default_factory=list)
     modes: list[JudgedByMode] = field(default_factory=list)
@@ -424,13 +424,13 @@ class DependencyJudges:
 
 @dataclass(frozen=True, slots=True)
 class DependencyGate:
-    """Some dependencies of which at least so many are needed."""
+    """A group of dependencies of which at least a number are required."""
 
     at_least: int
     parts: tuple[DependencyGate | DependencyJudges, ...]
 
     def blocking(self, passed: PassedBlockers) -> list[Blocker]:
-        """Return what is not ok of all parts if too few of them are ok."""
+        """Return the parts that are not ok, if too few of them are ok."""
         found = [part.blocking(passed) for part in self.parts]
         if sum(not blockers for blockers in found) >= self.at_least:
             return []
@@ -439,10 +439,10 @@ class DependencyGate:
 
 @dataclass(frozen=True, slots=True)
 class DependencyEdges:
-    """What a component depends on: ``sources`` are the components (places) that matter for it.
+    """The dependencies of a component: ``sources`` are the relevant components (by index).
 
-    Of ``components`` among them it matters what blocks them. ``notes`` name the dependencies that
-    nothing judges: they never block.
+    For ``components`` among them, their own blockers matter. ``notes`` name dependencies without a
+    monitor: they never block.
     """
 
     needs: DependencyGate | DependencyJudges
@@ -457,7 +457,7 @@ def edges_of(
     modes: Mapping[tuple[str, str], ModeState],
     allowed: frozenset[int],
 ) -> DependencyEdges:
-    """Find what a component depends on, among the components that it may depend on."""
+    """Return the dependencies of a component among the components in ``places``."""
     by_name: dict[str, DependencyJudges] = {}
     components, sources, open_names = set(), set(), []
     whole = DependencyJudges()
@@ -482,7 +482,7 @@ def edges_of(
 
 
 def _gate(needs: Needs, by_name: Mapping[str, DependencyJudges]) -> DependencyGate:
-    """Replace names by judges; a dependency that nothing judges is taken to be ok."""
+    """Replace names by their modes or components; a dependency without a monitor counts as ok."""
     parts = (
         by_name.get(part, DependencyJudges()) if isinstance(part, str) else _gate(part, by_name)
         for part in needs.parts
@@ -502,9 +502,9 @@ def _judge(dependency: DependencyPlan, mode: ModeState) -> JudgedByMode:
 
 
 def in_order(plan: MonitoringPlan) -> list[int]:
-    """Return the places of all components, dependencies first, else as they are in the plan.
+    """Return the indices of all components, dependencies first, else in the order of the plan.
 
-    Where there is a cycle, which the configuration refuses, its first component comes first.
+    In a cycle, which the configuration refuses, its first component comes first.
     """
     places = {component.id: place for place, component in enumerate(plan.components)}
     needs = [_needs(component, places) - {p} for p, component in enumerate(plan.components)]
@@ -543,7 +543,7 @@ _MOST_DESCRIBED = 3  # dependencies described in a reason; ``blocked_by`` names 
 
 
 class OwnState(NamedTuple):
-    """The state of a component by its own modes alone, whatever it depends on."""
+    """The state of a component by its own modes alone, independent of its dependencies."""
 
     level: Level
     state: str
@@ -555,7 +555,7 @@ NO_MONITOR = OwnState("unknown", "not_monitored", "no monitor", "urgent")
 
 
 class ComponentState:
-    """A component as it stands.
+    """The state of a component.
 
     ``own`` is its state by its modes, ``waits`` its blockers, ``passed`` those it passes on.
     """
@@ -589,7 +589,7 @@ class ComponentState:
 
     @property
     def monitored(self) -> bool:
-        """Return whether it has modes of its own; else what it depends on counts in its place."""
+        """Return whether it has modes of its own; otherwise its dependencies count in its place."""
         return bool(self.modes)
 
     def judge_modes(self) -> None:

@@ -1,8 +1,8 @@
-"""The present state of a robot, or that at an instant, as its watcher has written it.
+"""The state of a robot, now or at an instant, as written by its watcher.
 
-Statuses, open alarms, symptoms and diagnoses come from the watcher's journal. State files beside
-it show that the watcher runs, how late it evaluates, and which configuration files it has read;
-they do not wait for statuses, so that a late watcher differs from one that hangs.
+Statuses, open alarms, symptoms and diagnoses come from the watcher's journal. State files beside it
+show that the watcher runs, how late it evaluates, and which configuration files it has read; they
+do not wait for statuses, so that a late watcher can be distinguished from one that hangs.
 """
 
 from __future__ import annotations
@@ -323,11 +323,11 @@ def overload_text(delay_s: float) -> str:
 
 
 def _newest(statuses: Sequence[Status]) -> list[Status]:
-    """Return the newest status of each mode and component that is still watched.
+    """Return the newest status of each mode and component that is still monitored.
 
-    Their order is that of the last whole second, when all are written in the plan's order. The last
-    record written counts as the newest: a watcher that was held up first writes that the present is
-    unknown, then goes on with the past.
+    Their order is that of the last complete second, when all are written in the plan's order. The
+    last record written counts as the newest: a watcher that was held up first writes that the
+    present is unknown, then continues with the past.
     """
     last: dict[tuple[str, str], Status] = {}
     for status in statuses:
@@ -367,7 +367,7 @@ class RecordedFindings:
 
     symptoms: Sequence[Symptom] = ()
     diagnoses: Sequence[Diagnosis] = ()
-    """Each id's revisions; the last one stood at the instant."""
+    """Revisions by id; the last one is that at the instant."""
 
 
 def record_end_ns(store: Store) -> int | None:

@@ -64,7 +64,7 @@ def _is_name(node: Node) -> bool:
 
 
 def _by_name(node: Node) -> dict[str, Node]:
-    """Return the names in order, each with the entry where it stands first."""
+    """Return the names in order, each with the node of its first entry."""
     found: dict[str, Node] = {}
     for entry in _names_in(node):
         found.setdefault(entry.text, entry)
@@ -84,7 +84,7 @@ def _names_in(node: Node) -> Iterator[Node]:
 
 @dataclass(frozen=True)
 class MonitorReference:
-    """A reference to a mode that judges a dependency, or to an output of it."""
+    """A reference to a mode that gives the state of a dependency, or to an output of it."""
 
     component: ComponentPlan
     mode: ModePlan
@@ -214,7 +214,7 @@ class _Edge:
     problems: list[Problem]
 
     def made(self, text: str) -> DependencyPlan:
-        """Return the edge: judged by an output, a mode, the component, or not at all."""
+        """Return the edge: its state is given by an output, a mode, the component, or nothing."""
         component = self.names.component(self.name)
         edge = DependencyPlan(self.name, self.kind, component.id if component else None)  # type: ignore[arg-type]  # kinds are keys of the file
         if text == NO_MODE:
@@ -280,7 +280,7 @@ def _cycles(graph: Mapping[str, Sequence[str]]) -> Iterator[tuple[str, ...]]:
 
 
 def part_problems(components: Sequence[ComponentEntry]) -> Iterator[Problem]:
-    """Yield what is wrong with the tree: parts of nothing, and of themselves."""
+    """Yield the problems of the tree: ``part_of`` unknown components, and cycles."""
     above = {entry.plan.id: entry.plan.part_of for entry in components}
     for entry in components:
         place = (entry.node.mapping or {}).get("part_of", entry.node)
@@ -302,7 +302,7 @@ def _all_above(name: str, above: Mapping[str, str]) -> list[str]:
 def with_recovery(
     root: Node | None, components: Sequence[ComponentEntry], problems: list[Problem]
 ) -> list[ComponentEntry]:
-    """Return the components with their recovery actions; report what is wrong with the entries."""
+    """Return the components with their recovery actions; report invalid entries."""
     if root is None or root.value is None:
         return list(components)
     if root.mapping is None:

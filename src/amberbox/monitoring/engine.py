@@ -61,7 +61,7 @@ class RunGroup:
     runs: list[MappingRun] = field(default_factory=list)
 
     def forget(self) -> None:
-        """Begin anew."""
+        """Reset all windows and results."""
         for run in self.runs:
             run.forget()
             for output in run.outputs:
@@ -139,7 +139,7 @@ class Engine:
         self._until_ns = 0
         self._forgot_ns = 0
         self._put_off_ns = 0
-        """Up to when a stall of the recorder has put off what lasts."""
+        """Time until which ``for`` and ``heal`` are deferred because of a stall of the recorder."""
         self._began_ns: int | None = None
         self._pending: list[Finding] = []
         self._view = _View(plan, self._outputs)
@@ -295,9 +295,10 @@ class _View:
 
 
 def _ticks(table: SampleTable, after_ns: int, until_ns: int) -> IntArray:
-    """Return the instants up to one at which rows of an item have come since the one before.
+    """Return the instants at which rows of an item have arrived since the previous instant.
 
-    Rows that no instant was evaluated for, as the recorder was held up, count for the first.
+    Rows for which no instant was evaluated, because the recorder was held up, count for the first
+    one.
     """
     if not table.fresh:
         return _NONE

@@ -35,9 +35,9 @@ AlarmState: TypeAlias = Literal["open", "acknowledged", "shelved", "healed"]
 class OutputChange(NamedTuple):
     """The condition of one output found at an instant.
 
-    ``output`` is its number in ``states.outputs_of(plan)``. ``reason`` is why it is unknown,
-    stale or bad; for bad it may be empty. Changes of bools and texts come as such too, also
-    where nothing is expected of them.
+    ``output`` is its number in ``states.outputs_of(plan)``. ``reason`` is why it is unknown, stale
+    or bad; for bad it may be empty. Changes of bools and texts are such findings too, even without
+    an expected value.
     """
 
     at_ns: int
@@ -63,9 +63,9 @@ class HealthState(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Transition:
-    """A mode or component (``mode`` empty) went from one condition to another.
+    """A mode or component (``mode`` empty) changed from one condition to another.
 
-    ``hint`` is what can be done, by the hints of its outputs.
+    ``hint`` describes what to do, from the hints of its outputs.
     """
 
     robot: str
@@ -97,10 +97,10 @@ class Transition:
 class AlarmChange:
     """An alarm after a change.
 
-    ``count`` is how often it has opened. ``who`` acknowledged or shelved it, ``until_ns`` is when
-    a shelved one comes back. ``cause`` is the leading answer of the ``diagnosis`` (its id) that
-    the component is part of, both empty while there is none. ``also`` are components whose own
-    alarms are part of this one, since they have the same leading cause.
+    ``count`` is how often it has opened. ``who`` acknowledged or shelved it, ``until_ns`` is the
+    end of shelving. ``cause`` is the leading answer of the ``diagnosis`` (its id) that concerns the
+    component, both empty while there is none. ``also`` are components whose own alarms are part of
+    this one, since they have the same leading cause.
     """
 
     robot: str
@@ -279,7 +279,7 @@ def record_of(finding: Finding) -> tuple[str, Values]:
 
 
 def encoded(finding: Finding) -> tuple[str, bytes]:
-    """Return the channel and the JSON of a finding, as they stand in the journal."""
+    """Return the channel and the JSON of a finding, as written in the journal."""
     channel, values = record_of(finding)
     return channel, _encode(values)
 

@@ -19,8 +19,8 @@ Keys: TypeAlias = dict[str, Node]
 class LegacyMonitor:
     """A monitor of the predecessor: the function that replaces it, and how its keys are changed.
 
-    ``renamed`` gives arguments another name; ``dropped`` are those that become inputs, or nothing.
-    ``fixed`` are arguments that its code had. ``mappings`` rewrites each mapping.
+    ``renamed`` gives arguments another name; ``dropped`` are those that become inputs, or have no
+    effect. ``fixed`` are arguments that its code had. ``mappings`` rewrites each mapping.
     """
 
     monitor: str
@@ -87,7 +87,7 @@ def _as_ours(node: Node, keys: Keys, arguments: Keys, entry: LegacyMonitor) -> N
 
 
 def as_node(value: Any, place: Node) -> Node:
-    """Write plain values as they would stand at a place in a file."""
+    """Convert plain values to nodes, as if they had been written at a place in a file."""
     if isinstance(value, Mapping):
         inner: Any = {key: as_node(entry, place) for key, entry in value.items()}
     elif isinstance(value, list | tuple):
@@ -121,7 +121,7 @@ def _changed(mapping: Node, change: Callable[[Keys], Mapping[str, Any]]) -> Node
 
 
 def as_node_kept(value: Any, place: Node) -> Node:
-    """Return a node as it is, and plain values as nodes."""
+    """Return a node unchanged, and plain values as nodes."""
     return value if isinstance(value, Node) else as_node(value, place)
 
 

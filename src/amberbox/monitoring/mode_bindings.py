@@ -52,7 +52,7 @@ class InputBinder:
     def of(
         self, text: str, module: ModuleType, config: Any, kinds: Sequence[str] | None = None
     ) -> list[InputPlan]:
-        """Return the inputs that a text names for a mode; several where it has ``*``.
+        """Return the inputs that a text names for a mode; several if it has ``*``.
 
         ``kinds`` are the kinds allowed, by default those that the mode accepts. Raises InputError.
         """
@@ -150,7 +150,7 @@ class InputBinder:
         return _of_places(text, [guessed_column(item, path)])
 
     def _short(self, text: str) -> list[InputPlan]:
-        """Find a variable by its end alone, among those that are known."""
+        """Find a variable by the end of its name, among the known ones."""
         found: list[InputPlan] = []
         for item in self.recorded.items:
             schema = self.recorded.schema(item)
@@ -314,7 +314,7 @@ def bind_outputs(
     where: str,
     problems: list[Problem],
 ) -> list[OutputPlan]:
-    """Bind each output to a result; those that nothing produces become problems.
+    """Bind each output to a result; outputs without a result become problems.
 
     An output is bound by its ``result:``, else by its name, else by its type in order. With
     ``per_input`` there are as many of a result as there are ``inputs``.
@@ -422,7 +422,9 @@ def _by_type(
     inputs: int,
     results: Sequence[Result],
 ) -> dict[int, ResultBinding | str]:
-    """Bind what is left: k-th bool to k-th bool result; numbers take what numbers are left."""
+    """Bind the remaining outputs: k-th bool to k-th bool result; numbers to the remaining
+    numbers.
+    """
     found: dict[int, ResultBinding | str] = {}
     left = list(free)
     for kind in ("bool", "int", "float", "string"):
@@ -468,7 +470,7 @@ def _fitting(output: OutputOptions, binding: ResultBinding | str) -> ResultBindi
 
 
 def repeated(names: Sequence[str]) -> Iterator[int]:
-    """Yield the places of names that came before."""
+    """Yield the indices of names that occurred before."""
     seen: set[str] = set()
     for index, name in enumerate(names):
         if name in seen:

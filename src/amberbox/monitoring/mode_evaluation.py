@@ -32,7 +32,7 @@ FRESH, NO_VALUE, NEVER, OLD, LOST = 0, 1, 2, 3, 4  # in order: of several inputs
 
 
 def flow_codes(flow: Flow, stale_s: float | None, instants: IntArray) -> Any:
-    """Return a freshness code for each instant: whether messages of an item still come."""
+    """Return a freshness code for each instant: whether messages of an item still arrive."""
     ages = flow.age_s(instants)
     codes = np.where(np.isinf(ages), NEVER, FRESH)
     if stale_s is not None:
@@ -98,7 +98,7 @@ _COMPARE: Mapping[str, Callable[[Any, Any], Any]] = {
 
 
 class OutputJudge:
-    """Judges the results that one output of a plan is bound to."""
+    """Compares the results that one output of a plan is bound to with the expected value."""
 
     __slots__ = (
         *("result", "is_bool", "is_int", "is_discrete"),
@@ -119,7 +119,7 @@ class OutputJudge:
         self._missing = NOT_KNOWN if judged else OK
 
     def one(self, result: Any) -> tuple[int, Any]:
-        """Judge one value, or None; return the verdict and the kept value (bools as their code).
+        """Evaluate one value, or None; return the verdict and the kept value (bools as their code).
 
         Raises TypeError if it is not of the output's type.
         """
@@ -155,7 +155,7 @@ class OutputJudge:
         return OK if good else BAD
 
     def many(self, results: Any, count: int) -> tuple[Any, list[Any]]:
-        """Judge a column; return the verdicts and the kept values."""
+        """Evaluate a column; return the verdicts and the kept values."""
         column = np.broadcast_to(np.asarray(results), (count,))
         if column.dtype.kind not in self._kinds:
             judged = [self.one(value) for value in column]
@@ -222,7 +222,7 @@ class InstantBlock:
         self.instants = instants
         self.times: list[int] = instants.tolist()
         self.has_rows = has_rows
-        """Where rows came since the instant before."""
+        """Where rows arrived since the previous instant."""
         self.is_quarter = instants % QUARTER_NS == 0
         self.codes: dict[tuple[int, float | None], Any] = {}
         self.few = len(self.times) <= _FEW
@@ -244,7 +244,7 @@ class InstantBlock:
 
 
 class OutputRun:
-    """One output as the blocks go by: how it was judged last, and its values in this block."""
+    """One output over several blocks: its last verdict, and its values in this block."""
 
     __slots__ = ("before", "column", "judge", "key", "number", "plan", "times")
 
@@ -529,7 +529,7 @@ class MappingRun:
 
     @staticmethod
     def _changes(output: OutputRun, codes: Any, kept: list[Any]) -> list[int]:
-        """Return the rows where an output is judged otherwise than before, or has another value."""
+        """Return the rows at which an output has another verdict or value than before."""
         if output.judge.is_bool:
             marks = codes.astype(np.int64) * 8 + np.array([v or 0 for v in kept], np.int64)
         elif output.judge.is_discrete:

@@ -1,7 +1,7 @@
 """The monitoring plan: component and mode files bound to recorded items; its summary.
 
-Everything that the engine needs is resolved here, so that it reads no files; ``PlanNames`` are
-the names of components and modes as messages carry them.
+All names that the engine needs are resolved here, so that it reads no files; ``PlanNames`` are the
+names of components and modes in messages.
 """
 
 from __future__ import annotations
@@ -104,8 +104,8 @@ def measured_from(mapping: MappingPlan, output: OutputPlan) -> list[str]:
 class ModePlan:
     """One mode file. ``id`` is its name as an id, ``name`` as it was written (``monitorName``).
 
-    ``problem`` is why it cannot run; then ``module`` may be None. ``states`` name fault states
-    by conditions over its outputs. ``stale_s`` is how old an input may be, None for any age.
+    ``problem`` is why it cannot run; then ``module`` may be None. ``states`` name fault states by
+    conditions over its outputs. ``stale_s`` is how old an input may be, None for any age.
     """
 
     id: str
@@ -128,8 +128,8 @@ class ModePlan:
 class DependencyPlan:
     """One dependency of a component: a component, or a monitor (a mode, or one output of it).
 
-    ``kind`` is the level of the paper that it belongs to; ``component`` is None where nothing in
-    the folder has that name, and nothing judges it (``problem`` has the text).
+    ``kind`` is the level of the paper that it belongs to; ``component`` is None if the folder has
+    no component of that name, and no monitor gives its state (``problem`` has the text).
     """
 
     name: str
@@ -143,7 +143,7 @@ class DependencyPlan:
 
 @dataclass(frozen=True, slots=True)
 class ComponentPlan:
-    """One component file; ``part_of`` is the component above it in the tree.
+    """One component file; ``part_of`` is its parent in the tree.
 
     ``needs`` is how many of which dependencies, by name, have to work; None for all of them.
     """
@@ -219,16 +219,16 @@ class Naming:
 
 
 class ComponentDepth(NamedTuple):
-    """One component and how deep it stands in the tree."""
+    """One component and its depth in the tree."""
 
     depth: int
     component: str
 
 
 def branches(plan: MonitoringPlan) -> list[ComponentDepth]:
-    """Return every component of a plan once, each below what it is part of.
+    """Return every component of a plan once, each below its parent.
 
-    Without any ``part_of``, a component stands below the first that needs it.
+    Without any ``part_of``, a component is below the first one that needs it.
     """
     known = [component.id for component in plan.components]
     parts = {c.id: c.part_of for c in plan.components if c.part_of in known}
@@ -244,7 +244,9 @@ def branches(plan: MonitoringPlan) -> list[ComponentDepth]:
 
 
 def _walked(known: Sequence[str], below: Mapping[str, Sequence[str]]) -> Iterator[ComponentDepth]:
-    """Walk from those that are below nothing, then from what is left (a circle)."""
+    """Walk the tree from the components without a parent, then from the remaining ones (a
+    cycle).
+    """
     lower = {name for names in below.values() for name in names}
     roots = [name for name in known if name not in lower]
     seen: set[str] = set()
@@ -308,7 +310,7 @@ def short_table(plan: MonitoringPlan) -> Iterator[tuple[str, ...]]:
 
 
 def needs_text(component: ComponentPlan, joint: str) -> str:
-    """Return the needs of a component as text: names, or how many of which."""
+    """Return the needs of a component as text: names, or how many of them."""
     if component.needs is not None:
         return str(component.needs)
     return joint.join(dict.fromkeys(edge.name for edge in component.dependencies))

@@ -1,7 +1,8 @@
-"""Load the plan of a robot folder: mode files made into plans, all problems reported at once.
+"""Load the plan of a robot folder: mode files are converted to plans, all problems are reported at
+once.
 
-A mode's function, arguments, inputs, outputs and states are resolved, and the sampling rate that
-filters leave is compared with the rate that the mode wants.
+A mode's function, arguments, inputs, outputs and states are resolved, and the sampling rate after
+the filters is compared with the rate that the mode needs.
 """
 
 from __future__ import annotations
@@ -218,7 +219,7 @@ def _plan(
 
 
 def _time_problems(module: Any, config: Any, node: Node) -> Iterator[Problem]:
-    """Call a monitor's functions of time; yield an impossible history, raise what they raise."""
+    """Call a monitor's functions of time; yield an impossible history, and pass on their errors."""
     if hasattr(module, "timed"):
         module.timed(config)
     seconds = module.history_s(config) if hasattr(module, "history_s") else 0.0
@@ -369,7 +370,7 @@ def _unwrapped(node: Node, key: str) -> Node:
 def _states(
     states: Mapping[str, Expression], plan: ModePlan, node: Node, problems: list[Problem]
 ) -> Mapping[str, Expression]:
-    """Judge the conditions of fault states: they read outputs of their mode."""
+    """Check the conditions of fault states: they read outputs of their mode."""
     names = [output.name for output in plan.outputs]
     found = {}
     for name, condition in states.items():

@@ -1,6 +1,6 @@
-"""Load probes, run each in a thread of its own on time, and publish their results over ZeroMQ.
+"""Load probes, run each periodically in a thread of its own, and publish their results over ZeroMQ.
 
-A probe that hangs delays no other one; its answers are checked against what it declares.
+A probe that hangs delays no other one; its results are checked against its declaration.
 """
 
 from __future__ import annotations
@@ -164,11 +164,11 @@ class _Post:
 
 
 class ProbeRunner:
-    """Runs probes from ``start`` to ``close`` and hands each row to ``put``.
+    """Runs probes from ``start`` to ``close`` and passes each row to ``put``.
 
     A measurement that takes longer than the probe's ``TIMEOUT_S`` gives a row with that error,
-    another one each period until it is over; its result is then too old and is dropped. Missed
-    measurements are not made up for. After ``close``, ``put`` is not called any more.
+    another one each period until it ends; its result is then too old and is dropped. Missed
+    measurements are not repeated. After ``close``, ``put`` is not called any more.
     """
 
     def __init__(
@@ -259,9 +259,9 @@ _ENDPOINT = re.compile(r"tcp://(?P<host>\*|[\w.-]+|\[[0-9A-Fa-f:]+\]):(?P<port>\
 
 
 def is_open(endpoint: str) -> bool:
-    """Return whether other computers can read what is published there.
+    """Return whether other computers can read what is published at an address.
 
-    Raises UsageError if the address is none.
+    Raises UsageError if the address is invalid.
     """
     found = _ENDPOINT.fullmatch(endpoint)
     if found is None or (found["port"] and not int(found["port"]) < 65536):

@@ -78,11 +78,10 @@ class HangGuard:
         self._checked = (clock_s(), waited_s())
 
     def check(self, _number: int, frame: FrameType | None) -> None:
-        """Interrupt a call that was under way at several checks in a row.
+        """Interrupt a call that was still running at several checks in a row.
 
         Checks are counted, not seconds: while the whole process is suspended there are none. A
-        check does not count where the process has waited for a processor most of the time before
-        it.
+        check does not count if the process has waited for a processor most of the time before it.
         """
         before_s, waited_s = self._checked
         self._checked = now_s, now_waited_s = self._clock_s(), self._waited_s()
@@ -145,11 +144,11 @@ class Diagnoser(Protocol):
 
     @property
     def history_s(self) -> float:
-        """Return how far its conditions look back, seconds."""
+        """Return how far its conditions look back, in seconds."""
 
     @property
     def facts(self) -> Mapping[str, FaultFacts]:
-        """Return the facts of failure modes, by id; empty where there are none."""
+        """Return the facts of failure modes, by id; empty if there are none."""
 
     def begin(self, at_ns: int) -> None:
         """Begin an epoch, in which nothing is known yet; an open diagnosis stays open."""
@@ -190,9 +189,9 @@ class DiagnosedEngine:
         self._diagnoser = diagnoser
         self._again = again
         self.states = engine.states
-        """What the engine knows of components and their alarms."""
+        """The engine's states of components and their alarms."""
         self.items = engine.items
-        """Names of the items that are wanted from the record."""
+        """Names of the items that are read from the record."""
         self.history_s = engine.history_s
         """How far monitors and conditions look back."""
         facts: Mapping[str, FaultFacts] = {}
@@ -229,7 +228,7 @@ class DiagnosedEngine:
                 self._fail(error)
 
     def advance(self, until_ns: int) -> list[Finding]:
-        """Return what is found up to an instant, in order of time."""
+        """Return the findings up to an instant, in order of time."""
         until_ns = until_ns // TICK_NS * TICK_NS
         found = self._engine.advance(until_ns)
         diagnosed: Sequence[Symptom | Diagnosis] = ()
@@ -278,9 +277,9 @@ class DiagnosedEngine:
         return {**self._engine.snapshot(), PART: part}
 
     def resume(self, snapshot: Mapping[str, Any]) -> None:
-        """Go on from a snapshot; one without a diagnosis begins it anew.
+        """Continue from a snapshot; without a diagnosis in it, start with a new one.
 
-        A diagnoser that had failed stays left out until the next epoch.
+        A diagnoser that had failed stays off until the next epoch.
         """
         self._engine.resume(snapshot)
         part = snapshot.get(PART)
@@ -313,16 +312,18 @@ def _merged(found: Sequence[Finding], diagnosed: Sequence[Finding]) -> Iterator[
 class RecordEvaluation:
     """Feeds an engine block by block, and keeps the instant up to which it has evaluated.
 
-    With a memory it goes on from there: earlier findings are not returned again.
+    With a checkpoint it continues from there: earlier findings are not returned again.
     """
 
     engine: DiagnosedEngine
     memory: RecoveredProgress = field(default_factory=RecoveredProgress)
     place: EvaluatedPosition | None = None
     trouble: str = ""
-    """Why what was remembered could not be used; empty if it could."""
+    """Why the checkpoint could not be used; empty if it could."""
     anew: bool = False
-    """It did not go on with what was remembered, but for the alarms."""
+    """Whether it started from the beginning, except for the alarms, instead of from the
+    checkpoint.
+    """
     _epoch: RecordEpoch | None = None
     _known: EvaluatedPosition | None = None
     _more: int = 0
@@ -400,7 +401,7 @@ class RecordEvaluation:
         return self._known is not None
 
     def _repeat(self, known: EvaluatedPosition, block: RecordBlock) -> None:
-        """Evaluate again, without results, what was evaluated and written before."""
+        """Evaluate again, without results, the part that was evaluated and written before."""
         if block.epoch.run > known.epoch.run:
             self._known, self._more = None, 0
             return
@@ -423,7 +424,7 @@ class ReplayOptions:
     from_ns: int | None = None
     to_ns: int | None = None
     speed: float | None = None
-    """None is as fast as it goes."""
+    """Speed of the replay; None for as fast as possible."""
 
 
 class EndOfRecord(NamedTuple):

@@ -26,7 +26,9 @@ WRITERS = (*RECORDED, WATCH)
 
 
 def before_end(store: Store, lookback_s: float) -> dict[str, WriterCursor]:
-    """Return positions so long before the end of each journal, or at the start of its epoch."""
+    """Return positions ``lookback_s`` before the end of each journal, or at the start of
+    its epoch.
+    """
     found = {}
     for writer in WRITERS:
         newest = next(newest_first(store, writer), None)
@@ -64,7 +66,7 @@ def _files_of(
 ) -> Iterator[JournalFile]:
     """Yield the files of an epoch that have rows before a position, newest first.
 
-    The position may lie in a later epoch already.
+    The position may be in a later epoch already.
     """
     found = False
     for journal in newest_first(store, writer):
@@ -95,7 +97,7 @@ def epoch_of_file(journal: JournalFile) -> RecordEpoch | None:
 
 
 def comes_later(store: Store, epoch: RecordEpoch, than: RecordEpoch) -> bool:
-    """Return whether an epoch comes after another one, by the recorder's files."""
+    """Return whether an epoch is later than another one, by the recorder's files."""
     if epoch.run != than.run:
         return epoch.run > than.run
     for journal in newest_first(store, "main"):
@@ -118,8 +120,8 @@ _BACK_NS = 1_000_000_000  # a step back in log time that does not count from boo
 class EpochRows:
     """Rows of one epoch that were written together.
 
-    ``end`` is run and sequence after them. ``last_ns`` is the log time of the last row that is of
-    interest, ``counted_ns`` of the last counters: later rows never lie before it.
+    ``end`` is run and sequence after them. ``last_ns`` is the log time of the last relevant row,
+    ``counted_ns`` of the last counters: later rows are never before it.
     """
 
     epoch: RecordEpoch
@@ -155,7 +157,7 @@ class WriterStream:
             self.epoch = _epoch_at(self.store, self.writer, self.start)
 
     def begin(self, *, at_once: bool) -> None:
-        """Begin a step: look for new rows; without ``at_once`` only if the head has moved."""
+        """Begin a step: check for new rows; without ``at_once`` only if the head has moved."""
         head = read_head(self.store.folder(self.writer))
         if at_once or head is None or head != self._seen:
             self._steps, self.drained, self._seen = self._tail.step(), False, head
@@ -243,7 +245,7 @@ Positions: TypeAlias = Mapping[str, WriterCursor]
 
 @dataclass(frozen=True, slots=True)
 class RecordBlock:
-    """Rows of one epoch; then everything up to ``until_ns`` (log time) has come.
+    """Rows of one epoch; all rows up to ``until_ns`` (log time) are in this or earlier blocks.
 
     ``batches`` may reach further. Times of an item never decrease from batch to batch.
     """
@@ -300,7 +302,7 @@ class RecordedItemsReader:
         return max(self._reached.values(), default=0)
 
     def step(self) -> Iterator[RecordBlock]:
-        """Read on to what is written now, block by block."""
+        """Read the newly written rows, block by block."""
         alive = is_locked(self._store, _MAIN)
         head = read_head(self._store.folder(_MAIN))  # before the journals: never too much
         if alive and head is None:

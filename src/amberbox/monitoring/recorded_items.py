@@ -50,7 +50,7 @@ class RecordedItems:
             _named(item for block, topics in known for item in _items(block, topics))
         )
         self.open = tuple(block.name for block, topics in known if topics is None)
-        """Names of the blocks that record everything they hear."""
+        """Names of the blocks that record everything they receive."""
 
     @cached_property
     def by_name(self) -> Mapping[str, RecordedItem]:
@@ -125,7 +125,7 @@ def _with_children(
 
 
 def _topics(block: SourceBlock, sources: str) -> Sequence[tuple[TopicOptions, Topic | None]] | None:
-    """Return the topics of a block, as announced where the source knows; None for everything."""
+    """Return the topics of a block, as announced if the source knows them; None for all topics."""
     try:
         module = get(sources, block.plugin).load()
         configured = module.Source(block.config, block.name).topics()
@@ -189,7 +189,7 @@ def schema_of_type(name: str) -> ItemSchema | None:
 
 
 def chosen_place(item: RecordedItem, text: str) -> bool | None:
-    """Return whether ``variable_names`` of an item name a variable, or what it lies below.
+    """Return whether ``variable_names`` of an item include a variable or a parent of it.
 
     None if there are no ``variable_names``.
     """

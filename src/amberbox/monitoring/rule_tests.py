@@ -73,7 +73,7 @@ ABSENT: Final = AbsentValue()
 
 @dataclass(frozen=True, slots=True)
 class RuleTestSeries:
-    """Values, one for each interval; ``ABSENT`` where no message comes."""
+    """Values, one for each interval; ``ABSENT`` for no message."""
 
     values: tuple[Any, ...]
 
@@ -84,9 +84,9 @@ class RuleTestSeries:
 
 
 def read_series(text: str) -> list[Any]:
-    """Return the values of a series, ``ABSENT`` where no message comes.
+    """Return the values of a series, ``ABSENT`` for no message.
 
-    Raises UsageError for what cannot be read, and for more than ``MOST_VALUES`` values.
+    Raises UsageError for unreadable text, and for more than ``MOST_VALUES`` values.
     """
     values: list[Any] = []
     for part in _parts(text.strip()):
@@ -159,7 +159,9 @@ PATTERN = "*.test.yaml"
 
 @dataclass(frozen=True, slots=True)
 class ExpectedStatus:
-    """What a component or mode must be at a time; what is left out may be anything."""
+    """The required status of a component or mode at a time; fields that are left out may be
+    anything.
+    """
 
     at: float = option(doc="when, after the first value", unit="s")
     of: str = option("", "component, or component/mode")
@@ -172,7 +174,7 @@ class ExpectedStatus:
 
 @dataclass(frozen=True, slots=True)
 class ExpectedTransition:
-    """A change that must come. The list is complete from its first entry on, for each name."""
+    """A required change. The list is complete from its first entry on, for each name."""
 
     at: float | None = option(None, "when, after the first value; any time when absent", unit="s")
     of: str = option("", "component, or component/mode")
@@ -183,7 +185,7 @@ class ExpectedTransition:
 
 @dataclass(frozen=True, slots=True)
 class ExpectedAlarm:
-    """A change of an alarm that must come; all changes of all alarms are listed."""
+    """A required change of an alarm; all changes of all alarms are listed."""
 
     at: float | None = option(None, "when, after the first value; any time when absent", unit="s")
     of: str = option("", "component")
@@ -290,7 +292,7 @@ def read_rule_tests(
 
 
 def find_rule_tests(folder: Path, skip: Path | None = None) -> FoundRuleTests:
-    """Read every test file below a folder, in order; ``skip`` is a folder not to look into."""
+    """Read every test file below a folder, in order; ``skip`` is a folder to leave out."""
     found = FoundRuleTests()
     for path in sorted(folder.rglob(PATTERN)):
         if skip is not None and path.is_relative_to(skip):
@@ -521,7 +523,7 @@ COMPONENT = "tested"  # component of a mode that is tested alone
 def single_mode_plan(
     mode: Node, file: RuleTestFile, folder: Path
 ) -> tuple[MonitoringPlan, list[Problem]]:
-    """Make a plan of one mode, with what is wrong with it.
+    """Make a plan of one mode; return it with the problems.
 
     ``folder`` is a robot folder, for the monitors and probes of its own.
     """
@@ -583,7 +585,7 @@ _NEAR = 1e-9
 
 @dataclass(frozen=True, slots=True)
 class RuleTestOutcome:
-    """The outcome of a test: statuses at the times asked for, and all findings."""
+    """The outcome of a test: statuses at the requested times, and all findings."""
 
     statuses: Mapping[float, Mapping[tuple[str, str], Status]]
     findings: Sequence[Finding]
@@ -836,7 +838,7 @@ def _unknown_names(
 
 
 def _part_of(plan: MonitoringPlan, wanted: set[str]) -> MonitoringPlan:
-    """Return the components that a test is about, and what they depend on."""
+    """Return the components of a test, and their dependencies."""
     by_id = {component.id: component for component in plan.components}
     reached: set[str] = set()
     waiting = [name for name in wanted if name in by_id]

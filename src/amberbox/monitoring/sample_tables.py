@@ -74,7 +74,9 @@ Key = tuple[str, int | None]  # column; or element of a list, or row of a child 
 
 @dataclass(slots=True)
 class SampleTable:
-    """One item: the columns that are read, when rows came, how many were received."""
+    """One item: the columns that are read, the times of rows, and the counts of received
+    messages.
+    """
 
     item: str
     flow: Flow = field(default_factory=Flow)
@@ -84,16 +86,16 @@ class SampleTable:
     whole: dict[str, Samples] | None = None
     """All columns, where they are wanted."""
     labels: dict[str, dict[int, str]] = field(default_factory=dict)
-    """Names that the message gives values of the columns that are read."""
+    """Names of values, as defined by the message, for the columns that are read."""
     keep_ns: int = NS
     is_list: bool = False
-    """It is a list of structures within the messages of another item."""
+    """Whether it is a list of structures within the messages of another item."""
     fresh: list[IntArray] = field(default_factory=list)
     """Times of rows that no instant has been evaluated for yet."""
     _schema: ItemSchema | None = None
     _gaps: dict[tuple[str, int], int] = field(default_factory=dict)
     _held_ns: dict[str, int] = field(default_factory=dict)
-    """Up to when everything is held already, after ``resume``: such rows come again."""
+    """Time up to which all rows are stored already, after ``resume``: such rows are read again."""
 
     def feed(self, batch: Batch, after_ns: int) -> None:
         """Add the rows of a batch that are later than those held."""

@@ -39,7 +39,7 @@ SymptomCondition: TypeAlias = tuple[SymptomState, tuple[str, ...]]
 
 
 class _Watched:
-    """An output of which something is expected; ``last`` is None until a symptom was emitted."""
+    """An output with an expected value; ``last`` is None until a symptom was emitted."""
 
     __slots__ = ("address", "component", "last", "measured", "output")
 
@@ -529,7 +529,7 @@ class RobotStates:
 class _Changes:
     """The changes at an instant.
 
-    ``modes`` (numbers) and ``components`` (places) get a status; ``places`` are components of which
+    ``modes`` (numbers) and ``components`` (indices) get a status; ``places`` are components whose
     modes have changed, ``looked_at`` those whose modes were evaluated, ``blocked`` those whose
     blockers have changed. ``outputs`` (numbers) were settled.
     """

@@ -38,10 +38,10 @@ class _Outlet:
 
 
 class StatusPublisher:
-    """Publishes statuses at the configured addresses, each in its format and at its pace.
+    """Publishes statuses at the configured addresses, each in its format and at its interval.
 
-    ``open`` binds the addresses; ``publish`` may be called as often as there is something new, and
-    sends where a message is due. It never waits for a subscriber. One thread.
+    ``open`` binds the addresses; ``publish`` may be called whenever there are new statuses, and
+    sends the messages that are due. It never waits for a subscriber. One thread.
     """
 
     def __init__(

@@ -90,7 +90,7 @@ class SilenceTimer:
     _polled_s: float = field(init=False)
     _reported_s: float | None = None
     _empty: int = 0
-    """How many looks in a row have found nothing."""
+    """Number of consecutive polls without new rows."""
 
     def __post_init__(self) -> None:
         self._received_s = self._polled_s = self.clock_s()
@@ -100,7 +100,7 @@ class SilenceTimer:
         self._polled_s, self._empty = self.clock_s(), self._empty + 1
 
     def received(self) -> None:
-        """Record that new rows have come."""
+        """Record that new rows were received."""
         self._received_s, self._reported_s, self._empty = self.clock_s(), None, 0
 
     def due(self, *, is_recording: bool) -> float:
@@ -147,7 +147,7 @@ class WatcherSetup:
     clock: Clock = field(default_factory=SystemClock)
     clock_s: Callable[[], float] = time.monotonic
     diagnoser: MakeDiagnoser | None = None
-    """Makes what diagnoses what the monitors find."""
+    """Creates the diagnoser of the monitors' findings."""
 
     @property
     def monitors(self) -> str:
@@ -231,7 +231,7 @@ class RecordWatcher:
     def step(self) -> None:
         """Write measurements of probes, read new rows, evaluate them, write the findings.
 
-        Raises OSError when writing fails; the next watcher goes on from before that.
+        Raises OSError when writing fails; the next watcher continues from before that.
         """
         self._is_sound = False
         self._lateness.began()
@@ -281,7 +281,7 @@ class RecordWatcher:
             self._measured.append((order, values))
 
     def _write(self, found: Sequence[Finding]) -> None:
-        """Write the findings up to a position together with a note of the position."""
+        """Write the findings up to a position, and the position, in one chunk."""
         self._settle(found)
         place = self._evaluation.place
         assert place is not None
@@ -343,7 +343,7 @@ class RecordWatcher:
         return list(unknown_statuses(statuses, now_ns, late_s, reason))
 
     def _status_line(self) -> str:
-        """Return one line on what is watched, for the process supervisor."""
+        """Return one line on the monitored robot, for the process supervisor."""
         behind = "; catching up with the record" if self._evaluation.is_behind else ""
         if self._lateness.is_overloaded:
             behind += f"; overloaded, {self._lateness.delay_s():.0f} s late"

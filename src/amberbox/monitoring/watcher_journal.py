@@ -52,7 +52,7 @@ _TEXT = re.compile(r"main (\d+)/(-?\d+)")
 class RecordEpoch(NamedTuple):
     """One run of the recorder without a step of its clock.
 
-    ``base_ns`` is log time minus the time since the computer's start, the same throughout; in a
+    ``base_ns`` is log time minus the time since the computer's start, constant throughout; in a
     record whose time does not count from there (an import) it counts how often time went back.
     """
 
@@ -94,7 +94,7 @@ class EvaluatedPosition:
         return EvaluatedPosition(self.epoch, 0)
 
     def note(self, store_id: str) -> ReaderProgress:
-        """Return the note that is written with the findings up to here."""
+        """Return the position record that is written with the findings up to here."""
         state = {"epoch": str(self.epoch), "until_ns": self.until_ns}
         return ReaderProgress(Cursor(store_id), EVALUATED, msgspec.json.encode(state).decode())
 
@@ -103,8 +103,8 @@ class EvaluatedPosition:
 class Checkpoint:
     """A checkpoint: the engine's state at a position, and the positions of the reader.
 
-    Rows that matter begin ``lookback_s`` before there. Without anything in ``engine`` it has to
-    begin anew there.
+    Relevant rows begin ``lookback_s`` before it. Without an ``engine`` state, evaluation has to
+    start again at this position.
     """
 
     place: EvaluatedPosition
@@ -129,7 +129,7 @@ class Checkpoint:
 
 @dataclass(slots=True)
 class RecoveredProgress:
-    """The progress of an earlier watcher: its last checkpoint, and how far it came after it.
+    """The progress of an earlier watcher: its last checkpoint, and its position after it.
 
     ``more`` findings were written after those up to ``place``: it was killed meanwhile.
     """
@@ -138,7 +138,7 @@ class RecoveredProgress:
     checkpoint: Checkpoint | None = None
     more: int = 0
     is_ours: bool = True
-    """What the engine knew was known by the same monitors."""
+    """Whether the engine's state was made with the same monitors."""
 
 
 def _plain(value: Any) -> Any:
@@ -243,7 +243,7 @@ class RetainedState:
     def settle(self, found: Sequence[Finding], at_ns: int, *, anew: bool) -> list[Finding]:
         """Switch to the engine's state; return the findings that differ from the journal.
 
-        Only an engine that began ``anew`` differs; ``found`` is written anyway.
+        Only an engine that started ``anew`` differs; ``found`` is written in any case.
         """
         self.settled = True
         if not anew:
@@ -324,10 +324,10 @@ def closed_diagnosis(diagnosis: Diagnosis, at_ns: int) -> Diagnosis:
 
 @dataclass(slots=True)
 class RecordAxis:
-    """The clock of the watcher's records: on the epoch's axis, after all evaluated so far.
+    """The clock of the watcher's records: on the epoch's axis, after all evaluated instants.
 
-    A record of another boot, or one whose time does not count from the computer's start, has no
-    time that passes by itself: there it is right after what was evaluated last.
+    In a record of another boot, or one whose time does not count from the computer's start, time
+    does not pass by itself: the clock is directly after the last evaluated instant.
     """
 
     clock: Clock
@@ -397,14 +397,14 @@ class WatcherJournal:
         return self._own.now_ns()
 
     def follow(self, epoch: RecordEpoch) -> None:
-        """Switch to the axis of an epoch; later records belong to it."""
+        """Switch to the time axis of an epoch; later records belong to it."""
         if self.epoch != epoch:
             same_boot = _boot_of(self._store, epoch.run) == self._clock.boot_id()
             self._axis = RecordAxis(self._clock, epoch, same_boot)
             self._own.begin_run(self._axis, str(epoch))
 
     def passed(self, place: EvaluatedPosition) -> None:
-        """Record that everything up to a position is evaluated; later records come after it."""
+        """Record that everything up to a position is evaluated; later records are after it."""
         self.follow(place.epoch)
         assert self._axis is not None
         self._axis.passed(place.until_ns)

@@ -55,7 +55,7 @@ class MarkedIncident:
 
 
 def missions(connection: Connection, robot: str) -> list[RecordedMission]:
-    """Return the missions of a robot that people began here, in order of their start."""
+    """Return the missions of a robot that people began on the server, in order of their start."""
     chosen = select(MISSION).where(MISSION.c.robot == robot)
     rows = connection.execute(chosen.order_by(MISSION.c.from_ns, MISSION.c.id))
     return [_mission(row) for row in rows]
@@ -89,7 +89,8 @@ def end(
 ) -> RecordedMission:  # fmt: skip
     """End a mission that people began on the server.
 
-    Raises UsageError when there is none of this id, or it has ended, or began later than ``at_ns``.
+    Raises UsageError for an unknown id, a mission that has ended, or one that began later than
+    ``at_ns``.
     """
     mission = _found(connection, robot, mission_id)
     if mission.end is not None:
@@ -147,7 +148,9 @@ def mission_annotations(
 
 
 def incidents(connection: Connection, robot: str) -> list[MarkedIncident]:
-    """Return the incidents of a robot that people marked here, in order of their windows."""
+    """Return the incidents of a robot that people marked on the server, in order of their
+    windows.
+    """
     chosen = select(INCIDENT).where(INCIDENT.c.robot == robot)
     rows = connection.execute(chosen.order_by(INCIDENT.c.from_ns, INCIDENT.c.id))
     return [

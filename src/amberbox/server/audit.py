@@ -47,7 +47,7 @@ class AuditEntry:
 
 @dataclass(frozen=True, slots=True)
 class AuditLogRow:
-    """A row as it is stored; ``details`` is JSON text, ``hash`` 64 hex digits."""
+    """A stored row; ``details`` is JSON text, ``hash`` 64 hex digits."""
 
     seq: int
     time_ns: int
@@ -212,8 +212,8 @@ class AuditVerification:
 def verify(connection: Connection, kept: Iterable[AuditChainHead] = ()) -> AuditVerification:
     """Verify the hash chain from the first row to the last.
 
-    ``kept`` are heads that were copied elsewhere earlier: with one of them, rows up to there cannot
-    have been rewritten unnoticed, even by somebody with write access to the database.
+    ``kept`` are heads that were copied elsewhere earlier: with one of them, a change of rows up to
+    there is detected, even if it was made by a person with write access to the database.
     """
     return follow(rows(connection), head(connection), kept)
 

@@ -57,7 +57,7 @@ def upsert(
     """Return a statement that inserts rows, or updates the columns ``change`` of rows with this
     key.
 
-    Without ``change``, existing rows stay as they are. ``when`` gets the columns of the new row and
+    Without ``change``, existing rows are not changed. ``when`` gets the columns of the new row and
     returns the condition for an update, for instance that it is newer. Execute the statement with a
     list of rows: ``connection.execute(upsert(connection.dialect, ...), rows)``.
     """

@@ -345,7 +345,7 @@ def derived_records(
 
     ``channel`` is one of ``blackbox.journal.reserved`` (``reserved.EVENT``); ``values`` is the
     record, as the functions of ``monitoring.messages`` read it. In order of time, at most
-    ``limit``: the first ones, or with ``newest`` the last. With ``aside`` records that were put
+    ``limit``: the first ones, or with ``newest`` the last. With ``aside`` records that were set
     aside are included.
     """
     limit = min(limit, MOST)

@@ -35,7 +35,7 @@ METADATA = MetaData(
         "pk": "pk_%(table_name)s",
     }
 )
-"""All tables of the server. Constraints have names, so that a migration can speak of them."""
+"""All tables of the server. Constraints have names, so that migrations can refer to them."""
 
 Counted = BigInteger().with_variant(Integer(), "sqlite")
 """A key that the database counts up; SQLite does so for INTEGER only, which has 64 bits there."""
@@ -50,7 +50,7 @@ SCHEMA_VERSION = Table(
     Column("what", Text, nullable=False),
     Column("applied_ns", Time, nullable=False),
 )
-"""What was done to the database, by number; the largest is its version."""
+"""Applied migrations by number; the largest is the version of the database."""
 
 Id = String(64)
 """An id as in ``core.ids``."""
@@ -176,7 +176,7 @@ LOGIN_ATTEMPTS = Table(
     Column("refused", BigInteger, nullable=False),
     Index("ix_login_attempts_last_ns", "last_ns"),
 )
-"""Wrong logins per account, per address and per pair of both; ``key`` is a hash of which."""
+"""Wrong logins per account, per address and per pair of both; ``key`` is a hash of these."""
 
 KNOWN_ADDRESSES = Table(
     "known_addresses",
@@ -185,7 +185,7 @@ KNOWN_ADDRESSES = Table(
     Column("address", String(64), primary_key=True),
     Column("last_ns", Time, nullable=False),
 )
-"""Where somebody has logged in from: wrong logins elsewhere do not keep them waiting here."""
+"""Addresses of earlier logins: there, wrong logins from other addresses cause no waiting."""
 
 
 AUDIT = Table(
@@ -209,7 +209,7 @@ AUDIT_HEAD = Table(
     Column("seq", BigInteger, nullable=False),
     Column("hash", Digest, nullable=False),
 )
-"""One row: the newest row of the log. Whoever adds one holds it first."""
+"""One row: the newest row of the log. A transaction that adds a row locks it first."""
 
 for _change in ("update", "delete"):
     event.listen(
@@ -264,7 +264,7 @@ ROBOT = Table(
     Column("backlog", BigInteger, nullable=False),
     Column("backlog_bytes", BigInteger, nullable=False),
 )
-"""Each robot and its newest connection; ``epoch`` fences off all that came before."""
+"""Each robot and its newest connection; frames of an older ``epoch`` are refused."""
 
 STORE = Table(
     "link_store",
@@ -306,7 +306,7 @@ RUN = Table(
     Column("boot", _Word, nullable=False),
     Column("end_seq", BigInteger, nullable=False),
 )
-"""Each run that is known: the boot that wrote it, and the end of what is held of it."""
+"""Known runs: the boot that wrote each, and the end of its stored rows."""
 
 ROW = Table(
     "link_row",
@@ -318,7 +318,7 @@ ROW = Table(
     Column("received_ns", Time, nullable=False),
     Index(None, "robot", "channel", "log_ns"),
 )
-"""Rows as they stand in the robot's journals, until the journal itself is committed."""
+"""Rows of the robot's journals, until the journal itself is committed."""
 
 ASIDE = Table(
     "link_aside",
@@ -340,7 +340,7 @@ COMMITTED = Table(
     Column("from_seq", BigInteger, primary_key=True, autoincrement=False),
     Column("to_seq", BigInteger, nullable=False),
 )
-"""What the archive holds from journals: rows of it that come late are not taken any more."""
+"""Ranges that the archive holds from journals: late rows of them are ignored."""
 
 STATUS = Table(
     "link_status",
@@ -379,7 +379,7 @@ EVENT = Table(
     Column("text", Text, nullable=False),
     Index(None, "robot", "at_ns"),
 )
-"""What the server has noticed of a robot's link, store and journals."""
+"""Events about a robot's link, store and journals, recorded by the server."""
 
 HEADS = Table(
     "link_heads",
@@ -418,8 +418,8 @@ UPLOAD = Table(
 )
 """Each file by its content; ``state`` is incoming, verified, aside or quarantined.
 
-``path`` is relative to the server's folder. What is verified is part of the robot's record; what is
-aside is sound, too, but of another history of the same store than the file held under its name.
+``path`` is relative to the server's folder. A verified file is part of the robot's record; a file
+set aside is valid too, but of another history of the same store than the file held under its name.
 ``start_ns`` and ``end_ns`` are the robot's corrected times of receipt.
 """
 
@@ -440,9 +440,12 @@ FETCH = Table(
     Column("ended_ns", Time, nullable=True),
     Index(None, "robot", "state"),
 )
-"""``state``: waiting (for the robot), asked (sent to it), copying, ready, gone (the robot has
-nothing of it), cancelled. ``files`` is JSON: the journals that the robot named, by store, and what
-became of each."""
+"""Windows requested from robots.
+
+``state``: waiting (for the robot), asked (sent to it), copying, ready, gone (the robot has none of
+its data), cancelled. ``files`` is JSON: the journals that the robot named, by store, and the state
+of each.
+"""
 
 
 FOLDER = Table(
@@ -484,10 +487,13 @@ JOURNALS = Table(
     Column("columns_gone", Boolean, nullable=False),
     Column("own_gone", Boolean, nullable=False),
 )
-"""One row per journal, for ever: what was deleted since says so. ``state`` is ``put`` (kept, its
-rows are in no table yet), ``committed``, or ``refused`` (it changed before its rows were read).
-``facts`` is JSON: readings of the clock, configured variables, what could not be read.
-``own_gone`` is about what the box said (statuses, events ...), ``columns_gone`` about the rest."""
+"""One row per journal, kept for ever, with its deletion if it was deleted.
+
+``state`` is ``put`` (kept, its rows are in no table yet), ``committed``, or ``refused`` (it changed
+before its rows were read). ``facts`` is JSON: readings of the clock, configured variables,
+unreadable parts. ``own_gone`` is about the box's own records (statuses, events ...),
+``columns_gone`` about all others.
+"""
 
 BATCHES = Table(
     "archive_batches",
@@ -507,7 +513,7 @@ SCHEMAS = Table(
     Column("number", Integer, nullable=False),
     Column("definition", Text, nullable=False),
 )
-"""What the columns of each table are; ``number`` says in which order they came."""
+"""Columns of each table; ``number`` is the order in which the schemas arrived."""
 
 SOURCES = Table(
     "archive_sources",
@@ -517,7 +523,7 @@ SOURCES = Table(
     Column("item", String(200), primary_key=True),
     Column("schema_id", String(32), primary_key=True),
 )
-"""Which tables have, or had, rows of which robot's store."""
+"""The tables that have, or had, rows of a robot's store."""
 
 MISSING = Table(
     "archive_missing",
@@ -533,7 +539,9 @@ MISSING = Table(
     Column("to_ns", Time, nullable=False),
     Column("reason", Text, nullable=False),
 )
-"""Ranges that the robot says will never come, or that a power cut took; kept and shown as gaps."""
+"""Ranges that will never arrive according to the robot, or that a power cut destroyed; shown as
+gaps.
+"""
 
 
 MISSION = Table(
@@ -562,8 +570,7 @@ MISSION_NOTE = Table(
     Column("text", Text, nullable=False),
     Index(None, "robot", "mission"),
 )
-"""What people remarked on missions, the robots' own ones too; ``mission`` is empty where it is on a
-moment alone."""
+"""Annotations of missions and moments; ``mission`` is empty for a moment without a mission."""
 
 INCIDENT = Table(
     "server_incident",
@@ -577,7 +584,7 @@ INCIDENT = Table(
     Column("made_ns", Time, nullable=False),
     Column("released_ns", Time, nullable=True),
 )
-"""Windows that people marked on the server: what lies in them is kept until they are released."""
+"""Windows that people marked on the server: their data are kept until they are released."""
 
 
 _Name = String(128)
@@ -595,7 +602,7 @@ ANSWER = Table(
     Column("at_ns", Time, nullable=False),
     Index(None, "robot", "diagnosis"),
 )
-"""What a test of a diagnosis gave; of several answers to one test the last counts."""
+"""Answers to tests of a diagnosis; of several answers to one test the last counts."""
 
 REVISION = Table(
     "diagnosis_revision",
@@ -608,7 +615,7 @@ REVISION = Table(
     Column("body", Text, nullable=False),
     Index(None, "robot", "diagnosis"),
 )
-"""What the server made of a diagnosis with an answer more; ``body`` is JSON as people got it."""
+"""Revisions of diagnoses that the server made after an answer; ``body`` is JSON as it was sent."""
 
 CAUSE = Table(
     "diagnosis_cause",
@@ -622,7 +629,7 @@ CAUSE = Table(
     Column("at_ns", Time, nullable=False),
     Index(None, "robot", "diagnosis"),
 )
-"""What it was in the end, as somebody says who has found it; nothing is ever taken back here."""
+"""Confirmed causes of diagnoses, entered by people; entries are never deleted."""
 
 
 _Short = String(16)
@@ -667,9 +674,10 @@ ALARM = Table(
     Index(None, "state"),
     Index(None, "notify_ns"),
 )
-"""Alarms. ``robot`` is empty where several robots are in one; ``told`` is the severity that was
-last notified, ``notify_ns`` when the next notification is due; ``revised``, ``effect`` and
-``words`` are of the diagnosis as it was last while the alarm lasted."""
+"""Alarms. ``robot`` is empty for an alarm of several robots; ``told`` is the severity that was last
+notified, ``notify_ns`` when the next notification is due; ``revised``, ``effect`` and ``words``
+are those of the last diagnosis while the alarm was active.
+"""
 
 ALARM_ROBOT = Table(
     "alarm_robot",
@@ -702,7 +710,7 @@ PART = Table(
     Column("run", BigInteger, nullable=False),
     Column("seq", BigInteger, nullable=False),
 )
-"""What robots said: their own alarms (``source`` is its id there), each part of one of ours."""
+"""Robots' own alarms (``source`` is the id on the robot), each part of an alarm of the server."""
 
 HISTORY = Table(
     "alarm_history",
@@ -714,7 +722,7 @@ HISTORY = Table(
     Column("what", _Short, nullable=False),
     Column("text", Text, nullable=False),
 )
-"""What happened to an alarm, and who did what; ``who`` is empty for the server itself."""
+"""History of an alarm; ``who`` is the person who made the change, empty for the server itself."""
 
 BLOCKED = Table(
     "alarm_blocked",
@@ -729,7 +737,7 @@ BLOCKED = Table(
     Column("run", BigInteger, nullable=False),
     Column("seq", BigInteger, nullable=False),
 )
-"""Components by the last transition that was told of each; ``blocked_by`` is a list as JSON."""
+"""Components by their last reported transition; ``blocked_by`` is a list as JSON."""
 
 CONSEQUENCE = Table(
     "alarm_consequence",
@@ -754,8 +762,9 @@ ROOTS = Table(
     Column("effect", _Short, nullable=False, server_default=""),
     Column("words", Text, nullable=False, server_default=""),
 )
-"""What the leading answer of a robot's diagnosis says has failed: components, as JSON; ``effect``
-and ``words`` are those that were explained last, see ``words.py``."""
+"""Components that have failed according to the leading answer of a robot's diagnosis, as JSON;
+``effect`` and ``words`` are those that were explained last, see ``words.py``.
+"""
 
 MARK = Table(
     "alarm_mark",
@@ -763,7 +772,7 @@ MARK = Table(
     Column("one", BigInteger, primary_key=True, autoincrement=False),
     Column("received_ns", Time, nullable=False),
 )
-"""All rows that robots sent up to here have been looked at."""
+"""Position up to which all rows of robots have been processed."""
 
 
 OUTBOX = Table(
@@ -797,7 +806,7 @@ CHANGED = Table(
     Column("alarm", BigInteger, primary_key=True, autoincrement=False),
     Column("due_ns", Time, nullable=False, index=True),
 )
-"""Alarms that somebody was told of and whose state has changed since: when to look at them."""
+"""Alarms with notifications whose state has changed since, and when to check them."""
 
 
 JOB = Table(
@@ -817,5 +826,8 @@ JOB = Table(
     Column("ended_ns", Time, nullable=True),
     Index(None, "state", "asked_ns"),
 )
-"""``owner`` is the person, also where a token of theirs asked. ``state``: queued, running, done,
-failed, cancelled, or expired (its file is gone). ``request`` and ``notes`` are JSON."""
+"""Downloads. ``owner`` is the person, also for a request with a token.
+
+``state``: queued, running, done, failed, cancelled, or expired (its file is deleted). ``request``
+and ``notes`` are JSON.
+"""

@@ -30,7 +30,7 @@ _SEALED: Final = "sealed:1:"
 
 
 def seal(connection: Connection, value: Any) -> Any:
-    """Return plain data with its secrets encrypted; encrypted or lost ones stay as they are."""
+    """Return plain data with its secrets encrypted; encrypted or lost ones are not changed."""
     return _with_secrets(value, lambda text: text if _is_done(text) else _sealed(connection, text))
 
 

@@ -122,7 +122,7 @@ class StartedServer:
     settings: ServerSettings
     code: SetupCode | None = None
     renewed: bool = False
-    """Whether the server's certificate was made anew."""
+    """Whether the server's certificate was renewed."""
 
 
 def run(
@@ -184,7 +184,7 @@ def make_folder(folder: Path) -> None:
 
 
 def _prepared(services: Services, *, new_code: bool) -> SetupCode | None:
-    """Store the server's address; return a setup code where one is needed or wanted.
+    """Store the server's address; return a setup code if one is needed or requested.
 
     Secrets of settings that an earlier version stored in plain text are encrypted.
     """

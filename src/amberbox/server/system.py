@@ -200,7 +200,7 @@ _FEW_ROWS = 200
 
 @dataclass
 class RecordLateness:
-    """Estimates how late a robot's records arrive, from what is known of its clock.
+    """Estimates how late a robot's records arrive, from the offset of its clock.
 
     ``ahead_ns`` is by how much the server's clock was ahead at the robot's hello. The robot's log
     time may differ from its clock after that was set; if the robot has no backlog, its records are
@@ -349,7 +349,7 @@ _WAITING = 20_000
 
 @dataclass(frozen=True, slots=True)
 class WatchedFolder:
-    """A team or system folder as it is now, and the state of its process."""
+    """A team or system folder in its present version, and the state of its process."""
 
     place: LevelFolder
     state: State

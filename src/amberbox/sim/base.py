@@ -282,7 +282,7 @@ class WheelUnit:
         return push_1, self._transmit(dt, 1, torque_2 / radius, radius)
 
     def _transmit(self, dt: float, index: int, push: float, radius: float) -> float:
-        """Pass a force to the floor; what the floor does not take spins the wheel."""
+        """Pass a force to the floor; force beyond the grip spins the wheel."""
         limit = _GRIP * self.grip * 160.0
         passed = clamp(push, limit)
         spin = self._spin[index] + (push - passed) * radius / _WHEEL_INERTIA * dt
@@ -379,7 +379,7 @@ class MovingBase:
         self._move(dt, force_x, force_y, moment)
 
     def halt(self) -> None:
-        """Stand still at once, as against a wall."""
+        """Stop at once, as at a wall."""
         self.twist = (0.0, 0.0, 0.0)
 
     def _move(self, dt: float, force_x: float, force_y: float, moment: float) -> None:

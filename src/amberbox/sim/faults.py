@@ -95,7 +95,7 @@ class SimulatedFault:
 
 @functools.cache
 def catalogue() -> Mapping[str, SimulatedFault]:
-    """Return the faults that come with the package, by id."""
+    """Return the faults of the catalogue, by id."""
     text = resources.files("amberbox.sim").joinpath("faults.yaml").read_text()
     return parse_faults(text, "faults.yaml")
 
@@ -118,7 +118,7 @@ def parse_faults(text: str, origin: str) -> Mapping[str, SimulatedFault]:
 
 
 def find_fault(fault_id: str) -> SimulatedFault:
-    """Return a fault by id; UsageError with a suggestion when there is none."""
+    """Return a fault by id; raises UsageError with a suggestion when there is none."""
     faults = catalogue()
     if fault_id in faults:
         return faults[fault_id]
@@ -222,7 +222,8 @@ class _Course:
 class Injector:
     """Sets the knobs of the robot's parts by the active faults.
 
-    Faults add up: a knob stands at its nominal value plus gain x magnitude x level of each.
+    Faults add up: the value of a knob is its nominal value plus gain x magnitude x level of each
+    fault.
     """
 
     def __init__(self, seed: int, parts: Mapping[str, object]) -> None:
@@ -255,7 +256,7 @@ class Injector:
         self._courses.append(_Course(fault, at_s, magnitude, end_s, noise))
 
     def heal(self, fault_id: str, now_s: float) -> None:
-        """End every course of a fault; UsageError if there is none."""
+        """End every occurrence of a fault; raises UsageError if there is none."""
         courses = [course for course in self._courses if course.fault.id == fault_id]
         if not courses:
             raise UsageError(f"{fault_id} was not injected", "inject it first")

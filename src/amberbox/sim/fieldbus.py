@@ -22,7 +22,7 @@ _ODD_SAMPLES = 0.12  # share of samples of a lost device that hold arbitrary mem
 
 
 class Fieldbus:
-    """Transfers the units' frames to the computer; a lost device leaves its last data there.
+    """Transfers the units' frames to the computer; the last data of a lost device stay in memory.
 
     Knobs (nominal value): ``frame_loss`` (0) share of cycles that do not come back,
     ``cycle_jitter_us`` (0) extra jitter of the cycle time.

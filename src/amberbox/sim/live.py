@@ -71,7 +71,7 @@ def publish(
     orders: queue.SimpleQueue[str],
     stop: threading.Event,
 ) -> int:
-    """Publish until the plan's end or ``stop``; return how many messages went out.
+    """Publish until the plan's end or ``stop``; return how many messages were sent.
 
     The truth (topic, seq, stamp in ns) of each batch is written and flushed before the batch is
     sent, so that it contains every message sent.

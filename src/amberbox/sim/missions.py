@@ -138,7 +138,9 @@ class Body(Protocol):
 
 
 class Executor:
-    """Knows the task, its stage and the floor; drives navigation; collects events and log."""
+    """The task executor: knows the task, its stage and the floor, controls navigation, writes the
+    log.
+    """
 
     def __init__(self, planner: Planner, navigation: Navigation, body: Body) -> None:
         self._planner = planner
@@ -242,7 +244,7 @@ class Executor:
         self.task = None
 
     def _watch(self, dt: float) -> None:
-        """Log when the way is blocked for some time, or when no scan comes."""
+        """Log when the path has been blocked for some time, or when no scan is received."""
         navigation = self._navigation
         held_up = not navigation.is_idle and abs(navigation.command[0]) < 0.02
         held_up = held_up and abs(navigation.command[2]) < 0.05

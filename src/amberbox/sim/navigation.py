@@ -149,7 +149,7 @@ class Navigation:
         self.path = list(path)
 
     def stop(self) -> None:
-        """Forget the path and stand still."""
+        """Drop the path and stop."""
         self.path = []
         self.command = (0.0, 0.0, 0.0)
 
@@ -188,7 +188,7 @@ class Navigation:
         return along / length
 
     def _target(self, pose: Pose2D) -> Point:
-        """Return the point of the segment that lies a little ahead."""
+        """Return a point of the segment slightly ahead of the robot."""
         goal = self.path[0]
         length = math.dist(self._from, goal)
         if length < 0.3:

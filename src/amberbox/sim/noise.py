@@ -70,7 +70,7 @@ def clamp(value: float, limit: float) -> float:
 
 @dataclass(slots=True)
 class Pose2D:
-    """Where something stands in the plane: metres and radians."""
+    """A position and heading in the plane: metres and radians."""
 
     x: float = 0.0
     y: float = 0.0

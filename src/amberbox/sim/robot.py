@@ -47,10 +47,10 @@ class _Outlet:
 
 
 class Robot:
-    """A robot and its software; ``step_until`` gives what it publishes, in order of time.
+    """A robot and its software; ``step_until`` yields its messages, in order of time.
 
-    The same seed, scenario and faults give the same messages byte for byte. Messages carry what
-    sensors measure; ``truth()`` is never published.
+    The same seed, scenario and faults give the same messages byte for byte. Messages contain the
+    measurements of sensors; ``truth()`` is never published.
     """
 
     def __init__(
@@ -232,7 +232,7 @@ class Robot:
                 laser.turn(view, self.now_ns, self.base.has_cart and laser is self.laser_rear)
 
     def _free(self, dt: float) -> None:
-        """Move a robot that has stood against an obstacle for a while back to the corridor."""
+        """Move a robot that has been blocked by an obstacle for a while back to the corridor."""
         self._stuck_s = self._stuck_s + dt if self.safety.touches else 0.0
         if self._stuck_s < _FREED_AFTER_S:
             return
@@ -263,7 +263,7 @@ class Robot:
         heapq.heappush(self._waiting, (sent_ns, self._order, outlet.topic, message))
 
     def _speak(self) -> None:
-        """Publish the events and log lines that came up since the last tick."""
+        """Publish the events and log lines since the last tick."""
         events, self.executor.events = self.executor.events, []
         lines, self._log, self.executor.log = self._log + self.executor.log, [], []
         for event in events:
@@ -332,7 +332,7 @@ def _distance(point: tuple[float, float], pose: Pose2D) -> float:
 
 
 def _plan(outlets: Mapping[str, _Outlet]) -> list[list[tuple[_Outlet, Make]]]:
-    """Return for each tick of a second what is published in it; slow topics are spread out."""
+    """Return the messages to publish in each tick of a second; slow topics are spread out."""
     plan: list[list[tuple[_Outlet, Make]]] = [[] for _ in range(TICKS_PER_S)]
     for index, spec in enumerate(TOPICS):
         if spec.rate_hz == 0:

@@ -20,7 +20,7 @@ class Imu:
     """Measures acceleration and turn rate; integrates a heading that drifts.
 
     Knobs (nominal value): ``gyro_bias`` (0, rad/s), ``accel_bias`` (0, m/s2), ``held`` (0) above
-    0.5 the registers stand still, ``mount_shake`` (0) how much the mount rattles while moving.
+    0.5 the registers are stuck, ``mount_shake`` (0) how much the mount rattles while moving.
     """
 
     def __init__(self, yaw: float, noise: Noise) -> None:
@@ -70,7 +70,7 @@ _CART_LEGS = np.where(
 
 
 class Scan(NamedTuple):
-    """A scan with its own stamp (ns of true time), as the rest of the software gets it."""
+    """A scan with its own stamp (ns of true time), as delivered to the software."""
 
     stamp_ns: int
     ranges: NDArray[np.float64]
@@ -87,12 +87,12 @@ class LaserView(NamedTuple):
 
 
 class Laser:
-    """One scanner, ``offset_m`` ahead of the robot's middle, looking along ``facing_rad``.
+    """One scanner, ``offset_m`` ahead of the robot's centre, facing ``facing_rad``.
 
-    Knobs (nominal value): ``cover_deg`` (0) width of a sector with something on the window,
-    ``dirt`` (0) share of light lost, ``held`` (0) above 0.5 the driver hands out its last scan
-    again, ``quiet`` (0) above 0.5 no scan comes, ``yaw_rad`` (0) turn of the mount,
-    ``spin_loss`` (0) share of the motor's speed lost.
+    Knobs (nominal value): ``cover_deg`` (0) width of a covered sector of the window, ``dirt`` (0)
+    share of light lost, ``held`` (0) above 0.5 the driver delivers its last scan again, ``quiet``
+    (0) above 0.5 there is no scan, ``yaw_rad`` (0) rotation of the mount, ``spin_loss`` (0) share
+    of the motor's speed lost.
     """
 
     def __init__(self, offset_m: float, facing_rad: float, noise: Noise) -> None:
@@ -125,7 +125,7 @@ class Laser:
         self._fresh = self.last
 
     def take(self) -> Scan | None:
-        """Return the scan that has come since the last call, if any."""
+        """Return the new scan since the last call, if any."""
         scan, self._fresh = self._fresh, None
         return scan
 

@@ -34,8 +34,11 @@ class LogLine(NamedTuple):
 
 
 class SimulatedNode:
-    """A process. Knobs (nominal value): ``killed`` (0) above 0.5 it dies and does not come up,
-    ``stalled`` (0) above 0.5 it exists but does nothing, ``leak_mb_s`` (0)."""
+    """A process.
+
+    Knobs (nominal value): ``killed`` (0) above 0.5 it dies and is not restarted, ``stalled`` (0)
+    above 0.5 it exists but does nothing, ``leak_mb_s`` (0).
+    """
 
     def __init__(self, name: str, noise: Noise) -> None:
         self.name = name

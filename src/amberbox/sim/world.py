@@ -1,4 +1,4 @@
-"""The hospital: walls, furniture, places, people walking by, and what a laser beam hits."""
+"""The hospital: walls, furniture, places, people walking by, and the obstacles of laser beams."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class HospitalPlace:
 
     @property
     def spot(self) -> Point:
-        """Return where the robot stands."""
+        """Return the point of a place where the robot stops."""
         return self.way_in[-1]
 
 

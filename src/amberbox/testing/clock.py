@@ -12,7 +12,7 @@ from amberbox.core.clock import NS
 
 @dataclass
 class ManualClock:
-    """Stands still until ``advance`` or ``step`` is called."""
+    """A clock that advances only by ``advance`` or ``step``."""
 
     wall: int = 1_700_000_000 * NS
     boot: int = 100 * NS

@@ -37,7 +37,7 @@ from amberbox.testing.clock import PATIENCE_S
 
 @dataclass
 class MemorySink:
-    """Keeps topics, messages, links and events in the order they came."""
+    """Stores topics, messages, links and events in the order of their calls."""
 
     topics: list[Topic] = field(default_factory=list)
     messages: list[tuple[int, bytes, int]] = field(default_factory=list)
@@ -133,7 +133,7 @@ _KIND = re.compile(r"[a-z][a-z0-9_]*")
 
 
 def assert_source_contract(module: ModuleType, name: str, *, run_s: float = 0.3) -> None:
-    """Check a source module: what it defines, its sample, and a run without its device.
+    """Check a source module: its definitions, its sample, and a run without its device.
 
     Raises AssertionError with all problems found.
     """
@@ -148,7 +148,7 @@ def assert_source_contract(module: ModuleType, name: str, *, run_s: float = 0.3)
 
 
 def module_problems(module: ModuleType, name: str) -> list[str]:
-    """Return what is wrong with the names a source module defines and their documentation."""
+    """Return the problems of the names that a source module defines, and of their documentation."""
     missing = [n for n in ("Config", "Source", "SAMPLE") if not hasattr(module, n)]
     if missing:
         return [f"{name}: the module does not define {n}" for n in missing]
@@ -268,9 +268,9 @@ class ObservedSink(MemorySink):
 
 @contextmanager
 def observe(source: Source) -> Iterator[ObservedSink]:
-    """Run a source in a thread; at the end stop it and check that it kept to the contract.
+    """Run a source in a thread; at the end stop it and check that it kept the contract.
 
-    ``run`` may raise AmberboxError when its device is not there; anything else fails.
+    ``run`` may raise AmberboxError when its device is missing; any other exception fails.
     """
     sink = ObservedSink(declared=frozenset(topic.name for topic in source.topics()))
     stop = threading.Event()

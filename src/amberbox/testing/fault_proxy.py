@@ -31,7 +31,7 @@ class FrameFaults:
     reorder: float = 0.0
     corrupt: float = 0.0
     hold: float = 0.0
-    """A frame is held back and comes much later, behind others."""
+    """A frame is held back and delivered much later, after others."""
 
 
 @dataclass(slots=True)
@@ -47,7 +47,7 @@ class _Direction:
 
 
 class Mangler:
-    """Mangles the frames of one connection; what comes before the upgrade passes untouched."""
+    """Mangles the frames of one connection; data before the upgrade pass unchanged."""
 
     def __init__(self, faults: FrameFaults, seed: int) -> None:
         self._faults = faults
@@ -153,7 +153,7 @@ class Faults:
 
 @dataclass(frozen=True, slots=True)
 class Planned:
-    """The fault of one connection: it begins once so many bytes have passed."""
+    """The fault of one connection, and the number of bytes after which it begins."""
 
     kind: Fault
     after_bytes: int
@@ -169,7 +169,7 @@ def plan(faults: Faults, seed: int, connection: int) -> Planned:
 
 @dataclass(slots=True, eq=False)
 class _Pair:
-    """One connection: both its sockets, and what has passed."""
+    """One connection: both its sockets, and the bytes passed so far."""
 
     client: socket.socket
     server: socket.socket

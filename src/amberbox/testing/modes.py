@@ -55,7 +55,7 @@ _FLAGS = ("COLUMNS", "PER_INPUT", "TIMED", "SEES_SILENCE", "PARTS")
 
 @dataclass(frozen=True)
 class SampleModeFile:
-    """A mode file as the sample shows it; for each mapping its inputs, and the results it has."""
+    """A mode file like the sample; for each mapping its inputs and its results."""
 
     config: Any
     inputs: Sequence[Sequence[str]]
@@ -73,7 +73,9 @@ class SampleModeFile:
 
 
 def module_problems(module: ModuleType, name: str) -> list[str]:
-    """Return what is wrong with the names a mode defines, their documentation and its sample."""
+    """Return the problems of the names that a mode defines, of their documentation and of its
+    sample.
+    """
     wanted = ("Config", "ACCEPTS", "RESULTS", "SAMPLE", "evaluate")
     missing = [n for n in wanted if not hasattr(module, n)]
     if missing:
@@ -209,7 +211,7 @@ class InputSeries:
     series: Mapping[str, SampleSeries]
 
     def empty(self) -> Input:
-        """Return the input before there is any sample."""
+        """Return the input before any sample."""
         made = Input(self.name)
         made.parts = {n[6:]: Samples() for n in self.series if n.startswith("parts ")}
         if "samples" not in self.series:
@@ -265,7 +267,7 @@ class GrowingInput:
                 self._done[name] = stop
 
     def forget_before(self, time_ns: int) -> None:
-        """Forget the samples before the history that the mode asked for."""
+        """Drop the samples before the history that the mode needs."""
         for name in self._given.series:
             samples_at(self.input, name).forget_before(time_ns)
 
@@ -416,11 +418,11 @@ def assert_mode_contract(
     parts: Mapping[str, str] | None = None,
     examples: int = 40,
 ) -> None:
-    """Check a mode: what it defines, its sample, and its function on made-up samples.
+    """Check a mode: its definitions, its sample, and its function on generated samples.
 
     ``configs`` are further configurations to try beside the one of the sample. With ``text`` its
-    inputs may also be texts. ``parts`` are the names and types (``bool int float string``) of
-    what its probes measure or its items hold. Raises AssertionError.
+    inputs may also be texts. ``parts`` are the names and types (``bool int float string``) of the
+    measurements of its probes, or of the columns of its items. Raises AssertionError.
     """
     problems = module_problems(module, name)
     assert not problems, "\n".join(problems)
@@ -517,7 +519,7 @@ class _Check:
         assert _bits(rows) == _bits(expected), f"at once {rows}, one by one {expected}"
 
     def _check_feeding(self, world: SampledWorld, expected: Sequence[Mapping[str, Any]]) -> None:
-        """Evaluate as in live operation: samples come in parts, and old ones are forgotten."""
+        """Evaluate as in live operation: samples are added in parts, and old ones are dropped."""
         inputs = [GrowingInput(given, world.cuts) for given in world.inputs]
         found = []
         for now in world.instants.tolist():

@@ -60,7 +60,7 @@ class FakeRun:
         self.journal = JournalWriter(JournalOptions(folder, store.id, self.writer, self.run, boot))
 
     def write(self, rows: Sequence[tuple[int, FakeItem, Any]]) -> None:
-        """Write messages given as (log time, item, values); bytes stand as they are."""
+        """Write messages given as (log time, item, values); bytes are written unchanged."""
         for start in range(0, len(rows), _CHUNK_ROWS):
             part = rows[start : start + _CHUNK_ROWS]
             self._write([

@@ -1,4 +1,4 @@
-"""Where the doctor's facts come from: /proc, /sys, /etc and the store, on a made-up computer."""
+"""Sources of the doctor's facts: /proc, /sys, /etc and the store, on a simulated computer."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def write(host: HostSystem, files: Mapping[str, str]) -> None:
 
 
 def record(folder: Path, seconds: int = 20, clock: ManualClock | None = None) -> ManualBox:
-    """Record a number each second; the run goes on."""
+    """Record a number each second; the run continues."""
     box = ManualBox(folder / "store", clock=clock or ManualClock())
     for value in range(seconds):
         box.hear(COUNT, number(value))

@@ -1,4 +1,4 @@
-"""What the doctor makes of facts: each check judges numbers and words, no computer needed."""
+"""Findings of the doctor: each check is given numbers and words, without a computer."""
 
 from __future__ import annotations
 

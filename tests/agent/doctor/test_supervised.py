@@ -1,4 +1,4 @@
-"""What the doctor says of ``amberbox run``."""
+"""Findings of the doctor about ``amberbox run``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Definitions and messages that say little and mean very much: they have no columns, at once."""
+"""Small definitions and messages that would expand enormously get no columns, and quickly."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Units and names of codes that a sender's schema tells: they come with the columns."""
+"""Units and labels in a sender's schema are attached to the columns."""
 
 from __future__ import annotations
 

@@ -275,7 +275,7 @@ def test_damaged_messages_are_named_or_read_as_rosbags_reads_them(
 
 
 def damage(data: st.DataObject, message: bytes) -> tuple[bytes, bool]:
-    """Damage a message; also tell whether it is certain to be unreadable."""
+    """Damage a message; also return whether it is certain to be unreadable."""
     how = data.draw(st.sampled_from(["cut", "longer", "flip", "flip"]))
     if how == "cut":
         return message[: data.draw(st.integers(0, len(message) - 1))], True

@@ -226,7 +226,7 @@ def test_names_that_ros_1_allows_and_rosbags_does_not() -> None:
 @pytest.mark.parametrize("field", ["Header", "roslib/Header", "std_msgs/Header"])
 @pytest.mark.parametrize("package", ["roslib", "std_msgs"])
 def test_a_header_is_known_by_its_old_name(field: str, package: str) -> None:
-    """Definitions of ROS before Diamondback say roslib/Header (REP 100)."""
+    """Definitions of ROS before Diamondback use roslib/Header (REP 100)."""
     text = f"{field} header\nint32 x\n" + HEADER.replace("std_msgs", package)
     topic = ros1(text)
     assert topic.schema.stamp == "header/stamp"

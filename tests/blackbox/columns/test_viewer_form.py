@@ -1,4 +1,4 @@
-"""Schemas of JSON topics in journals: viewers take them, and they tell all that was seen."""
+"""Schemas of JSON topics in journals: viewers accept them, and they contain all types seen."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ START_NS = 1_600_000_000_000_000_000
 
 
 def read_all(path: Path) -> tuple[Messages, RecordingReader]:
-    """Read a recording; return its messages by name of the topic, and what it was read with."""
+    """Read a recording; return its messages by name of the topic, and its reader."""
     with open_recording(path) as recording:
         topics = recording.topics
         found = [(topics[m.topic_index].name, m.log_time_ns, m.data) for m in recording.messages()]
@@ -54,7 +54,7 @@ def make_messages(count: int, seed: int = 1) -> Messages:
 
 
 def write_ros1(path: Path, messages: Messages, compression: str = "", chunk: int = 4096) -> None:
-    """Write a ROS 1 bag with small chunks; the bytes go in as they are."""
+    """Write a ROS 1 bag with small chunks; the bytes are written unchanged."""
     store = get_typestore(Stores.ROS1_NOETIC)
     writer = Ros1Writer(path)
     if compression:

@@ -26,7 +26,7 @@ def write_collection(folder: Path, name: str, documents: Iterable[Mapping[str, A
 
 
 def write_metadata(folder: Path, *collections: tuple[str, str, str]) -> None:
-    """Write what the black box says about its collections: name, topic, type ('' for no ROS)."""
+    """Write the black box's metadata of its collections: name, topic, type ('' if not ROS)."""
     write_collection(
         folder,
         "black_box_metadata",

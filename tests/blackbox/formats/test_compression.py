@@ -53,7 +53,7 @@ def peak_bytes(work: Callable[[], object]) -> int:
 
 @pytest.mark.parametrize("name", PACKERS)
 def test_little_more_is_unpacked_than_was_promised(bombs: dict[str, bytes], name: str) -> None:
-    """The promise may be what is damaged, so 16 MB are unpacked all the same."""
+    """The announced size may be the damaged part, so 16 MB are unpacked in any case."""
     unpacked, problem = unpack(name, bombs[name], 1000)
     assert 1000 < len(unpacked) <= 16 << 20 and "instead of 1000" in problem
     assert peak_bytes(lambda: unpack(name, bombs[name], 1000)) < 100_000_000

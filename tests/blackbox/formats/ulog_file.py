@@ -10,7 +10,7 @@ MAGIC = b"ULog\x01\x12\x35\x01"
 SYNC = b"\x2f\x73\x13\x20\x25\x0c\xbb\x12"
 START_US = 5_000_000
 GPS_US = 1_700_000_000_000_000
-"""What time it was, by GPS, when the autopilot's clock stood at 0."""
+"""GPS time at which the autopilot's clock was 0."""
 FORMATS = {
     "vector": "float x;float y;uint8_t[4] _padding0",
     "sensor_accel": "uint64_t timestamp;uint32_t device_id;float x;float[2] yz;bool clipped",

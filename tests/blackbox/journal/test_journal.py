@@ -1,4 +1,4 @@
-"""Journals: any MCAP reader reads finished ones, and damage costs only what it touches."""
+"""Journals: any MCAP reader reads finished ones, and damage affects only the damaged chunks."""
 
 from __future__ import annotations
 

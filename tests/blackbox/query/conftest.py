@@ -68,7 +68,7 @@ def record_robot(
 
 
 def item_like(record: Record, item: str) -> str:
-    """Find an item that was exported and imported again, whatever source it is of now."""
+    """Find an item that was exported and imported again, whatever its source is then."""
     names = [info.name for info in record.items() if info.name.endswith(item)]
     return min(names, key=len)
 

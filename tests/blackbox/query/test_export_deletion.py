@@ -1,4 +1,4 @@
-"""The keeper deletes while an export looks at what there is: the rest is exported, with a word."""
+"""The keeper deletes during an export: the remaining data are exported, with a note."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""MCAP with the messages as they came: for mcap, for rosbags, and back into a store."""
+"""MCAP with original messages: for mcap, for rosbags, and imported into a store again."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""CSV and Parquet: the rows of a query, whatever the range, wherever they lie."""
+"""CSV and Parquet contain the rows of a query, for any range, from journals and segments."""
 
 from __future__ import annotations
 

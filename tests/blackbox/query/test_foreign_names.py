@@ -1,4 +1,4 @@
-"""Recordings of others name their items as they like: what is made of them stays in its place."""
+"""Recordings of other tools may use any item names: files made from them stay in the store."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Gaps: what is missing is listed with its reason; empty and strange places say so."""
+"""Gaps: missing data are listed with the reason; empty and unusual stores are handled."""
 
 from __future__ import annotations
 

@@ -43,7 +43,7 @@ def encoded(value: int) -> bytes:
 
 
 def record_some(box: ManualBox, writes: int, chance: random.Random) -> None:
-    """Hear a random choice of topics at each write."""
+    """Receive messages of randomly chosen topics at each write."""
     for value in range(writes):
         if chance.random() < 0.9:
             box.hear(POSES, *(encoded(value + n) for n in range(chance.randint(1, 3))))
@@ -195,7 +195,7 @@ def test_sql_shows_all_columns(live: ManualBox, what: str) -> None:
 def test_answers_stay_the_same(
     tmp_path_factory: pytest.TempPathFactory, seed: int, writes: int
 ) -> None:
-    """A live journal, the same one finished, and its segments say the same."""
+    """A growing journal, the same one finished, and its segments give the same answers."""
     chance = random.Random(seed)
     store = tmp_path_factory.mktemp("asked") / "store"
     options = PipelineOptions(rotate_ns=chance.choice([2, 20, 600]) * NS)
@@ -255,7 +255,9 @@ def test_child_tables_of_a_long_live_journal_are_estimated(live: ManualBox) -> N
 def test_damage_of_a_live_journal_costs_what_it_touches(
     tmp_path_factory: pytest.TempPathFactory, seed: int
 ) -> None:
-    """Whatever bytes change, no row is invented, and a walk finds as many as a live look."""
+    """Whatever bytes change, no row is invented, and a full scan finds as many rows as the
+    index.
+    """
     chance = random.Random(seed)
     box = ManualBox(tmp_path_factory.mktemp("damaged") / "store", OPTIONS)
     record_some(box, 30, chance)

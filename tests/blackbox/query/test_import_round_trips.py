@@ -1,4 +1,4 @@
-"""What was exported is imported again to equal columns; what has no columns is kept as it came."""
+"""Exported data are imported again with equal columns; data without columns stay unchanged."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ FLAT = Topic(
 
 
 def flat(n: int) -> bytes:
-    """Make a message of ``FLAT`` whose own stamp lies 2 s before its receipt."""
+    """Make a message of ``FLAT`` whose own stamp is 2 s before its receipt."""
     values = np.array([(START_NS // NS + n, n, n / 7, -n, n % 2)],
                       "<u4,<u4,<f8,<i4,u1").tobytes()  # fmt: skip
     word = f"word {n}".encode()

@@ -214,7 +214,7 @@ def test_a_truncated_bag_gives_what_can_be_read(bag: Path, tmp_path: Path, share
 
 
 def test_damage_is_a_gap_of_the_time_around_it(tmp_path: Path) -> None:
-    """What lies before and behind the damaged chunk is no gap, nor is anything of a whole bag."""
+    """Data before and after the damaged chunk are no gap, nor is anything in an undamaged bag."""
     whole = write_bag(tmp_path / "whole.bag", 400)
     content = bytearray(whole.read_bytes())
     middle = content.find(b"op=\x02", len(content) // 2)

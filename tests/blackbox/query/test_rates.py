@@ -1,4 +1,4 @@
-"""Rates of items: over the time of recording, whatever the pauses."""
+"""Rates of items: over the time of recording, independent of pauses."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""SQL: the views say the same as queries, and nothing but the store can be reached."""
+"""SQL: the views give the same as queries, and only the store can be read."""
 
 from __future__ import annotations
 

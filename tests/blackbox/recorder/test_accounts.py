@@ -44,7 +44,7 @@ def message(rng: random.Random, name: str) -> bytes:
 
 
 def live(box: ManualBox, rng: random.Random) -> dict[str, int]:
-    """Let messages come in at random; return how many of each topic were sent."""
+    """Send messages at random times; return the number of each topic."""
     sent = {options.name: 0 for options in OPTIONS}
     for _ in range(rng.randint(5, 40)):
         for _ in range(rng.randint(0, 40)):

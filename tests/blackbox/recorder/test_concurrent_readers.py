@@ -1,4 +1,4 @@
-"""Readers beside the recorder: locks they look at, files that go, rows that a power cut takes."""
+"""Readers beside the recorder: locks, deleted files, rows lost in a power cut."""
 
 from __future__ import annotations
 

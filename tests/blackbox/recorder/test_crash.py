@@ -31,7 +31,7 @@ pytest.importorskip("zmq", reason="the sender speaks ZMQ; pip install 'amberbox[
 
 
 def send(truth: Path, port: int) -> None:
-    """Publish numbered messages at 1 kHz; say of each when it was handed over, before sending."""
+    """Publish numbered messages at 1 kHz; write the time of each to a file before sending it."""
     import zmq
 
     context = zmq.Context()
@@ -118,8 +118,9 @@ def test_kill_9_loses_only_the_last_write_interval(folder: Path, sender: tuple[P
 def _may_be_lost(
     number: int, sent_ns: NDArray[np.int64], numbers: NDArray[np.int64], kills: list[int]
 ) -> bool:
-    """A message may be missing if it came in the last interval before a kill, or while no
-    recorder was connected: between a kill and the first message of the next run."""
+    """Return whether a message may be missing: it was sent in the last interval before a kill, or
+    while no recorder was connected, between a kill and the first message of the next run.
+    """
     at = int(sent_ns[number])
     after = int(numbers[np.searchsorted(numbers, number)])
     for kill in kills:

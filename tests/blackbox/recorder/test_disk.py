@@ -39,7 +39,7 @@ ITEM = "ros_robot_count"
 
 
 class Disk:
-    """Stands in for the writer's ``write``: works, stalls, or has no room left."""
+    """Replaces the writer's ``write``: works, stalls, or is full."""
 
     def __init__(self) -> None:
         self.works = threading.Event()

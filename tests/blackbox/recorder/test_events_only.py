@@ -1,4 +1,4 @@
-"""Events only: what is turned away while there is no room is counted, and then all goes on."""
+"""Events only: messages refused while the disk is full are counted; then recording resumes."""
 
 from __future__ import annotations
 

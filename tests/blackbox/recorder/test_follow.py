@@ -61,7 +61,7 @@ def numbered(rng: random.Random, start: int) -> list[Row]:
 
 
 def history(store: Path, seed: int) -> list[Row]:
-    """Write several runs, some of which crash; return everything in the order it was said."""
+    """Write several runs, some of which crash; return all rows in the order of writing."""
     rng, clock = random.Random(seed), ManualClock()
     said: list[Row] = []
     for _ in range(rng.randint(1, 3)):

@@ -27,7 +27,7 @@ def ros_topic(name: str, kind: str) -> Topic:
 
 
 def names_given(box: ManualBox, topics: list[str]) -> dict[str, str]:
-    """Hear a message of each topic in this order; return the names that the items have."""
+    """Receive a message of each topic in this order; return the names of the items."""
     for n, topic in enumerate(topics):
         box.hear(Topic(topic, COUNT.message_encoding, COUNT.schema), number(n))
     box.write()

@@ -1,4 +1,4 @@
-"""Rate limits through the whole recorder: what comes at the limit is kept, bursts are thinned."""
+"""Rate limits through the whole recorder: a stream at the limit is kept, bursts are thinned."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def too_fast(rng: random.Random) -> list[float]:
 
 
 def record(store: Path, times: list[float]) -> ManualBox:
-    """Hear a message at each time (seconds), writing every 100 ms."""
+    """Receive a message at each time (seconds), writing every 100 ms."""
     options = [TopicOptions("/count", max_frequency=LIMIT_HZ)]
     box = ManualBox(store, options, ManualClock())
     start_ns, next_write = box.clock.wall, 0.1

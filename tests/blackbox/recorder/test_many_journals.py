@@ -1,4 +1,4 @@
-"""A store of thousands of journals: who begins where it ends looks at the last ones only."""
+"""A store of thousands of journals: a reader that starts at its end opens only the last ones."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A power cut: what was not yet synced is gone or torn, everything older is there."""
+"""A power cut: unsynced data are gone or incomplete, everything older is there."""
 
 from __future__ import annotations
 

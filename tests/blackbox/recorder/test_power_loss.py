@@ -20,7 +20,7 @@ BOX = "- ros: {ros_master_uri: 'http://127.0.0.1:1', topics: [{name: /count}]}\n
 
 
 class SyncNotes(Syncer):
-    """Notes what is asked of the syncer."""
+    """Records the calls of the syncer."""
 
     def __init__(self, box: ManualBox) -> None:
         super().__init__(box.pipeline, 1.0)
@@ -36,7 +36,7 @@ class SyncNotes(Syncer):
 
 
 def watched(store: Path, *states: Power) -> tuple[list[bool], SyncNotes, ManualBox]:
-    """Let a source say how the box is powered; return when the run has to end."""
+    """Let a source report the states of the supply; return when the run has to end."""
     box = ManualBox(store)
     syncer = SyncNotes(box)
     watch = PowerWatch(box.pipeline, syncer, 1.0)

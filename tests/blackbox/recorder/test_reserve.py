@@ -15,7 +15,7 @@ RESERVE = 200_000
 
 @pytest.fixture
 def free(monkeypatch: pytest.MonkeyPatch) -> list[int | None]:
-    """Give what the disk says is free."""
+    """Set the free space that the disk reports."""
     said: list[int | None] = [10**9]
     monkeypatch.setattr(module, "free_bytes", lambda folder: said[0])
     monkeypatch.setattr(module, "_PAUSE_S", 0.0)

@@ -1,4 +1,6 @@
-"""A ring that lies elsewhere, in memory say: linked, made again after a restart, moved back."""
+"""A ring in another folder, such as in memory: linked, created again after a restart,
+moved back.
+"""
 
 from __future__ import annotations
 

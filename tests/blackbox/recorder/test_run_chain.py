@@ -1,4 +1,4 @@
-"""The hash chain goes on from run to run: a run that is taken out leaves a chain that breaks."""
+"""The hash chain continues from run to run: removing a run breaks it."""
 
 from __future__ import annotations
 

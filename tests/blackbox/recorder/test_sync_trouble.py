@@ -1,4 +1,4 @@
-"""A disk that does not sync: told once, and what comes after goes into a new file."""
+"""A disk that does not sync: one event, and a new file for later messages."""
 
 from __future__ import annotations
 

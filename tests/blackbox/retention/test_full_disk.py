@@ -69,7 +69,7 @@ def run_apart(request: pytest.FixtureRequest) -> None:
 
 
 class Sender:
-    """Publishes numbered messages that do not compress, and knows when it sent each."""
+    """Publishes numbered messages that cannot be compressed, and stores the time of each."""
 
     def __init__(self, port: int, pause_s: float, size: int) -> None:
         self.sent_ns: list[int] = []
@@ -141,7 +141,7 @@ def recorder(folder: Path, *, keeper: bool) -> Iterator[subprocess.Popen[bytes]]
 
 
 def fill(disk: Path) -> Path:
-    """Take all the room that is left, as somebody else may."""
+    """Use all remaining disk space, as another program may."""
     path = disk / "somebody_else"
     with path.open("wb", buffering=0) as file, pytest.raises(OSError, match="No space"):
         while True:

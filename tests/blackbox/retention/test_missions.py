@@ -1,4 +1,4 @@
-"""Missions: by rule, by hand, over runs, found in old recordings, asked for in queries."""
+"""Missions: by rule, by hand, over several runs, detected in old recordings, used in queries."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def clock(**values: Any) -> ManualClock:
 
 @dataclass
 class Robot:
-    """A robot that tells of its task once a second, its recorder and its keeper."""
+    """A robot that publishes its task once a second, its recorder and its keeper."""
 
     store: Path
     rules: Sequence[MissionRule] = (RULE,)
@@ -180,7 +180,7 @@ def test_a_mission_times_out_though_the_recorder_always_writes_on(
 
 @pytest.mark.parametrize("restarts", [False, True])
 def test_a_mission_times_out_while_nothing_is_recorded(tmp_path: Path, restarts: bool) -> None:
-    """The recorder is gone: the keeper goes by the clock, and so does the one after it."""
+    """The recorder is dead: the keeper uses the clock, and so does the keeper after it."""
     rule = MissionRule("dock", "ros_task.state == 'DOCK'", "ros_task.state == 'OK'", max_s=5.0)
     robot = Robot(tmp_path / "store", [rule])
     robot.tell("DOCK", 2)
@@ -241,7 +241,7 @@ def test_the_keeper_looks_after_missions(tmp_path: Path) -> None:
 
 @dataclass
 class MortalRobot(Robot):
-    """A robot whose recorder and keeper die at any moment; ``told`` is what the truth is."""
+    """A robot whose recorder and keeper die at any moment; ``told`` is the true history."""
 
     keep: Literal["all", "ring"] = "all"
     rotate_ns: int = 600 * NS

@@ -1,4 +1,4 @@
-"""Whatever happens to a box, what it answers equals a simple model of what was written."""
+"""For any history of a box, its answers equal a simple model of the written data."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ TIGHT = 200_000
 
 
 class KilledError(BaseException):
-    """Stands for ``kill -9`` at any moment."""
+    """Simulates ``kill -9`` at any moment."""
 
 
 ACTS: list[tuple[Any, str]] = [
@@ -78,7 +78,7 @@ ACTS: list[tuple[Any, str]] = [
 
 @dataclass
 class Model:
-    """What was written: of each item the time of receipt of each value; marks in order."""
+    """The written data: for each item the time of receipt of each value; marks in order."""
 
     rows: dict[str, dict[int, int]] = field(default_factory=lambda: {i: {} for i in ITEMS})
     waiting: dict[str, dict[int, int]] = field(default_factory=lambda: {i: {} for i in ITEMS})
@@ -139,7 +139,7 @@ class World:
         self.keeper.step(threading.Event())
 
     def forget_keeper(self) -> None:
-        """What kill -9 does: nothing is closed; whoever comes next finds what lies there."""
+        """Simulate ``kill -9``: nothing is closed; the next keeper finds the files as they are."""
         self.keeper = None
 
     # -- what the box says
@@ -187,7 +187,7 @@ class World:
         assert not mf.read(self.path).damage
 
     def untouched(self, item: str) -> set[int]:
-        """Return the rows that nothing was told to have been done to."""
+        """Return the rows without any deletion."""
         rows = self.model.rows[item]
         if item == "ros_ring":
             newest_ns = max(rows.values(), default=0)
@@ -198,7 +198,7 @@ class World:
         return {v for v, at in rows.items() if not any(a <= at <= b for a, b in spans)}
 
     def told_gone(self, item: str) -> set[int]:
-        """Return the rows that lie well inside what was deleted, raw and columns."""
+        """Return the rows well inside the deleted ranges, raw and columns."""
         stones = mf.read(self.path).tombstones
         writer = {"ros_bulky": "bulk", "ros_ring": "ring"}.get(item, "main")
         spans = [
@@ -293,7 +293,7 @@ class BoxMachine(RuleBasedStateMachine):
 
     @rule()
     def settle(self) -> None:
-        """Keep until nothing more is deleted: then nothing of what has a tombstone is left."""
+        """Run the keeper until nothing more is deleted: then no data with a tombstone are left."""
         stones = -1
         while stones != (stones := len(mf.read(self.world.path).tombstones)):
             self.world.keep()

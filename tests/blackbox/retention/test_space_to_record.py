@@ -1,4 +1,4 @@
-"""Whatever a robot may be configured to, and whatever incidents hold: recording goes on."""
+"""For any configuration of a robot, and any incidents, recording continues."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ WRITE_S = 0.5
 
 
 class Robot:
-    """A recorder with its keeper on a small disk, in time that passes when told to."""
+    """A recorder with its keeper on a small disk, with time moved by hand."""
 
     def __init__(
         self, path: Path, store: StoreOptions, classes: Sequence[str], rate: int, share: float
@@ -56,7 +56,7 @@ class Robot:
         self.keeper = RetentionService(self.store, self.options, clock=self.box.clock)
 
     def record(self, seconds: float) -> int:
-        """Record for a while, with a keeper that looks every two seconds; return bytes taken."""
+        """Record for a while, with a keeper that runs every two seconds; return bytes used."""
         taken = 0
         for step in range(round(seconds / WRITE_S)):
             for name in self.classes:

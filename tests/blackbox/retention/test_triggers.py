@@ -32,7 +32,7 @@ def box_at(store: Path, clock: ManualClock | None = None) -> ManualBox:
 
 
 class Kept:
-    """A keeper's work on incidents; ``killed`` begins anew as after kill -9."""
+    """The keeper's handling of incidents; ``killed`` starts it again as after ``kill -9``."""
 
     def __init__(self, box: ManualBox, *triggers: Trigger, per_hour: int = 10) -> None:
         self.box = box

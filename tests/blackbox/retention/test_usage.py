@@ -1,4 +1,4 @@
-"""Disk use: every file and every inode once, however it changed since the last look."""
+"""Disk use: every file and every inode counts once, however the store changes between checks."""
 
 from __future__ import annotations
 

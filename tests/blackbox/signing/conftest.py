@@ -1,4 +1,4 @@
-"""A store as a robot leaves it, and the hands of somebody who tampers with it."""
+"""A store of a robot, and functions that tamper with it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The robot's key: made once, private, never lost to a power cut; told when it is not as it was."""
+"""The robot's key: created once, private, never lost in a power cut; a change is reported."""
 
 from __future__ import annotations
 

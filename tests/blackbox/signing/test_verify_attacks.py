@@ -1,4 +1,4 @@
-"""What is done to a store is named: by file, by chunk, by time, and as what it is."""
+"""Changes to a store are reported by file, chunk and time, with the right state."""
 
 from __future__ import annotations
 
@@ -187,7 +187,7 @@ def test_swapped_chunks_are_altered(robot: Robot) -> None:
 
 
 def test_a_chain_made_anew_is_altered_where_it_was_sealed(robot: Robot) -> None:
-    """Somebody records the file again, with chain and all, but has no key."""
+    """An attacker records the file again, with a valid chain, but has no key."""
 
     name = robot.journals(2)[0]
     _record_anew(robot, name)

@@ -1,4 +1,4 @@
-"""No false alarm: whatever a robot lives through, verify finds it intact or unsigned at its end."""
+"""No false alarm: for any history of a robot, verify finds it intact or unsigned at its end."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def test_the_manifest_condensed_still_knows_the_old_head(robot: Robot) -> None:
 
 @pytest.mark.parametrize("seed", range(8))
 def test_a_power_cut_is_never_taken_for_tampering(tmp_path: Path, seed: int) -> None:
-    """What was not synced may be cut short or zero; nobody has altered it."""
+    """Unsynced data may be cut off or zero, although no one has altered them."""
     rng = random.Random(seed)
     clock = ManualClock()
     box = ManualBox(tmp_path / "store", clock=clock)

@@ -1,4 +1,4 @@
-"""The power source: what it says to the recorder, when, and what it records."""
+"""The power source: its reports to the recorder, their times, and its messages."""
 
 from __future__ import annotations
 

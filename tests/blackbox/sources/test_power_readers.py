@@ -1,4 +1,4 @@
-"""What kernel supplies, upsd, lines and files say about the box's power."""
+"""Readers of the power state: kernel supplies, upsd, GPIO lines and files."""
 
 from __future__ import annotations
 

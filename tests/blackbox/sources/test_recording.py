@@ -1,4 +1,4 @@
-"""Replay of recordings: what comes, in which order, at which pace, and how it ends."""
+"""Replay of recordings: messages, their order and pace, and the end of the replay."""
 
 from __future__ import annotations
 

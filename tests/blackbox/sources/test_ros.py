@@ -1,4 +1,4 @@
-"""The ``ros`` block: what it accepts, and what is wrong with it before anything is opened."""
+"""The ``ros`` block: valid values, and the errors that are found before anything is opened."""
 
 from __future__ import annotations
 

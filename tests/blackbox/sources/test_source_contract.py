@@ -1,4 +1,4 @@
-"""Every source that is built keeps to the contract; the kit finds one that does not."""
+"""Every built-in source keeps the contract; the kit finds a source that does not."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def module(**changes: Any) -> types.ModuleType:
 
 
 class Faulty:
-    """Says what it is told to the sink."""
+    """A source that calls the sink with given arguments."""
 
     lossless: Any = False
 

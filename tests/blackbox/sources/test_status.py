@@ -61,7 +61,7 @@ def alarm(run: FakeRun, name: str, state: str) -> None:
 
 
 def heard(sink: ObservedSink, topic: str, act: Callable[[], object]) -> dict[str, Any]:
-    """Repeat an act, as a watcher repeats its statuses, until a message has come; return it."""
+    """Repeat an act, as a watcher repeats its statuses, until a message was received; return it."""
     count = len(sink.of(topic))
     for _ in range(100):
         act()

@@ -1,4 +1,4 @@
-"""What was lost before the box, seen in a sequence number or in stamps at a fixed rate."""
+"""Messages lost before the box, detected by a sequence number or by stamps at a fixed rate."""
 
 from __future__ import annotations
 

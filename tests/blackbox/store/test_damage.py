@@ -1,4 +1,4 @@
-"""Damage of what follows from journals costs time only, is told, and verify names it."""
+"""Damage of derived files costs only time, is reported, and verify names it."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ DAY_S = 86_400.0
 _SHOWN = ("data", "received", "seq")
 KEEP = RetentionOptions(quota=10**9, min_free=0, ring_s=9e9)
 LATER = 100_000
-"""Numbers from here on are heard after the damage."""
+"""Numbers from here on are received after the damage."""
 
 
 def record(store: Path, clock: ManualClock, first: int, *, crash: bool = False) -> None:
@@ -64,7 +64,7 @@ def keep(store: Path, clock: ManualClock, options: RetentionOptions = KEEP) -> N
 
 @dataclass(frozen=True)
 class Answers:
-    """What a store answers: rows of each item by number, what is missing, what happened."""
+    """The answers of a store: rows of each item by number, missing data, events."""
 
     rows: Mapping[str, frozenset[tuple[int, ...]]]
     gaps: list[Gap]
@@ -128,7 +128,7 @@ def content_of(store: Path) -> dict[str, bytes]:
 
 
 def named(store: Path) -> set[str]:
-    """Return the files that verify says something of."""
+    """Return the files in the findings of verify."""
     report = verify(store)
     return {finding.file for finding in report.findings} | report.uncovered.keys()
 
@@ -196,7 +196,7 @@ def test_whatever_is_damaged_nothing_raises_or_is_invented(
 
 
 _NAMED = ("manifest", "segments", "heads.json", IDENTITY, "names.json", "key.pub")
-"""What verify names itself, whatever was done to it: others may go, or show it elsewhere."""
+"""Files that verify names in any case; damage of others may show elsewhere."""
 
 
 def damaged(path: Path, data: st.DataObject) -> None:

@@ -73,7 +73,7 @@ def test_a_run_begins_on_another_axis(tmp_path: Path) -> None:
 
 
 class Disk:
-    """A disk that is asked to flush."""
+    """A disk that counts its flushes."""
 
     def __init__(self) -> None:
         self.flushed = 0

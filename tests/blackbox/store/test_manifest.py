@@ -1,4 +1,4 @@
-"""The manifest: what was appended is read back, whatever happens to the file's end or middle."""
+"""The manifest: appended lines are read back, whatever happens to the file's end or middle."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The condensed manifest: much smaller, on the same chain, and it says the same."""
+"""The condensed manifest: much smaller, on the same chain, with the same content."""
 
 from __future__ import annotations
 

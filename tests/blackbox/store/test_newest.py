@@ -57,7 +57,7 @@ def test_newest_of_a_file(store: Store, is_finished: bool) -> None:
 
 @pytest.mark.parametrize("lookback_s", [0, 0.0])
 def test_newest_alone_is_found_at_any_instant(store: Store, lookback_s: float) -> None:
-    """Instants are counted in whole ns, more of them than a float can tell apart."""
+    """Instants are in ns, which a float64 cannot always distinguish."""
     run = FakeRun(store.path, "watch")
     for number in range(100):
         run.own(channels.STATUS, T0_NS + number * 10_000_001, {"reason": f"{number}"})

@@ -1,4 +1,4 @@
-"""Real recordings: segments give back what the journals say, column by column, and are smaller."""
+"""Real recordings: segments give the same values as journals, column by column, and are smaller."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Segments as files: every value comes back bit for bit, by range, with checked pages."""
+"""Segments as files: every value is read bit for bit, by range, with checked pages."""
 
 from __future__ import annotations
 
@@ -207,7 +207,7 @@ def test_an_unfinished_file_leaves_nothing(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("by", ["received", "timestamp"])
 def test_a_flipped_bit_in_the_statistics_loses_no_row(tmp_path: Path, by: str) -> None:
-    """The footer has no checksum; the bounds of a row group stand in it."""
+    """The footer has no checksum, and contains the bounds of a row group."""
     flats = [table({"v": ("int64", np.arange(50))}, 50, start) for start in (0, 50, 100)]
     segment = write(tmp_path, flats)
     path = tmp_path / segment.path

@@ -117,7 +117,7 @@ def test_a_lost_manifest_is_rebuilt(
 def test_a_record_that_moves_on_is_looked_at_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Between the look at the manifest and the reading, keep builds and deletes."""
+    """Between reading the manifest and the segments, the keeper builds and deletes."""
     fill_store(tmp_path)
     looked: list[Path] = []
 

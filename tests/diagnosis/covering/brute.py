@@ -49,7 +49,7 @@ def posterior(model: Model, evidence: Evidence) -> dict[frozenset[str], float]:
 def with_common_cause(
     model: Model, evidence: Evidence, exact: dict[frozenset[str], float]
 ) -> dict[frozenset[str], float]:
-    """Let the unknown mode look like every set of three or more that began together."""
+    """Let the unknown mode look like every set of three or more modes that began together."""
     other = model.unknown
     if other is None or any(UNKNOWN not in conflict for conflict in evidence.conflicts):
         return exact
@@ -108,7 +108,7 @@ def _priors(model: Model, active: NDArray[np.bool_]) -> Floats:
 
 
 def _lost(model: Model, active: NDArray[np.bool_]) -> dict[str, NDArray[np.bool_]]:
-    """Return per function in which sets it is lost, as the definition says, set by set."""
+    """Return per function in which sets it is lost, computed from the definition."""
     needs = {function.id: function.needs for function in model.functions}
     takers = [(n, mode.component) for n, mode in enumerate(model.modes) if mode.takes_down]
     memory: dict[frozenset[str], list[bool]] = {}

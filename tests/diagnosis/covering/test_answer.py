@@ -37,7 +37,9 @@ def test_probabilities_are_those_computed_by_hand() -> None:
 
 
 def test_a_cause_of_all_beats_two_causes_of_one_each_by_their_priors() -> None:
-    """Peng and Reggia's covers: {wide} and {left, right}; what is added to a cover costs."""
+    """Peng and Reggia's covers: {wide} and {left, right}; adding a fault to a cover costs
+    probability.
+    """
     modes = (Mode("w#wide", 0.01), Mode("l#left", 0.05), Mode("r#right", 0.05))
     links = (Link("w#wide", "m1", 1), Link("w#wide", "m2", 1),
              Link("l#left", "m1", 1), Link("r#right", "m2", 1))  # fmt: skip
@@ -118,7 +120,7 @@ def test_what_nothing_in_the_model_explains_is_something_else() -> None:
 
 
 def alike() -> Model:
-    """Make two modes that only the symptom ``apart`` tells from each other."""
+    """Make two modes that only the symptom ``apart`` distinguishes."""
     modes = (Mode("a#x", 0.01, criticality=2.0), Mode("b#y", 0.02), Mode("c#z", 0.01))
     links = (Link("a#x", "s", 0.99), Link("b#y", "s", 0.95), Link("c#z", "t", 0.99),
              Link("a#x", "apart", 0.99))  # fmt: skip

@@ -21,7 +21,7 @@ from tests.diagnosis.covering.known import evidence, probabilities
 
 
 def even() -> Model:
-    """Make two modes that explain a symptom equally well; reading ``t`` tells them apart."""
+    """Make two modes that explain a symptom equally well; reading ``t`` distinguishes them."""
     modes = (Mode("a#x", 0.001), Mode("b#y", 0.001))
     links = (Link("a#x", "s", 1.0), Link("b#y", "s", 1.0), Link("a#x", "t", 1.0))
     return Model(modes, (Sign("s"), Sign("t", 0.0, 30.0)), links, unknown=None)

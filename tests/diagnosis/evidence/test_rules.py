@@ -197,7 +197,7 @@ broken(x). strange(x).
     ],
 )
 def test_a_finding_begins_with_the_last_of_its_goals(rest: str, onset_ns: int) -> None:
-    """What is absent has no beginning."""
+    """An absent symptom has no onset."""
     present = [("ropod2/power/on", 40), ("m1/turns/freely", 70), ("m2/turns/freely", 20)]
     symptoms = [
         Symptom(name, "present", name, at, 90, evidence=((f"item.{name}", at, 90),))

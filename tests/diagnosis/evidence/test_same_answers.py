@@ -38,7 +38,7 @@ CASES: dict[str, tuple[float, Sequence[str], str]] = {
     "rules": (2.5, (), "rule:short_circuit(motor)"),
     "faulttree": (2.5, ("--engine", "faulttree"), "motor/temperature/cool"),
 }
-"""By provider: when it is asked, with what options, and a symptom that comes of it."""
+"""By provider: the time of the diagnosis, its options, and a symptom that results."""
 SAME = ("hypotheses", "groups", "next_tests", "findings", "make_safe", "symptoms", "answers")
 
 

@@ -25,7 +25,7 @@ OPERATORS: tuple[Operator, ...] = (
     *("not", "xor", "iff", "nand", "nor", "imply", "cardinality"),
 )
 States = NDArray[np.bool_]
-"""One entry per state; bit i of its index says whether event i has happened."""
+"""One entry per state; bit i of its index is set if event i has happened."""
 
 
 @st.composite

@@ -1,4 +1,4 @@
-"""Known answers, budgets, deep trees, and what a technician asks of a running robot."""
+"""Known answers, budgets, deep trees, and queries about a running robot."""
 
 from __future__ import annotations
 
@@ -125,7 +125,7 @@ def test_a_deadline_during_the_cut_sets_leaves_the_probability() -> None:
 
 
 def after(count: int) -> Callable[[], bool]:
-    """Return a deadline that passes after it was asked ``count`` times."""
+    """Return a deadline that passes after ``count`` calls."""
     asked = iter(range(count))
     return lambda: next(asked, None) is None
 

@@ -1,4 +1,4 @@
-"""The page of the documentation: its example runs and says what is true."""
+"""The page of the documentation: its example runs and its results are right."""
 
 from __future__ import annotations
 

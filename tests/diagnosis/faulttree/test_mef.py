@@ -1,4 +1,4 @@
-"""Open-PSA files: what is read, what is refused and where, and that writing loses nothing."""
+"""Open-PSA files: accepted and refused elements, and writing without loss."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Coverage: what nobody sees, what nothing explains, what looks the same."""
+"""Coverage: undetected failure modes, unexplained symptoms, indistinguishable failure modes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``findings:`` of fmea.yaml: what it may say, what is wrong, what the model gets of it."""
+"""``findings:`` of fmea.yaml: its keys, its errors, its part of the model."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Reading fmea.yaml: types are written out, names resolved, and all that is wrong is told."""
+"""Reading fmea.yaml: types are expanded, names resolved, and all errors reported."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Priority tables of the user: the first line that fits counts, wrong lines are told."""
+"""Priority tables of the user: the first matching line counts, wrong lines are reported."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The FMEA that comes with the simulated robot: complete, and right about what its monitors see."""
+"""The FMEA of the simulated robot: complete, and consistent with its monitors."""
 
 from __future__ import annotations
 
@@ -130,7 +130,7 @@ def test_conditions_show_what_they_are_for(fmea: Fmea, fault: str) -> None:
 
 
 def _shows(condition: Expression, record: Mapping[str, Batch]) -> bool:
-    """Tell whether a condition is true soon after a fault."""
+    """Return whether a condition is true soon after a fault."""
     series = {name: _series(name, record) for name in condition.addresses()}
     at_ns = START_NS + np.arange(round(FAULT_S), round(FAULT_S) + LATEST_S) * NS
     return bool(np.ma.filled(condition.evaluate_series(series, at_ns), False).any())

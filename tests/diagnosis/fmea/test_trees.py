@@ -36,7 +36,7 @@ def needs_of(draw: st.DrawFn, names: Sequence[str], deep: int = 2) -> Needs:
 
 @st.composite
 def fmeas(draw: st.DrawFn) -> Fmea:
-    """Draw components with failure modes and functions; each may need what came before it."""
+    """Draw components with failure modes and functions; each may need earlier ones."""
     modes: dict[str, FailureMode] = {}
     components: dict[str, FmeaComponent] = {}
     functions: dict[str, FmeaFunction] = {}

@@ -39,7 +39,7 @@ def need_swipl() -> str:
 
 
 def ask_swi(folder: Path, text: str, goals: Sequence[str]) -> list[Result]:
-    """Return what SWI-Prolog answers to each goal after loading a text as it is."""
+    """Return SWI-Prolog's answers to each goal after loading a text unchanged."""
     program, driver = folder / "program.pl", folder / "driver.pl"
     program.write_text(text, encoding="utf-8")
     questions = "\n".join(_question(number, goal) for number, goal in enumerate(goals))

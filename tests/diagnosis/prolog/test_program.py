@@ -1,4 +1,4 @@
-"""Programs: files, facts, declarations, notes on what looks wrong, lookups, export."""
+"""Programs: files, facts, declarations, notes on likely mistakes, lookups, export."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The outputs on the page: ``python -m tests.diagnosis.report.page`` writes them anew."""
+"""The outputs on the page: ``python -m tests.diagnosis.report.page`` writes them again."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def outputs() -> tuple[str, str]:
 
 
 def written(page: str) -> str:
-    """Return the page with its outputs as they are now."""
+    """Return the page with its present outputs."""
     made = iter(outputs())
     return BLOCK.sub(lambda _: f"```text\n{next(made).rstrip()}\n```", page)
 

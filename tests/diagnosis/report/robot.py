@@ -145,14 +145,14 @@ ODD = ("wheel_left/encoders/encoder_1", "laser_rear/window/clear", "safety/butto
 
 @cache
 def knowledge() -> Knowledge:
-    """Return what is known of the small robot."""
+    """Return the knowledge of the small robot."""
     fmea, problems = read_fmea(FMEA)
     assert fmea is not None, problems
     return Knowledge("ropod_001", fmea, "c0ffee")
 
 
 def symptoms(of: Knowledge, present: Collection[str], rest: bool = True) -> tuple[Symptom, ...]:
-    """Return symptoms that came half a second after each other; the others are absent."""
+    """Return symptoms with onsets half a second after each other; the others are absent."""
     there = tuple(
         Symptom(
             name, "present", name, START_NS + place * 500_000_000, START_NS + place * 10**9,
@@ -176,6 +176,6 @@ def diagnosis(
 
 
 def explained(*present: str, rest: bool = True) -> Explanation:
-    """Return the explanation of what is seen on the small robot."""
+    """Return the explanation of symptoms on the small robot."""
     seen = symptoms(knowledge(), present, rest)
     return explain(diagnosis(knowledge(), seen), knowledge(), seen)

@@ -1,4 +1,4 @@
-"""Active causes and cleared ones are told apart, and what is seen stands worst first."""
+"""Active and cleared causes are distinguished, and symptoms are listed by importance."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ GONE_NS = START_NS + 30 * 10**9
 
 
 def told(*present: str, gone: tuple[str, ...] = ()) -> Explanation:
-    """Explain what is seen; of that some has gone and is remembered."""
+    """Explain present symptoms; those in ``gone`` have disappeared and are remembered."""
     seen = symptoms(knowledge(), present)
     found = diagnosis(knowledge(), seen)
     marked = [replace(s, gone_ns=GONE_NS if s.id in gone else None) for s in seen]

@@ -1,4 +1,4 @@
-"""What differs by the instance of a type alone is told as one cause and asked as one question."""
+"""Causes and tests that differ only in the instance of a type are combined."""
 
 from __future__ import annotations
 

@@ -106,7 +106,7 @@ def run(tracker: FaultTracker, happens: Iterable[At], until_s: float) -> list[Sy
 
 
 def diagnoses(out: Sequence[Symptom | Diagnosis]) -> list[Diagnosis]:
-    """Return the diagnoses of what came out."""
+    """Return the diagnoses among the findings."""
     return [one for one in out if isinstance(one, Diagnosis)]
 
 
@@ -126,13 +126,13 @@ def rows(item: str, times_s: Sequence[float], **columns: Any) -> Batch:
 
 
 def status(at_s: float, component: str, mode: str, **outputs: Any) -> Status:
-    """Return what a monitor's mode says."""
+    """Return the status of a monitor's mode."""
     at_ns = seconds(at_s)
     return Status("robot_1", component, mode, "ok", "nominal", outputs, (), at_ns, at_ns, "", "h")
 
 
 def copied(tracker: FaultTracker) -> FaultTracker:
-    """Return a tracker that goes on from a snapshot of another, by way of a file."""
+    """Return a tracker that continues from a snapshot of another, through a file."""
     made = FaultTracker(tracker.knowledge)
     made.resume(json.loads(json.dumps(tracker.snapshot(), allow_nan=False)))
     return made

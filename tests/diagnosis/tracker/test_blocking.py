@@ -1,4 +1,4 @@
-"""A unit on a bus: what it shows counts unless the bus may be down."""
+"""A unit on a bus: its symptoms count unless the bus may be down."""
 
 from __future__ import annotations
 

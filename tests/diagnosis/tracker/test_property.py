@@ -1,4 +1,4 @@
-"""However a life is cut into calls, and wherever it is remembered, the same comes out."""
+"""The result does not depend on the division into calls, or on where snapshots are taken."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ lamps = st.tuples(ticks, st.booleans())
 
 @dataclass(frozen=True)
 class Life:
-    """What is told, and what was measured, by ticks; at ``epoch`` a new epoch begins."""
+    """Findings and measurements by ticks; at ``epoch`` a new epoch begins."""
 
     told: Sequence[tuple[int, str, SymptomState, tuple[str, ...]]]
     samples: Sequence[tuple[int, float]]
@@ -54,7 +54,7 @@ class Life:
         return [*lit, *told]
 
     def feed(self, tracker: FaultTracker, after: int, until: int) -> None:
-        """Feed what was measured in some ticks."""
+        """Feed the measurements of some ticks."""
         part = [(tick, value) for tick, value in self.samples if after < tick <= until]
         if part:
             tracker.feed(rows("motor", [t / 20 for t, _ in part], temperature=[v for _, v in part]))

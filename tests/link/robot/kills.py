@@ -23,7 +23,7 @@ ROOT = Path(__file__).parents[3]
 
 @dataclass
 class Result:
-    """What came of it: rows that were written, and how long the last ones took to arrive."""
+    """The result: written rows, and how long the last ones took to arrive."""
 
     rows: int = 0
     kills: int = 0
@@ -68,7 +68,7 @@ class Field:
         process.wait()
 
     def end(self) -> None:
-        """Kill whatever is left."""
+        """Kill all remaining processes."""
         for name in list(self.processes):
             self.kill(name)
 
@@ -134,7 +134,7 @@ def _has_all(database: ServerDatabase, name: str, wanted: Held) -> bool:
 
 
 def _await(is_so: Callable[[], bool]) -> None:
-    """Wait for what has to come, a minute at most: whoever asks next sees what is missing."""
+    """Wait for a condition, a minute at most; the next check reports what is missing."""
     end = time.monotonic() + 60
     while not is_so() and time.monotonic() < end:
         time.sleep(0.1)

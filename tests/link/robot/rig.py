@@ -32,7 +32,7 @@ from amberbox.testing.clock import PATIENCE_S
 Position = tuple[str, str, int, int]
 """Store, writer, run, seq."""
 Held = dict[Position, tuple[str, int, bytes]]
-"""What stands at positions: channel, log time, bytes."""
+"""Rows at positions: channel, log time, bytes."""
 
 
 class Watcher:
@@ -80,7 +80,7 @@ class Watcher:
 
 
 def recorded(path: Path) -> Held:
-    """Return what a store's journals hold that goes over the link, position by position."""
+    """Return the rows of a store's journals that are sent over the link, by position."""
     store = open_store(path)
     found: Held = {}
     for journal in journals(path):
@@ -90,7 +90,7 @@ def recorded(path: Path) -> Held:
 
 
 def conclusions_of(journal: JournalFile, store_id: str) -> Held:
-    """Return what of a journal goes over the link."""
+    """Return the rows of a journal that are sent over the link."""
     found: Held = {}
     for chunk in sound_chunks(journal):
         seq = sequences(chunk, journal.first_seq).tolist()
@@ -150,7 +150,7 @@ class WebsocketsSocket:
 async def serving(
     database: ServerDatabase, hooks: LinkHooks | None = None, port: int = 0, silent_s: float = 5.0
 ) -> AsyncIterator[tuple[LinkServer, int]]:
-    """Serve links on loopback; robots come with the key ``key-<id>``."""
+    """Serve links on loopback; robots use the key ``key-<id>``."""
     link = LinkServer(database, hooks, silent_s=silent_s)
 
     async def handle(connection: ServerConnection) -> None:

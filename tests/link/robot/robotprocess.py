@@ -11,7 +11,9 @@ from tests.link.robot.rig import Watcher, client_of
 
 
 async def live(path: Path, robot: str, port: int, seed: int) -> None:
-    """Write until a file beside the store says to be quiet; stay linked until another says stop."""
+    """Write until a file beside the store requests silence; stay linked until another requests the
+    end.
+    """
     chance = random.Random(seed)
     watcher = Watcher(path, robot)
     watcher.count = seed * 1_000_000

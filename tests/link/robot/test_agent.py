@@ -1,4 +1,4 @@
-"""``amberbox link`` as a process: killed again and again, and what is recorded has no gap."""
+"""``amberbox link`` as a process, killed repeatedly: the server's data have no gap."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The link from end to end: what the journals say is on the server, once each."""
+"""The link from end to end: all rows of the journals are on the server, once each."""
 
 from __future__ import annotations
 

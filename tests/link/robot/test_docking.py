@@ -1,4 +1,4 @@
-"""Whether the robot is in its dock, by what it records."""
+"""Whether the robot is in its dock, by its recorded variables."""
 
 from __future__ import annotations
 

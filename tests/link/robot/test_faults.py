@@ -76,7 +76,7 @@ def test_frames_twice_swapped_late_and_damaged_change_nothing(
 
 
 def cut_power(path: Path, keep_bytes: int) -> None:
-    """Take from the newest journal what was written behind a byte, and its head with it."""
+    """Remove from the newest journal the data after a byte, and its head."""
     newest = open_store(path).journal_files("watch")[-1]
     with newest.open("r+b") as file:
         file.truncate(keep_bytes)
@@ -132,7 +132,7 @@ def test_a_new_card_begins_anew_and_is_told(tmp_path: Path, database: ServerData
 def test_an_old_image_never_joins_what_was_before(
     tmp_path: Path, database: ServerDatabase, monkeypatch: pytest.MonkeyPatch, runs_since: int
 ) -> None:
-    """The image knows nothing of the last runs; it goes on with the same numbers of runs."""
+    """The image does not contain the last runs; new runs get the same numbers."""
     path, image = tmp_path / "store", tmp_path / "image"
 
     async def go_on(path: Path, boot: str, runs: int) -> None:

@@ -1,4 +1,4 @@
-"""Windows that somebody wants: which journals hold them, what is told, what is remembered."""
+"""Requested windows: their journals, the answers, and the stored requests."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What incidents keep goes to the server first, the ring's files that only they hold included."""
+"""Journals of incidents are sent first, including the ring's files that only incidents hold."""
 
 from __future__ import annotations
 

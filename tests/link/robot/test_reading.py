@@ -1,4 +1,4 @@
-"""What the link reads of a store: rows as they stand, how far journals reach, latest values."""
+"""The link's reader of a store: unchanged rows, ends of journals, latest values."""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""A server that was restored from a backup: robots find out what it lacks, and send it again."""
+"""A server that was restored from a backup: robots detect which journals it lacks, and
+send them.
+"""
 
 from __future__ import annotations
 
@@ -41,7 +43,9 @@ ALWAYS = 2**62
 
 
 class Backend:
-    """A server's folder and desk, asked without a network; ``old`` ones know no holdings."""
+    """A server's folder and upload service, called without a network; ``old`` ones lack the
+    comparison.
+    """
 
     def __init__(self, folder: Path, verifier: Verifier, store: Store, *, old: bool = False):
         self.folder, self.old, self.asked = folder, old, 0
@@ -85,7 +89,7 @@ class Backend:
             return {row.journal: row.state for row in connection.execute(select(UPLOAD))}
 
     def backup(self, target: Path) -> None:
-        """Copy the folder as it is, as somebody does who has stopped the server."""
+        """Copy the folder, as an admin does after stopping the server."""
         self.database.close()
         shutil.rmtree(target, ignore_errors=True)
         shutil.copytree(self.folder, target)
@@ -123,7 +127,7 @@ class Robot:
         return self.loop.copied - before
 
     def connect(self) -> int:
-        """Come again with a new connection."""
+        """Connect again with a new connection."""
         self.contact += 1
         return self.run()
 

@@ -1,4 +1,4 @@
-"""TLS by a pinned authority, whatever the date."""
+"""TLS with a pinned authority, independent of the date."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class Authority:
 
 @contextmanager
 def served(authority: Authority) -> Iterator[int]:
-    """Serve the authority's certificate over TLS, to anybody."""
+    """Serve the authority's certificate over TLS, without authentication."""
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     context.load_cert_chain(authority.chain, authority.private)
     listener = socket.create_server(("127.0.0.1", 0))

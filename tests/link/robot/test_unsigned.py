@@ -1,4 +1,4 @@
-"""A journal goes to the server once its seal is signed: before, the server would refuse it."""
+"""A journal is uploaded once its seal is signed: before, the server would refuse it."""
 
 from __future__ import annotations
 

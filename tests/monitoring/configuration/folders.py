@@ -63,12 +63,12 @@ def component(plan: MonitoringPlan, name: str) -> ComponentPlan:
 
 
 def errors(problems: list[Problem]) -> list[str]:
-    """Return what is wrong, each as ``file:line: where: what``, without the folder."""
+    """Return the errors, each as ``file:line: where: what``, without the folder."""
     return [_short(problem) for problem in problems if problem.is_error]
 
 
 def notes(problems: list[Problem]) -> list[str]:
-    """Return what is noted, in the same way."""
+    """Return the notes, in the same form."""
     return [_short(problem) for problem in problems if not problem.is_error]
 
 

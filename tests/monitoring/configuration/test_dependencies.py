@@ -1,4 +1,4 @@
-"""What components need, what speaks for it, and what is wrong with it."""
+"""Dependencies of components, the monitors that give their state, and their errors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A folder's component and mode files become a plan; what is wrong is said with file and line."""
+"""Component and mode files become a plan; errors are reported with file and line."""
 
 from __future__ import annotations
 
@@ -142,7 +142,7 @@ def test_modes_that_no_component_lists_are_judged(tmp_path: Path) -> None:
 
 
 def test_a_fault_is_called_by_a_name_of_its_own(tmp_path: Path) -> None:
-    """Else a component in error could be said to be nominal."""
+    """Otherwise a component in error could have the state nominal."""
     text = RANGE.replace("name: fine", "name: stale") + "states: {nominal: stale == false}\n"
     _, problems = mode_of(tmp_path, text)
     assert errors(problems) == [
@@ -214,7 +214,7 @@ def test_a_monitor_that_cannot_be_loaded(tmp_path: Path, code: str, what: str) -
     ],
 )
 def test_a_monitor_that_crashes_when_it_is_asked(tmp_path: Path, code: str, what: str) -> None:
-    """All of it is asked here: once it runs, it would take the other monitors with it."""
+    """All functions are called here: an error at run time would also stop other monitors."""
     own = (EXAMPLE.parents[1] / "src/amberbox/monitoring/modes/range.py").read_text()
     (tmp_path / "modes").mkdir()
     (tmp_path / "modes" / "heat.py").write_text(f"{own}\n\n{code}")

@@ -1,4 +1,4 @@
-"""Modes that want to see more of an item than its filters leave."""
+"""Modes that need more rows of an item than its filters keep."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def test_filters(
 
 
 def test_windows_are_compared_with_what_was_recorded(tmp_path: Path) -> None:
-    """A folder that records everything: only its store tells how often an item comes."""
+    """A folder that records everything: only its store shows the rate of an item."""
     log = tmp_path / "pose.csv"
     log.write_text("t,x\n" + "".join(f"{1_700_000_000 + n / 4},{n}\n" for n in range(40)))
     assert main(["import", str(log), "--store", str(tmp_path / "store")]) == 0

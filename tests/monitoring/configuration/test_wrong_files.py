@@ -1,4 +1,4 @@
-"""Whatever stands in component and mode files: a plan comes of it, and problems with lines."""
+"""Any content of component and mode files gives a plan, and problems with lines."""
 
 from __future__ import annotations
 

@@ -72,7 +72,7 @@ def variable(name: str = "v", item: str = "a") -> InputPlan:
 
 
 def output(result: Result = GOOD, **options: Any) -> OutputPlan:
-    """Return an output; a bool one expects what is nominal."""
+    """Return an output; a bool one expects its nominal value."""
     expectation = Expectation(True) if result.type == "bool" else Expectation()
     given = {"expectation": expectation, **options}
     return OutputPlan(result.name, result.type, result, **given)

@@ -1,4 +1,4 @@
-"""A test stand for states: what is found is written down as seconds, levels and reasons."""
+"""A test bench for states: findings are written as seconds, levels and reasons."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def at_ns(seconds: float) -> int:
 
 
 def output(name: str = "working", **more: Any) -> OutputPlan:
-    """Plan an output, a bool that should be true unless ``more`` says otherwise."""
+    """Make an output, a bool that is expected to be true unless ``more`` changes it."""
     kind = more.pop("type", "bool")
     result = Result(name, kind, "made for a test", nominal=more.pop("nominal", True))
     return OutputPlan(name, kind, result, **more)
@@ -49,7 +49,7 @@ def mode(name: str = "device", *outputs: OutputPlan, **more: Any) -> ModePlan:
 def component(
     name: str, *needs: str | DependencyPlan, modes: Sequence[ModePlan] | None = None, **more: Any
 ) -> ComponentPlan:
-    """Plan a component with a mode ``device``; what it needs are names of components."""
+    """Make a component with a mode ``device``; ``needs`` are names of components."""
     edges = [DependencyPlan(n, component=n) if isinstance(n, str) else n for n in needs]
     own = [mode()] if modes is None else modes
     return ComponentPlan(name, name, own, edges, **more)
@@ -61,7 +61,7 @@ def plan(*components: ComponentPlan) -> MonitoringPlan:
 
 
 class Stand:
-    """States of a plan, what was found so far, and what came of it."""
+    """States of a plan, the changes of outputs so far, and the findings."""
 
     def __init__(self, *components: ComponentPlan, begin: bool = True) -> None:
         self.plan = plan(*components)
@@ -82,7 +82,7 @@ class Stand:
     def find(
         self, seconds: float, where: str, what: OutputCondition, value: Output = None, why: str = ""
     ) -> None:
-        """Note what is found of an output; ``where`` begins its address."""
+        """Add a change of an output; ``where`` is the beginning of its address."""
         (number,) = [n for n, p in enumerate(self.places) if _address(p).startswith(f"{where}/")]
         self._found.append(OutputChange(at_ns(seconds), number, what, value, why))
 
@@ -101,7 +101,7 @@ class Stand:
         self.find(seconds, where, "stale", None, "nothing received of scan for 5 s")
 
     def until(self, seconds: float) -> list[Finding]:
-        """Advance, and return what is found."""
+        """Advance, and return the findings."""
         found = sorted(self._found, key=lambda entry: entry[:2])
         self._found = []
         self.view.take(found)
@@ -122,7 +122,7 @@ class Stand:
 
 
 class Values:
-    """The values of outputs over time, made from what was found."""
+    """The values of outputs over time, made from their changes."""
 
     def __init__(self, plan: MonitoringPlan) -> None:
         self._modes: list[list[tuple[int, str]]] = [[] for _ in plan.modes()]
@@ -133,7 +133,7 @@ class Values:
         self._values: dict[int, list[OutputChange]] = {}
 
     def take(self, found: Iterable[OutputChange]) -> None:
-        """Take what is found, in order of time."""
+        """Add changes, in order of time."""
         for entry in found:
             self._values.setdefault(entry.output, []).append(entry)
 

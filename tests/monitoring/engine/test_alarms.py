@@ -1,4 +1,4 @@
-"""Alarms: one for each root, counted and not repeated, and what people do with them."""
+"""Alarms: one for each root, counted and not repeated, and people's actions on them."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def brief(findings: list[Finding]) -> list[tuple[float, str, str, int]]:
 
 
 def well(*components: Any) -> Stand:
-    """Make a stand on which all is well since second 1."""
+    """Make a bench on which everything has been ok since second 1."""
     stand = Stand(*components)
     stand.ok(1, *(f"{place.component}/{place.mode}/{place.output.name}" for place in stand.places))
     assert alarms(stand.until(1)) == []

@@ -1,4 +1,4 @@
-"""Modes that look at one input at a time, lists, probes: how inputs and outputs are tied."""
+"""Modes with one input at a time, lists, probes: how inputs and outputs are bound."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The engine: what is found does not depend on how the record came, and nothing stays green."""
+"""The engine: findings do not depend on batches, and nothing stays green without data."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def test_what_depends_on_time_changes_without_a_row() -> None:
 def test_no_jump_falls_between_two_windows(
     period_ms: int, phase_ms: int, place: int, spare_ms: int, word: str
 ) -> None:
-    """A window of two periods sees every sample with the one before it, whenever it is asked."""
+    """A window of two periods sees every sample together with the one before it, at any instant."""
     window_ms = max(2 * period_ms, 100) + spare_ms
     times = np.arange(10, dtype=np.int64) * period_ms * 10**6 + (1000 + phase_ms) * 10**6
     if word == "rate":
@@ -131,7 +131,7 @@ def test_another_publisher_of_the_same_keeps_it_fresh() -> None:
 
 
 def test_when_both_publishers_are_lost_the_later_one_counts() -> None:
-    """The first has been lost for long when the second goes: what it sent meanwhile is past."""
+    """The first has been lost for long when the second is lost: its earlier messages are past."""
     batches = [
         rows(seconds(1.0, 2.5, 3.5), v=[1.0] * 3),
         gap(2 * NS, 2 * NS, None),
@@ -142,7 +142,7 @@ def test_when_both_publishers_are_lost_the_later_one_counts() -> None:
 
 
 def test_lost_publishers_are_remembered() -> None:
-    """Two are lost before the snapshot, one comes back after it and says nothing."""
+    """Two are lost before the snapshot; one comes back after it without sending."""
     plan = one(mode(POSITIVE, variable(), stale_s=None))
     first, resumed = Engine(plan), Engine(plan)
     first.begin(0)
@@ -230,7 +230,7 @@ def lists(at_s: float, values: Sequence[float]) -> Batch:
 
 
 def test_a_row_that_is_no_longer_in_its_list_is_not_known() -> None:
-    """Whoever wrote it has died, though messages with the others still come."""
+    """Its writer has died, although messages with the other rows are still received."""
     second = mode(POSITIVE, replace(variable("v", "a__parts"), index=1))
     batches = [lists(1, [1, 2]), lists(2, [1]), lists(3, [1, 2]), lists(4, [])]
     found = [(0.0, "unknown"), (1.0, "ok"), (2.0, "unknown"), (3.0, "ok"), (4.0, "unknown")]
@@ -373,7 +373,7 @@ def test_instants_are_multiples_of_the_tick() -> None:
 
 
 def test_the_reason_names_what_is_missing_now() -> None:
-    """Of two inputs one comes back just when the other has gone: the level stays as it is."""
+    """Of two inputs one comes back when the other is lost: the level stays the same."""
     both = mode(POSITIVE, variable(), variable("w", "b"), stale_s=1.0)
     batches = [
         rows(seconds(1, 5, 5.5, 6, 6.5), "a", v=[1.0] * 5),

@@ -16,7 +16,7 @@ from amberbox.monitoring.plan import Expectation, OutputPlan
 
 
 def judge(kind: Any, expectation: Expectation | None = None) -> OutputJudge:
-    """Return the judge of an output of a type."""
+    """Return the evaluation of an output of a type."""
     return OutputJudge(
         OutputPlan("o", kind, Result("o", kind, ""), None, expectation or Expectation())
     )

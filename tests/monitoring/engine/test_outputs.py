@@ -1,4 +1,4 @@
-"""One output: pending, confirmed, healed, flapping, and what it says of that."""
+"""One output: pending, confirmed, healed, flapping, and the reasons for these."""
 
 from __future__ import annotations
 

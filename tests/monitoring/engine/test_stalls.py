@@ -1,4 +1,4 @@
-"""A recorder that was held up: nothing is concluded from what came late, and faults still are."""
+"""A recorder that was held up: late messages prove nothing, and faults are still found."""
 
 from __future__ import annotations
 

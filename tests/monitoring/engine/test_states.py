@@ -1,4 +1,4 @@
-"""States over time: what is told when, epochs, and that the way of asking changes nothing."""
+"""States over time: findings and their times, epochs, independent of the calls."""
 
 from __future__ import annotations
 
@@ -239,7 +239,7 @@ def mode_plans(draw: st.DrawFn, name: str) -> ModePlan:
 
 @st.composite
 def plans(draw: st.DrawFn) -> MonitoringPlan:
-    """Draw a robot whose components need others that come later, mixed up."""
+    """Draw a robot whose components need later ones, in mixed order."""
     made: list[ComponentPlan] = []
     for number in range(draw(st.integers(1, 6))):
         modes = [draw(mode_plans(f"m{n}")) for n in range(draw(st.integers(0, 2)))]
@@ -313,7 +313,9 @@ def _drawn_found(draw: st.DrawFn, drawn: MonitoringPlan, now: int, number: int) 
 
 
 def tell(story: Story, cuts: Sequence[int] = (), resumes: bool = False) -> list[Finding]:
-    """Return all findings, asked for at the cuts as well, perhaps of a new object each time."""
+    """Return all findings, with calls at the cuts as well, optionally with a new object
+    each time.
+    """
     states, view = RobotStates(story.plan), Values(story.plan)
     findings = states.begin(T0_NS)
     for chapter, end, between in zip(story.chapters, story.ends, story.between, strict=True):
@@ -387,7 +389,7 @@ def _transitions_follow_one_another(findings: Sequence[Finding]) -> None:
 
 
 def _blocked_by_what_is_below(drawn: MonitoringPlan, findings: Sequence[Finding]) -> None:
-    """Compare with the definition, worked out anew for the last statuses of all."""
+    """Compare with the definition, computed again from the last statuses of all components."""
     newest = {(s.component, s.mode): s for s in statuses(findings)}
     known = {component.id: component for component in drawn.components}
     functional = ("ok", "warn")
@@ -434,9 +436,9 @@ SAYS = {"ok": "absent", "warn": "present", "error": "present"}
 
 
 def _symptoms_are_what_statuses_say(drawn: MonitoringPlan, findings: Sequence[Finding]) -> None:
-    """Compare each with the statuses of its instant; none is told twice, none is left out.
+    """Compare each with the statuses of its instant; none is repeated, none is missing.
 
-    Only what speaks neither for nor against a fault may stay untold after unknown.
+    Only a symptom that is no evidence may be missing after unknown.
     """
     of_mode = _expected_alone(drawn)
     last: dict[str, tuple[str, tuple[str, ...]]] = {}

@@ -1,4 +1,4 @@
-"""What outputs say for or against faults: told when it changes, and when they are blocked."""
+"""Symptoms of outputs: emitted when they change, and when they become blocked."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def laser(*needs: str, name: str = "laser", **more: Any) -> ComponentPlan:
 
 
 def told(findings: Iterable[Finding]) -> list[tuple[float, str, str, tuple[str, ...]]]:
-    """Return when, of which output, what, and blocked by what is told."""
+    """Return time, output, state and blockers of the symptoms."""
     return [
         (seconds(s.confirmed_ns or 0), s.id.removesuffix("/device/working"), s.state, s.blocked_by)
         for s in symptoms(findings)
@@ -260,7 +260,7 @@ def test_a_snapshot_from_before_there_were_symptoms_is_taken() -> None:
 
 
 def test_a_change_of_one_output_costs_nothing_for_the_others(monkeypatch: Any) -> None:
-    """Count what is looked at: one output of a thousand changes, ten are blocked by it."""
+    """Count evaluated outputs: one of a thousand changes, ten are blocked by it."""
     names = [f"c{n}" for n in range(1000)]
     parts = [laser(*(["c0"] if 0 < n <= 10 else []), name=name) for n, name in enumerate(names)]
     states, view = RobotStates(plan(*parts)), Values(plan(*parts))

@@ -84,7 +84,9 @@ def records(draw: st.DrawFn) -> list[Row]:
 
 
 def levels(record: Sequence[Row], condition: str, cuts: Sequence[int]) -> list[tuple[int, str]]:
-    """Return when the level of a mode changes, for rows that come in batches cut at times."""
+    """Return the times at which the level of a mode changes, for rows in batches cut at given
+    times.
+    """
     wanted = output(expression.RESULTS[0], flaps=10**6)
     mapping = MappingPlan([], [wanted], [variable()])
     config = expression.Config(condition=parse(condition))

@@ -1,4 +1,4 @@
-"""A device is there or not, or nobody knows."""
+"""A device is present, absent or unknown."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Numbers, bools, texts and names of values are compared as one would write them."""
+"""Numbers, bools, texts and names of values are compared in their written form."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A heartbeat is judged by counts taken before any filter, and silence is never well."""
+"""A heartbeat is evaluated by counts taken before any filter, and silence is never ok."""
 
 from __future__ import annotations
 

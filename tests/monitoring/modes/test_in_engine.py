@@ -1,4 +1,4 @@
-"""Modes as the engine runs them: what it has to give them besides values."""
+"""Modes run by the engine: what it gives them besides values."""
 
 from __future__ import annotations
 

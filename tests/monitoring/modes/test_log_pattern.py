@@ -1,4 +1,4 @@
-"""Lines that match: bad ones counted, good ones that must come, levels, and the last of them."""
+"""Matching lines: faults are counted, required lines must appear; levels, and the last line."""
 
 from __future__ import annotations
 

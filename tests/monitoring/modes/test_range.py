@@ -1,4 +1,4 @@
-"""Limits, what is no number, and hysteresis."""
+"""Limits, values that are not numbers, and hysteresis."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What probes of units, processes, containers and ROS found is what is said."""
+"""Results of probes of units, processes, containers and ROS."""
 
 from __future__ import annotations
 

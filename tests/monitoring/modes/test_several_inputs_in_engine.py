@@ -1,4 +1,4 @@
-"""Modes that look at several inputs, or at whole tables, as the engine runs them."""
+"""Modes with several inputs, or with whole tables, run by the engine."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Status words fall apart into their bits, and what is no word has none."""
+"""Status words are split into their bits; an invalid word has none."""
 
 from __future__ import annotations
 

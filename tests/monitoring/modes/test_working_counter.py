@@ -1,4 +1,4 @@
-"""Bad samples in a row, one alone, and one that stands because a filter drops its repetitions."""
+"""Consecutive bad samples, a single one, and one that lasts because a filter drops repetitions."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Containers, asked of an HTTP server on a socket of the file system as engines have it."""
+"""Containers, queried from an HTTP server on a Unix socket, as container engines have it."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ ANSWERS: Mapping[str, tuple[int, Any]] = {
 
 
 class Engine(BaseHTTPRequestHandler):
-    """Answers as the Docker Engine API does; knows nothing but GET."""
+    """A part of the Docker Engine API, with GET only."""
 
     def do_GET(self) -> None:
         status, answer = ANSWERS.get(self.path, (404, {"message": "No such container"}))
@@ -45,7 +45,7 @@ class Engine(BaseHTTPRequestHandler):
         return "socket"
 
     def log_message(self, format: str, *args: Any) -> None:
-        """Say nothing."""
+        """Suppress the log."""
 
 
 @pytest.fixture

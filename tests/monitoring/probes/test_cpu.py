@@ -1,4 +1,4 @@
-"""Load of the processor, from two looks at the kernel's counters."""
+"""Load of the processor, from two readings of the kernel's counters."""
 
 from __future__ import annotations
 

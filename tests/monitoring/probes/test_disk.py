@@ -1,4 +1,4 @@
-"""How full a disk is: this computer's, and what the system says of others."""
+"""Use of disks: this computer's, and simulated ones."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What ``docs/robot/probes.md`` shows works as it says: its own probe, its block for the box."""
+"""The examples of ``docs/robot/probes.md`` work: its own probe, its block for the box."""
 
 from __future__ import annotations
 

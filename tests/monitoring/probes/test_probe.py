@@ -1,4 +1,4 @@
-"""What a probe gives, made fit to be recorded whatever it is."""
+"""Results of a probe, converted so that any of them can be recorded."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Real processes: found by name, script or command line, and what they use."""
+"""Real processes: found by name, script or command line, and their usage."""
 
 from __future__ import annotations
 

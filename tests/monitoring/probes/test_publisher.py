@@ -1,4 +1,4 @@
-"""What is published is recorded by the box's own source under the names that monitors use."""
+"""Published probes are recorded by the box's own source under the names that monitors use."""
 
 from __future__ import annotations
 

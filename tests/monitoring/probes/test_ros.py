@@ -25,7 +25,7 @@ def master() -> Iterator[RosMaster]:
 
 
 def run_node(*, knows_pid: bool = True) -> SimpleXMLRPCServer:
-    """Run a node that answers calls, with or without the one that is asked."""
+    """Run a node that answers calls, with or without ``getPid``."""
     node = SimpleXMLRPCServer(("127.0.0.1", 0), logRequests=False)
     name = "getPid" if knows_pid else "getBusStats"
     node.register_function(lambda caller: (1, "", 4711), name)

@@ -1,4 +1,4 @@
-"""Probes run on time in threads of their own; those that hang or crash disturb nobody."""
+"""Probes run on time in threads of their own; those that hang or crash do not affect others."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Wireless interfaces: what the kernel's table says, and where it says nothing."""
+"""Wireless interfaces: by the kernel's table, and without that table."""
 
 from __future__ import annotations
 

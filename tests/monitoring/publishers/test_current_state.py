@@ -1,4 +1,4 @@
-"""What is known of a robot now, from real journals; nothing stays green when nobody looks."""
+"""The present state of a robot, from real journals; nothing stays green without a watcher."""
 
 from __future__ import annotations
 
@@ -122,7 +122,7 @@ def test_what_is_only_seen_live_is_of_now(store: Store, watcher: FakeRun) -> Non
 def test_board_of_a_watcher_that_goes_on_after_it_was_held_up(
     store: Store, watcher: FakeRun
 ) -> None:
-    """It said that nothing is known, found what was recorded meanwhile, and goes on there."""
+    """The watcher wrote that nothing is known, evaluated the backlog, and continued."""
     for number, status in enumerate((OF_DEVICE, COMPONENT)):
         silent = replace(status, level="unknown", measured_ns=T0_NS + 30 * NS, live_only=True)
         channel, values = record_of(silent)

@@ -1,4 +1,4 @@
-"""Statuses over ZeroMQ: a real subscriber gets them, and nobody is held up by one."""
+"""Statuses over ZeroMQ: a real subscriber gets them, and none can delay the watcher."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def publishing(*entries: PublishOptions, **how: Any) -> Iterator[StatusPublisher
 
 
 def first_heard(publisher: StatusPublisher, socket: Any) -> list[bytes]:
-    """Publish until the subscriber, whose subscription takes a moment, has heard something."""
+    """Publish until the subscriber, whose subscription takes a moment, has received a message."""
     until = time.monotonic() + PATIENCE_S
     while time.monotonic() < until:
         publisher.publish(STATUSES)
@@ -113,7 +113,7 @@ def test_numbers_of_numpy_are_published(url: str) -> None:
 
 
 class Noting(StatusPublisher):
-    """Notes which outlets speak instead of sending."""
+    """Records which outlets publish instead of sending."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)

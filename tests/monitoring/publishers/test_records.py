@@ -1,4 +1,4 @@
-"""Findings become records and come back the same; the same finding gives the same bytes."""
+"""Findings are encoded as records and decoded without change; equal findings give equal bytes."""
 
 from __future__ import annotations
 

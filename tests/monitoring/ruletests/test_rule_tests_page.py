@@ -1,4 +1,4 @@
-"""The page on rule tests: its examples run, its notation can be read, its failure looks so."""
+"""The page on rule tests: its examples run, its notation is valid, its error message is right."""
 
 from __future__ import annotations
 

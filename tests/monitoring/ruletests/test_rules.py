@@ -1,4 +1,4 @@
-"""Rule tests that are right pass; those that are wrong say where, when, and what came instead."""
+"""Right rule tests pass; wrong ones report position, time, and the actual result."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A diagnoser small enough to foresee: what is bad is broken, and one item must be positive."""
+"""A predictable diagnoser: a bad output is a fault, and one item must be positive."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def answer(
 
 
 class PlainDiagnoser:
-    """Says after each instant at which that changes what has failed: whatever is bad."""
+    """Returns after each instant the failed components, when they change."""
 
     def __init__(self) -> None:
         self.items = frozenset({ITEM})
@@ -54,7 +54,7 @@ class PlainDiagnoser:
         self.rows: list[tuple[int, float]] = []
 
     def begin(self, at_ns: int) -> None:
-        """Know nothing; what is open stays open."""
+        """Reset all evidence; an open diagnosis stays open."""
         self.rows, self.last, self.until_ns = [], None, at_ns
 
     def feed(self, batch: Batch) -> None:
@@ -107,12 +107,12 @@ class PlainDiagnoser:
         return answer(faults, list(self.present), self.revision, at_ns, id=f"robot-{self.number}")
 
     def snapshot(self) -> dict[str, Any]:
-        """Return what it knows."""
+        """Return its state."""
         names = ("last", "until_ns", "negative", "number", "revision")
         return {"present": list(self.present)} | {name: getattr(self, name) for name in names}
 
     def resume(self, snapshot: Mapping[str, Any]) -> None:
-        """Know it again."""
+        """Restore its state."""
         self.__dict__.update(snapshot)
         self.present = dict.fromkeys(snapshot["present"])
         self.rows = []

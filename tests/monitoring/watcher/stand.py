@@ -1,4 +1,4 @@
-"""A recorder moved by hand, small monitors of what it records, and a watcher beside it."""
+"""A recorder moved by hand, small monitors of its items, and a watcher beside it."""
 
 from __future__ import annotations
 
@@ -53,17 +53,17 @@ def positive(config: Any, inputs: Sequence[Input], now: Now) -> Mapping[str, Any
 
 
 def steady(config: Any, inputs: Sequence[Input], now: Now) -> Mapping[str, Any]:
-    """Good while the mean of the last second is above 0: looks back."""
+    """Good while the mean of the last second is above 0; looks back."""
     return {"good": inputs[0].over(now, 1.0).mean() > 0}
 
 
 def there(config: Any, inputs: Sequence[Input], now: Now) -> Mapping[str, Any]:
-    """Good while the probe says so."""
+    """Good while the probe is ok."""
     return {"good": inputs[0].at(now) == 1}
 
 
 def endless(config: Any, inputs: Sequence[Input], now: Now) -> Mapping[str, Any]:
-    """Never come back."""
+    """Never return."""
     while True:
         pass
 
@@ -101,7 +101,7 @@ def plan_of(*more: ComponentPlan, config_hash: str = "hash") -> MonitoringPlan:
 
 @dataclass
 class Stand:
-    """A store whose recorder says random things, run after run."""
+    """A store with a recorder that writes random messages, run after run."""
 
     path: Path
     seed: int = 0
@@ -118,7 +118,7 @@ class Stand:
         return ManualBox(self.path, TOPICS, clock=self.clock, options=options)
 
     def tick(self) -> None:
-        """Hear something, or nothing, and write it."""
+        """Receive some messages, or none, and write them."""
         for topic in NUMBERS.values():
             for _ in range(self.random.choice([0, 0, 1, 1, 3])):
                 self.box.hear(topic, struct.pack("<d", self.random.uniform(-1, 3)))

@@ -1,4 +1,4 @@
-"""Which alarms a diagnosis concerns, and what is said of them when."""
+"""The alarms that a diagnosis concerns, and their causes over time."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def status(component: str, *blocked_by: str) -> Status:
 
 
 def through(causes: AlarmCauses, *findings: Finding) -> list[tuple[str, str, int]]:
-    """Return component, cause and time of the alarms that come out."""
+    """Return component, cause and time of the resulting alarms."""
     found = causes.process(findings)
     return [(f.component, f.cause, f.changed_ns) for f in found if isinstance(f, AlarmChange)]
 

@@ -1,4 +1,4 @@
-"""Alarms outlast restarts, other monitors and old files; nothing old goes out as current."""
+"""Alarms survive restarts, other monitors and old files; nothing old is published as current."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def begun(stand: Stand, plan: MonitoringPlan, value: float = -1.0) -> RecordWatc
 
 
 def states(stand: Stand) -> dict[str, str]:
-    """Return how each alarm stands by its newest record, live only or not, by component."""
+    """Return the state of each alarm by its newest record, live only or not, by component."""
     alarms = [*values_of(written(stand.path), "amberbox/alarm")]
     alarms += values_of(written(stand.path, live_only=True), "amberbox/alarm")
     newest = {str(a["component"]): a for a in sorted(alarms, key=lambda a: str(a["changed_ns"]))}
@@ -86,7 +86,7 @@ def test_an_alarm_of_a_component_that_is_gone_heals(tmp_path: Path) -> None:
 
 
 def test_an_alarm_that_stands_heals_under_other_monitors(tmp_path: Path) -> None:
-    """It keeps its id, what was said of it, and its end is written down."""
+    """It keeps its id and its annotations, and its end is recorded."""
     stand = Stand(tmp_path / "store")
     watcher = begun(stand, only(base()))
     (opened,) = values_of(written(stand.path), "amberbox/alarm")
@@ -104,7 +104,7 @@ def test_an_alarm_that_stands_heals_under_other_monitors(tmp_path: Path) -> None
 
 
 def test_what_opens_in_the_silent_repeat_is_written(tmp_path: Path) -> None:
-    """New monitors find wrong at once what was there before they were."""
+    """New monitors detect at once a fault that began before them."""
     stand = Stand(tmp_path / "store")
     begun(stand, only(base(), arm()), 1.0).close()
     strict = component("arm", lambda c, i, n: {"good": i[0].at(n) > 2}, variable("ros_bulk"))
@@ -140,7 +140,7 @@ def test_a_new_file_has_the_alarms_that_last(
 
 
 class Ear:
-    """Hears what is published."""
+    """A subscriber of the published statuses."""
 
     def __init__(self) -> None:
         self.heard: list[Sequence[Status]] = []
@@ -197,7 +197,7 @@ def test_a_request_that_cannot_be_done_is_said(tmp_path: Path) -> None:
 
 
 def stuck(config: Any, results: Any) -> str:
-    """Never come back."""
+    """Never return."""
     while True:
         pass
 

@@ -28,7 +28,7 @@ from tests.monitoring.watcher.stand import kill, line_of, written
 from tests.support.manual_recorder import ManualBox
 
 WATCHED = {"host", "imu", "laser_front", "localisation", "odometry", "wheel_front_left"}
-"""Components of the robot whose modes look at silence, rates, jumps, means and frozen values."""
+"""Components of the robot whose modes evaluate silence, rates, jumps, means and frozen values."""
 
 
 @pytest.fixture(scope="module")
@@ -79,7 +79,7 @@ class Scene:
             self.next = next(self.messages)
 
     def write(self) -> None:
-        """Write what was heard."""
+        """Write the received messages."""
         self.box.write(0.0)
 
     def go_on(self, seconds: float) -> Iterator[None]:
@@ -109,7 +109,7 @@ class Scene:
         return [line_of(finding) for finding in replay(self.plan, open_store(self.path))]
 
     def bad(self) -> set[tuple[str, str, str, str]]:
-        """Return what was found to be bad."""
+        """Return the bad outputs."""
         return {
             (found.component, found.mode, found.level, found.reason)
             for found in replay(self.plan, open_store(self.path))

@@ -1,4 +1,4 @@
-"""One alarm for one cause: raised by the diagnosis, gathered, merged, and told apart."""
+"""One alarm for one cause: raised by the diagnosis, merged, and separated again."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def causes_of() -> AlarmCauses:
 
 
 def told(causes: AlarmCauses, *findings: Finding, until_s: float = 0) -> list[tuple[str, str, str]]:
-    """Return component, state and cause of what is said of alarms, up to an instant."""
+    """Return component, state and cause of the emitted alarms, up to an instant."""
     found = causes.process(findings, round(until_s * NS))
     return [(f.component, f.state, f.cause) for f in found if isinstance(f, AlarmChange)]
 
@@ -42,7 +42,7 @@ def opens(component: str, at_s: float, **more: object) -> AlarmChange:
 
 
 def lasting(causes: AlarmCauses, *monitors: AlarmChange) -> list[tuple[str, str]]:
-    """Return the alarms that last as they are shown: id and severity."""
+    """Return the active alarms as shown: id and severity."""
     return [(one.id, one.severity) for one in causes.named(monitors)]
 
 

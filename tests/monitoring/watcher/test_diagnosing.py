@@ -123,7 +123,7 @@ def test_items_that_only_conditions_read_are_read(tmp_path: Path) -> None:
 
 
 def pieces_of(block: RecordBlock, stand: Stand) -> list[RecordBlock]:
-    """Cut a block into some: the rows come with the first."""
+    """Divide a block: all rows are in the first part."""
     cuts = sorted(stand.random.uniform(block.start_ns, block.until_ns) for _ in range(4))
     ends = [*(round(cut) for cut in cuts), block.until_ns]
     first, *others = ends
@@ -190,7 +190,7 @@ def test_a_snapshot_without_diagnosis_begins_it_anew(tmp_path: Path) -> None:
 
 
 def test_other_monitors_close_what_the_ones_before_left_open(tmp_path: Path) -> None:
-    """With the configuration changed nobody goes on with it: it is said to be over."""
+    """With a changed configuration the open diagnosis is not continued: it ends."""
     stand = stand_of(tmp_path, 1)
     say(stand, 1, 1.0)
     watcher = stand.watcher(base_only())

@@ -14,7 +14,7 @@ def hypothesis(*faults: str, probability: float = 0.5) -> Hypothesis:
 
 
 def diagnosis(*groups: tuple[float, list[Hypothesis]], **more: object) -> Diagnosis:
-    """Make a diagnosis of groups; the hypotheses stand in their order."""
+    """Make a diagnosis of groups, with the hypotheses in their order."""
     made = tuple(AmbiguityGroup(tuple(h.id for h in hs), p) for p, hs in groups)
     hypotheses = tuple(h for _, hs in groups for h in hs)
     return Diagnosis("d", 1, "r", 0, "h", hypotheses, 1.0, groups=made, **more)  # type: ignore[arg-type]  # its last fields
@@ -25,7 +25,7 @@ LOOK = NextTest("look", "question", "Is it dirty?")
 
 
 def cause(found: Diagnosis) -> str:
-    """Say what an alarm of the laser comes from."""
+    """Return the cause of an alarm of the laser."""
     blame = LeadingAnswer.of(found, {}, {})
     return blame.text(blame.share("laser"))
 

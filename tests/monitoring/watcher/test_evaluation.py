@@ -1,4 +1,4 @@
-"""What was written before the watcher was killed is not written again."""
+"""Findings written before the watcher was killed are not written again."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ SAID = replace(FIRST, state="acknowledged", live_only=True)
 
 
 class Told(Engine):
-    """An engine that finds what it is told, block by block."""
+    """An engine that returns given findings, block by block."""
 
     def __init__(self, *found: list[Finding]) -> None:
         super().__init__(MonitoringPlan("robot", "hash", []))
@@ -37,7 +37,7 @@ class Told(Engine):
         return self.found.pop(0)
 
     def resume(self, snapshot: Mapping[str, Any]) -> None:
-        """Know all."""
+        """Do nothing."""
 
 
 @pytest.mark.parametrize(
@@ -50,7 +50,7 @@ class Told(Engine):
     ],
 )
 def test_what_people_said_is_not_counted(written: int, left: list[list[Finding]]) -> None:
-    """A replay does not find it, so the count of what was written leaves it out."""
+    """A replay does not find it, so it is left out of the count of written findings."""
     place = EvaluatedPosition(EPOCH, 100)
     memory = RecoveredProgress(place, Checkpoint(place, {}, 0.0, {"known": 1}), written)
     evaluation = RecordEvaluation(DiagnosedEngine(Told([FIRST, SAID, SECOND], [THIRD])), memory)

@@ -1,4 +1,4 @@
-"""A watcher that is late, stopped or starved: it says so, and invents nothing about the robot."""
+"""A watcher that is late, stopped or starved: it reports this, and no fault of the robot."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def test_sign_of_life_of_a_watcher_before_says_nothing(
 
 
 def test_sign_of_life_does_not_wait_for_the_evaluation(tmp_path: Path) -> None:
-    """The thread writes while nothing is evaluated; a look that goes on makes it late."""
+    """The thread writes while nothing is evaluated; a poll that takes long makes it late."""
     store, clock = create_store(tmp_path / "store"), ManualClock()
     lock = WriterLock(store, "watch")
     lateness = EvaluationLateness(store, clock)
@@ -124,7 +124,7 @@ def test_slow_evaluation_is_overload_and_not_a_silent_recorder(
 def test_one_look_that_finds_nothing_is_no_silence(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The process was stopped for 25 s, and the head is just being written at its first look."""
+    """The process was stopped for 25 s, and the head is being written at its first poll."""
     stand = Stand(tmp_path / "store", 3)
     stand.tick()
     watcher = stand.watcher()

@@ -1,4 +1,4 @@
-"""The reader: side by side, bounded, complete up to where it says."""
+"""The reader: all items in parallel, bounded memory, complete up to its stated time."""
 
 from __future__ import annotations
 

@@ -77,7 +77,7 @@ def in_bytes(findings: Iterator[Finding] | list[Finding]) -> list[bytes]:
 
 
 def in_pieces(plan: MonitoringPlan, store: Store, seed: int) -> list[bytes]:
-    """Evaluate rows that come in random pieces, a random time after each other."""
+    """Evaluate rows in random batches, with random delays between them."""
     engine, rng = Engine(plan), random.Random(seed)
     found: list[Finding] = []
     epoch: Any = None

@@ -1,4 +1,4 @@
-"""Triggers on what the watcher writes, which comes a moment later than what it is about."""
+"""Triggers on records of the watcher, which are written slightly later than the data."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ TRANSITION = Trigger("transition", event="component_state", before_s=1, after_s=
 def test_a_trigger_on_a_status_makes_an_incident(
     tmp_path: Path, trigger: Trigger, killed: bool
 ) -> None:
-    """The keeper has always read the recorder's rows long before the watcher says anything."""
+    """The keeper has always read the recorder's rows long before the watcher writes."""
     stand = Stand(tmp_path / "store", diagnoser=PlainDiagnoser)
     options = RetentionOptions(triggers=(trigger,))
     store = open_store(stand.path)

@@ -1,4 +1,4 @@
-"""What goes wrong beside the watcher, or in it: everything is said, nothing stays green."""
+"""Failures beside the watcher, or in it: all are reported, nothing stays green."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A subscriber that runs on ROS's own Python and writes down what it hears.
+"""A subscriber that runs on ROS's own Python and writes its messages to a file.
 
 Usage: listener.py OUT TOPIC... Each line of OUT is a topic, latching or not, and the message.
 """

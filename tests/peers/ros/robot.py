@@ -136,7 +136,7 @@ class Truth:
 
 
 class Listener(rospy.SubscribeListener):  # type: ignore[misc]  # nor does rospy
-    """Notes when rospy sees a subscriber come and go."""
+    """Records when rospy connects and disconnects a subscriber."""
 
     def __init__(self, truth: Truth) -> None:
         super().__init__()
@@ -298,7 +298,7 @@ def wait_for_subscribers(robot: Robot, stop: threading.Event) -> None:
 
 
 def run(robot: Robot, stop: threading.Event) -> None:
-    """Publish by schedule until told to stop or the time is over."""
+    """Publish by schedule until it is stopped or the time is over."""
     options = robot.options
     began = time.monotonic()
     due = {name: began for name in options.topics if name != "map"}

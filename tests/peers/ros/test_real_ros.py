@@ -56,7 +56,7 @@ def bodies(sink: GapSink, topic: str) -> list[str]:
 
 
 def verdicts(ros: Ros, *sinks: GapSink, tolerance_s: float = 0.2) -> dict[str, Verdict]:
-    """Judge what one box, or one box after the other, has recorded."""
+    """Compare the record of one box, or of one box after the other, with the truth."""
     found = {}
     for topic, truth in ros.published().items():
         heard = [body for sink in sinks for body in bodies(sink, topic)]

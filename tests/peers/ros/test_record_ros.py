@@ -1,4 +1,4 @@
-"""The whole box against a real ROS master: what was published is in the store, or in a gap."""
+"""The whole box against a real ROS master: every published message is in the store, or in a gap."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class Box:
         assert self.process.returncode == 0, self.log.read_text()
 
     def rows(self, item: str) -> int:
-        """Count an item's rows; what is being written counts, too."""
+        """Count an item's rows, including those being written."""
         try:
             return sum(
                 journal.items.get(item, 0) for journal in journal_reader.journals(self.store)
@@ -71,7 +71,9 @@ class Box:
         wait_until(lambda: self.rows(item) >= before + count, f"more rows of {item}")
 
     def bodies(self, item: str) -> list[str]:
-        """Return what is recorded of an item, raw and in order, as the truth file names it."""
+        """Return the recorded messages of an item, raw and in order, in the form of the
+        truth file.
+        """
         found = []
         for journal in journal_reader.journals(self.store):
             numbers = [n for n, s in journal.streams.items() if s.item == item and not s.repeated]

@@ -19,7 +19,7 @@ RATE_HZ = 1000
 STALL_S = 5.0
 ITEM = "ros_robot_odom"
 QUEUE = "2 MB"
-"""Too small for the stall: what is lost must be counted."""
+"""Too small for the stall: lost messages must be counted."""
 
 
 def robot_folder(ros: Ros) -> Path:

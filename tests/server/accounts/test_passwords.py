@@ -1,4 +1,4 @@
-"""Passwords: argon2id as RFC 9106 asks for, equal work for everybody, never in the event loop."""
+"""Passwords: argon2id by RFC 9106, equal work for all accounts, never in the event loop."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def test_a_hash_that_cannot_be_read_is_an_error(passwords: Passwords) -> None:
 
 
 class _Held(Passwords):
-    """Stands still while it compares, until it is let go."""
+    """Waits in a comparison until it is released."""
 
     def __init__(self) -> None:
         super().__init__(CHEAP)

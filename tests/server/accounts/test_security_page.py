@@ -1,4 +1,4 @@
-"""docs/server/security.md says what the code does: the table, the limits, the times."""
+"""docs/server/security.md matches the code: the table, the limits, the times."""
 
 from __future__ import annotations
 

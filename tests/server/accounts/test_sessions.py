@@ -1,4 +1,4 @@
-"""Sessions: begun by the server, ended by time, people and admins, whatever comes in what order."""
+"""Sessions: begun by the server, ended by time, people and admins, in any order."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The code of the first start: once, half an hour, for whoever can read the server's folder."""
+"""The code of the first start: once, half an hour, readable only in the server's folder."""
 
 from __future__ import annotations
 

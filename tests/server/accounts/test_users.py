@@ -1,4 +1,4 @@
-"""People: accounts, roles, groups, and that somebody can always administer."""
+"""People: accounts, roles, groups, and at least one admin at any time."""
 
 from __future__ import annotations
 

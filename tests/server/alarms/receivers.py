@@ -18,7 +18,7 @@ from amberbox.testing.clock import PATIENCE_S
 
 @dataclass
 class MailServer:
-    """Speaks as much SMTP (RFC 5321) as a sender needs; refuses as often as it is told."""
+    """Implements as much SMTP (RFC 5321) as a sender needs; refuses a given number of times."""
 
     port: int = 0
     mails: list[Message] = field(default_factory=list)
@@ -90,7 +90,7 @@ def _running(work: Coroutine[Any, Any, None]) -> Iterator[None]:
 
 @dataclass
 class Hook:
-    """What a web server was sent, and what it answers."""
+    """The requests to a web server, and its answers."""
 
     url: str = ""
     bodies: list[bytes] = field(default_factory=list)
@@ -117,7 +117,7 @@ def hook_server() -> Iterator[Hook]:
             self.end_headers()
 
         def log_message(self, *_: Any) -> None:
-            """Say nothing."""
+            """Suppress the log."""
 
     server = HTTPServer(("127.0.0.1", 0), Handler)
     hook.url = f"http://127.0.0.1:{server.server_port}/alarms?of=fleet"

@@ -1,4 +1,4 @@
-"""A server's alarms without a network: robots say something, time goes by, people are told."""
+"""A server's alarms without a network: reports of robots, time moved by hand, notifications."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ EVERYTHING = Notifications(webhooks=(Webhook("hook", "https://hook.example/", "0
 
 
 def reaches(boot: str) -> dict[str, WriterReach]:
-    """Return what a robot says of a run: its boot as the names of journals tell it."""
+    """Return a robot's statement of a run: its boot as in the names of journals."""
     run = RunEnd(1, short_boot_id(boot), 1_000_000, closed=False)
     return {
         "watch": WriterReach(
@@ -61,7 +61,7 @@ def reaches(boot: str) -> dict[str, WriterReach]:
 
 @dataclass
 class Stand:
-    """Alarms of a server, and who was told what."""
+    """Alarms of a server, and the notifications sent."""
 
     database: ServerDatabase
     clock: ManualClock
@@ -136,7 +136,7 @@ class Stand:
         return made
 
     def send(self, robot: str, rows: list[LinkRow], *, heard: bool = True) -> None:
-        """Let rows of a robot arrive; not ``heard`` if the server dies right after storing them."""
+        """Store rows of a robot; without ``heard`` the server dies directly after storing them."""
         with self.database.begin() as connection:
             batch = ledger.RowBatch(
                 robot, self.epochs[robot], STORE, rows, {}, {}, self.clock.wall_ns()
@@ -147,17 +147,19 @@ class Stand:
             self.bus.publish(ServerChange("rows", robot, told))
 
     def say(self, robot: str, *found: Finding) -> None:
-        """Let a robot find something now, and the server hear of it."""
+        """Store findings of a robot written now, and notify the server of them."""
         self.send(robot, self.rows(robot, found))
         self.alarms.step()
 
     def hear(self, robot: str, *found: Finding) -> None:
-        """Tell the alarms what a robot finds now, which is stored nowhere; they look next."""
+        """Notify the alarms of findings of a robot, without storing them; they are
+        processed next.
+        """
         told = {"store_id": STORE, "rows": self.rows(robot, found)}
         self.bus.publish(ServerChange("rows", robot, told))
 
     def wait(self, seconds: float, step_s: float = 0.0) -> None:
-        """Let time go by, for the server too, which looks a dozen times or every second."""
+        """Let time pass, also for the server, which runs its step a dozen times or every second."""
         step_s = step_s or max(1.0, seconds / 12)
         end_ns = self.clock.wall_ns() + round(seconds * NS)
         while self.clock.wall_ns() < end_ns:
@@ -196,9 +198,9 @@ class Stand:
 
 @contextmanager
 def stand(folder: Path, *, portable: bool = False) -> Iterator[Stand]:
-    """Keep a stand for the time of a test; somebody wants to hear of everything.
+    """Yield a bench for the duration of a test; one destination receives all notifications.
 
-    With ``portable`` every statement is checked to be one that PostgreSQL takes, which takes time.
+    With ``portable`` every statement is also compiled for PostgreSQL, which takes time.
     """
     clock = ManualClock(START_NS)
     opened = portable_database if portable else _database
@@ -242,7 +244,7 @@ def alarm(
     cause: str = "",
     diagnosis: str = "",
 ) -> AlarmChange:
-    """Make what a robot says of an alarm of its own."""
+    """Make a robot's report of an alarm of its own."""
     now_ns = stand.clock.wall_ns()
     opened = now_ns if opened_ns is None else opened_ns
     changed = now_ns if changed_ns is None else changed_ns
@@ -253,7 +255,7 @@ def alarm(
 
 
 def explained(stand: Stand, component: str = "laser", cause: str = "laser#x") -> AlarmChange:
-    """Make what a robot says of an alarm of its own that a diagnosis explains."""
+    """Make a robot's report of an alarm of its own that a diagnosis explains."""
     return alarm(stand, component, cause=cause, diagnosis="d1")
 
 
@@ -272,5 +274,5 @@ def blocked(stand: Stand, component: str, *by: str, level: Level = "error") -> T
 
 
 def described(message: NotificationMessage) -> dict[str, Any]:
-    """Return what a program is told."""
+    """Return the fields of a message to a program."""
     return dict(json.loads(json.dumps(message.data)))

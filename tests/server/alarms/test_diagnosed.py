@@ -1,4 +1,6 @@
-"""What a diagnosis says of an alarm: kept as it was last while the alarm lasted."""
+"""The diagnosis of an alarm: stored in the state of its last revision while the alarm was
+active.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What became of an alarm is told to those who ask for it: in order, once, and to nobody else."""
+"""Changes of an alarm are sent to the destinations that request them: in order, once."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def home(tmp_path: Path) -> Iterator[Stand]:
 
 
 def events(home: Stand) -> list[str]:
-    """Return what was told, by event and number of the alarm."""
+    """Return the messages, by event and number of the alarm."""
     return [f"{message.data['event']} {message.data['id']}" for _, message in home.told]
 
 

@@ -1,4 +1,4 @@
-"""What robots say that makes no sense, and settings that cannot work: alarms go on."""
+"""Invalid reports of robots, and settings that cannot work: alarms continue."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What happened while a robot was offline is listed, and nobody is woken for it."""
+"""Alarms of the time while a robot was offline are listed, without notifications."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Settings of notifications: what is refused, and when it is quiet."""
+"""Settings of notifications: refused values, and quiet hours."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a diagnosis says in words, for each of the alarms that it is about."""
+"""The explanation of a diagnosis in words, for each of the alarms that it concerns."""
 
 from __future__ import annotations
 

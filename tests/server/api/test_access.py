@@ -1,4 +1,4 @@
-"""Guards: who gets through, and what those learn who do not."""
+"""Guards: who is admitted, and what a refusal reveals."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Downloads: asked for, made, fetched in parts, cancelled, begun again, kept from others."""
+"""Downloads: requested, made, fetched in parts, cancelled, restarted, hidden from others."""
 
 from __future__ import annotations
 

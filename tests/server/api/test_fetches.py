@@ -43,7 +43,7 @@ def frames(home: House, monkeypatch: pytest.MonkeyPatch) -> list[ServerFrame]:
 
 
 def told(home: House, changes: list[ServerChange], until: Callable[[], bool]) -> None:
-    """Let the part work while it is told of changes."""
+    """Run the service while it receives changes."""
 
     async def run() -> None:
         fetches = home.services.fetches
@@ -145,7 +145,7 @@ def test_what_the_robot_deletes_before_it_is_copied_is_not_waited_for(
 
 @pytest.fixture
 def hour(home: House, monkeypatch: pytest.MonkeyPatch) -> Callable[[float], None]:
-    """Let time go by for what waits for robots, and let it look after them."""
+    """Let time pass for windows that wait for robots, and run the service's step."""
     fetches, clock = home.services.fetches, ManualClock()
     monkeypatch.setattr(fetches, "_clock", clock)
 
@@ -159,7 +159,7 @@ def hour(home: House, monkeypatch: pytest.MonkeyPatch) -> Callable[[float], None
 def test_a_robot_that_takes_for_copied_what_is_not_here_is_not_waited_for_for_ever(
     home: House, frames: list[ServerFrame], hour: Callable[[float], None]
 ) -> None:
-    """An amberbox that never asks what the server holds; the server was restored."""
+    """An older robot that never compares its journals; the server was restored from a backup."""
     one, other = ask(home, item="lost"), ask(home, item="half")
     files = [("journal/000009-a-0000.mcap", 10), ("journal/000009-a-0001.mcap", 20)]
     named = [ServerChange("connected", "ropod_001"), has(one, files[0]), has(other, *files)]

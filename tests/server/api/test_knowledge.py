@@ -1,4 +1,4 @@
-"""What robots know, over HTTP: diagnoses of now and then, answers, rules that never end."""
+"""Robots' knowledge over HTTP: diagnoses of any time, answers, rules that never end."""
 
 from __future__ import annotations
 
@@ -125,7 +125,7 @@ def test_it_is_what_the_command_line_says_on_the_robot(
 
 
 def test_what_a_watcher_found_late_counts_for_its_time(tmp_path: Path) -> None:
-    """A watcher that has little of its computer writes down half a minute later what was."""
+    """A watcher with little processor time writes half a minute late."""
     silent = sim.symptom(sim.NO_SCANS, sim.AT_NS)
     with house(tmp_path) as found:
         sim.hand_in(found)
@@ -237,7 +237,7 @@ def test_an_answer_ranks_anew_and_is_kept(home: House, operator: TestClient) -> 
 def test_two_answers_at_the_same_time_both_count(
     home: House, operator: TestClient, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """While the first is ranked, somebody else gives another."""
+    """While the first one is being ranked, another person gives a second answer."""
     path = f"{PATH}/diagnoses/{sim.DIAGNOSIS}/answers"
     ask_worker, other = home.services.worker_pool.ask, home.client("nurse")
     asked: list[int] = []

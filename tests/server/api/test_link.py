@@ -1,4 +1,4 @@
-"""The robots' end of the API: who gets in, and what becomes of what is sent."""
+"""The robots' routes of the API: who is admitted, and the state of uploads."""
 
 from __future__ import annotations
 
@@ -178,7 +178,7 @@ def test_without_tls_of_its_own_there_is_no_authority(home: House) -> None:
 
 
 class FakeSocket:
-    """A connection that hears what is sent and waits for what is not."""
+    """A connection that stores sent frames and waits for frames that never arrive."""
 
     def __init__(self) -> None:
         self.sent: list[ServerFrame] = []

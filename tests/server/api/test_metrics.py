@@ -1,4 +1,4 @@
-"""Figures for Prometheus, and health that says nothing."""
+"""Metrics for Prometheus, and health, which reveals nothing."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Rows over the API: forms, limits, what waits, what is missing, sums, and who may ask."""
+"""Rows over the API: formats, limits, waiting journals, gaps, statistics, and permissions."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The end of the server's process: soon, whatever somebody waits for."""
+"""The end of the server's process: soon, even with open requests."""
 
 from __future__ import annotations
 

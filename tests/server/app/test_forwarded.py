@@ -1,4 +1,4 @@
-"""Where a request comes from: what trusted proxies say counts, what others say does not."""
+"""The address of a request: headers of trusted proxies count, others do not."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The layers around the app: who may ask, how often, how much, and what is written down."""
+"""The middleware of the app: permissions, rates, sizes, and the access log."""
 
 from __future__ import annotations
 

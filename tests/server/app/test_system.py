@@ -1,4 +1,4 @@
-"""The system level: members' statuses as they come, a team that is watched, what it says."""
+"""The system level: members' statuses on arrival, a monitored team, its statuses."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def row(robot: str, at_ns: int, seq: int, level: Any = "ok") -> LinkRow:
 
 
 class Robots:
-    """Robots that speak over the link as of now: hello, then rows."""
+    """Robots that send over the link in the present: hello, then rows."""
 
     def __init__(self, home: House, now_ns: int) -> None:
         self.home, self.seq = home, 0
@@ -94,7 +94,7 @@ class Robots:
 
 
 async def _until(home: House, robots: Robots, wanted: Mapping[str, str], *speak: str) -> None:
-    """Let some robots speak every half second until the system's components are so."""
+    """Let some robots send every half second until the system's components have given levels."""
     end_s = time.monotonic() + DEADLINE_S
     levels: dict[str, str] = {}
     while time.monotonic() < end_s:
@@ -109,7 +109,7 @@ async def _until(home: House, robots: Robots, wanted: Mapping[str, str], *speak:
 
 
 def test_a_system_is_watched_by_what_its_robots_send(home: House) -> None:
-    """With the real recorder and watcher; what is wrong in one file does not stop the rest."""
+    """With the real recorder and watcher; an error in one file does not stop the others."""
     home.services.system._clock = SystemClock()  # the processes have no other
     wrong = {"components/x.yaml": "component_name: x\nmodez: []\n"}
     write(home.services.folder / "system", {**SYSTEM, **wrong})
@@ -217,7 +217,7 @@ def test_the_clock_of_a_member_may_say_1970() -> None:
 
 
 def test_log_time_may_differ_from_the_clock_that_was_put_right() -> None:
-    """Once the robot has nothing older left to send, what it says is so now."""
+    """When the robot has no backlog, its records count as present."""
     now_ns = 1_800_000_000 * NS
     late = RecordLateness(ahead_ns=0, since_ns=now_ns)
     behind = now_ns - 3600 * NS

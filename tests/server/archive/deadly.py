@@ -1,7 +1,7 @@
-"""A worker of the archive that fails over items of certain names, as one does over a bomb.
+"""A worker of the archive that fails at items of certain names, as one does at a bomb.
 
 ``python -m tests.server.archive.deadly DIR NICE``: an item ``kills`` ends the process, ``lasts``
-never comes to an end.
+never ends.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ _flats_of = commit.flats_of
 
 
 def deadly(journal: Any, *arguments: Any) -> Any:
-    """Unroll a journal, or fail over what it holds."""
+    """Unroll a journal, or fail at one of its items."""
     names = {stream.item for stream in journal.streams.values()}
     if "kills" in names:
         os.kill(os.getpid(), signal.SIGKILL)

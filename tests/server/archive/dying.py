@@ -88,7 +88,7 @@ def attempt(where: Path, fate: Fate | None) -> int:
 
 
 def main() -> None:
-    """Run the attempts. What is imported here is not imported again by each of them."""
+    """Run the attempts. Modules imported here are not imported again by each of them."""
     for library in ("pyarrow.parquet", "pandas", "deltalake"):
         import_module(library)
     where, chance, count = Path(sys.argv[1]), random.Random(int(sys.argv[2])), int(sys.argv[3])

@@ -1,4 +1,4 @@
-"""What is missing is said with its reason: lost, deleted, to come, waiting."""
+"""Missing data have a reason: lost, deleted, to come, waiting."""
 
 from __future__ import annotations
 

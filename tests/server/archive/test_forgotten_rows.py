@@ -1,4 +1,4 @@
-"""What the server wrote down beside recordings goes by the rules for them; the last word stays."""
+"""The server's records beside recordings are deleted by the rules; the newest ones stay."""
 
 from __future__ import annotations
 

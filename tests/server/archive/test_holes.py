@@ -1,4 +1,4 @@
-"""What a refused file leaves is said as such, whether its rows are known or only its name."""
+"""The gap of a refused file is reported, whether its rows are known or only its name."""
 
 from __future__ import annotations
 

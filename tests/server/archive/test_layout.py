@@ -1,4 +1,4 @@
-"""Columns come back from the archive as they went in, whatever their type and name."""
+"""Columns are read from the archive unchanged, whatever their type and name."""
 
 from __future__ import annotations
 

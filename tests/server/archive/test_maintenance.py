@@ -1,4 +1,4 @@
-"""The archive is kept going: committed as journals come, tidied, and its disk watched."""
+"""Maintenance of the archive: commits of arriving journals, joining, and disk space."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ _GB = 1 << 30
 
 
 class Scene:
-    """An archive that is kept, with a disk that is as full as it is said to be."""
+    """A maintained archive, with a disk whose free space the test sets."""
 
     def __init__(self, folder: Path) -> None:
         folder.mkdir()
@@ -58,7 +58,7 @@ class Scene:
             return connection.execute(select(func.count()).select_from(table)).scalar() or 0
 
     def early_rows(self, *seqs: int) -> None:
-        """Have rows come over the link before their journal."""
+        """Store rows from the link before their journal arrives."""
         about = {"robot": "r1", "store_id": self.robot.store_id, "writer": "main", "run": 1}
         rows = [
             {**about, "seq": seq, "channel": "c", "log_ns": 1, "data": b"", "received_ns": 1}
@@ -68,12 +68,12 @@ class Scene:
             connection.execute(insert(ROW), rows)
 
     def hand_in(self) -> None:
-        """Have what the robot recorded come."""
+        """Upload the robot's journals."""
         self.robot.hand_in_all(self.archive)
         self.bus.publish(ServerChange("journal", "r1", {"state": "verified"}))
 
     def play(self, play: Callable[[], Awaitable[None]]) -> None:
-        """Run the keeping beside what somebody does."""
+        """Run the maintenance beside the actions of a test."""
 
         async def both() -> None:
             self.bus.attach(asyncio.get_running_loop())
@@ -174,7 +174,7 @@ def test_a_journal_that_was_verified_before_a_crash_is_taken_over(scene: Scene) 
 
 
 def _verified(scene: Scene, path: Path) -> None:
-    """Enter a journal as the desk does, and die before the archive hears of it."""
+    """Enter a journal as the upload service does, and die before the archive is notified."""
     key = scene.robot.key(path)
     place = scene.archive.layout.journal(key.robot, key.store_id, key.file)
     place.parent.mkdir(parents=True, exist_ok=True)
@@ -214,7 +214,7 @@ def test_what_a_power_cut_took_is_a_gap(scene: Scene) -> None:
 def test_what_was_deleted_before_the_copy_is_a_gap_with_its_reason(
     scene: Scene, is_near: bool
 ) -> None:
-    """Whether it stands between the journal's seal and its signature, or anywhere else."""
+    """Whether it is between the journal's seal and its signature, or anywhere else."""
     scene.robot.record(0, files=2)
     scene.hand_in()
     gone = Tombstone(("journal/000002-x-0000.mcap",), "both", "main", 2, 100, 200, 5, 9, "",

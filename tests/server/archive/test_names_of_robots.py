@@ -1,4 +1,4 @@
-"""Whatever a journal calls its items, also one that an older server took in: all stays inside."""
+"""Any names of items in a journal, also in one of an older server: no file outside the archive."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ def test_tables_that_an_older_server_made_elsewhere_do_not_break_this_one(
 def test_names_that_differ_in_case_are_views_of_their_own(
     archive: FolderArchive, tmp_path: Path
 ) -> None:
-    """SQL does not tell them apart; a robot must not take everybody's answers away by one."""
+    """SQL ignores case; a robot must not break other robots' queries by such a name."""
     for number, name in enumerate(["Odom", "odom", "ODOM"]):
         robot = Robot(f"r{number}", tmp_path)
         run = FakeRun(robot.store, items=[FakeItem(name, [{"a": 1}])])

@@ -1,4 +1,4 @@
-"""What is older than its rule goes, journals and columns apart; incidents and events stay."""
+"""Data older than their rule are deleted, journals and columns apart; incidents and events stay."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _DAY_S = 24 * 3600.0
 
 @pytest.fixture
 def robot(archive: FolderArchive, tmp_path: Path, clock: ManualClock) -> Robot:
-    """A robot with three journals that came three days ago, joined to one file per table."""
+    """A robot with three journals that arrived three days ago, joined to one file per table."""
     made = Robot("r1", tmp_path)
     made.record(0, files=3)
     _incident(made, 1, "complete")

@@ -1,4 +1,4 @@
-"""Nothing becomes older by a clock that jumps: held, told, confirmed by people or by evidence."""
+"""A clock jump ages nothing: it is held, reported, confirmed by people or by evidence."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _RULE = [Retention(journals_s=30 * _DAY_S, columns_s=30 * _DAY_S)]
 
 @pytest.fixture
 def robot(archive: FolderArchive, tmp_path: Path) -> Robot:
-    """A robot with three journals that came just now."""
+    """A robot with three journals that arrived just now."""
     made = Robot("r1", tmp_path)
     made.record(0, files=3)
     made.hand_in_all(archive)
@@ -55,7 +55,7 @@ def off(clock: ManualClock, days: float, name: str = "next boot") -> None:
 
 
 def looks(ages: RetentionClock, clock: ManualClock, hours: float) -> None:
-    """Let time pass with a look every ten minutes."""
+    """Let time pass with a step every ten minutes."""
     for _ in range(round(hours * 6)):
         clock.advance(600.0)
         ages.look()
@@ -238,7 +238,7 @@ ACTS = st.lists(
 def test_whatever_the_clock_does_no_age_is_more_than_the_time_that_passed(
     tmp_path_factory: pytest.TempPathFactory, acts: list[tuple[str, float]]
 ) -> None:
-    """Nobody confirms anything; restarts may each add a day, for a machine may have been off."""
+    """Without any confirmation; each restart may add a day, because a machine may have been off."""
     clock = ManualClock(is_synchronised=False)
     database = ServerDatabase(tmp_path_factory.mktemp("ages") / FILE, clock)
     ages = RetentionClock(database, clock)

@@ -1,4 +1,4 @@
-"""One journal never stops the archive: it is tried alone, refused and told; all others go on."""
+"""One journal never stops the archive: it is tried alone, refused and reported; others continue."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The audit log: rows follow on one another, and what was done to them is found out."""
+"""The audit log: rows are chained, and changes of them are detected."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def _verified(database: ServerDatabase, *kept: AuditChainHead) -> AuditVerificat
 
 
 def _tamper(database: ServerDatabase, *statements: str) -> None:
-    """Change rows as somebody does who has the file: without the triggers."""
+    """Change rows as a person with the file does: without the triggers."""
     with database.begin() as connection:
         for change in ("update", "delete"):
             connection.exec_driver_sql(f"DROP TRIGGER IF EXISTS audit_no_{change}")
@@ -61,7 +61,7 @@ def _tamper(database: ServerDatabase, *statements: str) -> None:
 
 
 def _rewrite(database: ServerDatabase, seq: int, hash_: str) -> None:
-    """Change a row and make all hashes from there on anew, the head as well."""
+    """Change a row and recompute all later hashes, including the head."""
     _tamper(database, f"UPDATE audit SET principal = 'user:eve' WHERE seq = {seq}")
     with database.begin() as connection:
         for row in list(rows(connection, after_seq=seq - 1)):

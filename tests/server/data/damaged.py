@@ -16,7 +16,7 @@ WHY = "altered: a block was changed"
 def quarantined(
     home: House, robot: Robot, *journals: str, came_ns: int, **read: object
 ) -> Iterator[None]:
-    """Have journals that came and do not hold; ``read`` is what could be read of them."""
+    """Quarantine journals that arrived invalid; ``read`` is the readable part of them."""
     row = {
         "robot": robot.name, "store_id": robot.store_id, "sha256": "d" * 64,
         "bytes": 99, "state": "quarantined", "reason": WHY, "path": "", "signed": False,

@@ -22,7 +22,7 @@ _NOTE = FakeItem("note", [{"text": "x"}])
 
 
 def fill(home: House, folder: Path) -> Robot:
-    """Record two robots; commit what the first one has recorded but its last journals."""
+    """Record two robots; commit the journals of the first one except its last."""
     archive = home.services.archive
     robot = Robot("ropod_001", folder)
     robot.record(0)

@@ -1,4 +1,4 @@
-"""One look at a record: each row once, whatever is being committed meanwhile."""
+"""A snapshot of a record: each row once, also during a commit."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def test_a_journal_that_is_committed_during_the_look_counts_once(archive: Folder
 
 
 def test_what_is_still_on_the_robot_is_said_and_how_to_get_it(archive: FolderArchive) -> None:
-    """The newest status came over the link a minute after the end of what was copied."""
+    """The newest status arrived over the link a minute after the end of the copied data."""
     folder = archive.layout.folder
     end_ns = T0_NS + 1_190 * _MS
     status = {"robot": "r1", "component": "c", "mode": "", "level": "ok", "store_id": "s",

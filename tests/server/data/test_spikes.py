@@ -1,4 +1,4 @@
-"""A spike of one row is seen in every window that holds it, however few points are asked for."""
+"""A spike of one row is shown in every window that contains it, for any number of points."""
 
 from __future__ import annotations
 

@@ -295,7 +295,9 @@ def test_every_table_compiles_for_postgresql() -> None:
 
 @pytest.mark.parametrize("room", ["accounts/*.py", "audit.py"])
 def test_rooms_write_no_sql_by_hand(room: str) -> None:
-    """What is made by SQLAlchemy is compiled for PostgreSQL, too, in every test of the room."""
+    """Statements made by SQLAlchemy are also compiled for PostgreSQL, in every test of the
+    folder.
+    """
     folder = Path(server.__path__[0])
     sources = {path.name: path.read_text() for path in folder.glob(room)}
     assert sources

@@ -1,4 +1,4 @@
-"""Every migration: an older database gets what a new one has, and questions use the indexes."""
+"""Every migration: an older database gets the schema of a new one, and queries use the indexes."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def test_an_old_database_becomes_as_a_new_one(tmp_path: Path) -> None:
 
 
 class Explained:
-    """A connection that remembers how SQLite finds what is asked."""
+    """A connection that stores SQLite's query plans."""
 
     def __init__(self, connection: Connection) -> None:
         self.connection = connection

@@ -1,4 +1,4 @@
-"""Drawings read back: what stands in them and where."""
+"""Parsed drawings: their elements and positions."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from amberbox.core.svg import SVG, SvgElement
 from amberbox.server.web.text import drawing_words
 
 WORDS = drawing_words()
-"""What drawings say in tests: the words of pages."""
+"""Texts of drawings in tests: those of pages."""
 
 HOSTILE = (
     "<img src=x onerror=alert(1)>",
@@ -39,12 +39,12 @@ def texts(tree: ElementTree.Element) -> list[str]:
 
 
 def shown(tree: ElementTree.Element) -> str:
-    """Return all that stands in a drawing as text, titles too."""
+    """Return all text in a drawing, including titles."""
     return " ".join(tree.itertext())
 
 
 def titles(tree: ElementTree.Element) -> list[str]:
-    """Return what a resting pointer is told."""
+    """Return the tooltips."""
     return [part.text or "" for part in tree.iter(f"{{{SVG}}}title")]
 
 
@@ -64,7 +64,7 @@ class Frame:
         return not (beside or above)
 
     def holds(self, x: float, y: float) -> bool:
-        """Return whether a point lies inside, and not on the edge."""
+        """Return whether a point is inside, and not on the edge."""
         return (
             self.x + 0.2 < x < self.x + self.width - 0.2
             and self.y + 0.2 < y < self.y + self.height - 0.2

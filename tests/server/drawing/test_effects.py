@@ -70,7 +70,7 @@ def test_kinds_stand_in_columns() -> None:
 
 
 def test_symptoms_have_a_word_and_a_sign_each() -> None:
-    """Tell what is seen from what is not, not by colour alone."""
+    """Present and absent symptoms differ by a word and a sign, not by colour alone."""
     tree = _drawn()
     assert {"seen", "should show, does not", "seen, not explained"} <= set(texts(tree))
     signs = {tuple(part.get("d") for part in icon) for icon in of_class(tree, "icon")}
@@ -99,7 +99,7 @@ def test_nothing_is_highlighted_unless_chosen() -> None:
 
 
 def test_what_is_missing_is_dashed_and_counted() -> None:
-    """Mark the arrow to what should show, and say how much is left out."""
+    """The arrow to an expected but absent symptom is dashed, and hidden ones are counted."""
     tree = _drawn()
     missing = of_class(tree, "missing")
     assert [part.get("data-end") for part in missing] == ["symptom:lamp"]
@@ -132,7 +132,7 @@ def test_hostile_texts_are_text(hostile: str) -> None:
 
 
 def test_links_and_states_come_along() -> None:
-    """Link a node, show a symptom that nobody knows."""
+    """A node has its link, and an unknown symptom is marked."""
     effects = effect_diagram(GRAPH, {"symptom:scans": "/robots/r/data?from=1"})
     linked = [
         link.get("href") for link in parsed(effect_graph(effects, label="x", words=WORDS)).iter()

@@ -83,7 +83,7 @@ def test_every_edge_is_drawn_once() -> None:
 
 
 def test_gates_differ_by_sign_and_word() -> None:
-    """Draw AND, OR, and k out of n with their signs, and say what they mean."""
+    """AND, OR, and k out of n are drawn with their signs and explained in words."""
     tree = _drawn()
     signs = {
         kind: [part.get("d") for part in of_class(gate, "symbol")]
@@ -120,7 +120,7 @@ def test_nothing_is_highlighted_without_a_cut_set() -> None:
 
 
 def test_deep_gates_say_how_much_is_below() -> None:
-    """Stop at a depth, and count what is not drawn."""
+    """Below a certain depth, vertices are only counted."""
     tree = _drawn(depth=1)
     assert _ids(tree, "gate") == ["stranded"]
     assert "4 below" in _said(tree, "drive")
@@ -131,7 +131,7 @@ def _said(tree: ElementTree.Element, name: str) -> str:
 
 
 def test_large_tree_stops_unfolding() -> None:
-    """Draw no more places than asked for, but for the inputs of what is drawn."""
+    """At most a given number of vertices is drawn, except for the inputs of drawn ones."""
     wide = tuple(f"g{n}" for n in range(50))
     gates = {name: GateBox(name, name, "or", ("a", "b")) for name in wide}
     tree = TreeDrawing(

@@ -1,4 +1,6 @@
-"""Dependency graphs: every component and every need once, what is fine counted when it is much."""
+"""Dependency graphs: every component and dependency once; in large ones healthy ones are
+counted.
+"""
 
 from __future__ import annotations
 
@@ -54,7 +56,7 @@ def test_every_node_and_edge_stands_once() -> None:
 
 
 def test_level_is_sign_word_and_class() -> None:
-    """Say how a component is three times, not by colour alone."""
+    """The level of a component is shown in three ways, not by colour alone."""
     laser = next(n for n in of_class(_drawn(), "node") if n.get("data-id") == "laser")
     assert "level-error" in laser.get("class", "").split()
     assert of_class(laser, "icon")
@@ -73,14 +75,14 @@ def test_signs_differ_by_shape() -> None:
 
 
 def test_cause_is_a_word_on_a_thick_box() -> None:
-    """Mark where it comes from."""
+    """The origin of a failure is marked."""
     tree = _drawn()
     assert [node.get("data-id") for node in of_class(tree, "root")] == ["laser"]
     assert texts(tree).count("cause") == 1
 
 
 def test_what_fails_together_is_one_way() -> None:
-    """Mark the edges between what is broken."""
+    """The edges between failed components are marked."""
     bad = [(e.get("data-start"), e.get("data-end")) for e in of_class(_drawn(), "bad")]
     assert bad == [("navigation", "laser")]
 
@@ -100,7 +102,7 @@ def test_both_ways_are_no_circle() -> None:
 
 
 def test_circle_is_marked() -> None:
-    """Say which need closes a circle."""
+    """The dependency that closes a cycle is marked."""
     tree = parsed(
         dependency_graph(
             (), (DependencyEdge("a", "b"), DependencyEdge("b", "a")), label="x", words=WORDS
@@ -112,7 +114,7 @@ def test_circle_is_marked() -> None:
 
 
 def test_much_that_is_fine_is_counted() -> None:
-    """Draw what is wrong and what is near to it, count the rest, keep the way between."""
+    """Failed components and their neighbours are drawn, others counted, paths between them kept."""
     chain = [ComponentBox(f"c{n}", f"c{n}", "error" if n in (0, 99) else "ok") for n in range(100)]
     edges = [DependencyEdge(f"c{n}", f"c{n + 1}") for n in range(99)]
     tree = parsed(dependency_graph(chain, edges, label="x", most=10, more_href="/all", words=WORDS))
@@ -126,7 +128,7 @@ def test_much_that_is_fine_is_counted() -> None:
 
 
 def test_all_that_is_wrong_is_drawn() -> None:
-    """Never leave out what is not fine."""
+    """Components that are not ok are never left out."""
     broken = [ComponentBox(f"c{n}", f"c{n}", "error") for n in range(80)]
     tree = parsed(dependency_graph(broken, (), label="x", most=60, words=WORDS))
     assert len(of_class(tree, "node")) == 80
@@ -160,7 +162,7 @@ def test_hostile_names_are_text(hostile: str) -> None:
 
 
 def test_words_come_from_the_caller() -> None:
-    """Speak the words of a catalogue."""
+    """Texts are those of a given catalogue."""
     words = replace(WORDS, error="kaputt", cause="Ursache", needs="braucht")
     said = shown(parsed(dependency_graph(ROBOT, NEEDS, label="x", words=words)))
     assert "kaputt" in said
@@ -176,13 +178,13 @@ def test_same_data_same_drawing() -> None:
 
 
 def test_kept_is_near_to_what_is_wrong() -> None:
-    """Keep the neighbours first; without anything wrong what comes first."""
+    """Neighbours are kept first; without a failed component the first ones."""
     pairs = [("a", "b"), ("b", "c"), ("c", "d")]
     assert select_components("abcd", {"d"}, pairs, 2) == {"d", "c"}
     assert select_components("abcd", set(), pairs, 2) == {"a", "b"}
 
 
 def test_bridges_count_what_they_pass() -> None:
-    """Lead over what is hidden, but not where a link is there anyway."""
+    """Bridges lead over hidden components, except where there is a direct link."""
     pairs = [("a", "x"), ("x", "y"), ("y", "b"), ("x", "c"), ("a", "c"), ("x", "a")]
     assert indirect_links(pairs, "abc") == {("a", "b"): 2}

@@ -103,7 +103,7 @@ def test_spikes_survive() -> None:
 
 @given(some.lists(some.none() | some.floats(), max_size=250))
 def test_any_values_stay_inside(values: list[float | None]) -> None:
-    """Stay inside the drawing whatever the values are."""
+    """The line stays inside the drawing, whatever the values are."""
     drawing = spark(values, label="x")
     assert drawing.get("aria-label") == "x"
     known = [value for value in values if value is not None and math.isfinite(value)]

@@ -35,7 +35,7 @@ def test_template_inserts_it_as_it_is() -> None:
 
 @given(some.text(max_size=40), some.text(max_size=40))
 def test_any_text_is_well_formed(text: str, value: str) -> None:
-    """Write whatever text there is so that a parser reads one element with one text."""
+    """Any text is written so that a parser reads one element with one text."""
     tree = parsed(element("text", text, data_id=value))
     assert tree.tag == "text"
     assert not list(tree)
@@ -43,7 +43,7 @@ def test_any_text_is_well_formed(text: str, value: str) -> None:
 
 @pytest.mark.parametrize("hostile", HOSTILE)
 def test_hostile_text_is_text(hostile: str) -> None:
-    """Show what looks like markup as the text that it is."""
+    """Text that looks like markup is shown as text."""
     tree = parsed(root("x", (10, 10), hostile, (lettering(hostile, (0, 0), 900),)))
     kept = "".join(c for c in hostile if c.isprintable() and c.isascii()).strip()
     assert kept in shown(tree).replace("\ufffd", "").replace("\u202e", "").replace("\u200f", "")
@@ -59,7 +59,7 @@ def test_numbers_are_short(value: float, text: str) -> None:
 
 
 def test_nanoseconds_keep_every_digit() -> None:
-    """Write whole numbers as they are: floats have too few digits for times."""
+    """Whole numbers are written unchanged: floats have too few digits for times."""
     assert element("g", data_from=1799998995000000001).get("data-from") == "1799998995000000001"
 
 
@@ -94,7 +94,7 @@ def test_image_has_a_name() -> None:
 
 
 def test_links_make_it_a_group() -> None:
-    """Be a group with links inside: what is inside an image cannot be reached."""
+    """An element with links inside is a group: the contents of an image cannot be reached."""
     part = linked("/robots/1", element("g"))
     assert root("graph", (1, 1), "x", (part,)).get("role") == "group"
 
@@ -113,7 +113,7 @@ def test_shortened_text_fits(text: str, most: float) -> None:
 
 
 def test_shortened_text_is_whole_in_its_title() -> None:
-    """Tell all of it to a resting pointer, and only if it is needed."""
+    """The full text is in the tooltip, and only if it was shortened."""
     long = "a long name of a component that has no room"
     tree = parsed(lettering(long, (0, 0), 80))
     assert shown(tree).endswith(ELLIPSIS)

@@ -59,7 +59,7 @@ def test_stretches_say_from_when_to_when() -> None:
 
 
 def test_levels_differ_by_pattern_or_height() -> None:
-    """Tell levels apart without colours."""
+    """Levels can be distinguished without colours."""
     levels = ("ok", "warn", "error", "stale", "unknown", "gap")
     spans = tuple(StateInterval(START + n, START + n + SECOND, x) for n, x in enumerate(levels))
     tree = _drawn(TimelineLane("x", "x", spans))
@@ -105,7 +105,7 @@ def test_ticks_and_markers_stand_at_their_times() -> None:
 
 
 def test_ids_begin_with_the_name() -> None:
-    """Let two drawings stand on one page."""
+    """Two drawings can be on one page."""
     one, two = (_drawn(name=name) for name in ("a", "b"))
     ids = [{part.get("id") for part in tree.iter()} - {None} for tree in (one, two)]
     assert not ids[0] & ids[1]
@@ -135,7 +135,7 @@ def test_hostile_names_are_text(hostile: str) -> None:
 
 
 def test_coverage_is_told_apart_without_colours() -> None:
-    """Draw each kind with a look of its own, incidents below the bar."""
+    """Each kind has a pattern of its own, incidents are below the bar."""
     spans = [
         covering.CoverageInterval(START + n * 9 * SECOND, START + (n + 1) * 9 * SECOND, kind, "why")
         for n, kind in enumerate(covering.KINDS)
@@ -150,6 +150,6 @@ def test_coverage_is_told_apart_without_colours() -> None:
 
 
 def test_coverage_outside_is_left_out() -> None:
-    """Draw what lies on the axis only."""
+    """Only intervals on the axis are drawn."""
     spans = [covering.CoverageInterval(START - 9, START - 5, "recorded")]
     assert not of_class(parsed(covering.coverage(spans, AXIS, label="x", words=WORDS)), "stretch")

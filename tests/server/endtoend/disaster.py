@@ -1,4 +1,4 @@
-"""What may happen to a store: the power is cut, the card is changed, an old image comes back."""
+"""Disasters of a store: a power cut, a new card, an old image that is restored."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from amberbox.blackbox.store.store import Store, open_store, run_and_number
 
 
 def cut_power(path: Path) -> int:
-    """Take from each newest journal what its disk did not have for good; return the bytes."""
+    """Remove from each newest journal the data that were not durable; return the bytes."""
     store = open_store(path)
     return sum(_cut(store, writer) for writer in store.writers())
 
@@ -41,7 +41,7 @@ def _durable_bytes(path: Path, head: JournalHead) -> int:
 
 
 def new_card(path: Path) -> Path:
-    """Take the card away; return where it lies now, for comparison."""
+    """Remove the card; return its new path, for comparison."""
     number = len(list(path.parent.glob(f"{path.name}-old*")))
     return path.rename(path.with_name(f"{path.name}-old{number}"))
 
@@ -52,7 +52,7 @@ def image(path: Path) -> Path:
 
 
 def restore(path: Path) -> Path:
-    """Bring the image back in place of what is there, which is returned for comparison."""
+    """Restore the image; return the path of the replaced store, for comparison."""
     old = new_card(path)
     path.with_name(f"{path.name}-image").rename(path)
     return old

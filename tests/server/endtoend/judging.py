@@ -1,4 +1,4 @@
-"""What has to hold in the end, whatever happened: nothing lost, nothing twice, byte for byte."""
+"""Conditions at the end, whatever happened: nothing lost, nothing twice, byte for byte."""
 
 from __future__ import annotations
 
@@ -42,9 +42,9 @@ def copies(database: ServerDatabase, data: Path, robot: str) -> list[Copy]:
 
 
 def is_caught_up(database: ServerDatabase, path: Path, robot: str) -> bool:
-    """Tell whether the server has acknowledged all that a store's journals say, and each of them.
+    """Return whether the server has acknowledged all rows of a store's journals, and each journal.
 
-    Rows that are in the archive leave the table of the link, so its cursor counts.
+    Rows that are in the archive are deleted from the table of the link, so its cursor counts.
     """
     store, said = open_store(path), manifest.read(path)
     names = {name for name in said.sealed if name not in said.raw_gone}
@@ -59,7 +59,7 @@ def is_caught_up(database: ServerDatabase, path: Path, robot: str) -> bool:
 
 
 def confirmed(path: Path) -> set[str]:
-    """Return what the robot was told to be safe, also what its next keeper is to write down."""
+    """Return the journals that were confirmed to the robot, including unprocessed requests."""
     waiting = (r for r in store.pending(open_store(path)) if r.kind == CONFIRM)
     return {*manifest.read(path).confirmed, *(n for r in waiting for n in r.values["journals"])}
 
@@ -83,7 +83,7 @@ def on_server(database: ServerDatabase, data: Path, robot: str) -> Held:
 def judge_rows(
     database: ServerDatabase, data: Path, robot: str, path: Path, old: list[Path]
 ) -> int:
-    """Each row of the record is there once; what was acknowledged before is there, too."""
+    """Check that each row of the record is on the server once, and each acknowledged row too."""
     known, aside = on_server(database, data, robot), put_aside(database, robot)
     store_id = open_store(path).id
     wanted = recorded(path)
@@ -108,7 +108,7 @@ def _acknowledged(path: Path) -> Held:
 
 
 def judge_journals(database: ServerDatabase, data: Path, robot: str, stores: list[Path]) -> int:
-    """Whatever a robot was told to be safe is on the server, byte for byte; return how many."""
+    """Check that all confirmed journals are on the server, byte for byte; return their number."""
     there = copies(database, data, robot)
     by_content = {(c.store_id, c.journal, c.sha256): c for c in there}
     count = 0

@@ -23,7 +23,7 @@ from tests.server.endtoend.world import Robot, World, kill
 
 @dataclass
 class Result:
-    """What came of it; ``faults`` are those of connections, ``frames`` those of frames."""
+    """The result; ``faults`` are those of connections, ``frames`` those of frames."""
 
     kills: int = 0
     rows: int = 0
@@ -35,7 +35,7 @@ class Result:
 
 
 def run(folder: Path, robots: int, seconds: float, kills: int, seed: int = 0) -> Result:
-    """Go through it, wait until the networks are good again, and judge what is on the server."""
+    """Run it, wait until the networks are good again, and check the data on the server."""
     chance = random.Random(seed)
     result = Result(kills=kills)
     with World(folder, robots, seed) as world:

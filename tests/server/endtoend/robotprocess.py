@@ -30,7 +30,7 @@ _MESSAGES = 10
 
 
 class Robot:
-    """One life of a robot: everything is written until its end; numbers never come twice."""
+    """One life of a robot: everything is written until its end; numbers are never repeated."""
 
     def __init__(self, path: Path, robot: str, boot: str, life: int) -> None:
         SystemClock.boot_id = lambda self: boot  # type: ignore[method-assign]  # one per life
@@ -54,7 +54,7 @@ class Robot:
         self.end = path.with_name(END)
 
     def live(self) -> None:
-        """Write until a file says that it is enough, and end in order."""
+        """Write until a file requests the end, and end cleanly."""
         keeping = threading.Thread(target=self._keep, daemon=True)
         keeping.start()
         while not self.end.exists():
@@ -70,7 +70,7 @@ class Robot:
         self.keeper_lock.release()
 
     def turn(self) -> None:
-        """Hear messages, conclude something, write."""
+        """Receive messages, add findings, write."""
         stream = self.sink.topic(COUNT)
         for _ in range(_MESSAGES):
             self.sink.message(stream, number(self.count), self.sink.now_ns())

@@ -84,7 +84,7 @@ class Robot:
 
     @property
     def is_linked(self) -> bool:
-        """Tell whether its link says that there is a connection."""
+        """Return whether its link reports a connection."""
         try:
             return bool(json.loads((self.store / LINK_STATE_FILE).read_text())["connected"])
         except (OSError, ValueError):

@@ -1,4 +1,4 @@
-"""A whole server that starts, is asked for one of everything that reads, and stops."""
+"""A whole server that starts, answers a request to every route that reads, and stops."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from amberbox.testing.clock import PATIENCE_S
 
 
 def main(folder: Path, port: int) -> None:
-    """Serve until everything was asked; the answers' statuses go to stdout as JSON."""
+    """Serve until every route was requested; the statuses go to stdout as JSON."""
     start.make_folder(folder)
     secret = _prepare(folder)
     found: dict[str, int] = {}

@@ -1,4 +1,4 @@
-"""Rows of many robots taken together leave in the database what they leave one by one."""
+"""Rows of many robots stored together give the same database as rows stored one by one."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ BEYOND = 1 << 63
 
 
 class Chance:
-    """Makes what robots might say: mostly what comes next, sometimes anything else."""
+    """Makes random frames of robots: mostly the expected next one, sometimes any other."""
 
     def __init__(self, seed: int) -> None:
         self.random = random.Random(seed)
         self.ends: dict[tuple[str, int], int] = {}
 
     def batch(self) -> RowBatch:
-        """Say the next thing."""
+        """Return the next batch."""
         robot, run = self.random.choice(ROBOTS), self.random.choice((1, 1, 1, 2))
         end = self.ends.get((robot, run), 0)
         start = end if self.random.random() < 0.9 else self.random.randint(0, end)

@@ -1,4 +1,4 @@
-"""A part that is cancelled ends, also when what it waits for comes at the same moment."""
+"""A cancelled service ends, also when an event that it waits for arrives at the same moment."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from tests.server.house import house
 from tests.server.ingest.test_link_server import FakeSocket
 
 TURNS = range(6)
-"""How many turns of the event loop lie between what comes and the end."""
+"""Turns of the event loop between the event and the cancellation."""
 
 
 async def _ends(work: Coroutine[Any, Any, None], happen: Callable[[], object], turns: int) -> bool:
-    """Let something happen, cancel soon after; tell whether the work ends."""
+    """Trigger an event, cancel soon after; return whether the work ends."""
     task = asyncio.create_task(work)
     await asyncio.sleep(0.05)
     happen()

@@ -72,7 +72,7 @@ def recorded(home: House, tmp_path_factory: pytest.TempPathFactory) -> Robot:
 
 
 def come_early(home: House, store_id: str, seqs: Sequence[int], run: int = 1) -> None:
-    """Let rows come over the link."""
+    """Store rows from the link."""
     about = {"robot": ROBOT, "store_id": store_id, "writer": "watch", "run": run,
              "channel": channels.STATUS, "received_ns": 0}  # fmt: skip
     rows = [

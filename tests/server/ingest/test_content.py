@@ -42,7 +42,7 @@ MB = 1 << 20
 
 
 def journal_with(store: Path, items: list[FakeItem], messages: list[bytes]) -> Path:
-    """Record a journal of the ring, which comes without a seal."""
+    """Record a journal of the ring, which has no seal."""
     run = FakeRun(store, writer="ring", items=items)
     rows: list[Any] = [(T0_NS + n, items[n % len(items)], m) for n, m in enumerate(messages)]
     run.write(rows)
@@ -114,7 +114,7 @@ def test_a_signed_journal_with_such_a_name_is_quarantined_and_told(tmp_path: Pat
 
 @pytest.fixture
 def packs_all(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Have the writer pack what it would leave as it is."""
+    """Let the writer compress chunks that it would leave uncompressed."""
     monkeypatch.setattr(writer, "CHUNK_BYTES", 1 << 40)
     yield
 
@@ -201,7 +201,7 @@ def bomb(kind: str, size: int) -> bytes:
 
 @pytest.mark.parametrize("kind", ["zstd", "lz4"])
 def test_a_chunk_never_unpacks_to_more_than_it_announced(kind: str) -> None:
-    """Neither the chunk nor the packed frame in it says how much memory is taken."""
+    """Neither the chunk nor the compressed frame in it decides how much memory is used."""
     record = mcap.chunk_record(0, 0, 1000, 0, kind, bomb(kind, 1000 * MB))
     head = mcap.parse_chunk_head(record, 0)
     assert head is not None

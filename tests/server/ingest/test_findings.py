@@ -1,4 +1,4 @@
-"""Records are read strictly: what is not of its form is nothing, whatever it is."""
+"""Records are decoded strictly: an invalid one is ignored."""
 
 from __future__ import annotations
 

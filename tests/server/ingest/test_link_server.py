@@ -1,4 +1,4 @@
-"""The server's end: one connection per robot, silence noticed, the board, what is committed."""
+"""The server's end: one connection per robot, detected silence, the state, committed rows."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def database(tmp_path: Path) -> Iterator[ServerDatabase]:
 
 
 class FakeSocket:
-    """Two queues that stand for a WebSocket."""
+    """Two queues in place of a WebSocket."""
 
     def __init__(self) -> None:
         self.up: asyncio.Queue[bytes | None] = asyncio.Queue()
@@ -124,7 +124,7 @@ def test_a_robot_that_connects_again_ends_its_older_connection(database: ServerD
 
 
 def test_a_first_key_is_no_other_key(database: ServerDatabase) -> None:
-    """A store begins without a key; what comes first is none that takes another's place."""
+    """A store begins without a key; the first one replaces no other."""
     with database.begin() as connection:
         for key in ("", "first", "first", "", "second"):
             ledger.admit(connection, msgspec.structs.replace(HELLO, public_key=key), 0)
@@ -167,7 +167,7 @@ def test_names_that_fit_in_no_frame_keep_no_robot_out(database: ServerDatabase) 
 def test_what_cannot_be_answered_ends_the_connection(
     database: ServerDatabase, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Nobody would be heard on it any more, and the robot would look as if it were there."""
+    """No frame could be received on it any more, although the robot would be shown as connected."""
 
     async def scene() -> None:
         link, socket = LinkServer(database), FakeSocket()

@@ -1,6 +1,6 @@
-"""Masking finds what it found with the patterns of before, in time that grows with the text alone.
+"""Masking finds the same secrets as the earlier patterns, in time linear in the length of the text.
 
-The patterns below are plainer, and take quadratic time for texts that a hostile robot may send.
+The patterns below are simpler, and take quadratic time for texts that a hostile robot may send.
 """
 
 from __future__ import annotations

@@ -56,7 +56,7 @@ def brought(home: House, store: Store, name: str) -> tuple[str, str]:
 
 
 def shown_key(home: House) -> str:
-    """Return what the API says of the robot's key; its pages say it, too."""
+    """Return the API's state of the robot's key; the pages must show the same."""
     viewer = home.client("viewer")
     said = str(viewer.get(f"/api/v1/robots/{ROBOT}").json()["signing_key"])
     for page in ("/", f"/robots/{ROBOT}"):

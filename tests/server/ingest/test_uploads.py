@@ -1,4 +1,4 @@
-"""Journals come in pieces over bad networks; what is confirmed is here, byte for byte."""
+"""Journals are uploaded in pieces over bad networks; confirmed ones are stored byte for byte."""
 
 from __future__ import annotations
 

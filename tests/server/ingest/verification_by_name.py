@@ -1,4 +1,4 @@
-"""A worker that judges files by their names: a bomb, one without an end, and sound ones."""
+"""A worker that verifies files by their names: a bomb, one without an end, and valid ones."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from amberbox.server.workers.process import main
 
 
 def judged_by_name(claim: UploadClaim) -> VerificationResult:
-    """Stand for the verification of a bomb, of one without an end, and of a sound file."""
+    """Simulate the verification of a bomb, of one without an end, and of a valid file."""
     if claim.path.name == "bomb":
         os._exit(1)
     if claim.path.name == "endless":

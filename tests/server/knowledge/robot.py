@@ -1,4 +1,4 @@
-"""A simulated robot's folder and what its watcher said, planted as the link brings it."""
+"""A simulated robot's folder and the findings of its watcher, stored as if sent over the link."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def status(
 
 
 def diagnosis(at_ns: int, *symptoms: Symptom) -> Diagnosis:
-    """Return what the watcher's own engine says of these symptoms."""
+    """Return the diagnosis of these symptoms by the watcher's own engine."""
     knowledge = read_declared_robot(FOLDER, "ropod_001", HASH).knowledge()
     situation = ObservedSituation(symptoms, watched=True)
     return answer(knowledge, situation, DiagnosisId(DIAGNOSIS, 1, at_ns))
@@ -66,7 +66,7 @@ def diagnosis(at_ns: int, *symptoms: Symptom) -> Diagnosis:
 def say(
     home: House, found: Sequence[tuple[int, Finding]], robot: str = "ropod_001", start: int = 0
 ) -> None:
-    """Let findings come over the link, each written at an instant."""
+    """Store findings as if sent over the link, each written at an instant."""
     rows = []
     for seq, (at_ns, finding) in enumerate(found, start):
         channel, data = encoded(finding)
@@ -79,7 +79,7 @@ def say(
 
 
 def is_here(home: House, robot: str = "ropod_001") -> None:
-    """Let a robot be connected, and all of it be well as its watcher says now."""
+    """Connect a robot whose watcher reports all components as ok."""
     now_ns = home.clock.wall_ns()
     link = RobotConnection(robot, FakeSocket(), ServerEnd(robot), now_ns)
     link.last_received_s = math.inf

@@ -1,4 +1,4 @@
-"""Diagnoses in words: asked of a worker once, before anybody looks."""
+"""Diagnoses in words: computed by a worker once, before the page is opened."""
 
 import asyncio
 import json
@@ -19,7 +19,7 @@ FOUND = sim.diagnosis(sim.AT_NS, SILENT)
 
 
 class Worker:
-    """Answers what it is told to, and remembers what it was asked."""
+    """Returns given answers, and stores its tasks."""
 
     def __init__(self) -> None:
         self.asked: list[Mapping[str, Any]] = []

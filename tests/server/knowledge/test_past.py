@@ -1,4 +1,4 @@
-"""What rules look up on the server: conditions in the archive, statuses wherever they are."""
+"""Lookups of rules on the server: conditions in the archive, statuses in archive and link."""
 
 from __future__ import annotations
 

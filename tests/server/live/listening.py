@@ -1,4 +1,4 @@
-"""A server's app on a port of the loopback, its feed at work, and people who listen."""
+"""A server's app on a loopback port, its running feed, and listeners."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Stage:
         self.seq = 0
 
     def session(self, name: str) -> str:
-        """Sign somebody in."""
+        """Sign a person in."""
         services = self.home.services
         with services.database.begin() as connection:
             user = find_user(connection, name)
@@ -92,7 +92,7 @@ async def hear(socket: ClientConnection, kind: str) -> dict[str, Any]:
 
 
 async def heard_within(socket: ClientConnection, seconds: float) -> list[dict[str, Any]]:
-    """Return all messages that come within a time."""
+    """Return all messages received within a time."""
     found: list[dict[str, Any]] = []
     with suppress(TimeoutError):
         async with asyncio.timeout(seconds):
@@ -102,5 +102,5 @@ async def heard_within(socket: ClientConnection, seconds: float) -> list[dict[st
 
 
 async def ask(socket: ClientConnection, **asked: Any) -> None:
-    """Say what one wants to hear."""
+    """Send a subscription."""
     await socket.send(json.dumps(asked))

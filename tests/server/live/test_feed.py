@@ -439,7 +439,7 @@ def test_the_ring_is_bounded_by_count_and_bytes() -> None:
 def test_a_robot_whose_past_cannot_be_read_ends_nothing(
     home: House, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Damaged columns raise whatever the library that reads them thinks of."""
+    """Reading damaged columns may raise any exception of the library."""
     state, read = home.services.feed.state, list[str]()
 
     def load(stores: RecordStores, robot: str) -> None:

@@ -20,7 +20,7 @@ from amberbox.testing.clock import PATIENCE_S
 
 
 def application(upload_service: UploadService) -> Any:
-    """Make an ASGI application of a desk; robots come with the key ``key-<id>``."""
+    """Make an ASGI application of an upload service; robots use the key ``key-<id>``."""
 
     async def app(scope: Any, receive: Any, send: Any) -> None:
         if scope["type"] != "http":

@@ -1,6 +1,6 @@
-"""Write down, and refuse, every attempt of a Python process to reach beyond this machine.
+"""Log, and refuse, every attempt of a Python process to connect beyond this machine.
 
-Copied as ``sitecustomize.py`` to where Python looks for it, so that workers are watched, too.
+It is copied as ``sitecustomize.py`` to Python's path, so that workers are watched, too.
 """
 
 import ipaddress
@@ -13,7 +13,7 @@ NAMES = ("socket.getaddrinfo", "socket.gethostbyname", "socket.gethostbyaddr", "
 
 
 def is_here(host: object) -> bool:
-    """Tell whether a name or address is this machine."""
+    """Return whether a name or address is this machine."""
     if host in (None, "", "localhost", b"localhost"):
         return True
     text = host.decode("ascii", "replace") if isinstance(host, bytes) else str(host)

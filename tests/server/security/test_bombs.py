@@ -57,7 +57,7 @@ def _peak() -> int:
 
 @pytest.mark.parametrize("kind", DEEP)
 def test_no_body_is_too_deep_for_any_route(home: House, kind: str) -> None:
-    """Routes that take no body may not even look at it; the others refuse it."""
+    """Routes without a body must not read it; the others refuse it."""
     headers = {"Content-Type": "application/json"}
     for method, path in _taking_bodies(home):
         answer = _client(home, path).request(method, path, content=DEEP[kind], headers=headers)

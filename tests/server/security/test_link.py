@@ -1,4 +1,4 @@
-"""A robot that lies, over the real socket: as another, with old frames, with what is no frame."""
+"""A dishonest robot over the real socket: a false id, old frames, invalid frames."""
 
 from __future__ import annotations
 

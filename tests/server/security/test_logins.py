@@ -133,7 +133,7 @@ def test_a_page_of_others_signs_nobody_in(home: House) -> None:
 
 @pytest.mark.parametrize("kind", ["text/plain", "application/x-www-form-urlencoded", ""])
 def test_forms_of_others_change_nothing(home: House, kind: str) -> None:
-    """What a page may send to any server without being asked: a form, with the cookie."""
+    """Requests that any page can send to any server: a form, with the user's cookie."""
     admin = home.client("admin")
     del admin.headers[CSRF_HEADER]
     headers = {"Content-Type": kind, "Origin": "https://evil.example"} if kind else {}
@@ -152,7 +152,7 @@ def test_the_token_of_another_session_is_none(home: House) -> None:
 
 
 def test_a_stranger_learns_nothing_of_the_server(home: House) -> None:
-    """The doors that stood open in JekyllBot: accounts, hashes, a socket that drives robots."""
+    """The attacks of JekyllBot: accounts, hashes, a socket that drives robots."""
     stranger = _client(home)
     for path in ("/api/v1/users", "/api/v1/robots", "/api/v1/robots/ropod_001", "/api/v1/audit",
                  "/api/v1/settings", "/api/v1/openapi.json", "/api/docs"):  # fmt: skip

@@ -1,4 +1,4 @@
-"""Whatever happens to robots, API, pages, metrics and command line say the same of them."""
+"""API, pages, metrics and command line agree on robots, whatever happens to these."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ FAULT = "laser/device/working"
 LEVELS = ["ok", "warn", "error", "stale", "unknown"]
 ROBOT = st.sampled_from(NAMES)
 PHASES = (Phase.explicit, Phase.reuse, Phase.generate)
-"""Not made smaller: an example asks for a dozen pages."""
+"""Without shrinking: an example requests a dozen pages."""
 Event = tuple[Any, ...]
 EVENTS: st.SearchStrategy[Event] = st.one_of(
     st.tuples(st.sampled_from(["hello", "lost", "silent", "broken", "healed", "mended"]), ROBOT),
@@ -56,7 +56,7 @@ class World:
         self._load()
 
     def sign_in(self) -> None:
-        """Let somebody look at it: sessions of before may have ended."""
+        """Sign a person in: earlier sessions may have ended."""
         self.viewer: TestClient = self.home.client("admin")
 
     def happen(self, event: Event) -> None:
@@ -122,7 +122,7 @@ class World:
         self.home.clock.advance(seconds)
 
     def _restart(self) -> None:
-        """The server forgets what it had in memory, and reads the past anew."""
+        """Restart the server: its memory is lost, and it reads the past again."""
         services = self.home.services
         services.links.robots.clear()
         with services.database.begin() as connection:
@@ -212,7 +212,7 @@ def numbers_agree(world: World, cards: Any, fleet: str) -> None:
 
 
 def of_robot(world: World, card: Any) -> None:
-    """Compare all that is said of one robot."""
+    """Compare everything that is shown of one robot."""
     robot, status = card["robot"], card["status"]
     assert json.loads(world.read(f"/api/v1/robots/{robot}"))["status"] == status
     tree = json.loads(world.read(f"/api/v1/robots/{robot}/status"))

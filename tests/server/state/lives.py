@@ -1,4 +1,4 @@
-"""Robots that live in a test: they connect, say statuses, and have a folder."""
+"""Robots of a test: they connect, send statuses, and have a folder."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def connect(home: House, robot: str, *, ahead_ns: int = 0, config_hash: str = ""
 
 
 def say(home: House, robot: str, channel: str, at_ns: int, seq: int, values: Any) -> LinkRow:
-    """Let a record arrive; tell nobody."""
+    """Store a record without notifying the server."""
     data = msgspec.json.encode(values)
     row = LinkRow("watch", 1, seq, channel, at_ns, data)
     with home.services.database.begin() as connection:

@@ -1,4 +1,4 @@
-"""Files that are set aside as damaged: everybody who looks at the server is told of them."""
+"""Files that are set aside as damaged are shown to all users of the server."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What folders say is remembered; what a worker was too slow for is asked for again."""
+"""Contents of folders are cached; a folder that a worker was too slow for is read again."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ GOOD = msgspec.json.encode(FolderFacts(model="Ropod 2"))
 
 @dataclass
 class Desk:
-    """A worker that answers what it is told to, and the folders of a robot."""
+    """A worker that gives prepared answers, and the folders of a robot."""
 
     answers: list[bytes | AmberboxError]
     now_s: float = 0.0

@@ -1,4 +1,4 @@
-"""The unit of an output: as its mode file declares it, else as its monitor says."""
+"""The unit of an output: the one declared in its mode file, else that of its monitor."""
 
 from __future__ import annotations
 

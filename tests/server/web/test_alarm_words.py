@@ -11,7 +11,7 @@ from amberbox.server.web.alarms import AlarmTexts
 
 
 class Counted(list[ComponentFacts]):
-    """Components of a folder, and how often somebody looked through them."""
+    """Components of a folder that count how often they are iterated."""
 
     looked = 0
 

@@ -1,4 +1,4 @@
-"""Modules of the pages in one file: each runs once, when it is needed, and tells its exports."""
+"""Modules of the pages in one file: each runs once, when it is needed, with its exports."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a bar of recordings shows: what lies close together is one, reasons have kinds."""
+"""The coverage bar of recordings: close intervals are joined, reasons have kinds."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The page of data: what it offers to whom, variables, what there is over all time."""
+"""The page of data: its functions by role, variables, and the whole time of the data."""
 
 from collections.abc import Iterator
 

@@ -1,4 +1,4 @@
-"""With what somebody is signed in, in words."""
+"""The description of a session's browser, in words."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""The page of a robot's diagnosis: what it shows to whom, and what is kept."""
+"""The page of a robot's diagnosis: its contents by role, and stored answers."""
 
 import html
 import re
@@ -246,7 +246,7 @@ def revised(
 
 
 def told(*found: tuple[int, str, Any], at_ns: int = sim.AT_NS) -> list[tuple[int, Any]]:
-    """Return what the watcher says of symptoms, seconds after the first instant."""
+    """Return the watcher's findings about symptoms, seconds after the first instant."""
     return [(at_ns + s * NS, sim.symptom(name, at_ns + s * NS, state)) for s, name, state in found]
 
 

@@ -1,4 +1,4 @@
-"""The card of a diagnosis: what it makes of answers."""
+"""The card of a diagnosis, made from answers of the engine."""
 
 from dataclasses import replace
 from html import unescape

@@ -17,7 +17,7 @@ UPLOT = {
     "uplot.iife.min.js": "2d27e8ad3d228164525ce213f9dc716f39b4e3aee0cc773fb3491c96cf4921a2",
     "uplot.min.css": "df630c6a8d6f8eeaff264b50f73ce5b114f646ffd9a0bb74f049b0a00135fa04",
 }
-"""uPlot 1.6.31 as youplot 1.0.0 carries it: another file is code that nobody has looked at."""
+"""Hashes of uPlot 1.6.31 in youplot 1.0.0: any other file has not been reviewed."""
 SCRIPTS = assets.FOLDER / "js"
 HTML = {"accept": "text/html"}
 

@@ -1,4 +1,4 @@
-"""The first page: the numbers on it agree with each other and with what they lead to."""
+"""The first page: its numbers agree with each other and with the pages they link to."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ OVER = {"active": False, "cleared_ns": START_NS}
 
 @pytest.fixture(scope="module")
 def home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[House]:
-    """Alarms that last and that are over, and of which people have said something or not."""
+    """Active and past alarms, acknowledged or not."""
     with house(tmp_path_factory.mktemp("house"), shared=True) as made:
         happened: Sequence[Mapping[str, Any]] = ({}, OVER, SEEN_TO, SHELVED)
         for number, changes in enumerate(happened, 1):

@@ -1,4 +1,4 @@
-"""The pages about recordings: what they say, what they offer to whom, and that names stay text."""
+"""The pages of recordings: their contents by role, and escaping of names."""
 
 import re
 from collections.abc import Iterator
@@ -89,7 +89,7 @@ def test_a_file_that_was_changed_is_named(home: House) -> None:
 
 
 def looked_at(home: House, path: str, monkeypatch: pytest.MonkeyPatch) -> int:
-    """Return how many files a page looks at."""
+    """Return the number of files that a page reads."""
     found: list[str] = []
 
     def look(_: object, path: str) -> str:

@@ -1,4 +1,4 @@
-"""The page of a robot: what it shows of components, times, missions, and to whom."""
+"""The page of a robot: components, times, missions, and its contents by role."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def text_of(markup: str) -> str:
 
 
 def branch(markup: str, component: str) -> str:
-    """Return the markup of a component with what is inside."""
+    """Return the markup of a component with its children."""
     found = re.search(rf'data-component="{component}".*?(?=<div class="branch"|id="tree-keys")',
                       markup, re.DOTALL)  # fmt: skip
     assert found, component
@@ -339,7 +339,7 @@ def timeline_of(*lanes: Lane) -> Timeline:
 
 
 def stretches(*found: tuple[str, str, str]) -> list[Stretch]:
-    """Make stretches of from, to and level; hours and minutes stand for times."""
+    """Make intervals of from, to and level; times are given as hours and minutes."""
     return [
         Stretch(from_=f"2027-01-15T{start}:00Z", to=f"2027-01-15T{to}:00Z", level=level,
                 state=level, reason="", changes=0)

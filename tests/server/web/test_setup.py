@@ -23,7 +23,7 @@ FORM = {"name": "anna", "password": PASSWORD, "again": PASSWORD}
 
 
 class Fresh:
-    """A server that nobody has set up."""
+    """A server without any account."""
 
     def __init__(self, home: House) -> None:
         self.home = home

@@ -1,4 +1,4 @@
-"""The catalogue holds what pages say, and nothing that no page says any more."""
+"""The catalogue holds all texts of pages, and no unused ones."""
 
 import re
 from collections.abc import Iterator
@@ -8,11 +8,11 @@ from amberbox.server.web.text import catalogue
 
 PAGES = TEMPLATES.parent
 NAMED = re.compile(r"""["'`]([a-z][\w-]*(?:\.[\w-]+)+)["'`]""")
-"""A name of a text that stands in a source as it is."""
+"""A name of a text that occurs literally in a source."""
 BEGUN = re.compile(r"""["'`]([a-z][\w-]*\.[\w.-]*)(?:["'] ~|\$?\{)""")
 """A name whose end is worked out: ``"alarms.tabs." ~ tab``, ``f"error.hint.{name}"``."""
 WHOLE = ("words.", "robot.time.windows.")
-"""Every word stands on the page of help; chips are put together of two names."""
+"""Every word is on the page of help; chips are composed of two names."""
 WRITES = re.compile(
     r"""\.textContent\s*=[^=]|\.title\s*=[^=]|\.innerText\b|\.innerHTML\b|insertAdjacent|\.ariaLabel\b"""
     r"""|setAttribute\(\s*["'](?:title|alt|placeholder|label|aria-label|aria-description|data-label)["']"""

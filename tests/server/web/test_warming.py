@@ -1,4 +1,4 @@
-"""Templates are ready before the first page is asked for, those of what is looked at first soon."""
+"""Templates are compiled before the first request, the most used ones first."""
 
 from __future__ import annotations
 

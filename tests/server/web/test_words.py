@@ -1,4 +1,4 @@
-"""The words that people read: one meaning each, and none that only experts know."""
+"""The words on pages: one meaning each, and no words for experts only."""
 
 import re
 from collections.abc import Iterator
@@ -20,7 +20,7 @@ EXPERT = re.compile(
     re.IGNORECASE,
 )
 FOR_EXPERTS = "{# details:"
-"""How a template begins all of which stands behind "Details"."""
+"""The beginning of a template that is shown only under "Details"."""
 ELSEWHERE = ("/api/", "/link/", "/static/", "/knowledge", "/licences")
 """Not for everybody, or not in our words."""
 
@@ -89,7 +89,7 @@ def test_templates_speak_plainly_outside_details_and_knowledge() -> None:
 
 
 class Shown(HTMLParser):
-    """What a page shows outside ``details``: texts, and what is read aloud."""
+    """The contents of a page outside ``details``: texts, and accessible labels."""
 
     ALOUD = ("title", "aria-label", "placeholder", "alt")
 

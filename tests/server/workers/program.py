@@ -16,7 +16,7 @@ MODULE = "amberbox.server.trial.worker"
 
 
 def echo(folder: Path, arguments: Mapping[str, Any]) -> bytes:
-    """Say again what was said, after a while."""
+    """Return the argument, after a while."""
     time.sleep(arguments.get("wait_s", 0.0))
     return str(arguments["text"]).encode()
 

@@ -46,7 +46,7 @@ def space(subject: ExaminedRobot, host: HostSystem) -> Iterator[DoctorFinding]:
 def judged_space(
     total: int, free: int, used: int, options: StoreOptions, traffic: Traffic | None
 ) -> DoctorFinding:
-    """Judge free bytes of the partition and the store's own use against its limits."""
+    """Check the free bytes of the partition and the size of the store against its limits."""
     limit = min(options.quota or total, total * options.quota_percent / 100)
     room = max(0.0, min(limit - used, free - options.min_free))
     found = f"{bytes_text(free)} of {bytes_text(total)} free, the record takes {bytes_text(used)}"
@@ -79,7 +79,7 @@ def _size(path: Path) -> int:
 
 
 def file_system(subject: ExaminedRobot, host: HostSystem) -> Iterator[DoctorFinding]:
-    """Judge the file system that the store lies on."""
+    """Check the file system of the store."""
     mount = mount_of(subject.ground, host.text(MOUNTS))
     if mount is None:
         yield warn("file system", "this system does not tell its mounts", "look at it yourself")
@@ -88,7 +88,7 @@ def file_system(subject: ExaminedRobot, host: HostSystem) -> Iterator[DoctorFind
 
 
 def judged_file_system(mount: MountPoint) -> DoctorFinding:
-    """Judge whether the record survives a power cut or a lost network on this file system."""
+    """Check whether the record survives a power cut or a lost network on this file system."""
     found = f"{mount.kind} on {mount.source} at {mount.point}"
     check = "file system"
     if "ro" in mount.options:
@@ -129,7 +129,7 @@ def root(subject: ExaminedRobot, host: HostSystem) -> Iterator[DoctorFinding]:
 
 
 def judged_root(mount: MountPoint, has_own_partition: bool) -> DoctorFinding:
-    """Judge the root file system; ``has_own_partition`` is about the store."""
+    """Check the root file system; ``has_own_partition`` states whether the store has its own."""
     if mount.kind == "overlay" or "ro" in mount.options:
         return ok("root file system", f"{mount.kind}, not written: a power cut cannot damage it")
     hint = "a box bolted to a robot lives longer with a read-only root (docs/robot/appliance.md)"
@@ -143,7 +143,7 @@ _BYTES = 65_536
 
 
 def latency(subject: ExaminedRobot, host: HostSystem) -> Iterator[DoctorFinding]:
-    """Measure at the store's place; needs write permission there."""
+    """Measure the write latency in the store's folder; needs write permission there."""
     try:
         writes, syncs = probe(subject.ground)
     except OSError as trouble:
@@ -172,7 +172,7 @@ def probe(place: Path) -> tuple[list[float], list[float]]:
 def judged_latency(
     writes: Sequence[float], syncs: Sequence[float], write_s: float, sync_s: float
 ) -> DoctorFinding:
-    """Judge measured seconds against the intervals that are promised."""
+    """Check measured latencies (seconds) against the configured intervals."""
     found = f"write {_range(writes)}, sync {_range(syncs)} (64 kB)"
     if median(syncs) > sync_s:
         hint = (
@@ -262,7 +262,7 @@ def _numbers(path: Path) -> list[int]:
 def judged_traffic(
     traffic: Traffic | None, sync_s: float, disk: BlockDevice | None
 ) -> DoctorFinding:
-    """Judge a day of recording against the endurance of the device."""
+    """Check a day of recording against the endurance of the device."""
     if traffic is None:
         return ok("wear", "nothing measured yet: it needs some seconds of recording")
     syncs = traffic.syncs(sync_s)
@@ -281,7 +281,7 @@ def judged_traffic(
 
 
 def judged_disk(disk: BlockDevice, up_s: float) -> DoctorFinding:
-    """Judge the bytes written since boot, and the device's own report of wear."""
+    """Check the bytes written since boot, and the wear that the device reports."""
     check = f"disk {disk.name}"
     flushes = f", {disk.flushes:,} flushes" if disk.flushes is not None else ""
     found = f"{bytes_text(disk.written_bytes)} written{flushes} in {in_time(up_s)} since the start"

@@ -72,7 +72,7 @@ def why_only_events(store: Store, reserve: int) -> str:
 def judged_recorder(
     pid: int | None, head: JournalHead | None, now_ns: int, late_s: float, folder: Path
 ) -> DoctorFinding:
-    """Judge the recorder by its process and the head of its journal."""
+    """Check the recorder by its process and the head of its journal."""
     age_s = (now_ns - head.watermark_ns) / NS if head and head.watermark_ns else None
     last = f"last write {in_time(max(0.0, age_s))} ago" if age_s is not None else "no last write"
     if pid is None:
@@ -129,7 +129,7 @@ def find_unit(folder: Path, host: HostSystem) -> SystemdUnit | None:
 def judged_service(
     unit: SystemdUnit | None, pid: int | None, group: str, folder: Path
 ) -> DoctorFinding:
-    """Judge unit and running process; ``group`` is the process's control group."""
+    """Check the systemd unit and the running process; ``group`` is the process's control group."""
     if unit is None:
         hint = f"amberbox install-service {folder} shows what it would set up"
         return warn("service", "not installed: after a start or a crash nobody records", hint)
@@ -163,7 +163,7 @@ def supervisor(subject: ExaminedRobot, host: HostSystem) -> Iterator[DoctorFindi
 
 
 def judged_supervisor(state: Mapping[str, Any], hint: str) -> DoctorFinding:
-    """Judge the processes by their supervisor's state."""
+    """Check the processes by the state that their supervisor wrote."""
     children: Mapping[str, Mapping[str, Any]] = state.get("children", {})
     found = f"amberbox run (process {state.get('pid', 'unknown')}) looks after " + ", ".join(
         _one(name, child) for name, child in children.items() if child["state"] != "off"
@@ -203,7 +203,7 @@ def link(subject: ExaminedRobot, host: HostSystem) -> Iterator[DoctorFinding]:
 
 
 def judged_link(state: Mapping[str, Any], now_ns: int, hint: str) -> DoctorFinding:
-    """Judge the link by its state."""
+    """Check the link by the state that it wrote."""
     words = link_in_words(state, now_ns)
     is_old = now_ns - int(state.get("at_ns", 0)) > _OLD_NS
     return ok("link", words) if state.get("connected") and not is_old else warn("link", words, hint)

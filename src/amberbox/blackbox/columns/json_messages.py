@@ -395,7 +395,9 @@ def _described(name: str, path: str, kind: str, note: ValueNote) -> Column:
 def _found(
     shape: Shape, values: Sequence[Any], path: str
 ) -> Iterator[tuple[str, Shape, str, Sequence[Any]]]:
-    """Yield the places of a table in the order of ``places``, with the values found there."""
+    """Yield the columns and child tables of a table in the order of ``places``, with
+    their values.
+    """
     kind = column_kind(shape)
     if kind == "nested":
         for number, (key, inner) in enumerate(shape.properties.items()):

@@ -154,9 +154,9 @@ def _observe_array(shape: Shape, value: list[Any], depth: int) -> None:
 
 
 def column_kind(shape: Shape) -> str:
-    """Return the kind of a place: a column type, ``nested``, ``children``, or '' for nothing.
+    """Return the kind of a place: a column type, ``nested``, ``children``, or '' for no column.
 
-    Columns of mixed kinds are ``text``: strings as they are, everything else as JSON.
+    Columns of mixed kinds are ``text``: strings unchanged, all other values as JSON.
     """
     kinds = shape.values()
     if len(kinds) != 1:
@@ -431,7 +431,7 @@ def from_schema(schema: Schema) -> Shape:
 
 
 def is_exact_schema(document: Any) -> bool:
-    """Return whether a document is one of ``to_schema``, or of a reserved channel."""
+    """Return whether a document was made by ``to_schema``, or is that of a reserved channel."""
     return isinstance(document, dict) and document.get("$comment") == EXACT_COMMENT
 
 

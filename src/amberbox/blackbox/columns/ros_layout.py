@@ -51,9 +51,9 @@ MOST_ROWS = 1 << 21
 def compile_walker(plan: WirePlan, watch: bool = False) -> Walker:
     """Compile ``make(big_endian, slots, checks) -> walk(data, start, end)``.
 
-    A walk appends the places of one message to the slots. It raises one of ``MISFITS`` if the
-    message is shorter or longer than its definition says. With ``watch`` it also appends to
-    ``checks`` the place and length of everything that other fields' places depend on.
+    A walk appends the positions of one message's fields to the slots. It raises one of ``MISFITS``
+    if the message is shorter or longer than its definition requires. With ``watch`` it also appends
+    to ``checks`` the position and length of every prefix that other positions depend on.
     """
     lines = list(_WalkerSource(plan, watch).lines())
     space: dict[str, Any] = {
@@ -302,7 +302,7 @@ class ScatteredPlaces:
 
 @dataclass(frozen=True, slots=True)
 class EvenPlaces:
-    """Places of ``count`` messages of ``size`` bytes that share one layout (``slots``).
+    """Positions of the fields of ``count`` messages of ``size`` bytes with one layout (``slots``).
 
     ``texts_of_all`` are the strings of each slot of starts when they are equal in all messages.
     """

@@ -346,7 +346,7 @@ def _stamp_column(schema: ItemSchema, stamp: str | None) -> Column | None:
 
 
 def _stamp_reader(plan: WirePlan, stamp: Column | None) -> Callable[[bytes], int | None] | None:
-    """Return a reader for a stamp that lies at the same place in every message, else None."""
+    """Return a reader for a stamp at a fixed offset in every message; None if the offset varies."""
     place = _fixed_place(plan, stamp.name) if stamp and stamp.type == "time" else None
     if place is None:
         return None

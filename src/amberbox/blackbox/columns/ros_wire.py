@@ -1,9 +1,8 @@
 """A ROS message definition as a flat table, and that table as bytes on the wire.
 
-Fields are columns, lists of structures child tables; fields that always lie alike are read as
-one piece. Alignment (CDR, XCDR1) is worked out beforehand as far as the place of a field is
-known; behind strings and sequences it is found again while reading. ROS 1 packs everything
-without gaps.
+Fields are columns, lists of structures child tables; adjacent fields of fixed size are read as one
+piece. Alignment (CDR, XCDR1) is computed beforehand as far as the offset of a field is known; after
+strings and sequences it is computed while reading. ROS 1 packs everything without gaps.
 """
 
 from __future__ import annotations
@@ -244,7 +243,7 @@ class Padding:
 
 @dataclass(frozen=True, slots=True)
 class ScalarRun:
-    """Columns of one type that lie next to each other, from ``offset`` in their piece."""
+    """Adjacent columns of one type, from ``offset`` in their piece."""
 
     kind: str
     offset: int

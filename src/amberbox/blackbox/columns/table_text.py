@@ -258,7 +258,7 @@ def format_grid(
     least_widths: Sequence[int] = (),
     room: LineWidth | None = None,
 ) -> str:
-    """Format cells in columns; numbers to the right, the rest to the left.
+    """Format cells in columns; numbers aligned to the right, other values to the left.
 
     Without ``room`` the length of lines is not limited. ``least_widths``, if given, decide which
     columns are shown, so that every call shows the same ones.

@@ -215,15 +215,15 @@ class ColumnAddress(NamedTuple):
 
     @property
     def address(self) -> str:
-        """Return it as text."""
+        """Return the address as text."""
         return f"{self.item}.{self.variable}" + ("" if self.number is None else f"[{self.number}]")
 
 
 def find_addresses(schema: ItemSchema, item: str, text: str) -> list[ColumnAddress]:
     """Return the addresses that a name matches; several if it is ambiguous, else one or none.
 
-    A column, else an exact path, else every path that ends so. A number is an element of a list
-    or a row of a child table; ``*`` stands for any part of a path.
+    A name matches a column, else an exact path, else every path with this ending. A number is an
+    element of a list or a row of a child table; ``*`` matches any part of a path.
     """
     named = [column for column in schema.columns if column.name == text]
     if named:
@@ -270,7 +270,7 @@ class _Candidate(NamedTuple):
     path: tuple[str, ...]
     place: ColumnAddress
     rows: int | None
-    """Where in the path the row of a child table stands."""
+    """Position of the row number of a child table in the path."""
 
 
 def _places(schema: ItemSchema, item: str) -> Iterator[_Candidate]:
@@ -296,7 +296,7 @@ def _matching(
 
 
 def _match(candidate: _Candidate, asked: tuple[str, ...], whole: bool) -> ColumnAddress | None:
-    """Compare the asked path with a candidate's end, or with all of it."""
+    """Compare the path with the end of a candidate, or if ``whole`` with all of it."""
     path, place, rows = candidate
     if rows is not None:
         start = len(path) - len(asked)
@@ -324,9 +324,9 @@ def _ends(path: tuple[str, ...], asked: tuple[str, ...], whole: bool) -> bool:
 
 
 def is_same_or_below(name: str, entry: str) -> bool:
-    """Return whether a name is a configured entry, ends like it, or lies below it.
+    """Return whether a name is a configured entry, ends with it, or is below it.
 
-    For items of which only the entries are known.
+    Used for items of which only the configured entries are known.
     """
     flat, wanted = "_".join(path_tokens(entry)), "_".join(path_tokens(name))
     return (

@@ -357,7 +357,7 @@ class _Banded:
     def next_kept(self, last: int, stop: int) -> int:
         """Return the first row after ``last`` and before ``stop`` to keep, else ``stop``.
 
-        No list changes its length from ``last`` to there.
+        All lists between ``last`` and ``stop`` must have the length that they have at ``last``.
         """
         start, width = last + 1, FIRST_WINDOW
         while start < stop:

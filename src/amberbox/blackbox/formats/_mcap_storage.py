@@ -1,4 +1,4 @@
-"""MCAP files of any origin, finished or torn: ROS 1, ROS 2, JSON and whatever else is in them.
+"""MCAP files of any origin, finished or truncated: ROS 1, ROS 2, JSON and other encodings.
 
 Flat columns that were exported as JSON become the same columns again.
 """

@@ -24,7 +24,7 @@ from amberbox.core.types import Schema, Topic
 
 
 class ByteSource(Protocol):
-    """Bytes that are read by offset; behind the end there are none."""
+    """Bytes that are read by offset; a read beyond the end returns fewer bytes."""
 
     size: int
 
@@ -225,7 +225,7 @@ class RecordingDamage:
     def between(self, places: Sequence[ReadableRange]) -> RecordingDamage:
         """Return the damage with its time range: from the data before it to the data after it.
 
-        ``places`` come in the order of the file; one that is damaged itself counts whole.
+        ``places`` are in the order of the file; a damaged one counts as a whole.
         """
         first = bisect_right(places, self.offset, key=_end)
         after = bisect_left(places, self.offset + self.length, lo=first, key=_offset)

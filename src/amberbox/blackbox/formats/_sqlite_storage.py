@@ -198,7 +198,7 @@ _SELECT = "SELECT id, topic_id, timestamp, data FROM messages WHERE id BETWEEN ?
 
 @dataclass
 class BagDatabase:
-    """An open .db3 file; ``scratch`` is a folder that goes away with it."""
+    """An open .db3 file; the folder ``scratch`` is deleted when it is closed."""
 
     path: Path
     connection: sqlite3.Connection

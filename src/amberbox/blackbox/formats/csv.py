@@ -451,7 +451,7 @@ def in_ns(value: Decimal, unit: str) -> int:
 
 
 def is_relative(largest_ns: int) -> bool:
-    """Return whether times are no dates: they would lie in the first years after 1970."""
+    """Return whether times are relative: as dates they would be in the first years after 1970."""
     return largest_ns < _LONG_AGO * 10**9
 
 
@@ -676,7 +676,7 @@ def _stamp(table: CsvTable) -> tuple[str, bool]:
 
 
 def _possible(batch: CsvBatch, table: CsvTable, plan: _Plan) -> CsvBatch | None:
-    """Return the rows whose time a journal can hold; None if there is none."""
+    """Return the rows whose time a journal can hold; None if there are none."""
     edges = [_log_ns(plan, time) for time in (batch.first, batch.last)]
     if all(map(is_possible, edges)):
         return batch

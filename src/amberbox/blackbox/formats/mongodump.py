@@ -450,7 +450,7 @@ def document_blocks(
 
 
 def read_document_block(source: ByteSource, offset: int) -> DocumentBlock:
-    """Read about a megabyte of documents, at least one if there is one at this place."""
+    """Read about a megabyte of documents, at least one if there is one at this offset."""
     block = source.read(offset, STRETCH_BYTES)
     length = _length(block[:4])
     if len(block) < length <= _LARGEST:
@@ -528,8 +528,8 @@ _MILLISECOND = datetime.timedelta(milliseconds=1)
 def log_time_ns(document: Mapping[str, Any]) -> int:
     """Return when the black box logged a document; 0 if unknown.
 
-    That is its ``timestamp``: seconds as a float (whose own resolution is 0.24 us), or whatever
-    else is a time.
+    That is its ``timestamp``: seconds as a float (with a resolution of 0.24 us), or a time in
+    another form.
     """
     value = document.get(_TIME)
     if isinstance(value, datetime.datetime):
@@ -555,7 +555,7 @@ def content_of(document: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _rolled_up(flat: Mapping[str, Any]) -> dict[str, Any]:
-    """Nest paths; the document stays as it is when a path is a value and a structure at once."""
+    """Nest paths; the document stays unchanged when a path is a value and a structure at once."""
     nested: dict[str, Any] = {}
     for path, value in flat.items():
         *parents, name = path.strip("/").split("/")

@@ -60,7 +60,9 @@ OnDamage = Callable[[int, int, str], None]  # called with offset, length and rea
 
 
 class BagRecord(NamedTuple):
-    """A record's header fields and the place of its data; ``end`` may lie behind the file's."""
+    """A record's header fields and the offset of its data; ``end`` may be beyond the end of the
+    file.
+    """
 
     offset: int
     operation: int
@@ -271,9 +273,9 @@ def _read_run(
     topic_of: Mapping[int, int],
     content: ChunkContent,
 ) -> int:
-    """Read messages as long as their headers have this layout; return where the run ends.
+    """Read messages as long as their headers have this layout; return the end of the run.
 
-    A message that is followed by no record is left to ``walk``: its length may be wrong.
+    A message that is not followed by another record is left to ``walk``: its length may be wrong.
     """
     unpack, (k0, k1, k2), conn_first, size = layout
     new, append, size_of_raw = tuple.__new__, content.messages.append, len(raw)

@@ -153,7 +153,7 @@ def _decompress_file(path: Path, bag: _Bag) -> Path:
 
 
 def _read_metadata(path: Path, report: RecordingReport) -> Mapping[str, Any]:
-    """Read metadata.yaml; empty, and a note, if it is not there or broken."""
+    """Read metadata.yaml; return an empty mapping and add a note if it is missing or invalid."""
     try:
         content = yaml.safe_load(path.read_text(errors="replace"))["rosbag2_bagfile_information"]
     except FileNotFoundError:

@@ -283,7 +283,7 @@ class UlogState:
 
 @dataclass
 class UlogReader:
-    """Reads records from a known state on and collects their content."""
+    """Reads records from a given position on and collects their content."""
 
     topics: UlogTopics
     formats: dict[str, Any]
@@ -299,7 +299,9 @@ class UlogReader:
         self._subscriptions, self._last_us = self.state.subscriptions, self.state.last_us
 
     def read(self, block: bytes) -> tuple[int, bool]:
-        """Read the whole records of a block; returns how far, and whether damage is there."""
+        """Read the complete records of a block; return the bytes read, and whether there
+        is damage.
+        """
         at, end = 0, len(block)
         while at + 3 <= end:
             size, kind = HEAD(block, at)

@@ -1,1 +1,1 @@
-"""Journal files: MCAP written for power cuts, and read in whatever state they are."""
+"""Journal files: MCAP that survives power cuts, and readers for files in any state."""

@@ -193,9 +193,9 @@ def schema_of(name: str) -> Schema:
 
 
 def topic_of(name: str) -> Topic:
-    """Return the topic of a reserved channel as it is written into MCAP.
+    """Return the topic of a reserved channel for MCAP.
 
-    It carries no MCAP schema: readers that know ROS 2 only refuse a file with others in it.
+    It has no MCAP schema, because readers that support only ROS 2 refuse files with other schemas.
     """
     return Topic(name, "json", None)
 

@@ -194,9 +194,10 @@ class _Records:
 
 
 def _message_sizes(begins: IntArray, bounds: IntArray) -> IntArray:
-    """Return the sizes of messages from where they begin; nothing else lies between them.
+    """Return the sizes of messages from their offsets; the messages have to be adjacent.
 
-    Both count from the first chunk's first byte, ``bounds`` are where the chunks begin and end.
+    All offsets count from the first chunk's first byte; ``bounds`` are those at which the chunks
+    begin and end.
     """
     order = np.argsort(begins, kind="stable")  # they come in long runs that are in order
     begin = begins[order]

@@ -332,7 +332,7 @@ def is_finished(data: bytes | memoryview) -> bool:
 
 
 def ends_of_data(data: bytes | memoryview) -> tuple[int, int]:
-    """Return where the DataEnd record and the footer of a finished file must lie."""
+    """Return the required offsets of the DataEnd record and the footer of a finished file."""
     footer = len(data) - FOOTER_SIZE
     _, _, start = struct.unpack_from("<BQQ", data, footer)
     return (start or footer) - _DATA_END_SIZE, footer

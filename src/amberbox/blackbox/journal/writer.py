@@ -100,7 +100,7 @@ class PackedChunk:
 
 
 def chunk_slices(messages: Sequence[bytes]) -> list[slice]:
-    """Split messages into chunks of about ``CHUNK_BYTES``; larger messages stand alone."""
+    """Split messages into chunks of about ``CHUNK_BYTES``; a larger message gets its own chunk."""
     lengths = np.fromiter(map(len, messages), np.int64, len(messages))
     ends = np.cumsum(lengths)
     if not len(ends) or int(ends[-1]) <= CHUNK_BYTES:
@@ -115,7 +115,7 @@ def chunk_slices(messages: Sequence[bytes]) -> list[slice]:
 
 
 def pack_chunk(rows: MessageRows, define: Define, zstd: zstandard.ZstdCompressor) -> PackedChunk:
-    """Frame and compress one chunk; a message larger than a chunk stays as it is."""
+    """Frame and compress one chunk; a message larger than a chunk is not compressed."""
     order = np.argsort(rows.channels, kind="stable")
     grouped = rows.channels[order]
     firsts = np.flatnonzero(np.concatenate(([True], grouped[1:] != grouped[:-1])))

@@ -517,8 +517,8 @@ def export(
 ) -> ExportReport:
     """Write a view of a record in one of ``FORMS``.
 
-    Memory is bounded whatever the range. The target appears when it is complete; without one, CSV
-    goes to stdout. Requested data that could not be exported are named in the report. Raises
+    Memory use does not depend on the range. The target appears when it is complete; without one,
+    CSV goes to stdout. The report names requested data that could not be exported. Raises
     UsageError for an impossible choice, AmberboxError where there are no data.
     """
     if form not in FORMS:

@@ -179,8 +179,8 @@ class RefreshingCatalogue:
 class View:
     """The selection of a record for an export.
 
-    Without ``items`` these are all that the robot's buses carried; with ``with_box`` also the box's
-    own records. ``variables`` names the columns per table, as a query does; the rest have those
+    Without ``items`` all items of the robot's buses are exported; with ``with_box`` also the box's
+    own records. ``variables`` names the columns per table, as a query does; other tables have those
     chosen in ``black_box.yaml``, or with ``all_variables`` every one. ``received`` adds the columns
     ``received`` and ``seq``. Several ``windows``, such as missions, follow each other in one
     export.
@@ -220,10 +220,10 @@ def _later(first_ns: int | None, second_ns: int | None) -> int | None:
 
 
 def chosen_tables(catalogue: StoreCatalogue, view: View) -> list[TableSchema]:
-    """Return the tables of a view, child tables behind their items.
+    """Return the tables of a view, child tables after their items.
 
-    An item brings its child tables along, unless its variables are named. Raises UsageError for
-    an item that is not there, and where nothing is left.
+    The child tables of an item are included, unless its variables are named. Raises UsageError for
+    an unknown item, and if no table is left.
     """
     named = [*dict.fromkeys([*view.items, *view.variables])]
     schemas = {name: catalogue.schema(name) for name in sorted(catalogue.schemas)}
@@ -250,8 +250,8 @@ def _with_children(
 def chosen_items(catalogue: StoreCatalogue, view: View) -> frozenset[str] | None:
     """Return the items whose messages are in a view; None for all.
 
-    A child table's messages are those of its item. Raises UsageError for an item that is not
-    there, and for variables: messages are whole.
+    A child table's messages are those of its item. Raises UsageError for an unknown item, and for
+    variables, because messages can only be exported whole.
     """
     if view.variables:
         raise UsageError(

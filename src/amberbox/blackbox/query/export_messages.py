@@ -1,4 +1,4 @@
-"""The messages of a record as they came, all items in order of time, in bounded memory.
+"""The original messages of a record, all items in order of time, in bounded memory.
 
 ``read_originals`` adds the last messages of latched topics before the view.
 """
@@ -281,7 +281,7 @@ def without_originals(
 
 @dataclass(frozen=True)
 class Originals:
-    """The streams that there are, and their messages in order of receipt."""
+    """The available streams, and their messages in order of receipt."""
 
     streams: list[ItemStream]
     blocks: Iterator[Messages]

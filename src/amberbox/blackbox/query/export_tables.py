@@ -61,7 +61,7 @@ TableSlice = LazySlice[list[FlatTable]]
 
 @dataclass(frozen=True)
 class TableBlock:
-    """Rows of a table, ready to be written, and how much of the table is done with them."""
+    """Rows of a table, ready to be written, and the share of the table that is then finished."""
 
     table: Table
     received_ns: IntArray

@@ -162,7 +162,7 @@ class ViewerListener:
         self._latched[frame.topic.name] = channel, frame
 
     def on_subscribe(self, client: Client, channel: ChannelView) -> None:
-        """Send a viewer the latched messages from before it came."""
+        """Send a viewer the latched messages from before its connection."""
         self.subscribed.set()
         kept = self._latched.get(channel.topic)
         if kept is not None:
@@ -178,7 +178,7 @@ class ViewerListener:
 
 @dataclass
 class MessageFrames:
-    """The messages of a window as they came."""
+    """The original messages of a window."""
 
     record: Record
     items: Sequence[str]
@@ -399,7 +399,7 @@ _NOW_S = 1e-3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReceivedMessages:
-    """Messages of one stream as they came, with their times of receipt."""
+    """Original messages of one stream, with their times of receipt."""
 
     stream: ItemStream
     received_ns: IntArray
@@ -428,7 +428,7 @@ class MessageTail(WriterTail):
 
 @dataclass
 class LiveMessages:
-    """The messages of a store as they come."""
+    """New messages of a store, sent as they are written."""
 
     store: Path
     items: Sequence[str]
@@ -470,7 +470,7 @@ class LiveMessages:
 
 @dataclass
 class LiveColumns:
-    """The rows of a store as JSON as they come, one topic per table."""
+    """New rows of a store as JSON, sent as they are written; one topic per table."""
 
     store: Path
     items: Sequence[str]

@@ -141,9 +141,9 @@ def last_received_ns(catalogue: StoreCatalogue) -> int | None:
 
 
 def _holes(catalogue: StoreCatalogue) -> Iterator[Gap]:
-    """Yield the missing rows of the journals; rows that are in segments are no gap.
+    """Yield the missing rows of the journals; rows that are in segments are not missing.
 
-    Deleted rows come with their reason, from the tombstones.
+    For deleted rows the tombstones give the reason.
     """
     store = open_store(catalogue.store)
     for writer in (writer for writer in store.writers() if writer in RECORDED):
@@ -153,7 +153,7 @@ def _holes(catalogue: StoreCatalogue) -> Iterator[Gap]:
 
 
 class _HoleTail(WriterTail):
-    """Finds rows that are not there; journals whose rows are in segments are not read again."""
+    """Finds missing rows; journals whose rows are in segments are not read again."""
 
     def __init__(self, store: Store, writer: str, condensed: Collection[str]) -> None:
         super().__init__(store, writer, (), WriterCursor())
@@ -168,7 +168,7 @@ class _HoleTail(WriterTail):
 
 
 def _outside_segments(gap: Gap, catalogue: StoreCatalogue) -> Iterator[Gap]:
-    """Cut out of a gap the journals whose rows are in segments."""
+    """Yield the parts of a gap that are outside of journals whose rows are in segments."""
     assert gap.from_seq is not None
     reached, since_ns = gap.from_seq, gap.from_ns
     end = gap.from_seq if gap.to_seq is None else gap.to_seq

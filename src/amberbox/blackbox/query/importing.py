@@ -49,7 +49,9 @@ _WRITERS = (*(writer for writer in FOLDERS if writer != "main"), "main")
 
 @dataclass(frozen=True, slots=True)
 class StagedStore(Store):
-    """A store whose new journals lie aside; its names, locks and runs are those of the store."""
+    """A store with new journals in a separate folder, but the names, locks and runs of
+    the store.
+    """
 
     def folder(self, writer: str) -> Path:
         """Return the folder of a writer's journal until the import is complete."""
@@ -62,7 +64,7 @@ class StagedStore(Store):
 
 @contextmanager
 def staged(store: Store) -> Iterator[StagedStore]:
-    """Yield a store to write an import to; its journals become the store's when all went well."""
+    """Yield a store to write an import to; its journals are moved into the store on success."""
     remove_leftovers(store)
     stage = StagedStore(store.path, store.id)
     try:
@@ -159,7 +161,7 @@ class ImportReport:
     damage: list[str] = field(default_factory=list)
     known: bool = False
     kinds: dict[str, str] = field(default_factory=dict)
-    """Where the columns of an item come from, if its format leaves a choice."""
+    """Origin of the columns of each item, if its format leaves a choice."""
     accounts: list[str] = field(default_factory=list)
     """What became of every document, row or record of the input."""
 
@@ -188,11 +190,11 @@ def import_recordings(
     segments: bool = True,
     options: ReadOptions = _NO_OPTIONS,
 ) -> list[ImportReport]:
-    """Import recordings into a store, one run each; one that is there already is left out.
+    """Import recordings into a store, one run each; a recording that is already in it is left out.
 
-    Log times are the recording's own, stamps stay with the messages. Items are named as if they
-    had been recorded live, or begin with ``source`` if that is given. Raises AmberboxError when
-    an input cannot be read or the store not written; that input then leaves nothing behind.
+    Log times are the recording's own, stamps stay with the messages. Items are named as if they had
+    been recorded live, or begin with ``source`` if that is given. Raises AmberboxError when an
+    input cannot be read or the store not written; that input then leaves nothing behind.
     """
     digests = [digest_of(path) for path in paths]
     store = create_store(store_path)

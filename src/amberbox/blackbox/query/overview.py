@@ -1,7 +1,7 @@
 """Summarise a record item by item: rows, times, rates, the stamps' distance from receipt.
 
-Of journals that are in no segments yet the index is counted, and messages of a few chunks are
-unrolled: a list of items has to come at once, also of an hour that is just being written.
+For journals that are not segments yet, the index is counted, and only messages of a few chunks are
+unrolled, so that the list is fast also for an hour that is being written.
 """
 
 from __future__ import annotations
@@ -78,13 +78,13 @@ _CHUNKS = 16  # chunks of an item that are unpacked for data not in the index
 class ItemInfo:
     """One data item or child table of a record.
 
-    ``rate_hz`` is over the time of recording: pauses between runs, and what was deleted whole, do
-    not count; None where no two rows came in one run. ``stamp_offset_s`` is how far stamps are
-    behind receipt (median over the record), None without stamps; ``bytes`` counts the messages as
-    received (0 for child tables). ``estimated``: the ``rows`` of a child table come from a sample
-    of messages. Of items the rows are all messages: those that turn out not to decode are left out
-    when their journal becomes segments, and ``gaps`` names them. ``no_columns`` is why there are
-    only raw messages.
+    ``rate_hz`` is over the time of recording: pauses between runs, and completely deleted parts, do
+    not count; None if no run has two rows. ``stamp_offset_s`` is how far stamps are behind receipt
+    (median over the record), None without stamps; ``bytes`` counts the messages as received (0 for
+    child tables). ``estimated``: the ``rows`` of a child table come from a sample of messages. The
+    ``rows`` of an item count all its messages; messages that cannot be decoded are subtracted when
+    their journal becomes segments, and ``gaps`` names them. ``no_columns`` is the reason why there
+    are only raw messages.
     """
 
     name: str
@@ -250,9 +250,10 @@ def _tallies(journal: JournalFile) -> Mapping[int, ChannelTally]:
 def _chosen(
     journal: JournalFile, numbers: Mapping[str, Collection[int]], sampled: Collection[str]
 ) -> tuple[list[ChunkPlace], set[str]]:
-    """Return the chunks to be unpacked, and the items of which these are all.
+    """Return the chunks to unpack, and the items of which these are all chunks.
 
-    All are of a small journal. In others ``_CHUNKS`` are taken evenly of each item with more.
+    Of a small journal all chunks are unpacked. In others ``_CHUNKS`` of each item are chosen
+    evenly.
     """
     holding: dict[int, list[int]] = {n: [] for found in numbers.values() for n in found}
     for index, place in enumerate(journal.places):
@@ -306,7 +307,7 @@ def _share(
 
 
 def _without_rows(catalogue: StoreCatalogue, named: Container[str]) -> Iterator[ItemInfo]:
-    """Yield items of which no message can be unrolled, by their receipt alone."""
+    """Yield items of which no message can be unrolled, with times and counts of receipt only."""
     found: dict[str, list[tuple[JournalFile, ChannelTally]]] = {}
     for journal in catalogue.journals(skip=catalogue.columns_done):
         for item, count in journal.items.items():

@@ -97,8 +97,9 @@ class Record(Protocol):
         """Return ``timestamp`` and variables of an item, in order of time.
 
         Without ``variables`` the table has the ones chosen in ``black_box.yaml``, else all;
-        ``received`` and ``seq`` come when named. ``points`` thins out, keeping extremes.
-        With ``missions`` the ranges are theirs; of several, a column ``mission`` holds the id.
+        ``received`` and ``seq`` are included when named. ``points`` reduces the rows, keeping
+        extremes. With ``missions`` their ranges are returned; for several, a column ``mission``
+        holds the id.
         """
 
     def time_ns(self, moment: Time) -> int | None:
@@ -125,7 +126,7 @@ class Record(Protocol):
     def drawn(
         self, item: str, variables: Sequence[str], span: tuple[Time, Time], by: By, points: int
     ) -> tuple[Table, bool]:
-        """Return the rows that a plot of so many points is made of; whether these are all."""
+        """Return the rows for a plot of ``points`` points, and whether these are all rows."""
         return self.query(item, variables, *span, by), True
 
     def incident_windows(self, incident: str) -> list[tuple[int, int]]:
@@ -239,7 +240,7 @@ class LocalRecord(Record):
 def open(where: str | Path) -> LocalRecord:
     """Open a robot folder, a store, or a recording (bag, MCAP, ULog, CSV, mongodump), for reading.
 
-    Raises UsageError when there is none of these at ``where``.
+    Raises UsageError when ``where`` is none of these.
     """
     path = Path(where)
     if _is_recording(path):
@@ -271,7 +272,7 @@ _CLOSE_NS = 60 * NS
 def windows_of(store: Path, incident: StoredIncident) -> list[tuple[int, int]]:
     """Return the ranges ``[from, to)`` of an incident, in order.
 
-    There are several where its clock was set in between by an unknown amount.
+    There are several if its clock was set within the window by an unknown amount.
     """
     book = read_catalogue(store, with_segments=can_build()).book
     found = sorted(_received(span, book) for span in incident.spans)
@@ -305,9 +306,9 @@ def follow_tables(
     live: bool = True,
     stop: threading.Event | None = None,
 ) -> Iterator[Table]:
-    """Yield rows of an item as they come, from ``from_`` on, or from the newest one.
+    """Yield rows of an item as they are written, from ``from_`` on, or from the newest one.
 
-    Raises UsageError for an item or variable that is not there.
+    Raises UsageError for an unknown item or variable.
     """
     catalogue = read_catalogue(record.path, with_segments=can_build())
     schema = catalogue.schema(item)

@@ -120,7 +120,7 @@ def event_time_ns(at_ns: int, received_ns: int) -> int:
 
 
 def join_spans(spans: Iterable[Span]) -> list[Span]:
-    """Join spans that touch; they come in order."""
+    """Join spans that touch; they have to be in order."""
     found: list[Span] = []
     for first, last in spans:
         if found and found[-1][1] >= first:

@@ -32,10 +32,10 @@ _KEYS = {
 
 
 class TableCatalogue(Protocol):
-    """The tables that a query chooses from: a catalogue of one store, or of several."""
+    """The tables available to a query: a catalogue of one store, or of several."""
 
     def schema(self, table: str) -> TableSchema:
-        """Return a table's columns; raises UsageError for one that is not there."""
+        """Return a table's columns; raises UsageError for an unknown table."""
 
     @property
     def selection(self) -> Mapping[str, Sequence[str]]:
@@ -75,7 +75,7 @@ def answer(
 
 
 def check_order(by: str, points: int | None) -> None:
-    """Raise UsageError for an order of rows, or a number of points, that there is not."""
+    """Raise UsageError for an invalid order of rows or number of points."""
     if by not in ("received", "timestamp"):
         raise UsageError(f"rows are ordered by received or timestamp, not by {by!r}")
     if points is not None and points < 1:
@@ -157,7 +157,7 @@ MISSION = "mission"
 def query_missions(
     missions: Sequence[RecordedMission], query: Callable[[int, int | None], Table]
 ) -> Table:
-    """Return the rows of each mission; of several, a column ``mission`` holds their ids.
+    """Return the rows of each mission; for several, a column ``mission`` holds their ids.
 
     ``query`` returns the rows of ``[from, to)``. Raises UsageError when there is no mission.
     """

@@ -48,7 +48,9 @@ class DiskRoom:
         return self._wanted_bytes // 8
 
     def begin(self) -> None:
-        """Allocate the reserve, unless the run before released it or there is too little room."""
+        """Allocate the reserve, unless the previous run released it or there is too
+        little space.
+        """
         self.release_if_tight()
         self.update()
         short = self._wanted_bytes - (self._size() or 0)
@@ -56,7 +58,7 @@ class DiskRoom:
             self.trouble = "too little room is free"
 
     def update(self, written_bytes: int = 0, coming_bytes: int = 0) -> None:
-        """Update ``reason`` by whether there is room for the next ``coming_bytes``.
+        """Update ``reason``: whether there is space for the next ``coming_bytes``.
 
         ``written_bytes`` are those that this run has written so far.
         """
@@ -91,7 +93,7 @@ class DiskRoom:
             self.release()
 
     def _refill(self, left_bytes: int | None) -> None:
-        """Allocate the whole reserve once there is room for it and ``SPARE_BYTES`` more."""
+        """Allocate the whole reserve once there is space for it and ``SPARE_BYTES`` more."""
         size = self._size() or 0
         if left_bytes is not None and left_bytes < self._wanted_bytes - size:
             return
@@ -104,7 +106,7 @@ class DiskRoom:
         self._not_before_s = time.monotonic() + _PAUSE_S if self.trouble else 0.0
 
     def _size(self) -> int | None:
-        """Return the size of the reserve; None if there never was one."""
+        """Return the size of the reserve; None if it was never allocated."""
         try:
             return self._path.stat().st_size
         except OSError:
@@ -152,8 +154,8 @@ _NOT_CONNECTED = "publisher not connected yet"
 class GapLog:
     """The open gaps per item and peer; writes a record when one opens and when it closes.
 
-    The record of the opening has ``to_ns`` null: should the box die, the gap lasts at least to
-    the end of its record, and the next run opens its own from there.
+    The record of the opening has ``to_ns`` null: if the box dies, the gap lasts at least to the end
+    of its record, and the next run opens its own from there.
     """
 
     write: Write
@@ -263,10 +265,10 @@ ACCOUNT_NS = (NS, 60 * NS)
 
 @dataclass
 class AdmissionControl:
-    """Refuses messages while there is no room on the disk, and counts every one of them.
+    """Refuses messages while there is no space on the disk, and counts every one of them.
 
-    Items of the ``elsewhere`` writers are kept on another disk and go on. The last message of a
-    latched topic is held back and recorded when there is room, as it is not sent again.
+    Items of the ``elsewhere`` writers are on another disk and are still recorded. The last message
+    of a latched topic is held back and recorded when there is space, as it is not sent again.
     """
 
     room: DiskRoom
@@ -330,7 +332,7 @@ class AdmissionControl:
         self.queue.refuse(messages, reason)
 
     def report(self) -> None:
-        """Report by an event when the room is used up, or there is room again."""
+        """Emit an event when the space is used up, or available again."""
         reason, trouble = self.room.reason, self.room.trouble
         if trouble and trouble != self._reported_trouble:
             self.emit("no_reserve", f"there is no reserve for the last events: {trouble}")

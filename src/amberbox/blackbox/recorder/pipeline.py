@@ -658,9 +658,9 @@ class Pipeline:
         return self._journals.mark_sync()
 
     def close(self) -> None:
-        """Write the rest, finish the files, release the locks of the store.
+        """Write the remaining rows, finish the files, release the locks of the store.
 
-        Raises AmberboxError when the rest cannot be written.
+        Raises AmberboxError when the rows cannot be written.
         """
         self.gaps.close(self.clock.now_ns())
         if self._admission is not None:

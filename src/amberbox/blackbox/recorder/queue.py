@@ -1,7 +1,8 @@
 """The recorder's queue, and the streams and items whose messages pass through it.
 
-The queue is bounded and never blocks a live source; every drop is counted. A batch is filtered by
-the rate limit; then schemas are inferred from the rest; then unchanged messages are dropped.
+The queue is bounded and never blocks a live source; every drop is counted. A batch first passes the
+rate limit; then schemas are inferred from the remaining messages; then unchanged messages are
+dropped.
 """
 
 from __future__ import annotations
@@ -239,7 +240,7 @@ def change_filtered(kept: list[StreamMessage], emit: EmitEvent) -> list[StreamMe
 
 
 def _infer(stream: TopicStream, messages: Sequence[bytes], now_ns: int, emit: EmitEvent) -> None:
-    """Widen a stream's schema to fit all these messages; a wider schema is an event."""
+    """Widen a stream's schema so that it fits all these messages; emit an event if it is wider."""
     topic, item = stream.topic, stream.item
     if item.versions >= MOST_VERSIONS:
         return
@@ -363,7 +364,7 @@ class MessageQueue:
             self._queue.append((stream, data, received_ns))
 
     def _is_full_for(self, size: int) -> bool:
-        """Return whether there is no room; an empty queue accepts one message of any size."""
+        """Return whether the queue is full; an empty queue accepts one message of any size."""
         used = self._bytes + self._waiting_bytes
         return used > 0 and used + size > self.limit_bytes
 

@@ -174,7 +174,7 @@ class Syncer:
 
 
 def _wait_for(mark: SyncMark) -> str:
-    """Make a journal durable; return the error text, empty on success."""
+    """Wait until a journal is durable; return the error text, empty on success."""
     try:
         mark.wait()
     except OSError as error:
@@ -476,7 +476,8 @@ def _pipeline(folder: RobotFolder, store: Store, clock: Clock) -> Pipeline:
 
 
 def virtual_start_ns(folder: RobotFolder) -> int | None:
-    """Return the start of virtual time if all sources of a folder bring their own time, else None.
+    """Return the start of virtual time if all sources of a folder have times of their own, else
+    None.
 
     Raises UsageError when only some do: a record has one time base.
     """

@@ -1,7 +1,8 @@
-"""Delete the units that the rule chose: tombstones first and durable, then the files.
+"""Delete the units chosen by the rule: tombstones are written and synced before the files are
+deleted.
 
 The box's own records of a journal that is deleted before it has columns are copied to a kept
-journal; deletions are logged as summed-up events. Making room runs in a thread of its own.
+journal; deletions are logged as summarised events. Space is freed in a thread of its own.
 ``JournalInventory`` describes a store's sealed journals, from which units of the rule are made.
 """
 
@@ -100,7 +101,9 @@ class JournalInventory:
         return self._use.sizes(folder).get(file, 0)
 
     def windows(self, known: Manifest) -> dict[str, JournalWindow]:
-        """Return where each journal lies of which raw or columns are here, writer by writer."""
+        """Return the run and times of each journal whose raw data or columns exist, writer by
+        writer.
+        """
         found: list[JournalWindow] = []
         on_disk: set[str] = set()
         for writer in RECORDED:
@@ -195,7 +198,7 @@ class JournalInventory:
 
 
 def _place(name: str) -> tuple[int, int]:
-    """Read run and file number from a journal's name; there may be very many of them."""
+    """Read run and file number from a journal's name; called for very many of them."""
     run, _, rest = name.rpartition("/")[2].removesuffix(".mcap").partition("-")
     number = rest.rpartition("-")[2]
     return (int(run), int(number)) if run.isdigit() and number.isdigit() else (0, 0)
@@ -380,7 +383,9 @@ def pinned_incidents(store: Store) -> list[StoredIncident]:
 
 
 def release_confirmed(store: Store) -> str | None:
-    """Release the oldest incident that a server holds; return its id, None if there is none."""
+    """Release the oldest incident that a server has confirmed; return its id, None if there is
+    none.
+    """
     from amberbox.blackbox.retention.pins import release
 
     confirmed = [incident for incident in pinned_incidents(store) if incident.confirmed]
@@ -452,7 +457,7 @@ class Remover:
         return removal.what == "columns" and (self.store.path / removal.unit.name).exists()
 
     def _what(self, removal: Removal, known: Manifest) -> DeletionKind | None:
-        """Return what is really deleted; raw data without columns counts as both."""
+        """Return the part that is really deleted; raw data without columns counts as both."""
         has_raw = (self.store.path / removal.unit.name).exists()
         has_columns = removal.unit.name in known.journals
         raw = has_raw and removal.what != "columns"
@@ -543,7 +548,7 @@ class Deleter:
 
     @contextmanager
     def expecting(self, size: int, busy: str = "") -> Iterator[bool]:
-        """Hold ``size`` bytes free for a coming write; yields whether there is room.
+        """Hold ``size`` bytes free for a coming write; yields whether there is space.
 
         Journal ``busy`` is being read meanwhile and is not deleted.
         """
@@ -557,7 +562,7 @@ class Deleter:
 
     @property
     def is_full(self) -> bool:
-        """Return whether nothing but events is recorded for want of room."""
+        """Return whether only events are recorded because of missing space."""
         return self._full.is_set
 
     def sealed(self, writer: str) -> list[str]:
@@ -573,7 +578,7 @@ class Deleter:
             self.make_room(patient=now_s < self._retry_after_s)
 
     def make_room(self, *, patient: bool = False) -> None:
-        """Delete until there is room again; where nothing may go, mark the store as full."""
+        """Delete until there is space again; mark the store as full if nothing may be deleted."""
         try:
             with mf.CHANGING:
                 left = self.measure()
@@ -655,7 +660,7 @@ class Deleter:
                 self._log.forget()
 
     def close(self) -> None:
-        """Write down the rest."""
+        """Write the pending deletions into the log."""
         self.report(now=True)
         with suppress(OSError):
             self._kept.close()

@@ -139,7 +139,9 @@ class IncidentService:
         self._unreadable: set[Path] = set()
 
     def step(self) -> None:
-        """Handle requests, open incidents, and those that are not in the journal yet."""
+        """Handle requests, update open incidents, and write incidents that are not in the journal
+        yet.
+        """
         for request in store.pending(self._store):
             if request.kind == KIND:
                 self._grant(request)
@@ -281,10 +283,10 @@ class Firing:
 
 
 class TriggerWatcher(Protocol):
-    """Evaluates a trigger on rows as they come.
+    """Evaluates a trigger on new rows.
 
-    ``items`` are those whose rows it reads, ``waits_for`` those that have to come before it can
-    fire; rows matter for ``history_ns``.
+    ``items`` are those whose rows it reads, ``waits_for`` those that must have been received before
+    it can fire; rows are needed for ``history_ns``.
     """
 
     items: frozenset[str]
@@ -320,7 +322,7 @@ class WhenWatcher:
         return [Firing(edge.at_ns) for edge in self._conditions.edges(until_ns)]
 
     def problems(self) -> Iterator[str]:
-        """Return why the expression cannot be judged."""
+        """Yield the reasons why the expression cannot be evaluated."""
         yield from self._conditions.problems.values()
 
 
@@ -407,7 +409,7 @@ def watcher_of(trigger: Trigger) -> TriggerWatcher:
 
 
 def reads_watch(trigger: Trigger, watcher: TriggerWatcher) -> bool:
-    """Return whether a trigger reads records of the watcher, which come a moment later."""
+    """Return whether a trigger reads records of the watcher, which arrive slightly later."""
     if trigger.event:
         return fnmatchcase(_TRANSITION, trigger.event)
     return any(item in _WATCHED or item.startswith(_PROBE) for item in watcher.waits_for)
@@ -580,7 +582,7 @@ class Triggers:
 
 
 def _until(watch: _Watch, part: RunSlice) -> int:
-    """Return up to when a trigger can be judged: the watcher writes a moment later than others."""
+    """Return up to when a trigger can be evaluated: the watcher writes slightly later."""
     if part.watched_ns is None or not watch.reads_watch:
         return part.until_ns
     return min(part.until_ns, max(part.watched_ns, part.until_ns - _PATIENCE_NS))

@@ -1,7 +1,7 @@
 """Read a record as it grows, run by run, on one axis of time for all its journals.
 
-The axis is log time; where the clock was set within a run, it goes on as if nothing had happened,
-so that durations stay right.
+The axis is log time. If the clock was set within a run, the axis continues without a step, so that
+durations stay right.
 """
 
 from __future__ import annotations
@@ -84,9 +84,9 @@ class RunSlice:
     batches: list[tuple[Batch, IntArray]] = field(default_factory=list)
     until_ns: int = 0
     known: int = 1
-    """So many stretches of log time had begun where the reading goes on."""
+    """Number of sections of log time that had begun at the reading position."""
     watched_ns: int | None = None
-    """Up to when the watcher has written down what it finds; None where none is at work."""
+    """Time up to which the watcher has written its findings; None if no watcher runs."""
 
     def left_ns(self, log_ns: int) -> int:
         """Return the time of the log time at which the reading was left."""
@@ -105,7 +105,8 @@ class RunSlice:
 class LiveReader:
     """Reads some items of a store from a cursor on; ``step`` returns new rows, run by run.
 
-    Only recorders count runs here; rows of other writers (``watch``) come with the present run.
+    Only the recorder's runs count; rows of other writers (``watch``) are returned with the present
+    run.
     """
 
     def __init__(

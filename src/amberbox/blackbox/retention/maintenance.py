@@ -70,7 +70,7 @@ class StoreChangeDetector:
         return True
 
     def _now(self) -> Situation:
-        """Return the manifest's head, which files there are, and which of them are written."""
+        """Return the manifest's head, the existing files, and which of them are being written."""
         folders = [self._store.folder(writer) for writer in FOLDERS]
         times_ns = [folder.stat().st_mtime_ns for folder in folders if folder.exists()]
         locks = [is_locked(self._store, writer) for writer in ("main", "bulk")]
@@ -107,7 +107,7 @@ class RetentionService:
         """The manifest for which nothing is left to be dropped."""
 
     def start_space_thread(self) -> None:
-        """Make room in a thread of its own from now on, whatever else there is to do."""
+        """Start the thread that frees disk space from now on, independent of other tasks."""
         self._room = FreeSpaceThread(self._deleter.make_room_if_due)
 
     def step(self, stop: threading.Event) -> None:

@@ -59,7 +59,7 @@ _FIELDS = ("id", "name", "state", "outcome", "from_ns", "to_ns", "who", "details
 
 @dataclass(frozen=True, slots=True)
 class MissionInstant:
-    """When something was, as well as it was known then, and how to find out better.
+    """The time of a moment as known then, and the position from which it can be corrected later.
 
     Either ``run`` and log time are known, or the boot and the time since then; or neither.
     """
@@ -108,12 +108,12 @@ class RecordedMission:
     def ended(
         self, end: MissionInstant, outcome: str, failed: bool | None = None
     ) -> RecordedMission:
-        """Return the mission as it is once it has ended."""
+        """Return the mission with its end and outcome."""
         judged = outcome in FAILED if failed is None else failed
         return replace(self, end=end, outcome=outcome, failed=judged)
 
     def corrected(self, book: ClockBook) -> RecordedMission:
-        """Return the mission with times as they are known now."""
+        """Return the mission with times corrected by the present knowledge of the clocks."""
         start = replace(self.start, received_ns=self.start.corrected_ns(book))
         if self.end is None:
             return replace(self, start=start)
@@ -203,7 +203,7 @@ def choose(
     last: int | None = None,
     span: tuple[int | None, int | None] = (None, None),
 ) -> list[RecordedMission]:
-    """Return missions of a name, failed ones, those that overlap ``[from, to)``, the last few."""
+    """Return missions by name, failed ones, those that overlap ``[from, to)``, or the last few."""
     from_ns, to_ns = span
     chosen = [
         mission
@@ -288,9 +288,9 @@ class MissionTracker:
         return [mission for mission in self._known.values() if mission.end is None]
 
     def start(self, mission: RecordedMission) -> list[RecordedMission]:
-        """Begin a mission and end an open one of that name; return both as they are then.
+        """Begin a mission and end an open one of that name; return both.
 
-        Nothing happens if it is known already.
+        A mission that is already known changes nothing.
         """
         if mission.id in self._known:
             return []
@@ -419,7 +419,7 @@ class MissionService:
             self._write_progress(self._follower)
 
     def note(self, missions: Sequence[RecordedMission]) -> None:
-        """Write missions down as they are."""
+        """Write missions into the journal."""
         self._journal.write([mission.record() for mission in missions])
 
     def _take_requests(self) -> None:
@@ -674,7 +674,7 @@ def with_keeper_lock(store: Store, work: Callable[[MissionService], object]) -> 
 
 
 def write(store: Store, missions: list[RecordedMission]) -> None:
-    """Write down missions that were found later; raises AmberboxError while a keeper runs."""
+    """Write missions that were detected later; raises AmberboxError while a keeper runs."""
 
     def add(keeper: MissionService) -> None:
         for mission in missions:

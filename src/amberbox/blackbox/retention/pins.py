@@ -67,7 +67,7 @@ _MARGIN_NS = NS  # other journals may have rows just before the main one's first
 
 @dataclass(frozen=True, slots=True)
 class RunSection:
-    """A stretch of a run without a step of the clock, and where it lies in the record's time.
+    """A section of a run without a step of the clock, and its place in the record's time.
 
     ``age_ns`` is how long before the end of the record it ended.
     """
@@ -106,7 +106,7 @@ class RecordTimeline:
         return self.pieces[0].end_ns + self.pieces[0].offset_ns
 
     def age_ns(self, at: LogMoment) -> int | None:
-        """Return how long before the end a moment was; None where it lies before all pieces."""
+        """Return how long before the end a moment was; None if it is before all sections."""
         for piece in self.pieces:
             if piece.run == at.run and piece.start_ns - _MARGIN_NS <= at.log_ns:
                 return max(piece.age_of(at.log_ns), 0)
@@ -115,7 +115,7 @@ class RecordTimeline:
         return None
 
     def at(self, age_ns: int) -> LogMoment:
-        """Return the moment that was so long before the end, or the oldest one there is."""
+        """Return the moment ``age_ns`` before the end, or the oldest known moment."""
         for piece in self.pieces:
             if age_ns <= piece.start_age_ns:
                 return LogMoment(
@@ -260,9 +260,9 @@ def refused_by_budget(
 def _lasting_bytes(
     store: Store, pinned: Sequence[StoredIncident], options: RetentionOptions
 ) -> int:
-    """Return how much cannot be deleted because of incidents, now and when files have grown.
+    """Return how many bytes cannot be deleted because of incidents, now and when files have grown.
 
-    Columns count where their journal is gone; else they are there twice, and go when there is need.
+    Columns count only if their journal is gone; otherwise they are duplicates, and can be deleted.
     """
     journals = list(_journals(store, pinned, wide=True))
     raw = {f"{path.parent.name}/{path.name}" for path in journals}
@@ -332,7 +332,7 @@ def _is_held(path: Path, incidents: Sequence[StoredIncident], *, wide: bool = Fa
 def _segments(
     store: Store, incidents: Sequence[StoredIncident]
 ) -> Iterator[tuple[Path, Sequence[SegmentPart]]]:
-    """Yield the segments that are held, and their parts that lie in a window."""
+    """Yield the segments that incidents hold, and their parts within a window."""
     for segments in manifest.read(store.path).segments.values() if incidents else ():
         for segment in segments:
             inside = [
@@ -578,7 +578,9 @@ def _fits(store: Store, incident: StoredIncident, options: RetentionOptions) -> 
 
 
 def _ended(incident: StoredIncident, timeline: RecordTimeline, end_age_ns: int) -> StoredIncident:
-    """Return an incident as it is complete when its window ends so long before the record's end."""
+    """Return an incident as complete, with a window that ends ``end_age_ns`` before the record's
+    end.
+    """
     since_age_ns = timeline.age_ns(incident.since) or 0
     spans = joined_spans(incident.spans, timeline.spans(since_age_ns, end_age_ns))
     to_ns = timeline.received_ns(timeline.at(end_age_ns)) + 1

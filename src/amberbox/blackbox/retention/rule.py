@@ -22,7 +22,7 @@ TOO_OLD = "older than its lifetime"
 
 
 class Pin(Protocol):
-    """A stretch of the record that stays: an incident."""
+    """A pinned section of the record: an incident."""
 
     def holds_received(self, run: int, from_ns: int, to_ns: int) -> bool:
         """Return whether it meets rows of a run that were received in ``[from, to]``."""
@@ -32,7 +32,7 @@ class Pin(Protocol):
 class DeletionUnit:
     """A unit of deletion: a finished journal file, and its columns.
 
-    Bytes are 0 for a part that does not exist (any more). ``age_s`` is how much record there is
+    Bytes are 0 for a part that does not exist (any more). ``age_s`` is the duration of the record
     after its end; ``pending``: its columns are still to be built.
     """
 
@@ -161,10 +161,10 @@ def _lifetimes(options: RetentionOptions) -> tuple[float, float]:
 
 @dataclass(frozen=True, slots=True)
 class JournalWindow:
-    """Where a journal file lies in its writer's run, and when it was received.
+    """The position of a journal file in its writer's run, and its times of receipt.
 
-    ``stepped_ns`` is by how much its clock was set meanwhile; ``synchronised`` whether it was right
-    at its end, as far as that is known.
+    ``stepped_ns`` is by how much its clock was set meanwhile; ``synchronised`` whether the clock
+    was right at its end, as far as that is known.
     """
 
     name: str
@@ -181,7 +181,7 @@ class JournalWindow:
 
 
 def ages_s(windows: Sequence[JournalWindow], *, sure: bool = False) -> dict[str, float]:
-    """Return how much record there is after the end of each journal, independent of clock steps.
+    """Return the duration of the record after the end of each journal, independent of clock steps.
 
     Files of a run follow each other without a pause: where their times do not, the clock was set.
     Journals of other writers are placed among the main journals of their run. With ``sure`` a pause

@@ -149,7 +149,7 @@ class Allowance:
         self._written: deque[tuple[int, int]] = deque(maxlen=_HISTORY)
         self._stated = read_statement(self._path)
         self._baseline = 0
-        """What this run had written when the keeper looked; what it finds at first is older."""
+        """Bytes that this run had written at the keeper's measurement; the first one is older."""
 
     def left_bytes(self, written_bytes: int) -> int | None:
         """Return the bytes that a run may still write after ``written_bytes``; None: no bound."""
@@ -178,7 +178,7 @@ def publish_statement(store: Path, statement: SpaceStatement) -> None:
 
 
 def read_statement(path: Path) -> SpaceStatement | None:
-    """Return the statement of the maintenance process; None where there is no whole one."""
+    """Return the statement of the maintenance process; None if it is missing or incomplete."""
     with suppress(OSError, ValueError):
         left, enough, looked = map(int, path.read_bytes().split())
         return SpaceStatement(left, enough, looked)
@@ -205,7 +205,7 @@ class SpaceBudget:
 
     @property
     def needed(self) -> int:
-        """Return the bytes that have to be deleted now; 0 or less when there is room."""
+        """Return the bytes that have to be deleted now; 0 or less when there is enough space."""
         return self.used + self.headroom - self.limit
 
     @property
@@ -240,7 +240,7 @@ def space_budget(
 
 
 class FullMark:
-    """The file ``full`` in a store: while it is there, nothing but events is recorded."""
+    """The file ``full`` in a store: while it exists, only events are recorded."""
 
     def __init__(self, store: Store) -> None:
         self._path = store.path / FULL
@@ -255,7 +255,7 @@ class FullMark:
         return True
 
     def clear(self) -> bool:
-        """Remove the mark; False if there was none."""
+        """Remove the mark; False if it did not exist."""
         if not self.is_set:
             return False
         self._path.unlink(missing_ok=True)
@@ -274,7 +274,7 @@ def with_reserve(store: Store, action: Callable[[], Result]) -> Result:
 
 
 def shrink_reserve(reserve: Path) -> bool:
-    """Free a part of the reserve; False when there is none left."""
+    """Free a part of the reserve; False when none is left."""
     try:
         size = reserve.stat().st_size
         if size == 0:
@@ -290,7 +290,7 @@ PIN_LOCK_FILE = "lock.pins"
 
 @contextmanager
 def pin_lock(store: Store) -> Iterator[None]:
-    """Hold the lock for pinning and deleting; its holder reads the pins anew before deleting.
+    """Hold the lock for pinning and deleting; its holder reads the pins again before deleting.
 
     Waits for the other holder, which keeps it for a few files at most.
     """

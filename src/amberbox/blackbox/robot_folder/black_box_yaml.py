@@ -40,7 +40,7 @@ NOT_BUILT_YET = (
 
 @dataclass(frozen=True)
 class DefaultParameters:
-    """What holds for all topics that do not say otherwise."""
+    """Default values of the keys of topics."""
 
     max_frequency: float | None = option(None, "keep at most this many per second", unit="Hz")
 

@@ -42,8 +42,8 @@ class Lifetime:
 class Trigger:
     """A trigger of incidents: a condition that becomes true, an event, or the silence of an item.
 
-    ``when`` is an expression, ``event`` the kind of an event (``*`` stands for anything); nothing
-    was received of item ``silence`` for ``silence_s``. One of the three is given.
+    ``when`` is an expression, ``event`` the kind of an event (``*`` matches any text); nothing was
+    received of item ``silence`` for ``silence_s``. One of the three is given.
     """
 
     name: str
@@ -61,8 +61,8 @@ class Trigger:
 class MissionRule:
     """Expressions that begin and end a mission of a name.
 
-    ``failed``, ``outcome`` are read at its end, ``parameters`` at its start. After ``max_s`` it
-    ends by itself.
+    ``failed``, ``outcome`` are evaluated at its end, ``parameters`` at its start. After ``max_s``
+    it ends automatically.
     """
 
     name: str
@@ -253,7 +253,7 @@ def _unknown(item: str, sources: Sequence[str], items: Sequence[str]) -> str:
 
 @dataclass(frozen=True)
 class MissionOptions:
-    """What begins and ends the missions of one kind, read from what is recorded."""
+    """Configuration of the rule that begins and ends the missions of one kind."""
 
     name: str = option(doc="kind of mission, such as transport")
     start: str = option(doc="expression: a mission begins when it becomes true")
@@ -291,7 +291,7 @@ class MissionOptions:
 def read_rules(path: Path) -> tuple[MissionRule, ...]:
     """Read the mission rules of a robot folder or of a YAML file; other keys are ignored.
 
-    Raises UsageError when there is no such file, ConfigurationError for what is wrong in it.
+    Raises UsageError when there is no such file, ConfigurationError for invalid values.
     """
     file = path / "robot.yaml" if path.is_dir() else path
     if not file.is_file():

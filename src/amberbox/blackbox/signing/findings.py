@@ -25,9 +25,9 @@ BAD: frozenset[FindingState] = frozenset({"damaged", "altered", "missing"})
 class VerifyFinding:
     """A finding: data changed since the robot wrote them, or not covered by a signature.
 
-    ``chunk`` is the offset of the chunk that is hit (of the first one where several may be),
-    ``from_byte`` and ``to_byte`` bound what is hit, ``from_ns`` and ``to_ns`` are when it was
-    received; None where it is not known. ``item`` is set for segments.
+    ``chunk`` is the offset of the affected chunk (the first one if there may be several),
+    ``from_byte`` and ``to_byte`` bound the affected bytes, ``from_ns`` and ``to_ns`` are their
+    times of receipt; None where unknown. ``item`` is set for segments.
     """
 
     state: FindingState
@@ -88,7 +88,7 @@ class VerifyReport:
 
 @dataclass(slots=True)
 class FindingCollector:
-    """Findings and files as they come in."""
+    """Collects findings and checked files."""
 
     findings: list[VerifyFinding] = field(default_factory=list)
     files: dict[str, FindingState] = field(default_factory=dict)

@@ -1,9 +1,9 @@
 """Check one journal file: its hash chain, its end, and its identity with its name.
 
 A block of a journal holds compressed messages with a checksum, and bytes around them that follow
-from the messages (indices, lengths, links of the chain). When the messages hold, everything else
-can be written anew. If the result has the hash that the chain states, the messages are proven and
-only the frame was hit; if it has not, messages were changed and their checksums repaired.
+from the messages (indices, lengths, links of the chain). If the messages are valid, all other bytes
+can be rebuilt. If the rebuilt block has the hash of the chain, the messages are proven and only the
+bytes around them were damaged; otherwise messages were changed and their checksums recomputed.
 """
 
 from __future__ import annotations
@@ -167,7 +167,7 @@ def rebuilt_block(
 
 
 def first_difference(data: Buffer, start: int, block: bytes) -> int:
-    """Return the offset of the first byte that is not as it was."""
+    """Return the offset of the first byte that differs."""
     is_now = np.frombuffer(data[start : start + len(block)], np.uint8)
     was = np.frombuffer(block, np.uint8)[: len(is_now)]
     different = np.flatnonzero(is_now != was)
@@ -225,7 +225,7 @@ _PROFILES = ("", "ros1", "ros2")
 
 @dataclass(frozen=True, slots=True)
 class JournalIdentity:
-    """The expected start of a journal file; ``chains`` are the links it may go on from."""
+    """The expected start of a journal file; ``chains`` are the links it may continue from."""
 
     store_id: str
     writer: str
@@ -311,7 +311,9 @@ def _mend(data: Buffer, identity: JournalIdentity, block: HashedBlock, seen: _Se
 def _file_ends(
     data: Buffer, seen: _Seen, leads: Sequence[bytes], block: HashedBlock
 ) -> Iterator[bytes]:
-    """Yield possible ends of a file after its last chunk: as it is, or an index after a mark."""
+    """Yield possible ends of a file after its last chunk: the present bytes, or an index after a
+    mark.
+    """
     for lead in leads[:1]:
         at = seen.chunks[-1].end if seen.chunks else block.start + len(lead)
         rest = bytes(data[at : block.end])
@@ -414,10 +416,10 @@ class CheckTarget:
 
 @dataclass(slots=True)
 class CheckedJournal:
-    """The result of checking a file: how far its chain goes, and the findings.
+    """The result of checking a file: how far its chain reaches, and the findings.
 
-    ``loose_from`` is the first byte that no link covers, ``torn`` how many bytes at the end are no
-    whole record, ``tail`` the SHA-256 of what follows the ``last`` link, itself included. ``noted``
+    ``loose_from`` is the first byte that no link covers, ``torn`` the number of bytes of an
+    incomplete record at the end, ``tail`` the SHA-256 from the ``last`` link to the end. ``noted``
     are the links that were searched for.
     """
 
@@ -444,7 +446,7 @@ class CheckedJournal:
 
     @property
     def chain(self) -> str:
-        """Return the last link; where there is none, the one that the file began with."""
+        """Return the last link; without one, the link that the file began with."""
         return self.last.chain if self.last is not None else self.start_chain
 
 
@@ -655,7 +657,9 @@ class _Checking:
             self._add("damaged", found.reason, start, end, start)
 
     def _is_finished(self) -> bool:
-        """Return whether the file has its end; check the bytes there that no checksum covers."""
+        """Return whether the file has its final records; check their bytes, which no checksum
+        covers.
+        """
         link, data = self.before, self.data
         summary = read_summary(data)
         if summary is None or link is None:

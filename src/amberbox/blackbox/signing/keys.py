@@ -36,7 +36,7 @@ class RobotSigningKey:
 class StoreKeys:
     """The key to sign with, if there is one, and warnings about it.
 
-    ``is_new``: the key published before was another one, or there was none.
+    ``is_new``: the key published before was a different one, or there was none.
     """
 
     key: RobotSigningKey | None
@@ -50,9 +50,9 @@ def can_sign() -> bool:
 
 
 def open_keys(store: Store) -> StoreKeys:
-    """Read the store's key, or make one at the first start; only the keeper calls this.
+    """Read the store's key, or create one at the first start; only the keeper calls this.
 
-    Without a key that can be used everything goes on unsigned, and ``warnings`` hold why.
+    Without a usable key data stay unsigned, and ``warnings`` give the reason.
     """
     if not can_sign():
         return StoreKeys(None, ("nothing is signed: the package cryptography is not installed",))
@@ -93,7 +93,7 @@ def _width(path: Path) -> list[str]:
 
 
 def _publish(store: Store, public: str, *, made: bool) -> list[str]:
-    """Write the public half beside the key; return a warning when another one was there."""
+    """Write the public half beside the key; return a warning if it replaces another one."""
     path = store.path / PUBLIC
     known = public_key(store.path)
     if known == public:
@@ -115,7 +115,7 @@ def to_pem(public: str) -> str:
 
 
 def public_key(store: Path) -> str | None:
-    """Return the public key that lies in a store (hex); None without one that can be read."""
+    """Return the public key of a store (hex); None without a readable one."""
     try:
         return _from_pem((store / PUBLIC).read_bytes())
     except (OSError, ValueError, TypeError):

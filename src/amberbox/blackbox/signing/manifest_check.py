@@ -58,8 +58,8 @@ class CheckedManifest:
     """The content of the lines and how far they are trusted.
 
     ``hashes`` are the numbers of the lines with each hash, ``sealed`` those that seal each journal;
-    ``signatures`` are those that hold, with the line they stand in; ``claims`` are the statements
-    of each line on files other than sealed ones; ``known`` is the manifest as a whole.
+    ``signatures`` are the valid ones, with their line; ``claims`` are the statements of each line
+    on files other than sealed ones; ``known`` is the manifest as a whole.
     """
 
     hashes: dict[str, int] = field(default_factory=dict)
@@ -212,7 +212,7 @@ class KeyTrust:
 
     @property
     def is_signed(self) -> bool:
-        """Return whether there is any signature to go by."""
+        """Return whether there is any valid signature."""
         return self.signed_line > 0
 
 
@@ -238,7 +238,7 @@ def check_trust(given: str, store: Path, lines: CheckedManifest) -> KeyTrust:
 def _choose(
     given: str, store: Path, last: ManifestSignature | None
 ) -> tuple[str, list[str], list[VerifyFinding]]:
-    """Return the key to believe; one that differs from ``key.pub`` by a bit shows damage there."""
+    """Return the key to trust; one that differs from ``key.pub`` by a bit shows damage there."""
     published = public_key(store)
     if given or (last is None and published is None):
         return given, [], []
@@ -436,7 +436,7 @@ def _all_links(checked: CheckedJournal) -> set[str]:
 
 
 def _is_explained(checked: CheckedJournal, before: CheckedJournal | None) -> bool:
-    """Return whether something was found already that explains why the chain breaks here."""
+    """Return whether an earlier finding explains why the chain breaks at this file."""
     both = [*checked.findings, *(before.findings if before is not None else ())]
     return any(finding.state in BAD for finding in both)
 
@@ -490,7 +490,7 @@ class KnownHashes:
     graves: DeletedFiles
 
     def where(self, digits: str) -> str:
-        """Return the place of a hash that begins with these digits; empty if there is none."""
+        """Return the position of a hash that begins with these digits; empty if there is none."""
         for hash_, number in self.manifest.hashes.items():
             if hash_.startswith(digits):
                 return f"line {number} of the manifest"
@@ -515,7 +515,7 @@ def check_noted_head(
 ) -> tuple[list[VerifyFinding], str]:
     """Look up a noted head; return findings, and a note on it.
 
-    Raises AmberboxError when it is a statement whose signature does not hold.
+    Raises AmberboxError when it is a copy of ``heads.json`` with an invalid signature.
     """
     if noted.heads is not None:
         refuse_forged(noted.heads, known.store_id, key)
@@ -608,7 +608,7 @@ def read_stored_heads(store: Path) -> StoredHeads:
 def check_stored_heads(
     own: StoredHeads, known: KnownHashes, key: str
 ) -> tuple[list[VerifyFinding], SignedHeads | None]:
-    """Check the statement that lies in the store; None where there is none to go by."""
+    """Check the ``heads.json`` of the store; None if there is no usable one."""
     heads = own.heads
     if own.content is None:
         text = "there is none: nobody states how far the journals reach"
@@ -628,7 +628,7 @@ def check_stored_heads(
 
 
 def _is_plain(content: bytes) -> bool:
-    """Return whether a statement has no other keys than those that are written."""
+    """Return whether a ``heads.json`` has only the keys that Amberbox writes."""
     known = {field.name for field in fields(SignedHeads)}
     return set(json.loads(content)) <= known
 

@@ -581,7 +581,7 @@ class _Verification:
 
 
 def _last_link(path: Path) -> str:
-    """Read the last link of a file; nothing where there is none."""
+    """Read the last link of a file; empty if there is none."""
     try:
         with open_buffer(path) as data:
             found = links(data)

@@ -683,11 +683,11 @@ class PowerSource:
         self.name = name
 
     def topics(self) -> Sequence[TopicOptions]:
-        """Return the one topic that is always there: all supplies together."""
+        """Return the one topic that always exists: all supplies together."""
         return [TopicOptions(name=TOPIC)]
 
     def run(self, sink: Sink, stop: threading.Event) -> None:
-        """Read until ``stop``; supplies may be missing at first, and go and come back."""
+        """Read until ``stop``; supplies may be missing at first, disappear and come back."""
         config = self.config
         limits = PowerLimits(config.for_s, config.low_after_s)
         watch = SupplyWatch(config.supplies, limits, config.record_s, sink)

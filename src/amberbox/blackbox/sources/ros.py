@@ -90,7 +90,7 @@ Config = RosOptions
 
 
 class RosSource:
-    """A ROS 1 subscriber in pure Python; records message bytes as they come."""
+    """A ROS 1 subscriber in pure Python; records message bytes unchanged."""
 
     lossless = False
 
@@ -103,7 +103,7 @@ class RosSource:
         return [replace(topic, name=global_name(topic.name)) for topic in self._config.topics]
 
     def run(self, sink: Sink, stop: threading.Event) -> None:
-        """Receive until ``stop`` is set; master and publishers may come, go and return."""
+        """Receive until ``stop`` is set; master and publishers may start, stop and restart."""
         types = {topic.name: topic.type for topic in self.topics()}
         RosSubscriber(settings(self._config, sink.longest_message()), types, sink).run(stop)
 

@@ -67,7 +67,7 @@ class StatusOptions:
         return replace(self, where=str(folder / Path(self.where).expanduser()))
 
     def notes(self) -> Iterator[tuple[str, str]]:
-        """Yield a note if the member is not there yet."""
+        """Yield a note if the member does not exist yet."""
         if not Path(self.where).exists():
             yield "where", f"there is nothing at {self.where} yet"
 
@@ -105,7 +105,7 @@ class StatusSource:
         return self.config.topics
 
     def run(self, sink: Sink, stop: threading.Event) -> None:
-        """Follow until ``stop`` is set; a member that is not there yet is awaited."""
+        """Follow until ``stop`` is set; wait for a member that does not exist yet."""
         member: _Member | None = None
         is_reported = False
         while not stop.is_set():

@@ -53,7 +53,9 @@ class StoreCatalogue:
     opened: dict[str, JournalFile] = field(default_factory=dict, compare=False, repr=False)
     """Journals as they were found at first: one that grows is looked into once."""
     lasting: bool = False
-    """Whether it is asked for long: then what has been added since counts, too."""
+    """Whether it is queried for a long time: then it also reads what is added to the store
+    meanwhile.
+    """
 
     def journals(self, skip: Container[str]) -> Iterator[JournalFile]:
         """Open the journal files that are not named in ``skip``, in the order of writing.
@@ -122,7 +124,7 @@ class StoreCatalogue:
     def schema(self, table: str) -> TableSchema:
         """Return the union of a table's versions: every column, in its widest type.
 
-        Raises UsageError for a table that is not there.
+        Raises UsageError for an unknown table.
         """
         known = self.schemas if "schemas" in self.__dict__ else self._versions(table)
         if known.get(table):
@@ -167,7 +169,9 @@ class StoreCatalogue:
         return chosen
 
     def still_holds(self) -> bool:
-        """Return whether no journal went while the segments for it came; the ring has none."""
+        """Return whether no journal was deleted while its segments were read; the ring has no
+        segments.
+        """
         waiting = (
             name
             for name in self.existing
@@ -257,7 +261,7 @@ def boot_in(journal: str) -> str:
 
 
 def corrected(manifest: Manifest, book: ClockBook) -> Manifest:
-    """Return the manifest with the clocks of its segments as they are known now."""
+    """Return the manifest with the clocks of its segments corrected by the present knowledge."""
     return replace(manifest, segments=_Corrected(manifest, book))
 
 

@@ -1,7 +1,7 @@
 """Corrected times of receipt: log time plus the offset of the wall clock as known now.
 
 Within one boot the wall clock minus the time since boot is one continuous function, cut by steps.
-The newest stretch known to be synchronised is right (else the newest); the others are moved so that
+The newest section known to be synchronised is right (else the newest); the others are moved so that
 there is no step. Nothing is rewritten: readers use the ``ClockBook``. The reasons are in
 ``docs/develop/notes/004-clock-steps.md``.
 """
@@ -128,9 +128,9 @@ def _kept(points: Sequence[tuple[int, int]], tolerance_ns: int) -> Iterator[int]
 
 
 def _reach(points: Sequence[tuple[int, int]], start: int, tolerance_ns: int) -> int:
-    """Return the furthest point that one line from ``start`` may go to.
+    """Return the furthest point that one line from ``start`` can reach within the tolerance.
 
-    It has to lie in the cone that the points between leave open.
+    It has to be within the cone that the points in between leave open.
     """
     low, high = -np.inf, np.inf
     t0, o0 = points[start]
@@ -177,8 +177,8 @@ class JournalClock:
 class BootWallClock:
     """The wall clock of one boot, as far as it is known now.
 
-    ``points`` are (time since boot, wall clock minus that); ``synchronised`` is whether the
-    wall clock was ever known to be right, None if that cannot be known.
+    ``points`` are (time since boot, wall clock minus that); ``synchronised`` is whether the wall
+    clock was ever synchronised, None if unknown.
     """
 
     boot: str
@@ -344,7 +344,7 @@ def _continued(boot_ns: IntArray, ahead_ns: IntArray, section: slice, at_ns: int
 
 
 def _even(points: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
-    """Put points between those that are far apart, so that no slew is taken for a step."""
+    """Insert points between those that are far apart, so that no slew is mistaken for a step."""
     found = list(points[:1])
     for (b0, d0), (b1, d1) in pairwise(points):
         parts = abs(d1 - d0) // (STEP_NS // 2) + 1

@@ -1,4 +1,4 @@
-"""Rows of journals whose file is gone, out of segments, in the order they came."""
+"""Rows of journals whose file was deleted, read from segments in their original order."""
 
 from __future__ import annotations
 
@@ -158,7 +158,7 @@ def _children(top: FlatTable, taken: Sequence[FlatTable]) -> dict[str, FlatTable
 
 
 def _batch(flat: FlatTable, below: Mapping[str, FlatTable]) -> Batch:
-    """Build a batch with the child tables among ``below`` that hang directly on it."""
+    """Build a batch with its direct child tables among ``below``."""
     name, schema = flat.schema.item, flat.schema
     direct = [n for n in below if n.startswith(f"{name}__") and not _between(name, n, below)]
     children = {n.removeprefix(f"{name}__"): _batch(below[n], below) for n in direct}
@@ -254,7 +254,7 @@ def gone_journals(known: Manifest, writer: str) -> list[DeletedJournal]:
 
 
 def _gone(known: Manifest, writer: str) -> Iterator[DeletedJournal]:
-    """Yield a writer's journals by the manifest; the best known version of each comes last."""
+    """Yield a writer's journals by the manifest; the best known version of each is the last one."""
     for sealed in known.sealed.values():
         if sealed.writer == writer:
             yield _of_file(sealed.journal, sealed, LOST)
@@ -363,7 +363,7 @@ def _window(
 
 
 def _known_gaps(known: Manifest, of: SequenceRange, items: Collection[str] | None) -> Iterator[Gap]:
-    """Yield gaps of undecodable and damaged rows, as found when the segments were built."""
+    """Yield gaps of undecodable and damaged rows that were found when the segments were built."""
     journal, sealed = known.journals.get(of.journal), known.sealed.get(of.journal)
     for gap in journal.gaps if journal is not None else ():
         if items is None or gap.item in items:

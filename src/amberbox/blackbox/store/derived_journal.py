@@ -273,7 +273,7 @@ def _own(record: ChannelValues) -> EncodedRecord:
 
 
 def _progress_records(progress: ReaderProgress | None) -> Iterator[EncodedRecord]:
-    """Yield the record of how far a reader has come."""
+    """Yield the record of a reader's position."""
     if progress is not None:
         values = {"cursor": progress.cursor.to_json(), "reader": progress.reader}
         yield _own((channels.CURSOR, {**values, "state": progress.state}))
@@ -286,7 +286,7 @@ def event(kind: str, text: str, source: str = "", **details: Any) -> ChannelValu
 
 
 def last_progress(store: Store, writer: str, reader: str = "") -> ReaderProgress | None:
-    """Return how far a reader had come when the writer wrote it down last; None if it never did."""
+    """Return the last position of a reader that the writer recorded; None if there is none."""
     for journal in newest_first(store, writer):
         numbers = [n for n, s in journal.streams.items() if s.topic.name == channels.CURSOR]
         newest = None

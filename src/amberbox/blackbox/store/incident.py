@@ -46,7 +46,7 @@ class LogSpan:
     offset_ns: int = 0
 
     def meets(self, run: int, from_ns: int, to_ns: int) -> bool:
-        """Return whether rows of ``[from_ns, to_ns]`` (log time) may lie in it."""
+        """Return whether rows of ``[from_ns, to_ns]`` (log time) may be in the window."""
         return run == self.run and from_ns <= self.to_ns and to_ns >= self.from_ns
 
     def received(self) -> tuple[int, int]:
@@ -72,9 +72,9 @@ class IncidentReason:
 class StoredIncident:
     """A window of all items that is not deleted before it is confirmed or released.
 
-    ``spans`` are the pinned ranges; while it is ``open``, so is everything from ``since`` on, and
-    the window ends ``after_ns`` later. ``told`` is the last state written to the maintenance
-    journal; ``cut``: the window ended early, for incidents may not hold more.
+    ``spans`` are the pinned ranges; while it is ``open``, all rows from ``since`` on are pinned
+    too, and the window ends ``after_ns`` later. ``told`` is the last state written to the
+    maintenance journal; ``cut``: the window ended early because incidents may not hold more data.
     """
 
     id: str

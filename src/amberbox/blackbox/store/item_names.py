@@ -1,4 +1,4 @@
-"""Names of a store's items: given once, unique, kept for good."""
+"""Names of a store's items: assigned once, unique, never changed."""
 
 from __future__ import annotations
 

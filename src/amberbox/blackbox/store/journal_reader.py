@@ -79,7 +79,7 @@ class JournalFile:
     walked: bool = False
     readings: tuple[ClockReading, ...] = ()
     tallies: Mapping[int, ChannelTally] | None = field(default=None, repr=False)
-    """What there is of each channel, where that is known without reading messages."""
+    """Counts of each channel, if known without reading messages."""
 
     @property
     def rows(self) -> int:
@@ -128,7 +128,7 @@ def _journal_file(path: Path, name: str) -> _Looked:
 
 
 class _Looked:
-    """The cached state of one file; of one that is being written only the rest is read."""
+    """The cached state of one file; of a growing file only the new part is read."""
 
     def __init__(self, path: Path, name: str) -> None:
         self._path = path
@@ -164,9 +164,9 @@ class _Looked:
 
 
 def describe(found: FileScan, name: str, known: JournalFile | None = None) -> JournalFile:
-    """Return a journal file with items and clock, made of a scan.
+    """Return a journal file with items and clock, made from a scan.
 
-    ``known`` is the same file as it was before it grew.
+    ``known`` is an earlier description of the same file, before it grew.
     """
     start, summary = found.start, found.summary
     streams = {n: stream_of(c, summary.schemas) for n, c in summary.channels.items()}
@@ -267,7 +267,7 @@ def batches(
     """Yield rows received in ``[from_ns, to_ns)`` from the journals of a store.
 
     ``skip`` names journal files (relative to the store) that need not be read. Unreadable and
-    undecodable rows are passed to ``on_gap``. Batches of one item come in order within a file.
+    undecodable rows are passed to ``on_gap``. Batches of one item are in order within a file.
     """
     for journal in journals(store):
         if journal.name not in skip:
@@ -356,7 +356,7 @@ def _overlapping(
 
 
 def inside(times_ns: IntArray, from_ns: int | None, to_ns: int | None) -> NDArray[np.bool_]:
-    """Return which times lie in ``[from_ns, to_ns)``."""
+    """Return which times are in ``[from_ns, to_ns)``."""
     rows = np.ones(len(times_ns), bool)
     if from_ns is not None:
         rows &= times_ns >= from_ns

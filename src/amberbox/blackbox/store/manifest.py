@@ -2,8 +2,8 @@
 
 Unreadable lines are restored from segments' own metadata and from journals. A reader does so in
 memory and writes nothing; the maintenance process writes them (``restore``). ``confirm`` records
-which journals a server holds, verified; ``condense`` rewrites a large manifest with only the
-current entries, on the same chain.
+which journals a server has verified and stored; ``condense`` rewrites a large manifest with only
+the current entries, on the same chain.
 """
 
 from __future__ import annotations
@@ -80,14 +80,14 @@ class ManifestJournal:
 class Manifest:
     """The content of the manifest.
 
-    ``columns_gone`` and ``raw_gone`` name the journals of which one or the other was deleted, as
-    far as the manifest has not been condensed since; ``gone_segments`` are files that went thus.
-    ``incidents`` is the last entry of each; ``lines`` is how many there are. ``unsigned`` are
-    the journals that were sealed after the last signature; ``unconfirmed`` those that a server had
-    confirmed and lacks now. ``names`` are the items' names by source and topic. ``damage`` names
-    lines that cannot be read, ``mended`` those of which one bit is flipped, ``restored`` the damage
-    that later lines make up for. ``lost`` are segments that are listed and cannot be used, as far
-    as that is known without opening them.
+    ``columns_gone`` and ``raw_gone`` name the journals whose columns or raw data were deleted, as
+    far as the manifest has not been condensed since; ``gone_segments`` are files deleted in this
+    way. ``incidents`` is the last entry of each; ``lines`` is their number. ``unsigned`` are the
+    journals that were sealed after the last signature; ``unconfirmed`` those that a server had
+    confirmed but lacks now. ``names`` are the items' names by source and topic. ``damage`` names
+    lines that cannot be read, ``mended`` those with one flipped bit, ``restored`` the damage that
+    later lines repair. ``lost`` are listed segments that cannot be used, as far as that is known
+    without opening them.
     """
 
     schemas: Mapping[str, TableSchema] = field(default_factory=dict)
@@ -120,7 +120,8 @@ class Manifest:
     def complete(self, item: str, existing: Container[str] | None = None) -> frozenset[str]:
         """Return the journals whose rows of this item are all in segments.
 
-        Of journals that are not among the ``existing`` ones, segments are all there is.
+        Journals that are not among the ``existing`` ones always count: their rows can only be in
+        segments.
         """
         found = self.segments.get(item, ())
         count = Counter(part.journal for segment in found for part in segment.parts)
@@ -235,7 +236,7 @@ class _State:
         return gone and not (schema is not None and is_kept(schema))
 
     def result(self, read: manifest_lines.LineReader) -> Manifest:
-        """Return a snapshot, not touched by records to come."""
+        """Return a snapshot that later records do not change."""
         return Manifest(
             dict(self.schemas), by_item(self.live.values()), dict(self.journals),
             dict(self.sealed), tuple(self.tombstones),
@@ -332,7 +333,7 @@ class RestoredLines:
     """The findings of the maintenance process on damaged lines of the manifest.
 
     ``damage`` names the lines, ``undone`` the journals that have to be processed again, ``gone``
-    the listed segments without a file. The lines after it repeat what was lost.
+    the listed segments without a file. The lines after it repeat the lost contents.
     """
 
     damage: tuple[str, ...] = ()
@@ -363,7 +364,7 @@ def append(store: Path, records: Sequence[Mapping[str, Any]]) -> None:
 def rewrite(
     store: Path, records: Sequence[Mapping[str, Any]], last_hash: str = manifest_lines.FIRST_HASH
 ) -> None:
-    """Write a manifest anew, to condense it."""
+    """Write a new, condensed manifest."""
     temporary = store / f".{NAME}.tmp"
     temporary.unlink(missing_ok=True)
     manifest_lines.append_durably(temporary, manifest_lines.encode(records, last_hash))
@@ -499,7 +500,7 @@ class _Found:
     replaced: Sequence[str]
 
     def records(self) -> Iterator[Mapping[str, Any]]:
-        """Yield the lines that repeat what was lost."""
+        """Yield the lines that repeat the lost contents."""
         yield from (schema_record(schema) for schema in self.schemas)
         yield from (segment_record(segment) for segment in self.adopted)
         yield from (journal_record(journal) for journal in self.journals)
@@ -553,7 +554,7 @@ def _lost(store: Path, segment: Segment, rows_of: Collection[Key]) -> Segment | 
 
 
 def has_size(store: Path, segment: Segment) -> bool:
-    """Return whether a segment's file is there with as many bytes as were written."""
+    """Return whether a segment's file exists with the number of bytes that were written."""
     try:
         return (store / segment.path).stat().st_size == segment.bytes
     except OSError:
@@ -561,7 +562,7 @@ def has_size(store: Path, segment: Segment) -> bool:
 
 
 def _has_raw(store: Path, segment: Segment) -> bool:
-    """Return whether all journals of a segment are still there."""
+    """Return whether all journals of a segment still exist."""
     return all((store / part.journal).exists() for part in segment.parts)
 
 
@@ -578,7 +579,7 @@ def _is_there(store: Path, segment: Segment, schemas: dict[str, TableSchema]) ->
 
 
 def _described(store: Path, path: str) -> Described | None:
-    """Read a segment's own metadata, and all of its pages; None if that cannot be done here."""
+    """Read a segment's own metadata, and all of its pages; None if that is not possible."""
     from amberbox.blackbox.store.segment_file import can_build, outline, read_segment
 
     if not can_build():
@@ -626,7 +627,7 @@ def _keys(segments: Iterable[Segment]) -> set[Key]:
 
 
 def journals_of(segments: Collection[Segment], known: Manifest) -> list[ManifestJournal]:
-    """Derive from segments and seals which journals they came from and how far these went."""
+    """Derive the journals and their ends from segments and seals."""
     parts: dict[str, list[SegmentPart]] = {}
     for part in (part for segment in segments for part in segment.parts):
         parts.setdefault(part.journal, []).append(part)
@@ -659,7 +660,7 @@ def confirm(store: Store, journals: Sequence[str], by: str) -> None:
 
 
 def unconfirm(store: Store, journals: Sequence[str], by: str) -> None:
-    """Enter that the server ``by`` lacks journals that were confirmed, such as after a restore.
+    """Record that the server ``by`` lacks journals that were confirmed, such as after a restore.
 
     They are then deleted no earlier than others, and are copied again.
     """
@@ -709,7 +710,7 @@ def condense(
 ) -> bool:
     """Rewrite a large manifest if that makes it a third or less; return whether it was done.
 
-    ``exists`` returns whether a journal is still there. The first line is a checkpoint that goes on
+    ``exists`` returns whether a journal still exists. The first line is a checkpoint that continues
     from the old one's last hash, the second the signature of that hash.
     """
     path = store / NAME
@@ -787,7 +788,7 @@ def kept_records(known: Manifest, exists: Callable[[str], bool]) -> Iterator[Man
 
 
 def joined(tombstones: Iterable[Tombstone]) -> list[Tombstone]:
-    """Join the tombstones of neighbouring journals that went for the same reason."""
+    """Join the tombstones of neighbouring journals that were deleted for the same reason."""
     found: list[Tombstone] = []
     for tombstone in sorted(tombstones, key=_order):
         if found and _neighbours(found[-1], tombstone):

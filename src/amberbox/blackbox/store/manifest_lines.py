@@ -36,7 +36,7 @@ MALFORMED = (msgspec.MsgspecError, ValueError, KeyError, TypeError, AttributeErr
 
 @dataclass(slots=True)
 class RepairBudget:
-    """How many more bytes may be hashed in search of flipped bits: some seconds in all."""
+    """Number of bytes that may still be hashed in search of flipped bits: some seconds in all."""
 
     bytes: int = 2_000_000_000
 
@@ -54,9 +54,9 @@ class ManifestLine:
     """A line of the manifest in the file.
 
     ``records`` are those whose hash is right: two if a bit flip removed the newline between them,
-    none if the line is ``damaged`` beyond repair. ``size`` includes the newline, ``count`` is how
-    many lines the file shows for it: two if a bit flip made a newline. ``mended`` is its content
-    before one bit was flipped, empty if it is as it was written.
+    none if the line is ``damaged`` beyond repair. ``size`` includes the newline, ``count`` is the
+    number of lines that the file shows for it: two if a bit flip made a newline. ``mended`` is the
+    repaired content if one bit was flipped, else empty.
     """
 
     number: int
@@ -112,7 +112,7 @@ def _mended(pieces: Sequence[bytes], place: int, patience: RepairBudget) -> tupl
 
 
 def _without_flip(line: bytes) -> bytes | None:
-    """Return a line as it was before one bit of it was flipped; None if more was changed."""
+    """Return a line with its one flipped bit corrected; None if more than one bit differs."""
     head, body = line[:_HASH_FIELD], line[_HASH_FIELD:]
     expected = _BEGIN + hashlib.sha256(body).hexdigest().encode() + b'",'
     if len(head) == len(expected):
@@ -134,9 +134,10 @@ def _without_flip(line: bytes) -> bytes | None:
 
 @dataclass(slots=True)
 class LineReader:
-    """Reader of complete lines; it returns the records whose hash is right, one bit mended.
+    """Reader of complete lines; it returns the records whose hash is right after correcting one
+    bit.
 
-    ``damage`` names the lines that cannot be read, ``mended`` those of which one bit is flipped.
+    ``damage`` names the lines that cannot be read, ``mended`` those with one flipped bit.
     """
 
     last_hash: str = FIRST_HASH
@@ -181,7 +182,7 @@ def decode(line: bytes) -> LineRecord | None:
 
 
 def first_hash(path: Path) -> str:
-    """Return the hash that the first line of a manifest states; empty where there is none."""
+    """Return the hash in the first line of a manifest; empty without one."""
     try:
         with path.open("rb") as file:
             begin = file.read(_HASH_FIELD)
@@ -241,7 +242,7 @@ class LineState(Protocol[Result_co]):
         """Add one record."""
 
     def result(self, read: LineReader) -> Result_co:
-        """Return a snapshot, not touched by records to come."""
+        """Return a snapshot that later records do not change."""
 
 
 class GrowingLines(Generic[Result]):
@@ -261,7 +262,7 @@ class GrowingLines(Generic[Result]):
         self._result = self._nothing
 
     def read(self) -> Result:
-        """Return the content of the file now; the empty state when it is not there."""
+        """Return the present content of the file; the empty state if it does not exist."""
         with self._lock:
             try:
                 with self._path.open("rb") as file:

@@ -1,6 +1,7 @@
-"""The box's own records: the newest ones, or all on some channels as they come.
+"""The box's own records: the newest ones, or all new ones on some channels.
 
-A journal is read from its end back and no further; of old files only those that hold any.
+A journal is read backwards from its end, as far as needed; of old files only those with such
+records.
 """
 
 from __future__ import annotations
@@ -57,7 +58,7 @@ def _reaches(found: list[WrittenRecord], lookback_s: float) -> bool:
 
 
 def _of_file(path: Path, channels: Collection[str], lookback_s: float) -> list[WrittenRecord]:
-    """Read a file's end, more and more of it until that is enough."""
+    """Read increasing parts of a file's end until there are enough records."""
     with open_buffer(path) as data:
         size = _FIRST_BYTES
         while True:

@@ -80,7 +80,7 @@ def median(ages: Sequence[IntArray]) -> int | None:
 
 
 def bounds_of(flat: FlatTable) -> tuple[int, ...]:
-    """Return least and most of ``seq``, log time and stamp, in this order."""
+    """Return the least and greatest ``seq``, log time and stamp, in this order."""
     keys = (flat.seq, flat.log_time_ns, flat.timestamp_ns)
     return tuple(int(edge) for key in keys for edge in (key.min(), key.max()))
 
@@ -96,7 +96,7 @@ def _size(column: ColumnData) -> int:
 
 
 def _no_pause() -> None:
-    """Do nothing: there is no other work meanwhile."""
+    """Do nothing: the default where there is no other work to continue meanwhile."""
 
 
 def build_segments(
@@ -321,7 +321,7 @@ def _is_merged(store: Path, name: str, known: mf.Manifest) -> bool:
 
 
 def drop_gone(store: Path, report_progress: Callable[[], None]) -> int:
-    """Write segments that were joined anew without the journals whose columns were deleted."""
+    """Rewrite joined segments without the journals whose columns were deleted."""
     count = 0
     for item in mf.read(store).segments:
         report_progress()  # which may delete segments

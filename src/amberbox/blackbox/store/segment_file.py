@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 
 def can_build() -> bool:
-    """Return whether segments can be written and read here (pyarrow is installed)."""
+    """Return whether segments can be written and read (pyarrow is installed)."""
     return importlib.util.find_spec("pyarrow") is not None
 
 

@@ -41,7 +41,9 @@ _WITNESSES = 3  # how many journals of each writer are read for the store's iden
 
 @dataclass(frozen=True, slots=True)
 class Store:
-    """A store on disk; ``id`` was made with it and differs from that of a store made anew."""
+    """A store on disk; ``id`` is a UUID created with it, so that a new store at the same path
+    differs.
+    """
 
     path: Path
     id: str
@@ -61,7 +63,7 @@ class Store:
         return sorted(found.values(), key=run_and_number)
 
     def journal_path(self, name: str) -> Path:
-        """Return where a journal called ``folder/file`` lies; an incident may hold it.
+        """Return the path of a journal called ``folder/file``; an incident may hold it.
 
         Raises AmberboxError for a name that leads out of the store.
         """
@@ -72,7 +74,7 @@ class Store:
         return path
 
     def writers(self) -> list[str]:
-        """Return the writers that have a journal here."""
+        """Return the writers that have a journal in the store."""
         found = [writer for writer in FOLDERS if self.folder(writer).is_dir()]
         if "ring" not in found and any(self._held()):  # these outlast a ring in memory
             found.append("ring")
@@ -95,7 +97,7 @@ class Store:
             return 0
 
     def runs(self) -> list[int]:
-        """Return the numbers of the runs of which there are journals."""
+        """Return the numbers of the runs that have journals."""
         return [run_and_number(p)[0] for w in FOLDERS for p in self.journal_files(w)]
 
 
@@ -105,9 +107,9 @@ def is_store(path: Path) -> bool:
 
 
 def open_store(path: Path) -> Store:
-    """Open a store that exists; where its identity cannot be read, its journals state it.
+    """Open an existing store; if its identity cannot be read, it is taken from its journals.
 
-    Raises UsageError when there is none, AmberboxError when nothing states its identity.
+    Raises UsageError when there is no store, AmberboxError when its identity is unknown.
     """
     stated = stated_id(path)
     if stated:
@@ -151,9 +153,9 @@ def _witnesses(path: Path) -> Counter[str]:
 
 
 def open_to_write(path: Path) -> Store:
-    """Open an existing store; first correct its identity where all its files name another.
+    """Open an existing store; first correct its identity if all its files have another one.
 
-    Raises what ``open_store`` does.
+    Raises the errors of ``open_store``.
     """
     stated, witnesses = stated_id(path), _witnesses(path)
     found, count = witnesses.most_common(1)[0] if witnesses else ("", 0)
@@ -186,7 +188,7 @@ def create_store(path: Path) -> Store:
 
 
 class WriterLock:
-    """Keeps a second writer of the same kind away from a store for as long as it is held."""
+    """A lock that prevents a second writer of the same kind in a store while it is held."""
 
     def __init__(self, store: Store, writer: str) -> None:
         path = store.path / f"lock.{writer}"
@@ -264,7 +266,7 @@ def submit(store: Store, kind: str, values: Mapping[str, Any]) -> Path:
 def pending(store: Store) -> list[StoreRequest]:
     """Return the requests that are not finished yet, oldest first.
 
-    A file that is no request is moved aside to ``<name>.refused``; only the keeper calls this.
+    A file that is not a request is renamed to ``<name>.refused``; only the keeper calls this.
     """
     found = []
     for path in sorted((store.path / REQUESTS).glob("*.json")):
@@ -300,7 +302,7 @@ def request_event(store: Store, kind: str, text: str, source: str) -> None:
 
 
 def store_path(where: str | Path) -> Path:
-    """Find the store that ``where`` (a store or a robot folder) means.
+    """Return the path of the store of ``where`` (a store or a robot folder).
 
     Raises UsageError when there is none.
     """

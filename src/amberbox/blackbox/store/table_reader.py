@@ -44,7 +44,7 @@ class GatheredRows:
 
 
 class DamagedSegmentError(Exception):
-    """A segment that cannot be read: its journal, if there is one, has to do."""
+    """A segment that cannot be read: its journal is read instead, if it exists."""
 
     def __init__(self, segment: Segment, reason: str) -> None:
         super().__init__(reason)
@@ -235,7 +235,7 @@ def _column(pieces: Sequence[FlatTable], name: str, kind: str) -> ColumnData:
 
 
 def _order(pieces: Sequence[FlatTable], times: IntArray, merged: MergedRows) -> IntArray | None:
-    """Return the order of rows; None when they are in order as they are."""
+    """Return the order of rows; None when they are in order already."""
     steps, places = np.diff(times), np.diff(merged.seq)
     in_order = bool(((steps > 0) | ((steps == 0) & (places >= 0))).all())
     if in_order and len({piece.writer for piece in pieces}) <= 1:

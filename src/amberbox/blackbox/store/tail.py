@@ -1,6 +1,6 @@
 """Follow a record with a cursor: one writer's journals, file after file, from a position on.
 
-Live and replay are the same: rows come in ``seq`` order per writer, damage comes as gaps, and a
+Live and replay are the same: rows are returned in ``seq`` order per writer, damage as gaps, and a
 follower resumes exactly at its stored cursor.
 """
 
@@ -199,7 +199,7 @@ class WriterTail:
             yield from self._watermark_of_head(head)
 
     def _static(self, path: Path) -> Iterator[Delivery]:
-        """Yield the rest of a finished file."""
+        """Yield the remaining rows of a finished file."""
         journal = journal_file(path, f"{path.parent.name}/{path.name}")
         self._live = None
         if journal.places:
@@ -393,7 +393,7 @@ def _outline(live: _Live, writer: str) -> JournalFile:
 
 
 def _first_of_interest(files: list[Path], run: int, seq: int) -> int:
-    """Skip files that lie before a position, looking only at their names and start records."""
+    """Skip files before a position, by their names and start records only."""
     runs = [run_and_number(path)[0] for path in files]
     first, end = bisect_left(runs, run), bisect_right(runs, run)
     for place in range(end - 1, first, -1):  # most positions are near the end
@@ -482,10 +482,11 @@ def follow(
     """Yield the rows of a store and, while ``live``, those being added to it.
 
     Without ``cursor`` it begins with the oldest row, or ``lookback_s`` before the newest one. With
-    ``cursor`` it goes on there; ``lookback_s`` then repeats the rows of that many seconds before it
-    (``cursor.writers[w].has_read(run, seq, item)`` is true for them), so that windows can be filled
-    again. With a cursor of another store it starts at the beginning, after a Gap. ``items`` are
-    names; None means all. Each delivery carries the cursor that is right once it has been used.
+    ``cursor`` it continues there; ``lookback_s`` then repeats the rows of that many seconds before
+    it (``cursor.writers[w].has_read(run, seq, item)`` is true for them), so that windows can be
+    filled again. With a cursor of another store it starts at the beginning, after a Gap. ``items``
+    are names; None means all. Each delivery carries the cursor to continue with after it has been
+    processed.
 
     Raises UsageError when there is no store at ``where``.
     """

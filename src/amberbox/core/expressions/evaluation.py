@@ -86,7 +86,7 @@ class Instants:
 def series_of(
     reads: Iterable[AddressNode], columns: Mapping[str, tuple[IntArray, Any]]
 ) -> dict[str, Series]:
-    """Look up every address that a tree reads; raise Fault for one that is not there."""
+    """Look up every address that a tree reads; raise Fault for a missing one."""
     return {address.name: _series(address, columns) for address in reads}
 
 
@@ -278,7 +278,7 @@ def _clocks(names: Iterable[str], series: Mapping[str, Series]) -> list[IntArray
 
 
 def _between(clocks: Iterable[tuple[IntArray, int]], since_ns: int, until_ns: int) -> IntArray:
-    """Join instants in ``(since, until]``, each once, in order; clocks come with a delay."""
+    """Join instants in ``(since, until]``, each once, in order; each clock has a delay."""
     inside = [np.zeros(0, np.int64)]
     for times_ns, delay_ns in clocks:
         first, end = times_ns.searchsorted([since_ns - delay_ns, until_ns - delay_ns], "right")
@@ -290,7 +290,7 @@ Kinds: TypeAlias = Mapping[str, Kind]
 
 
 class Track(NamedTuple):
-    """Samples of one variable as they are held; ``times_ns`` never decreases."""
+    """Samples of one variable, each held until the next; ``times_ns`` never decreases."""
 
     times_ns: IntArray
     data: on.Array

@@ -63,7 +63,7 @@ _FOREIGN = {
 
 @dataclass(frozen=True, slots=True)
 class _Token:
-    """One word and its place; ``unit`` is what is glued to a number (``5s``)."""
+    """One token and its position; ``unit`` is the unit directly after a number (``5s``)."""
 
     sort: Sort
     text: str
@@ -155,7 +155,7 @@ class _Parser:
     place: int = 0
     depth: int = 0
     bare_for: list[ExpressionNode] = field(default_factory=list)
-    """Parts ``x for 5s`` that stand without brackets."""
+    """Parts ``x for 5s`` that are not in brackets."""
 
     @property
     def next(self) -> _Token:
@@ -170,7 +170,7 @@ class _Parser:
         return token
 
     def expect(self, text: str, why: str) -> None:
-        """Consume a token that must be here."""
+        """Consume a token that is required here."""
         if not self.take(text):
             raise ExpressionFault(f"expected '{text}' {why}", self.next.at)
 

@@ -183,7 +183,7 @@ def kind_of_value(value: object) -> Kind:
 
 
 def children(tree: ExpressionNode) -> Iterator[ExpressionNode]:
-    """Yield the parts right below, in order."""
+    """Yield the direct children, in order."""
     for field in dataclasses.fields(tree):
         value = getattr(tree, field.name)
         for part in value if isinstance(value, tuple) else (value,):
@@ -222,7 +222,7 @@ def history_ns(tree: ExpressionNode) -> int:
 
 
 def shortest_ns(tree: ExpressionNode) -> int | None:
-    """Return the shortest time that a tree looks back by ``over`` or ``for``; None without."""
+    """Return the shortest time of any ``over`` or ``for`` in a tree; None if it has none."""
     spans = [part.over_ns for part in walk(tree) if isinstance(part, WindowNode)]
     return min(
         spans + [part.for_ns for part in walk(tree) if isinstance(part, HeldNode)], default=None
@@ -238,7 +238,7 @@ def delays_ns(tree: ExpressionNode) -> frozenset[int]:
 
 
 def needs_history(tree: ExpressionNode) -> bool:
-    """Return whether a tree cannot be judged from the values of one instant."""
+    """Return whether a tree needs more than the values of one instant."""
     return any(isinstance(part, WindowNode | HeldNode | AgeNode) for part in walk(tree))
 
 

@@ -55,7 +55,7 @@ class Values:
 
 
 def values_of(column: Any, at: int) -> Values:
-    """Take over a column as batches and queries give it; a list may stand for an array."""
+    """Convert a column of a batch or query; a list may be given instead of an array."""
     if isinstance(column, Ragged):
         raise ExpressionFault("is a list; name one element of it", at, "such as: ranges[17]")
     array = column if isinstance(column, np.ndarray) else _object_array(column)
@@ -128,7 +128,7 @@ def as_condition(values: Values, wanted_by: str, at: int) -> Values:
 
 
 def require_condition(kind: Kind, wanted_by: str, at: int) -> None:
-    """Raise Fault for what is neither true nor false."""
+    """Raise Fault for a value that is not a condition (neither true nor false)."""
     if kind in ("number", "text"):
         hint = "compare it with something, such as: x > 0"
         raise ExpressionFault(f"{wanted_by} needs a condition, got {_NAMES[kind]}", at, hint)
@@ -192,7 +192,7 @@ def median(*columns: Any) -> Any:
 
 
 def _bit(word: Array, number: Array, null: Mask) -> Values:
-    """Return whether a bit is set; null for what is no whole number of at most 53 bits."""
+    """Return whether a bit is set; null for a number that is not an integer of at most 53 bits."""
     fits = (word == np.floor(word)) & (np.abs(word) < 2.0**53)
     fits &= (number == np.floor(number)) & (number >= 0) & (number < 53)
     whole, place = (np.where(fits, x, 0).astype(np.int64) for x in (word, number))
@@ -303,7 +303,9 @@ def count(times_ns: IntArray, flags: NDArray[np.bool_], after: IntArray, until: 
 def reduce_windows(
     name: str, times_ns: IntArray, samples: Floats, after: IntArray, until: IntArray
 ) -> Values:
-    """Apply ``min max mean std rate`` to the samples of each window; null where there are none."""
+    """Apply ``min max mean std rate`` to the samples of each window; null for a window without
+    samples.
+    """
     first, last = _bounds(times_ns, after, until)
     if name == "rate":
         return _rate(times_ns, samples, first, last)
@@ -314,7 +316,7 @@ def reduce_windows(
 
 
 def reduce_whole(name: str, times_ns: IntArray, samples: Floats) -> float | None:
-    """Apply it to all samples as to one window; None where there are too few."""
+    """Apply one of these functions to all samples; None if there are too few."""
     ends = np.array([0]), np.array([len(samples)])
     if name == "rate":
         rate = _rate(times_ns, samples, *ends)

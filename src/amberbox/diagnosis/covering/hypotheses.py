@@ -73,7 +73,7 @@ Misses = Mapping[int, float]  # per symptom how probable it does not show
 
 
 def with_common_cause(model: Model, evidence: Evidence, sets: Sets) -> tuple[Sets, float]:
-    """Return sets in which the unknown mode has its share of those that began together.
+    """Return sets in which the unknown mode has its share of modes that began together.
 
     The priors of such a set's modes are replaced by that of the unknown mode and ``looks_like`` for
     each of them. Return the sets with their new shares of the total, the likely ones first, and the
@@ -108,7 +108,7 @@ def _factor(
 
 
 def _together(model: Model, evidence: Evidence, sets: Sets, within_s: float) -> Sets:
-    """Return the sets of enough known modes that began at most so long after each other."""
+    """Return the sets of enough known modes that began within ``within_s`` of each other."""
     many = [(faults, share) for faults, share in sets if len(faults - {UNKNOWN}) >= FEWEST]
     named = sorted(frozenset().union(*(faults for faults, _ in many)) - {UNKNOWN})
     misses = {fault: predict(model, [fault]).misses for fault in named}
@@ -126,10 +126,11 @@ def _together(model: Model, evidence: Evidence, sets: Sets, within_s: float) -> 
 
 
 def _spread_ns(modes: Sequence[Misses], onsets: Mapping[int, int]) -> int:
-    """Return how long after the first mode the last one began, by the first that each shows.
+    """Return the time between the beginnings of the first and the last mode, by their first
+    symptoms.
 
-    A symptom of several modes is attributed to the one that shows it most surely. What has no known
-    onset does not count.
+    A symptom of several modes is attributed to the one that shows it with the highest probability.
+    Symptoms without a known onset do not count.
     """
     first: dict[int, int] = {}
     for place, onset_ns in onsets.items():
@@ -145,11 +146,11 @@ NO_FAULT = "no fault"
 
 @dataclass(frozen=True, slots=True)
 class RankedHypotheses:
-    """Hypotheses from likely to unlikely, and the ambiguity groups they fall into.
+    """Hypotheses from likely to unlikely, and their ambiguity groups.
 
-    A hypothesis' probability is its share of what was enumerated; its true posterior lies
-    between ``probability * mass_covered`` and ``probability``. ``incomplete`` says which budget
-    ended the search, empty if none did. ``findings`` are symptoms that the model does not know.
+    A hypothesis' probability is its share of what was enumerated; its true posterior lies between
+    ``probability * mass_covered`` and ``probability``. ``incomplete`` names the budget that ended
+    the search, empty if none did. ``findings`` are symptoms that are not in the model.
     """
 
     hypotheses: tuple[Hypothesis, ...]
@@ -170,11 +171,11 @@ def diagnose(
 ) -> RankedHypotheses:
     """Rank the sets of failure modes by their probability given the evidence.
 
-    The search ends when the hypotheses listed hold at least ``mass`` of all probability, when
-    ``max_hypotheses`` are listed, or when the budget is used up (then ``incomplete`` says so). What
-    is listed is exact and in order, unless the budget ended the search: then it is the best found
-    so far, and better ones may be in the part not covered. Raises UsageError for a conflict or an
-    answer with a name that the model does not have.
+    The search ends when the listed hypotheses hold at least ``mass`` of all probability, when
+    ``max_hypotheses`` are listed, or when the budget is used up (then ``incomplete`` names it). The
+    list is exact and in order, unless the budget ended the search: then it has the best hypotheses
+    found so far, and there may be better ones that were not reached. Raises UsageError for a
+    conflict or an answer with a name that the model does not have.
     """
     problem = covering_problem(model.tables, fold_evidence(model, evidence))
     found = search(problem, max_hypotheses, mass, budget or Budget())
@@ -205,7 +206,7 @@ class KnownSymptoms:
 
     @classmethod
     def of(cls, model: Model, evidence: Evidence) -> KnownSymptoms:
-        """Take the symptoms that the model knows."""
+        """Select the symptoms that are in the model."""
         places = model.sign_places
         present, absent = [], []
         for name, observation in evidence.observations.items():

@@ -16,10 +16,10 @@ from amberbox.core.types import UNKNOWN_FAULT
 
 
 class FunctionGates:
-    """The functions over the components that can go down; sets of both are bit masks.
+    """The functions over the components that can fail; sets of both are bit masks.
 
-    ``support[f]`` are the components on which function f depends at all, ``alone[c]`` the
-    functions that the loss of component c loses by itself.
+    ``support[f]`` are the components that function f depends on, ``alone[c]`` the functions that
+    are lost when component c alone is lost.
     """
 
     def __init__(self, functions: Sequence[tuple[str, Needs]], components: Sequence[str]) -> None:
@@ -67,7 +67,7 @@ class FunctionGates:
         return inherited | self._component_bits.get(name, 0)
 
     def _alone(self, needs: Needs, losers: Sequence[int]) -> int:
-        """Return the components of which each by itself makes the needs fail."""
+        """Return the components each of which alone makes the needs fail."""
         parts = [
             self._of(part, losers) if isinstance(part, str) else self._alone(part, losers)
             for part in needs.parts
@@ -106,7 +106,7 @@ def _transposed(masks: Sequence[int], width: int) -> list[int]:
 
 
 def _in_order(needs: Mapping[str, Needs], bit: Mapping[str, int]) -> list[int]:
-    """Return the places of the functions, each after those that it needs."""
+    """Return the indices of the functions, each after those that it needs."""
     order: list[int] = []
     done: set[str] = set()
     waiting = list(needs)
@@ -245,7 +245,7 @@ UNKNOWN = UNKNOWN_FAULT  # the mode that stands for everything that is not in th
 class Mode:
     """A failure mode ``component#mode`` with its prior probability.
 
-    ``takes_down``: while it is there, its component does not serve those that need it.
+    ``takes_down``: while it is present, its component does not serve those that need it.
     """
 
     id: str
@@ -298,15 +298,16 @@ class Link:
 
 @dataclass(frozen=True, slots=True)
 class Unknown:
-    """The failure mode for all that is not in the FMEA, with the prior ``prior``.
+    """The failure mode for all faults that are not in the FMEA, with the prior ``prior``.
 
     It shows any symptom with probability ``detects``. Which symptoms it would show is unknown, so
     an absent symptom is no evidence against it; ``denies`` above 0 makes each absent symptom count
-    like an absent symptom of a cause with that probability. A large ``detects`` makes it a cheap
-    excuse for two faults at once; the default leaves them most of their due.
+    like an absent symptom of a cause with that probability. With a large ``detects`` it explains
+    two simultaneous faults more cheaply than the two known faults do; with the default the two
+    faults keep most of their probability.
 
-    It may look like three or more known modes that begin within ``together_s`` of each other,
-    like each with probability ``looks_like``; 0: it never does.
+    It may look like three or more known modes that begin within ``together_s`` of each other, like
+    each with probability ``looks_like``; 0: it never does.
     """
 
     prior: float = 1e-3
@@ -371,7 +372,7 @@ class Model:
         return {function.id: place for place, function in enumerate(self.functions)}
 
     def mode_place(self, name: str) -> int:
-        """Return the place of a mode; raise UsageError when there is none."""
+        """Return the index of a mode; raise UsageError when there is none."""
         if name not in self.mode_places:
             near = did_you_mean(name, self.mode_ids)
             raise UsageError(f"there is no failure mode '{name}'{near}")

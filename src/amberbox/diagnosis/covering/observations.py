@@ -30,11 +30,11 @@ class CheckDetection:
 class Check:
     """A test: a symptom to read, a question, or a check by a person.
 
-    The first outcome is that of a sound robot, later ones are graver; each cause that is there
-    reaches its outcome with probability ``detects``, and the gravest that is reached is seen
-    (noisy-MAX). With no cause the first outcome comes with probability ``sure`` and the others
-    share the rest. For two outcomes ``detects`` and ``sure`` give sensitivity
-    ``1 - sure * (1 - detects)`` and specificity ``sure``.
+    The first outcome is that of a healthy robot, later ones are more severe; each present cause
+    reaches its outcome with probability ``detects``, and the most severe outcome that is reached is
+    observed (noisy-MAX). Without a cause the first outcome has probability ``sure`` and the others
+    share the remainder. For two outcomes ``detects`` and ``sure`` give sensitivity ``1 - sure * (1
+    - detects)`` and specificity ``sure``.
 
     A check that ``reads`` a symptom has the outcomes absent and present, and no detections.
     """
@@ -70,7 +70,7 @@ class Check:
         return self.outcomes.index(outcome)
 
     def at_most(self, level: int) -> float:
-        """Return the probability of an outcome up to this one while no cause is there."""
+        """Return the probability of an outcome up to this one without any cause."""
         return self.sure + (1 - self.sure) * level / (len(self.outcomes) - 1)
 
 
@@ -87,10 +87,10 @@ def reading_check(symptom: str, cost_s: float) -> Check:
 
 @dataclass(frozen=True, slots=True)
 class Observation:
-    """The state of a symptom and how far it is to be trusted.
+    """The state of a symptom and the trust in it.
 
-    With probability ``strength`` the observation is right, else it is the toss of a coin: its
-    likelihood is ``strength * P(state | faults) + (1 - strength) / 2``.
+    With probability ``strength`` the observation is right, else it is random with probability 1/2:
+    its likelihood is ``strength * P(state | faults) + (1 - strength) / 2``.
     """
 
     state: SymptomState
@@ -113,9 +113,9 @@ class AnsweredCheck:
 class Evidence:
     """The evidence: observations, conflicts and answered tests.
 
-    A conflict is a set of failure modes of which at least one is there. ``asked`` are tests
-    that were done or cannot be done: they are not proposed again. ``doubled`` are symptoms that
-    do not count, because what they were measured from has been counted. ``onsets_ns`` are when
+    A conflict is a set of failure modes of which at least one is present. ``asked`` are tests that
+    were done or cannot be done: they are not proposed again. ``doubled`` are symptoms that do not
+    count, because the data they were measured from have been counted. ``onsets_ns`` are when
     present symptoms began, as far as that is known.
     """
 
@@ -188,10 +188,10 @@ class LikelihoodFactor:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FoldedEvidence:
-    """The evidence for one model.
+    """The evidence combined with one model.
 
-    ``log_weight`` is per mode the logarithm of its prior odds times the chance that what is
-    surely absent does not show; ``log_loss`` that chance per lost function.
+    ``log_weight`` is per mode the logarithm of its prior odds times the probability that all
+    certainly absent symptoms are absent; ``log_loss`` that probability per lost function.
     """
 
     factors: tuple[LikelihoodFactor, ...]

@@ -1,4 +1,4 @@
-"""Best-first search over sets of faults, the most probable first; the rest is bounded.
+"""Best-first search over sets of faults, the most probable first, with bounds for unexplored sets.
 
 Bounds of the weight of a set with further faults added are never too low.
 """
@@ -25,10 +25,10 @@ Hits = tuple[tuple[int, float], ...]  # factors with 1 - detects
 
 
 class ModeGroup:
-    """Failure modes that act alike on every factor and function that matters.
+    """Failure modes with the same effect on every relevant factor and function.
 
-    ``hits`` are (factor, 1 - detects), ``component`` what they take down (-1: nothing that
-    matters), ``modes`` from the most to the least probable.
+    ``hits`` are (factor, 1 - detects), ``component`` what they take down (-1: nothing relevant),
+    ``modes`` from the most to the least probable.
     """
 
     __slots__ = ("_sums", "component", "hits", "log_best", "modes", "weights")
@@ -52,7 +52,7 @@ class ModeGroup:
         return len(self.modes)
 
     def log_sum(self, count: int) -> float:
-        """Return the logarithm of the summed weight of all sets of so many members."""
+        """Return the logarithm of the summed weight of all sets of ``count`` members."""
         while len(self._sums) <= count:
             self._extend()
         return self._sums[count]
@@ -70,12 +70,12 @@ class ModeGroup:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CoveringProblem:
-    """The groups that matter, with what each factor and function needs of them.
+    """The relevant groups, and for each factor and function the groups that act on it.
 
-    ``unknown`` is the group of the unknown mode, which is alone in it; -1 if there is none.
+    ``unknown`` is the group of the unknown mode, its only member; -1 if there is none.
 
     ``causes[k]`` are the groups that can act on factor k, ``cause_masks`` the same as masks;
-    ``limits[k]`` is its likelihood when everything is there. ``log_all`` is the logarithm of the
+    ``limits[k]`` is its likelihood when all modes are present. ``log_all`` is the logarithm of the
     product of 1 + weight over all modes, ``log_odd`` that of all weights above 1.
     """
 
@@ -113,7 +113,7 @@ class CoveringProblem:
 
 
 def covering_problem(tables: ModelTables, evidence: FoldedEvidence) -> CoveringProblem:
-    """Find the modes that matter for some factor and group those that are alike."""
+    """Find the modes that are relevant for any factor, and group those with the same effect."""
     function_hits = _function_hits(evidence.factors)
     matters = evidence.log_loss < 0
     matters[list(function_hits)] = True
@@ -200,7 +200,7 @@ def _groups(
     hits: Mapping[int, Sequence[tuple[int, float]]],
     components: int,
 ) -> Iterator[ModeGroup]:
-    """Yield the modes that factors see by what they do, and the others by their component."""
+    """Yield the modes that act on factors, grouped by their effect, and the others by component."""
     weights = log_weight.tolist()
     found: dict[tuple[int, Hits, bool], list[int]] = {}
     for mode, seen in hits.items():
@@ -217,7 +217,7 @@ def _groups(
 
 
 def _merged(hits: Sequence[tuple[int, float]]) -> Hits:
-    """Make one hit of several on one factor: links that are there twice."""
+    """Combine several hits on one factor, from repeated links, into one."""
     if len(hits) == 1:
         return (hits[0],)
     merged: dict[int, float] = {}
@@ -257,10 +257,10 @@ def _limits(groups: Sequence[ModeGroup], factors: Sequence[LikelihoodFactor]) ->
 
 
 class FaultCounts(NamedTuple):
-    """So many members of each group are faulty, and nothing else.
+    """A state of the search: the number of faulty members of each group, and no other faults.
 
     ``misses[k]`` is q of factor k. ``log_best`` is the weight of the most probable choice of
-    members, ``log_sum`` that of all choices; both with what the lost functions cost.
+    members, ``log_sum`` that of all choices; both include the cost of the lost functions.
     """
 
     counts: tuple[tuple[int, int], ...]
@@ -348,8 +348,8 @@ class OpenCauses(NamedTuple):
 class GroupWeights:
     """Weights of adding one more group while certain functions are lost.
 
-    ``bests`` (logarithms) and ``sums`` bound, per group, the weight of its best member and of
-    all members, with what the functions cost that this member alone would lose.
+    ``bests`` (logarithms) and ``sums`` bound, per group, the weight of its best member and of all
+    members, including the cost of the functions that only this member would lose.
     """
 
     __slots__ = ("_known", "_order", "bests", "sums", "total")
@@ -467,9 +467,9 @@ class SearchBounds:
     ) -> SearchBound:
         """Bound the sets that have a cause of factors that are not explained yet.
 
-        Each factor gives a bound of its own: either one of its causes is added, or none is and
-        its likelihood stays as it is. So do factors without common causes together, and so do
-        the gains of all that may be added, as if no two of them explained the same factor.
+        Each factor gives a bound of its own: either one of its causes is added, or none is and its
+        likelihood stays the same. Factors without common causes together give another bound, and so
+        does the sum of the gains of all causes, as if no two of them explained the same factor.
         """
         view = self._view(state.lost)
         gains: dict[int, float] = {}
@@ -507,7 +507,9 @@ class SearchBounds:
         gains: Mapping[int, float],
         net: Mapping[int, float],
     ) -> SearchBound:
-        """Bound by gains: what each group can make of all factors, whatever others make of them."""
+        """Bound by gains: the most that each group can gain on all factors, independent of other
+        groups.
+        """
         log_share = sum(factor.log_share for factor in factors)
         branch = max(net, key=net.__getitem__)
         rising = log_sum = others = 0.0
@@ -596,12 +598,12 @@ def _apart(
 
 @dataclass(frozen=True, slots=True)
 class SearchResult:
-    """Sets of modes (by place) with their probabilities, from likely to unlikely.
+    """Sets of modes (by index) with their probabilities, from likely to unlikely.
 
-    When a budget ended the search, they are the best that were reached: better ones may wait.
+    When a budget ended the search, they are the best that were reached: there may be better ones.
 
-    Probabilities are shares of what was enumerated, ``covered`` is the least share that this
-    is of everything. ``incomplete`` says which budget ended the search.
+    Probabilities are shares of what was enumerated, ``covered`` is a lower bound of the share of
+    this in all probability. ``incomplete`` names the budget that ended the search.
     """
 
     sets: tuple[tuple[tuple[int, ...], float], ...]
@@ -612,7 +614,9 @@ class SearchResult:
 
 @dataclass(slots=True)
 class _Sum:
-    """A sum of exponentials, relative to a reference; exact at the end, running meanwhile."""
+    """A sum of exponentials, relative to a reference; it is updated continuously, and exact at the
+    end.
+    """
 
     reference: float
     terms: list[float] = field(default_factory=list)
@@ -631,9 +635,10 @@ class _Node(NamedTuple):
 
 
 class _Members(NamedTuple):
-    """The sets of one state that have not come up yet, the best first.
+    """The sets of one state that have not been returned yet, the best first.
 
-    ``ways`` are (weight of the members chosen, their modes), ``log_base`` the rest of the score.
+    ``ways`` are (weight of the members chosen, their modes), ``log_base`` the remaining part of the
+    score.
     """
 
     first: tuple[float, tuple[int, ...]]
@@ -645,7 +650,7 @@ _Entry = tuple[float, int, "_Node | _Members | FaultCounts"]
 
 
 class _Search:
-    """The heap of nodes and sets that wait, and what has been found."""
+    """The heap of open nodes and sets, and the sets found so far."""
 
     def __init__(self, problem: CoveringProblem, most: int) -> None:
         self.problem = problem
@@ -666,7 +671,7 @@ class _Search:
         self.push_node(_Node(start, 0, first))
 
     def push_node(self, node: _Node) -> None:
-        """Push a node on the heap, unless no set can come of it."""
+        """Push a node on the heap, unless it cannot lead to any set."""
         if node.bound.log_best > NEVER:
             self.waiting += _exp(node.bound.log_mass - self.reference)
             heapq.heappush(self.heap, (-node.bound.log_best, next(self.order), node))
@@ -707,7 +712,7 @@ class _Search:
         self.list_best(best)
 
     def list_reached(self) -> None:
-        """List the best of what was reached, though nodes that wait may hold better."""
+        """List the best sets reached so far, although open nodes may hold better ones."""
         nodes = [entry for entry in self.heap if isinstance(entry[2], _Node)]
         self.heap = [entry for entry in self.heap if not isinstance(entry[2], _Node)]
         heapq.heapify(self.heap)
@@ -760,7 +765,8 @@ class _Search:
 
 
 def search(problem: CoveringProblem, max_sets: int, mass: float, budget: Budget) -> SearchResult:
-    """Enumerate sets of faults until so many are listed or they hold so much of the mass.
+    """Enumerate sets of faults until ``max_sets`` are listed or they hold ``mass`` of the
+    probability.
 
     The budget is checked after each set; when it is used up, the best sets reached are listed.
     """
@@ -791,7 +797,7 @@ def _ways(
 
 
 def _members(group: ModeGroup, number: int, most: int) -> list[_Way]:
-    """Return the best sets of so many members: they are among the first members."""
+    """Return the best sets of ``number`` members: they are among the first members."""
     places = range(min(len(group), number + most - 1))
     if number == 1:
         return [(group.weights[place], (group.modes[place],)) for place in places]

@@ -41,8 +41,8 @@ from amberbox.diagnosis.knowledge import Knowledge
 def causal_chain(fmea: Fmea, cause: str, faults: Collection[str], gone: Collection[str]) -> str:
     """Return the chain to a cause: ``carry lost because see lost because laser_front#dead``.
 
-    ``gone`` is what no longer serves while the faults are there (``propagation.lost``). A failure
-    mode is a reason by itself.
+    ``gone`` is what these faults take out of service (``propagation.lost``). A failure mode is a
+    reason by itself.
     """
     if cause in fmea.modes:
         return cause
@@ -57,7 +57,7 @@ def causal_chain(fmea: Fmea, cause: str, faults: Collection[str], gone: Collecti
 
 
 def _joined(reasons: list[str]) -> str:
-    """Join reasons; those that have reasons of their own in brackets."""
+    """Join reasons; those that have reasons of their own are in brackets."""
     distinct = list(dict.fromkeys(reasons))
     if len(distinct) == 1:
         return distinct[0]
@@ -91,10 +91,10 @@ def conclude(
 ) -> Diagnosis:
     """Return the diagnosis of a situation by fault trees: a pure function of its arguments.
 
-    Probabilities are shares among the cut sets that were looked at; ``mass_covered`` is a lower
-    bound of the share of those listed in all cut sets. ``incomplete`` says what was cut off. The
-    proof of a hypothesis is the way through the tree, a line per symptom. Raises UsageError for
-    answers and conflicts that name what the knowledge does not have.
+    Probabilities are shares among the cut sets that were enumerated; ``mass_covered`` is a lower
+    bound of the share of the listed ones in all cut sets. ``incomplete`` names what was cut off.
+    The proof of a hypothesis is the path through the tree, a line per symptom. Raises UsageError
+    for answers and conflicts with names that the knowledge does not have.
     """
     effort = effort or Effort()
     known = evidence_of_situation(knowledge, situation)

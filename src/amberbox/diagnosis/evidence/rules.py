@@ -50,8 +50,8 @@ def rule_files(folder: Path) -> list[Path]:
 def with_rules(known: FmeaReferences, folder: Path) -> FmeaReferences:
     """Return the references of failure modes, with the names that a folder's rules define.
 
-    Rules that cannot be read define no names: ``amberbox check`` reports what is wrong with them,
-    and the robot is diagnosed without them meanwhile.
+    Rules that cannot be read define no names: ``amberbox check`` reports their errors, and the
+    robot is diagnosed without them meanwhile.
     """
     try:
         program = read_rules(rule_files(folder))
@@ -63,15 +63,15 @@ def with_rules(known: FmeaReferences, folder: Path) -> FmeaReferences:
 
 FMEA = "fmea.yaml"
 SEEN = "symptoms"
-"""Names of where facts come from, in proofs."""
+"""Origin of facts about symptoms, as shown in proofs."""
 
 
 @dataclass(frozen=True, slots=True)
 class Facts:
     """Facts besides the rules' own.
 
-    ``seen`` are facts of an instant, each with what it was measured from. ``lookups`` are
-    predicates that look into a record.
+    ``seen`` are facts of an instant, each with the data it was measured from. ``lookups`` are
+    predicates that query a record.
     """
 
     known: tuple[Fact, ...] = ()
@@ -153,7 +153,7 @@ def seen_facts(symptoms: Iterable[Symptom], fmea: Fmea) -> Iterator[tuple[Fact, 
 
 SOURCE = "rules"
 _BESIDE_OTHERS = 1.0 - 1e-9
-"""Strength of a finding: of one measurement, what a monitor makes of it counts first."""
+"""Strength of a finding: if a monitor uses the same measurement, the monitor counts first."""
 _MOST_SHOWN = 20
 _STATUS = ("status", "state")
 
@@ -162,9 +162,9 @@ _STATUS = ("status", "state")
 class RuleFindings:
     """The findings of rules.
 
-    ``symptoms`` are ``rule:GOAL``, ``conflicts`` sets of failure modes of which one is there for
-    sure, ``findings`` texts that indicate no failure mode. ``proofs`` are those of each symptom and
-    each conflict (its failure modes joined by `` or ``).
+    ``symptoms`` are ``rule:GOAL``, ``conflicts`` sets of failure modes of which one is certainly
+    present, ``findings`` texts that indicate no failure mode. ``proofs`` are those of each symptom
+    and each conflict (its failure modes joined by `` or ``).
     """
 
     symptoms: tuple[Symptom, ...] = ()
@@ -236,7 +236,7 @@ def provide(knowledge: Knowledge, window: EvidenceWindow) -> Iterator[EvidenceIt
 
 
 def alone(knowledge: Knowledge, window: EvidenceWindow, case: DiagnosisContext) -> Diagnosis | None:
-    """Return the diagnosis by the folder's rules; raises UsageError where there are none."""
+    """Return the diagnosis by the folder's rules; raises UsageError if it has none."""
     if not rule_files(window.folder):
         raise UsageError(f"there are no rules/*.pl in {window.folder}", "see docs/robot/rules.md")
     facts = _facts(knowledge, window)
@@ -262,8 +262,8 @@ def conclude(
     """Return the diagnosis by the rules alone.
 
     The hypotheses are failure modes that answers indicate, each with the proof; answers that
-    indicate none are in ``findings``. Probabilities come of the FMEA's, given nothing but the
-    answers.
+    indicate none are in ``findings``. Probabilities are computed from those of the FMEA, given only
+    the answers.
     """
     found = rule_findings(program, knowledge.fmea, facts, heading.at_ns, all_heads=True)
     alone = ObservedSituation(found.symptoms, conflicts=found.conflicts, findings=found.findings)
@@ -337,7 +337,9 @@ class _Collected:
         return True
 
     def _measured(self, leaf: ProofNode) -> Measured:
-        """Return what a leaf of a proof was measured from; of a status, what its symptoms were."""
+        """Return the data that a leaf of a proof was measured from; for a status, those of its
+        symptoms.
+        """
         if leaf.place is not None and leaf.place.file == SEEN and leaf.kind == "fact":
             return self._facts.seen[leaf.place.line - 1][1]
         if leaf.source is None:
@@ -346,9 +348,10 @@ class _Collected:
         return self._components.get(named) or leaf.source.evidence
 
     def _onset_ns(self, proof: Sequence[ProofNode]) -> Iterator[int]:
-        """Yield when (ns) the goals of an answer became true; the answer did with the last of them.
+        """Yield when (ns) each goal of an answer became true; the answer began with the last of
+        them.
 
-        What is absent or unknown has no beginning; nor has an answer of facts alone.
+        Absent or unknown symptoms have no onset, neither has an answer from facts alone.
         """
         begun = [self._begun_ns(leaf) for node in proof for leaf in node.leaves()]
         yield from sorted(at_ns for at_ns in begun if at_ns is not None)[-1:]
@@ -376,7 +379,7 @@ class _Collected:
 
 
 def _by_component(facts: Facts) -> dict[str, Measured]:
-    """Return what the present symptoms of each component were measured from."""
+    """Return the data that the present symptoms of each component were measured from."""
     found: dict[str, Measured] = {}
     for (name, *values), of in facts.seen:
         component, slash, _ = str(values[0]).partition("/")

@@ -25,7 +25,7 @@ _NEEDS = EvidenceNeeds(symptoms=False)
 
 
 def needs(knowledge: Knowledge, folder: Path) -> EvidenceNeeds | None:
-    """Return that it needs nothing: a user's evidence replaces what was read."""
+    """Return that it reads nothing: a user's evidence replaces the symptoms that were read."""
     return _NEEDS
 
 

@@ -207,7 +207,7 @@ class CutSets:
 
     @property
     def count(self) -> int:
-        """Return how many sets there are (may be too large for ``len``)."""
+        """Return the number of sets (may be too large for ``len``)."""
         return sum(self.by_order)
 
     def __iter__(self) -> Iterator[frozenset[str]]:
@@ -223,8 +223,7 @@ class CutSets:
     def upper_bound(self, of_event: Mapping[str, float]) -> float | None:
         """Return the min cut upper bound, 1 - product of (1 - probability of each set).
 
-        None where sets are so probable, or so many, that the sum that it is computed from would
-        take too long.
+        None if the sets are so probable, or so many, that computing it would take too long.
         """
         logarithm = 0.0
         work = sum(len(sets) for sets in self.sets)
@@ -395,11 +394,11 @@ def _leaf_slopes(
 class Analysis:
     """The results for the top event of a fault tree.
 
-    ``top_probability`` is exact, basic events being independent; None when an event has no
-    probability (they are in ``without_probability``) or the budget ended. ``cut_sets`` is None
-    when the budget ended; those of a tree that is not ``coherent`` are the positive parts of its
-    minimal solutions. ``truncated_at`` is the order limit if there was one: then larger cut sets
-    are not counted. ``incomplete`` says which budget ended what; empty if all was done.
+    ``top_probability`` is exact for independent basic events; None when an event has no probability
+    (they are in ``without_probability``) or the budget ended. ``cut_sets`` is None when the budget
+    ended; those of a tree that is not ``coherent`` are the positive parts of its minimal solutions.
+    ``truncated_at`` is the order limit if there was one: then larger cut sets are not counted.
+    ``incomplete`` names the budget and what it ended; empty if the analysis is complete.
     """
 
     tree: FaultTree
@@ -502,7 +501,8 @@ State: TypeAlias = Mapping[str, "bool | float | None"]
 
 @dataclass(frozen=True, slots=True)
 class CutSetCloseness:
-    """A cut set: what of it has happened, what is missing, how probable it is to be completed.
+    """A cut set: which of its events have happened, which are missing, its probability of
+    completion.
 
     ``probability`` is None when one of the missing events has none.
     """
@@ -517,10 +517,10 @@ def closest(
 ) -> list[CutSetCloseness]:
     """Return the ``n`` minimal cut sets that are closest to complete, the closest first.
 
-    Closest is what is most probable to be completed, with equal probability what misses fewer
-    events; if an event of the tree has no probability at all, what misses fewer events. Cut sets
-    with an event that has surely not happened are left out. An ``Analysis`` is solved already:
-    give it when asking again and again. Raises AmberboxError when the budget did not suffice.
+    They are ordered by the probability of completion, then by the number of missing events; if an
+    event of the tree has no probability at all, by the number of missing events. Cut sets with an
+    event that has certainly not happened are left out. For repeated calls give an ``Analysis``,
+    which is solved already. Raises AmberboxError when the budget did not suffice.
     """
     analysis = tree if isinstance(tree, Analysis) else analyse(tree, budget=budget)
     chances = _chances(analysis, state)
@@ -544,7 +544,7 @@ def ranked(analysis: Analysis, chances: Mapping[str, float | None]) -> Iterator[
 
 
 def _chances(analysis: Analysis, state: State) -> dict[str, float | None]:
-    """Return the probability of each event as things stand; 1 for what has happened."""
+    """Return the probability of each event in the given state; 1 for events that have happened."""
     chances: dict[str, float | None] = {}
     for event in analysis.events:
         known = state.get(event)
@@ -582,7 +582,7 @@ _SAME = 1.0 - 1e-9
 
 @dataclass(frozen=True, slots=True)
 class NearCutSet:
-    """A cut set as things stand: how probable it is complete, and each of its events by itself."""
+    """A cut set in the present state: its probability of being complete, and that of each event."""
 
     probability: float
     events: Mapping[str, float]

@@ -26,7 +26,7 @@ MOST_NODES = 10_000_000
 class ExhaustedError(Exception):
     """A budget was used up; ``reason`` names it, in words for the result.
 
-    ``done`` counts how far the work had come.
+    ``done`` counts the completed steps.
     """
 
     def __init__(self, reason: str, done: int = 0) -> None:
@@ -54,9 +54,9 @@ _SHARE_OF_CACHE = 4
 
 @dataclass
 class Diagram:
-    """Nodes of a diagram: the level of the variable, the branch where it is true, where false.
+    """Nodes of a diagram: the level of the variable, and its true and false branches.
 
-    ``limit`` bounds what is held: nodes and remembered results together.
+    ``limit`` bounds the number of nodes and cached results together.
     """
 
     budget: Budget
@@ -120,7 +120,7 @@ class Diagram:
         return result
 
     def at_least(self, count: int, nodes: Sequence[int]) -> int:
-        """Return what is true when ``count`` or more of the nodes are."""
+        """Return the node that is true when ``count`` or more of the nodes are."""
         reached = [1] + [0] * count  # [k]: k or more of those seen so far
         left = len(nodes)
         for node in self._from_below(nodes):
@@ -136,8 +136,8 @@ class Diagram:
     def _combine(self, left: int, right: int, absorbing: int) -> int:  # noqa: C901 (one hot loop)
         """Compute AND (``absorbing`` 0) or OR (1) of two nodes.
 
-        On ``todo`` lie pairs to compute, as one number, and below them, inverted, the pair whose
-        two branches they are. The code is one loop because this is where the time goes.
+        ``todo`` is a stack of pairs to compute, as one number, and below them, inverted, the pair
+        whose two branches they are. The code is one loop because most of the time is spent in it.
         """
         levels, highs, lows, tables = self.levels, self.highs, self.lows, self.tables
         cache = self.caches[absorbing]
@@ -197,7 +197,7 @@ class Diagram:
                 cache.clear()
 
     def compact(self, roots: Iterable[int]) -> dict[int, int]:
-        """Keep only what is below ``roots``; return the new number of every node that stays."""
+        """Keep only the nodes below ``roots``; return the new number of every remaining node."""
         levels, highs, lows = self.levels, self.highs, self.lows
         stay = reachable(highs, lows, roots)
         self.levels, self.highs, self.lows, self.tables = [BELOW, BELOW], [0, 1], [0, 1], {}
@@ -231,8 +231,9 @@ class ZeroSuppressedDiagram(Diagram):
     def without(self, sets: int, others: int) -> int:
         """Return the sets that contain none of the others.
 
-        On ``todo`` lie pairs to compute as one number, and inverted what to do with results: even
-        numbers make the node of a pair, odd ones take further sets out of the last result.
+        ``todo`` is a stack of pairs to compute as one number, and inverted the operations on
+        results: even numbers make the node of a pair, odd ones remove further sets from the last
+        result.
         """
         levels, highs, lows = self.levels, self.highs, self.lows
         cache = self.caches[0]
@@ -413,7 +414,7 @@ def _left(budget: Budget, held: int) -> Budget:
 
 
 def finish_diagram(diagram: Diagram, root: int) -> DiagramNodes:
-    """Keep what is below a node, in few tuples."""
+    """Keep the nodes below a node, in few tuples."""
     if root < 2:
         return DiagramNodes(
             tuple(diagram.levels[: root + 1]), (0, 1)[: root + 1], (0, 1)[: root + 1]
@@ -441,7 +442,7 @@ def _decisions(
 ) -> tuple[tuple[int, ...], DiagramNodes]:
     """Build the diagram of a part: try all orders with few nodes, the better half with more.
 
-    Better are those that came further through the gates before their nodes were used up.
+    An order is better if more of the gates were processed before its nodes were used up.
     """
     candidates = variable_orders(graph, part)
     allowance, most = _FIRST_ALLOWANCE, budget.most_nodes(MOST_NODES)

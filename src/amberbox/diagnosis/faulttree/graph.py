@@ -116,7 +116,7 @@ class FaultGraph:
 
 @dataclass
 class _Builder:
-    """Turns formulas into vertices without recursion: what is left to do lies on ``tasks``."""
+    """Converts formulas to vertices without recursion: ``tasks`` is the stack of open work."""
 
     gates: Mapping[str, Formula]
     constants: Mapping[str, bool]
@@ -212,8 +212,8 @@ _PLAIN = frozenset({"event", "constant"}) | COHERENT
 class FaultTreeModule:
     """A vertex and the vertices below it down to events and other parts, its ``leaves``.
 
-    ``leaves`` and ``inner`` are in the order of a walk from left to right; in ``inner`` inputs
-    come before what uses them.
+    ``leaves`` and ``inner`` are in the order of a walk from left to right; in ``inner`` a vertex
+    comes after its inputs.
     """
 
     vertex: int
@@ -224,8 +224,9 @@ class FaultTreeModule:
 def split_modules(graph: FaultGraph, top: int) -> list[FaultTreeModule]:
     """Return the parts below and including ``top``, each after those it needs.
 
-    Only coherent parts are taken out: for these the minimal cut sets of the whole are those of
-    the rest with the part's own put in. New vertices may be added to ``graph``.
+    Only coherent parts are separated: for these the minimal cut sets of the whole tree are those of
+    the remaining tree with the cut sets of the part inserted. New vertices may be added to
+    ``graph``.
     """
     alone = _group(graph, top, _modules(graph, top))
     parts: dict[int, FaultTreeModule] = {}
@@ -266,7 +267,9 @@ def _part(graph: FaultGraph, top: int, alone: set[int]) -> FaultTreeModule:
 
 @dataclass(slots=True)
 class _Visit:
-    """When a walk came first, left (gates: after all inputs) and came last."""
+    """The steps at which a walk first reached, left (gates: after all inputs) and last reached a
+    vertex.
+    """
 
     first: int
     left: int = 0
@@ -311,7 +314,7 @@ def _walk(graph: FaultGraph, top: int) -> dict[int, _Visit]:
 
 
 def _inputs_first(graph: FaultGraph, top: int) -> list[int]:
-    """Return what is below a vertex, inputs before what uses them."""
+    """Return the vertices below a vertex, inputs before the gates that use them."""
     order: dict[int, None] = {}
     waiting = [top]
     while waiting:
@@ -325,7 +328,7 @@ def _inputs_first(graph: FaultGraph, top: int) -> list[int]:
 
 
 def _group(graph: FaultGraph, top: int, found: set[int]) -> set[int]:
-    """Put together what stands alone below each AND and OR; return all parts."""
+    """Group inputs that are used only by one AND or OR; return all parts."""
     parents = graph.parents(top)
     events = _events_below(graph, top)
     grouped = set(found)
@@ -391,7 +394,7 @@ _ROUNDS = 20
 
 
 def variable_orders(graph: FaultGraph, part: FaultTreeModule) -> list[tuple[int, ...]]:
-    """Return orders of the leaves of a part; those that are most often good come first."""
+    """Return orders of the leaves of a part; the most promising ones first."""
     inputs = {number: graph.vertices[number].inputs for number in part.inner}
     if len(part.leaves) < 3 or len(part.inner) < 2:
         return [part.leaves]
@@ -419,7 +422,7 @@ def _uses(inputs: Mapping[int, Sequence[int]]) -> dict[int, int]:
 
 
 def _sizes(inputs: Mapping[int, Sequence[int]]) -> dict[int, int]:
-    """Return by gate how much is below it, what is shared counted again and again."""
+    """Return by gate the number of vertices below it; shared vertices count repeatedly."""
     sizes: dict[int, int] = {}
     for number, entries in inputs.items():  # inputs come before what uses them
         sizes[number] = 1 + sum(sizes.get(entry, 1) for entry in entries)
@@ -435,7 +438,9 @@ def _heights(inputs: Mapping[int, Sequence[int]]) -> dict[int, int]:
 
 
 def _depths(top: int, inputs: Mapping[int, Sequence[int]]) -> dict[int, int]:
-    """Return by gate the longest way up, negative: what is near the top is the highest."""
+    """Return by gate the negative length of the longest path to the top, so that the top is
+    highest.
+    """
     depths = {top: 0}
     for number in reversed(list(inputs)):
         for entry in inputs[number]:
@@ -453,7 +458,7 @@ def _by_place(
     places: Mapping[int, int],
     among: Callable[[Sequence[int]], float],
 ) -> tuple[int, ...]:
-    """Sort leaves by how high the gates stand that use them, the highest first."""
+    """Sort leaves by the position of the gates that use them, the highest first."""
     users: dict[int, list[int]] = {leaf: [] for leaf in order}
     for number, entries in inputs.items():
         for entry in entries:
@@ -479,7 +484,9 @@ def _ordering_walk(
 
 
 def _forced(order: tuple[int, ...], inputs: Mapping[int, Sequence[int]]) -> tuple[int, ...]:
-    """Improve an order: gates to the middle of what they join, what they join towards the gates."""
+    """Improve an order: move gates to the middle of their inputs, and inputs towards
+    their gates.
+    """
     best, best_span = order, _span(order, inputs)
     for _ in range(_ROUNDS):
         place = {leaf: float(n) for n, leaf in enumerate(order)}
@@ -498,7 +505,7 @@ def _forced(order: tuple[int, ...], inputs: Mapping[int, Sequence[int]]) -> tupl
 
 
 def _span(order: Sequence[int], inputs: Mapping[int, Sequence[int]]) -> int:
-    """Add up how far the events of each gate lie apart."""
+    """Add up the distances between the events of each gate."""
     ranges = {leaf: (n, n) for n, leaf in enumerate(order)}
     total = 0
     for number, entries in inputs.items():

@@ -46,7 +46,7 @@ _DEEPEST = 100
 
 @dataclass(slots=True)
 class MefElement:
-    """An element of an XML file; ``text`` is what stands directly in it."""
+    """An element of an XML file; ``text`` is its direct text."""
 
     tag: str
     attributes: Mapping[str, str]
@@ -82,7 +82,7 @@ def parse(data: bytes, file: str, problems: list[Problem]) -> MefElement | None:
 
 
 class _Builder:
-    """Builds elements from what the parser calls."""
+    """Builds elements from the calls of the parser."""
 
     def __init__(self, parser: expat.XMLParserType, file: str) -> None:
         self.parser = parser
@@ -153,8 +153,8 @@ class MefDefinition:
 class MefScope:
     """All definitions of a model by their full path, and the public ones by their bare name.
 
-    Parameters (True) and what gates refer to (False) have names of their own. ``known`` holds
-    what the tree will call each.
+    Parameters (True) and events or gates (False) have separate names. ``known`` holds the name of
+    each in the tree.
     """
 
     problems: list[Problem]
@@ -187,7 +187,7 @@ class MefScope:
         return (entry for entry in self.by_path.values() if entry.kind == kind)
 
     def find(self, element: MefElement, path: Path, kinds: tuple[str, ...]) -> MefDefinition | None:
-        """Return what an element refers to; None and a problem if there is no such thing."""
+        """Return the definition that an element refers to; None and a problem if there is none."""
         name = element.attributes.get("name", "")
         is_parameter = kinds == ("parameter",)
         found = self._lookup(is_parameter, name, path)
@@ -244,12 +244,12 @@ _ZERO = Number(0.0)
 
 
 def content(element: MefElement) -> list[MefElement]:
-    """Return what an element holds besides its description."""
+    """Return the children of an element without its description."""
     return [child for child in element.children if child.tag not in _DESCRIBING]
 
 
 def formula(element: MefElement, path: Path, scope: MefScope) -> Formula:
-    """Read a formula; what is wrong with it goes to the problems of the scope."""
+    """Read a formula; its errors are added to the problems of the scope."""
     if element.tag in REFERENCES:
         found = scope.find(element, path, REFERENCES[element.tag])
         return _NOTHING if found is None else Name(found.name)
@@ -281,7 +281,7 @@ def boolean(element: MefElement, scope: MefScope) -> bool:
 
 
 def expression(element: MefElement, path: Path, scope: MefScope) -> Expression:
-    """Read an expression; what is wrong with it goes to the problems of the scope."""
+    """Read an expression; its errors are added to the problems of the scope."""
     tag = element.tag
     if tag in ("float", "int"):
         return Number(_number(element, scope))
@@ -346,11 +346,11 @@ def read_mef(
     top: str = "",
     mission_time_h: float = DEFAULT_MISSION_TIME_H,
 ) -> FaultTree:
-    """Read the fault tree of a file, or of several that name each other's gates and events.
+    """Read the fault tree of a file, or of several that refer to each other's gates and events.
 
-    ``top`` is the gate to analyse; without, the one that no other gate uses. Raises
-    ConfigurationError with the line of everything that is wrong, UsageError when there are
-    several gates to choose from.
+    ``top`` is the gate to analyse; by default the one that no other gate uses. Raises
+    ConfigurationError with the line of every error, UsageError when there are several gates to
+    choose from.
     """
     paths = [path] if isinstance(path, str | FilePath) else list(path)
     scope = MefScope([])
@@ -561,7 +561,7 @@ def _top(gates: Mapping[str, Gate], wanted: str, file: str) -> str:
 
 
 def _tree_name(definition: MefDefinition, roots: Sequence[MefElement]) -> str:
-    """Return the name of the fault tree that a gate stands in."""
+    """Return the name of the fault tree that contains a gate."""
     if not definition.path:
         return ""
     name = definition.path[0]
@@ -576,10 +576,10 @@ _Naming = Callable[[str], str]
 
 
 def write_mef(tree: FaultTree) -> str:
-    """Return the text of a file with all of a tree.
+    """Return the text of a file with a whole tree.
 
-    Names that the format does not allow are changed; the own name stands in an attribute, so
-    that reading the file gives the same tree again.
+    Names that the format does not allow are changed; the original name is in an attribute, so that
+    reading the file gives the same tree again.
     """
     naming = _names([*tree.gates, *tree.events, *tree.houses])
     parameters = _names(tree.parameters)
@@ -688,7 +688,7 @@ def _constant(value: bool) -> str:
 
 
 def _names(names: Iterable[str]) -> _Naming:
-    """Return a function that makes names of the format; allowed ones stay as they are."""
+    """Return a function that makes names of the format; allowed names are not changed."""
     known = list(names)
     given = {name: name for name in known if _ALLOWED.fullmatch(name)}
     taken = set(given)

@@ -13,7 +13,7 @@ from amberbox.core.errors import Problem, did_you_mean
 
 @dataclass(frozen=True, slots=True)
 class Number:
-    """A number as it stands in the file."""
+    """A number with its text in the file."""
 
     value: float
 
@@ -90,7 +90,7 @@ FUNCTIONS: Mapping[str, tuple[int, int | None, Callable[..., float]]] = {
 
 
 def count_problem(kind: str, given: int, fewest: int, most: int | None) -> str:
-    """Return what is wrong with the number of inputs of something; empty if nothing is."""
+    """Return the problem with the number of inputs of something; empty if it is valid."""
     if fewest <= given and (most is None or given <= most):
         return ""
     wanted = "at least" if most is None else "exactly"
@@ -157,7 +157,7 @@ class Name:
 
 @dataclass(frozen=True, slots=True)
 class BooleanConstant:
-    """True or false, whatever happens."""
+    """A constant, true or false."""
 
     value: bool
 
@@ -190,7 +190,7 @@ def any_of(*inputs: Formula | str) -> GateOperation:
 
 
 def at_least(count: int, *inputs: Formula | str) -> GateOperation:
-    """Return what is true when ``count`` or more of the inputs are."""
+    """Return a formula that is true when ``count`` or more of the inputs are."""
     return GateOperation("atleast", _formulas(inputs), count)
 
 
@@ -227,7 +227,7 @@ _NONE: Mapping[str, Any] = MappingProxyType({})
 
 @dataclass(frozen=True, slots=True)
 class Gate:
-    """A named formula; ``label`` is what people call it."""
+    """A named formula; ``label`` is its name for people."""
 
     name: str
     formula: Formula
@@ -314,7 +314,7 @@ def below(tree: FaultTree) -> tuple[list[str], list[str]]:
 
 @dataclass(frozen=True, slots=True)
 class DefinitionLines:
-    """Where the elements of a tree stand: file and line of each name."""
+    """File and line of each name of a tree."""
 
     file: str = "fault tree"
     places: Mapping[str, tuple[str, int]] = field(default_factory=dict)
@@ -355,7 +355,7 @@ def _of_gates(tree: FaultTree, places: DefinitionLines) -> Iterator[Problem]:
 
 
 def operation_problem(operation: GateOperation) -> str:
-    """Return what is wrong with an operator and its inputs; empty if nothing is."""
+    """Return the problem with an operator and its inputs; empty if it is valid."""
     kind, size = operation.operator, len(operation.inputs)
     if size == 0:
         return f"'{kind}' has no input"
@@ -401,7 +401,7 @@ def path_back(uses: Mapping[str, list[str]]) -> list[str]:
 
 
 def _next(path: dict[str, Iterator[str]], finished: set[str]) -> str | None:
-    """Return what the last name of a path leads to; drop names that lead to nothing more."""
+    """Return the next name of a path; drop names that lead to no further ones."""
     if not path:
         return None
     last = next(reversed(path))

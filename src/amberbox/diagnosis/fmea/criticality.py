@@ -81,7 +81,7 @@ def matrix(fmea: Fmea, exposure_h: float | None = None) -> CriticalityMatrix:
 
 
 def by_risk_number(modes: Iterable[FailureMode]) -> list[FailureMode]:
-    """Return the modes by S x O x D from high to low; those without a number come last."""
+    """Return the modes by S x O x D from high to low; those without a number are last."""
     return sorted(modes, key=lambda mode: -(mode.ranks.number or 0))
 
 
@@ -109,7 +109,7 @@ def priority(ranks: RiskRanks, rules: Sequence[PriorityRule]) -> str:
 
 
 def load_priorities(path: Path, problems: list[Problem]) -> list[PriorityRule]:
-    """Read a table; add what is wrong with it to the problems."""
+    """Read a table; add its errors to the problems."""
     try:
         text = path.read_text(encoding="utf-8-sig")
     except OSError as error:
@@ -168,7 +168,7 @@ class AmbiguousModes:
 
 @dataclass(frozen=True, slots=True)
 class FmeaCoverage:
-    """What is covered and what is not; ``unseen`` has the reason by mode."""
+    """Covered and uncovered failure modes; ``unseen`` has the reason by mode."""
 
     modes: int
     unseen: dict[str, str]

@@ -37,8 +37,8 @@ def effects(fmea: Fmea) -> tuple[str, ...]:
 def fault_tree_of(fmea: Fmea, effect: str, exposure_h: float | None = None) -> FaultTree:
     """Return the tree of the loss of a function, or of a component that no longer serves.
 
-    An event's probability is that its failure mode is there, after an exposure or after its own.
-    The beta of a mode is left out: whether its effect comes about is what the tree computes. Raises
+    An event's probability is that its failure mode is present, after an exposure or after its own.
+    The beta of a mode is left out, because the tree computes whether its effect occurs. Raises
     UsageError for an unknown effect.
     """
     needs = fmea.needs()
@@ -51,7 +51,7 @@ def fault_tree_of(fmea: Fmea, effect: str, exposure_h: float | None = None) -> F
 def tree_over(
     fmea: Fmea, top: str, gates: Mapping[str, Gate], exposure_h: float | None = None
 ) -> FaultTree:
-    """Return the tree below ``top``: gates of one's own over failure modes and losses.
+    """Return the tree below ``top``: given gates over failure modes and losses.
 
     ``gates`` may name failure modes, and components and functions: these stand for their loss.
     """
@@ -114,7 +114,7 @@ FACTORS = ("mif", "cif", "dif", "raw", "rrw")  # measures of how much an event m
 def analysis_json(
     analysis: Analysis, importance: bool = False, cut_sets: int = 0
 ) -> dict[str, Any]:
-    """Return all numbers; importance and the smallest cut sets where they were asked for."""
+    """Return all numbers; importance and the smallest cut sets if requested."""
     by_order = analysis.by_order
     answer: dict[str, Any] = {
         "top": analysis.tree.top,
@@ -191,7 +191,7 @@ class EffectOutlook:
 
     @property
     def rank(self) -> tuple[bool, float]:
-        """Sort effects: first those that something that has happened leads to."""
+        """Return a sort key: effects with an event that has happened come first."""
         has_begun = any(near.happened for near in self.near)
         return not has_begun, -self.near[0].probability if self.near else 0.0
 

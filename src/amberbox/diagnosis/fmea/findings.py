@@ -24,7 +24,7 @@ Values = Mapping[str, str]  # values of variables by name
 def map_findings(
     sheet: ParsedFmea, modes: Collection[str], known: FmeaReferences | None, problems: list[Problem]
 ) -> tuple[FindingMapping, ...]:
-    """Return the findings of the file; report what is wrong with them, and what nothing maps."""
+    """Return the findings of the file; report their errors, and findings without failure modes."""
     found = [_mapped(entry, sheet.file.defaults) for _, entry in sheet.findings]
     for number, (node, _) in enumerate(sheet.findings):
         problems.extend(_problems(found[number], node, f"findings[{number}]", modes, known))

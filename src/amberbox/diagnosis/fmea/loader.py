@@ -63,7 +63,7 @@ from amberbox.diagnosis.fmea.parser import (
 
 @dataclass(frozen=True)
 class Vocabulary:
-    """One taxonomy: where it comes from, and what each word means, in our own words."""
+    """One taxonomy: its source, and the meaning of each word, paraphrased."""
 
     source: str = option(doc="publication that the words come from")
     words: Mapping[str, str] = option(doc="meaning of each word")
@@ -98,7 +98,7 @@ def resolve(word: str) -> str:
 
 
 class SymptomCollector:
-    """Collects the symptoms that something links to, and those that the file names."""
+    """Collects the symptoms that entries refer to, and those that the file names."""
 
     def __init__(
         self, defaults: DefaultsFile, known: FmeaReferences | None, problems: list[Problem]
@@ -190,7 +190,7 @@ class SymptomCollector:
     ) -> None:
         """Add symptoms with a name or address; a component's names are ``component.name``.
 
-        Reports those that are neither an output nor have a condition, and resolves conditions.
+        Reports symptoms that are neither an output nor a condition, and resolves conditions.
         """
         for short, entry in entries.items():
             place = child_node(node, short)
@@ -423,7 +423,9 @@ def member_components(
 def _offered(
     member: MemberFile, node: Node, scope: EntryScope, folder: Path
 ) -> dict[str, str] | None:
-    """Return the functions in the robot's own file, described; None if that is not there (yet)."""
+    """Return the functions in the robot's own file, with descriptions; None if it does not exist
+    (yet).
+    """
     path = folder / member.where
     path = path / "fmea.yaml" if path.is_dir() else path
     if not member.where or not path.is_file():
@@ -668,9 +670,9 @@ def _of_folder(
     functions: Mapping[str, FmeaFunction],
     sheet: ParsedFmea,
 ) -> dict[str, FmeaComponent]:
-    """Return the components without an entry that something needs, directly or not.
+    """Return the components without an entry that others need, directly or not.
 
-    One in a circle, which a monitor may judge in the folder, is taken to need nothing.
+    A component in a cycle of the folder's dependencies is taken to need nothing.
     """
     users = {name: component.needs for name, component in components.items()}
     users |= {name: function.needs for name, function in functions.items()}
@@ -687,7 +689,7 @@ def _of_folder(
 
 
 def _first_circle(needs: Mapping[str, Needs], among: Mapping[str, FmeaComponent]) -> list[str]:
-    """Return which of some components lie on a circle of needs; none if there is no such circle."""
+    """Return components on a cycle of needs, in order; none if there is no cycle."""
     parts = ([name for name in circle if name in among] for circle in cycles(needs))
     return next(filter(None, parts), [])
 

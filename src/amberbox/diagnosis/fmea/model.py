@@ -1,4 +1,4 @@
-"""A failure mode and effects analysis as it is used: types written out, names resolved.
+"""A failure mode and effects analysis with types expanded and names resolved.
 
 ``FmeaReferences`` are the names of the robot's other files that failure modes can refer to;
 ``DependencyStructure`` gives the components and functions lost when failure modes are present.
@@ -21,12 +21,12 @@ class FmeaReferences:
     """The names that failure modes can refer to.
 
     ``outputs`` are the addresses of all outputs of monitors (``component/mode/output``),
-    ``watched`` those of which something is expected: only they can be symptoms. ``needs`` are those
-    of component files; they count where the failure modes' file has none. ``addresses`` are those
-    that conditions may also read, None if they are not known. ``needs`` has a key for every
-    component of the folder; ``files`` those with monitors, and where. ``predicates`` are the names
-    that a finding's goal may have, None if the rules are not known; ``heads`` those of rules that
-    no other rule calls, with file and line.
+    ``watched`` those with an expected value: only they can be symptoms. ``needs`` are those of
+    component files, with a key for every component of the folder; they apply if the failure modes'
+    file has none. ``addresses`` are those that conditions may also read, None if unknown. ``files``
+    are the files of the components with monitors. ``predicates`` are the names that a finding's
+    goal may have, None if the rules are not known; ``heads`` those of rules that no other rule
+    calls, with file and line.
     """
 
     outputs: Collection[str] = ()
@@ -43,12 +43,12 @@ Kind: TypeAlias = Literal["read", "question", "check"]
 
 @dataclass(frozen=True, slots=True)
 class FmeaSymptom:
-    """Something that can be seen: a monitor's output that is bad, or a condition that is true.
+    """An observable symptom: a monitor's output that is bad, or a condition that is true.
 
-    ``id`` is the address of the output, or a name of the file; then ``condition`` is what must
-    be true. ``leak`` is how probable it shows although no cause of it is there. It counts as
-    absent only ``within_s`` after a cause can have begun, and is remembered for ``hold_s``.
-    ``by_itself``: it counts also while its component is blocked.
+    ``id`` is the address of the output, or a name of the file with its ``condition``. ``leak`` is
+    the probability that it appears without any of its causes. It counts as absent only ``within_s``
+    after a cause can have begun, and is remembered for ``hold_s``. ``by_itself``: it counts also
+    while its component is blocked.
     """
 
     id: str
@@ -72,10 +72,11 @@ class SymptomLink:
 
 @dataclass(frozen=True, slots=True)
 class ModeEffects:
-    """What a failure mode does: to its component (text), next to it, and to the system.
+    """The effects of a failure mode: on its component (text), on the next components, on the
+    system.
 
-    ``next`` and ``system`` are names of components and functions; what the file does not say is
-    derived from what needs the component.
+    ``next`` and ``system`` are names of components and functions; effects that the file leaves out
+    are derived from needs.
     """
 
     local: str = ""
@@ -112,11 +113,11 @@ class ExpectedOutcome:
 class FailureMode:
     """One way in which a component fails; its ``id`` is ``component#mode``.
 
-    ``rate`` is per hour of exposure (mode ratio times the component's rate, where the file says it
-    so); else ``probability`` holds whatever the exposure. ``beta`` is the conditional probability
-    that the effect on the system comes about. ``takes_down``: the component stops serving those
-    that need it. ``make_safe`` is to be done before a test or repair, ``remedy`` is the repair.
-    ``line`` is where the file has it.
+    ``rate`` is per hour of exposure (mode ratio times the component's rate, if the file gives
+    these); otherwise ``probability`` applies for any exposure. ``beta`` is the conditional
+    probability that the effect on the system occurs. ``takes_down``: the component stops serving
+    those that need it. ``make_safe`` is required before a test or repair, ``remedy`` is the repair.
+    ``line`` is its line in the file.
     """
 
     id: str
@@ -142,7 +143,7 @@ class FailureMode:
     make_safe: str = ""
 
     def chance(self, exposure_h: float | None = None) -> float:
-        """Return how probable it is to be there: after an exposure, else its own."""
+        """Return the probability that it is present: after the given exposure, else its own."""
         if self.rate is None:
             return self.probability or 0.0
         return -math.expm1(-self.rate * (self.exposure_h if exposure_h is None else exposure_h))
@@ -193,7 +194,8 @@ class FindingMapping:
     """A finding of another engine: answers of a ``goal`` of rules, or a ``finding`` by its id.
 
     ``maps_to`` are failure modes that it indicates, in which ``<Variable>`` stands for a value;
-    none: it is only shown. ``proves``: at least one of them is there, so that it is no symptom.
+    without any it is only shown. ``proves``: at least one of them is present, so that it is a
+    conflict, not a symptom.
     """
 
     goal: str = ""
@@ -207,10 +209,10 @@ class FindingMapping:
 
 @dataclass(frozen=True, slots=True)
 class UnlistedFault:
-    """Something that is not in this analysis: how probable, and what it shows of anything.
+    """A fault that is not in this analysis: its probability, and that of any symptom of it.
 
-    ``looks_like`` is how probable it looks like a failure mode when it looks like several that
-    begin within ``together_s``.
+    ``looks_like`` is the probability that it looks like a failure mode when it looks like several
+    that begin within ``together_s``.
     """
 
     probability: float = 1e-3
@@ -223,7 +225,7 @@ class UnlistedFault:
 class Fmea:
     """The whole analysis, by id. ``members`` are a team's robots with their folders, where named.
 
-    For ``remember_s`` a symptom that cannot be evaluated any more goes on to count.
+    A symptom that cannot be evaluated any more continues to count for ``remember_s``.
     """
 
     name: str
@@ -266,7 +268,7 @@ class DependencyStructure:
         return cls(needs, {name: tuple(found) for name, found in users.items()})
 
     def dependents(self, names: Iterable[str]) -> frozenset[str]:
-        """Return all that needs one of the names, directly or not, whatever else serves."""
+        """Return everything that needs one of the names, directly or not, ignoring redundancy."""
         found: set[str] = set()
         waiting = list(names)
         while waiting:
@@ -288,13 +290,13 @@ class DependencyStructure:
 
 
 def lost(fmea: Fmea, modes: Iterable[str]) -> frozenset[str]:
-    """Return the components and functions that no longer serve while these modes are there."""
+    """Return the components and functions that no longer serve while these modes are present."""
     down = {fmea.modes[mode].component for mode in modes if fmea.modes[mode].takes_down}
     return DependencyStructure.of(fmea.needs()).lost(down)
 
 
 def links_by_mode(fmea: Fmea) -> dict[str, tuple[SymptomLink, ...]]:
-    """Return what shows when a mode alone is there: its own symptoms and of what it loses."""
+    """Return the symptoms of each mode alone: its own and those of the functions it loses."""
     structure = DependencyStructure.of(fmea.needs())
     of_loss = {
         name: tuple(

@@ -37,7 +37,7 @@ class DefaultsFile:
     hold_s: float = option(0.0, "so long a symptom that has gone is remembered", unit="s")
 
     def check(self) -> Iterator[Finding]:
-        """Yield what is wrong."""
+        """Yield the errors."""
         yield from _shares(self, "detects", "leak")
         yield from _not_below_zero(self, "within_s", "hold_s")
 
@@ -52,7 +52,7 @@ class OtherFile:
     together_s: float = option(10.0, "so short after each other these begin", unit="s")
 
     def check(self) -> Iterator[Finding]:
-        """Yield what is wrong."""
+        """Yield the errors."""
         yield from _shares(self, "probability", "detects", "looks_like")
         yield from _not_below_zero(self, "together_s")
 
@@ -68,7 +68,7 @@ class ScalesFile:
     )
 
     def check(self) -> Iterator[Finding]:
-        """Yield what is wrong."""
+        """Yield the errors."""
         words = Severity.__args__  # type: ignore[attr-defined]  # a Literal has its words there
         for word, rank in self.severity.items():
             if word not in words:
@@ -90,7 +90,7 @@ class RanksFile:
     d: int | None = option(None, "detection from 1 (always seen) to 10 (never)")
 
     def check(self) -> Iterator[Finding]:
-        """Yield what is wrong."""
+        """Yield the errors."""
         for key in ("s", "o", "d"):
             rank = getattr(self, key)
             if rank is not None and not 1 <= rank <= 10:
@@ -108,7 +108,7 @@ class LinkFile:
     hold_s: float | None = option(None, "so long it is remembered when it has gone", unit="s")
 
     def check(self) -> Iterator[Finding]:
-        """Yield what is wrong."""
+        """Yield the errors."""
         if bool(self.symptom) == (self.when is not None):
             yield "give either 'symptom' or 'when'"
         yield from _shares(self, "detects")
@@ -127,14 +127,14 @@ class SymptomFile:
     description: str = option("", "what it is")
 
     def check(self) -> Iterator[Finding]:
-        """Yield what is wrong."""
+        """Yield the errors."""
         yield from _shares(self, "leak")
         yield from _not_below_zero(self, "within_s", "hold_s")
 
 
 @dataclass(frozen=True)
 class EffectsFile:
-    """What a failure mode does."""
+    """The effects of a failure mode."""
 
     local: str = option("", "what its component does then, as text")
     next: Sequence[str] = option((), "components and functions that it harms directly")
@@ -143,13 +143,13 @@ class EffectsFile:
 
 @dataclass(frozen=True)
 class ResultFile:
-    """What a test gives when the failure mode is there."""
+    """The outcome of a test when the failure mode is present."""
 
     outcome: str = option(doc="one of the test's outcomes")
     detects: float = option(0.95, "how probable it gives that")
 
     def check(self) -> Iterator[Finding]:
-        """Yield what is wrong."""
+        """Yield the errors."""
         yield from _shares(self, "detects")
 
 
@@ -177,7 +177,7 @@ class FailureModeFile:
     intermittent: bool = option(False, "whether it comes and goes")
 
     def check(self) -> Iterator[Finding]:
-        """Yield what is wrong."""
+        """Yield the errors."""
         yield from _shares(self, "probability", "ratio", "beta")
         yield from _not_below_zero(self, "rate", "exposure_h")
         given = [key for key in ("probability", "rate", "ratio") if getattr(self, key) is not None]
@@ -204,7 +204,7 @@ class TestFile:
     sure: float = option(0.99, "how probable the first answer is when nothing is wrong with it")
 
     def check(self) -> Iterator[Finding]:
-        """Yield what is wrong."""
+        """Yield the errors."""
         given = [key for key in ("question", "look", "read") if getattr(self, key)]
         if len(given) != 1:
             yield "give one of question, check and read"
@@ -226,7 +226,7 @@ class TypeFile:
     symptoms: Any = option(None, "conditions with a name, of each instance")
 
     def check(self) -> Iterator[Finding]:
-        """Yield what is wrong."""
+        """Yield the errors."""
         yield from _not_below_zero(self, "rate")
 
 
@@ -254,7 +254,7 @@ class FindingFile:
     description: str = option("", "what it means, for a technician")
 
     def check(self) -> Iterator[Finding]:
-        """Yield what is wrong."""
+        """Yield the errors."""
         if bool(self.rule) == bool(self.finding):
             yield "give either 'rule' or 'finding'"
         yield from _shares(self, "detects", "leak")
@@ -278,7 +278,7 @@ class MemberFunctionFile:
     make_safe: str = option("", "what to do first, before anybody tests or repairs it")
 
     def wrong(self) -> Iterator[tuple[str, str]]:
-        """Yield each value out of its range, by key; the functions beside it are judged, too."""
+        """Yield each value out of its range, by key; the functions beside it are checked, too."""
         yield from _shares(self, "probability")
         yield from _not_below_zero(self, "rate")
 
@@ -312,7 +312,7 @@ class FmeaFile:
     findings: Any = option(None, "what other engines find, and what it speaks for")
 
     def check(self) -> Iterator[Finding]:
-        """Yield what is wrong."""
+        """Yield the errors."""
         yield from _not_below_zero(self, "exposure_h", "remember_s")
 
 
@@ -336,7 +336,7 @@ def _not_below_zero(entry: object, *keys: str) -> Iterator[tuple[str, str]]:
 
 
 def child_node(node: Node, *keys: str | int) -> Node:
-    """Go down a tree by keys and places in lists, as far as it goes."""
+    """Follow keys and list indices down a tree, as far as they exist."""
     for key in keys:
         if isinstance(key, int):
             node = (node.items or ())[key] if key < len(node.items or ()) else node
@@ -466,13 +466,13 @@ class ExpandedComponent:
     symptoms: Mapping[str, SymptomFile]
 
     def mode_node(self, name: str) -> Node:
-        """Return where a failure mode stands."""
+        """Return the node of a failure mode."""
         return child_node(_modes_node(self.node), name)
 
 
 @dataclass(frozen=True, slots=True)
 class ParsedFmea:
-    """Everything that could be read, and the names of all that is there.
+    """Everything that could be read, and the names of all entries.
 
     ``folder`` has the components that only the robot folder has, with their needs.
     """
@@ -610,7 +610,7 @@ def rate_notes(rate: float | None, node: Node, where: str) -> Iterator[Problem]:
 def _ratio_problems(
     file: TypeFile, modes: Mapping[str, FailureModeFile], node: Node, where: str
 ) -> Iterator[Problem]:
-    """Yield what is wrong with shares of a component's failures."""
+    """Yield the errors in shares of a component's failures."""
     ratios = {name: mode.ratio for name, mode in modes.items() if mode.ratio is not None}
     place = _modes_node(node)
     if sum(ratios.values()) > 1 + 1e-9:

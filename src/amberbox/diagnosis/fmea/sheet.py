@@ -317,7 +317,7 @@ def _entries(cell: str) -> list[str]:
 
 
 def _given(**values: Any) -> Iterator[tuple[str, Any]]:
-    """Yield what is not empty."""
+    """Yield the values that are not empty."""
     return ((key, value) for key, value in values.items() if value)
 
 

@@ -221,7 +221,7 @@ def compile_clause(
 
 
 def compile_goal(term: Term, place: SourcePosition | None = None) -> PrologGoal | None:
-    """Compile a goal whose variables are in use already; None if there is nothing to do."""
+    """Compile a goal whose variables are in use already; None for an empty goal."""
     return _Compiler(lambda _: place, in_use=True).goals(term)
 
 
@@ -232,7 +232,7 @@ class _Compiler:
     in_use: bool = False
 
     def pattern(self, term: Term) -> Term:
-        """Replace variables by slots; what has none stays as it is."""
+        """Replace variables by slots; a term without variables stays unchanged."""
         if self.in_use:
             return term
         spine: list[tuple[Struct, list[Term]]] = []
@@ -341,7 +341,7 @@ Answer = tuple[Term, ...]
 
 @dataclass(eq=False)
 class _Consumer:
-    """A call that waits for answers: its arguments and what is left to do after it."""
+    """A call that waits for answers: its arguments and its continuation."""
 
     args: Answer
     after: Frame
@@ -503,7 +503,7 @@ def _feed(
 
 
 def _suspend(m: PrologMachine, table: _Table, args: Sequence[Term], after: Frame) -> None:
-    """Keep a call that has to wait, with what is left to do after it."""
+    """Store a call that has to wait, with its continuation."""
     memo: Memo = {}
     frame = _copy_frames(m, table, after, memo)
     own = tuple(copy(arg, memo) for arg in args)

@@ -126,7 +126,7 @@ def _slots(terms: Sequence[Term]) -> Iterator[int]:
 def _check_bound(head: Row, literals: Sequence[Literal]) -> None:
     """Refuse a head, negation or test with a variable that no goal before it binds.
 
-    A variable that occurs nowhere else but in a negation means anything there.
+    A variable that occurs only in a negation matches anything there.
     """
     bound: set[int] = set()
     for number, literal in enumerate(literals):
@@ -147,7 +147,7 @@ Index: TypeAlias = Mapping[Any, Collection[Row]]
 
 
 class DatalogRelation:
-    """Rows in the order in which they were added, each with where it comes from."""
+    """Rows in the order in which they were added, each with its origin."""
 
     def __init__(self) -> None:
         self.rows: dict[Row, Any] = {}
@@ -155,7 +155,7 @@ class DatalogRelation:
         self._indexes: dict[Columns, dict[Any, list[Row]]] = {}
 
     def add(self, row: Row, origin: Any) -> bool:
-        """Add a row; False if it was there."""
+        """Add a row; False if it existed already."""
         if row in self.rows:
             return False
         self.rows[row] = origin
@@ -179,7 +179,7 @@ class DatalogRelation:
         return found
 
     def per_key(self, columns: Columns) -> float:
-        """Return how many rows there are on average for given values of some columns."""
+        """Return the average number of rows for given values of some columns."""
         return len(self._order) / max(1, len(self.index(columns)))
 
 
@@ -193,7 +193,7 @@ Graph = Mapping[Key, Iterable[Key]]
 def dependency_groups(graph: Graph) -> list[list[Key]]:
     """Return groups of relations that depend on each other, after those that they need.
 
-    Tarjan's algorithm, without recursion.
+    Uses Tarjan's algorithm, without recursion.
     """
     number: dict[Key, int] = {}
     lowest: dict[Key, int] = {}
@@ -239,7 +239,7 @@ Filter = Callable[[Env], bool]
 
 @dataclass(slots=True)
 class JoinStep:
-    """Look up one relation: what is known of its columns, and which variables it binds."""
+    """A lookup of one relation: its bound columns, and the variables it binds."""
 
     index: Index
     known: tuple[Term, ...]
@@ -250,7 +250,7 @@ class JoinStep:
     decides: bool = False
 
     def rows(self, env: Env) -> Any:
-        """Return the rows that match what is known."""
+        """Return the rows that match the bound columns."""
         known = self.known
         if len(known) == 1:
             part = known[0]
@@ -473,7 +473,7 @@ class DeductiveDatabase:
     def _refuse_loops(
         self, group: Sequence[Key], graph: dict[Key, list[Key]], query: DatalogRule
     ) -> None:
-        """Leave loops to tabling unless all of a tabled relation is asked for."""
+        """Leave loops to tabling unless all rows of a tabled relation are requested."""
         if not _is_loop(group, graph):
             return
         is_part = any(not isinstance(a, Slot) for lit in query.relations for a in lit.args)
@@ -664,7 +664,7 @@ class _Prover:
         self.open: list[tuple[ProofNode, DatalogRule, Env]] = []
 
     def proof(self, rule: DatalogRule, env: Env) -> tuple[ProofNode, ...]:
-        """Return what an answer follows from."""
+        """Return the facts and goals that an answer follows from."""
         root = ProofNode("true", "rule")
         self.open.append((root, rule, env))
         while self.open:

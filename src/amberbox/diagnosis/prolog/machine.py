@@ -193,14 +193,14 @@ Kind: TypeAlias = Literal["rule", "fact", "builtin", "lookup"]
 
 @dataclass(frozen=True, slots=True)
 class LookupSource:
-    """Where something was looked up, in words, and what was measured: address, from, to in ns."""
+    """The source of a lookup, in words, and the measured data: address, from, to in ns."""
 
     text: str
     evidence: tuple[tuple[str, int, int], ...] = ()
 
 
 class LookedUp(NamedTuple):
-    """A goal that holds because of what was looked up."""
+    """A goal that was proven by a lookup."""
 
     goal: Term
     source: LookupSource
@@ -223,7 +223,7 @@ class ProofNode:
                 yield node
 
     def walk(self) -> Iterator[tuple[ProofNode, int, bool]]:
-        """Yield every node with its depth, and whether it was shown before with what is below."""
+        """Yield every node with its depth, and whether it was already shown with its children."""
         shown: set[int] = set()
         open_nodes = [(self, 0)]
         while open_nodes:
@@ -244,9 +244,9 @@ class ProofNode:
         return "\n".join(lines)
 
     def to_json(self) -> dict[str, Any]:
-        """Return the tree as plain Python; what is below a repeated goal is given once.
+        """Return the tree as plain Python; the children of a repeated goal are given once.
 
-        Goals deeper than 40 are beside each other there, in order, each with its ``depth``.
+        Goals deeper than 40 are in a flat list, in order, each with its ``depth``.
         """
         root: dict[str, Any] | None = None
         path: list[dict[str, Any]] = []
@@ -304,7 +304,7 @@ LIBRARY = "library"
 
 
 def node_of(trace: Trace, goal: Term) -> ProofNode:
-    """Return the only goal that a trace proves, as it is known after the proof."""
+    """Return the only goal that a trace proves, with the bindings after the proof."""
     node = nodes_of(trace)[0]
     return ProofNode(goal, node.kind, node.place, node.children)
 
@@ -373,8 +373,8 @@ class Virtual:
     """A predicate that is a lookup.
 
     ``needs`` are the arguments, counted from 1, that must have a value; of several sets one is
-    enough. Calls that have too few are refused with ``hint``. ``clauses`` writes down what it
-    finds as Prolog that answers the same, for calls with given values of the first argument.
+    enough. Calls with too few are refused with ``hint``. ``clauses`` writes the results as Prolog
+    that gives the same answers, for calls with given values of the first argument.
     """
 
     name: str
@@ -570,7 +570,7 @@ class PrologMachine:
         return text
 
     def choose(self, go_on: Callable[..., Frame | None], *rest: Any) -> None:
-        """Remember that something else may be tried from here."""
+        """Add a choice point: an alternative that may be tried from here."""
         self.choices.append((len(self.trail), self.trace, go_on, *rest))
 
     def cut(self, height: int) -> None:
@@ -578,11 +578,11 @@ class PrologMachine:
         del self.choices[height:]
 
     def unify(self, left: Term, right: Term) -> bool:
-        """Make two terms equal; the bindings are undone when the search goes back."""
+        """Unify two terms; the bindings are undone on backtracking."""
         return unify(left, right, self.trail)
 
     def predicate(self, key: Key) -> PrologPredicate:
-        """Return what a goal calls; raise RuleFault if there is nothing of that name."""
+        """Return the predicate that a goal calls; raise RuleFault if there is none of that name."""
         found = self.predicates.get(key)
         if found is None:
             raise unknown_predicate(key, self.predicates)

@@ -108,7 +108,7 @@ def _rows(of: Intervals, args: tuple[Term | None, ...]) -> Iterator[SourcedRow]:
 def _time(given: Term | None, of: Intervals) -> int | None:
     """Return a time in nanoseconds since the epoch.
 
-    Raises RuleFault for what is none.
+    Raises RuleFault for an invalid time.
     """
     if given is None or isinstance(given, int):
         return given
@@ -187,7 +187,7 @@ class SourceText:
         return SourcePosition(self.file, line, at - self.starts[line - 1] + 1)
 
     def problem(self, fault: RuleFault, at: int, *, is_error: bool = True) -> Problem:
-        """Return what is wrong where, and show the line."""
+        """Return a problem with its position, and show the line."""
         place = self.place(fault.at if fault.at >= 0 else at)
         what = fault.what + self.picture(place)
         where = f"column {place.column}"
@@ -220,7 +220,7 @@ _DECLARATIONS = ("table", "dynamic", "discontiguous", "multifile")
 
 
 def declarations(directive: Term) -> Iterator[tuple[Declaration, Key]]:
-    """Yield what a directive declares; raise RuleFault if it is no declaration."""
+    """Yield the declarations of a directive; raise RuleFault if it is not a declaration."""
     directive = deref(directive)
     key = key_of(directive)
     if key is None or not isinstance(directive, Struct) or key[0] not in _DECLARATIONS:
@@ -301,7 +301,7 @@ def reachable(goals: Iterable[Term], known: Mapping[Key, PrologPredicate]) -> di
 
 
 def suspicions(sentence: Sentence) -> Iterator[RuleFault]:
-    """Yield what is odd about a fact or a rule."""
+    """Yield warnings about a fact or a rule."""
     names = {variable: name for name, variable in sentence.names.items()}
     single = [n for n, count in sentence.counts.items() if count == 1 and n[0] != "_"]
     if single:
@@ -333,7 +333,7 @@ def _unlinked(head: Term, body: Term, names: Mapping[Var, str]) -> Iterator[Rule
 
 
 def _is_choice(body: Term) -> bool:
-    """Return whether the body as a whole is a choice, whose branches need not be linked."""
+    """Return whether a body is a choice as a whole; its branches need not share variables."""
     body = deref(body)
     return isinstance(body, Struct) and body.name in (";", "->")
 
@@ -486,7 +486,7 @@ aggregate_all(What, G, R) :- '$aggregate'(What, G, R).
 
 @cache
 def library() -> dict[Key, PrologPredicate]:
-    """Return the predicates that come with the language."""
+    """Return the predicates of the standard library."""
     found: dict[Key, PrologPredicate] = {}
     for sentence in sentences(_TEXT):
         if isinstance(sentence, RuleFault):
@@ -504,9 +504,9 @@ Fact = Sequence[object]
 
 @dataclass(frozen=True)
 class Program:
-    """Predicates by name and number of arguments, and notes on what looks like a mistake.
+    """Predicates by name and number of arguments, and notes on likely mistakes.
 
-    It does not change; what was worked out about it is kept with it.
+    It does not change; results computed from it are cached in it.
     """
 
     predicates: Mapping[Key, PrologPredicate]
@@ -515,7 +515,7 @@ class Program:
 
     @cached_property
     def known(self) -> Mapping[Key, PrologPredicate]:
-        """Everything that a goal may call besides what is built in."""
+        """Everything that a goal may call besides built-in predicates."""
         empty = {key: PrologPredicate(key, origin="vocabulary") for key in VOCABULARY}
         return {**library(), **empty, **self.predicates}
 
@@ -533,9 +533,9 @@ class Program:
 
     @cached_property
     def heads(self) -> Mapping[Key, SourcePosition]:
-        """Names of rules that no other rule calls: what the program concludes, with places.
+        """Names and positions of rules that no other rule calls: the conclusions of the program.
 
-        Those of files called ``questions*.pl`` are for people to ask.
+        Those of files called ``questions*.pl`` are for manual queries.
         """
         rules = {
             key: clause.place
@@ -558,7 +558,7 @@ class Program:
         return DeductiveDatabase(self.known)
 
     def problems(self) -> list[Problem]:
-        """Return what is wrong with the program as a whole."""
+        """Return the problems of the program as a whole."""
         return [self.unknown_problem(clause, key) for clause, key in self.unknown]
 
     def unknown_problem(self, clause: PrologClause, key: Key) -> Problem:
@@ -683,8 +683,8 @@ def _checked(clause: PrologClause) -> PrologClause:
 def export(program: Program, goal: str = "") -> str:
     """Return facts and rules with the declarations that SWI-Prolog needs.
 
-    Results of lookups are written as facts, as far as they are known: of conditions those that the
-    rules and ``goal`` name. Other lookups are declared as empty. Raises what lookups raise.
+    Results of lookups are written as facts, as far as they are known: for conditions those that the
+    rules and ``goal`` name. Other lookups are declared as empty. Raises the errors of lookups.
     """
     lines = [*_declarations(program), "", *_clauses(program), *_found(program, goal)]
     return "\n".join(lines) + "\n"

@@ -65,7 +65,7 @@ class TriedClause:
     failed: FailedGoal
 
     def lines(self, indent: str) -> Iterator[str]:
-        """Write it with what is below."""
+        """Write the goal and the goals below it."""
         yield f"{indent}{write(self.head, longest=LONGEST_GOAL)}   {self.place}"
         for goal in self.held:
             yield f"{indent}  holds: {write(goal, longest=LONGEST_GOAL)}"
@@ -81,7 +81,7 @@ class FailedGoal:
     tried: tuple[TriedClause, ...] = ()
 
     def lines(self, indent: str = "") -> Iterator[str]:
-        """Write it with what is below, a line each."""
+        """Write the goal and the goals below it, a line each."""
         yield f"{indent}fails: {write(self.goal, longest=LONGEST_GOAL)}   {self.what}".rstrip()
         for tried in self.tried:
             yield from tried.lines(f"{indent}  ")
@@ -101,7 +101,7 @@ class FailedGoal:
 
 
 class FailureSearch:
-    """Looks for reasons, within one budget for all of them."""
+    """Searches reasons why goals fail, within one budget for all of them."""
 
     def __init__(self, known: Mapping[Key, PrologPredicate], budget: Budget) -> None:
         self.known = known
@@ -188,7 +188,7 @@ Answer: TypeAlias = Mapping[str, Term]
 
 @dataclass(frozen=True)
 class Answers:
-    """All answers, each once, why each holds, or why there is none."""
+    """All answers, each once, with their proofs, or the reasons why there is none."""
 
     answers: tuple[Answer, ...]
     # For each answer the goals that hold, with what they follow from
@@ -242,9 +242,9 @@ def ask(
 ) -> Answers:
     """Return all answers of a goal, each once.
 
-    ``want`` asks for the proof of each answer, or for what failed when there is none. Raises
-    RuleError for a goal that cannot be asked, ConfigurationError when the rules behind it call
-    what there is not, StoppedError (with what was found) when the budget is used up.
+    ``want`` requests the proof of each answer, or the failed goals when there is none. Raises
+    RuleError for an invalid goal, ConfigurationError when its rules call unknown predicates,
+    StoppedError (with the answers found) when the budget is used up.
     """
     sentence = _read(goal_text)
     _refuse_unknown(sentence, program)
@@ -260,7 +260,7 @@ def ask(
 
 
 class _Question:
-    """A goal with what was found so far."""
+    """A goal with the answers found so far."""
 
     def __init__(self, program: Program, sentence: Sentence, budget: Budget, want: Want) -> None:
         self.program = program

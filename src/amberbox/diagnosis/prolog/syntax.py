@@ -70,7 +70,7 @@ def _quote(text: str, sign: str) -> str:
 
 
 class _Glued(NamedTuple):
-    """An operator: a blank parts it from a neighbour with which it would become one word."""
+    """An operator that needs a blank before a neighbour with which it would form one token."""
 
     text: str
     is_prefix: bool = False
@@ -121,7 +121,7 @@ class _Writer:
         return (glued or last is not None) and _would_join(before, text)
 
     def _parts(self, term: Term, most: int) -> list[_Open]:
-        """Return what a term is written as."""
+        """Return the parts of a term's written form."""
         term = deref(term)
         if isinstance(term, Struct):
             return self._struct(term, most)
@@ -237,7 +237,9 @@ Sort: TypeAlias = Literal["name", "quoted", "var", "value", "punct", "stop", "en
 
 
 class RuleToken(NamedTuple):
-    """One word: its sort, its text or value, its place, and what touches it."""
+    """One token: its sort, its text or value, its position, and whether it touches its
+    neighbours.
+    """
 
     sort: Sort
     value: Term
@@ -359,7 +361,7 @@ _CLOSING = frozenset(")]},|")
 
 @dataclass(slots=True)
 class Sentence:
-    """A term up to its dot: the names of its variables, how often each stands there."""
+    """A term up to its dot: the names of its variables, and how often each occurs."""
 
     term: Term
     at: int
@@ -518,7 +520,7 @@ class _Reader:
         return Struct("{}", (inner,)) if token.value == "{" else inner
 
     def _argument(self) -> Term:
-        """Read what stands between the commas of a structure or a list."""
+        """Read an argument between the commas of a structure or a list."""
         outside, self.in_argument = self.in_argument, True
         term = self.term(1200)
         self.in_argument = outside

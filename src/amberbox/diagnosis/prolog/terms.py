@@ -15,7 +15,7 @@ TOO_DEEP = "a term is nested too deeply", "use lists, not f(f(f(...)))"
 
 
 class RuleFault(Exception):  # noqa: N818  # not an error yet: it becomes one with its place
-    """Something is wrong; ``at`` is the place in the text being read, -1 where there is none."""
+    """An error; ``at`` is the position in the text being read, -1 if there is none."""
 
     def __init__(self, what: str, hint: str = "", at: int = -1) -> None:
         super().__init__(what)
@@ -29,7 +29,7 @@ class StopFault(Exception):  # noqa: N818  # as above
 
 
 class RuleError(UsageError):
-    """A goal cannot be asked, or fails with an error rather than with no."""
+    """A goal that is invalid, or that ends with an error."""
 
 
 class StoppedError(AmberboxError):
@@ -42,7 +42,7 @@ class StoppedError(AmberboxError):
 
 @dataclass(frozen=True, slots=True)
 class SourcePosition:
-    """Where something stands: lines and columns count from 1."""
+    """A position in a file: lines and columns count from 1."""
 
     file: str
     line: int
@@ -65,7 +65,7 @@ Key: TypeAlias = tuple[str, int]  # name and number of arguments of a predicate 
 
 
 class Var:
-    """A variable; ``ref`` is what it is bound to, None while it is free."""
+    """A variable; ``ref`` is the term it is bound to, None while it is free."""
 
     __slots__ = ("ref",)
 
@@ -137,7 +137,7 @@ Env: TypeAlias = list[Term]  # the variables of a clause that is in use
 
 
 def deref(term: Term) -> Term:
-    """Follow bound variables to what they stand for."""
+    """Follow bound variables to their values."""
     while type(term) is Var:
         ref = term.ref
         if ref is None:
@@ -196,7 +196,7 @@ def is_callable(term: Term) -> bool:
 def to_term(value: object) -> Term:
     """Turn plain Python into a term: a string is an atom, a sequence is a list.
 
-    Raises RuleFault for what has no term.
+    Raises RuleFault for a value without a term.
     """
     if isinstance(value, bool):
         return "true" if value else "false"
@@ -326,7 +326,7 @@ Copies = dict[int, tuple[Struct, Term]]  # structures with their copies, by id
 
 
 def freeze(term: Term, copies: Copies) -> Term:
-    """Copy a term with its bindings; what the copies have in common is copied once."""
+    """Copy a term with its bindings; shared subterms are copied once."""
     spine: list[tuple[Struct, list[Term]]] = []
     term = deref(term)
     while isinstance(term, Struct):

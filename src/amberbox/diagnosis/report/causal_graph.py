@@ -47,9 +47,9 @@ class LostFunctions:
         return cls(structure, down, structure.lost(down))
 
     def origins(self, name: str) -> tuple[str, ...]:
-        """Return the components without whose failure this would still serve.
+        """Return the components whose failure is necessary for a loss.
 
-        If each of several would do alone, all of them that lead there are named.
+        If any of several would be sufficient alone, all of them that lead to the loss are returned.
         """
         leading = [start for start in sorted(self.down) if self.path(start, name)]
         decisive = [
@@ -58,7 +58,7 @@ class LostFunctions:
         return tuple(decisive or leading)
 
     def path(self, start: str, end: str) -> tuple[str, ...]:
-        """Return the shortest way from a component to what is lost, both included, else ()."""
+        """Return the shortest path from a component to a lost function, both included, else ()."""
         came_from = {start: ""}
         waiting = deque([start])
         while waiting and end not in came_from:
@@ -90,7 +90,7 @@ class CausalPaths:
         return cls(names, DependencyStructure.of(names.fmea.needs()))
 
     def losses(self, faults: Collection[str]) -> LostFunctions:
-        """Return what the faults cost."""
+        """Return the functions and components that the faults take out of service."""
         return LostFunctions.of(self.names.fmea, self.structure, faults)
 
     def to(self, symptom: str, faults: Collection[str]) -> tuple[CausalPath, ...]:
@@ -136,7 +136,7 @@ def _link(links: Collection[SymptomLink], symptom: str) -> SymptomLink | None:
 
 @dataclass(frozen=True, slots=True)
 class SymptomDescriptions:
-    """Describes symptoms: what was found of each, and how faults show it."""
+    """Describes symptoms: the observations of each, and how faults cause it."""
 
     names: FaultNames
     paths: CausalPaths
@@ -191,13 +191,13 @@ class SymptomDescriptions:
     def worst_first(
         self, symptoms: Iterable[str], hypotheses: Sequence[Hypothesis]
     ) -> tuple[SeenSymptom, ...]:
-        """Describe symptoms: what is there still first, and of that what matters most."""
+        """Describe symptoms: present ones first, then in order of importance."""
         seen = self.in_time(symptoms, hypotheses)
         return tuple(sorted(seen, key=lambda s: (s.gone_ns is not None, -round(s.weight, 6))))
 
 
 def _gone_ns(found: Iterable[Symptom]) -> int | None:
-    """Return when the last of some findings of a symptom went, None if one is there still."""
+    """Return when the last observation of a symptom disappeared, None if one is still present."""
     ends = [symptom.gone_ns for symptom in found]
     known = [end_ns for end_ns in ends if end_ns is not None]
     return max(known) if known and len(known) == len(ends) else None
@@ -238,7 +238,7 @@ def _causes(hypotheses: Sequence[Hypothesis]) -> list[str]:
 
 
 def _marks(leading: Sequence[Hypothesis], hypotheses: Sequence[Hypothesis]) -> dict[str, NodeMark]:
-    """Return the symptoms: what is explained, what is not, what should show and does not."""
+    """Return the symptoms with their marks: explained, unexplained, or expected but absent."""
     marks: dict[str, NodeMark] = {name: "present" for h in leading for name in h.explains}
     for hypothesis in (*leading, *hypotheses):
         for name in (*hypothesis.unexplained, *hypothesis.explains):
@@ -250,7 +250,7 @@ def _marks(leading: Sequence[Hypothesis], hypotheses: Sequence[Hypothesis]) -> d
 
 
 def _in_time(descriptions: SymptomDescriptions, marks: Mapping[str, NodeMark]) -> list[str]:
-    """Put what is seen in order of onset, what does not show last."""
+    """Put symptoms in order of onset, absent ones last."""
     seen = descriptions.in_time(
         (name for name, mark in marks.items() if mark != "contradicted"), ()
     )

@@ -44,7 +44,7 @@ from amberbox.diagnosis.report.wording import (
 
 
 def similarity_text(names: FaultNames, diagnosis: Diagnosis, leading: Sequence[Hypothesis]) -> str:
-    """Return which known failure modes the unknown one that leads looks like; empty if none."""
+    """Return the known failure modes that the leading unknown one looks like; empty if none."""
     if [h.faults for h in leading] != [{UNKNOWN}] or not names.fmea.other.looks_like:
         return ""
     known = (h.faults - {UNKNOWN} for h in diagnosis.hypotheses)
@@ -77,10 +77,10 @@ class FaultActivity:
     def of(
         cls, knowledge: Knowledge, diagnosis: Diagnosis, symptoms: Iterable[Symptom]
     ) -> FaultActivity:
-        """Compare what hypotheses explain with what is there still.
+        """Compare the symptoms of hypotheses with those still present.
 
-        A cause is cleared when all that it shows is gone; one that comes and goes by its nature
-        never is, nor is anything of a diagnosis that is over as a whole.
+        A cause is cleared when all its symptoms are gone, except intermittent causes, and causes of
+        a diagnosis that has healed.
         """
         shown = _shown(knowledge, diagnosis.hypotheses)
         gone = {s.id: s.gone_ns for s in symptoms if s.gone_ns is not None}
@@ -88,7 +88,7 @@ class FaultActivity:
         return cls(cleared, _weights(knowledge, diagnosis.hypotheses, shown))
 
     def active(self, hypothesis: Hypothesis) -> Hypothesis:
-        """Return a hypothesis with what is active of it; as it is if nothing of it is."""
+        """Return a hypothesis with its active failure modes; unchanged if none is active."""
         left = hypothesis.faults - frozenset(self.cleared)
         return replace(hypothesis, faults=left) if left else hypothesis
 
@@ -105,7 +105,9 @@ def _shown(knowledge: Knowledge, hypotheses: Sequence[Hypothesis]) -> dict[str, 
 
 
 def _detects(knowledge: Knowledge, fault: str) -> Mapping[str, float]:
-    """Return how surely a failure mode shows each symptom, directly or by what it costs."""
+    """Return the probability with which a failure mode shows each symptom, directly or by lost
+    functions.
+    """
     model = knowledge.model
     if fault == UNKNOWN or fault not in model.mode_places:
         return {}
@@ -175,7 +177,7 @@ COVERED = 0.98  # what share of all probability must have been looked at to say 
 def confidence_of(
     diagnosis: Diagnosis, broken: ExplainedGroup | None, remark: str = ""
 ) -> Confidence:
-    """Return how sure the leading group is; the word is that of the least it can be.
+    """Return the confidence of the leading group; its word is that of the lower bound.
 
     ``remark`` comes before the sentence on the part that was not searched.
     """
@@ -202,7 +204,7 @@ def headline(
     sure: Confidence,
     symptoms: Iterable[Symptom],
 ) -> str:
-    """Return what is broken and how sure that is; of what has healed, what it was."""
+    """Return what is broken and the confidence; for a healed diagnosis in the past tense."""
     if broken is None:
         return sentence(NOTHING)
     ids = [member.id for member in broken.members]
@@ -223,7 +225,7 @@ def chance(sure: Confidence) -> str:
 
 
 def _healed_ns(diagnosis: Diagnosis, symptoms: Iterable[Symptom]) -> int:
-    """Return when the last symptom went, else when the diagnosis was closed."""
+    """Return when the last symptom disappeared, else when the diagnosis was closed."""
     gone = {s.id: s.confirmed_ns for s in symptoms if s.state == "absent"}
     times = [gone.get(name) for name in diagnosis.symptoms]
     known = [time for time in times if time is not None]
@@ -233,7 +235,7 @@ def _healed_ns(diagnosis: Diagnosis, symptoms: Iterable[Symptom]) -> int:
 def ranked_groups(
     diagnosis: Diagnosis,
 ) -> tuple[tuple[AmbiguityGroup, tuple[Hypothesis, ...]], ...]:
-    """Return the groups with their members; hypotheses of no group are groups by themselves."""
+    """Return the groups with their members; hypotheses without a group become groups of one."""
     by_id = {hypothesis.id: hypothesis for hypothesis in diagnosis.hypotheses}
     grouped = {name for g in diagnosis.groups for name in (*g.members, *g.wider)}
     alone = (
@@ -269,7 +271,7 @@ def _text(names: FaultNames, members: Sequence[Hypothesis]) -> str:
 
 
 def _texts(names: FaultNames, sets: Sequence[Collection[str]]) -> list[str]:
-    """Describe sets of failure modes; those that differ by an instance alone are one."""
+    """Describe sets of failure modes; sets that differ only in an instance are combined."""
     kinds = [mode_kinds(names.fmea, faults) for faults in sets]
     return merge_by_kind(kinds, [names.faults(faults) for faults in sets])
 
@@ -305,7 +307,7 @@ def usability(
 
 
 def worst_severity(severities: Iterable[Severity]) -> Severity:
-    """Return the gravest of severities, empty if there is none."""
+    """Return the worst of severities, empty if there is none."""
     return max(severities, key=_rank, default="")
 
 
@@ -332,9 +334,10 @@ def _lost(paths: CausalPaths, members: Sequence[Hypothesis]) -> tuple[LostFuncti
 
 
 def _gone(paths: CausalPaths, hypothesis: Hypothesis) -> Iterable[str]:
-    """Return what is lost by needs, and what modes cost that take nothing down.
+    """Return the lost functions and the effects of modes that do not take their component down.
 
-    Of modes that take their component down, effects name all that may suffer, spares or not.
+    For modes that take it down the effects are left out, because they name everything that may
+    suffer, regardless of redundancy.
     """
     modes = (paths.names.fmea.modes.get(fault) for fault in sorted(hypothesis.faults))
     named = [name for m in modes if m and not m.takes_down for name in m.effects.system]
@@ -368,9 +371,9 @@ OTHERS = 3  # how many groups are described besides the leading one
 def explain(diagnosis: Diagnosis, knowledge: Knowledge, symptoms: Iterable[Symptom]) -> Explanation:
     """Return the explanation of a diagnosis in words.
 
-    ``symptoms`` are those it was made of, with their times and what they were measured from;
-    what is not among them is described without. Failure modes and tests that the knowledge does not
-    have are called by their ids.
+    ``symptoms`` are those it was made from, with their times and data; symptoms that are not among
+    them are described without these. Failure modes and tests that the knowledge does not have are
+    called by their ids.
     """
     symptoms = tuple(symptoms)
     activity = FaultActivity.of(knowledge, diagnosis, symptoms)
@@ -434,7 +437,7 @@ def _explain_cleared(
 def _missed(
     diagnosis: Diagnosis, members: Sequence[Hypothesis], explained: Collection[str]
 ) -> tuple[str, ...]:
-    """Return what was seen and does not follow from what leads."""
+    """Return the present symptoms that the leading hypotheses do not explain."""
     missed = [name for h in members for name in h.unexplained]
     if not members:
         missed = [name for name in diagnosis.symptoms if name not in diagnosis.findings]

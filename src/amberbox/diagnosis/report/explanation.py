@@ -11,11 +11,10 @@ Severity: TypeAlias = Literal["", "warning", "urgent", "critical", "fatal"]
 
 @dataclass(frozen=True, slots=True)
 class ExplainedFault:
-    """A failure mode in words; ``cause`` is how it may come about, ``remedy`` what helps.
+    """A failure mode in words; ``cause`` is how it may occur, ``remedy`` how to repair it.
 
-    ``gone_ns`` is since when nothing of it shows any more; what is ``intermittent`` comes and
-    goes by its nature, so that this says nothing. ``kind`` is what it has in common with those
-    of other instances of its type.
+    ``gone_ns`` is since when none of its symptoms is present; for an ``intermittent`` fault this is
+    no evidence. ``kind`` is its description without the instance.
     """
 
     id: str
@@ -32,7 +31,7 @@ class ExplainedFault:
 class Possibility:
     """One hypothesis in words, with its failure modes (none: a false alarm).
 
-    ``text`` names those that are active, where any is.
+    ``text`` names only the active ones, if any is active.
     """
 
     id: str
@@ -45,7 +44,7 @@ class Possibility:
 
 @dataclass(frozen=True, slots=True)
 class ExplainedGroup:
-    """What nothing known tells apart: in one text, and each by itself."""
+    """Hypotheses that the evidence cannot distinguish: in one text, and each by itself."""
 
     text: str
     probability: float
@@ -65,10 +64,11 @@ class Confidence:
 
 @dataclass(frozen=True, slots=True)
 class CausalPath:
-    """How a failure mode shows a symptom: directly, or by what is lost (``via``, in order).
+    """The path by which a failure mode shows a symptom: directly, or by lost functions (``via``, in
+    order).
 
-    ``text`` is what is lost on the way in words, or the failure mode itself if it is direct.
-    ``detects`` is how probable it shows when the cause at the end of the way is there.
+    ``text`` names the lost functions in words, or the failure mode itself if it is direct.
+    ``detects`` is the probability of the symptom when the cause at the end of the path is present.
     """
 
     fault: str
@@ -79,11 +79,12 @@ class CausalPath:
 
 @dataclass(frozen=True, slots=True)
 class SeenSymptom:
-    """A symptom in words: where it is read, when it began, what it was measured from, and why.
+    """A symptom in words: its address, its onset, the data it was measured from, and its causal
+    path.
 
-    ``after_s`` counts from the first symptom; times are None where unknown. ``reason``
-    says the measured value and its limit, ``gone_ns`` is when it went. ``weight`` is how much it
-    matters: the severity of its worst cause times the probability of that.
+    ``after_s`` counts from the first symptom; times are None where unknown. ``reason`` gives the
+    measured value and its limit, ``gone_ns`` is when it disappeared. ``weight`` is its importance:
+    the severity of its worst cause times the probability of that cause.
     """
 
     id: str
@@ -119,7 +120,9 @@ class Usability:
 
 @dataclass(frozen=True, slots=True)
 class AnswerBranch:
-    """What an answer to a test would mean: how probable it is, and what would lead then."""
+    """The consequence of an answer to a test: its probability, and the hypothesis that would lead
+    then.
+    """
 
     answer: str
     probability: float
@@ -146,7 +149,7 @@ class ProposedAction:
 
 @dataclass(frozen=True, slots=True)
 class TestInstance:
-    """One of several tests that are the same but for the instance, asked as one question."""
+    """One of several tests that differ only in the instance, asked as one question."""
 
     where: str
     test: str
@@ -184,10 +187,10 @@ MemberState: TypeAlias = Literal["open", "healed", "none", "unknown"]
 
 @dataclass(frozen=True, slots=True)
 class MemberDiagnosis:
-    """What the own diagnosis of a robot says of which its team has lost something.
+    """The diagnosis of a robot of a team, if the team has lost a function of that robot.
 
     ``where`` is its folder, ``text`` the answer in one or two sentences. ``state`` is that of the
-    diagnosis: none if nothing is wrong there, unknown if it cannot be read; then ``text`` says why.
+    diagnosis: none without a fault, unknown if it cannot be read; then ``text`` is the reason.
     """
 
     name: str
@@ -219,9 +222,9 @@ class GraphNode:
 
 @dataclass(frozen=True, slots=True)
 class GraphEdge:
-    """From a cause to what it makes; ``missing`` if that should show and does not.
+    """An edge from a cause to its effect; ``missing`` if the effect is expected but absent.
 
-    ``leading``: it belongs to what leads.
+    ``leading``: it belongs to a leading hypothesis.
     """
 
     start: str
@@ -232,7 +235,7 @@ class GraphEdge:
 
 @dataclass(frozen=True, slots=True)
 class CausalGraph:
-    """Causes, what they cost and what is seen; how many causes and symptoms are left out."""
+    """Causes, lost functions and symptoms; the number of causes and symptoms that are left out."""
 
     nodes: tuple[GraphNode, ...]
     edges: tuple[GraphEdge, ...]
@@ -245,12 +248,11 @@ class Explanation:
     """A diagnosis for people: each question has an answer, ``details`` are for experts.
 
     ``headline`` is the answer in one or two sentences. ``broken`` is the leading group (None if
-    nothing explains what is seen), ``others`` what follows it. ``unexplained`` was seen and does
-    not follow from what leads, ``against`` should show and does not, ``unknown`` was seen and the
-    FMEA does not know it, ``blocked`` was seen and does not count. ``members`` are the robots that
-    lead on, if it is the diagnosis of their team. ``cleared`` are failure modes beside active ones
-    of which nothing shows any more. What was seen is in order: what is there still first, and of
-    that what matters most.
+    nothing explains the symptoms), ``others`` are the next ones. ``unexplained`` symptoms are
+    present but not explained by the leading group, ``against`` are expected but absent, ``unknown``
+    are not in the FMEA, ``blocked`` do not count. ``members`` are the robots with faults, if it is
+    the diagnosis of their team. ``cleared`` are failure modes beside active ones whose symptoms
+    have all gone. Symptoms are in order: present ones first, then by importance.
     """
 
     diagnosis: str

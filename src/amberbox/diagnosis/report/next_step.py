@@ -48,11 +48,11 @@ def step_of(
     diagnosis: Diagnosis,
     leading: Leading | None,
 ) -> NextStep:
-    """Return what to do next, in the order in which it is safe.
+    """Return what to do next, in an order that is safe.
 
-    What makes credible dangerous causes safe comes first. Then, if one fault is almost certain, its
-    repair, else the most informative test; no repair comes first while a false alarm is about as
-    likely. ``leading`` has what is active of the hypotheses that lead.
+    Actions that make credible dangerous causes safe come first. Then, if one fault is almost
+    certain, its repair, else the most informative test; no repair comes first while a false alarm
+    is about as likely. ``leading`` has the active failure modes of the leading hypotheses.
     """
     ids = leading_ids(diagnosis.groups, diagnosis.hypotheses)
     safe = safety_actions(names.fmea, diagnosis.hypotheses, ids, names.cleared)
@@ -106,7 +106,7 @@ class CandidateTest:
 
 
 def _instances(names: FaultNames, same_kind: Sequence[Check]) -> tuple[TestInstance, ...]:
-    """Return where tests are done that are asked as one; nothing for one alone."""
+    """Return the instances of tests that are asked as one question; nothing for a single one."""
     if len(same_kind) < 2:
         return ()
     components = [names.component(one.id.rpartition(".")[0]) for one in same_kind]
@@ -117,7 +117,7 @@ def _instances(names: FaultNames, same_kind: Sequence[Check]) -> tuple[TestInsta
 
 
 def _text(safe: Sequence[MakeSafeAction], rest: str) -> str:
-    """Put what makes safe before all the rest, in the words of the FMEA."""
+    """Put the actions that make the robot safe before the other text, as worded in the FMEA."""
     if not safe:
         return rest
     return f"First, make it safe: {'; '.join(action.text for action in safe)}. Then: {rest}"
@@ -241,9 +241,9 @@ def _look_there(names: FaultNames, members: Sequence[Hypothesis]) -> str:
 def _remedies(
     names: FaultNames, members: Sequence[Hypothesis], safe: Sequence[MakeSafeAction] = ()
 ) -> tuple[str, ...]:
-    """Return what helps, that of the most probable first, each once.
+    """Return the remedies, that of the most probable cause first, each once.
 
-    Of what is made ``safe`` first only what mends it.
+    For causes with an action in ``safe`` only the part of the remedy that repairs.
     """
     covered = {fault for action in safe for fault in action.faults}
     found = dict.fromkeys(fault for h in members for fault in sort_modes(h.faults))
@@ -257,9 +257,9 @@ def _remedies(
 def _answers(
     knowledge: Knowledge, names: FaultNames, diagnosis: Diagnosis, check: Check
 ) -> tuple[AnswerBranch, ...]:
-    """Return per answer how probable it is and what would lead then, by Bayes' rule.
+    """Return per answer its probability and the hypothesis that would lead then, by Bayes' rule.
 
-    As in the choice of the test, what is not listed is taken to be out of the question.
+    As in the choice of the test, hypotheses that are not listed are ignored.
     """
     model = knowledge.model
     listed = [h for h in diagnosis.hypotheses if h.faults <= model.mode_places.keys()]

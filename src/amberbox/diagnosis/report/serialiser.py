@@ -145,7 +145,7 @@ def context_json(
 
 
 def _seen(case: DiagnosisContext) -> Sequence[Symptom]:
-    """Return what is known of symptoms; those of the diagnosis as they were when it was made."""
+    """Return the known symptoms; those of a past diagnosis with their state at that time."""
     present = {symptom.id for symptom in case.situation.present()}
     before = [s for s in with_end_times(case.seen, case.situation.symptoms) if s.id not in present]
     past = {symptom.id for symptom in before}
@@ -153,7 +153,9 @@ def _seen(case: DiagnosisContext) -> Sequence[Symptom]:
 
 
 def with_end_times(seen: Iterable[Symptom], now: Iterable[Symptom]) -> list[Symptom]:
-    """Return symptoms as they were, with when they went by what is known of them now."""
+    """Return earlier symptoms, with the times when they disappeared according to the
+    present ones.
+    """
     ends = {s.id: s.confirmed_ns if s.state == "absent" else s.gone_ns for s in now}
     return [replace(symptom, gone_ns=ends.get(symptom.id)) for symptom in seen]
 

@@ -41,10 +41,10 @@ class _Columns:
 
 
 def _columns_of(graph: CausalGraph) -> _Columns:
-    """Put causes left, symptoms right, and what is lost between them by its distance.
+    """Put causes left, symptoms right, and lost functions between them by their distance.
 
-    The first column keeps its order, the most probable causes first, and so does the last, what
-    was seen first.
+    The first column keeps its order, the most probable causes first, and so does the last, present
+    symptoms first.
     """
     numbers = {node.id: number for number, node in enumerate(graph.nodes)}
     pairs = [(numbers[edge.start], numbers[edge.end]) for edge in graph.edges]
@@ -221,7 +221,9 @@ def _notes(graph: CausalGraph, columns: _Columns, y: float) -> Iterator[Line]:
 
 
 def _strokes(columns: _Columns, spots: Mapping[int, _Spot]) -> Iterator[Stroke]:
-    """Yield the lines, those of what leads last, so that they lie above the others."""
+    """Yield the lines, those of leading hypotheses last, so that they are drawn above the
+    others.
+    """
     for item in (item for items in columns.items for item in items if item in columns.lanes):
         x, y, height = spots[item]
         yield Stroke(f"M{x:g} {y + height / 2:.1f}h{BOX:g}", leading=columns.lanes[item])
@@ -237,7 +239,9 @@ def _strokes(columns: _Columns, spots: Mapping[int, _Spot]) -> Iterator[Stroke]:
 
 
 def _entries(links: Sequence[_Link], spots: Mapping[int, _Spot]) -> dict[_Link, float]:
-    """Return at what share of a box's height each line enters it, in the order they come."""
+    """Return the height at which each line enters a box, as a share of it, in the order of
+    origins.
+    """
     into: dict[int, list[_Link]] = {}
     for link in links:
         into.setdefault(link.end, []).append(link)
@@ -298,10 +302,10 @@ def _rules(rules: Sequence[tuple[str, str]]) -> str:
 
 
 def as_svg(explanation: Explanation) -> str:
-    """Draw causes on the left, what they cost in the middle, what is seen on the right.
+    """Draw causes on the left, lost functions in the middle, symptoms on the right.
 
-    The image needs nothing from outside and runs no script. It is as large as its contents, and
-    light or dark as the reader's screen is.
+    The image is self-contained and contains no script. It is as large as its contents, and follows
+    the light or dark setting of the screen.
     """
     drawing = layout(explanation)
     size = {"width": f"{drawing.width:g}", "height": f"{drawing.height:g}"}
@@ -328,7 +332,7 @@ def as_svg(explanation: Explanation) -> str:
 
 
 def _description(explanation: Explanation) -> str:
-    """Return in words what the image shows."""
+    """Return the contents of the image in words."""
     seen = [seen.text for seen in explanation.because]
     causes = [node.text for node in explanation.graph.nodes if node.kind == "cause"]
     return f"Possible causes: {'; '.join(causes)}. Symptoms explained: {'; '.join(seen)}."

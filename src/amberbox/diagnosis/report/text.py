@@ -47,7 +47,7 @@ def group_by_reasons(
 
 
 def reasons(seen: SeenSymptom, broken: ExplainedGroup | None) -> tuple[str, ...]:
-    """Return why a symptom follows: directly, or by what is lost on the way."""
+    """Return why a symptom follows from the cause: directly, or by lost functions."""
     faults = {
         fault.id: fault.text for m in (broken.members if broken else ()) for fault in m.faults
     }
@@ -272,7 +272,7 @@ def _effort(step: NextStep) -> str:
 
 
 def _helps(branch: AnswerBranch) -> tuple[str, ...]:
-    """Return the remedy if the answer makes sure enough that it is the right one."""
+    """Return the remedy if the answer makes it certain enough that it is the right one."""
     return (branch.remedy,) if branch.remedy and branch.then >= SURE_ENOUGH else ()
 
 

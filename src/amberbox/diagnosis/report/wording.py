@@ -35,7 +35,7 @@ def duration(seconds: float) -> str:
 
 
 def delay_text(seconds: float) -> str:
-    """Return how long after the first something came."""
+    """Return a delay after the first symptom as text."""
     if seconds <= 0:
         return "first"
     if seconds < 0.05:
@@ -73,7 +73,7 @@ def capitalize(text: str) -> str:
 
 
 def join_with_and(texts: Sequence[str]) -> str:
-    """Join what is there together."""
+    """Join descriptions of simultaneous faults with "and"."""
     if len(texts) < 3:
         return " and ".join(texts)
     return f"{', '.join(texts[:-1])} and {texts[-1]}"
@@ -101,7 +101,7 @@ def mode_kind(fmea: Fmea, fault: str) -> str:
 
 
 def mode_kinds(fmea: Fmea, faults: Collection[str]) -> tuple[str, ...]:
-    """Return the kinds of failure modes that are there together."""
+    """Return the kinds of failure modes that are present together."""
     return tuple(sorted(mode_kind(fmea, fault) for fault in faults))
 
 
@@ -121,7 +121,9 @@ def instance_words(texts: Sequence[str]) -> list[str]:
 
 
 def _differing(texts: Sequence[str]) -> tuple[int, int, list[str]]:
-    """Return how many words are alike at the beginning and at the end, and what is between."""
+    """Return how many words are equal at the beginning and at the end, and the different words
+    between.
+    """
     words = [text.split() for text in texts]
     first = _common_words(words)
     last = _common_words([one[first:][::-1] for one in words])
@@ -138,9 +140,9 @@ def merge_by_kind(kinds: Sequence[tuple[str, ...]], texts: Sequence[str]) -> lis
 
 
 def same_tests(knowledge: Knowledge, diagnosis: Diagnosis, check: Check) -> list[Check]:
-    """Return a test with the same test of other instances that may be broken as well.
+    """Return a test together with the same test of other instances that may be broken.
 
-    They are in order of how probable what they see is.
+    They are in order of the probability of the causes that they detect.
     """
     component, _, name = check.id.rpartition(".")
     known = knowledge.fmea.components
@@ -176,10 +178,10 @@ FALSE_ALARM = "probably a false alarm"
 
 @dataclass(frozen=True, slots=True)
 class FaultNames:
-    """Describes an FMEA's parts in words; what it does not have is called by its id.
+    """Describes an FMEA's entries in words; unknown entries are called by their id.
 
-    ``cleared`` are failure modes of which nothing shows any more, and since when: beside others
-    that are active they are not named.
+    ``cleared`` are failure modes whose symptoms have all gone, with the time: beside active ones
+    they are not named.
     """
 
     fmea: Fmea
@@ -212,7 +214,7 @@ class FaultNames:
         return f"out of service: {self.component(name)}"
 
     def symptom(self, symptom_id: str, reason: str = "") -> str:
-        """Return what is seen when a symptom is there; ``reason`` is a value and its limit."""
+        """Return the observation when a symptom is present; ``reason`` is a value and its limit."""
         symptom = self.fmea.symptoms.get(symptom_id)
         text = symptom.description if symptom is not None else ""
         text = text or finding_text(self.fmea, symptom_id)
@@ -238,7 +240,7 @@ class FaultNames:
         return self.component(component)
 
     def faults(self, faults: Collection[str]) -> str:
-        """Describe failure modes that are there together; none is a false alarm."""
+        """Describe failure modes that are present together; none is a false alarm."""
         if not faults:
             return FALSE_ALARM
         texts = [self.mode(fault) for fault in sort_modes(self.active(faults))]
@@ -271,14 +273,14 @@ class FaultNames:
 
 
 def together_text(number: int) -> str:
-    """Return that several faults are there at once."""
+    """Return the text that several faults are present at once."""
     if number < 2:
         return ""
     return " (both together)" if number == 2 else f" (all {number_word(number)} together)"
 
 
 def sort_modes(faults: Collection[str]) -> list[str]:
-    """Put failure modes in the order of their ids, what the FMEA does not know last."""
+    """Sort failure modes by their ids, faults that are not in the FMEA last."""
     return sorted(faults, key=lambda fault: (fault == UNKNOWN, fault))
 
 

@@ -52,7 +52,7 @@ _LEAST_DROP = 0.05  # percent between the halves of a window; less is noise
 
 @dataclass(frozen=True, slots=True)
 class BatteryOptions:
-    """What the inputs are when the battery is empty and full."""
+    """Limits of the charge, and the values of the inputs when the battery is empty and full."""
 
     empty: float = option(0.0, "the inputs when the battery is empty", aliases=("lowest_voltage",))
     full: float = option(
@@ -87,7 +87,7 @@ def history_s(config: BatteryOptions) -> float:
 
 
 def evaluate(config: BatteryOptions, inputs: Sequence[Input], now: Now) -> Mapping[str, Any]:
-    """Judge the charge, of which one input that shows nonsense takes nothing away."""
+    """Evaluate the charge; a single input with an invalid value does not change it."""
     times_ns = sample_times(inputs, now, config.smoothing)
     shown = _percent(config, [numbers_at(one, times_ns) for one in inputs])
     (percent,) = medians(times_ns, shown[None], now, config.smoothing)

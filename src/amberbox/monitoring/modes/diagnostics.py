@@ -74,7 +74,7 @@ class DiagnosticEntry(NamedTuple):
 
 
 def history_s(config: DiagnosticsOptions) -> float:
-    """Return how far back it looks: publishers send arrays of their own, each at its pace."""
+    """Return how far back it looks: each publisher sends arrays of its own, at its own rate."""
     return config.max_age
 
 

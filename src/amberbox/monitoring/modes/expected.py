@@ -40,14 +40,14 @@ Plain: TypeAlias = bool | int | float | str
 
 @dataclass(frozen=True, slots=True)
 class ExpectedOptions:
-    """What is well: one value, one of several, or texts that look like this."""
+    """The expected value: one value, one of several, or texts that match a pattern."""
 
     equals: Plain | None = option(None, "the value that is well: a number, true or false, a text")
     one_of: Sequence[Plain] = option((), "several values that are well")
     matches: str = option("", "a regular expression that is found in a text that is well")
 
     def check(self) -> Iterator[Finding]:
-        """Yield arguments that check nothing, and what is no regular expression."""
+        """Yield arguments without a check, and invalid regular expressions."""
         if sum((self.equals is not None, bool(self.one_of), bool(self.matches))) != 1:
             yield "give one of 'equals', 'one_of', 'matches'"
         try:
@@ -65,7 +65,7 @@ Config = ExpectedOptions
 
 
 def evaluate(config: ExpectedOptions, inputs: Sequence[Input], now: Now) -> Mapping[str, Any]:
-    """Compare the last value, and the name that it has, with those that are well."""
+    """Compare the last value, and the name that it has, with the expected ones."""
     (variable,) = inputs
     values, known = np.asarray(variable.at(now)), variable.samples.known(now)
     texts = [_text(value, variable.labels) for value in np.atleast_1d(values).tolist()]
@@ -79,7 +79,7 @@ def evaluate(config: ExpectedOptions, inputs: Sequence[Input], now: Now) -> Mapp
 
 
 def _text(value: Any, labels: Mapping[int, str]) -> str:
-    """Return the name of a value, else how one would write it."""
+    """Return the name of a value, else its written form."""
     if isinstance(value, float) and value.is_integer() and abs(value) < 1e15:
         value = int(value)
     if isinstance(value, bool):
@@ -94,7 +94,7 @@ def _fits(config: ExpectedOptions, text: str) -> bool:
 
 
 def explain(config: ExpectedOptions, results: Mapping[str, Any]) -> str:
-    """Describe what the value is, and what it should be."""
+    """Describe the value, and the expected value."""
     if results["as_expected"] is not False:
         return ""
     well = " or ".join(_text(value, {}) for value in config.well)

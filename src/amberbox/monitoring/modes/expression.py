@@ -38,13 +38,13 @@ _MOST_SHOWN = 100  # characters; a longer condition in an alarm is not readable
 
 @dataclass(frozen=True, slots=True)
 class ExpressionOptions:
-    """What is asked; inputs of the mapping are called input_1, input_2 ..."""
+    """The condition or number; inputs of the mapping are called input_1, input_2 ..."""
 
     condition: Expression | None = option(None, "what holds on a healthy robot")
     number: Expression | None = option(None, "what to show, or to compare with `expected`")
 
     def check(self) -> Iterator[Finding]:
-        """Refuse what asks for nothing, or for something else."""
+        """Yield an error if neither is given, or if one is of the wrong kind."""
         if self.condition is None and self.number is None:
             yield "give 'condition', 'number' or both"
         if self.condition is not None and self.condition.kind not in ("condition", "any"):

@@ -59,7 +59,7 @@ _MOST_MISSING = 0.75  # of a window: two rows in it, one of them late, are enoug
 
 @dataclass(frozen=True, slots=True)
 class FrozenOptions:
-    """What counts as moving, and when it should."""
+    """The criteria for a changing value, and the condition under which it should change."""
 
     window: float = option(5.0, "how long it may stay the same", unit="s", aliases=["for"])
     should_move: Expression | None = option(
@@ -73,7 +73,7 @@ class FrozenOptions:
     )
 
     def check(self) -> Iterator[Finding]:
-        """Refuse what cannot be judged."""
+        """Yield combinations of arguments that cannot be evaluated."""
         if not 0 < self.window < inf:
             yield "window", "must lie above 0"
         if not 0 <= self.tolerance < inf:
@@ -101,9 +101,10 @@ def reads(config: FrozenOptions) -> Sequence[str]:
 
 
 def evaluate(config: FrozenOptions, inputs: Sequence[Input], now: Now) -> Mapping[str, Any]:
-    """Look for movement between valid values, from the one in force when the window began on.
+    """Detect changes between valid values, beginning with the value at the start of the window.
 
-    Movement is detected at once. It stands still where valid values came throughout the window.
+    A change is detected at once. The value is frozen if valid values were received throughout the
+    window.
     """
     entry = inputs[0]
     named = by_name(inputs, reads(config))
@@ -200,7 +201,7 @@ def explain(config: FrozenOptions, results: Mapping[str, Any]) -> str:
 
 
 def explain_unknown(config: FrozenOptions, results: Mapping[str, Any]) -> str:
-    """Describe what was not judged: the window is not full, or valid rows are missing."""
+    """Describe why there is no result: the window is not full, or valid rows are missing."""
     gap_s = results["gap_s"]
     if np.isnan(gap_s):
         return f"not judged before it has been seen for {config.window:g} s"

@@ -45,7 +45,7 @@ arguments:
 
 @dataclass(frozen=True, slots=True)
 class GarbageOptions:
-    """What is garbage beside NaN and infinity, and how much of it is well."""
+    """Values that are garbage besides NaN and infinity, and the share that is tolerated."""
 
     min: float = option(-inf, "what lies below is impossible")
     max: float = option(inf, "what lies above is impossible")
@@ -75,10 +75,10 @@ def history_s(config: GarbageOptions) -> float:
 
 
 def evaluate(config: GarbageOptions, inputs: Sequence[Input], now: Now) -> Mapping[str, Any]:
-    """Count over the window, with the value that was in force when it began.
+    """Count over the window, including the value at its start.
 
-    It is judged when the window is full, or what is garbage is too much already: more than is
-    tolerated of all values that a window will have at the pace at which they come.
+    There is a result when the window is full, or when the garbage is already more than is tolerated
+    of all values that the window will have at the present rate.
     """
     (entry,) = inputs
     total, garbage = _counted(config, entry, now)
@@ -92,9 +92,9 @@ def evaluate(config: GarbageOptions, inputs: Sequence[Input], now: Now) -> Mappi
 
 
 def _missing(config: GarbageOptions, entry: Input, now: Now, mixed: Any) -> tuple[Any, Any]:
-    """Return how long until a window is full, and how much of one has been filled (1: all).
+    """Return the time until a window is full, and the share of it that is filled (1: all).
 
-    It is full where a value was in force when it began, unless nothing came for three quarters of
+    It is full if there was a value at its start, unless nothing was received for three quarters of
     it afterwards and several values since, or a single one that is ``mixed`` with the old one.
     """
     window_ns = round(config.window * NS)
@@ -112,7 +112,7 @@ def _missing(config: GarbageOptions, entry: Input, now: Now, mixed: Any) -> tupl
 
 
 def _counted(config: GarbageOptions, entry: Input, now: Now) -> tuple[Any, Any]:
-    """Return how many values there were in the windows, and how many of these are garbage."""
+    """Return the number of values in the windows, and how many of them are garbage."""
     near = Input(entry.name, entry.samples.within(now, config.window))
     near.parts = {name: part.within(now, config.window) for name, part in entry.parts.items()}
     counts = _in_lists(config, near) if "finite" in near.parts else _in_values(config, near)

@@ -45,7 +45,7 @@ arguments:
 
 @dataclass(frozen=True, slots=True)
 class HeartbeatOptions:
-    """How often messages come when all is well, and when silence is a fault."""
+    """The expected rate of messages, and the age from which silence is a fault."""
 
     rate: float | None = option(
         None, "how often messages come; without it any rate will do", unit="Hz"
@@ -82,7 +82,9 @@ def history_s(config: HeartbeatOptions) -> float:
 
 
 def evaluate(config: HeartbeatOptions, inputs: Sequence[Input], now: Now) -> Mapping[str, Any]:
-    """Judge the last message's age, and the rate once there has been a whole window of them."""
+    """Evaluate the last message's age, and the rate once messages were received for a
+    whole window.
+    """
     (item,) = inputs
     age_s = item.age_s(now)
     received = np.isfinite(age_s)
@@ -101,7 +103,7 @@ def evaluate(config: HeartbeatOptions, inputs: Sequence[Input], now: Now) -> Map
 
 
 def _is_steady(config: HeartbeatOptions, item: Input, now: Now, enough: Any) -> Any:
-    """Return, where there are too few messages, whether they came throughout the window.
+    """Return, where there are too few messages, whether they arrived throughout the window.
 
     An item that has just come back after a silence is not slow: it was silent.
     """
@@ -133,7 +135,7 @@ def explain(config: HeartbeatOptions, results: Mapping[str, Any]) -> str:
 
 
 def explain_unknown(config: HeartbeatOptions, results: Mapping[str, Any]) -> str:
-    """Describe that the rate is unknown: in silence, or before messages came long enough."""
+    """Describe that the rate is unknown: during silence, or before the window is full."""
     if results["heard"] is False:
         return "its rate is not judged while it is silent"
     return f"not judged before messages came for {config.window:g} s without a break"

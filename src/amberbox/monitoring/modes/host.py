@@ -86,7 +86,7 @@ def history_s(config: HostOptions) -> float:
 
 
 def evaluate(config: HostOptions, inputs: Sequence[Input], now: Now) -> Mapping[str, Any]:
-    """Compare the mean of what the probe measured with the limit of its kind."""
+    """Compare the mean of the measurements of the probe with the limit of its kind."""
     (one,) = inputs
     word = one.name.split(" ")[0]
     works, known = np.asarray(one.at(now), bool), one.samples.known(now)

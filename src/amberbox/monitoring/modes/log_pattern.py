@@ -45,7 +45,7 @@ arguments:
 
 @dataclass(frozen=True, slots=True)
 class LogPatternOptions:
-    """Which lines count, and what they mean."""
+    """The lines that count, and their meaning."""
 
     pattern: str = option(doc="a regular expression that is found anywhere in a line that counts")
     good: bool = option(False, "whether matching lines are good news, which must come")
@@ -112,7 +112,7 @@ def _matching(config: LogPatternOptions, inputs: Sequence[Input]) -> Any:
 
 
 def explain(config: LogPatternOptions, results: Mapping[str, Any]) -> str:
-    """Quote the last bad line, or say what has not been read."""
+    """Quote the last bad line, or name the line that is missing."""
     if results["ok"] is not False:
         return ""
     if config.good:

@@ -45,7 +45,7 @@ _PARTS = {
 
 @dataclass(frozen=True, slots=True)
 class NetworkOptions:
-    """What the inputs are, where they are variables and no probes."""
+    """What the inputs measure, if they are variables and not probes."""
 
     values: tuple[Literal["quality", "signal_dbm", "latency_ms", "loss_percent"], ...] = option(
         (), "what the inputs are, in their order, where they are variables and no probes"

@@ -79,7 +79,9 @@ def evaluate(config: RangeOptions, inputs: Sequence[Input], now: Now) -> Mapping
 
 
 def reason(config: RangeOptions, given: Given) -> str:
-    """Describe which values are outside of which limit; none that only lie in the hysteresis."""
+    """Describe which values are outside of which limit; values that are only within the hysteresis
+    are left out.
+    """
     low, high = min(config.min, as_single(config.min)), max(config.max, as_single(config.max))
     found = ((one.name, float(numbers(one.at(given.now_ns))[()])) for one in given.inputs)
     return "; ".join(

@@ -70,10 +70,10 @@ def history_s(config: RateOfChangeOptions) -> float:
 
 
 def evaluate(config: RateOfChangeOptions, inputs: Sequence[Input], now: Now) -> Mapping[str, Any]:
-    """Compare the value with the one that was in force a window ago.
+    """Compare the value with the value one window ago.
 
-    Over a gap of messages the change is that of the gap. Where no message came since, a missing
-    change is no fault: a least rate is not judged then.
+    Over a gap of messages the change is that of the gap. Where no message was received since, a
+    missing change is no fault: the least rate is not evaluated.
     """
     (variable,) = inputs
     rate = _rate(config, variable, now)

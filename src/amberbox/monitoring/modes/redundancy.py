@@ -58,7 +58,7 @@ arguments:
 
 @dataclass(frozen=True, slots=True)
 class RedundancyOptions:
-    """How far a member may be off, and from what."""
+    """The permitted deviation of a member, and its expected value."""
 
     threshold: float = option(doc="how far a member may be off, in its own unit")
     window: float = option(
@@ -93,7 +93,7 @@ def history_s(config: RedundancyOptions) -> float:
 
 
 def timed(config: RedundancyOptions) -> bool:
-    """Return whether there is a window, which samples leave as time passes."""
+    """Return whether there is a window, whose samples expire as time passes."""
     return history_s(config) > 0 or (config.formula is not None and config.formula.needs_history)
 
 
@@ -109,7 +109,7 @@ def results_of(config: RedundancyOptions, inputs: int, bools: int) -> tuple[Resu
 
 
 def evaluate(config: RedundancyOptions, inputs: Sequence[Input], now: Now) -> Mapping[str, Any]:
-    """Take the median distance of each member from what it should be, over a full window."""
+    """Return the median distance of each member from its expected value, over a full window."""
     named = by_name(inputs, reads(config))
     windowed = timed(config)
     times_ns = sample_times(named.values(), now, config.window) if windowed else np.atleast_1d(now)

@@ -36,7 +36,7 @@ arguments:
 
 @dataclass(frozen=True, slots=True)
 class ServiceOptions:
-    """What the inputs are names of."""
+    """The kind of things that the inputs name."""
 
     kind: Literal["unit", "process", "container", "ros_node", "ros_topic", "ros_master", "http"] = (
         option("unit", "what the inputs are names of")

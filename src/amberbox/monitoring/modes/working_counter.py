@@ -39,7 +39,7 @@ arguments:
 
 @dataclass(frozen=True, slots=True)
 class WorkingCounterOptions:
-    """What the counter should be, and how many bad samples are a fault."""
+    """The expected counter, and how many bad samples are a fault."""
 
     expected: int = option(doc="the counter when every slave takes part")
     samples: int = option(2, "how many bad samples in a row are a fault")
@@ -59,12 +59,14 @@ Config = WorkingCounterOptions
 
 
 def history_s(config: WorkingCounterOptions) -> float:
-    """Return how far back it looks; what has been bad for longer is a fault anyhow."""
+    """Return how far back it looks; a counter that has been bad for longer is a fault in
+    any case.
+    """
     return config.lasting
 
 
 def evaluate(config: WorkingCounterOptions, inputs: Sequence[Input], now: Now) -> Mapping[str, Any]:
-    """Look for bad samples in a row, or for one that stands, as it does with a change filter."""
+    """Detect consecutive bad samples, or a single lasting one, as recorded by a change filter."""
     (one,) = inputs
     last = one.samples.last(now)
     places = np.where(_as_expected(config, one), np.arange(len(one.samples)), -1)
@@ -83,7 +85,7 @@ def _as_expected(config: WorkingCounterOptions, one: Input) -> Any:
 
 
 def explain(config: WorkingCounterOptions, results: Mapping[str, Any]) -> str:
-    """Describe what the counter is and what it should be."""
+    """Describe the counter and its expected value."""
     if results["complete"] is not False:
         return ""
     count = results["counter"]

@@ -95,7 +95,7 @@ def _inspect(path: Path, name: str) -> dict[str, Any] | None:
 
 
 class _Connection(http.client.HTTPConnection):
-    """HTTP over a socket of the file system."""
+    """HTTP over a Unix socket."""
 
     def __init__(self, path: Path) -> None:
         super().__init__("localhost", timeout=_WAIT_S)

@@ -39,7 +39,7 @@ class ProcessUsage(NamedTuple):
 
 
 def measure(subject: str) -> Measured:
-    """Find the processes twice, to measure what they use in between."""
+    """Find the processes twice, to measure their usage in between."""
     proc = Path("/proc")
     pids = find(proc, subject)
     begin_s, before = time.monotonic(), usage(proc, pids)

@@ -68,10 +68,12 @@ LONGEST = 256
 _FEWEST_DIFFERENT = 6
 _FEWEST_LEFT = 4
 _FEWEST_GUESSES = 1e8
-"""So many attempts a password has to stand: zxcvbn calls that safely unguessable."""
+"""Least number of guesses that a password has to withstand: zxcvbn calls that safely
+unguessable.
+"""
 _LOOKED_AT = 32
 _MOST_SIGNS = 12
-"""Beyond so many characters, and so many different digits and signs, zxcvbn takes seconds."""
+"""Beyond this number of characters, or of different digits and signs, zxcvbn takes seconds."""
 _COMMON = (
     "|password|passwort|kennwort|contrasena|motdepasse|qwertyuiop|qwertzuiop|asdfghjkl|yxcvbnm"
     "|zxcvbnm|azertyuiop|qwerty|qwertz|azerty|letmein|welcome|willkommen|iloveyou|administrator|admin"
@@ -119,7 +121,9 @@ def weakness(password: str, name: str = "") -> str | None:
 
 
 def _is_guessed(text: str, name: str) -> bool:
-    """Return whether both the beginning and the end take few guesses, as zxcvbn estimates them."""
+    """Return whether both the beginning and the end can be found with few guesses, by zxcvbn's
+    estimate.
+    """
     from zxcvbn import zxcvbn  # its import reads lists of words
 
     known = [*_COMMON.split("|")[1:], *_parts(name.casefold())]
@@ -143,7 +147,7 @@ def _left(text: str, name: str) -> str:
 
 
 def _plain(text: str) -> str:
-    """Replace digits and signs by the letters they stand for; drop years and a tail of digits."""
+    """Replace digits and signs by the letters they stand for; drop years and trailing digits."""
     return re.sub(rf"{_YEAR}|[\d\W]+$", "", text).translate(_LEET)
 
 

@@ -38,19 +38,20 @@ SCOPES: Mapping[str, str] = {
     "write:missions": "begin and end missions",
     "write:fetch": "ask a robot for a window of its data",
 }
-"""What a token can be given. Accounts, keys and settings are for people only."""
+"""Scopes that a token can have. Accounts, keys and settings are for people only."""
 
 Reach = Literal["robot", "server", "own"]
 
 
 @dataclass(frozen=True, slots=True)
 class Action:
-    """What an action requires.
+    """The requirements of an action.
 
-    ``role`` is the least role of a person, ``scope`` what a token needs besides; None: never
-    allowed. ``reach``: ``robot`` concerns one robot (or all of them if none is named), ``server``
-    everything (not for accounts restricted to groups), ``own`` one's own account. With ``robots`` a
-    robot may do it, for itself. With ``first`` it is allowed before a required change of password.
+    ``role`` is the least role of a person, ``scope`` the scope that a token needs in addition;
+    None: never allowed. ``reach``: ``robot`` concerns one robot (or all of them if none is named),
+    ``server`` everything (not for accounts restricted to groups), ``own`` one's own account. With
+    ``robots`` a robot may do it, for itself. With ``first`` it is allowed before a required change
+    of password.
     """
 
     role: Role | None

@@ -29,7 +29,7 @@ from amberbox.server.schema import GROUPS, ROBOT_GROUPS, ROBOT_KEYS, ROBOTS
 
 
 def add_group(connection: Connection, now_ns: int, name: str) -> None:
-    """Add a group; raises UsageError when there is one of that name, or for an invalid name."""
+    """Add a group; raises UsageError for an existing or an invalid name."""
     refuse_name(name, "group")
     if name in list_groups(connection):
         raise UsageError(f"there is a group '{name}' already", "take another name")

@@ -35,7 +35,7 @@ class NewSession:
 
 @dataclass(frozen=True, slots=True)
 class Session:
-    """A session as it is listed; ``session_id`` can only be used to revoke it."""
+    """A session in a list; ``session_id`` can only be used to revoke it."""
 
     session_id: str
     created_ns: int

@@ -53,7 +53,7 @@ class MustWaitError(AmberboxError):
 
 @dataclass(frozen=True, slots=True)
 class LoginOrigin:
-    """Where a login comes from: address, browser, and the secret of the browser's last session."""
+    """The origin of a login: address, browser, and the secret of the browser's last session."""
 
     address: str
     agent: str = ""
@@ -376,7 +376,7 @@ def set_up_here(
 ) -> User:
     """Add the first admin without a code, for a request from the server itself (loopback).
 
-    Raises WrongCodeError when there is an admin already: any other needs a code.
+    Raises WrongCodeError when there is an admin already: further ones need a code.
     """
     refuse_weak(password, name)
     hash_ = passwords.hash(password)

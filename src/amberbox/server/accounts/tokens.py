@@ -23,7 +23,7 @@ _TOUCH_NS = 60 * NS
 
 @dataclass(frozen=True, slots=True)
 class ApiToken:
-    """A token as it is listed, without its secret."""
+    """A token in a list, without its secret."""
 
     token_id: str
     name: str

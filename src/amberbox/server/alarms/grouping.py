@@ -27,7 +27,7 @@ from amberbox.server.database import upsert
 from amberbox.server.schema import ALARM, CONSEQUENCE
 
 _MOST = 100
-"""Names in a list of what blocks something; more are not of use to anybody."""
+"""Maximum number of names in a list of blocking components."""
 
 
 def note_blocked(register: AlarmRegister, report: AlarmReport, transition: Transition) -> None:
@@ -158,7 +158,7 @@ _SURE = 0.5
 """A diagnosis that is less probable than this does not make one alarm of two."""
 _LATEST_NS = 1 << 62
 _NAMED = 100
-"""Components that a diagnosis may blame; more are not of use to anybody."""
+"""Maximum number of components of a diagnosis that are considered."""
 
 
 def apply_reports(
@@ -248,10 +248,10 @@ def _housed(
 
 
 def _unresolved(register: AlarmRegister, part: AlarmPart, settings: AlarmSettings) -> Alarm | None:
-    """Return the unresolved alarm that already holds this component.
+    """Return the unresolved alarm that already contains this component.
 
-    An alarm that has been quiet for long enough is resolved first. An alarm about another component
-    counts only while it is active: what comes later is another fault.
+    An alarm that has been inactive for long enough is resolved first. An alarm about another
+    component counts only while it is active: a later failure is another fault.
     """
     for other in register.of_component(part.robot, part.component):
         alarm = register.alarm(other.alarm)

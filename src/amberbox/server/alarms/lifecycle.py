@@ -98,7 +98,7 @@ def explained(
 
 
 def _reopened(alarm: Alarm, now_ns: int, settings: AlarmSettings) -> Step:
-    """Reopen a resolved alarm; leave any other as it is."""
+    """Reopen a resolved alarm; return any other unchanged."""
     if alarm.state != "resolved":
         return alarm, []
     notify_ns = None if alarm.told else now_ns + settings.ns("settle_s")
@@ -141,7 +141,7 @@ def lost_again(alarm: Alarm, reason: str, now_ns: int, settings: AlarmSettings) 
 
 
 def settled(alarm: Alarm, now_ns: int, settings: AlarmSettings) -> Step:
-    """Resolve an alarm that has been quiet long enough, or unshelve one whose time is over."""
+    """Resolve an alarm that has been inactive long enough, or unshelve one whose time is over."""
     if alarm.state == "resolved":
         return alarm, []
     if not alarm.active and alarm.cleared_ns is not None:
@@ -229,7 +229,7 @@ def unshelved(alarm: Alarm, who: str, now_ns: int) -> Step:
 def _off_the_shelf(alarm: Alarm, now_ns: int, who: str) -> Alarm:
     """Return the alarm in its state before shelving.
 
-    When its time on the shelf is over (no ``who``), a missing notification is due at once.
+    When the time of shelving is over (no ``who``), a missing notification is due at once.
     """
     known = alarm.acknowledged_ns is not None
     is_unnotified = not known and not who and is_worse(alarm.severity, alarm.told) and alarm.active

@@ -51,7 +51,7 @@ from amberbox.server.settings import read
 
 _ASTRAY_NS: Final = 60 * NS
 _RECENT_NS: Final = 3600 * NS
-"""Alarms that were resolved in this time may still open again."""
+"""An alarm that was resolved within this time may still be reopened."""
 _AT_ONCE: Final = 50
 """Alarms notified in one transaction, the oldest first; the others a moment later."""
 
@@ -165,7 +165,9 @@ def _robots(register: AlarmRegister, number: int) -> dict[str, frozenset[str]]:
 
 _TICK_S: Final = 1.0
 _STEP_NS: Final = 2 * NS
-"""The wall clock was set if it is off by so much since the last look; less is slewing."""
+"""A wall clock that is off by this much since the last step was set; a smaller difference is
+slewing.
+"""
 
 
 class Alarms:
@@ -271,7 +273,7 @@ class Alarms:
     def _taken(self, news: list[InboxEntry]) -> set[int]:
         """Apply entries; leave out and log those that fail, so that the others are applied.
 
-        Raises AmberboxError when the database is busy: then they are applied later.
+        Raises AmberboxError when the database is busy: they are then applied later.
         """
         try:
             return self._take(news)
@@ -321,7 +323,7 @@ class Alarms:
                 self._absence.gone(one.robot, one.boot_ns)
 
     def _tick(self) -> set[int]:
-        """Apply what is due now; return the numbers of the changed alarms."""
+        """Carry out the changes that are due; return the numbers of the changed alarms."""
         absence, now_ns = self._absence, self._clock.wall_ns()
         assert absence is not None
         with self._database.reading() as connection:

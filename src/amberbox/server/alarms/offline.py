@@ -28,7 +28,7 @@ class AbsenceTracker:
 
     away: dict[str, int] = field(default_factory=dict)
     settled: set[str] = field(default_factory=set)
-    """Of these it is decided: there is an alarm, or they are excused."""
+    """Robots with a decision: there is an alarm, or their absence is excused."""
 
     def gone(self, robot: str, at_ns: int) -> None:
         """Note that a robot is away since ``at_ns``, or earlier if that is already known."""
@@ -68,7 +68,9 @@ def is_excused(statuses: Statuses, excuses: Iterable[Excuse]) -> bool:
 
 
 def shared_by(robots: Mapping[str, Statuses], shared: Iterable[Shared]) -> str:
-    """Return what all robots have in common, such as ``access point ap-3``; empty for nothing."""
+    """Return a property that all robots share, such as ``access point ap-3``; empty if there is
+    none.
+    """
     for one in shared:
         values = [set(map(str, _values(statuses, one.output))) for statuses in robots.values()]
         common = set.intersection(*values) - {"", "None"} if values else set()
@@ -78,7 +80,7 @@ def shared_by(robots: Mapping[str, Statuses], shared: Iterable[Shared]) -> str:
 
 
 def _values(statuses: Statuses, output: str) -> list[bool | float | str]:
-    """Return the values of an output, without those that are missing."""
+    """Return the values of an output, without missing ones."""
     component, mode, name = output.split("/")
     return [
         value
@@ -106,7 +108,7 @@ def _value(entry: Mapping[str, Any]) -> bool | float | str | None:
 
 
 CONNECTION: Final = "connection"
-"""What robots share of which nothing else is known."""
+"""The common property of robots without any other known one."""
 _NAMED = 5
 
 
@@ -210,7 +212,9 @@ def _open(
 def _shared(
     robots: Mapping[str, KnownRobot], missing: Mapping[str, Statuses], settings: AlarmSettings
 ) -> str:
-    """Return what robots have in common: an output of their statuses, a group, the connection."""
+    """Return the property that robots share: an output of their statuses, a group, the
+    connection.
+    """
     groups = frozenset.intersection(*(robots[name].groups for name in missing))
     group = f"group {min(groups)}" if groups else ""
     return shared_by(missing, settings.shared) or group or CONNECTION

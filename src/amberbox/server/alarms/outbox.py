@@ -55,7 +55,9 @@ from amberbox.server.schema import CHANGED, OUTBOX
 from amberbox.server.settings import LOST, read
 
 VERSION: Final = 1
-"""Of what programs get: goes up when a field changes its meaning, not when one is added."""
+"""Version of the messages to programs: increases when a field changes its meaning, not for new
+fields.
+"""
 
 Event: TypeAlias = Literal["opened", "acknowledged", "resolved"]
 """The event that a message is about; ``opened`` also when it got worse or came back."""
@@ -144,7 +146,7 @@ def data_of(
 
 
 TRIES: Final = 12
-"""After so many attempts a message counts as failed: that is about ten hours."""
+"""Number of attempts after which a message counts as failed: about ten hours."""
 _FIRST_NS = 15 * NS
 _LONGEST_NS = 3600 * NS
 _GATHER_NS = 60 * NS
@@ -435,8 +437,8 @@ def follow_up(
 ) -> None:
     """Add messages about changed alarms to the outbox, for destinations that ask for them.
 
-    For an alarm that resolved, came back and resolved again by itself, the message is sent when it
-    has stayed resolved for ``stays_ns``.
+    For an alarm that was resolved, came back and was resolved again automatically, the message is
+    sent when it has stayed resolved for ``stays_ns``.
     """
     chosen = select(CHANGED.c.alarm).where(CHANGED.c.due_ns <= now_ns).order_by(CHANGED.c.alarm)
     for number in connection.execute(chosen.limit(_AT_ONCE)).scalars().all():
@@ -507,7 +509,7 @@ SIGNATURE: Final = "Amberbox-Signature"
 DELIVERY: Final = "Amberbox-Delivery"
 
 Deliver: TypeAlias = Callable[[Destination, NotificationMessage, Notifications, int], str]
-"""Returns what went wrong, empty for nothing."""
+"""Delivers a message; returns the error, empty if there was none."""
 
 
 def deliver(
@@ -616,7 +618,7 @@ class NotificationSender:
     )
 
     def step(self) -> int:
-        """Deliver what is due now; return how many messages were delivered."""
+        """Deliver the messages that are due; return how many were delivered."""
         with self._stepping:
             return 0 if self._closed else self._step()
 

@@ -26,7 +26,7 @@ LOST_HINT: Final = (
 )
 
 Also: TypeAlias = Literal["acknowledged", "resolved"]
-"""What else a destination may be told of alarms that it was told of."""
+"""Further events about which a destination is notified, for alarms it was notified of."""
 
 _ADDRESS = re.compile(r"[^\s@<>,;:\"]{1,64}@[A-Za-z0-9.-]{1,190}")
 _HOST = re.compile(r"[A-Za-z0-9.:_-]{1,253}")
@@ -56,7 +56,9 @@ class Smtp:
 
 
 class Quiet(msgspec.Struct, frozen=True, rename={"from_": "from"}):
-    """Hours of the day in which only ``but`` and what is worse is told; the rest comes after."""
+    """Hours of the day in which only ``but`` and worse severities are sent; the others are sent
+    afterwards.
+    """
 
     from_: str
     to: str
@@ -87,9 +89,9 @@ class Quiet(msgspec.Struct, frozen=True, rename={"from_": "from"}):
 
 @dataclass(frozen=True, slots=True)
 class Email:
-    """Somebody who gets mails about alarms of ``groups`` (none: all) from ``least`` on.
+    """Recipients of mails about alarms of ``groups`` (none: all) from the severity ``least`` on.
 
-    ``also`` asks for messages when such an alarm is acknowledged or resolved.
+    ``also`` requests messages when such an alarm is acknowledged or resolved.
     """
 
     name: str
@@ -112,7 +114,9 @@ class Email:
 
 @dataclass(frozen=True, slots=True)
 class Webhook:
-    """A program that is told by HTTP; ``secret`` signs what it gets, and is never shown again."""
+    """A program that is notified by HTTP; ``secret`` signs the messages, and is never
+    shown again.
+    """
 
     name: str
     url: str
@@ -136,7 +140,9 @@ Destination: TypeAlias = Email | Webhook
 
 @dataclass(frozen=True, slots=True)
 class Notifications:
-    """Who is told. Above ``digest_above`` messages in ``digest_s`` the rest comes as one."""
+    """The destinations. Above ``digest_above`` messages in ``digest_s`` further ones are sent as a
+    digest.
+    """
 
     smtp: Smtp | None = None
     emails: tuple[Email, ...] = ()

@@ -89,9 +89,9 @@ def content_of(row: LinkRow) -> ReportContent | None:
 
 
 _MARGIN_NS: Final = 10_000_000_000
-"""So much of what came before the last mark is looked at again: it may have been on its way."""
+"""Overlap before the last mark that is read again: its rows may have been in transit."""
 _AT_ONCE: Final = 100
-"""News in one transaction: others want to write, too."""
+"""Maximum number of reports in one transaction, so that other writers are not blocked."""
 
 
 @dataclass(frozen=True, slots=True)

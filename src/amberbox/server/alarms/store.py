@@ -1,4 +1,4 @@
-"""Alarms in the database: read and write them with their history, and list those that match."""
+"""Alarms in the database: read and write them with their history, and list matching ones."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from amberbox.server.schema import ALARM, ALARM_ROBOT, BLOCKED, CONSEQUENCE, HIS
 
 _TEXT = 2_000
 _LISTS = frozenset({"blocked_by", "components", "words"})
-"""Columns with JSON, of which a part is nothing; who writes them bounds them."""
+"""Columns with JSON, which may be null; their writers bound the size."""
 
 
 class AlarmRegister:
@@ -29,7 +29,7 @@ class AlarmRegister:
         self.touched: set[int] = set()
 
     def alarm(self, number: int) -> Alarm | None:
-        """Return the alarm of a number; None if there is none."""
+        """Return the alarm with a number; None if there is none."""
         return next(iter(self.alarms(ALARM.c.number == number)), None)
 
     def alarms(self, *where: ColumnElement[bool]) -> list[Alarm]:

@@ -36,9 +36,9 @@ Answer = TypeVar("Answer")
 
 
 async def cancel_on_disconnect(request: Request, work: Coroutine[Any, Any, Answer]) -> Answer:
-    """Do some work as long as the client of a request is there.
+    """Run some work as long as the client of a request is connected.
 
-    Raises CancelledError, which nobody will read, when it has gone: the work is cancelled.
+    Raises CancelledError when the client has disconnected: the work is cancelled.
     """
     task = asyncio.ensure_future(work)
     try:

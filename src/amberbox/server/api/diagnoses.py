@@ -1,4 +1,4 @@
-"""Routes of diagnoses and of what robots know: failure modes, fault trees, rules, folders."""
+"""Routes of diagnoses and of robots' knowledge: failure modes, fault trees, rules, folders."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ routes = Routes("diagnoses")
 
 
 _TRIES = 5
-"""So often an answer is ranked anew because somebody else has answered meanwhile."""
+"""Number of times an answer is ranked again because another person has answered meanwhile."""
 
 _Address = Annotated[str, StringConstraints(min_length=1, max_length=300)]
 _Word = Annotated[str, StringConstraints(min_length=1, max_length=100)]
@@ -187,7 +187,7 @@ def words_of(body: NewAnswer) -> dict[str, str]:
 async def _check_mode(
     fleet: Services, who: Caller, known: DiagnosisHistory, robot: str, failure_mode: str
 ) -> None:
-    """Refuse what is no failure mode; one that the diagnosis names needs no folder."""
+    """Refuse an unknown failure mode; one that the diagnosis names needs no folder."""
     if any(failure_mode in h.faults for d in known.revisions for h in d.hypotheses):
         return
     asked = RobotQuestion(
@@ -215,7 +215,7 @@ def _keep_answer(
     fleet: Services, who: Caller, robot: str, diagnosis: str, body: NewAnswer,
     before: dict[str, str], answer: bytes,
 ) -> bool:  # fmt: skip
-    """Keep an answer and what follows; False if somebody else has answered since ``before``."""
+    """Store an answer and the new ranking; False if another answer was stored since ``before``."""
     now_ns, person = fleet.clock.wall_ns(), who.person
     given, *also = [
         explanations.GivenAnswer(test, word, person, now_ns)

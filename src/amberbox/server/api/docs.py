@@ -81,7 +81,7 @@ class RouteParameter:
 
 @dataclass(frozen=True, slots=True)
 class RouteAnswer:
-    """A status that can come beyond the problems that all routes may answer."""
+    """A status that a route may answer in addition to the problems of all routes."""
 
     status: str
     about: str
@@ -91,7 +91,7 @@ class RouteAnswer:
 
 @dataclass(frozen=True, slots=True)
 class RouteDescription:
-    """A route: how it is called, who may, what it takes and answers."""
+    """A route: how it is called, who may call it, its parameters and answers."""
 
     method: str
     path: str
@@ -115,7 +115,7 @@ class RouteGroup:
 def describe_routes(
     openapi: Mapping[str, Any], all_routes: Iterable[Routes], url: str
 ) -> list[RouteGroup]:
-    """Return what there is, room by room; sockets stand last in theirs."""
+    """Return all routes, grouped by router; sockets are last in their group."""
     found: dict[str, list[RouteDescription]] = {}
     for routes in all_routes:
         for (method, path), rule in routes.rules.items():
@@ -142,7 +142,7 @@ def operation_at(openapi: Mapping[str, Any], method: str, path: str) -> dict[str
 
 
 def who_may(rule: RouteRule) -> str:
-    """Say in words who gets through."""
+    """Return in words who may call a route."""
     if isinstance(rule.action, Open):
         return f"everybody: {rule.action.reason}"
     action = ACTIONS[rule.action]
@@ -227,7 +227,7 @@ def _answers(openapi: Mapping[str, Any], responses: Mapping[str, Any]) -> Iterab
 
 
 def _call(method: str, path: str, url: str, body: str, rule: RouteRule) -> str:
-    """Return how a program asks for it: with a token where one can be enough."""
+    """Return an example of a request by a program: with a token if one is sufficient."""
     parts = ["curl"] + ([f"-X {method}"] if method != "GET" else [])
     action = None if isinstance(rule.action, Open) else ACTIONS[rule.action]
     if action is not None and action.role is None:

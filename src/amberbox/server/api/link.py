@@ -114,7 +114,7 @@ def _number(request: Request, name: str) -> int:
 
 
 async def body_of(request: Request, most: int) -> bytes:
-    """Read what is sent; raises 413 as soon as it is too much."""
+    """Read the body of a request; raises 413 as soon as it is too large."""
     found = bytearray()
     async for piece in request.stream():
         found += piece

@@ -172,13 +172,13 @@ def _user(fleet: Services, name: str) -> User:
 
 
 def came_from(request: Request) -> signin.LoginOrigin:
-    """Return where a login comes from."""
+    """Return the origin of a login."""
     agent = request.headers.get("user-agent", "")
     return signin.LoginOrigin(address_of(request), agent, request.cookies.get(COOKIE))
 
 
 def myself(who: Principal, secret: str) -> Myself:
-    """Say who somebody is, who has a session."""
+    """Return the account of a session's user."""
     groups = None if who.groups is None else sorted(who.groups)
     csrf = csrf_token(secret) if secret else ""
     return Myself(who.kind, who.id, who.role, groups, who.must_change, csrf)

@@ -162,7 +162,7 @@ def end_logins(fleet: Fleet, who: Who, name: Named) -> EndedSessions:
 
 
 def login(session: sessions.Session) -> OpenSession:
-    """Return a session as it is listed."""
+    """Return a session for a list."""
     return OpenSession(
         session.session_id,
         format_time(session.created_ns),
@@ -300,7 +300,9 @@ def _refuse_too_many(held: list[tokens.ApiToken], now_ns: int) -> None:
 
 
 def _refuse_foreign(owner: User, groups: list[str] | None) -> None:
-    """Refuse groups that are not the owner's: they would open nothing, and tell which there are."""
+    """Refuse groups that the owner does not have: they would grant nothing, and reveal
+    their names.
+    """
     for name in groups or () if owner.groups is not None else ():
         if name not in (owner.groups or ()):
             listed = f"yours are: {', '.join(sorted(owner.groups or ()))}"

@@ -46,7 +46,7 @@ class ArchiveCatalogue:
         return next(iter(self.database.rows(select(JOURNALS).where(_is(key)))), None)
 
     def add(self, row: Mapping[str, Any]) -> bool:
-        """Add a journal; return False when it is there already."""
+        """Add a journal; return False when it is in the catalogue already."""
         with self.database.begin() as connection:
             return upsert_rows(connection, JOURNALS, [row]) > 0
 
@@ -74,7 +74,7 @@ class ArchiveCatalogue:
         return None if found is None else int(found)
 
     def plan(self, journals: Sequence[Row[Any]], now_ns: int) -> None:
-        """Begin a batch: from here on it consists of these journals, also after a crash."""
+        """Begin a batch: from now on it consists of these journals, even after a crash."""
         with self.database.begin() as connection:
             number = 1 + (connection.scalar(select(func.max(BATCHES.c.number))) or 0)
             connection.execute(
@@ -120,14 +120,14 @@ class ArchiveCatalogue:
             connection.execute(update(JOURNALS).where(_is(row)).values(**values))
 
     def cancel(self, connection: Connection, batch: CommitBatch) -> None:
-        """End a batch of which no row is in any table; its journals wait again."""
+        """End a batch without rows in any table; its journals wait again."""
         of_batch = update(JOURNALS).where(JOURNALS.c.batch == batch.number)
         connection.execute(of_batch.values(batch=None))
         ended = update(BATCHES).where(BATCHES.c.number == batch.number)
         connection.execute(ended.values(done=True))
 
     def note_missing(self, source: RobotStore, ranges: Sequence[MissingRows]) -> None:
-        """Store ranges of rows that will never arrive; known ones stay as they are."""
+        """Store ranges of rows that will never arrive; known ones are not changed."""
         if ranges:
             with self.database.begin() as connection:
                 rows = [asdict(source) | asdict(one) for one in ranges]

@@ -56,10 +56,11 @@ _NAME = "archive.suspects"
 
 @dataclass(frozen=True, slots=True)
 class Suspects:
-    """Failures of a batch: how often, over which journal and why; what is committed ``alone``.
+    """Failures of a batch: their number, journal and reason; ``alone`` are journals committed
+    separately.
 
-    Journals are named ``robot/store_id/folder/file``; ``at`` is empty when the failures happened
-    over different journals, or over none.
+    Journals are named ``robot/store_id/folder/file``; ``at`` is empty when the failures happened at
+    different journals, or at none.
     """
 
     batch: int = 0
@@ -100,9 +101,9 @@ def note_failure(catalogue: ArchiveCatalogue, now_ns: int, at: str, why: str) ->
 
 
 def give_up(catalogue: ArchiveCatalogue, batch: CommitBatch, now_ns: int) -> int:
-    """End a failed batch of which no row is in any table; return how many journals were refused.
+    """End a failed batch without rows in any table; return how many journals were refused.
 
-    The journal over which it failed is committed alone from now on, or each of them when that is
+    The journal at which it failed is committed alone from now on, or each of them when that is
     unknown. A journal that fails alone is refused.
     """
     with catalogue.database.begin() as connection:

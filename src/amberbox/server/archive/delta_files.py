@@ -234,7 +234,7 @@ class ArchiveFile(SegmentWriter):
 
 
 def _signed(column: ColumnData) -> ColumnData:
-    """Reinterpret 64-bit unsigned integers as signed; other columns stay as they are."""
+    """Reinterpret 64-bit unsigned integers as signed; other columns are not changed."""
     if isinstance(column, Ragged):
         values = _signed(column.values)
         assert not isinstance(values, Ragged)
@@ -272,7 +272,7 @@ def by_day(flat: FlatTable) -> Iterator[tuple[str, FlatTable]]:
 
 @dataclass(frozen=True, slots=True)
 class JournalOrigin:
-    """The journal from which the rows of a part come."""
+    """The journal that the rows of a part come from."""
 
     journal: str
     head: str

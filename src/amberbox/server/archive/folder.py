@@ -31,7 +31,7 @@ from amberbox.server.journals import (
 
 
 class FolderArchive:
-    """The archive of what robots recorded, below a server's data folder.
+    """The archive of recorded data, below a server's data folder.
 
     ``commit``, ``compact``, ``retain`` and ``sweep`` are for one process at a time: the worker. All
     other methods may run in several processes at once.
@@ -48,11 +48,11 @@ class FolderArchive:
         self.ages = RetentionClock(self.catalogue.database, self.clock)
 
     def put(self, key: JournalKey, path: Path, *, is_checked: bool = False) -> PutResult:
-        """Move a verified journal file to its place; one that is here already changes nothing.
+        """Move a verified journal file to its place; an existing one is not changed.
 
         With ``is_checked`` its hash and its chain have just been verified. Raises AmberboxError for
-        an invalid file, or one that differs from the stored file of this name; it stays where it
-        was.
+        an invalid file, or one that differs from the stored file of this name; the file is then not
+        moved.
         """
         checked_key(key)
         place = self.layout.journal(key.robot, key.store_id, key.file)
@@ -103,7 +103,7 @@ class FolderArchive:
         return archive_commit.compact(self.layout, self.catalogue)
 
     def retain(self, rules: Sequence[Retention], now_ns: int | None = None) -> int:
-        """Delete what is older than the rules allow; return how many journals it concerned.
+        """Delete data that are older than the rules allow; return the number of journals concerned.
 
         ``now_ns`` is the time from which ages count; the server gives it to the worker, since only
         the server compares its clock with the robots'.

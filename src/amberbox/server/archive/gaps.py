@@ -20,7 +20,7 @@ from amberbox.server.journals import LOST, MissingRows, decode
 
 TO_COME = "not on the server yet"
 REFUSED = "refused: "
-"""How the reason of what was refused begins."""
+"""Beginning of the reason of a gap with refused data."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +46,7 @@ class RefusedFile:
 
 @dataclass(frozen=True, slots=True)
 class _Stretch:
-    """A range of rows that are here or whose absence is explained; ``number`` is their file's."""
+    """A range of rows that exist or whose absence is explained; ``number`` is their file's."""
 
     from_seq: int
     to_seq: int
@@ -95,7 +95,7 @@ def holes(
 def _runs(
     rows: Sequence[Row[Any]], missing: Sequence[MissingRows], files: Sequence[RefusedFile]
 ) -> dict[tuple[str, int], _Run]:
-    """Group what is known by run; runs with refused files only are left out, having no times."""
+    """Group known ranges by run; runs with refused files only are left out, having no times."""
     runs: dict[tuple[str, int], _Run] = {}
     for row in rows:
         _, number = run_and_number(Path(row.file))
@@ -131,10 +131,10 @@ def _between(run: _Run) -> Iterator[Gap]:
 
 
 def _explained(hole: Gap, lost: Sequence[RefusedFile], files: float) -> Iterator[Gap]:
-    """Yield a gap, explained by refused files where there are any.
+    """Yield a gap, explained by refused files if there are any.
 
-    Where only some of its ``files`` were refused, the whole gap is yielded for both reasons,
-    without counts, since it is unknown which part belongs to which.
+    If only some of its ``files`` were refused, the whole gap is yielded for both reasons, without
+    counts, since it is unknown which part belongs to which.
     """
     if not lost:
         yield hole

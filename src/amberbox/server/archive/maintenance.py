@@ -259,7 +259,7 @@ class ArchiveMaintenance:
         return [text for text in (low, self._trouble, self._ages.read().text) if text]
 
     def note_deleted(self, incoming: IncomingJournal, proof: Proof) -> None:
-        """Record in the archive what the robot deleted before it was copied."""
+        """Record in the archive the data that the robot deleted before they were copied."""
         missing = list(deleted_rows(proof))
         if missing:
             self._archive.note_missing(incoming.robot, incoming.store_id, missing)
@@ -314,7 +314,9 @@ class ArchiveMaintenance:
             await asyncio.sleep(min(_GATHER_S, self._every_s))
 
     async def _commit_once(self) -> float | None:
-        """Commit what is due; return seconds until the next commit, None if nothing waits."""
+        """Commit the waiting journals if due; return seconds until the next commit, None if nothing
+        waits.
+        """
         archive, database = self._archive, self._database
         await self._in_thread(partial(take_confirmed, archive, database, self._folder))
         await self._in_thread(partial(note_lost, archive, database))

@@ -113,7 +113,7 @@ class ArchiveReader:
         return chosen
 
     def clocks(self, source: RobotStore) -> StoreClocks:
-        """Return what is known now of a store's clocks."""
+        """Return the present knowledge of a store's clocks."""
         if source not in self._known.clocks:
             rows = [row for row in self._catalogue.journals(source) if row.state == COMMITTED]
             self._known.clocks[source] = _clocks(rows)

@@ -207,7 +207,9 @@ class ArchiveRecord(Record):
         return self.catalogue.last_ns(self.robots)
 
     def gaps(self, item: str | None = None, from_: Time = None, to: Time = None) -> list[Gap]:
-        """Return what is missing in ``[from_, to)`` and why, including data that never arrived."""
+        """Return the missing ranges in ``[from_, to)`` with their reasons, including data that
+        never arrived.
+        """
         span = self.span_ns(from_, to)
         return self._look(lambda reader: gaps_of(reader, self.catalogue, item, span))
 

@@ -132,7 +132,7 @@ def _takes_files(folder: Path) -> bool:
 def _lock(folder: Path) -> IO[str]:
     """Lock the archive against a second worker; retry while a killed one is still ending.
 
-    Raises UsageError when another one works here.
+    Raises UsageError when another worker has the lock.
     """
     file = (folder / TABLES / ".lock").open("a")
     for _ in range(_LOCK_TRIES):
@@ -181,7 +181,9 @@ class ArchiveWorker:
         return int(self.ask("compact"))
 
     def retain(self, now_ns: int, *rules: Retention) -> int:
-        """Delete what is too old as of ``now_ns``; return how many journals it concerned."""
+        """Delete data that are too old as of ``now_ns``; return the number of journals
+        concerned.
+        """
         return int(self.ask("retain", rules=msgspec.to_builtins(rules), now_ns=now_ns))
 
     def sweep(self) -> int:

@@ -72,7 +72,7 @@ _REMEMBERED_NS = 30 * 24 * 3600 * 10**9
 
 @dataclass(frozen=True, slots=True)
 class DownloadJob:
-    """A download: who wants what, and what has become of it."""
+    """A download: its owner, its request, and its state."""
 
     id: str
     owner: str

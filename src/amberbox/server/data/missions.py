@@ -77,4 +77,4 @@ _MISSION: Mapping[str, Any] = {
     "id": "", "name": "", "state": "", "outcome": "", "from_ns": 0, "to_ns": None, "who": "",
     "details": "",
 }  # fmt: skip
-"""What a mission's record has, should an old one lack something."""
+"""Default values of a mission's record, for fields that an old one lacks."""

@@ -43,7 +43,7 @@ Form = Literal["json", "csv", "arrow", "plot"]
 By = Literal["received", "timestamp"]
 
 ROWS = 100_000
-"""Rows of an answer where nothing else is said."""
+"""Default maximum number of rows of an answer."""
 MOST_ROWS = 5_000_000
 MOST_POINTS = 100_000
 MOST_BINS = 500
@@ -189,7 +189,7 @@ def _narrowed(
 ) -> tuple[Span, int | None]:
     """Return the range without files that follow enough rows, and where those begin.
 
-    Raises LimitError where there is more than may be held in memory.
+    Raises LimitError for more rows than may be held in memory.
     """
     span = asked.from_ns, asked.to_ns
     files = files_of(look, schema, RowRequest(schema.item, (), span, asked.by))

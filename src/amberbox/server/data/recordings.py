@@ -40,13 +40,13 @@ from amberbox.server.schema import JOURNALS, UPLOAD
 
 @dataclass(frozen=True, slots=True)
 class JournalListing:
-    """A journal on the server, or on its way; times are those of receipt on the robot.
+    """A journal on the server, or on its way to it; times are those of receipt on the robot.
 
-    They are None where they are not known: of what is being copied, and of most that is damaged.
+    They are None where unknown: while it is copied, and for most damaged ones.
 
-    ``integrity``: ``unsigned`` is a journal that holds but stands behind the last head that the
-    robot signed; ``deleted`` one that retention took. By size only: ``altered`` also comes from a
-    check of its content.
+    ``integrity``: ``unsigned`` is a valid journal after the last head that the robot signed;
+    ``deleted`` one that retention deleted. It is judged by size only: ``altered`` may also be the
+    result of a check of its content.
     """
 
     store_id: str
@@ -174,7 +174,7 @@ _KINDS: Sequence[tuple[GapKind, re.Pattern[str]]] = (
     ("filtered", re.compile("filter|unchanged|rate.?limit", re.IGNORECASE)),
     ("lost", re.compile("lost|drop|queue|damaged|torn|refused|corrupt|decod|columns", re.I)),
 )
-"""Records say why rows are missing in words, those of years ago too: the first that fits."""
+"""Kinds by the wording of a gap's reason, also in old records; the first match counts."""
 
 
 def kind_of(reason: str) -> GapKind:

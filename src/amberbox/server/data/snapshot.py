@@ -32,7 +32,9 @@ from amberbox.server.journals import decode
 from amberbox.server.schema import JOURNALS
 
 READ_BYTES = 64 << 20
-"""Waiting journals that a question reads; of more the answer says up to when it is complete."""
+"""Bytes of waiting journals that a query reads; with more, the answer states up to when it is
+complete.
+"""
 
 NONE = (
     "no journal of this robot has come yet: it sends one every ten minutes, or when it is asked for"
@@ -40,7 +42,9 @@ NONE = (
 
 _ATTEMPTS = 5
 _MARGIN_NS = 60 * 10**9
-"""Corrected times of receipt may differ from those that were noted when a journal came."""
+"""Margin for corrected times of receipt, which may differ from those noted when a journal
+arrived.
+"""
 
 Answer = TypeVar("Answer")
 

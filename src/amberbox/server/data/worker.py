@@ -110,7 +110,7 @@ def _info(look: RecordSnapshot, table: str) -> dict[str, Any]:
 def _without_columns(look: RecordSnapshot, named: Collection[str]) -> Iterator[dict[str, Any]]:
     """Yield the items of which no message can be unrolled, from the gaps of their journals.
 
-    Topic and type are known only of journals that wait for their columns.
+    Topic and type are known only for journals that wait for their columns.
     """
     found: dict[str, list[Gap | GapFact]] = {}
     topics: dict[str, Topic] = {}
@@ -155,7 +155,7 @@ def _rate_hz(held: list[ItemExtent]) -> float | None:
 
 
 _STEPS = 1000
-"""A long range is summed up from so many steps: its edges are right to a step."""
+"""Number of steps from which a long range is summed up: its edges are accurate to a step."""
 
 
 def statistics_json(look: RecordSnapshot, asked: RowQuery) -> dict[str, Any]:

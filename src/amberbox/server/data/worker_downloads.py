@@ -222,7 +222,7 @@ def _exported(workshop: DownloadBuild, record: Record, view: View, target: Path)
 
 _STEP_ROWS = 200_000
 _STEP_BYTES = 16 << 20
-"""Of a stretch, as it lies compressed on the disk."""
+"""Compressed bytes of the section that is read at a time."""
 
 
 _Writer = Callable[[Table], None]
@@ -334,7 +334,7 @@ _OPEN: Mapping[str, Callable[[Path, Table], AbstractContextManager[_Writer]]] = 
 }
 
 FORMATS: Sequence[str] = tuple(_OPEN)
-"""The formats that are made here."""
+"""The formats that this worker makes."""
 
 
 CONTENTS = "contents.json"
@@ -394,7 +394,7 @@ _WRITE: Mapping[str, Callable[[DownloadBuild, RecordRange], Iterator[float]]] = 
     "journals": write_journals,
 }
 _MADE = 0.8
-"""How much of the work is done when all files are there."""
+"""Share of the progress when all files are written."""
 
 
 def make(folder: Path, arguments: Mapping[str, Any]) -> Iterator[bytes]:

@@ -100,7 +100,7 @@ def effect_graph(
     """Draw causes on the left, lost functions in the middle, symptoms on the right.
 
     ``chosen`` are ids of failure modes (with or without ``cause:``): all their effects are
-    highlighted, the rest is dimmed.
+    highlighted, other elements are dimmed.
     """
     nodes = {node.id: node for node in effects.nodes}
     edges = [e for e in dict.fromkeys(effects.edges) if e.start in nodes and e.end in nodes]

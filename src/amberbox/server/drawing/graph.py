@@ -76,7 +76,7 @@ def indirect_links(pairs: Sequence[Pair], shown: Collection[str]) -> dict[Pair, 
 def _beyond(
     name: str, outgoing: Mapping[str, Sequence[str]], shown: Collection[str]
 ) -> dict[str, int]:
-    """Return what is reached over hidden names only, with their number on the shortest path."""
+    """Return the names reached over hidden names only, with their number on the shortest path."""
     distance = {other: 1 for other in outgoing[name] if other not in shown}
     reached: dict[str, int] = {}
     order = list(distance)
@@ -136,7 +136,7 @@ def dependency_graph(
     down: bool = False,
     words: DrawingTexts,
 ) -> SvgElement:
-    """Draw components and what they need, left to right or top down.
+    """Draw components and their dependencies, left to right or top down.
 
     With more than ``most`` components, some that are ok are only counted in one box, which links to
     ``more_href``; all others are drawn. A component that only occurs in edges is drawn as unknown.
@@ -160,7 +160,7 @@ _Line: TypeAlias = tuple[tuple[str, str], _Kind, int]
 
 
 def _ahead(line: _Line) -> tuple[str, str]:
-    """Return the direction of a line: from what needs to what is needed, from whole to part."""
+    """Return the direction of a line: from a component to its dependency, from whole to part."""
     (start, end), kind, _ = line
     return (end, start) if kind == "part-of" else (start, end)
 

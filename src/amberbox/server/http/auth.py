@@ -49,7 +49,7 @@ class Open:
 
 @dataclass(frozen=True, slots=True)
 class RouteRule:
-    """What a route requires: an action, or a reason why it is open.
+    """The requirement of a route: an action, or a reason why it is open.
 
     With ``each`` it concerns many robots: the route itself leaves out those the caller may not see.
     """

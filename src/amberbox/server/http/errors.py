@@ -67,7 +67,7 @@ PROBLEMS: dict[int | str, dict[str, Any]] = {
         "not now, by its code: busy (try again), not_set_up (no admin yet), damaged (the database)"
     ),
 }
-"""Error answers of every route; routers declare only what they answer besides."""
+"""Error answers of every route; routers declare only their additional answers."""
 
 _STATUS: Mapping[type[AmberboxError], int] = {
     MustWaitError: 429,

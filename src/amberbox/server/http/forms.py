@@ -36,7 +36,7 @@ def not_found(error: UsageError) -> HTTPException:
 
 
 def download_headers(name: str) -> dict[str, Any]:
-    """Return the headers of a download; ``name`` is inserted as it is and must be trusted."""
+    """Return the headers of a download; ``name`` is inserted unchanged and must be trusted."""
     return {
         "Content-Disposition": f'attachment; filename="{name}"',
         "X-Content-Type-Options": "nosniff",

@@ -51,7 +51,7 @@ class RequestedFile(msgspec.Struct, frozen=True):
 
 @dataclass(frozen=True, slots=True)
 class RequestedWindow:
-    """A window of a robot's record that somebody wants on the server."""
+    """A window of a robot's record that was requested on the server."""
 
     id: str
     robot: str
@@ -160,9 +160,9 @@ def update_files(
     connection: Connection, now_ns: int, one: RequestedWindow, files: Sequence[RequestedFile],
     here: Collection[tuple[str, str]] | None = None,
 ) -> RequestedWindow | None:  # fmt: skip
-    """Update the states of a window's journals; None where that changes nothing.
+    """Update the states of a window's journals; return None if nothing changes.
 
-    ``here`` is what the robot still has (store and journal), None where unknown.
+    ``here`` are the journals that the robot still has (store and journal), None if unknown.
     """
     found = [_with_state(connection, one.robot, file) for file in files]
     if here is not None:
@@ -327,7 +327,7 @@ class FetchService:
     def _update(
         self, robot: str, work: Callable[[Connection, int, RequestedWindow], RequestedWindow | None]
     ) -> None:
-        """Update all windows whose journals are named; publish those that change."""
+        """Update all windows whose journals are named; publish the changed ones."""
         now_ns = self._clock.wall_ns()
         with self._database.begin() as connection:
             named = [one for one in waiting(connection, robot) if one.state == "copying"]

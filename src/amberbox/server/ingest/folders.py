@@ -199,7 +199,7 @@ class FolderService:
     def find(self, robot: str, config_hash: str = "") -> Path:
         """Return the path of a folder; without a hash the current one, else the newest.
 
-        Raises UsageError where there is none.
+        Raises UsageError if there is none.
         """
         wanted = config_hash or self.current(robot)
         if (robot, wanted) in self._known:

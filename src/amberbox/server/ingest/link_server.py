@@ -127,7 +127,7 @@ class LinkHooks:
     gone: Callable[[str], None] = _nothing
     live: Callable[[str, Mapping[str, Value]], None] = _nothing
     has: Callable[[str, str, HasFrame], None] = _nothing
-    """(robot, store id, which journals hold a window that was asked for)."""
+    """Called with robot, store id, and the journals that hold a requested window."""
     wants_folder: Callable[[str, str], bool] = lambda robot, config_hash: False
     """Whether the folder of a robot with this hash is not known yet."""
 
@@ -145,10 +145,10 @@ class RobotConnection:
     written_ns: int = 0
     backlog: int = 0
     monitoring: WatcherHeartbeat | None = None
-    """How its watcher is doing; None where it has not said."""
+    """State of the robot's watcher; None if it was not reported."""
     answers: asyncio.Queue[Answer | None] = field(default_factory=lambda: asyncio.Queue(_WAITING))
     last_received_s: float = field(default_factory=time.monotonic)
-    """When something came last, by a clock that nobody sets."""
+    """Time of the last received frame, by the monotonic clock."""
 
     @property
     def is_silent(self) -> bool:
@@ -254,7 +254,7 @@ class LinkServer:
             self._hooks.has(one.robot, _store_of(one), deed)
 
     async def _admit(self, one: RobotConnection, hello: Hello) -> None:
-        """Admit a robot; from here on its older connection is closed and cannot write."""
+        """Admit a robot; from now on its older connection is closed and cannot write."""
         now_ns = self._clock.wall_ns()
         work = partial(ledger.admit, hello=hello, now_ns=now_ns)
         admission = await asyncio.wrap_future(self._writes.submit(work))

@@ -192,7 +192,7 @@ class NewSigningKey:
 
 
 def waiting_reason(public_key: str) -> str:
-    """Return why a journal is set aside whose signing key is not confirmed."""
+    """Return the reason why a journal is set aside whose signing key is not confirmed."""
     return f"it is signed with another key than before, which waits for an admin: {public_key}"
 
 

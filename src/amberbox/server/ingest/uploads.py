@@ -51,7 +51,7 @@ class IncomingJournal:
     size: int
 
     def problem(self) -> str:
-        """Return what is wrong with its names or size; empty where nothing is."""
+        """Return the problem with its names or size; empty if there is none."""
         if not is_store_id(self.store_id):
             return "no store has this id"
         if not is_journal_name(self.journal):
@@ -108,7 +108,7 @@ def append_piece(root: Path, incoming: IncomingJournal, offset: int, piece: byte
 
 
 def _write(descriptor: int, piece: bytes, at: int) -> None:
-    """Write all of a piece, or leave the file as long as it was."""
+    """Write a whole piece; on an error restore the length of the file."""
     view, to = memoryview(piece), at
     try:
         while view:
@@ -127,7 +127,7 @@ def discard_pieces(root: Path, incoming: IncomingJournal) -> None:
 def held_journals(
     database: ServerDatabase, root: Path, robot: str, store_id: str
 ) -> Iterator[JournalCopy]:
-    """Yield the journals of a store whose file is here, or was deleted on purpose. Blocks.
+    """Yield the journals of a store whose file exists, or was deleted on purpose. Blocks.
 
     Files that the database names and the disk lacks are left out: the disk may have been restored
     from an older backup than the database.
@@ -154,7 +154,7 @@ def known_uploads() -> Select[Any]:
 
 
 def is_held(root: Path, row: Row[Any]) -> bool:
-    """Return whether the file of one of ``known_uploads`` is here, or was deleted on purpose."""
+    """Return whether the file of one of ``known_uploads`` exists, or was deleted on purpose."""
     if row.raw_gone or row.state == "incoming":
         return True
     try:
@@ -359,8 +359,8 @@ def verdict(answer: UploadAnswer) -> Verdict:
 def _state(connection: Connection, incoming: IncomingJournal, result: VerificationResult) -> State:
     """Return the state of a verified file: a name in a store has one content in its record.
 
-    Other content, or rows at positions that are already held, come from a disk on which an old
-    image was restored: two histories of one store.
+    A file with other content, or with rows at positions that are already held, comes from a disk on
+    which an old image was restored: two histories of one store.
     """
     if result.reason:
         return "quarantined"

@@ -207,7 +207,7 @@ def _unreadable(reason: str, proven: ProvenSeal | None) -> VerificationResult:
 
 
 def _proven(claim: UploadClaim) -> ProvenSeal | None:
-    """Check the robot's proof of the file; only the ring's journals come without a seal."""
+    """Check the robot's proof of the file; only the ring's journals have no seal."""
     if claim.proof is not None and claim.proof.lines:
         return check_proof(claim.proof, claim.store_id, claim.journal, claim.public_key)
     if _folder(claim) != FOLDERS["ring"]:
@@ -275,7 +275,7 @@ class Verifier:
         return self._pool.pids
 
     def check(self, claim: UploadClaim) -> VerificationResult | None:
-        """Verify a file; None when workers died over it. Blocks: call it in a thread.
+        """Verify a file; None when workers died while verifying it. Blocks: call it in a thread.
 
         A worker may also die for other reasons (the system needs memory), so there is a second try.
         Raises AmberboxError when the server stops meanwhile: the file's state is then unknown.

@@ -16,10 +16,11 @@ from amberbox.server.derived import DerivedRecord, RecordStores, derived_records
 _STATUS_NS = 30 * NS
 """A watcher that runs repeats the status of every component within this time."""
 _LATE_NS = 5 * NS
-"""So long after an instant the statuses of it have been written."""
+"""Delay after an instant by which its statuses have been written."""
 _FOUND_LATE_NS = 600 * NS
-"""The same for symptoms and diagnoses: a watcher that was restarted, or has little of its computer,
-catches up with what it missed."""
+"""The same for symptoms and diagnoses: a watcher that was restarted, or has little processor time,
+catches up.
+"""
 _SYMPTOMS, _DIAGNOSES, _STATUSES = 20_000, 500, 5_000
 
 FindingT = TypeVar("FindingT", Status, Symptom, Diagnosis)
@@ -27,7 +28,7 @@ FindingT = TypeVar("FindingT", Status, Symptom, Diagnosis)
 
 @dataclass(frozen=True, slots=True)
 class EvidenceMoment:
-    """The evidence at an instant; ``notes`` state how it differs from the instant asked for.
+    """The evidence at an instant; ``notes`` state how it differs from the requested instant.
 
     Times are those of the robot, by the latest correction of its clock. ``config_hash`` is of the
     robot folder that the watcher used, empty if it recorded none.
@@ -166,7 +167,7 @@ def read_diagnoses(
 ) -> list[DiagnosisHistory]:
     """Return a robot's diagnoses with a revision in a range, newest first.
 
-    Reads the newest ``most`` revisions. A file of the watcher begins with what stands, so a
+    Reads the newest ``most`` revisions. A file of the watcher begins with the open diagnosis, so a
     revision may be written several times; it counts once.
     """
     found = derived_records(stores, robot, channels.DIAGNOSIS, (from_ns, to_ns), most, newest=True)
@@ -197,11 +198,11 @@ def diagnoses_page(
 
 
 _BEFORE_NS = 60 * NS
-"""A symptom is recorded at most so long before the diagnosis that it opens."""
+"""Longest time by which a symptom is recorded before the diagnosis that it opens."""
 _HOLDING_MOST = 2_000
 """Words on symptoms that are looked through, the newest of them."""
 _SETTLED_NS = 10 * NS
-"""What went so short ago may come and go."""
+"""A symptom that disappeared more recently than this may be intermittent."""
 
 
 class ReportedSymptom(Protocol):

@@ -50,7 +50,7 @@ class GivenCause:
 
 @dataclass(frozen=True, slots=True)
 class Revision:
-    """A diagnosis ranked anew by the server after an answer to a test."""
+    """A diagnosis with the server's new ranking after an answer to a test."""
 
     number: int
     who: str
@@ -99,7 +99,9 @@ def keep_answer(
     connection: Connection, robot: str, diagnosis: str, one: GivenAnswer, body: bytes,
     also: Sequence[GivenAnswer] = (),
 ) -> None:  # fmt: skip
-    """Store an answer, others given with it, and the diagnosis ranked anew (``body``, JSON)."""
+    """Store an answer, others given with it, and the diagnosis with the new ranking (``body``,
+    JSON).
+    """
     about = {"robot": robot, "diagnosis": diagnosis, "who": one.who, "at_ns": one.at_ns}
     rows = [{**about, "test": of.test, "answer": of.answer} for of in (one, *also)]
     connection.execute(ANSWER.insert(), rows)
@@ -174,7 +176,7 @@ class Explained:
         self._wanted: asyncio.Queue[tuple[str, str]] = asyncio.Queue()
 
     def known(self, robot: str, diagnosis: Diagnosis, answers: Mapping[str, str]) -> Answer | None:
-        """Return the cached explanation of a revision; None if it is not there."""
+        """Return the cached explanation of a revision; None if there is none."""
         with self._lock:
             return self._known.get(key_of(robot, diagnosis, answers))
 
@@ -183,8 +185,9 @@ class Explained:
     ) -> Answer:
         """Return the explanation; concurrent callers wait for the same computation.
 
-        People never wait for one in advance: its low priority may take long on a busy machine.
-        Raises AmberboxError where there is none, such as without the robot's folder.
+        People never wait for one that is computed in advance: its low priority may take long on a
+        busy machine. Raises AmberboxError if it cannot be computed, such as without the robot's
+        folder.
         """
         found = self.known(robot, diagnosis, answers)
         if found is not None:
@@ -205,7 +208,7 @@ class Explained:
             task.exception()  # retrieved, so that asyncio does not log it without callers
 
     async def run(self) -> None:
-        """Explain the newest diagnosis of each robot, then those that robots send, in turn."""
+        """Explain the newest diagnosis of each robot, then new diagnoses in order of arrival."""
         ends = [self._bus.on("diagnosis", self._note), self._bus.on("robot", self._robot)]
         try:
             for robot in await asyncio.to_thread(self._robots):

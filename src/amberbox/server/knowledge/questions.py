@@ -25,7 +25,7 @@ class RobotQuestion(msgspec.Struct, frozen=True, kw_only=True):
     at: str = ""
     config_hash: str = ""
     seconds: float = 15.0
-    """So long an engine may think before it says what it has found by then."""
+    """Time after which an engine stops and returns the results found so far."""
     exposure_h: float | None = None
 
 

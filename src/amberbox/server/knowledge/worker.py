@@ -138,7 +138,9 @@ def fmea(folder: Path, arguments: dict[str, Any]) -> Any:
 
 @json_operation
 def fault_trees(folder: Path, arguments: dict[str, Any]) -> Any:
-    """Return the fault trees of all functions, or one with its cut sets and those closest now."""
+    """Return the fault trees of all functions, or one with its cut sets and those closest to
+    complete.
+    """
     return _trees(folder, _stores(folder), decode_question(arguments, AskTrees))
 
 
@@ -287,7 +289,7 @@ _SHOWN = 12
 def folder_at(
     folder: Path, database: ServerDatabase, robot: str, wanted: str, watched: str
 ) -> tuple[DeclaredRobot, tuple[str, ...]]:
-    """Return what a robot's folder declares, and notes about which folder it is.
+    """Return the contents of a robot's folder, and notes about its version.
 
     ``wanted`` is the hash that the caller asks for, ``watched`` the one that the robot's watcher
     used at the time; without either it is the folder that the robot stated last. Raises UsageError

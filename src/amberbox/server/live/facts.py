@@ -28,7 +28,9 @@ _T = TypeVar("_T")
 
 
 class NeedFacts(msgspec.Struct, frozen=True):
-    """A dependency of a component, and the component and mode that judge it; empty if none do."""
+    """A dependency of a component, and the component and mode that give its state; empty if there
+    is none.
+    """
 
     name: str
     component: str = ""

@@ -311,7 +311,7 @@ class LiveValueRelay:
         return found
 
     def text(self, number: int, robot: str, variables: Iterable[str]) -> str:
-        """Return the message with a robot's latest values; empty where there are none."""
+        """Return the message with a robot's latest values; empty if there are none."""
         known = self._values.get(robot, {})
         data: dict[str, Any] = {
             name: {"at": format_moment(known[name][0]), "value": known[name][1]}
@@ -614,7 +614,7 @@ class Feed:
         return text
 
     def show_live(self, listener: LiveListener) -> None:
-        """Request the live values that a listener watches, and send those that are known."""
+        """Request the live values that a listener watches, and send the known ones."""
         self.live.look_again()
         for robot, names in listener.watch.items():
             text = self.live.text(self.ring.number, robot, names)

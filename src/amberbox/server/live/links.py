@@ -1,6 +1,4 @@
-"""What is known of a robot's link and files: stores, clocks, signed heads, events, damaged
-files.
-"""
+"""State of a robot's link and files: stores, clocks, signed heads, events, damaged files."""
 
 from __future__ import annotations
 
@@ -149,7 +147,9 @@ NEW_NS: Final = 24 * 3600 * NS
 
 @dataclass(frozen=True, slots=True)
 class DamagedFiles:
-    """How many files of a robot are set aside as damaged; ``new`` of them came lately."""
+    """Number of files of a robot that are set aside as damaged; ``new`` of them arrived
+    recently.
+    """
 
     count: int = 0
     new: int = 0

@@ -1,4 +1,4 @@
-"""Records of robots as they are shown, and the current statuses without stale entries."""
+"""Records of robots in the form in which they are shown, and the current statuses."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ class DiagnosisRecord(msgspec.Struct, frozen=True):
 
 
 class SymptomRecord(msgspec.Struct, frozen=True):
-    """A symptom, as far as it tells whether it is there."""
+    """A symptom, with the fields that state whether it is present."""
 
     id: str
     state: str = ""

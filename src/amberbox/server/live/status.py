@@ -117,7 +117,7 @@ class RecentRecords:
         default_factory=lambda: {channel: {} for channel in _KINDS}
     )
     holds: dict[str, SymptomInterval] = field(default_factory=dict)
-    """Since when each symptom was there last, and when it was seen to be gone."""
+    """When each symptom last appeared, and when it was observed to be gone."""
     effects: dict[str, tuple[int, Severity | Literal[""]]] = field(default_factory=dict)
     """What diagnoses leave of the robot, as they were put into words last, with their revisions."""
 
@@ -242,8 +242,8 @@ FEW = 50
 class AssessedRobot:
     """The status of a robot and its inputs.
 
-    ``silence`` is the reason why the present state is unknown, empty where it is known. ``gone_ns``
-    is since when no symptom of the open diagnosis is present (robot's clock).
+    ``silence`` is the reason why the present state is unknown, empty if it is known. ``gone_ns`` is
+    since when no symptom of the open diagnosis has been present (robot's clock).
     """
 
     robot: KnownRobot

@@ -116,7 +116,7 @@ def list_alarms(
 ) -> list[AlarmLine]:  # fmt: skip
     """List alarms, the newest first, of the robots that the caller may see.
 
-    ``since`` asks for those that have changed since then.
+    With ``since`` only those that have changed since then.
     """
     since_ns = query_time_ns(since, fleet.clock)
     with fleet.database.reading() as connection:
@@ -140,7 +140,7 @@ def find_alarm(connection: Connection, who: Caller, number: int) -> Alarm:
 
 
 def _seen(connection: Connection, who: Caller, robot: str, group: str) -> frozenset[str] | None:
-    """Return the robots whose alarms are asked for, and may be seen; None for all there are."""
+    """Return the robots whose alarms are requested and may be seen; None for all."""
     if who.principal.groups is None and not robot and not group:
         return None
     return frozenset(
@@ -151,7 +151,7 @@ def _seen(connection: Connection, who: Caller, robot: str, group: str) -> frozen
 
 
 def _lines(connection: Connection, who: Caller, alarms: list[Alarm]) -> list[AlarmLine]:
-    """Return alarms as they are shown, of their robots those that the caller may see."""
+    """Return alarms for a list, with those of their robots that the caller may see."""
     mine = _seen(connection, who, "", "")
     robots = store.robots_of(connection, [alarm.number for alarm in alarms])
     return [

@@ -23,7 +23,7 @@ Order = Literal["newest", "oldest"]
 def list_rows(
     fleet: Services, wanted: AuditQuery, order: Order = "newest", after: int = 0, limit: int = 100
 ) -> list[AuditRow]:
-    """List rows, newest first or oldest first; ``after`` goes on behind a row."""
+    """List rows, newest first or oldest first; ``after`` continues after a row."""
     chosen = select_rows(wanted, fleet.clock).limit(limit)
     if order == "oldest":
         chosen = chosen.where(AUDIT.c.seq > after).order_by(AUDIT.c.seq)
@@ -35,7 +35,7 @@ def list_rows(
 
 
 def read_head(fleet: Services) -> AuditHead:
-    """Return how far the log goes: note it elsewhere from time to time."""
+    """Return the head of the log, to be stored elsewhere from time to time."""
     with fleet.database.reading() as connection:
         return audit_head(audit.head(connection))
 
@@ -65,12 +65,12 @@ def select_rows(wanted: AuditQuery, clock: Clock) -> Select[Any]:
 
 
 def audit_head(head: audit.AuditChainHead) -> AuditHead:
-    """Return a head as it is shown."""
+    """Return a head in its published form."""
     return AuditHead(head.seq, head.hash, str(head))
 
 
 def audit_row(row: AuditLogRow) -> AuditRow:
-    """Return a row as it is shown."""
+    """Return a row in its published form."""
     return AuditRow(
         row.seq, format_time(row.time_ns), row.principal, row.address, row.action, row.object,
         row.result, json.loads(row.details), row.hash,
@@ -79,7 +79,7 @@ def audit_row(row: AuditLogRow) -> AuditRow:
 
 @dataclass(frozen=True, slots=True)
 class AuditQuery:
-    """Which rows; what is empty fits all. ``object`` fits what begins with it."""
+    """A selection of rows; an empty field matches all. ``object`` matches by its beginning."""
 
     from_: str = ""
     to: str = ""

@@ -1,4 +1,6 @@
-"""The context of a request: the parts of the running server, who asks, and the times of a query."""
+"""The context of a request: the parts of the running server, the caller, and the times of
+a query.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +37,9 @@ from amberbox.server.workers.pool import RequestThreads, WorkerPool
 
 
 class NotFoundError(AmberboxError):
-    """What was asked for is not there, or the caller may not see it: 404, in the same words."""
+    """A thing that does not exist, or that the caller may not see: 404, with the same text for
+    both.
+    """
 
 
 class Demonstration(Protocol):
@@ -54,21 +58,23 @@ class Demonstration(Protocol):
         """Return the faults that are offered, by their names in the simulator's catalogue."""
 
     def broken(self) -> Mapping[str, str]:
-        """Return which robot has which fault now; those that are well are not in it."""
+        """Return the present fault of each broken robot; healthy ones are not in it."""
 
     def damage(self, robot: str, fault: str) -> None:
-        """Let a robot have a fault, instead of what it had; raises UsageError for unknown ones."""
+        """Inject a fault into a robot, instead of its present one; raises UsageError for unknown
+        ones.
+        """
 
     def repair(self, robot: str) -> None:
         """Let a robot be well again; raises UsageError for an unknown one."""
 
     def end(self) -> None:
-        """Hear that the server is about to end: robots may end as well."""
+        """Handle the coming end of the server: robots may end as well."""
 
 
 @dataclass(slots=True, eq=False)
 class Services:
-    """The parts of the server, by what they are for; ``assembly.py`` puts them together."""
+    """The parts of the server by their task; ``assembly.py`` puts them together."""
 
     folder: Path
     settings: ServerSettings
@@ -81,9 +87,9 @@ class Services:
     upload_service: UploadService
     folders: FolderService
     worker_pool: WorkerPool
-    """Answers people."""
+    """Workers for the requests of people and programs."""
     robot_worker_pool: WorkerPool
-    """Unpacks and reads what robots send, and explains it before anybody asks."""
+    """Unpacks and reads data of robots, and explains diagnoses in advance."""
     explained: Explained
     jobs: DownloadService
     fetches: FetchService
@@ -99,7 +105,7 @@ class Services:
 
 @dataclass(frozen=True, slots=True)
 class Caller:
-    """Who asks, from where; ``session_id`` and ``secret`` where it is by a session's cookie."""
+    """The caller of a request; ``session_id`` and ``secret`` if a session's cookie was sent."""
 
     principal: Principal
     address: str
@@ -109,7 +115,7 @@ class Caller:
 
     @property
     def person(self) -> str:
-        """Return the id of the person who asks, whichever of their tokens it is by."""
+        """Return the id of the person who calls, with whichever of their tokens."""
         return self.principal.owner or self.principal.id
 
     def may(self, action: str, robot: KnownRobot | RobotGroups | None = None) -> bool:
@@ -120,7 +126,9 @@ class Caller:
         return allowed(self.principal, action, seen)
 
     def may_some(self, action: str) -> bool:
-        """Return whether an action is allowed to robots of one's groups, if there are any."""
+        """Return whether the caller may do an action for robots of their groups, if there
+        are any.
+        """
         groups = self.principal.groups
         if groups is None:
             return self.may(action)
@@ -145,7 +153,7 @@ def query_time_ns(text: str, clock: Clock) -> int | None:
 
 
 def robot_time_ns(services: Services, robot: str, text: str) -> int | None:
-    """Read a time, None for an empty one; ``-10m`` counts from what came last of a robot."""
+    """Read a time, None for an empty one; ``-10m`` counts from the robot's last record."""
     if not text.strip():
         return None
     return parse_time(

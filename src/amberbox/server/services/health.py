@@ -1,6 +1,4 @@
-"""Health and metrics of the server itself: what is wrong with it, and figures in Prometheus' text
-format.
-"""
+"""Health and metrics of the server itself: its problems, and metrics in Prometheus' text format."""
 
 from __future__ import annotations
 
@@ -236,7 +234,7 @@ def find_troubles(services: Services) -> list[str]:
 
 
 def _refused(connection: Connection, since_ns: int) -> list[str]:
-    """Say of which journals no rows could be made lately: robot, file and what to do."""
+    """Return texts on journals that could not be converted recently: robot, file and remedy."""
     chosen = select(EVENT.c.robot, EVENT.c.text).where(EVENT.c.kind == KIND)
     newest = chosen.where(EVENT.c.at_ns >= since_ns).order_by(EVENT.c.at_ns.desc()).limit(_SHOWN)
     return [f"{row.robot}: {row.text}" for row in connection.execute(newest)]
@@ -338,7 +336,7 @@ def read_health(fleet: Services) -> Health:
 
 
 def server_clock(found: ClockComparison) -> ServerClock:
-    """Return the clock as it is shown."""
+    """Return the clock in its published form."""
     return ServerClock(
         format_time(found.wall_ns), format_time(found.age_ns), found.jump,
         found.ahead_ns / NS if found.jump else 0.0, found.text,

@@ -27,7 +27,7 @@ async def read_fmea(
     fleet: Services, who: Caller, robot: KnownRobot, at: str = "", config_hash: str = "",
     exposure_h: float | None = None,
 ) -> dict[str, Any]:  # fmt: skip
-    """Return the failure modes of a robot: the sheet, what matters most, what nobody sees."""
+    """Return the failure modes of a robot: the sheet, criticality, and undetected faults."""
     asked = RobotQuestion(robot=robot.id, now_ns=fleet.clock.wall_ns(), at=at,
                        config_hash=config_hash, exposure_h=exposure_h)  # fmt: skip
     return decode_answer(await ask_worker(fleet, who, "fmea", asked))
@@ -62,7 +62,7 @@ class FolderList:
 
 
 def list_folders(fleet: Services, robot: KnownRobot) -> FolderList:
-    """List the folders that a robot had, as far as they are kept."""
+    """List the stored versions of a robot's folder."""
     current = fleet.folders.current(robot.id)
     found = fleet.folders.kept(robot.id)
     return FolderList(current, [_shown(folder, current) for folder in found])
@@ -76,7 +76,7 @@ def _shown(folder: KnownFolder, current: str) -> Folder:
 
 
 def decode_answer(answer: bytes) -> dict[str, Any]:
-    """Return an answer as it is sent."""
+    """Return an answer in its published form."""
     found: dict[str, Any] = json.loads(answer)
     return found
 

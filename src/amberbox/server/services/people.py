@@ -42,7 +42,7 @@ class Person:
 
 
 def describe_person(user: users.User) -> Person:
-    """Return an account as it is shown."""
+    """Return an account in its published form."""
     groups = None if user.groups is None else sorted(user.groups)
     return Person(
         user.name,
@@ -101,7 +101,7 @@ def find_account(connection: Connection, name: str) -> users.User:
 
 
 def describe_token(token: tokens.ApiToken) -> Token:
-    """Return a token as it is listed."""
+    """Return a token for a list."""
     return Token(
         token.token_id,
         token.name,

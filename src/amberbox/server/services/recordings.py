@@ -62,7 +62,7 @@ def known_missions(fleet: Services, who: Caller, robot: str) -> list[KnownMissio
 def mission_lines(
     connection: Connection, robot: str, found: Sequence[KnownMission]
 ) -> list[Mission]:
-    """Return missions as they are shown, with their notes."""
+    """Return missions for a list, with their notes."""
     noted = server_annotations.mission_annotations(
         connection, robot, [mission.id for mission in found]
     )
@@ -91,7 +91,7 @@ def list_notes(
 
 
 def note_line(one: MomentAnnotation) -> MomentNote:
-    """Return a note on a moment as it is shown."""
+    """Return a note on a moment in its published form."""
     return MomentNote(
         id=one.number, at=format_time(one.at_ns), who=one.who, text=one.text, mission=one.mission
     )
@@ -137,7 +137,7 @@ def _time(value: object) -> str:
 
 
 def marked_incident(one: MarkedIncident) -> Incident:
-    """Return a window that was marked here as it is shown."""
+    """Return a window that was marked on the server in its published form."""
     return Incident(
         id=one.id, origin="server", state="complete" if one.released_ns is None else _RELEASED,
         reason=one.reason, who=one.who, trigger="", from_=format_time(one.from_ns),
@@ -149,7 +149,7 @@ def list_gaps(
     fleet: Services, who: Caller, robot: KnownRobot, item: str = "", from_: str = "", to: str = "",
     limit: int = 1000,
 ) -> Gaps:  # fmt: skip
-    """List what is missing of a robot's record and why, in order of time."""
+    """List the missing ranges of a robot's record with their reasons, in order of time."""
     span = robot_span_ns(fleet, robot.id, from_, to)
     question = RowQuery(robot.id, item, None, *span, limit=limit)
     answer = fleet.worker_pool.ask_now(f"{WORKER}:gaps", arguments(question), origin=who.person)
@@ -159,13 +159,13 @@ def list_gaps(
 def list_fetches(
     fleet: Services, robot: KnownRobot, limit: int = 100, after: str = ""
 ) -> list[Fetch]:
-    """List what was asked of a robot, newest first."""
+    """List the windows requested from a robot, newest first."""
     with fleet.database.reading() as connection:
         return [fetch_line(one) for one in fetches.listed(connection, robot.id, after, limit)]
 
 
 def fetch_line(one: RequestedWindow) -> Fetch:
-    """Return what was asked of a robot as it is shown."""
+    """Return a window requested from a robot in its published form."""
     files = [
         FetchedJournal(store_id=f.store_id, journal=f.journal, bytes=f.bytes, state=f.state)
         for f in one.files
@@ -199,13 +199,13 @@ def hidden_downloads(connection: Connection, who: Caller, jobs: Sequence[Downloa
 
 
 def is_admin(who: Caller) -> bool:
-    """Return whether an admin of all robots asks, not a program."""
+    """Return whether the caller is an admin of all robots, and not a program."""
     unrestricted = who.principal.groups is None
     return who.principal.kind == "user" and who.principal.role == Role.ADMIN and unrestricted
 
 
 def download_line(job: DownloadJob) -> Download:
-    """Return a download as it is shown."""
+    """Return a download in its published form."""
     wanted = job.wanted
     return Download(
         job.id, job.owner, job.state, job.progress, wanted.robots, wanted.items, wanted.missions,

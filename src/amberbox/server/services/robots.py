@@ -174,7 +174,7 @@ def _stretch(one: TimelineInterval) -> Stretch:
 
 
 def current_status(fleet: Services, robot: KnownRobot) -> AssessedRobot:
-    """Return the one status of a robot with what it is made of."""
+    """Return the one status of a robot with its inputs."""
     with fleet.database.reading() as connection:
         statuses = fleet.feed.state.statuses
         return statuses.of(connection, [robot], fleet.clock.wall_ns())[0]
@@ -183,7 +183,7 @@ def current_status(fleet: Services, robot: KnownRobot) -> AssessedRobot:
 def list_cards(
     fleet: Services, who: Caller, group: str = "", after: str = "", limit: int = 1000
 ) -> list[Card]:
-    """Return the robots that one may see, by id; also those that never connected."""
+    """Return the robots that the caller may see, by id; also those that never connected."""
     with fleet.database.reading() as connection:
         chosen = [
             robot
@@ -200,7 +200,7 @@ def read_card(fleet: Services, robot: KnownRobot) -> Card:
 
 
 def read_status(fleet: Services, robot: KnownRobot) -> StatusTree:
-    """Return the components of a robot as a tree, with modes, outputs and what they need."""
+    """Return the components of a robot as a tree, with modes, outputs and dependencies."""
     return _status(fleet, robot, fleet.feed.state.facts.read)
 
 
@@ -212,7 +212,7 @@ def status_now(fleet: Services, robot: KnownRobot) -> StatusTree | None:
 
 
 def status_without_folder(fleet: Services, robot: KnownRobot) -> StatusTree:
-    """Return the tree of a robot as it is known without its folder."""
+    """Return the tree of a robot as far as it is known without its folder."""
     return _status(fleet, robot, lambda *_: FolderFacts())
 
 
@@ -257,7 +257,7 @@ def list_events(
 
 
 def read_link(fleet: Services, robot: KnownRobot, after: int = 0, limit: int = 100) -> links.Link:
-    """Return what is known of a robot's link, and what was noticed of it."""
+    """Return the state of a robot's link, and its events."""
     one = fleet.links.robots.get(robot.id)
     with fleet.database.reading() as connection:
         seen = next((each for each in presences(connection) if each.robot == robot.id), None)

@@ -1,4 +1,4 @@
-"""The settings there are: each with its form and checks; secrets are masked when shown."""
+"""The settings, each with its form and checks; secrets are masked when shown."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def setting_definitions() -> Mapping[str, SettingDefinition]:
 
 
 def setting_definition(name: str) -> SettingDefinition:
-    """Return a setting; raises UsageError for one that is not there."""
+    """Return a setting; raises UsageError for an unknown one."""
     settings = setting_definitions()
     if name not in settings:
         listed = f"settings are: {', '.join(settings)}"
@@ -99,9 +99,9 @@ def mask_secrets(value: Any) -> Any:
 
 
 def restore_secrets(value: Any, before: Any) -> Any:
-    """Put secrets back where the mask was sent: those at the same place of the value before.
+    """Replace masks by the stored secrets at the same place of the previous value.
 
-    Raises UsageError where there was none, or it would go to another host or address now.
+    Raises UsageError if there is none, or if it would now be sent to another host or address.
     """
     if isinstance(value, Mapping):
         old = before if isinstance(before, Mapping) else {}
@@ -151,7 +151,7 @@ class Setting:
 
 
 def find_setting(name: str) -> SettingDefinition:
-    """Return a setting; raises NotFoundError for one that is not there."""
+    """Return a setting; raises NotFoundError for an unknown one."""
     try:
         return setting_definition(name)
     except UsageError as error:
@@ -159,7 +159,7 @@ def find_setting(name: str) -> SettingDefinition:
 
 
 def setting_line(connection: Connection, name: str, setting: SettingDefinition) -> Setting:
-    """Return a setting with its value as it is shown."""
+    """Return a setting with its value in its published form."""
     value = msgspec.to_builtins(settings.read(connection, name, setting.kind))
     changed_ns = connection.execute(
         select(OPTION.c.changed_ns).where(OPTION.c.name == name)

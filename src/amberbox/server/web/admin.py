@@ -151,7 +151,7 @@ def _settings_destinations(fleet: Services) -> list[NotificationTarget]:
 
 
 _LOW, _VERY_LOW = 0.1, 0.03
-"""Of the disk: below this it needs somebody soon, below that at once."""
+"""Shares of free disk space: below the first it needs attention soon, below the second at once."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -199,7 +199,9 @@ def _figures(request: Request) -> Mapping[str, float]:
 
 _SHOWN = 100
 _NEWEST = 20_000
-"""Of so many rows the lists of people and acts are made; older ones are found by their names."""
+"""Number of rows from which the lists of people and actions are made; older ones are found
+by name.
+"""
 _AUDIT_LISTED = 300
 _ALARM = re.compile(r"[1-9][0-9]{0,17}")
 

@@ -38,7 +38,7 @@ Tab: TypeAlias = Literal["open", "acknowledged", "shelved", "resolved", "all"]
 Sort: TypeAlias = Literal["worst", "newest"]
 TABS: Sequence[Tab] = ("open", "acknowledged", "shelved", "resolved", "all")
 STEP = 50
-"""So many alarms are listed at once, and so many more each time somebody asks for more."""
+"""Number of alarms that are listed at once, and added with each request for more."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +70,7 @@ class AlarmListQuery:
 
 
 _NAMES = {"since": "from", "until": "to"}
-"""What stands in the address where Python keeps the word for itself."""
+"""Parameters of the address whose names are keywords of Python."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -429,7 +429,7 @@ def _me(who: Caller) -> str:
 routes = PageRoutes()
 
 PERIODS = ("now-1h", "now-24h", "now-7d", "now-30d")
-"""Periods that are offered; any other stands in the address."""
+"""Periods to choose from; any other can be given in the address."""
 _MOST = 1_000
 
 Text = Annotated[str, Query(max_length=128)]
@@ -526,7 +526,7 @@ _WORSE = re.compile(r"(\w+) -> (\w+)")
 _OVER = "over"
 _UNDESCRIBED = "not in the FMEA"
 _NAMED = 2
-"""So many causes are named where nothing tells them apart."""
+"""Maximum number of causes that are named if they cannot be distinguished."""
 _NO_FAULTS = ("false_alarm", "other")
 _LIKELY = tuple(word for least, word in CONFIDENCE_WORDS if least >= LIKELY)
 _SURE = re.compile(rf" \(({'|'.join(word for _, word in CONFIDENCE_WORDS)})\)$")

@@ -84,7 +84,7 @@ def _renamed(names: str) -> str:
 
 
 def _pairs(names: str) -> list[tuple[str, str]]:
-    """Return name there and name here of each part of ``a, b as c``."""
+    """Return the exported and the local name of each part of ``a, b as c``."""
     words = [one.split(" as ") for one in names.replace("\n", " ").split(",") if one.strip()]
     return [(one[0].strip(), one[-1].strip()) for one in words]
 

@@ -27,7 +27,7 @@ _UNITS: Mapping[str, str] = {
 _UNIT_NAMES = ("voltage", "newton")
 """What says more of an output than the unit behind its value does."""
 _LONG_S = 120.0
-"""From here on a duration is told in two units."""
+"""From this duration on, two units are shown."""
 _SPANS = (("d", 86_400), ("h", 3600), ("min", 60), ("s", 1))
 _DIGITS = 4
 _FOREVER_S = 1e9
@@ -195,7 +195,7 @@ OPENED = 3
 NONE = "-"
 """Value in the address when the user has closed all."""
 _KEPT = "!'()*"
-"""What encodeURIComponent of browsers leaves as it is."""
+"""Characters that encodeURIComponent of browsers does not encode."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -312,7 +312,7 @@ def _words(component: Component) -> Iterator[str]:
 
 @dataclass(frozen=True, slots=True)
 class ComponentRow:
-    """A component in the list, with what it needs and what needs it."""
+    """A component in the list, with its dependencies and dependents."""
 
     component: Component
     name: str

@@ -30,7 +30,7 @@ WINDOWS: Mapping[Window, int | None] = {
     "1h": 3600 * NS, "6h": 6 * 3600 * NS, "24h": 24 * 3600 * NS, "7d": 7 * 24 * 3600 * NS,
     "30d": 30 * 24 * 3600 * NS, "all": None,
 }  # fmt: skip
-"""How far a bar goes back from now, in ns; None is to the first recording."""
+"""How far a bar reaches back from now, in ns; None is to the first recording."""
 
 _MOST: Window = "7d"
 """The longest window that is shown as long as the user has chosen none."""
@@ -38,12 +38,12 @@ _STEPS = 800
 """Stretches nearer to each other than this part of the bar are drawn as one."""
 _HOUR_NS = 3600 * NS
 ASIDE = ("watch", "keep")
-"""Journals of what the box and its watcher say themselves: not what the robot's data cover."""
+"""Journals of the box and its watcher, which are not coverage of the robot's data."""
 _HELD = ("in_columns", "waiting")
 _DRAWN: Mapping[GapKind, Kind] = {
     "deleted": "deleted", "filtered": "filtered", "lost": "lost", "refused": "lost"
 }  # fmt: skip
-"""What of gaps has a look of its own; where nothing was recorded, nothing is drawn."""
+"""Kinds of gaps that are drawn; if nothing was recorded, nothing is drawn."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -31,7 +31,7 @@ from amberbox.server.web.page import PageRoutes, render
 _GAPS = 20_000
 _JOURNALS = 1_000_000
 _STEPS = 800
-"""Stretches nearer to each other than this share of all time are drawn as one."""
+"""Intervals closer to each other than this share of all time are drawn as one."""
 _HELD = ("in_columns", "waiting")
 
 
@@ -110,7 +110,7 @@ _MARKS = 200
 _AROUND_GAPS = 1000
 _POINTS = 400
 _HALF = 2
-"""Gaps are told of a half of the window more at each side: small moves need no new question."""
+"""Gaps are loaded for this fraction of the window at each side: small moves need no new request."""
 
 Items = Annotated[
     list[Annotated[str, Query(pattern=ITEM)]],
@@ -163,7 +163,7 @@ class _Window:
         )
 
     def notes(self, begin: str, end: str) -> Sequence[MomentNote]:
-        """Return the notes on moments only; those on missions come with the missions."""
+        """Return the notes on moments only; those on missions are part of the missions."""
         found = list_notes(self.fleet, self.robot, begin, end, limit=_MARKS)
         return [one for one in found if not one.mission]
 

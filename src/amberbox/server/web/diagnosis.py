@@ -78,7 +78,7 @@ class DiagnosisRequest:
         return self.fleet.clock.wall_ns()
 
     async def look(self) -> DiagnosisView:
-        """Return the diagnosis asked for."""
+        """Return the requested diagnosis."""
         return await asyncio.to_thread(look, self.fleet, self.robot, self.diagnosis)
 
     async def standing(self) -> tuple[str, dict[str, str]]:
@@ -116,7 +116,9 @@ class DiagnosisRequest:
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
-    """A possible cause, with the evidence for it, against it, and what it leaves unexplained."""
+    """A possible cause, with the evidence for it, against it, and the symptoms it leaves
+    unexplained.
+    """
 
     text: str
     share: str
@@ -302,9 +304,9 @@ def _revisions(known: DiagnosisHistory | None) -> list[Values]:
 
 
 CUT_SETS = 300
-"""So many sets are looked at, those of fewest failures first."""
+"""Number of sets that are evaluated, those with the fewest failures first."""
 PATTERNS = 20
-"""So many kinds of sets are listed."""
+"""Number of kinds of sets that are listed."""
 IMPORTANT = 10
 DEPTH, PLACES = 3, 60
 """How much of a tree is drawn: gates above each other, and places in all."""

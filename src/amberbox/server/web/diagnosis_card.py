@@ -42,7 +42,7 @@ from amberbox.server.services.knowledge import revision_json
 from amberbox.server.web.text import catalogue, moment_href, span
 
 REASONS = 3
-"""How many sentences say why."""
+"""Number of sentences under "Why"."""
 CANNOT = "cannot"
 
 Sure: TypeAlias = Literal["", "likely", "possible", "cannot_tell_apart"]
@@ -50,7 +50,7 @@ State: TypeAlias = Literal["open", "healed", "gone", "past", "none"]
 Answer: TypeAlias = Mapping[str, Any]
 
 _SHORT_S = 10.0
-"""What lasted less long is told in tenths of a second."""
+"""A shorter duration is shown in tenths of a second."""
 _FAILS = re.compile(r"\bfails(\.?)$")
 
 
@@ -226,7 +226,7 @@ class DiagnosisCard:
         return sentence("; and ".join(dict.fromkeys(texts)))
 
     def _sure_of(self, causes: Sequence[CardCause], over: Mapping[str, str]) -> DiagnosisCard:
-        """Return it with the probability of the one remaining cause, alone or with others."""
+        """Return the card with the probability of the one remaining cause, alone or with others."""
         if len(causes) != 1 or not causes[0].parts:
             return self
         left = {id_ for id_, _ in causes[0].parts} - over.keys()
@@ -490,7 +490,7 @@ def _plain_next(tests: Sequence[Answer], safe: Sequence[str]) -> CardNextStep | 
 
 
 def _in_order(choices: Sequence[Choice]) -> tuple[Choice, ...]:
-    """Return answers with yes before no, whatever is more probable; others keep their order."""
+    """Return answers with yes before no, whatever their probability; others keep their order."""
     rank = {"yes": 0, "no": 1}
     return tuple(sorted(choices, key=lambda choice: rank.get(choice.value, 2)))
 
@@ -505,15 +505,15 @@ def minutes(seconds: float) -> str:
 
 
 Missing: TypeAlias = Literal["", "never", "folder", "fmea"]
-"""What a diagnosis needs and is not there: a connection, the robot's folder, its failure modes."""
+"""A missing requirement of a diagnosis: a connection, the robot's folder, its failure modes."""
 
 
 @dataclass(frozen=True, slots=True)
 class DiagnosisView:
     """A diagnosis of a robot with answers and causes from people; ``known`` is None without one.
 
-    ``is_newest``: it is the robot's last diagnosis. ``is_past``: it is as it was at some revision.
-    ``holds`` are the intervals of its symptoms.
+    ``is_newest``: it is the robot's last diagnosis. ``is_past``: it is shown in the state of an
+    earlier revision. ``holds`` are the intervals of its symptoms.
     """
 
     robot: str
@@ -551,7 +551,7 @@ def look(fleet: Services, robot: str, diagnosis: str = "") -> DiagnosisView:
 def view_diagnosis_at(
     fleet: Services, robot: str, diagnosis: str, revision: int, end_ns: int | None = None
 ) -> DiagnosisView:
-    """Return a diagnosis as it was at a revision.
+    """Return a diagnosis in the state of a revision.
 
     With revision 0 it is the last one up to an instant. Raises 404 as ``look`` does.
     """
@@ -603,7 +603,7 @@ def current_card(fleet: Services, robot: str, now: Now | None = None) -> Diagnos
 
 
 def missing(fleet: Services, robot: str, ever_seen: bool) -> Missing:
-    """Return what a diagnosis of a robot needs and is missing."""
+    """Return the missing requirement of a diagnosis of a robot."""
     if not ever_seen:
         return "never"
     stated = fleet.folders.current(robot)

@@ -28,7 +28,7 @@ Show = Literal["all", "trouble", "alarms", "offline"]
 Sort = Literal["worst", "name", "battery", "seen"]
 _MOST = 10_000
 BEHIND_ROWS = 5000
-"""More than that a robot records in some seconds: one that has so many to send was away."""
+"""Rows that a robot records in some seconds: a robot with a larger backlog was offline."""
 
 
 @dataclass(frozen=True, slots=True)

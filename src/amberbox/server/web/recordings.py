@@ -166,7 +166,7 @@ SHOWS: Sequence[Show] = ("all", "trouble", "coming", "deleted")
 _MOST = 10_000
 _PAGE = 50
 _LISTED = 100
-"""Stretches in the list beside a bar."""
+"""Maximum number of intervals in the list beside a bar."""
 _COMING = ("copying", "waiting", "aside")
 
 After = Annotated[str, Query(max_length=400)]

@@ -55,7 +55,7 @@ Window = Literal["1h", "6h", "24h"]
 Lanes = Literal["", "all"]
 _TICKS = 4
 _SECOND_STEPS = (10, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 21_600)
-"""What lies between two ticks, in s; the smallest that needs no more ticks than there may be."""
+"""Distances between two ticks, in s; the smallest with few enough ticks is used."""
 _LEAST_WIDE_NS = 60 * NS
 _AROUND = 0.25
 """So much of a stretch's length is shown before and behind it in its data."""
@@ -179,10 +179,10 @@ routes = PageRoutes()
 
 EVENTS = 30
 _KINDS_OF = 300
-"""Newest events among which the kinds are looked for that one can choose."""
+"""Number of the newest events from which the selectable kinds are collected."""
 _POINTS = 300
 _NOTED = 5
-"""What was noticed of a link, the newest."""
+"""Number of the newest events of a link."""
 _ACTIONS = ("items.read", "diagnoses.read", "diagnoses.write", "incidents.write", "missions.write",
             "robots.write")  # fmt: skip
 NOTHING: list[str] = []
@@ -389,7 +389,7 @@ _NAMES: Mapping[str, tuple[str, ...]] = {
     "temperature": ("temp",), "voltage": ("volt",), "current": ("current", "amp"),
     CHARGE: ("percent", "charge", "soc", "level"),
 }  # fmt: skip
-"""Parts of names that tell what is measured where no unit does, in the order of looking."""
+"""Parts of names that indicate the measured quantity if no unit does, in order of precedence."""
 _ORDER = (CHARGE, "voltage", "current", "temperature")
 _CHARGING = re.compile(r"(^|[._])(is_)?(charging|docked|plugged(_in)?)$")
 _NUMBERS = ("float", "double", "int", "uint")
@@ -401,7 +401,7 @@ Key: TypeAlias = "tuple[Mode, Output]"
 
 @dataclass(frozen=True, slots=True)
 class BatteryOutputs:
-    """The outputs of a battery's component: measured quantities, and the rest, such as checks."""
+    """The outputs of a battery's component: measured quantities, and others, such as checks."""
 
     component: Component
     measured: Sequence[Key]

@@ -105,7 +105,7 @@ def span(seconds: float) -> str:
 
 
 EXPERTS = "experts"
-"""Words of this group stand under "Details" and on the pages about knowledge only."""
+"""Words of this group are only under "Details" and on the pages about knowledge."""
 _PART = "words."
 
 
@@ -214,7 +214,7 @@ def checks_fail(what: str, reason: str) -> str:
 
 
 def plain_cause(cause: str) -> str:
-    """Return in words what is wrong with a robot, from a cause such as "component: reason"."""
+    """Return the problem of a robot in words, from a cause such as "component: reason"."""
     component, colon, reason = cause.partition(": ")
     return checks_fail(capitalize(wording.readable(component)), reason) if colon else cause
 

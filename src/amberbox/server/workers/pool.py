@@ -128,7 +128,7 @@ class WorkerProcess:
         return None if self._process is None else self._process.pid
 
     def answer(self, task: WorkerTask) -> None:
-        """Run a task, whose answer goes to its sink; raises the operation's error.
+        """Run a task, whose answer is written to its sink; raises the operation's error.
 
         Raises LimitError for an answer beyond its limits, CancelledError for a cancelled task,
         BrokenError for a worker that died.
@@ -266,7 +266,7 @@ class WorkerPool:
 
     @classmethod
     def for_robots(cls, folder: Path) -> WorkerPool:
-        """Create a pool for what robots send, separate from the pool that answers people.
+        """Create a pool for data of robots, separate from the pool that answers people.
 
         One robot occupies at most one worker. On a busy machine these workers mostly wait for
         others, so that a task may take four times its limit; its limit of CPU time stays.

@@ -1,4 +1,4 @@
-"""The subscriber on a ROS network in memory: who comes, goes, returns, and what is told of it."""
+"""The subscriber on a ROS network in memory: publishers start, stop and restart, with events."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def network() -> Iterator[Network]:
 def listening(
     settings: SubscriberSettings, sink: MemorySink, topics: Mapping[str, str] | None = None
 ) -> Iterator[None]:
-    """Run the subscriber in a thread; raise what it raises."""
+    """Run the subscriber in a thread; raise its exceptions."""
     stop = threading.Event()
     errors: list[BaseException] = []
 
@@ -139,7 +139,7 @@ def test_a_publisher_that_leaves_is_gone(network: Network) -> None:
 
 
 def say(network: Network, sink: MemorySink, text: bytes, **offer: Any) -> RosPublisher:
-    """Start a talker, let it say one thing and wait until that is recorded."""
+    """Start a publisher, let it send one message and wait until that is recorded."""
     talker = network.talker(**offer)
     talker.wait_for_subscribers(TOPIC)
     before = len(sink.of(TOPIC))

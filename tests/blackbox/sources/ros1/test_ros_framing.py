@@ -1,4 +1,4 @@
-"""TCPROS framing: whatever the pieces in which bytes arrive, the same messages come out."""
+"""TCPROS framing: the same messages result, whatever the pieces in which bytes arrive."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Masters and publishers that answer with anything: errors that are told, never a crash."""
+"""Masters and publishers with arbitrary answers: reported errors, never a crash."""
 
 from __future__ import annotations
 

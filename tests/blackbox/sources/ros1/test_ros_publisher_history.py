@@ -1,4 +1,4 @@
-"""What is remembered of publishers, latched messages and sightings."""
+"""The stored history of publishers, latched messages and the last time each was seen."""
 
 from __future__ import annotations
 

@@ -1,9 +1,9 @@
 """The ROS 1 subscriber as a node: polls the master and hands publishers to the subscriptions.
 
-The master is asked who publishes every ``poll_s``, in both modes. Registering adds that new
-publishers are announced at once. Asking as well costs little and heals what notifications
-cannot: a master that was restarted, or one whose three notification workers hang. Every answer
-of the node is short: a node that does not answer ties one of these workers up.
+The list of publishers is requested from the master every ``poll_s``, in both modes. A registered
+node is also notified of new publishers. Polling in addition costs little and covers cases in which
+notifications fail: a master that was restarted, or one whose three notification workers hang. Every
+answer of the node is short, because a node that does not answer blocks one of these workers.
 """
 
 from __future__ import annotations

@@ -443,7 +443,7 @@ class TopicSubscription:
         self._reconcile()
 
     def noticed(self, uris: Sequence[str]) -> None:
-        """Handle a notice of the master that the publishers have changed.
+        """Handle a notification of the master that the publishers have changed.
 
         A publisher missing in it has unregistered, one in it may just have come back.
         """

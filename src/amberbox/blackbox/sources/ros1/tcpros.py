@@ -39,9 +39,9 @@ _length_at = struct.Struct("<I").unpack_from
 class Framer:
     """Splits a stream of bytes into messages.
 
-    Small messages are sliced out of one receive buffer that is reused; the rest of an incomplete
-    one is carried over. A message above ``LARGE_BYTES`` that is not complete yet is
-    received in its own place, which grows with it and is used again for the next one.
+    Small messages are sliced out of one receive buffer that is reused; the beginning of an
+    incomplete one is moved to its front. A message above ``LARGE_BYTES`` that is not complete yet
+    gets a buffer of its own, which grows with it and is reused for the next one.
     """
 
     def __init__(self, limit: int) -> None:
@@ -101,7 +101,7 @@ class Framer:
 
 
 class ConnectionReader:
-    """Reads one connection to its end; ``last_ns`` is when data came last."""
+    """Reads one connection to its end; ``last_ns`` is when data were last received."""
 
     def __init__(self, sock: socket.socket, limit: int, now_ns: Callable[[], int]) -> None:
         self._sock = sock
@@ -139,7 +139,7 @@ class PublisherInfo:
     latching: bool
 
     def topic(self, name: str) -> Topic:
-        """Return the topic with the message definition that came over the wire."""
+        """Return the topic with the message definition received with the connection."""
         return Topic(name, "ros1", Schema(self.type, "ros1msg", self.definition), self.latching)
 
     def has_header(self) -> bool:
