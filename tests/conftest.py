@@ -51,7 +51,7 @@ def parse_plugins_once() -> Iterator[None]:
 def pytest_configure(config: pytest.Config) -> None:
     config.stash[SKIPS] = Skips()
     config.pluginmanager.register(config.stash[SKIPS])
-    if in_ci() and not config.option.durations:
+    if in_ci() and config.option.durations is None:
         config.option.durations = 10
 
 

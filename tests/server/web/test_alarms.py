@@ -9,7 +9,6 @@ from typing import Any
 
 import pytest
 
-from amberbox.consult.folder_knowledge import read_declared_robot
 from amberbox.core.api import AlarmLine, Happening, LeadingCause, Words
 from amberbox.core.clock import NS
 from amberbox.core.timestamps import format_time
@@ -181,7 +180,7 @@ def test_an_alarm_in_words(home: House) -> None:
 
 def explained_answer(revision: int, **answers: str) -> dict[str, Any]:
     """Return what the server says of a silent laser after answers to tests."""
-    knowledge = read_declared_robot(sim.FOLDER, "ropod_001", sim.HASH).knowledge()
+    knowledge = sim.knowledge()
     silent = ObservedSituation(
         (sim.symptom(sim.NO_SCANS, sim.AT_NS),), watched=True, answers=answers
     )
