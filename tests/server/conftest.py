@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 
 import pytest
 from sqlalchemy import Connection, MetaData
@@ -10,6 +11,7 @@ from sqlalchemy import Connection, MetaData
 from amberbox.server import database
 from amberbox.server.database import Migration
 from amberbox.server.schema import METADATA
+from tests.server.house import House, house
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -35,3 +37,10 @@ def write_tables_once() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(database, "prepare", prepare)
         yield
+
+
+@pytest.fixture
+def home(tmp_path: Path) -> Iterator[House]:
+    """A server of the test's own, with an app that it has from the test before."""
+    with house(tmp_path / "server", shared=True) as found:
+        yield found
