@@ -19,6 +19,7 @@ from amberbox.cli.main import main
 from amberbox.core.errors import UsageError
 from amberbox.testing.clock import PATIENCE_S
 from amberbox.testing.records import T0_NS, FakeRun, build_segments_of, fill_store
+from tests.cli.conftest import Terminal
 
 
 @pytest.fixture
@@ -252,13 +253,6 @@ def test_sql_prints_what_is_asked(store: str, capsys: pytest.CaptureFixture[str]
         {"mode": "A", "n": 150, "s": 22350.0},
         {"mode": "B", "n": 150, "s": 22500.0},
     ]
-
-
-class Terminal(io.StringIO):
-    """Text as somebody sees it in a terminal."""
-
-    def isatty(self) -> bool:
-        return True
 
 
 @pytest.mark.parametrize("verb", ["query", "sql", "items"])

@@ -15,14 +15,8 @@ from amberbox.cli._output import fold, print_grid, text_output
 from amberbox.cli.main import main
 from amberbox.core.safe_text import LINE_START, OWN_ESCAPE, terminal_safe
 from amberbox.testing.records import fill_store
+from tests.cli.conftest import Terminal
 from tests.fuzzing import examples, fuzz
-
-
-class Terminal(io.StringIO):
-    """A stream that says it is a terminal."""
-
-    def isatty(self) -> bool:
-        return True
 
 
 def test_errors_show_escapes_of_others_as_text(capsys: pytest.CaptureFixture[str]) -> None:
