@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import gc
 import os
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -15,9 +16,14 @@ from hypothesis import settings
 from amberbox.core import plugins
 
 SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
-PEERS = "tests/peers/"
+TOGETHER = ("tests/peers/", "tests/browser/")
+"""Folders that one process has alone: peers keep to the clock, pages share a browser and a site."""
 NO_DATA = "needs_data: the folder ../shared/data beside the repository is absent"
 SKIPS: pytest.StashKey[Skips] = pytest.StashKey()
+
+# Compile tests and program once, not in each of the many processes that are started.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
 
 settings.register_profile("soak", max_examples=400)  # about twenty minutes of random histories
 settings.register_profile("ci", derandomize=True)  # the same examples every time: luck fails nobody
@@ -51,18 +57,20 @@ def parse_plugins_once() -> Iterator[None]:
 def pytest_configure(config: pytest.Config) -> None:
     config.stash[SKIPS] = Skips()
     config.pluginmanager.register(config.stash[SKIPS])
-    if in_ci() and not config.option.durations:
+    if in_ci() and config.option.durations is None:
         config.option.durations = 10
 
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
-    """Give each process whole files; one at a time has real peers, who keep to the clock."""
+    """Give each process whole files, and whole folders of what is to stay together."""
     from xdist.scheduler import LoadFileScheduling  # type: ignore[import-untyped]  # has no types
 
     scheduling = LoadFileScheduling(config, log)
     of_file = scheduling._split_scope
-    scheduling._split_scope = lambda node: PEERS if node.startswith(PEERS) else of_file(node)
+    scheduling._split_scope = lambda node: (
+        next((folder for folder in TOGETHER if node.startswith(folder)), None) or of_file(node)
+    )
     return scheduling
 
 

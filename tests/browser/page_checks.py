@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import os
-import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import pytest
 
@@ -66,6 +66,11 @@ class Watched:
             self.heard.append(f"failed: {request.method} {request.url}: {why}")
 
 
+Look = tuple[Literal["light", "dark"], int]
+"""A theme, and the width of a window in pixels."""
+LOOKS: Sequence[Look] = (("dark", 390), ("light", 1440))
+EVERY_LOOK: Sequence[Look] = (("light", 390), ("dark", 390), ("dark", 1440), ("light", 1440))
+
 NO_AXE = "the package axe-playwright-python is missing: pip install 'amberbox[test]'"
 SHOTS = "AMBERBOX_SHOTS"
 _GRAVE = ("serious", "critical")
@@ -121,12 +126,46 @@ def no_squeezed_values(page: Page) -> None:
     assert page.evaluate(_SQUEEZED) == [], f"{page.url} has values broken within words"
 
 
-def shot(page: Page, name: str, *, whole: bool = True) -> Path:
-    """Write ``<name>-<width>-<theme>.png`` to the folder $AMBERBOX_SHOTS; return where."""
-    folder = Path(os.environ.get(SHOTS) or Path(tempfile.gettempdir()) / "amberbox-shots")
+def shot(page: Page, name: str, *, whole: bool = True) -> None:
+    """Write ``<name>-<width>-<theme>.png`` to the folder $AMBERBOX_SHOTS, if one is named."""
+    if not os.environ.get(SHOTS):
+        return
+    folder = Path(os.environ[SHOTS])
     folder.mkdir(parents=True, exist_ok=True)
     dark = page.evaluate("() => matchMedia('(prefers-color-scheme: dark)').matches")
     width = page.viewport_size["width"] if page.viewport_size else 0
     path = folder / f"{name}-{width}-{'dark' if dark else 'light'}.png"
     page.screenshot(path=path, full_page=whole)
-    return path
+
+
+_WEAR = """(theme) => {
+    document.cookie = `theme=${theme}; path=/`
+    document.documentElement.dataset.theme = theme
+}"""
+
+
+@contextmanager
+def look(page: Page, theme: Literal["light", "dark"], width: int) -> Iterator[None]:
+    """Give an open page a theme and a width; what fails in the block is told with both."""
+    height = page.viewport_size["height"] if page.viewport_size else 900
+    page.set_viewport_size({"width": width, "height": height})
+    page.emulate_media(color_scheme=theme)
+    page.evaluate(_WEAR, theme)
+    try:
+        yield
+    except AssertionError as error:
+        error.add_note(f"in the {theme} theme, {width} px wide")
+        raise
+
+
+def judge(
+    page: Page, name: str, looks: Sequence[Look] = LOOKS, *,
+    within: Sequence[str | None] = (None,), whole: bool = True,
+) -> None:  # fmt: skip
+    """Fail when a page, as it stands, stops somebody or is too wide in one of the looks."""
+    for theme, width in looks:
+        with look(page, theme, width):
+            no_sideways_scroll(page)
+            for part in within:
+                axe(page, part)
+            shot(page, name, whole=whole)

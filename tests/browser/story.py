@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from amberbox.consult.folder_knowledge import read_declared_robot
 from amberbox.core.clock import NS
 from amberbox.core.types import Diagnosis, Symptom
 from amberbox.diagnosis.diagnose import DiagnosisId, ObservedSituation, answer
 from amberbox.monitoring.findings import AlarmChange
 from tests.browser import hostile
 from tests.browser.robot import Robot
-from tests.server.knowledge.robot import FOLDER, HASH
+from tests.server.knowledge.robot import HASH, knowledge
 
 MINUTE_NS = 60 * NS
 FAULT_NS = -15 * NS
@@ -69,7 +68,7 @@ def all_well(robot: Robot) -> None:
 
 def laser_dies(robot: Robot) -> None:
     """Let the front laser fall silent: status, consequences, symptom, diagnosis, alarm."""
-    known = read_declared_robot(FOLDER, robot.name, HASH).knowledge()
+    known = knowledge(robot.name)
     robot.clock.ago_ns = -FAULT_NS
     at_ns = robot.clock.wall_ns()
     robot.status("laser_front", "error", "alive", mode="heartbeat", reason=REASON, alive=False,

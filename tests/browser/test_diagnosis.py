@@ -9,13 +9,12 @@ from typing import TYPE_CHECKING
 import pytest
 from playwright.sync_api import expect
 
-from amberbox.consult.folder_knowledge import read_declared_robot
 from amberbox.core.types import Symptom
 from amberbox.diagnosis.diagnose import DiagnosisId, ObservedSituation, answer
 from tests.browser.conftest import PageAs
-from tests.browser.page_checks import axe, no_sideways_scroll, shot
+from tests.browser.page_checks import axe, judge, no_sideways_scroll, shot
 from tests.browser.site import HASH_2, Site
-from tests.server.knowledge.robot import FOLDER
+from tests.server.knowledge.robot import knowledge
 
 if TYPE_CHECKING:
     from playwright.sync_api import Page
@@ -32,9 +31,8 @@ def broken(site: Site, request: pytest.FixtureRequest) -> Iterator[str]:
     at_ns = robot.clock.wall_ns()
     silent = Symptom(NO_SCANS, "present", NO_SCANS, at_ns, at_ns,
                      evidence=(("sim_scan_front", at_ns, at_ns),))  # fmt: skip
-    knowledge = read_declared_robot(FOLDER, ROBOT, HASH_2).knowledge()
     heading = DiagnosisId(f"{ROBOT}-{request.node.name[:24]}", 1, at_ns)
-    found = answer(knowledge, ObservedSituation((silent,), watched=True), heading)
+    found = answer(knowledge(ROBOT, HASH_2), ObservedSituation((silent,), watched=True), heading)
     robot.say(silent, found)
     yield f"/robots/{ROBOT}/diagnosis"
     then_ns = robot.clock.wall_ns()
@@ -48,7 +46,7 @@ HEATS, HOT, JUMPS = (
 
 
 @pytest.fixture
-def hot(site: Site, request: pytest.FixtureRequest) -> Iterator[str]:
+def hot(site: Site) -> Iterator[str]:
     """Let a robot's battery overheat, an older fault being mended; give the page of it."""
     robot, ns = site.robots[ROBOT], 1_000_000_000
     at_ns = robot.clock.wall_ns()
@@ -56,9 +54,10 @@ def hot(site: Site, request: pytest.FixtureRequest) -> Iterator[str]:
     rate = "the rate of temperature over 40 s is 0.034, at most 0.01"
     heats = Symptom(HEATS, "present", HEATS, at_ns - 5 * ns, at_ns - 5 * ns, reason=rate)
     warm = Symptom(HOT, "present", HOT, at_ns, at_ns, reason="temperature is 58.2 °C, at most 50")
-    knowledge = read_declared_robot(FOLDER, ROBOT, HASH_2).knowledge()
-    heading = DiagnosisId(f"{ROBOT}-hot-{request.node.callspec.params['theme']}", 1, at_ns)
-    found = answer(knowledge, ObservedSituation((lost, heats, warm), watched=True), heading)
+    heading = DiagnosisId(f"{ROBOT}-hot", 1, at_ns)
+    found = answer(
+        knowledge(ROBOT, HASH_2), ObservedSituation((lost, heats, warm), watched=True), heading
+    )
     gone = Symptom(JUMPS, "absent", JUMPS, None, at_ns - 30 * ns)
     robot.say(lost, gone, heats, warm, found)
     yield f"/robots/{ROBOT}/diagnosis"
@@ -73,20 +72,16 @@ def opened(page: Page, path: str) -> Page:
     return page
 
 
-@pytest.mark.parametrize(("width", "theme"), [(1440, "light"), (390, "dark")])
-def test_the_card(page_as: PageAs, width: int, theme: str) -> None:
-    page = opened(page_as("viewer", width, theme), BASE)
+def test_the_card(page_as: PageAs) -> None:
+    page = opened(page_as("viewer"), BASE)
     expect(page.get_by_text("The front laser has no power", exact=True)).to_be_visible()
     expect(page.get_by_text("No, it cannot go on with what it does.")).to_be_visible()
     expect(page.get_by_role("button", name="Yes", exact=True)).to_have_count(0)
-    axe(page)
-    no_sideways_scroll(page)
-    shot(page, "diagnosis")
+    judge(page, "diagnosis")
 
 
-@pytest.mark.parametrize("theme", ["light", "dark"])
-def test_what_is_dangerous_is_told_first_on_a_phone(page_as: PageAs, hot: str, theme: str) -> None:
-    page = opened(page_as("operator", 390, theme, height=844), hot)
+def test_what_is_dangerous_is_told_first_on_a_phone(page_as: PageAs, hot: str) -> None:
+    page = opened(page_as("operator", 390, height=844), hot)
     card = page.locator("#dx-card")
     safe = card.locator(".dx-safe")
     expect(safe).to_contain_text("Switch off, let it cool outside.")
@@ -95,14 +90,12 @@ def test_what_is_dangerous_is_told_first_on_a_phone(page_as: PageAs, hot: str, t
     reason = card.locator(".dx-why li").first
     expect(reason).to_contain_text("temperature over 40 s is 0.034, at most 0.01")
     expect(card.locator(".dx-why")).to_contain_text("temperature is 58.2 °C, at most 50")
-    shot(page, "hot")
     tops = [page.evaluate("e => e.getBoundingClientRect().top", one.element_handle())
             for one in (card.locator(".dx > .dx-cause"), safe, reason)]  # fmt: skip
     box = reason.bounding_box()
     assert box is not None and tops == sorted(tops)
     assert box["y"] + box["height"] <= 844, "the first screenful has all three"
-    axe(page)
-    no_sideways_scroll(page)
+    judge(page, "hot", [("light", 390), ("dark", 390)])
 
 
 def test_a_test_is_answered_and_the_cause_is_said(page_as: PageAs, broken: str) -> None:

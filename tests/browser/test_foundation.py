@@ -15,7 +15,7 @@ from playwright.sync_api import expect
 from amberbox.testing.clock import wait_until
 from tests.browser import hostile
 from tests.browser.conftest import PageAs
-from tests.browser.page_checks import Watched, axe, no_sideways_scroll, shot
+from tests.browser.page_checks import EVERY_LOOK, Watched, axe, judge
 from tests.browser.site import Site, fresh
 
 if TYPE_CHECKING:
@@ -25,16 +25,11 @@ _SOME = "main > section:nth-of-type(-n+3)"
 """The whole page of the API takes axe many seconds, and is the same thing a hundred times."""
 
 
-@pytest.mark.parametrize("width", [390, 1440])
-@pytest.mark.parametrize("theme", ["light", "dark"])
-def test_the_page_of_the_api(page_as: PageAs, width: int, theme: str) -> None:
-    page = page_as("viewer", width, theme)
+def test_the_page_of_the_api(page_as: PageAs) -> None:
+    page = page_as("viewer")
     page.goto("/api/docs")
     expect(page.get_by_role("heading", name="Amberbox API")).to_be_visible()
-    no_sideways_scroll(page)
-    axe(page, "nav")
-    axe(page, _SOME)
-    shot(page, "api-docs", whole=False)
+    judge(page, "api-docs", EVERY_LOOK, within=("nav", _SOME), whole=False)
 
 
 @pytest.fixture(scope="module")
@@ -44,16 +39,12 @@ def empty(browser: object, tmp_path_factory: pytest.TempPathFactory) -> Iterator
         yield found
 
 
-@pytest.mark.parametrize("width", [390, 1440])
-@pytest.mark.parametrize("theme", ["light", "dark"])
-def test_the_page_to_set_up(page_as: PageAs, empty: Site, width: int, theme: str) -> None:
-    page = page_as("", width, theme, at=empty.url)
+def test_the_page_to_set_up(page_as: PageAs, empty: Site) -> None:
+    page = page_as("", at=empty.url)
     page.goto("/setup")
     expect(page.get_by_role("heading", name="Set up this server")).to_be_visible()
     page.get_by_label("Name").fill("anna")
-    no_sideways_scroll(page)
-    axe(page)
-    shot(page, "setup")
+    judge(page, "setup", EVERY_LOOK)
 
 
 def test_somebody_sets_the_server_up(page_as: PageAs, empty: Site) -> None:

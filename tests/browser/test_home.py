@@ -2,23 +2,18 @@
 
 import re
 
-import pytest
 from playwright.sync_api import expect
 
 from tests.browser.conftest import PageAs
-from tests.browser.page_checks import axe, no_sideways_scroll, shot
+from tests.browser.page_checks import EVERY_LOOK, judge
 from tests.browser.site import Site
 
 
-@pytest.mark.parametrize("theme", ["light", "dark"])
-@pytest.mark.parametrize("width", [390, 1440])
-def test_robots_at_a_glance(page_as: PageAs, site: Site, theme: str, width: int) -> None:
-    page = page_as("viewer", width=width, theme=theme)
+def test_robots_at_a_glance(page_as: PageAs, site: Site) -> None:
+    page = page_as("viewer")
     page.goto("/")
     expect(page.locator(".robot-card")).to_have_count(len(site.ask("/robots", "viewer")))
-    axe(page)
-    no_sideways_scroll(page)
-    shot(page, f"home-{theme}-{width}")
+    judge(page, "home", EVERY_LOOK)
 
 
 def test_a_card_follows_its_robot(page_as: PageAs, site: Site) -> None:

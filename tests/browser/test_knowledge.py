@@ -2,21 +2,21 @@
 
 import re
 
-import pytest
 from playwright.sync_api import expect
 
 from tests.browser.conftest import PageAs
-from tests.browser.page_checks import no_sideways_scroll, shot
+from tests.browser.page_checks import LOOKS, look, no_sideways_scroll, shot
 
 
-@pytest.mark.parametrize(("theme", "width"), [("light", 1440), ("dark", 390)])
-def test_what_can_fail(page_as: PageAs, theme: str, width: int) -> None:
-    page = page_as("technician", width=width, theme=theme)
+def test_what_can_fail(page_as: PageAs) -> None:
+    page = page_as("technician")
     page.goto("/knowledge")
     page.get_by_role("link", name="Failure modes").first.click()
     expect(page.locator(".sheet tbody tr")).not_to_have_count(0)
-    no_sideways_scroll(page)  # whom it would stop is asked once, in test_every_page.py
-    shot(page, f"knowledge-{theme}-{width}", whole=False)
+    for theme, width in LOOKS:
+        with look(page, theme, width):
+            no_sideways_scroll(page)  # whom it would stop is asked once, in test_every_page.py
+            shot(page, "knowledge", whole=False)
 
 
 def test_the_sheet_is_looked_through(page_as: PageAs) -> None:

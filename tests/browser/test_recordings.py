@@ -3,13 +3,12 @@
 import re
 from pathlib import Path
 
-import pytest
 from playwright.sync_api import expect
 
 from amberbox.core.safe_text import escape_hidden
 from tests.browser import hostile
 from tests.browser.conftest import PageAs
-from tests.browser.page_checks import axe, no_sideways_scroll, shot
+from tests.browser.page_checks import axe, judge, no_sideways_scroll, shot
 from tests.browser.site import Site
 
 ROBOT = "/recordings/ropod_001"
@@ -18,9 +17,8 @@ _POST = """async ([path, body]) => (await fetch(path, {method: 'POST', body: JSO
             'X-CSRF-Token': document.querySelector('meta[name=csrf]').content}})).json()"""
 
 
-@pytest.mark.parametrize(("theme", "width"), [("light", 1440), ("dark", 390)])
-def test_what_there_is_of_all_robots(page_as: PageAs, theme: str, width: int) -> None:
-    page = page_as("viewer", width=width, theme=theme)
+def test_what_there_is_of_all_robots(page_as: PageAs) -> None:
+    page = page_as("viewer", width=390)
     page.goto("/recordings?window=24h")
     for n in range(3):  # on a phone they are not in sight together
         card = page.locator("article.recording").nth(n)
@@ -30,9 +28,7 @@ def test_what_there_is_of_all_robots(page_as: PageAs, theme: str, width: int) ->
     away = page.locator('[data-robot="ropod_003"]')
     expect(away).to_contain_text("offline, last seen")
     expect(away).to_contain_text("1,234 rows (56 MB) still on the robot")
-    axe(page)
-    no_sideways_scroll(page)
-    shot(page, "recordings")
+    judge(page, "recordings")
 
 
 def test_only_robots_that_one_sees_are_asked_for(page_as: PageAs) -> None:
@@ -50,18 +46,15 @@ def test_only_robots_that_one_sees_are_asked_for(page_as: PageAs) -> None:
     expect(last.locator(".cover .drawing")).to_be_visible()
 
 
-@pytest.mark.parametrize(("theme", "width"), [("dark", 1440), ("light", 390)])
-def test_the_recordings_of_one_robot(page_as: PageAs, theme: str, width: int) -> None:
-    page = page_as("technician", width=width, theme=theme)
+def test_the_recordings_of_one_robot(page_as: PageAs) -> None:
+    page = page_as("technician")
     page.goto(f"{ROBOT}?window=24h")
     expect(page.locator(".cover .drawing")).to_be_visible()
     expect(page.locator("#missions tbody tr")).not_to_have_count(0)
     expect(page.get_by_role("link", name=hostile.MISSION)).to_be_visible()
     page.get_by_text("Mark an incident").click()
     expect(page.locator("#mark-incident input[name=from]")).not_to_have_value("")
-    axe(page)
-    no_sideways_scroll(page)
-    shot(page, "recordings-robot")
+    judge(page, "recordings-robot", [("dark", 1440), ("light", 390)])
 
 
 def test_missions_are_chosen_compared_and_downloaded(page_as: PageAs) -> None:

@@ -17,7 +17,7 @@ from amberbox.server.web.components import key
 from amberbox.testing.clock import wait_until
 from tests.browser import hostile
 from tests.browser.conftest import PageAs
-from tests.browser.page_checks import RESTART, axe, no_sideways_scroll, shot
+from tests.browser.page_checks import EVERY_LOOK, LOOKS, RESTART, axe, judge, look, shot
 from tests.browser.site import Site
 
 if TYPE_CHECKING:
@@ -60,19 +60,15 @@ def row(page: Page, component: str, mode: str = "", output: str = "") -> Locator
     return page.locator(f'#tree [data-k="{key(component, mode, output)}"]')
 
 
-@pytest.mark.parametrize("theme", ["light", "dark"])
-@pytest.mark.parametrize("width", [390, 1440])
-def test_a_robot_in_trouble(page_as: PageAs, theme: str, width: int) -> None:
-    page = page_as("technician", width=width, theme=theme)
+def test_a_robot_in_trouble(page_as: PageAs) -> None:
+    page = page_as("technician")
     page.goto(PAGE)
     is_live(page)
     expect(row(page, "laser_front")).to_have_attribute("aria-expanded", "true")
     expect(row(page, "laser_front").locator(".level")).to_have_text("error")
     explained = page.locator('#diagnosis [data-complete="yes"]')
     expect(explained).to_be_visible()
-    axe(page)
-    no_sideways_scroll(page)
-    shot(page, f"robot-{theme}-{width}")
+    judge(page, "robot", EVERY_LOOK)
 
 
 def test_values_levels_and_reasons_change_where_they_stand(page_as: PageAs, robot: Site) -> None:
@@ -218,13 +214,14 @@ def _light(colour: str) -> float:
     return 0.2126 * red + 0.7152 * green + 0.0722 * blue
 
 
-@pytest.mark.parametrize("theme", ["light", "dark"])
-def test_the_number_of_open_alarms_can_be_read_at_any_severity(page_as: PageAs, theme: str) -> None:
-    page = page_as("viewer", theme=theme)
+def test_the_number_of_open_alarms_can_be_read_at_any_severity(page_as: PageAs) -> None:
+    page = page_as("viewer")
     page.goto("/help")
-    for ink, ground in page.evaluate(COUNTS):
-        low, high = sorted((_light(ink), _light(ground)))
-        assert (high + 0.05) / (low + 0.05) >= 4.5, (theme, ink, ground)
+    for theme, width in LOOKS:
+        with look(page, theme, width):
+            for ink, ground in page.evaluate(COUNTS):
+                low, high = sorted((_light(ink), _light(ground)))
+                assert (high + 0.05) / (low + 0.05) >= 4.5, (ink, ground)
 
 
 class Line:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
-import socket
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from amberbox.cli.main import main
+
+pytestmark = pytest.mark.usefixtures("no_sockets")
 
 GOOD = """\
 - default_parameters: {max_frequency: 10, db_name: logs}
@@ -20,16 +20,6 @@ GOOD = """\
       - topic: {name: /a_b/c, keep: ring}
 - zyre: {}
 """
-
-
-@pytest.fixture(autouse=True)
-def no_sockets(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Make every socket an error."""
-
-    def refuse(*arguments: Any, **more: Any) -> None:
-        raise AssertionError("check opened a socket")
-
-    monkeypatch.setattr(socket.socket, "__init__", refuse)
 
 
 @pytest.fixture

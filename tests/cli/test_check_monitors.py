@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import json
 import shutil
-import socket
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from amberbox.cli.main import main
+
+pytestmark = pytest.mark.usefixtures("no_sockets")
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "laser"
 RULES = """\
@@ -22,16 +22,6 @@ tests:
     expect:
       - {at: 5, level: LEVEL}
 """
-
-
-@pytest.fixture(autouse=True)
-def no_sockets(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Make every socket an error."""
-
-    def refuse(*arguments: Any, **more: Any) -> None:
-        raise AssertionError("check opened a socket")
-
-    monkeypatch.setattr(socket.socket, "__init__", refuse)
 
 
 @pytest.fixture

@@ -17,13 +17,6 @@ from tests.diagnosis.fmea.small import TEXT
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "robot" / "faulttrees.md"
 
 
-@pytest.fixture
-def small(tmp_path: Path) -> Path:
-    path = tmp_path / "fmea.yaml"
-    path.write_text(TEXT, encoding="utf-8")
-    return path
-
-
 @pytest.fixture(scope="module")
 def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("simulated") / "ropod_001"

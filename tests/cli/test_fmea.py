@@ -14,13 +14,6 @@ from amberbox.cli.main import main
 from tests.diagnosis.fmea.small import TEXT
 
 
-@pytest.fixture
-def small(tmp_path: Path) -> Path:
-    path = tmp_path / "fmea.yaml"
-    path.write_text(TEXT, encoding="utf-8")
-    return path
-
-
 def printed(capsys: pytest.CaptureFixture[str], *arguments: str, status: int = 0) -> Any:
     assert main(["fmea", *arguments, "--json"]) == status
     return json.loads(capsys.readouterr().out)

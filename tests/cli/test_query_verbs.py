@@ -19,6 +19,7 @@ from amberbox.cli.main import main
 from amberbox.core.errors import UsageError
 from amberbox.testing.clock import PATIENCE_S
 from amberbox.testing.records import T0_NS, FakeRun, build_segments_of, fill_store
+from tests.cli.conftest import Terminal
 
 
 @pytest.fixture

@@ -13,6 +13,7 @@ import stat
 import subprocess
 import time
 from collections.abc import Iterator, Mapping
+from contextlib import redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -217,13 +218,12 @@ def test_a_robot_that_claims_to_be_another_is_sent_away(
     asyncio.run(scene())
 
 
-def test_a_key_that_is_revoked_ends_the_open_connection(server: Server, tmp_path: Path) -> None:
-    done = subprocess.run(
-        command("serve", "add-robot", "r3", "--data", server.data, "--group", "new"),
-        capture_output=True,
-        text=True,
-    )
-    mine = read_join_line(done.stdout)
+def test_a_key_that_is_revoked_ends_the_open_connection(
+    server: Server, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    add = ["serve", "add-robot", "r3", "--data", str(server.data), "--group", "new"]
+    assert main(add) == 0
+    mine = read_join_line(capsys.readouterr().out)
 
     async def scene() -> None:
         context = await asyncio.to_thread(tls_context, mine.url, mine.ca, tmp_path)
@@ -242,20 +242,22 @@ def test_a_key_that_is_revoked_ends_the_open_connection(server: Server, tmp_path
     asyncio.run(scene())
 
 
-def test_a_line_goes_to_a_file_that_nobody_else_reads(server: Server, tmp_path: Path) -> None:
-    file, add = tmp_path / "line", command("serve", "add-robot", "r8", "--data", server.data)
-    done = subprocess.run([*add, "--line-file", file], capture_output=True, text=True)
-    assert done.returncode == 0 and "abr_" not in done.stdout
+def test_a_line_goes_to_a_file_that_nobody_else_reads(
+    server: Server, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file, data = tmp_path / "line", ["--data", str(server.data)]
+    assert main(["serve", "add-robot", "r8", *data, "--line-file", str(file)]) == 0
+    assert "abr_" not in capsys.readouterr().out
     assert stat.S_IMODE(file.stat().st_mode) == 0o600
     assert read_join_line(file.read_text()).robot == "r8"
-    again = command("serve", "add-robot", "r9", "--data", server.data)
-    done = subprocess.run([*again, "--line-file", file], capture_output=True, text=True)
-    assert done.returncode == 2 and "is there already" in done.stderr
-    with (tmp_path / "open").open("w") as out:
+    assert main(["serve", "add-robot", "r9", *data, "--line-file", str(file)]) == 2
+    assert "is there already" in capsys.readouterr().err
+    with (tmp_path / "open").open("w") as out, redirect_stdout(out):
         (tmp_path / "open").chmod(0o644)
-        done = subprocess.run(again, stdout=out, stderr=subprocess.PIPE, text=True)
-    assert done.returncode == 0, "the refused one did not add the robot"
-    assert "others can read this file" in done.stderr
+        assert main(["serve", "add-robot", "r9", *data]) == 0, (
+            "the refused one did not add the robot"
+        )
+    assert "others can read this file" in capsys.readouterr().err
 
 
 def test_the_audit_log_holds_while_the_server_runs(

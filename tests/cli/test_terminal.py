@@ -15,6 +15,7 @@ from amberbox.cli._output import fold, print_grid, text_output
 from amberbox.cli.main import main
 from amberbox.core.safe_text import LINE_START, OWN_ESCAPE, terminal_safe
 from amberbox.testing.records import fill_store
+from tests.cli.conftest import Terminal
 from tests.fuzzing import examples, fuzz
 
 

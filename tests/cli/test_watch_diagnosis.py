@@ -23,7 +23,6 @@ from tests.cli.test_watch import record
 from tests.monitoring.watcher.stand import (
     Stand,
     component,
-    kill,
     plan_of,
     positive,
     values_of,
@@ -141,27 +140,7 @@ def test_killed_at_any_moment_no_diagnosis_is_lost_or_doubled(tmp_path: Path, se
     knowledge = Knowledge("robot", fmea, "hash")
     plan = plan_of(component("extra", positive, variable("ros_ring")))
     stand = Stand(tmp_path / "store", 70 + seed, diagnoser=partial(FaultTracker, knowledge))
-    rng = stand.random
-    stand.tick()
-    watcher = stand.watcher(plan)
-    for _ in range(80):
-        what = rng.random()
-        if what < 0.02:
-            stand.restart(clean=rng.random() < 0.5)
-        elif what < 0.03:
-            stand.clock.step(rng.choice([-3600, 3600]) + rng.uniform(0, 0.01))
-        elif what < 0.08:
-            kill(watcher)
-            watcher = stand.watcher(plan)
-        elif what < 0.1:
-            watcher.close()
-            watcher = stand.watcher(plan)
-        stand.tick()
-        if rng.random() < 0.5:
-            watcher.step()
-    stand.box.close()
-    watcher.step()
-    watcher.close()
+    stand.watch_with_kills(80, [-3600, 3600], killed=0.05, ended=0.02, plan=plan)
     live, replayed = written_in(stand.path), stand.replayed(plan)
     assert len(values_of(live, "amberbox/diagnosis")) > 3
     assert any(s["source"] == "condition" for s in values_of(live, "amberbox/symptom"))

@@ -4,19 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import replace
-from functools import cache
 from itertools import combinations
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from amberbox.consult.folder_knowledge import read_declared_robot
 from amberbox.core.types import AmbiguityGroup, Diagnosis, Hypothesis, Symptom
 from amberbox.core.types import Test as Proposed
 from amberbox.diagnosis.diagnose import DiagnosisId, Effort, ObservedSituation, answer
 from amberbox.diagnosis.fmea.model import FailureMode
-from amberbox.diagnosis.knowledge import Knowledge
 from amberbox.diagnosis.make_safe import (
     CREDIBLE,
     DANGEROUS,
@@ -45,7 +42,7 @@ def knowledge() -> Knowledge:
 
 def shown_by(modes: Iterable[str]) -> tuple[Symptom, ...]:
     """Return what failure modes are likely to show; all else is absent."""
-    fmea = knowledge().fmea
+    fmea = sim.knowledge().fmea
     links = [link for mode in modes for link in fmea.modes[mode].symptoms]
     there = [link.symptom for link in links if link.detects >= 0.5]
     there = list(dict.fromkeys(there or [link.symptom for link in links[:1]]))
@@ -57,14 +54,14 @@ def shown_by(modes: Iterable[str]) -> tuple[Symptom, ...]:
 def told_of(*modes: str) -> tuple[Diagnosis, Explanation]:
     """Return diagnosis and explanation of what failure modes show."""
     seen = shown_by(modes)
-    found = answer(knowledge(), ObservedSituation(seen, watched=True), DiagnosisId("d", 1, AT_NS),
-                   Effort(hypotheses=10))  # fmt: skip
-    return found, explain(found, knowledge(), seen)
+    situation, heading = ObservedSituation(seen, watched=True), DiagnosisId("d", 1, AT_NS)
+    found = answer(sim.knowledge(), situation, heading, Effort(hypotheses=10))
+    return found, explain(found, sim.knowledge(), seen)
 
 
 def assert_safe_order(found: Diagnosis, told: Explanation) -> None:
     """Check the order of what to do next against the diagnosis and the FMEA alone."""
-    fmea, step = knowledge().fmea, told.next
+    fmea, step = sim.knowledge().fmea, told.next
     leading = found.hypotheses[:1] if not found.groups else [
         h for h in found.hypotheses if h.id in found.groups[0].members
     ]  # fmt: skip
@@ -99,12 +96,12 @@ def test_a_battery_that_may_catch_fire_is_switched_off_before_any_question() -> 
 
 
 def test_every_failure_mode_alone_has_a_safe_order() -> None:
-    for mode in knowledge().fmea.modes:
+    for mode in sim.knowledge().fmea.modes:
         assert_safe_order(*told_of(mode))
 
 
 def test_pairs_of_failure_modes_have_a_safe_order() -> None:
-    modes = sorted(knowledge().fmea.modes)
+    modes = sorted(sim.knowledge().fmea.modes)
     for pair in list(combinations(modes, 2))[::67]:
         assert_safe_order(*told_of(*pair))
 
@@ -120,7 +117,7 @@ TESTS = st.lists(st.integers(0, 200), max_size=3, unique=True)
 def test_the_order_is_safe_for_any_posterior(
     sets: list[frozenset[int]], shares: list[float], tests: list[int]
 ) -> None:
-    modes, checks = sorted(knowledge().fmea.modes), list(knowledge().checks.values())
+    modes, checks = sorted(sim.knowledge().fmea.modes), list(sim.knowledge().checks.values())
     of_each = [frozenset(modes[k % len(modes)] for k in one) for one in sets]
     merged: dict[frozenset[str], float] = {}
     for faults, share in zip(of_each, shares, strict=True):
@@ -135,7 +132,7 @@ def test_the_order_is_safe_for_any_posterior(
         next_tests=tuple(Proposed(one.id, "check", one.text) for one in asked),
         groups=tuple(AmbiguityGroup((h.id,), h.probability) for h in ranked),
     )  # fmt: skip
-    assert_safe_order(found, explain(found, knowledge(), ()))
+    assert_safe_order(found, explain(found, sim.knowledge(), ()))
 
 
 @pytest.mark.parametrize(
@@ -159,7 +156,7 @@ def test_an_analysis_without_make_safe_is_read_by_how_its_remedies_begin(
 
 
 def test_the_worst_comes_first_and_what_is_hardly_possible_does_not() -> None:
-    fmea = knowledge().fmea
+    fmea = sim.knowledge().fmea
     hot = "wheel_front_left#winding_hot"
     both = [Hypothesis("a", frozenset({hot}), 0.94), Hypothesis("b", frozenset({BATTERY}), 0.06)]
     assert [a.faults for a in safety_actions(fmea, both, {"a"})] == [(BATTERY,), (hot,)]

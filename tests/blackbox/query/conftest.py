@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,10 @@ from rosbags.typesys import Stores, get_typestore
 
 from amberbox.blackbox.query.record import Record
 from amberbox.blackbox.recorder.pipeline import PipelineOptions
+from amberbox.blackbox.store import segment_builder
+from amberbox.blackbox.store.journal_reader import journals
 from amberbox.core.types import Schema, Topic
+from amberbox.testing.records import build_segments_of, fill_store
 from tests.support.manual_recorder import ManualBox
 
 ROS1 = get_typestore(Stores.ROS1_NOETIC)
@@ -65,6 +69,27 @@ def record_robot(
             box.hear(scan.topic("/range"), scan.encode(header, 1, *values))
         box.write()
     return box
+
+
+STORES = ("journals", "one segment", "segments", "joined", "raw gone", "no pyarrow")
+"""How the rows of a store may lie."""
+
+
+def filled_as(kind: str, path: Path, patch: pytest.MonkeyPatch, reader: ModuleType) -> Path:
+    """Fill a store whose rows lie as ``STORES`` names it; without pyarrow ``reader`` has none."""
+    fill_store(path)
+    if kind == "no pyarrow":
+        build_segments_of(path)
+        patch.setattr(reader, "can_build", lambda: False)
+    elif kind != "journals":
+        build_segments_of(path, 1 if kind == "one segment" else None)
+    if kind == "joined":
+        patch.setattr(segment_builder, "MERGE_COUNT", 2)
+        assert segment_builder.merge_small(path)
+    if kind == "raw gone":
+        for journal in [journal for journal in journals(path) if journal.finished]:
+            journal.path.unlink()
+    return path
 
 
 def item_like(record: Record, item: str) -> str:

@@ -32,27 +32,15 @@ from amberbox.testing.records import (
     fill_store,
     pose_rows,
 )
+from tests.blackbox.query.conftest import STORES, filled_as
 
 MS = 1_000_000
 
 
-@pytest.fixture(params=["journals", "one segment", "segments", "joined", "raw gone", "no pyarrow"])
+@pytest.fixture(params=STORES)
 def store(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    path = tmp_path / "store"
-    fill_store(path)
     monkeypatch.setattr(export_job, "SLICE_ROWS", 40)
-    if request.param == "no pyarrow":
-        build_segments_of(path)
-        monkeypatch.setattr(export_job, "can_build", lambda: False)
-    elif request.param != "journals":
-        build_segments_of(path, 1 if request.param == "one segment" else None)
-    if request.param == "joined":
-        monkeypatch.setattr(segments, "MERGE_COUNT", 2)
-        assert segments.merge_small(path)
-    if request.param == "raw gone":
-        for journal in [journal for journal in journals(path) if journal.finished]:
-            journal.path.unlink()
-    return path
+    return filled_as(request.param, tmp_path / "store", monkeypatch, export_job)
 
 
 @pytest.fixture

@@ -25,29 +25,18 @@ from amberbox.testing.records import (
     FakeItem,
     FakeRun,
     build_segments_of,
-    fill_store,
     pose,
 )
+from tests.blackbox.query.conftest import STORES, filled_as
 
 MS = 1_000_000
 
 
-@pytest.fixture(params=["journals", "one segment", "segments", "joined", "raw gone", "no pyarrow"])
+@pytest.fixture(params=STORES)
 def store(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    path = tmp_path / "store"
-    fill_store(path)
+    path = filled_as(request.param, tmp_path / "store", monkeypatch, query)
     if request.param == "no pyarrow":
-        build_segments_of(path)
-        monkeypatch.setattr(query, "can_build", lambda: False)
         monkeypatch.setitem(sys.modules, "pyarrow", None)
-    elif request.param != "journals":
-        build_segments_of(path, 1 if request.param == "one segment" else None)
-    if request.param == "joined":
-        monkeypatch.setattr(segments, "MERGE_COUNT", 2)
-        assert segments.merge_small(path)
-    if request.param == "raw gone":
-        for journal in [journal for journal in journals(path) if journal.finished]:
-            journal.path.unlink()
     return path
 
 

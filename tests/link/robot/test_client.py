@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Iterator
 from pathlib import Path
 
-import pytest
 from sqlalchemy import select
 
 from amberbox.blackbox.journal import channels
@@ -30,13 +28,6 @@ from tests.link.robot.rig import (
     serving,
     until,
 )
-
-
-@pytest.fixture
-def database(tmp_path: Path) -> Iterator[ServerDatabase]:
-    found = ServerDatabase(tmp_path / "server.db")
-    yield found
-    found.close()
 
 
 def test_rows_arrive_once_and_are_acknowledged(tmp_path: Path, database: ServerDatabase) -> None:

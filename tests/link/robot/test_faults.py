@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import shutil
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -25,13 +24,6 @@ from tests.link.robot.rig import (
     serving,
     until,
 )
-
-
-@pytest.fixture
-def database(tmp_path: Path) -> Iterator[ServerDatabase]:
-    found = ServerDatabase(tmp_path / "server.db")
-    yield found
-    found.close()
 
 
 def kinds(database: ServerDatabase) -> set[str]:

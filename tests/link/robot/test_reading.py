@@ -138,7 +138,7 @@ def test_what_is_remembered_belongs_to_its_store(tmp_path: Path) -> None:
     assert load_acknowledged(one) is None
 
 
-def test_a_remark_becomes_an_event_once(tmp_path: Path) -> None:
+def test_an_event_of_the_link_is_recorded_once(tmp_path: Path) -> None:
     store = create_store(tmp_path)
     link_events = LinkEvents(store)
     for _ in range(3):

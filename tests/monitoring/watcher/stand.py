@@ -143,6 +143,40 @@ class Stand:
     def clock_s(self) -> float:
         return self.clock.boot / NS
 
+    def watch_with_kills(
+        self, ticks: int, jumps_s: Sequence[float], *, killed: float, ended: float,
+        measured: float = 0.0, plan: MonitoringPlan | None = None,
+    ) -> None:  # fmt: skip
+        """Watch while the recorder restarts or crashes, its clock is set, the watcher is killed.
+
+        The last three are how likely each tick does that to the watcher, or brings it a row of a
+        probe.
+        """
+        rng = self.random
+        self.tick()
+        watcher = self.watcher(plan)
+        watcher.step()
+        for _ in range(ticks):
+            what = rng.random()
+            if what < 0.02:
+                self.restart(clean=rng.random() < 0.5)
+            elif what < 0.03:
+                self.clock.step(rng.choice(jumps_s) + rng.uniform(0, 0.01))
+            elif what < 0.03 + killed:
+                kill(watcher)
+                watcher = self.watcher(plan)
+            elif what < 0.03 + killed + ended:
+                watcher.close()
+                watcher = self.watcher(plan)
+            elif what < 0.03 + killed + ended + measured:
+                watcher.measured(PROBE, {"subject": PROBE.subject, "ok": rng.random() < 0.7})
+            self.tick()
+            if rng.random() < 0.5:
+                watcher.step()
+        self.box.close()
+        watcher.step()
+        watcher.close()
+
     def replayed(self, plan: MonitoringPlan | None = None) -> list[bytes]:
         store, diagnoser = open_store(self.path), self.diagnoser
         return [line_of(f) for f in replay(plan or plan_of(), store, diagnoser=diagnoser)]

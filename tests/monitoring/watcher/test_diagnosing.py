@@ -32,7 +32,6 @@ from amberbox.monitoring.watcher_journal import RetainedFindings, retained_findi
 from tests.monitoring.watcher.diagnoser import ITEM, NEGATIVE, PlainDiagnoser
 from tests.monitoring.watcher.stand import (
     NUMBERS,
-    PROBE,
     Stand,
     component,
     kill,
@@ -75,30 +74,7 @@ def channel(stand: Stand, name: str, *, live_only: bool = False) -> Sequence[Map
 def test_killed_at_any_moment_no_diagnosis_is_lost_or_doubled(tmp_path: Path, seed: int) -> None:
     """The recorder restarts, its clock is set; the watcher is killed amid all this."""
     stand = stand_of(tmp_path, 30 + seed)
-    rng = stand.random
-    stand.tick()
-    watcher = stand.watcher()
-    watcher.step()
-    for _ in range(120):
-        what = rng.random()
-        if what < 0.02:
-            stand.restart(clean=rng.random() < 0.5)
-        elif what < 0.03:
-            stand.clock.step(rng.choice([-3600, 2, 3600]) + rng.uniform(0, 0.01))
-        elif what < 0.07:
-            kill(watcher)
-            watcher = stand.watcher()
-        elif what < 0.09:
-            watcher.close()
-            watcher = stand.watcher()
-        elif what < 0.15:
-            watcher.measured(PROBE, {"subject": PROBE.subject, "ok": rng.random() < 0.7})
-        stand.tick()
-        if rng.random() < 0.5:
-            watcher.step()
-    stand.box.close()
-    watcher.step()
-    watcher.close()
+    stand.watch_with_kills(120, [-3600, 2, 3600], killed=0.04, ended=0.02, measured=0.06)
     found, replayed = written(stand.path), stand.replayed()
     assert len(channel(stand, "diagnosis")) > 10
     assert any(symptom["id"] == NEGATIVE for symptom in channel(stand, "symptom"))

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from amberbox.blackbox.store.derived_journal import DerivedJournal
-from tests.monitoring.watcher.stand import PROBE, Stand, kill, written
+from tests.monitoring.watcher.stand import Stand, written
 
 
 def test_live_and_replay_give_the_same_bytes(tmp_path: Path) -> None:
@@ -31,30 +31,7 @@ def test_live_and_replay_give_the_same_bytes(tmp_path: Path) -> None:
 def test_killed_at_any_moment_nothing_is_lost_or_doubled(tmp_path: Path, seed: int) -> None:
     """The recorder restarts, crashes, its clock is set; the watcher is killed amid all this."""
     stand = Stand(tmp_path / "store", seed)
-    rng = stand.random
-    stand.tick()
-    watcher = stand.watcher()
-    watcher.step()
-    for _ in range(120):
-        what = rng.random()
-        if what < 0.02:
-            stand.restart(clean=rng.random() < 0.5)
-        elif what < 0.03:
-            stand.clock.step(rng.choice([-3600, -1.5, 0.3, 2, 3600]) + rng.uniform(0, 0.01))
-        elif what < 0.06:
-            kill(watcher)
-            watcher = stand.watcher()
-        elif what < 0.08:
-            watcher.close()
-            watcher = stand.watcher()
-        elif what < 0.15:
-            watcher.measured(PROBE, {"subject": PROBE.subject, "ok": rng.random() < 0.7})
-        stand.tick()
-        if rng.random() < 0.5:
-            watcher.step()
-    stand.box.close()
-    watcher.step()
-    watcher.close()
+    stand.watch_with_kills(120, [-3600, -1.5, 0.3, 2, 3600], killed=0.03, ended=0.02, measured=0.07)
     live, replayed = written(stand.path), stand.replayed()
     assert len(replayed) > 100
     assert live == replayed

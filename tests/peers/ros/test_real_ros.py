@@ -81,6 +81,12 @@ def wait_for_links(sink: GapSink, count: int) -> None:
     wait_until(lambda: count_ups(sink) >= count, f"{count} links")
 
 
+def wait_for_all(sink: GapSink, links: int) -> None:
+    """Wait until all topics have had so many links, and messages come over the last of them."""
+    wait_for_links(sink, links * len(NAMES))
+    wait_for_more(sink)
+
+
 def wait_for_more(sink: GapSink, topic: str = "/robot/odom", count: int = 15) -> None:
     sink.wait_for(topic, len(sink.of(topic)) + count)
 
@@ -99,14 +105,10 @@ def test_a_healthy_robot_is_recorded_whole(ros: Ros) -> None:
     }
     assert {reason for way, _, _, reason, _ in sink.links if way == "down"} == {"publisher gone"}
     assert sink.events == []
+    assert_definitions_come_from_the_wire(ros, sink)
 
 
-def test_definitions_come_from_the_wire(ros: Ros) -> None:
-    ros.master()
-    sink = GapSink()
-    with box(ros, sink):
-        robot = ros.robot("--wait-for", "1", "--map-after", "0.1", "--duration", "0.3")
-        assert robot.wait(PATIENCE_S) == 0
+def assert_definitions_come_from_the_wire(ros: Ros, sink: GapSink) -> None:
     entries = read_truth(ros.truths()[0])
     types = next(entry["types"] for entry in entries if entry["k"] == "start")
     schemas = {topic.name: topic.schema for topic in sink.topics}
@@ -126,47 +128,34 @@ def kill_robot(ros: Ros, sink: GapSink, robot: subprocess.Popen[bytes]) -> None:
 
 
 @pytest.mark.parametrize("invisible", [False, True])
-def test_a_robot_that_is_killed_and_returns(ros: Ros, invisible: bool) -> None:
-    ros.master()
-    sink = GapSink()
-    with box(ros, sink, invisible=invisible):
-        robot = ros.robot()
-        wait_for_links(sink, len(NAMES))
-        wait_for_more(sink)
-        kill_robot(ros, sink, robot)
-        robot = ros.robot("--map-seed", "1")
-        wait_for_links(sink, 2 * len(NAMES))
-        wait_for_more(sink)
-        end(robot)
-    assert_right(verdicts(ros, sink, tolerance_s=POLL_S + 0.2 if invisible else 0.2))
-    downs = [at for way, _, _, _, at in sink.links if way == "down"]
-    assert len(downs) == 2 * len(NAMES)
-
-
-@pytest.mark.parametrize("order", ["master first", "robot first"])
-@pytest.mark.parametrize("invisible", [False, True])
-def test_master_and_robot_are_killed_and_return(ros: Ros, invisible: bool, order: str) -> None:
+def test_robot_and_master_are_killed_and_return(ros: Ros, invisible: bool) -> None:
+    """Kill the robot alone, then behind its master, then before its master."""
     master = ros.master()
     sink = GapSink()
     with box(ros, sink, invisible=invisible):
         robot = ros.robot()
-        wait_for_links(sink, len(NAMES))
+        wait_for_all(sink, links=1)
+        kill_robot(ros, sink, robot)
+        robot = ros.robot("--map-seed", "1")
+        wait_for_all(sink, links=2)
+
+        end(master, signal.SIGKILL)
         wait_for_more(sink)
-        if order == "master first":
-            end(master, signal.SIGKILL)
-            wait_for_more(sink)
-            ros.master()
-            wait_for_more(sink)
-            kill_robot(ros, sink, robot)
-        else:
-            kill_robot(ros, sink, robot)
-            end(master, signal.SIGKILL)
-            ros.master()
+        master = ros.master()
+        wait_for_more(sink)
+        kill_robot(ros, sink, robot)
         robot = ros.robot()
-        wait_for_links(sink, 2 * len(NAMES))
-        wait_for_more(sink)
+        wait_for_all(sink, links=3)
+
+        kill_robot(ros, sink, robot)
+        end(master, signal.SIGKILL)
+        ros.master()
+        robot = ros.robot()
+        wait_for_all(sink, links=4)
         end(robot)
     assert_right(verdicts(ros, sink, tolerance_s=POLL_S + 0.2 if invisible else 0.2))
+    downs = [at for way, _, _, _, at in sink.links if way == "down"]
+    assert len(downs) == 4 * len(NAMES)
     assert ("ros_registered_again" in {kind for kind, _, _ in sink.events}) is not invisible
 
 
@@ -275,8 +264,7 @@ def test_a_box_that_hangs_does_not_stop_the_master(ros: Ros) -> None:
     with box(ros, sink):
         wait_until(lambda: "/amberbox" in _subscribers(ros, "/robot/map"), "registered")
         robot = ros.robot()
-        wait_for_links(sink, len(NAMES))
-        wait_for_more(sink)
+        wait_for_all(sink, links=1)
         end(robot)
     os.kill(hanging.pid, signal.SIGCONT)
     assert_right(verdicts(ros, sink))

@@ -8,7 +8,6 @@ import subprocess
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from itertools import permutations
 
 import numpy as np
 import pytest
@@ -163,17 +162,19 @@ def masters(ros: Ros) -> list[subprocess.Popen[bytes]]:
 
 
 ACTS: dict[str, Act] = {"robot": kill_robot, "master": kill_master, "box": kill_box}
-ORDERS = [", ".join(order) for order in permutations(ACTS)]
-CASES = [(order, False) for order in ORDERS] + [(ORDERS[1], True), (ORDERS[3], True)]
+EVERY_ORDER = "robot master box robot master robot box master robot"
+"""Each of the six orders of the three stands in it."""
 
 
-@pytest.mark.parametrize(("order", "invisible"), CASES)
+@pytest.mark.parametrize(
+    ("order", "invisible"), [(EVERY_ORDER, False), ("robot box master box robot", True)]
+)
 def test_every_message_is_recorded_or_lies_in_a_gap(ros: Ros, order: str, invisible: bool) -> None:
     ros.master()
     with running(ros, invisible=invisible) as box:
         ros.robot()
         box.wait_for_more()
-        for act in order.split(", "):
+        for act in order.split():
             ACTS[act](ros, box)
             box.wait_for_more()
         end(robots(ros)[-1])

@@ -5,27 +5,18 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
-from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 
-import pytest
 from starlette.testclient import TestClient
 
 from amberbox.link.join_line import read_join_line
 from amberbox.server.bus import ServerChange
 from amberbox.server.certificates import CERTIFICATE
 from amberbox.server.schema import AUDIT
-from tests.server.house import URL, House, house
+from tests.server.house import URL, House
 
 ROBOTS = "/api/v1/robots"
 DER = b"a certificate, for the test"
-
-
-@pytest.fixture
-def home(tmp_path: Path) -> Iterator[House]:
-    with house(tmp_path / "server", shared=True) as found:
-        yield found
 
 
 def _robot(home: House, line: str) -> TestClient:

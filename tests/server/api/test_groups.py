@@ -2,21 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from pathlib import Path
-
 import pytest
 
 from amberbox.server.bus import ServerChange
-from tests.server.house import House, house
+from tests.server.house import House
 
 GROUPS = "/api/v1/groups"
-
-
-@pytest.fixture
-def home(tmp_path: Path) -> Iterator[House]:
-    with house(tmp_path / "server", shared=True) as found:
-        yield found
 
 
 def test_groups_show_who_and_what_is_in_them(home: House) -> None:

@@ -79,7 +79,7 @@ def test_the_robot_ends_its_own_missions(home: House) -> None:
     assert refused["error"]["hint"] == "the robot ends its own missions"
 
 
-def test_remarks_stay_with_a_mission(home: House) -> None:
+def test_notes_stay_with_a_mission(home: House) -> None:
     post(home, "missions/transport-1/notes", {"text": "the door was <b>shut</b>"})
     (note,) = get(home, "missions/transport-1")["notes"]
     assert note["text"] == "the door was <b>shut</b>"

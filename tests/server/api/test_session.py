@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import ipaddress
-from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 from sqlalchemy import select
@@ -15,16 +13,10 @@ from amberbox.server.accounts.users import set_password
 from amberbox.server.bus import ServerChange
 from amberbox.server.http.auth import COOKIE, CSRF_HEADER
 from amberbox.server.schema import AUDIT
-from tests.server.house import PASSWORD, URL, House, house
+from tests.server.house import PASSWORD, URL, House
 
 PATH = "/api/v1/session"
 NEW = "quite another passphrase"
-
-
-@pytest.fixture
-def home(tmp_path: Path) -> Iterator[House]:
-    with house(tmp_path / "server") as found:
-        yield found
 
 
 def signed_in(home: House, name: str = "operator", password: str = PASSWORD) -> TestClient:

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -17,7 +15,7 @@ from amberbox.server.journals import Retention
 from amberbox.server.schema import AUDIT
 from amberbox.server.services import settings
 from amberbox.server.services.settings import SettingDefinition, mask_secrets, restore_secrets
-from tests.server.house import House, house
+from tests.server.house import House
 
 SETTINGS = "/api/v1/settings"
 
@@ -27,12 +25,6 @@ class Mail:
     host: str = ""
     to: str = ""
     password: str = ""
-
-
-@pytest.fixture
-def home(tmp_path: Path) -> Iterator[House]:
-    with house(tmp_path / "server", shared=True) as found:
-        yield found
 
 
 def _put(home: House, name: str, value: Any) -> tuple[int, str]:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -13,16 +11,10 @@ from starlette.testclient import TestClient
 from amberbox.server.accounts.tokens import add_token
 from amberbox.server.accounts.users import find_user, set_password
 from amberbox.server.schema import AUDIT
-from tests.server.house import PASSWORD, House, house
+from tests.server.house import PASSWORD, House
 
 TOKENS = "/api/v1/tokens"
 AUDITS = "/api/v1/audit/head"
-
-
-@pytest.fixture
-def home(tmp_path: Path) -> Iterator[House]:
-    with house(tmp_path / "server", shared=True) as found:
-        yield found
 
 
 def _make(client: TestClient, **more: Any) -> dict[str, str]:

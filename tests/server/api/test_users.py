@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -14,15 +12,9 @@ from amberbox.server.accounts.signin import LoginOrigin, WrongLoginError, sign_i
 from amberbox.server.accounts.tokens import working_tokens
 from amberbox.server.bus import ServerChange
 from amberbox.server.schema import AUDIT
-from tests.server.house import PASSWORD, House, house
+from tests.server.house import PASSWORD, House
 
 USERS = "/api/v1/users"
-
-
-@pytest.fixture
-def home(tmp_path: Path) -> Iterator[House]:
-    with house(tmp_path / "server", shared=True) as found:
-        yield found
 
 
 def _log(home: House) -> list[tuple[str, str, str, Any]]:

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
-
-import pytest
 
 from amberbox.blackbox.journal import channels
 from amberbox.blackbox.store.own_records import newest_records
@@ -29,7 +27,7 @@ from amberbox.server.system import (
     paths,
 )
 from amberbox.testing.clock import PATIENCE_S
-from tests.server.house import House, house
+from tests.server.house import House
 
 DEADLINE_S = 60.0
 """Long enough for a computer with other work to do; it takes a tenth of that."""
@@ -55,12 +53,6 @@ SYSTEM = {
     "fmea.yaml": "types:\n  robot:\n    failure_modes:\n      lost: {probability: 0.01, "
                  "symptoms: [ropod_002/two_works/works]}\ninstances: {robot: [ropod_002]}\n",
 }  # fmt: skip
-
-
-@pytest.fixture
-def home(tmp_path: Path) -> Iterator[House]:
-    with house(tmp_path / "server") as found:
-        yield found
 
 
 def write(folder: Path, files: Mapping[str, str]) -> None:

@@ -299,7 +299,7 @@ def test_rooms_write_no_sql_by_hand(room: str) -> None:
     folder.
     """
     folder = Path(server.__path__[0])
-    sources = {path.name: path.read_text() for path in folder.glob(room)}
+    sources = {path.name: path.read_text() for path in folder.glob(pattern)}
     assert sources
     by_hand = re.compile(r"exec_driver_sql|\btext\(\"|import.*\btext\b|executescript")
     assert [name for name, source in sources.items() if by_hand.search(source)] == []

@@ -37,7 +37,7 @@ async def _ends(work: Coroutine[Any, Any, None], happen: Callable[[], object], t
 
 
 @pytest.mark.parametrize("turns", TURNS)
-def test_the_doorkeeper_ends(tmp_path: Path, turns: int) -> None:
+def test_session_revocation_ends(tmp_path: Path, turns: int) -> None:
     database = ServerDatabase(tmp_path / "server.db")
     links = LinkServer(database)
     revocation = SessionRevocation(database, EventBus(), SystemClock(), links)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterator
 from pathlib import Path
 
 import msgspec
@@ -20,16 +19,10 @@ from amberbox.server.ingest import folders
 from amberbox.server.ingest.folders import FolderService, FolderStore
 from amberbox.server.ingest.worker import keep, masked
 from tests.fuzzing import examples, fuzz
-from tests.server.house import House, house
+from tests.server.house import House
 
 A, B, C = "a" * 64, "b" * 64, "c" * 64
 SECRET = "hunter2-tr0ub4dor"
-
-
-@pytest.fixture
-def home(tmp_path: Path) -> Iterator[House]:
-    with house(tmp_path / "server") as found:
-        yield found
 
 
 def _hello(config_hash: str) -> Hello:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 from sqlalchemy import select
@@ -18,19 +16,13 @@ from amberbox.server.archive import maintenance
 from amberbox.server.ingest import ledger
 from amberbox.server.ingest.link_state import pending_keys
 from amberbox.server.schema import AUDIT, EVENT, UPLOAD
-from tests.server.house import House, house
+from tests.server.house import House
 from tests.server.ingest.test_uploads import bring, incoming_of, original, store
 
 __all__ = ["original", "store"]
 
 ROBOT = "ropod_001"
 OLD = "ab" * 32
-
-
-@pytest.fixture
-def home(tmp_path: Path) -> Iterator[House]:
-    with house(tmp_path / "server", shared=True) as found:
-        yield found
 
 
 def hello(home: House, store: Store, key: str, store_id: str = "") -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from amberbox.consult.folder_knowledge import read_declared_robot
 from amberbox.core.clock import NS
 from amberbox.core.types import Diagnosis, Output, Status, Symptom
 from amberbox.diagnosis.diagnose import DiagnosisId, ObservedSituation, answer
+from amberbox.diagnosis.knowledge import Knowledge
 from amberbox.link.folders import pack
 from amberbox.link.frames import LinkRow
 from amberbox.link.server_end import ServerEnd
@@ -56,11 +58,17 @@ def status(
                   "nominal", outputs, (), at_ns, at_ns, "why", config_hash)  # fmt: skip
 
 
+@cache
+def knowledge(robot: str = "ropod_001", hash_: str = HASH) -> Knowledge:
+    """Return what the folder says can fail."""
+    return read_declared_robot(FOLDER, robot, hash_).knowledge()
+
+
 def diagnosis(at_ns: int, *symptoms: Symptom) -> Diagnosis:
     """Return the diagnosis of these symptoms by the watcher's own engine."""
     knowledge = read_declared_robot(FOLDER, "ropod_001", HASH).knowledge()
     situation = ObservedSituation(symptoms, watched=True)
-    return answer(knowledge, situation, DiagnosisId(DIAGNOSIS, 1, at_ns))
+    return answer(knowledge(), situation, DiagnosisId(DIAGNOSIS, 1, at_ns))
 
 
 def say(

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import json
-from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -24,15 +22,9 @@ from amberbox.server.live.feed import MOST_EACH
 from amberbox.server.live.listener import ChangeRing
 from amberbox.server.live.records import LONGEST, StatusRecord, decode_record
 from amberbox.testing.clock import PATIENCE_S
-from tests.server.house import URL, House, house
+from tests.server.house import URL, House
 from tests.server.live.listening import Stage, ask, hear, heard_within, stage
 from tests.server.state.lives import put_alarm
-
-
-@pytest.fixture
-def home(tmp_path: Path) -> Iterator[House]:
-    with house(tmp_path / "server") as found:
-        yield found
 
 
 def token(home: House, owner: str, *scopes: str) -> dict[str, str]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -32,7 +31,7 @@ from amberbox.link.frames import (
 )
 from amberbox.server.http.auth import COOKIE
 from amberbox.server.schema import ROW
-from tests.server.house import URL, House, house
+from tests.server.house import URL, House
 
 LINK = limits.PATH
 STORE = "12345678-1234-1234-1234-123456789012"
@@ -42,12 +41,6 @@ REACH = WriterReach(
     JournalPosition(1, 9),
     (RunEnd(1, "b", 9, closed=False),),
 )
-
-
-@pytest.fixture
-def home(tmp_path: Path) -> Iterator[House]:
-    with house(tmp_path / "server", shared=True) as found:
-        yield found
 
 
 def _hello(robot: str) -> Hello:

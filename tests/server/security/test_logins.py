@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 from ipaddress import ip_network
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -13,16 +11,10 @@ from starlette.testclient import TestClient
 
 from amberbox.server.http.auth import COOKIE, CSRF_HEADER
 from amberbox.server.schema import AUDIT
-from tests.server.house import PASSWORD, URL, House, house
+from tests.server.house import PASSWORD, URL, House
 
 SESSION = "/api/v1/session"
 ATTACKER = ("203.0.113.66", 40_000)
-
-
-@pytest.fixture
-def home(tmp_path: Path) -> Iterator[House]:
-    with house(tmp_path / "server", shared=True) as found:
-        yield found
 
 
 def _client(home: House, address: tuple[str, int] = ATTACKER) -> TestClient:

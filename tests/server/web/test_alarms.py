@@ -9,7 +9,6 @@ from typing import Any
 
 import pytest
 
-from amberbox.consult.folder_knowledge import read_declared_robot
 from amberbox.core.api import AlarmLine, Happening, LeadingCause, Words
 from amberbox.core.clock import NS
 from amberbox.core.timestamps import format_time

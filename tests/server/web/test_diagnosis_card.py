@@ -6,7 +6,6 @@ from typing import Any
 
 import pytest
 
-from amberbox.consult.folder_knowledge import read_declared_robot
 from amberbox.core.types import Symptom
 from amberbox.diagnosis.diagnose import DiagnosisContext, ObservedSituation, diagnose_context
 from amberbox.diagnosis.knowledge import Knowledge
@@ -31,7 +30,7 @@ NO_POWER = "The front laser has no power"
 
 @pytest.fixture(scope="module")
 def knowledge() -> Knowledge:
-    return read_declared_robot(sim.FOLDER, "ropod_001", sim.HASH).knowledge()
+    return sim.knowledge()
 
 
 def seen(name: str, *addresses: str, at_ns: int = NOW) -> Symptom:
