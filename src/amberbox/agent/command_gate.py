@@ -32,6 +32,7 @@ from amberbox.core.command import (
     LeaseState,
     Risk,
     decode_command,
+    is_command_id,
     verify_command,
 )
 from amberbox.core.errors import AmberboxError, ConfigurationError
@@ -44,7 +45,7 @@ CONFIRM_TRIES = 3
 _CODE_DIGITS = 6
 _CHALLENGES = 1000
 _LABEL_LENGTH = 128
-# Refusals that could not be stored, and aborts of commands that have not come yet: the newest
+# Refusals that could not be stored: the newest
 _REMEMBERED = 1000
 # A server that revokes more is not trusted any further: no signed command runs
 _MOST_REVOKED = 10_000
@@ -60,7 +61,8 @@ class Decision:
     ``run``: start the action of ``command`` now; that it was accepted is on the disk. ``ask``: show
     ``code`` at the robot, or where it is empty wait for the button, to confirm ``command``.
     ``answer``: send ``answer`` to the server. ``stop``: stop the running command ``id`` safely.
-    ``note``: only record ``text``. ``text`` is the reason; ``person`` is whose key signed.
+    ``note``: only record ``text``. ``text`` is the reason; ``person`` is whose key signed, while
+    the command's ``issuer`` is only what the server states.
     """
 
     kind: DecisionKind
@@ -184,7 +186,6 @@ class CommandGate:
         self._waiting: _Waiting | None = None
         self._running: dict[str, _Running] = {}
         self._refused: dict[str, tuple[str, CommandAnswer]] = {}
-        self._aborted: dict[str, None] = {}
         # what the disk did not take yet
         self._ends: dict[str, tuple[str, CommandAnswer]] = {}
         self._revoked: set[str] = set()
@@ -278,7 +279,7 @@ class CommandGate:
     def _repeat(
         self, command: Command, digest: str, known: str, answer: CommandAnswer | None
     ) -> None:
-        if digest != known:
+        if digest != known and known:
             why = "a command with this id and other content came before"
             self._say(self._answer(command.id, "refused", why))
         elif answer is None:
@@ -306,7 +307,7 @@ class CommandGate:
             return wrong
         if RISKS.index(command.risk) < RISKS.index(least):
             return f"{command.action} has the risk {least}, and the command says {command.risk}"
-        return "it was aborted before it came" if command.id in self._aborted else ""
+        return ""
 
     def _right_problem(self, command: Command) -> tuple[str, _Signer]:
         """Return why this was not signed by a person who may order it, and who signed."""
@@ -558,9 +559,9 @@ class CommandGate:
         self._stop(is_meant, why)
         if self._lease is not None and target in ("", self._lease.run):
             self._end_lease(why)
-        if len(target) <= _LABEL_LENGTH:
-            self._aborted[target] = None  # the command may come later than its abort
-            _keep_newest(self._aborted)
+        if is_command_id(target) and self._known(target) is None:
+            # the command may come later than its abort, with a digest that is not known yet
+            self._conclude(target, "", "aborted", f"{why} before it came"[:REASON_LENGTH])
         self._note(f"{why}: {target or 'everything'}"[:REASON_LENGTH])
         return self.step()
 

@@ -5,8 +5,9 @@ far the server has stored the answers. What was appended is synced before ``add`
 ``accepted`` without an end was being carried out when the process or the power went. The newest
 100,000 ids are remembered, so that no command runs twice.
 
-The file replaces itself when most of it is no longer needed: the new one is complete and synced
-before it takes the name, so that a power cut leaves the old or the new one.
+The file is replaced at opening, after a failure, and when most of it is no longer needed: the new
+one is complete and synced before it takes the name, so that a power cut leaves the old or the new
+one.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from amberbox.core.errors import AmberboxError
 MOST_IDS = 100_000
 # Results of so many answers are kept until the server has them
 RESULTS = 200
-_LEAST_BYTES = 1 << 20  # a smaller file is not worth replacing
+TIDY_BYTES = 1 << 20
 _NUMBERS_LOST = 1000  # a damaged line may have held higher numbers than those that can be read
 _BLOCK = 1 << 20
 
@@ -82,12 +83,19 @@ class CommandLogFile:
     """The log in a file; only one process may have it open.
 
     ``notes`` says what was repaired at opening. Raises CommandLogError when the file cannot be
-    read, or not be repaired.
+    read, or not be replaced. A file of at most ``tidy_bytes`` is not worth replacing.
     """
 
-    def __init__(self, path: Path, system: FileSystem = os, most_ids: int = MOST_IDS) -> None:
+    def __init__(
+        self,
+        path: Path,
+        system: FileSystem = os,
+        most_ids: int = MOST_IDS,
+        tidy_bytes: int = TIDY_BYTES,
+    ) -> None:
         self._path, self._part = str(path), f"{path}.part"
         self._folder, self._system, self._most = str(path.parent), system, most_ids
+        self._tidy_bytes = tidy_bytes
         self.notes: list[str] = []
         self.lease_number = 0
         self._answers = self._acknowledged = 0
@@ -97,22 +105,23 @@ class CommandLogFile:
         self._running: dict[str, CommandAnswer] = {}
         self._unanswered: dict[str, CommandAnswer] = {}
         self._results: dict[str, None] = {}
-        # what has to be repaired before the next record: a torn tail, a name not synced
-        self._is_torn, self._is_name_synced = False, False
+        # whether all of the file is on the disk; else it is replaced before the next record
+        self._is_sound = False
         try:
             self._fd = system.open(self._path, os.O_RDWR | os.O_APPEND | os.O_CREAT, 0o640)
         except OSError as error:
             raise _failure(self._path, error) from error
         try:
-            self._size = self._read()
-            self._repair()
+            self._read()
+            # A sync may have failed before: what can be read need not be on the disk. And the torn
+            # tail, and what a killed process did not sync, are dealt with on the way.
+            self._replace()
         except OSError as error:
             self.close()
             raise _failure(self._path, error) from error
-        self._replaced_size = self._size
 
-    def _read(self) -> int:
-        """Read the file; return the end of its last whole record."""
+    def _read(self) -> None:
+        """Read the records of the file; note what is torn or damaged."""
         content = bytearray()
         while block := self._system.read(self._fd, _BLOCK):
             content += block
@@ -130,33 +139,8 @@ class CommandLogFile:
             self.lease_number += _NUMBERS_LOST
             self.notes.append(f"{self._path}: {damaged} damaged lines were skipped")
         if end < len(content):
-            self.notes.append(
-                f"{self._path}: the last {len(content) - end} bytes were torn and were cut off"
-            )
-        self._is_torn = end < len(content)
-        # numbers that were raised only here have to outlast the next line
-        self._must_replace = bool(damaged)
-        return end
-
-    def _repair(self) -> None:
-        """Cut what is no whole record off, and sync the file's name; raises OSError."""
-        if self._is_torn:
-            self._system.ftruncate(self._fd, self._size)
-            self._system.fsync(self._fd)
-            self._is_torn = False
-        if not self._is_name_synced:
-            self._system.fsync(self._fd)  # a killed process may have left records unsynced
-            self._sync_folder()
-            self._is_name_synced = True
-        if self._must_replace:
-            self._replace()
-
-    def _sync_folder(self) -> None:
-        fd = self._system.open(self._folder, os.O_RDONLY | os.O_DIRECTORY)
-        try:
-            self._system.fsync(fd)
-        finally:
-            self._system.close(fd)
+            what = f"the last {len(content) - end} bytes were torn and were cut off"
+            self.notes.append(f"{self._path}: {what}")
 
     # -- what is known
 
@@ -212,16 +196,17 @@ class CommandLogFile:
     def _append(self, record: _Record, *, is_synced: bool = True) -> None:
         line = _line(record)
         try:
-            self._repair()
-            self._is_torn = True
+            if not self._is_sound:
+                self._replace()
             _write(self._system, self._fd, line)
             if is_synced:
                 self._system.fsync(self._fd)
         except OSError as error:
-            with suppress(OSError):  # else before the next record, or at the next opening
-                self._repair()
+            # After a failed sync the system takes the pages as written: only a new file is sure.
+            self._is_sound = False
+            with suppress(OSError):  # so that a record that does not count is not found either
+                self._system.ftruncate(self._fd, self._size)
             raise _failure(self._path, error) from error
-        self._is_torn = False
         self._size += len(line)
         self._apply(record)
 
@@ -281,7 +266,7 @@ class CommandLogFile:
         It takes as long as the disk needs for up to 40 MB, so call it while nothing runs. Without
         room for the new file the old one goes on.
         """
-        if self._size > max(_LEAST_BYTES, 2 * self._replaced_size):
+        if self._size > max(self._tidy_bytes, 2 * self._replaced_size):
             with suppress(OSError):
                 self._replaced_size = self._size  # not at once again where it fails
                 self._replace()
@@ -302,10 +287,14 @@ class CommandLogFile:
             raise
         old, self._fd = self._fd, fd
         self._size = self._replaced_size = size
-        self._is_torn, self._must_replace, self._is_name_synced = False, False, False
+        self._is_sound = False  # until its name is on the disk, too
         self._system.close(old)
-        self._sync_folder()
-        self._is_name_synced = True
+        folder = self._system.open(self._folder, os.O_RDONLY | os.O_DIRECTORY)
+        try:
+            self._system.fsync(folder)
+        finally:
+            self._system.close(folder)
+        self._is_sound = True
 
     def _records(self) -> Iterator[_Record]:
         yield _Counters(self._answers, self._acknowledged, self.lease_number)
