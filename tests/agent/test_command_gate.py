@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from random import Random
 
@@ -99,7 +100,7 @@ def test_accepted_is_on_the_disk_before_it_runs() -> None:
     assert kinds(robot.give(robot.command())) == ["refused"]
 
 
-REFUSALS = {
+REFUSALS: dict[str, Callable[[Robot], Command]] = {
     "no action": lambda r: msgspec.structs.replace(r.command(), action="fly"),
     "no parameter bad": lambda r: msgspec.structs.replace(r.command(), parameters='{"bad": 1}'),
     "has the risk moves": lambda r: order(1, "drive", "state"),

@@ -295,12 +295,12 @@ class World:
         """Somebody orders something, mostly as it should be; the frame goes onto its way."""
         random = self.random
         self.next_id += 1
-        action: str
-        risk: Risk
-        action, risk = random.choice(
-            [("journal.rotate", "record"), ("lamp", "state"), ("drive", "moves")] * 4
-            + [("drive", "record"), ("drive", "state"), ("nothing", "record"), ("lamp", "moves")]
-        )
+        kinds: list[tuple[str, Risk]] = [
+            ("journal.rotate", "record"),
+            ("lamp", "state"),
+            ("drive", "moves"),
+        ] * 4 + [("drive", "record"), ("drive", "state"), ("nothing", "record"), ("lamp", "moves")]
+        action, risk = random.choice(kinds)
         lease = self.lease
         run = lease.run if lease is not None and random.random() < 0.95 else "other"
         command = msgspec.structs.replace(order(self.next_id, action, risk), run=run)
@@ -592,7 +592,12 @@ class World:
         self.stored_number = max([self.stored_number, *(a.number for a in answers)])
         if self.random.random() < 0.7:
             number = self.stored_number + self.random.choice([0, 0, 5])
-            self.act("acknowledges", lambda: self.gate.acknowledged(number) or [])
+
+            def acknowledging() -> list[Decision]:
+                self.gate.acknowledged(number)
+                return []
+
+            self.act("acknowledges", acknowledging)
         for raw in self.sent[-5:]:
             self.give(raw)
 

@@ -45,7 +45,7 @@ CONFIRM_TRIES = 3
 _CODE_DIGITS = 6
 _CHALLENGES = 1000
 _LABEL_LENGTH = 128
-# Refusals that could not be stored: the newest
+# Refusals that could not be stored yet: the newest
 _REMEMBERED = 1000
 # A server that revokes more is not trusted any further: no signed command runs
 _MOST_REVOKED = 10_000
@@ -221,10 +221,11 @@ class CommandGate:
             if self._revoked:
                 self._log.add_revoked(self._revoked)
                 self._revoked = set()
-            for command_id, (digest, answer) in list(self._ends.items()):
-                stored = self._log.add(answer, digest)
-                del self._ends[command_id]
-                self._say(stored)
+            for waiting in (self._ends, self._refused):
+                for command_id, (digest, answer) in list(waiting.items()):
+                    stored = self._log.add(answer, digest)
+                    del waiting[command_id]
+                    self._say(stored)
         except CommandLogError:
             return  # with the next step
 

@@ -107,6 +107,7 @@ class CommandLogFile:
         self._results: dict[str, None] = {}
         # whether all of the file is on the disk; else it is replaced before the next record
         self._is_sound = False
+        self._size = self._replaced_size = 0
         try:
             self._fd = system.open(self._path, os.O_RDWR | os.O_APPEND | os.O_CREAT, 0o640)
         except OSError as error:

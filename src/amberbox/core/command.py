@@ -13,7 +13,6 @@ import hashlib
 import json
 import re
 import uuid
-from collections.abc import Mapping
 from typing import Annotated, Any, Literal, NoReturn, TypeAlias
 
 import msgspec
@@ -195,8 +194,10 @@ def _not_finite(word: str) -> NoReturn:
 
 
 def _depth(value: object) -> int:
-    inner = value.values() if isinstance(value, Mapping) else value
-    return 1 + max(map(_depth, inner), default=0) if isinstance(value, (dict, list)) else 0
+    if not isinstance(value, (dict, list)):
+        return 0
+    inner = value.values() if isinstance(value, dict) else value
+    return 1 + max(map(_depth, inner), default=0)
 
 
 def signed_bytes(command: Command, signature: CommandSignature) -> bytes:
