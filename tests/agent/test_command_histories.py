@@ -301,6 +301,7 @@ class World:
         odd: list[tuple[str, Risk]] = [
             ("drive", "record"), ("drive", "state"), ("nothing", "record"), ("lamp", "moves"),
         ]  # fmt: skip
+        action, risk = random.choice(usual * 4 + odd)
         lease = self.lease
         run = lease.run if lease is not None and random.random() < 0.95 else "other"
         command = msgspec.structs.replace(order(self.next_id, action, risk), run=run)

@@ -101,7 +101,7 @@ class CommandAnswer(Struct, frozen=True):
 
     ``result`` is JSON text, ``at_ns`` the robot's wall clock, ``mono_ns`` its time since ``boot``
     began. ``number`` is the order of the robot's answers, from 1; 0 for a refusal that the
-    robot could not store, which comes again with a number, or that is not about a command of this robot.
+    robot could not store, which comes again with a number, or that is about no command of it.
     """
 
     id: CommandId
