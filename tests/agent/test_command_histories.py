@@ -633,7 +633,7 @@ class World:
         steps = [
             (self.new_order, 22), (self.deliver, 28), (self.pass_time, 10), (self.mint, 8),
             (self.take_lease, 8), (self.confirm, 14), (self.end, 9), (self.abort, 2),
-            (self.revoke, 1), (self.change_trust, 1), (self.contact, 4), (self.restore_server, 1),
+            (self.revoke, 3), (self.change_trust, 1), (self.contact, 4), (self.restore_server, 1),
             (self.break_disk, 2), (self.arm, 3), (self.lose, 4), (self.release, 1),
             (self.step_wall_clock, 3), (self.tick, 4), (lambda: self.crash(), 2),
         ]  # fmt: skip
