@@ -46,6 +46,7 @@ bench: $(TEST)  ## measure the numbers that the documentation quotes (BENCH_ARGS
 soak: $(TEST)  ## what takes long: random lives of stores, of robots and their server, load (about two hours)
 	$(BIN)/python -m benchmarks.soak_verify
 	HYPOTHESIS_PROFILE=soak $(BIN)/python -m pytest --timeout=0 tests/blackbox/retention/test_retention_model.py
+	HYPOTHESIS_PROFILE=soak $(BIN)/python -m pytest --timeout=0 tests/agent/test_command_histories.py
 	HYPOTHESIS_PROFILE=soak $(BIN)/python -m pytest --timeout=0 -m fuzz
 	$(BIN)/python -m tests.server.endtoend.ordeal 10 600 200
 	DAY_FAULTS=8 $(BIN)/python -m pytest --timeout=0 tests/browser/test_technician_day.py
