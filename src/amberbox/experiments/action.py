@@ -82,8 +82,9 @@ class ParameterOptions:
             yield "choices", f"are more than {MOST_CHOICES}"
         for key in ("unit", "description"):
             yield from _unfit(key, getattr(self, key))
+        one = replace(self, type=self.kind, choices=())
         for choice in self.choices:
-            yield from (("choices", what) for what in _refused(replace(self, choices=()), choice))
+            yield from (("choices", what) for what in _refused(one, choice))
         if self.default is not None:
             yield from (("default", what) for what in _refused(self, self.default))
 

@@ -29,7 +29,7 @@ def main(arguments: list[str]) -> int:
             command,
             stdin=subprocess.DEVNULL,
             start_new_session=True,
-            preexec_fn=_default_signals,  # noqa: PLW1509 -- this process has one thread
+            preexec_fn=_default_signals,  # this process has one thread
         )
     except OSError as error:
         print(f"{command[0]}: {error.strerror}", file=sys.stderr)

@@ -1,4 +1,4 @@
-"""A program with a fixed list of arguments, without a shell; its process group ends with the run."""
+"""A program with fixed arguments, without a shell; its process group ends with the run."""
 
 from __future__ import annotations
 
