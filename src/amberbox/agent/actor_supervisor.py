@@ -44,9 +44,16 @@ class SupervisedActor:
     Call ``step`` at least ten times a second, or whenever one of ``filenos`` can be read, until it
     returns the outcome, and ``renew`` while the lease is held. If the actor dies or does not react,
     what is left of it is killed and its ``safe_stop`` is run in a fresh actor.
+
+    ``process`` is one that was started before there was a task, to save that time.
     """
 
-    def __init__(self, task: Task, report: Callable[[str], None] = lambda text: None) -> None:
+    def __init__(
+        self,
+        task: Task,
+        report: Callable[[str], None] = lambda text: None,
+        process: ActorProcess | None = None,
+    ) -> None:
         self._task = task
         self._report = report
         self._phase: Literal["loading", "running", "stopping"] = "loading"
@@ -58,7 +65,8 @@ class SupervisedActor:
         self._killed: Ended | None = None
         self._after: Ended | None = None
         self.outcome: Outcome | None = None
-        self._actor = _Process(task)
+        self._actor = ActorProcess() if process is None else process
+        self._actor.give(task)
 
     @property
     def pid(self) -> int:
@@ -163,8 +171,9 @@ class SupervisedActor:
         self._after, self._since_s, self._killed = ended, boot_s(), None
         printed = self._actor.printed
         try:
-            self._actor = _Process(msgspec.structs.replace(self._task, after=ended))
+            self._actor = ActorProcess()
             self._actor.printed = printed
+            self._actor.give(msgspec.structs.replace(self._task, after=ended))
         except OSError as error:
             self._set(with_trouble(ended, f"the safe stop failed: {error.strerror}"))
 
@@ -174,17 +183,17 @@ class SupervisedActor:
         self.outcome = Outcome(ended.state, reason, hint, ended.result, printed)
 
 
-class _Process:
-    """The process of an actor with its pipes; it leads a session of its own."""
+class ActorProcess:
+    """The process of an actor with its pipes; it leads a session of its own.
 
-    def __init__(self, task: Task) -> None:
-        line = msgspec.json.encode(task) + b"\n"
-        if len(line) > TASK_BYTES:
-            raise UsageError(f"a task has at most {TASK_BYTES} bytes")
+    It waits for its task, and ends if it is closed before.
+    """
+
+    def __init__(self) -> None:
         left_out = ("NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID")
         environment = {k: v for k, v in os.environ.items() if k not in left_out}
         self.process = subprocess.Popen(
-            COMMAND, bufsize=0, env=environment, cwd=task.folder, start_new_session=True,
+            COMMAND, bufsize=0, env=environment, start_new_session=True,
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
         )  # fmt: skip
         assert self.process.stdin and self.process.stdout and self.process.stderr, "they are pipes"
@@ -197,6 +206,13 @@ class _Process:
         self.printed = b""
         for pipe in (self._commands, *self._open):
             os.set_blocking(pipe.fileno(), False)
+
+    def give(self, task: Task) -> None:
+        """Give it its task; raises UsageError for one that is too long."""
+        line = msgspec.json.encode(task) + b"\n"
+        if len(line) > TASK_BYTES:
+            self.close()
+            raise UsageError(f"a task has at most {TASK_BYTES} bytes")
         self._write(line)
 
     def tell(self, line: str) -> None:

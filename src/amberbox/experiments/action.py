@@ -363,8 +363,8 @@ def _keys(cls: type[Any]) -> frozenset[str]:
 def _check_parameter_names(
     name: str, node: Node, options: ActionOptions, problems: list[Problem]
 ) -> None:
-    nodes = ((node.mapping or {}).get("parameters", node).mapping or {}).items()
-    for key, at in nodes:
+    declared = (node.mapping or {}).get("parameters")
+    for key, at in ((declared and declared.mapping) or {}).items():
         where = f"{name}.parameters.{key}"
         if not _PARAMETER_NAME.fullmatch(key):
             hint = "a-z 0-9 _ and a letter first"
