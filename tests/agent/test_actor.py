@@ -12,9 +12,10 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 
-from amberbox.agent.actor import COMMAND, Task
+from amberbox.agent.actor import COMMAND, Ended, Task
 from amberbox.agent.actor_supervisor import ActorProcess, Outcome, SupervisedActor
 from amberbox.core.errors import UsageError
 from amberbox.testing.clock import PATIENCE_S, wait_until
@@ -171,6 +172,47 @@ def test_killed_while_the_robot_moves(folder: Path, robot: ZmqRobot) -> None:
     assert robot.heard("stop")[0] > killed_s
 
 
+def test_killed_while_it_stops(own: Own, robot: ZmqRobot) -> None:
+    stop = """
+def stop(context):
+    tell("stop")
+    if not os.path.exists("stopped_once"):
+        open("stopped_once", "w").close()
+        time.sleep(1000)
+"""
+    actor = SupervisedActor(own("def act(context):\n    context.wait(60)\n", stop))
+    until_running(actor)
+    actor.abort("by anna")
+    robot.wait_until("stop")
+    os.kill(actor.pid, signal.SIGKILL)
+    outcome = to_end(actor)
+    assert outcome == Outcome("outcome_unknown", "its process was killed (SIGKILL)")
+    assert len(robot.heard("stop")) == 2
+
+
+def test_only_stops_after_a_run_that_nobody_has_seen_end(folder: Path, robot: ZmqRobot) -> None:
+    ended = Ended("outcome_unknown", "the robot was restarted")
+    outcome = to_end(SupervisedActor(drive(folder, after=ended)))
+    assert outcome == Outcome("outcome_unknown", "the robot was restarted")
+    assert [said["do"] for _, said in robot.hears] == ["stop"]
+
+
+def test_an_actor_that_fails_itself_stops_without_its_parent(own: Own, robot: ZmqRobot) -> None:
+    act = """
+    def act(context):
+        tell("linear")
+        import select
+        select.select = None
+        time.sleep(1000)
+    """
+    with subprocess.Popen(COMMAND, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL) as process:
+        assert process.stdin is not None
+        process.stdin.write(msgspec.json.encode(own(act)) + b"\n")
+        process.stdin.flush()
+        robot.wait_until("stop")
+    assert not robot.moving
+
+
 def test_lost_renewals(folder: Path, robot: ZmqRobot) -> None:
     actor = SupervisedActor(drive(folder))
     moving(actor, robot)
@@ -207,8 +249,6 @@ def raw(task: Task) -> subprocess.Popen[bytes]:
     """Start an actor without its parent."""
     process = subprocess.Popen(COMMAND, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
     assert process.stdin is not None
-    import msgspec
-
     process.stdin.write(msgspec.json.encode(task) + b"\n")
     process.stdin.flush()
     return process

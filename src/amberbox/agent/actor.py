@@ -45,6 +45,7 @@ REPORTS_PER_S = 10
 _LOOK_S = 0.1  # the longest look at anything but CLOCK_BOOTTIME, which select does not know
 _WRITE_S = 1.0
 _NS = 1_000_000_000
+_SIGNALS = (signal.SIGTERM, signal.SIGINT)
 
 EndState = Literal["done", "failed", "aborted", "outcome_unknown"]
 COMMAND = (sys.executable, "-P", "-m", "amberbox.agent.actor")
@@ -191,10 +192,11 @@ class Actor:
         self._woken, self._wake = os.pipe()
         os.set_blocking(self._woken, False)
         os.set_blocking(self._wake, False)
-        for number in (signal.SIGTERM, signal.SIGINT):
+        for number in _SIGNALS:
             signal.signal(number, lambda number, frame: None)
         # C code writes the number: it arrives even while the action is deep in a library
         signal.set_wakeup_fd(self._wake, warn_on_full_buffer=False)
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, _SIGNALS)  # see _replace_process
 
     def carry_out(self) -> None:
         """Load the action and run it; whatever it raises becomes the end of the run."""
@@ -248,12 +250,16 @@ class Actor:
         """Wait for the end of the run or a reason to end it; end the process."""
         try:
             self._watch()
-        except BaseException as error:  # a defect: the parent stops the robot when we are gone
-            self._pipes.put(State("report", reason=describe(error)))
-        os._exit(1)
+        except BaseException as error:  # such as no memory for one more thread
+            with contextlib.suppress(BaseException):
+                if self._begun_s is not None and self._can_stop:
+                    what = f"the actor failed: {describe(error)}"
+                    self._replace_process(Ended("outcome_unknown", what))
+        finally:
+            os._exit(1)  # the parent stops the robot when we are gone
 
     def _watch(self) -> NoReturn:
-        lost_s = LOST_AFTER * self._task.renewal_s
+        lost_s = LOST_AFTER * min(1.0, max(0.05, self._task.renewal_s))
         renewed_s = boot_s()
         while True:
             select.select([self._pipes.commands, self._woken], [], [], min(_LOOK_S, lost_s / 4))
@@ -317,7 +323,9 @@ class Actor:
         os.write(task, b"\n")
         os.lseek(task, 0, os.SEEK_SET)
         os.dup2(task, 0)
-        os.dup2(self._pipes.states, 1)
+        with contextlib.suppress(OSError):  # an action may close anything
+            os.dup2(self._pipes.states, 1)
+        signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS)  # until there are handlers again
         os.execv(sys.executable, COMMAND)
 
     def _exit(self, ended: Ended) -> NoReturn:

@@ -15,6 +15,7 @@ import msgspec
 from amberbox.agent.actor import COMMAND, Ended, EndState, State, Task, boot_s, with_trouble
 from amberbox.core.errors import UsageError
 from amberbox.core.safe_text import one_line
+from amberbox.experiments.action import LONGEST_STOP_S
 
 TASK_BYTES = 60_000  # what fits into a pipe at once
 PRINTED_BYTES = 4096  # the end of what the action prints
@@ -46,7 +47,8 @@ class SupervisedActor:
     returns the outcome, and ``renew`` while the lease is held. If the actor dies or does not react,
     what is left of it is killed and its ``safe_stop`` is run in a fresh actor.
 
-    ``process`` is one that was started before there was a task, to save that time.
+    ``process`` is one that was started before there was a task, to save that time. A task with
+    ``after`` only stops the robot, such as after a restart that has left a run without an end.
     """
 
     def __init__(
@@ -64,7 +66,7 @@ class SupervisedActor:
         self._abort_reason = ""
         self._end: Ended | None = None
         self._killed: Ended | None = None
-        self._after: Ended | None = None
+        self._after = task.after
         self.outcome: Outcome | None = None
         self._actor = ActorProcess() if process is None else process
         self._actor.give(task)
@@ -131,7 +133,7 @@ class SupervisedActor:
         """Return how the run ends if its process does not react in time; None while it does."""
         now_s = boot_s()
         for_s = now_s - self._since_s
-        stop_s = self._limits.stop_timeout_s
+        stop_s = self._limits.stop_timeout_s or LONGEST_STOP_S
         if self._end is not None:
             return self._end if for_s > EXIT_S else None
         if self._after is not None:

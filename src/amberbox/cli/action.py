@@ -6,7 +6,7 @@ import argparse
 import contextlib
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -69,7 +69,7 @@ def _list(args: argparse.Namespace, folder: Path) -> int:
     return 0
 
 
-def action_rows(actions: Any) -> list[Sequence[str]]:
+def action_rows(actions: Iterable[DeclaredAction]) -> list[Sequence[str]]:
     """Return a row for each action: name, risk, parameters with their limits, description."""
     return [
         (
@@ -166,5 +166,6 @@ def _ask(action: DeclaredAction, values: dict[str, Any]) -> None:
         raise UsageError(f"{action.name} moves the robot", "--yes says that nobody is in its way")
     shown = " ".join(f"{name}={value}" for name, value in values.items())
     question = f"{action.name} {shown}".rstrip() + " moves the robot. Is its way free? [y/N] "
-    if input(question).strip().lower() not in ("y", "yes"):
+    print(question, end="", flush=True)
+    if sys.stdin.readline().strip().lower() not in ("y", "yes"):
         raise UsageError("not confirmed: nothing was done")

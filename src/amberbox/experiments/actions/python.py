@@ -8,12 +8,14 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from amberbox.core.contracts import ActionContext
 from amberbox.core.errors import AmberboxError, NotStartedError, did_you_mean
 from amberbox.core.options import option
 from amberbox.core.plugins import Plugin
+
+if TYPE_CHECKING:  # it loads numpy, which takes longer than the rest of an actor's start
+    from amberbox.core.contracts import ActionContext
 
 SAMPLE = """\
 dock:

@@ -11,12 +11,14 @@ import sys
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, TYPE_CHECKING, Any
 
-from amberbox.core.contracts import ActionContext
 from amberbox.core.errors import AmberboxError, NotStartedError
 from amberbox.core.options import option
 from amberbox.experiments.actions import _placeholders
+
+if TYPE_CHECKING:  # it loads numpy, which takes longer than the rest of an actor's start
+    from amberbox.core.contracts import ActionContext
 
 SAMPLE = """\
 restart_driver:

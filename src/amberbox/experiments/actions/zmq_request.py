@@ -7,15 +7,17 @@ import re
 import time
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 
 from amberbox.core.config import Finding
-from amberbox.core.contracts import ActionContext
 from amberbox.core.errors import AmberboxError, NotStartedError
 from amberbox.core.options import option
 from amberbox.experiments.actions import _placeholders
+
+if TYPE_CHECKING:  # it loads numpy, which takes longer than the rest of an actor's start
+    from amberbox.core.contracts import ActionContext
 
 SAMPLE = """\
 drive_linear:
