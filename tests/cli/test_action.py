@@ -62,7 +62,7 @@ def folder(tmp_path: Path, robot: ZmqRobot) -> str:
 def test_list(folder: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["action", folder]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert lines[2].split() == [
+    assert lines[1].split() == [
         "drive", "moves", "distance_m", "-2", "..", "2", "m,", "slow", "bool,", "where", "string",
         "Drive", "straight", "ahead",
     ]  # fmt: skip

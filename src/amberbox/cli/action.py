@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from amberbox.cli._arguments import add_actions
-from amberbox.cli._output import print_grid, print_json
+from amberbox.cli._output import in_columns, print_json, print_lines
 from amberbox.core.errors import AmberboxError, ConfigurationError, UsageError
 from amberbox.core.interrupt import Interrupt
 from amberbox.experiments.action import (
@@ -60,7 +60,8 @@ def _list(args: argparse.Namespace, folder: Path) -> int:
     if args.json:
         print_json(json.loads(announcement(folder)))
     elif found:
-        print_grid(("action", "risk", "parameters", "description"), action_rows(found.values()))
+        header = ("action", "risk", "parameters", "description")
+        print_lines(in_columns([header, *action_rows(found.values())], ""))
     else:
         print(f"no actions: there is no {FOLDER}/*.yaml in {folder}")
     errors = [problem for problem in problems if problem.is_error]
