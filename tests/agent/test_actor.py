@@ -195,6 +195,9 @@ def test_only_stops_after_a_run_that_nobody_has_seen_end(folder: Path, robot: Zm
     outcome = to_end(SupervisedActor(drive(folder, after=ended)))
     assert outcome == Outcome("outcome_unknown", "the robot was restarted")
     assert [said["do"] for _, said in robot.hears] == ["stop"]
+    twin = drive(folder, simulated=True, after=ended)
+    assert to_end(SupervisedActor(twin)) == outcome, "nothing has to be stopped"
+    assert len(robot.hears) == 1
 
 
 def test_an_actor_that_fails_itself_stops_without_its_parent(own: Own, robot: ZmqRobot) -> None:

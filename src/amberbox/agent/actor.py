@@ -337,6 +337,8 @@ class Actor:
             self._load()
         except AmberboxError as error:
             exit_with(with_trouble(ended, f"the safe stop failed: {error.what}"), self._pipes)
+        if not self._can_stop:
+            exit_with(ended, self._pipes)
         trouble, _ = stop_safely(self._loaded, self._values, self._pipes)
         exit_with(with_trouble(ended, trouble), self._pipes)
 
