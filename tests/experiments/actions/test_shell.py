@@ -79,6 +79,9 @@ def test_commands_that_are_fine() -> None:
     assert [key for key, _ in Config(("x",), environment={"A=": "b"}, end=-1).check()] == [
         "end", "environment",
     ]  # fmt: skip
+    assert list(Config(("x",), end=10).check()) == []
+    stopped = list(Config(("x",), safe_stop=("y",), end=10).check())
+    assert [key for key, _ in stopped] == ["end"], "it could command the robot after the stop"
 
 
 def test_failure_and_a_program_that_is_not_there() -> None:

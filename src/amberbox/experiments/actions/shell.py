@@ -37,6 +37,7 @@ _GROUP = Path(__file__).with_name("_group.py")
 _INTERPRETERS = re.compile(r"(?:ba|da|z|k|fi|c|tc)?sh|busybox|python[\d.]*|perl|ruby|node|lua|awk")
 _CODE = ("-c", "-e", "--eval", "--command")
 _LOOK_S = 0.05
+_END_BEFORE_STOP_S = 0.2
 _LATE_S = 1.0  # how long the group may take to be gone after SIGKILL
 
 
@@ -58,8 +59,10 @@ class Config:
             yield from ((key, what) for what in _unfit(getattr(self, key)))
         if not self.command:
             yield "command", "names no program"
-        if not 0 <= self.end <= 30:
-            yield "end", "must be from 0 to 30 s"
+        most = _END_BEFORE_STOP_S if self.safe_stop else 30.0
+        if not 0 <= self.end <= most:
+            what = ": the program must be gone when the robot is stopped" * bool(self.safe_stop)
+            yield "end", f"must be from 0 to {most:g} s{what}"
         for name, value in self.environment.items():
             if not name or "=" in name or "\0" in name + value:
                 yield "environment", f"'{name}' is no variable of the environment"
