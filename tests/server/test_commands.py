@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import msgspec
 import pytest
@@ -97,8 +97,8 @@ def said(one: StoredCommand, state: AnswerState, number: int, reason: str = "") 
     return CommandAnswer(one.id, state, reason, "{}", 5, "boot", 6, number)
 
 
-def drive(**values: object) -> Command:
-    return command(action="drive_linear", parameters='{"distance_m": 1}', risk="moves", **values)
+def drive() -> Command:
+    return command(action="drive_linear", parameters='{"distance_m": 1}', risk="moves")
 
 
 def test_the_id_of_a_server_is_made_once(rows: Rows, tmp_path: Path) -> None:
@@ -150,7 +150,7 @@ def test_a_command_is_made_once_and_another_with_its_id_is_refused(rows: Rows) -
     ],
 )
 def test_what_no_robot_would_accept_is_not_stored(
-    rows: Rows, values: dict[str, object], what: str
+    rows: Rows, values: dict[str, Any], what: str
 ) -> None:
     with pytest.raises(UsageError, match=what):
         rows.create(command(**values))

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import secrets
+from typing import Any
 
 from amberbox.core.clock import NS, SystemClock
-from amberbox.core.command import Command
+from amberbox.core.command import Command, new_command_id
 from amberbox.server import commands
 from amberbox.server.commands import StoredCommand
 from amberbox.server.database import ServerDatabase
@@ -13,10 +13,13 @@ from amberbox.server.database import ServerDatabase
 HOUR_NS = 3600 * NS
 
 
-def command(robot: str = "r1", action: str = "incident.pin", **values: object) -> Command:
-    """Compose an unsigned command."""
-    given = {"id": secrets.token_hex(16), "parameters": "{}", "issuer": "anna", "risk": "record"}
-    return Command(**{"robot": robot, "action": action, **given, **values})  # type: ignore[arg-type]  # any field
+def command(robot: str = "r1", **values: Any) -> Command:
+    """Compose an unsigned command, with other values than usual."""
+    usual: dict[str, Any] = {
+        "id": new_command_id(), "robot": robot, "action": "incident.pin", "parameters": "{}",
+        "issuer": "anna", "risk": "record",
+    }  # fmt: skip
+    return Command(**{**usual, **values})
 
 
 def created(

@@ -89,7 +89,8 @@ class NoCommands:
 
     async def report(self) -> GateReport:
         """Wait for ever: there is nothing to send."""
-        return await asyncio.get_running_loop().create_future()
+        never: asyncio.Future[GateReport] = asyncio.get_running_loop().create_future()
+        return await never
 
     def commands(self, commands: Sequence[bytes]) -> None:
         """Do nothing."""

@@ -52,7 +52,7 @@ RESEND_NS: Final = 10 * NS
 MOST_OPEN: Final = 1000
 
 # What is said of a command that expired in this state
-_EXPIRED: Final[Mapping[CommandState, str]] = {
+_EXPIRED: Final[Mapping[str, str]] = {
     "waiting": "it expired before the robot was there",
     "sent": "it expired without an answer: the robot may have received it",
 }
