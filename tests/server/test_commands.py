@@ -296,6 +296,15 @@ def test_a_refusal_that_the_robot_could_not_store_is_kept_but_not_acknowledged(r
     assert rows.do(lambda c: commands.begin_contact(c, "r1", epoch, "s")).answered == 0
 
 
+def test_a_refusal_of_other_bytes_does_not_end_what_is_carried_out(rows: Rows) -> None:
+    one = rows.create(command())
+    epoch = rows.connect()
+    rows.answer(epoch, said(one, "accepted", 1), said(one, "refused", 0, "other content"))
+    assert rows.find(one).state == "accepted"
+    rows.answer(epoch, said(one, "done", 2))
+    assert rows.find(one).state == "done"
+
+
 def test_only_the_newer_of_two_connections_sends_and_stores(rows: Rows) -> None:
     one = rows.create(command())
     old, new = rows.connect(), rows.connect()
@@ -399,6 +408,8 @@ def test_an_older_log_of_the_same_store_is_acknowledged_by_its_own_numbers(rows:
     assert rows.answer(epoch, said(two, "done", 300)).number == 300
     assert rows.do(lambda c: commands.begin_contact(c, "r1", epoch, "s")).answered == 300
     assert rows.find(two).state == "done"
+    begun = rows.do(lambda c: commands.begin_contact(c, "r1", epoch, "s", is_other_history=True))
+    assert begun.answered == 0, "where the image is noticed, nothing is taken for stored"
 
 
 def test_revocations_only_grow(rows: Rows) -> None:

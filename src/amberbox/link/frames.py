@@ -292,7 +292,7 @@ class LeaseFrame(Struct, frozen=True, tag="lease"):
 
 
 class AbortFrame(Struct, frozen=True, tag="abort"):
-    """Stop what a run or one command does, safely; of the two one is empty."""
+    """Stop what a run or one command does, safely; without either all that the robot does."""
 
     run: Name = ""
     command: Name = ""

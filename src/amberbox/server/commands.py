@@ -340,7 +340,9 @@ def store_answers(
         last = changes.get(one.id)
         is_answered = last is not None or row.answered_ns is not None
         state = row.state if last is None else last.state
-        if not is_answered or (state == "accepted" and one.state != "accepted"):
+        # a refusal without a number is of other bytes with this id, or was not stored
+        is_end = bool(one.number) and state == "accepted" and one.state != "accepted"
+        if not is_answered or is_end:
             changes[one.id] = one
     for command_id, one in changes.items():
         values = {"state": one.state, "reason": one.reason, "answered_ns": now_ns}
@@ -360,15 +362,23 @@ class CommandContact:
     answered: int
 
 
-def begin_contact(connection: Connection, robot: str, epoch: int, store_id: str) -> CommandContact:
+def begin_contact(
+    connection: Connection,
+    robot: str,
+    epoch: int,
+    store_id: str,
+    *,
+    is_other_history: bool = False,
+) -> CommandContact:
     """Begin a connection of a robot that takes commands.
 
-    In another store it counts its answers anew. Raises StaleEpochError when the robot has since
-    connected again.
+    In another store it counts its answers anew, and after an old image of its disk was restored
+    (``is_other_history``) from an earlier number: none are acknowledged then before they come.
+    Raises StaleEpochError when the robot has since connected again.
     """
     _hold(connection, robot, epoch)
     known = select(COMMAND_ROBOT.c.store_id).where(COMMAND_ROBOT.c.robot == robot)
-    if connection.execute(known).scalar() != store_id:
+    if is_other_history or connection.execute(known).scalar() != store_id:
         row = {"robot": robot, "store_id": store_id, "answered": 0, "actions": "", "lease": 0,
                "holder": "", "run": ""}  # fmt: skip
         upsert_rows(connection, COMMAND_ROBOT, [row], ("store_id", "answered"))

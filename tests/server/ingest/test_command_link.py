@@ -15,6 +15,7 @@ from amberbox.core.command import CommandAnswer, LeaseState, decode_command
 from amberbox.link import limits
 from amberbox.link.frames import (
     AbortFrame,
+    Ack,
     ActionsFrame,
     AnsweredFrame,
     AnswersFrame,
@@ -23,11 +24,15 @@ from amberbox.link.frames import (
     ChallengeFrame,
     CommandsFrame,
     Hello,
+    JournalPosition,
     LeaseFrame,
     Pong,
     RevokedFrame,
+    RowsFrame,
+    RunEnd,
     ServerFrame,
     Welcome,
+    WriterReach,
 )
 from amberbox.server import commands
 from amberbox.server.database import ServerDatabase
@@ -176,6 +181,27 @@ def test_many_commands_come_in_frames_of_bounded_size(database: ServerDatabase) 
                     heard += ids(frame)
                 assert len(heard) == (100, 120)[number]
             assert len(set(heard)) == 120
+
+    asyncio.run(scene())
+
+
+def test_an_old_image_of_the_disk_has_nothing_acknowledged_that_did_not_come(
+    database: ServerDatabase,
+) -> None:
+    def hello(run: int) -> Hello:
+        at = JournalPosition(run, 9)
+        reach = WriterReach(JournalPosition(1, 0), at, at, (RunEnd(run, "b", 9),))
+        return msgspec.structs.replace(HELLO, writers={"watch": reach})
+
+    async def scene() -> None:
+        for run, answered in ((3, 0), (3, 7), (1, 0)):
+            async with serving_one(database, "r1") as (_, socket):
+                epoch, heard = await greeted(socket, hello(run))
+                assert heard == [AnsweredFrame(answered)]
+                socket.say(RowsFrame(epoch, 1, [], {"watch": JournalPosition(run, 9)}))
+                socket.say(AnswersFrame(epoch, 1, [done("ab" * 16, 7)]))
+                assert isinstance(await socket.hear(), Ack)
+                assert await socket.hear() == AnsweredFrame(7)
 
     asyncio.run(scene())
 

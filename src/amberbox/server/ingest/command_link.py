@@ -46,6 +46,8 @@ class RobotContact:
     robot: str
     epoch: int
     store_id: str
+    is_other_history: bool = False
+    """Whether an old image of its disk was restored since the connection before."""
     challenges: tuple[tuple[int, bytes], ...] = ()
     """Times of receipt (ns since the server's boot) and challenges, oldest first."""
     lease: LeaseState | None = None
@@ -85,7 +87,7 @@ class CommandLink:
         """Begin a connection: return revoked keys, and which answers are stored."""
         work = partial(
             commands.begin_contact, robot=contact.robot, epoch=contact.epoch,
-            store_id=contact.store_id,
+            store_id=contact.store_id, is_other_history=contact.is_other_history,
         )  # fmt: skip
         return self._after(
             work,

@@ -40,7 +40,7 @@ from amberbox.link.frames import (
     encode,
     from_robot,
 )
-from amberbox.link.ledger import LinkAdmission, StaleEpochError, StoredRows
+from amberbox.link.ledger import OTHER, LinkAdmission, StaleEpochError, StoredRows
 from amberbox.link.server_end import (
     AdmitRobot,
     IgnoreFrame,
@@ -331,7 +331,8 @@ class LinkServer:
         )  # fmt: skip
         await one.answers.put((welcome,))
         if one.end.takes_commands:
-            one.contact = RobotContact(one.robot, admission.epoch, hello.store_id)
+            is_other = any(conflict.why == OTHER for conflict in admission.conflicts)
+            one.contact = RobotContact(one.robot, admission.epoch, hello.store_id, is_other)
             await one.answers.put(self._task(one, self._commands.begin(one.contact)))
         self._hooks.admitted(hello, admission)
         if known is not None:
