@@ -253,4 +253,6 @@ def parse_key_text(text: str) -> bytes:
         raise CommandError(f"no public key: {error}", hint) from error
     if len(public) != ed25519.KEY_BYTES:
         raise CommandError(f"a public key has {ed25519.KEY_BYTES} bytes, not {len(public)}", hint)
+    if key_text(public) != text:
+        raise CommandError("the last character of a public key is another one", hint)
     return public
