@@ -203,6 +203,12 @@ def test_a_command_signed_for_another_server_or_with_a_revoked_key_is_not_stored
         rows.create(rows.signed(drive()), HOUR_NS, CHALLENGE)
 
 
+@pytest.mark.parametrize("ttl_s", [0, 61, 31_536_000])
+def test_a_signature_that_holds_too_long_is_not_stored(rows: Rows, ttl_s: int) -> None:
+    with pytest.raises(UsageError, match="1 to 60 s"):
+        rows.create(rows.signed(drive(), ttl_s=ttl_s), HOUR_NS, CHALLENGE)
+
+
 def test_unanswered_commands_are_sent_on_each_connection_and_again_after_a_while(
     rows: Rows,
 ) -> None:

@@ -199,6 +199,8 @@ def _check_signature(
     again = "sign it again while the robot is connected"
     if signature.server != server_id(connection, now_ns):
         raise UsageError("the command is signed for another server", again)
+    if not 0 < signature.ttl_s <= MOST_TTL_S:
+        raise UsageError(f"a signature holds for 1 to {MOST_TTL_S} s", again)
     if signature.challenge not in challenges:
         what = f"{command.robot} is not connected, or has not minted this challenge in the last "
         raise UsageError(f"{what}{MOST_TTL_S} s", again)

@@ -35,11 +35,13 @@ from amberbox.link.frames import (
     WriterReach,
 )
 from amberbox.server import commands
+from amberbox.server.bus import ServerChange
 from amberbox.server.database import ServerDatabase
 from amberbox.server.ingest.link_server import LinkHooks, LinkServer
 from amberbox.server.schema import COMMAND, COMMAND_ROBOT, EVENT
 from amberbox.testing.clock import PATIENCE_S, ManualClock, until
 from tests.link.old_wire import encode as encode_anything
+from tests.server.house import House, house
 from tests.support.commands import command, created, found
 from tests.support.sockets import FakeSocket, serving_one
 
@@ -486,3 +488,34 @@ def test_expired_commands_are_given_up_when_the_robot_comes(database: ServerData
     with database.reading() as connection:
         state = connection.scalar(select(COMMAND.c.state).where(COMMAND.c.id == one.id))
     assert state == "expired"
+
+
+def test_the_server_sends_what_was_made_and_tells_what_was_answered(tmp_path: Path) -> None:
+    heard: list[ServerChange] = []
+
+    async def scene(home: House) -> None:
+        services, socket = home.services, FakeSocket()
+        services.bus.attach(asyncio.get_running_loop())
+        services.bus.on("answered", heard.append)
+        task = asyncio.create_task(services.links.serve(socket, "ropod_001"))
+        epoch, _ = await greeted(socket, msgspec.structs.replace(HELLO, robot="ropod_001"))
+        socket.say(challenge(epoch), BeatFrame(epoch, 1, 3))
+        assert isinstance(await socket.hear(), Pong)
+
+        def make() -> str:
+            with services.database.begin() as connection:
+                now_ns = services.clock.wall_ns()
+                one = commands.create(connection, now_ns, command("ropod_001"), 60 * NS)
+            services.bus.publish(ServerChange("command", "ropod_001", {"id": one.id}))
+            return one.id
+
+        made = await asyncio.to_thread(make)
+        assert ids(await socket.hear()) == [made]
+        socket.say(AnswersFrame(epoch, 1, [done(made, 1)]))
+        assert await socket.hear() == AnsweredFrame(1)
+        assert heard == [ServerChange("answered", "ropod_001", {"ids": (made,)})]
+        await socket.close()
+        await task
+
+    with house(tmp_path / "server") as home:
+        asyncio.run(scene(home))
