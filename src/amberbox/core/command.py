@@ -11,6 +11,7 @@ import base64
 import binascii
 import hashlib
 import json
+import re
 import uuid
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal, NoReturn, TypeAlias
@@ -44,6 +45,7 @@ _LARGEST = 2**62
 _DOMAIN = b"amberbox-command-1\0"
 _KEY_PREFIX = "ed25519:"
 
+_ID = re.compile(r"[0-9a-f]{32}")
 # ``\Z`` and not ``$``, which would let a line end pass
 CommandId: TypeAlias = Annotated[str, Meta(pattern=r"\A[0-9a-f]{32}\Z")]
 KeyId: TypeAlias = Annotated[str, Meta(pattern=r"\A[0-9a-f]{16}\Z")]
@@ -77,7 +79,8 @@ class CommandSignature(Struct, frozen=True):
 class Command(Struct, frozen=True):
     """What a person or a run wants a robot to do.
 
-    ``parameters`` is the JSON text of an object as it was signed, never encoded again.
+    ``parameters`` is the JSON text of an object as it was signed, never encoded again. ``issuer``
+    is the name of the person at the server, which no signature covers.
     ``created_ns`` and ``expires_ns`` are the server's wall clock; the robot ignores them.
     """
 
@@ -132,6 +135,11 @@ _DECODER: msgspec.msgpack.Decoder[Command] = msgspec.msgpack.Decoder(Command)
 def new_command_id() -> str:
     """Return a random id for a command, 32 hex digits."""
     return uuid.uuid4().hex
+
+
+def is_command_id(text: str) -> bool:
+    """Return whether a text has the form of a command's id."""
+    return _ID.fullmatch(text) is not None
 
 
 def encode_command(command: Command) -> bytes:
