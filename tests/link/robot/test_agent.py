@@ -114,6 +114,8 @@ def test_the_doctor_says_how_the_link_is() -> None:
     assert link_in_words({**state, "backlog": 12}, now_ns).endswith(
         "the newest 12 records are not acknowledged yet"
     )
+    newer = link_in_words({**state, "unknown_frames": 3}, now_ns)
+    assert newer == "linked to https://f, 3 frames of its newer version were ignored"
     late = judged_link(state, now_ns + 300 * NS, "")
     assert (late.level, late.found) == ("warn", "the link to https://f has said nothing for 5 min")
     cut = {**state, "connected": False, "trouble": "no way"}

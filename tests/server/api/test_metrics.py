@@ -35,6 +35,7 @@ def test_figures_are_there(home: House) -> None:
     values = dict(line.rsplit(" ", 1) for line in found.text.splitlines() if line[0] != "#")
     assert values["amberbox_robots"] == "3" and values["amberbox_robots_online"] == "0"
     assert values["amberbox_rows_received_total"] == "3"
+    assert values["amberbox_link_unknown_frames_total"] == "0"
     assert values["amberbox_row_bytes_received_total"] == "15"
     assert int(values["amberbox_database_bytes"]) > 4096
     assert float(values["process_resident_memory_bytes"]) > 1e7
