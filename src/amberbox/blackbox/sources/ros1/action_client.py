@@ -149,7 +149,9 @@ class GoalOutcome:
 class ActionClient:
     """A client of one action server; use it in a ``with`` block."""
 
-    def __init__(self, name: str, kind: ActionType, settings: NodeSettings) -> None:
+    def __init__(
+        self, name: str, kind: ActionType, settings: NodeSettings, deadline: Deadline
+    ) -> None:
         self.name = name
         self._kind = kind
         self._changed = threading.Condition()
@@ -160,7 +162,8 @@ class ActionClient:
         self._status = message_type(STATUS)
         self._readers: dict[str, TopicReader] = {}
         self._bad = ""
-        self._node = RosNode(settings)
+        self.statuses_heard = 0
+        self._node = RosNode(settings, deadline)
         self._caller_id = settings.caller_id
 
     def __enter__(self) -> ActionClient:
@@ -288,6 +291,7 @@ class ActionClient:
             return
         with self._changed:
             self._heard[node] = statuses
+            self.statuses_heard += node == self._server
             if self._tracker is not None and node == self._server:
                 self._tracker.status_received(statuses, time.monotonic())
             self._changed.notify_all()

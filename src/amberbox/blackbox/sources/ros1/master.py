@@ -20,7 +20,7 @@ from urllib.parse import urlsplit
 from xml.etree import ElementTree
 from xml.etree.ElementTree import ParseError
 
-from amberbox.core.errors import AmberboxError
+from amberbox.core.errors import AmberboxError, UsageError
 from amberbox.core.tls import is_loopback
 
 
@@ -97,6 +97,17 @@ def master_uri(text: str) -> str:
     if not _HOST.fullmatch(f"[{host}]" if ":" in host else host):
         raise ValueError(f"'{text}' names no host")
     return _uri(host, port)
+
+
+def chosen_master(configured: str, environment: Mapping[str, str]) -> str:
+    """Return the URI of the master: the configured one, ROS_MASTER_URI, or the local one.
+
+    Raises UsageError if it cannot be one.
+    """
+    try:
+        return master_uri(configured or environment.get("ROS_MASTER_URI") or DEFAULT_MASTER)
+    except ValueError as error:
+        raise UsageError(f"ros_master_uri: {error}", "write http://HOST:11311") from error
 
 
 def host_and_port(uri: str, default_port: int = 0) -> tuple[str, int]:

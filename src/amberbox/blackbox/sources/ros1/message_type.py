@@ -40,7 +40,8 @@ MOST_DEFINITION_BYTES = 1 << 18
 MOST_PROBLEMS = 20
 
 _TYPE_NAME = re.compile(r"[A-Za-z]\w*/[A-Za-z]\w*", re.ASCII)
-_ABSENT: Any = object()
+UNGIVEN: Any = object()
+"""In place of a value that is not known yet: the field is checked by its name only."""
 
 _CODES = {
     "bool": "?", "int8": "b", "byte": "b", "uint8": "B", "int16": "h", "uint16": "H",
@@ -264,7 +265,7 @@ class _MessageWriter:
     def structure(self, name: str, value: Any, path: str) -> None:
         self.budget.spend()
         fields = self.definition.structures[name].fields
-        given = {} if value is _ABSENT else value
+        given = {} if value is UNGIVEN else value
         if not isinstance(given, Mapping):
             self.refuse(path, f"must have the fields of {_short(name)}, {_shown(value)} has none")
             return
@@ -275,21 +276,21 @@ class _MessageWriter:
                 self.refuse(_below(path, key), f"is no field of {_short(name)}{near}")
         for member, kind in fields:
             if member != FILLER:
-                self.member(kind, given.get(member, _ABSENT), _below(path, member))
+                self.member(kind, given.get(member, UNGIVEN), _below(path, member))
 
     def member(self, kind: FieldType, value: Any, path: str) -> None:
         if kind.count is None:
             self.single(kind.base, value, path)
             return
         fixed = kind.count >= 0
-        if value is _ABSENT and fixed and kind.base in SIZES:
+        if value is UNGIVEN and fixed and kind.base in SIZES:
             self.room(SIZES[kind.base] * kind.count)
             self.out += bytes(SIZES[kind.base] * kind.count)
             return
         items = self.items(kind, value, path)
         if items is None:
             return
-        if fixed and value is not _ABSENT and len(items) != kind.count:
+        if fixed and value is not UNGIVEN and len(items) != kind.count:
             self.refuse(path, f"must have {kind.count} values, not {len(items)}")
             return
         if not fixed:
@@ -302,10 +303,10 @@ class _MessageWriter:
 
     def items(self, kind: FieldType, value: Any, path: str) -> Sequence[Any] | None:
         """Return the values of a list or array, bytes as they are; None if there are none."""
-        if value is _ABSENT:
+        if value is UNGIVEN:
             count = max(0, kind.count or 0)
             self.budget.spend(count)
-            return [_ABSENT] * count
+            return [UNGIVEN] * count
         if isinstance(value, str) and kind.base == "uint8":
             try:
                 return base64.b64decode(value, validate=True)
@@ -333,7 +334,7 @@ class _MessageWriter:
 
     def number(self, base: str, value: Any, path: str) -> None:
         packer = _PACKERS[base]
-        if value is _ABSENT:
+        if value is UNGIVEN:
             self.add(bytes(packer.size))
         elif base == "bool":
             if isinstance(value, bool):
@@ -358,7 +359,7 @@ class _MessageWriter:
                 self.refuse(path, f"is too large for {base}: {_shown(value)}")
 
     def text(self, value: Any, path: str) -> None:
-        text = "" if value is _ABSENT else value
+        text = "" if value is UNGIVEN else value
         if not isinstance(text, str):
             self.refuse(path, f"must be a text, not {_shown(value)}")
             return
@@ -384,7 +385,7 @@ class _MessageWriter:
 
     def nanoseconds(self, base: str, value: Any) -> int | None:
         """Return a time in nanoseconds; None for what is none."""
-        if value is _ABSENT:
+        if value is UNGIVEN:
             return 0
         if value == "now" and base == "time":
             return self.now_ns

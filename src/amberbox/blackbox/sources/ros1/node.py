@@ -157,7 +157,7 @@ class RosNode:
     that crashed leaves no trace of it.
     """
 
-    def __init__(self, settings: NodeSettings) -> None:
+    def __init__(self, settings: NodeSettings, deadline: Deadline) -> None:
         limit = min(settings.message_limit, MOST_BYTES)
         self.settings = replace(settings, message_limit=limit)
         self._readers: dict[str, TopicReader] = {}
@@ -165,14 +165,20 @@ class RosNode:
         self._is_closed = False
         host, _ = host_and_port(settings.master_uri)
         bind_host = "127.0.0.1" if is_loopback(host) else ""
-        self._own_host = own_host(settings.advertise, os.environ, settings.master_uri)
-        self._topics = TopicServer(bind_host, settings.caller_id)
-        self._server = NodeServer(
-            bind_host, 0, settings.master_uri, self._updated, self._shut_down, self
+        self._own_host = deadline.call(
+            lambda: own_host(settings.advertise, os.environ, settings.master_uri),
+            f"the name {host} is not resolved",
         )
-        self._server.start()
-        self._uri = f"http://{self._own_host}:{self._server.port}/"
         self._registered: list[tuple[str, bool]] = []
+        try:
+            self._topics = TopicServer(bind_host, settings.caller_id)
+            self._server = NodeServer(
+                bind_host, 0, settings.master_uri, self._updated, self._shut_down, self
+            )
+        except OSError as error:
+            raise RosError(f"no port for a ROS node: {error.strerror or error}") from error
+        self._uri = f"http://{self._own_host}:{self._server.port}/"
+        self._server.start()
 
     def __enter__(self) -> RosNode:
         return self
