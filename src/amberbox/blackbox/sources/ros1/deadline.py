@@ -48,6 +48,7 @@ class Deadline:
         It runs in a thread, which is left behind if it does not end in time: neither a name server
         nor a peer that hangs holds up the caller.
         """
+        self.check(what)
         results: list[T] = []
         errors: list[BaseException] = []
         done = threading.Event()

@@ -248,7 +248,8 @@ class TopicServer:
             self._note(offered, f"{subscriber.node} expects messages of {wanted[:100]}")
             raise TcprosError(f"{offered.name} has messages of {offered.type}, not {wanted[:100]}")
         if offered.kind is None:
-            offered.kind = self._learnt(offered, md5, texts.get("message_definition", ""))
+            definition = fields.get("message_definition", b"").decode("utf-8", "replace")
+            offered.kind = self._learnt(offered, md5, definition)
         if md5 not in ("*", offered.kind.md5sum):
             self._note(offered, f"{subscriber.node} has another definition of {offered.type}")
             what = (
