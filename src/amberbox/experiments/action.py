@@ -82,16 +82,19 @@ class ParameterOptions:
             yield "choices", f"are more than {MOST_CHOICES}"
         for key in ("unit", "description"):
             yield from _unfit(key, getattr(self, key))
+        one = replace(self, type=self.kind, choices=())
         for choice in self.choices:
-            yield from (("choices", what) for what in _refused(replace(self, choices=()), choice))
+            yield from (("choices", what) for what in _refused(one, choice))
         if self.default is not None:
             yield from (("default", what) for what in _refused(self, self.default))
 
     @property
-    def kind(self) -> str:
-        """Return its type: bool, int, float or string."""
+    def kind(self) -> Literal["bool", "int", "float", "string"]:
+        """Return its type."""
+        if self.type:
+            return self.type
         is_text = any(isinstance(choice, str) for choice in self.choices)
-        return self.type or ("string" if is_text else "float")
+        return "string" if is_text else "float"
 
     def accept(self, value: object) -> Value:
         """Return a value in the parameter's type; raises ValueError with a sentence."""
@@ -307,9 +310,9 @@ def _declared(
     hook = getattr(config, "in_folder", None)
     config = config if hook is None else hook(folder)
     for finding in _combined(options, module, config):
-        key, what, *hint = ("", finding) if isinstance(finding, str) else finding
+        key, *texts = ("", finding) if isinstance(finding, str) else finding
         at = node.mapping.get(key, node)
-        problems.append(at.problem(f"{name}.{key}" if key else name, what, *hint))
+        problems.append(at.problem(f"{name}.{key}" if key else name, *texts))
     if any(problem.is_error for problem in problems):
         return None
     return DeclaredAction(name, options, config, module, node.file, node.line)
@@ -362,8 +365,8 @@ def _keys(cls: type[Any]) -> frozenset[str]:
 def _check_parameter_names(
     name: str, node: Node, options: ActionOptions, problems: list[Problem]
 ) -> None:
-    nodes = ((node.mapping or {}).get("parameters", node).mapping or {}).items()
-    for key, at in nodes:
+    declared = (node.mapping or {}).get("parameters")
+    for key, at in ((declared and declared.mapping) or {}).items():
         where = f"{name}.parameters.{key}"
         if not _PARAMETER_NAME.fullmatch(key):
             hint = "a-z 0-9 _ and a letter first"
