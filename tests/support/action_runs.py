@@ -1,33 +1,16 @@
-"""Runs declared actions in tests, as the actor does: by their declaration, with a context."""
+"""Runs declared actions in tests: by their declaration, in a thread, with a context."""
 
 from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from amberbox.experiments.action import DeclaredAction, load_action
-
-
-@dataclass
-class RunContext:
-    """The context of one run; ``stop`` it, or have it stopped by a timer."""
-
-    parameters: Mapping[str, bool | int | float | str] = field(default_factory=dict)
-    reports: list[str] = field(default_factory=list)
-    stop: threading.Event = field(default_factory=threading.Event)
-
-    def stopped(self) -> bool:
-        return self.stop.is_set()
-
-    def wait(self, seconds: float) -> bool:
-        return self.stop.wait(seconds)
-
-    def report(self, text: str) -> None:
-        self.reports.append(text)
+from amberbox.testing.actions import ManualContext
 
 
 def declared(folder: Path, text: str) -> DeclaredAction:
@@ -43,7 +26,7 @@ class BackgroundRun:
     """A run in a thread of its own, with what it returned or raised."""
 
     action: DeclaredAction
-    context: RunContext
+    context: ManualContext
     result: Any = None
     error: Exception | None = None
     ended_s: float = 0.0

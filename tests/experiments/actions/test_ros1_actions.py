@@ -12,7 +12,8 @@ from amberbox.core.errors import ConfigurationError, NotStartedError
 from amberbox.core.yaml_nodes import parse_yaml
 from amberbox.experiments.action import load_action, read_actions
 from amberbox.experiments.actions.ros1_publish import _due_times
-from tests.support.action_runs import BackgroundRun, RunContext, declared
+from amberbox.testing.actions import ManualContext
+from tests.support.action_runs import BackgroundRun, declared
 
 KINDS = ("ros1_publish", "ros1_service", "ros1_action")
 PUBLISH = """
@@ -123,9 +124,9 @@ def test_the_twin_waits_and_gives_the_declared_result(text: str, tmp_path: Path)
     twin = f'simulated: {{value: "{{{name}}}"}}\nsimulated_for: 0.01\n'
     action = declared(tmp_path, text + twin)
     assert action.has("simulated")
-    assert action.module.simulated(action.config, RunContext({name: 1})) == {"value": 1}
-    stopped = RunContext({name: 1})
-    stopped.stop.set()
+    assert action.module.simulated(action.config, ManualContext({name: 1})) == {"value": 1}
+    stopped = ManualContext({name: 1})
+    stopped.stop()
     assert action.module.simulated(action.config, stopped) is None
     assert not declared(tmp_path, text).has("simulated")
 
@@ -135,9 +136,9 @@ def test_without_a_master_nothing_is_started(text: str, tmp_path: Path) -> None:
     parameters = {"speed": 0.5, "on": True, "x": 0.5}
     action = declared(tmp_path, text + "ros_master_uri: http://127.0.0.1:1\n")
     with pytest.raises(NotStartedError):
-        action.module.run(action.config, RunContext(parameters))
-    stopped = RunContext(parameters)
-    stopped.stop.set()
+        action.module.run(action.config, ManualContext(parameters))
+    stopped = ManualContext(parameters)
+    stopped.stop()
     assert BackgroundRun(action, stopped).join() is None
 
 

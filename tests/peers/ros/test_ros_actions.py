@@ -17,8 +17,9 @@ from typing import Any
 import pytest
 
 from amberbox.core.errors import AmberboxError, NotStartedError
+from amberbox.testing.actions import ManualContext
 from amberbox.testing.clock import wait_until
-from tests.support.action_runs import BackgroundRun, RunContext, declared, timed
+from tests.support.action_runs import BackgroundRun, declared, timed
 from tests.support.ros_nodes import PYTHON, Ros, missing_ros, system_state
 
 FOLDER = Path(__file__).parent
@@ -69,16 +70,16 @@ class Commanded:
     def run(self, text: str, **parameters: Any) -> Any:
         """Run an action to its end and return its result."""
         action = declared(self.ros.folder, text)
-        return action.module.run(action.config, RunContext(parameters))
+        return action.module.run(action.config, ManualContext(parameters))
 
     def begin(self, text: str, **parameters: Any) -> BackgroundRun:
         """Begin a run and return it."""
-        return BackgroundRun(declared(self.ros.folder, text), RunContext(parameters))
+        return BackgroundRun(declared(self.ros.folder, text), ManualContext(parameters))
 
-    def safe_stop(self, text: str, context: RunContext | None = None) -> None:
+    def safe_stop(self, text: str, context: ManualContext | None = None) -> None:
         """Bring the robot to a safe state as the action's declaration says."""
         action = declared(self.ros.folder, text)
-        action.module.safe_stop(action.config, context or RunContext())
+        action.module.safe_stop(action.config, context or ManualContext())
 
     def speeds(self) -> list[float]:
         """Return the speeds that were received."""
@@ -162,7 +163,7 @@ def test_a_late_subscriber_gets_the_latched_message(robot: Commanded) -> None:
     wait_until(lambda: out.exists() and out.read_text().endswith("\n"), "the late subscriber")
     heard = json.loads(out.read_text())
     assert heard["latching"] == "1" and heard["type"] == "geometry_msgs/Twist"
-    run.context.stop.set()
+    run.context.stop()
     assert run.join() is None
     assert robot.speeds() == [0.5]
 
@@ -171,7 +172,7 @@ def test_an_abort_stops_the_robot_at_once(robot: Commanded) -> None:
     run = robot.begin(DRIVE, seconds=60)
     robot.wait_for(topic="/cmd_vel", x=0.5)
     aborted = time.time()
-    run.context.stop.set()
+    run.context.stop()
     assert run.join() is None
     stopped = robot.wait_for(topic="/cmd_vel", x=0.0)["t"]
     assert stopped - aborted < 0.5
@@ -192,9 +193,9 @@ def crash(robot: Commanded, parameters: dict[str, Any], **fields: Any) -> None:
     script = (
         "import json, sys, pathlib\n"
         "from amberbox.experiments.action import load_action\n"
-        "from tests.support.action_runs import RunContext\n"
+        "from amberbox.testing.actions import ManualContext\n"
         "action = load_action(pathlib.Path(sys.argv[1]), 'act')\n"
-        "action.module.run(action.config, RunContext(json.loads(sys.argv[2])))\n"
+        "action.module.run(action.config, ManualContext(json.loads(sys.argv[2])))\n"
     )
     command = [sys.executable, "-c", script, str(robot.ros.folder), json.dumps(parameters)]
     environment = {**os.environ, "PYTHONPATH": str(FOLDER.parents[2])}
@@ -325,7 +326,7 @@ def test_a_service_that_hangs_does_not_hold_up_an_abort(robot: Commanded) -> Non
     text = service("hang").replace("within: 0.5", "within: 60") + "safe_stop: {service: /trigger}\n"
     run = robot.begin(text)
     robot.wait_for(service="/hang")
-    run.context.stop.set()
+    run.context.stop()
     assert timed(run.join) < 0.5
     robot.safe_stop(text)
     assert robot.notes(service="/trigger")
@@ -365,7 +366,7 @@ def test_an_abort_cancels_the_goal(robot: Commanded) -> None:
     run = robot.begin(TEST, what=UNTIL_PREEMPTED)
     robot.wait_for(action="/test", goal=UNTIL_PREEMPTED)
     aborted = time.time()
-    run.context.stop.set()
+    run.context.stop()
     assert run.join() is None
     assert robot.wait_for(action="/test", preempted=True)["t"] - aborted < 0.5
 
@@ -392,10 +393,10 @@ def test_the_safe_stop_leaves_goals_of_others_alone(robot: Commanded) -> None:
 def test_a_goal_that_does_not_end_is_reported(robot: Commanded) -> None:
     run = robot.begin(TEST, what=IGNORE_CANCEL)
     robot.wait_for(action="/test", goal=IGNORE_CANCEL)
-    run.context.stop.set()
+    run.context.stop()
     assert timed(run.join) < 2
-    context = RunContext()
-    timer = threading.Timer(1.0, context.stop.set)
+    context = ManualContext()
+    timer = threading.Timer(1.0, context.stop)
     timer.start()
     with pytest.raises(AmberboxError, match="told to cancel, but its goals have not ended"):
         robot.safe_stop(TEST, context)
