@@ -199,8 +199,11 @@ def _connect(node: RosNode, topic: OfferedTopic, config: Config, context: Action
         node.learn(topic, deadline)
     node.advertise(topic, deadline)
     listed = node.subscribers(topic.name, deadline)
-    is_stop = topic.name != global_name(config.topic)
-    node.wait_for(topic.name, set(), 1 if is_stop else config.subscribers, deadline)
+    stop = _stop_topic(config)
+    takes_stop = stop is not None and stop.name == topic.name
+    is_message = topic.name == global_name(config.topic)
+    needed = max(int(takes_stop), config.subscribers if is_message else 0)
+    node.wait_for(topic.name, set(), needed, deadline)
     node.wait_for(topic.name, listed, 0, Deadline.within(OTHERS_S, context.stopped))
 
 

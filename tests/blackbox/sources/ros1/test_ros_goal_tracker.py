@@ -10,7 +10,7 @@ from amberbox.blackbox.sources.ros1.action_client import STATES, GoalTracker
 
 
 def status(state: str, goal: str = "/a-1", text: str = "") -> dict[str, Any]:
-    number = STATES.index(state) if state in STATES else 77  # type: ignore[arg-type]
+    number = STATES.index(state) if state in STATES else 77
     return {"goal_id": {"id": goal}, "status": number, "text": text}
 
 
@@ -24,10 +24,12 @@ def goal() -> GoalTracker:
 
 
 def test_a_goal_goes_its_way(goal: GoalTracker) -> None:
-    assert goal.state == ""
+    goal.status_received([status("active", "/b-1")], 100.5)
+    seen: list[str] = [goal.state]
     for state in ("pending", "active", "preempting"):
         goal.status_received([status("active", "/b-1"), status(state)], 101.0)
-        assert goal.state == state
+        seen.append(goal.state)
+    assert seen == ["", "pending", "active", "preempting"]
     goal.result_received(result("preempted"))
     assert (goal.state, goal.text, goal.result) == ("preempted", "it says", {"result": 42})
     goal.result_received(result("succeeded", value=1))

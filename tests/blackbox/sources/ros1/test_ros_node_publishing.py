@@ -104,12 +104,12 @@ def test_two_nodes_talk_and_the_end_of_one_is_noticed(master: RosMaster) -> None
 def test_a_node_answers_tools(master: RosMaster) -> None:
     with node(master) as publisher:
         publisher.advertise(offered(), soon())
-        proxy = xmlrpc.client.ServerProxy(master.publishers["/t"]["/act"])
+        proxy: Any = xmlrpc.client.ServerProxy(master.publishers["/t"]["/act"])
         assert proxy.getPublications("/x") == [1, "", [["/t", "std_msgs/String"]]]
-        code, _, address = proxy.requestTopic("/x", "/t", [["UDPROS"], ["TCPROS"]])  # type: ignore[misc]
-        assert code == 1 and address[:2] == ["TCPROS", "127.0.0.1"]  # type: ignore[index]
-        assert proxy.requestTopic("/x", "/other", [["TCPROS"]])[0] == 0  # type: ignore[index]
-        assert proxy.requestTopic("/x", "/t", [["UDPROS"]])[0] == 0  # type: ignore[index]
+        code, _, address = proxy.requestTopic("/x", "/t", [["UDPROS"], ["TCPROS"]])
+        assert code == 1 and address[:2] == ["TCPROS", "127.0.0.1"]
+        assert proxy.requestTopic("/x", "/other", [["TCPROS"]])[0] == 0
+        assert proxy.requestTopic("/x", "/t", [["UDPROS"]])[0] == 0
         with pytest.raises(xmlrpc.client.Fault):
             proxy.requestTopic("/x", "/t", 5)
 
@@ -198,10 +198,10 @@ def test_a_registration_that_comes_through_after_the_end_is_taken_back(master: R
     registering, go_on = threading.Event(), threading.Event()
     announce = master.register
 
-    def slow(topic: str, name: str, uri: str) -> None:
+    def slow(topic: str, node: str, uri: str) -> None:
         registering.set()
         go_on.wait(PATIENCE_S)
-        announce(topic, name, uri)
+        announce(topic, node, uri)
 
     master.register = slow  # type: ignore[method-assign]
     with node(master) as publisher, pytest.raises(RosStoppedError):

@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 from amberbox.blackbox.sources.ros1.deadline import Deadline
 from amberbox.blackbox.sources.ros1.master import (
@@ -29,6 +29,8 @@ from amberbox.blackbox.sources.ros1.tcpros import encode_header, read_exactly, r
 
 MOST_ERROR_BYTES = 4096  # of a service's own text; what is longer is cut
 _LENGTH = struct.Struct("<I")
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -115,11 +117,11 @@ class _OpenCall:
                 self._sock.shutdown(socket.SHUT_RDWR)
 
 
-def _within(deadline: Deadline, what: str, work: Callable[[_OpenCall], Any]) -> Any:
+def _within(deadline: Deadline, what: str, work: Callable[[_OpenCall], T]) -> T:
     """Run a call, and hang up when its time is up; errors of its socket become RosError."""
     call = _OpenCall(deadline.end_s)
 
-    def run() -> Any:
+    def run() -> T:
         try:
             return work(call)
         except TimeoutError as error:
