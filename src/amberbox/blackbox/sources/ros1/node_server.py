@@ -42,7 +42,7 @@ class _Server(ThreadingMixIn, SimpleXMLRPCServer):
         """Ignore callers that break off."""
 
 
-class OfferedTopics(Protocol):
+class PublishedTopics(Protocol):
     """What a node publishes."""
 
     def address_of(self, topic: str) -> tuple[str, int] | None:
@@ -62,7 +62,7 @@ class NodeServer:
         master_uri: str,
         on_update: Callable[[str, Sequence[str]], None],
         on_shutdown: Callable[[str], None],
-        offered: OfferedTopics | None = None,
+        offered: PublishedTopics | None = None,
     ) -> None:
         self._master_uri = master_uri
         self._offered = offered
