@@ -9,7 +9,7 @@ HOUSE := pyproject.toml tools/venv.sh tools/python.sh
 
 ROS := ros-core python3-rospy python3-roslaunch python3-rosbag \
   python3-std-msgs python3-nav-msgs python3-sensor-msgs python3-geometry-msgs \
-  python3-diagnostic-msgs python3-tf2-msgs
+  python3-diagnostic-msgs python3-tf2-msgs python3-actionlib python3-std-srvs
 
 SYSTEM := systemd swi-prolog-nox chromium fonts-dejavu-core
 

@@ -70,8 +70,12 @@ PLUGINS: Mapping[str, tuple[str, Sequence[str]]] = {
 
 READERS: Mapping[str, Sequence[str]] = {
     f"{SOURCES}.status": tuple(f"{OURS}.blackbox.{name}" for name in ("journal.channels", "store")),
+    f"{SOURCES}.ros1": tuple(
+        f"{OURS}.blackbox.columns.{name}" for name in ("ros1_text", "ros_definition")
+    ),
 }
-"""Plugins whose protocol is our own record: what a robot's watcher writes is read by its team."""
+"""What single plugins may import besides: our own record, for the statuses that a robot's watcher
+wrote; the definitions of ROS 1 messages, for the protocol of ROS 1."""
 
 HEAVY = frozenset({"pyarrow", "duckdb", "zmq", "matplotlib", "pandas", "polars", "tsdownsample"})
 RECORDING = tuple(

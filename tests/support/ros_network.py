@@ -49,6 +49,7 @@ class RosMaster:
     def __init__(self, port: int = 0, announces: bool = True) -> None:
         self.publishers: dict[str, dict[str, str]] = {}
         self.subscribers: dict[str, dict[str, str]] = {}
+        self.services: dict[str, str] = {}
         self.calls: list[str] = []
         self.announces = announces
         self._server = _serve(self._functions(), port)
@@ -75,6 +76,9 @@ class RosMaster:
             "lookupNode": self._lookup,
             "registerSubscriber": self._subscribe,
             "unregisterSubscriber": self._unsubscribe,
+            "registerPublisher": self._publish,
+            "unregisterPublisher": self._unpublish,
+            "lookupService": self._look_up_service,
         }
 
     def _announce(self, topic: str) -> None:
@@ -101,6 +105,22 @@ class RosMaster:
         self.calls.append("registerSubscriber")
         self.subscribers.setdefault(topic, {})[caller] = uri
         return 1, "", list(self.publishers.get(topic, {}).values())
+
+    def _publish(self, caller: str, topic: str, kind: str, uri: str) -> Any:
+        self.calls.append("registerPublisher")
+        self.register(topic, caller, uri)
+        return 1, "", list(self.subscribers.get(topic, {}).values())
+
+    def _unpublish(self, caller: str, topic: str, uri: str) -> Any:
+        self.calls.append("unregisterPublisher")
+        self.unregister(topic, caller)
+        return 1, "", 1
+
+    def _look_up_service(self, caller: str, name: str) -> Any:
+        self.calls.append("lookupService")
+        if name in self.services:
+            return 1, "", self.services[name]
+        return -1, "unknown service", ""
 
     def _unsubscribe(self, caller: str, topic: str, uri: str) -> Any:
         self.calls.append("unregisterSubscriber")

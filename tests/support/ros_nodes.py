@@ -22,9 +22,9 @@ PYTHON = "/usr/bin/python3"
 PACKAGES = ("rospy", "rosmaster", "nav_msgs", "sensor_msgs", "std_msgs", "rosgraph_msgs")
 
 
-def missing_ros() -> str:
+def missing_ros(packages: Sequence[str] = PACKAGES) -> str:
     """Return why no ROS can be run here, empty if it can."""
-    code = f"import {', '.join(PACKAGES)}"
+    code = f"import {', '.join(packages)}"
     try:
         done = subprocess.run([PYTHON, "-c", code], env=ros_environment(0), capture_output=True)
     except OSError as error:

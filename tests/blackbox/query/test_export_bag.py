@@ -13,7 +13,8 @@ from rosbags.rosbag1 import Reader
 from rosbags.typesys import Stores, get_typestore
 
 import amberbox
-from amberbox.blackbox.query.export import export, md5sum
+from amberbox.blackbox.columns.ros1_text import md5sum
+from amberbox.blackbox.query.export import export
 from amberbox.blackbox.query.export_job import ExportOptions, ExportReport, View
 from amberbox.blackbox.query.export_messages import MessageStream
 from amberbox.blackbox.store.batches import ItemStream

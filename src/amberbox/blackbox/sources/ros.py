@@ -9,13 +9,12 @@ from dataclasses import dataclass, replace
 
 from amberbox.blackbox.sources.ros1.client import RosSubscriber
 from amberbox.blackbox.sources.ros1.master import (
-    DEFAULT_MASTER,
     SubscriberSettings,
+    chosen_master,
     global_name,
     is_global_name,
     master_uri,
 )
-from amberbox.core.errors import UsageError
 from amberbox.core.options import option
 from amberbox.core.source import Sink, TopicOptions
 
@@ -116,14 +115,9 @@ def settings(config: RosOptions, longest_message: int) -> SubscriberSettings:
 
     ``longest_message`` is the recorder's limit in bytes, used where the configuration sets none.
     """
-    text = config.ros_master_uri or os.environ.get("ROS_MASTER_URI") or DEFAULT_MASTER
-    try:
-        uri = master_uri(text)
-    except ValueError as error:
-        raise UsageError(f"ros_master_uri: {error}", "write http://HOST:11311") from error
     limit_mb = config.max_message_mb
     return SubscriberSettings(
-        master_uri=uri,
+        master_uri=chosen_master(config.ros_master_uri, os.environ),
         caller_id=global_name(config.caller_id),
         hosts=config.hosts,
         advertise=config.advertise,

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from amberbox.blackbox.sources.ros1.client import MOST_BYTES, NodeServer
+from amberbox.blackbox.sources.ros1.node_server import MOST_BYTES, NodeServer
 from amberbox.testing.clock import PATIENCE_S
 
 Updates = list[tuple[str, Sequence[str]]]

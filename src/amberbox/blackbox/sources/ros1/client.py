@@ -2,8 +2,7 @@
 
 The list of publishers is requested from the master every ``poll_s``, in both modes. A registered
 node is also notified of new publishers. Polling in addition costs little and covers cases in which
-notifications fail: a master that was restarted, or one whose three notification workers hang. Every
-answer of the node is short, because a node that does not answer blocks one of these workers.
+notifications fail: a master that was restarted, or one whose three notification workers hang.
 """
 
 from __future__ import annotations
@@ -11,14 +10,10 @@ from __future__ import annotations
 import os
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from http import HTTPStatus
 from queue import SimpleQueue
-from socketserver import ThreadingMixIn
-from typing import Any
-from xmlrpc.server import SimpleXMLRPCRequestHandler, SimpleXMLRPCServer
 
 from amberbox.blackbox.sources.ros1.master import (
     RosError,
@@ -30,6 +25,7 @@ from amberbox.blackbox.sources.ros1.master import (
     own_host,
     publications,
 )
+from amberbox.blackbox.sources.ros1.node_server import NodeServer
 from amberbox.blackbox.sources.ros1.subscription import (
     PublisherHistory,
     RosEvents,
@@ -37,96 +33,6 @@ from amberbox.blackbox.sources.ros1.subscription import (
 )
 from amberbox.core.source import Sink
 from amberbox.core.tls import is_loopback
-
-MOST_BYTES = 1 << 20
-IDLE_S = 5.0
-
-Answer = tuple[int, str, Any]
-
-
-class _Handler(SimpleXMLRPCRequestHandler):
-    timeout = IDLE_S
-
-    def do_POST(self) -> None:  # noqa: N802 (the name http.server calls)
-        length = self.headers.get("content-length", "")
-        if not length.isdigit() or int(length) > MOST_BYTES:
-            self.send_error(HTTPStatus.REQUEST_ENTITY_TOO_LARGE)
-            return
-        super().do_POST()
-
-    def log_message(self, format: str, *args: Any) -> None:
-        """Log nothing: requests of other nodes are no events of the robot."""
-
-
-class _Server(ThreadingMixIn, SimpleXMLRPCServer):
-    daemon_threads = True
-    block_on_close = False
-
-    def handle_error(self, request: Any, client_address: Any) -> None:
-        """Ignore callers that break off."""
-
-
-class NodeServer:
-    """The XML-RPC server of a subscriber that publishes nothing."""
-
-    def __init__(
-        self,
-        bind_host: str,
-        port: int,
-        master_uri: str,
-        on_update: Callable[[str, Sequence[str]], None],
-        on_shutdown: Callable[[str], None],
-    ) -> None:
-        self._master_uri = master_uri
-        self._on_update = on_update
-        self._on_shutdown = on_shutdown
-        self._server = _bound(bind_host, port)
-        self.port = int(self._server.server_address[1])
-        for name, function in self._calls().items():
-            self._server.register_function(function, name)
-        self._thread = threading.Thread(
-            target=self._server.serve_forever, args=(0.2,), name="ros-node", daemon=True
-        )
-
-    def start(self) -> None:
-        """Answer calls from now on."""
-        self._thread.start()
-
-    def close(self) -> None:
-        """Stop answering and free the port."""
-        self._server.shutdown()
-        self._server.server_close()
-
-    def _calls(self) -> dict[str, Callable[..., Answer]]:
-        return {
-            "publisherUpdate": self._publisher_update,
-            "paramUpdate": lambda caller, key, value: (1, "", 0),
-            "requestTopic": lambda caller, topic, protocols: (0, "amberbox only listens", 0),
-            "getPid": lambda caller: (1, "", os.getpid()),
-            "getMasterUri": lambda caller: (1, "", self._master_uri),
-            "getPublications": lambda caller: (1, "", []),
-            "getSubscriptions": lambda caller: (1, "", []),
-            "getBusInfo": lambda caller: (1, "", []),
-            "getBusStats": lambda caller: (1, "", [[], [], []]),
-            "shutdown": self._shutdown,
-        }
-
-    def _publisher_update(self, caller: str, topic: str, uris: Sequence[str]) -> Answer:
-        self._on_update(str(topic), [str(uri) for uri in uris])
-        return 1, "", 0
-
-    def _shutdown(self, caller: str, reason: str = "") -> Answer:
-        self._on_shutdown(str(reason))
-        return 1, "", 0
-
-
-def _bound(host: str, port: int) -> _Server:
-    """Return a server on the port of the last run if that is free, else on any."""
-    try:
-        return _Server((host, port), _Handler, logRequests=False, allow_none=True)
-    except OSError:
-        return _Server((host, 0), _Handler, logRequests=False, allow_none=True)
-
 
 LONGEST_WAIT_S = 2.0
 FAILURE_CHECK_S = 0.2

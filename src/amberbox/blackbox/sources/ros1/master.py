@@ -20,27 +20,33 @@ from urllib.parse import urlsplit
 from xml.etree import ElementTree
 from xml.etree.ElementTree import ParseError
 
-from amberbox.core.errors import AmberboxError
+from amberbox.core.errors import AmberboxError, UsageError
 from amberbox.core.tls import is_loopback
 
 
 @dataclass(frozen=True)
-class SubscriberSettings:
-    """Settings of the subscriber; the defaults of its times are changed by tests only."""
+class NodeSettings:
+    """Settings of any node; ``timeout_s`` is that of one call or handshake."""
 
     master_uri: str = "http://localhost:11311/"
     caller_id: str = "/amberbox"
     hosts: Mapping[str, str] = field(default_factory=dict)
     advertise: str = ""
-    invisible: bool = False
-    all_topics: bool = False
-    poll_s: float = 1.0
     tcp_nodelay: bool = True
     message_limit: int = 64_000_000
     dead_after_s: float = 40.0
     timeout_s: float = 3.0
-    unknown_after_s: float = 10.0
     first_retry_s: float = 0.1
+
+
+@dataclass(frozen=True)
+class SubscriberSettings(NodeSettings):
+    """Settings of the subscriber; the defaults of its times are changed by tests only."""
+
+    invisible: bool = False
+    all_topics: bool = False
+    poll_s: float = 1.0
+    unknown_after_s: float = 10.0
     listed_retry_s: float = 2.0
     unlisted_retry_s: float = 30.0
 
@@ -91,6 +97,17 @@ def master_uri(text: str) -> str:
     if not _HOST.fullmatch(f"[{host}]" if ":" in host else host):
         raise ValueError(f"'{text}' names no host")
     return _uri(host, port)
+
+
+def chosen_master(configured: str, environment: Mapping[str, str]) -> str:
+    """Return the URI of the master: the configured one, ROS_MASTER_URI, or the local one.
+
+    Raises UsageError if it cannot be one.
+    """
+    try:
+        return master_uri(configured or environment.get("ROS_MASTER_URI") or DEFAULT_MASTER)
+    except ValueError as error:
+        raise UsageError(f"ros_master_uri: {error}", "write http://HOST:11311") from error
 
 
 def host_and_port(uri: str, default_port: int = 0) -> tuple[str, int]:
@@ -282,7 +299,7 @@ class _TimedTransport(xmlrpc.client.Transport):
 class RosApi:
     """One master or node that answers ``(code, text, value)``; for one thread."""
 
-    def __init__(self, uri: str, settings: SubscriberSettings) -> None:
+    def __init__(self, uri: str, settings: NodeSettings) -> None:
         self.uri = uri
         self._caller_id = settings.caller_id
         address = mapped(uri, settings.hosts)
@@ -318,9 +335,9 @@ class SystemState:
 
 
 class RosMaster:
-    """The calls to the ROS master that a listener needs."""
+    """The calls to the ROS master that nodes need."""
 
-    def __init__(self, settings: SubscriberSettings) -> None:
+    def __init__(self, settings: NodeSettings) -> None:
         self._api = RosApi(settings.master_uri, settings)
 
     def graph(self) -> SystemState:
@@ -343,6 +360,18 @@ class RosMaster:
         """Unregister as a subscriber."""
         self._api.call("unregisterSubscriber", topic, own_uri)
 
+    def publish(self, topic: str, type_name: str, own_uri: str) -> list[str]:
+        """Register as a publisher; return the URIs of the subscribers."""
+        return [str(u) for u in self._api.call("registerPublisher", topic, type_name, own_uri)]
+
+    def unpublish(self, topic: str, own_uri: str) -> None:
+        """Unregister as a publisher."""
+        self._api.call("unregisterPublisher", topic, own_uri)
+
+    def service_uri(self, service: str) -> str:
+        """Return the ``rosrpc`` URI of a service; RefusedError if the master does not know it."""
+        return str(self._api.call("lookupService", service))
+
     def close(self) -> None:
         """End the connection."""
         self._api.close()
@@ -352,7 +381,7 @@ def _nodes_by_topic(pairs: Any) -> dict[str, list[str]]:
     return {str(topic): [str(node) for node in nodes] for topic, nodes in pairs}
 
 
-def request_topic(node_uri: str, topic: str, settings: SubscriberSettings) -> tuple[str, int]:
+def request_topic(node_uri: str, topic: str, settings: NodeSettings) -> tuple[str, int]:
     """Request a topic from a publisher; return the host and TCP port to connect to."""
     try:
         api = RosApi(node_uri, settings)
@@ -368,7 +397,7 @@ def request_topic(node_uri: str, topic: str, settings: SubscriberSettings) -> tu
         api.close()
 
 
-def publications(node_uri: str, settings: SubscriberSettings) -> list[str]:
+def publications(node_uri: str, settings: NodeSettings) -> list[str]:
     """Return the topics that a node publishes."""
     api = RosApi(node_uri, settings)
     try:

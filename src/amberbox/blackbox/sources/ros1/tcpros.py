@@ -7,20 +7,22 @@ https://wiki.ros.org/ROS/TCPROS, https://wiki.ros.org/ROS/Connection%20Header
 
 from __future__ import annotations
 
+import math
 import re
 import socket
 import struct
 import threading
+import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Protocol
 
 from amberbox.blackbox.sources.ros1.master import (
+    NodeSettings,
     RosError,
     RosNoAnswerError,
     RosRefusedError,
-    SubscriberSettings,
     TcprosError,
     request_topic,
 )
@@ -178,7 +180,7 @@ def decode_header(body: bytes) -> dict[str, bytes]:
     return fields
 
 
-def connect(host: str, port: int, topic: str, settings: SubscriberSettings) -> socket.socket:
+def connect(host: str, port: int, topic: str, settings: NodeSettings) -> socket.socket:
     """Open a connection to a publisher and ask for a topic; raise NoAnswerError."""
     try:
         sock = socket.create_connection((host, port), settings.timeout_s)
@@ -193,7 +195,7 @@ def connect(host: str, port: int, topic: str, settings: SubscriberSettings) -> s
     return sock
 
 
-def _request(topic: str, settings: SubscriberSettings) -> dict[str, str | bytes]:
+def _request(topic: str, settings: NodeSettings) -> dict[str, str | bytes]:
     return {
         "callerid": settings.caller_id,
         "topic": topic,
@@ -205,13 +207,7 @@ def _request(topic: str, settings: SubscriberSettings) -> dict[str, str | bytes]
 
 def read_answer(sock: socket.socket, fallback_name: str) -> PublisherInfo:
     """Read the publisher's header; raise RefusedError, MalformedError or NoAnswerError."""
-    try:
-        length = _LENGTH.unpack(_read_exactly(sock, 4))[0]
-        if length > HEADER_LIMIT:
-            raise TcprosError(f"connection header of {length} bytes")
-        fields = decode_header(_read_exactly(sock, length))
-    except OSError as error:
-        raise RosNoAnswerError(f"no connection header: {error.strerror or error}") from error
+    fields = read_header(sock)
     if "error" in fields:
         raise RosRefusedError(f"publisher refused: {_text(fields['error'])}")
     if "type" not in fields or "md5sum" not in fields:
@@ -229,12 +225,33 @@ def _text(value: bytes) -> str:
     return value.decode("utf-8", "replace").strip()
 
 
-def _read_exactly(sock: socket.socket, count: int) -> bytes:
+def read_header(sock: socket.socket, end_s: float = math.inf) -> dict[str, bytes]:
+    """Read a connection header until a moment of the monotonic clock.
+
+    Raises MalformedError or NoAnswerError. Without ``end_s`` the time limit of the socket holds for
+    each part that arrives.
+    """
+    try:
+        length = _LENGTH.unpack(read_exactly(sock, 4, end_s))[0]
+        if length > HEADER_LIMIT:
+            raise TcprosError(f"connection header of {length} bytes")
+        return decode_header(read_exactly(sock, length, end_s))
+    except OSError as error:
+        raise RosNoAnswerError(f"no connection header: {error.strerror or error}") from error
+
+
+def read_exactly(sock: socket.socket, count: int, end_s: float = math.inf) -> bytes:
+    """Read bytes until a moment of the monotonic clock; raise OSError or NoAnswerError."""
     data = bytearray()
     while len(data) < count:
+        if end_s < math.inf:
+            left_s = end_s - time.monotonic()
+            if left_s <= 0:
+                raise TimeoutError("timed out")
+            sock.settimeout(left_s)
         part = sock.recv(min(count - len(data), 1 << 16))
         if not part:
-            raise RosNoAnswerError("the publisher closed the connection during the handshake")
+            raise RosNoAnswerError("the peer closed the connection")
         data += part
     return bytes(data)
 
@@ -291,7 +308,7 @@ class PublisherLink:
         topic: str,
         uri: str,
         owner: _LinkOwner,
-        settings: SubscriberSettings,
+        settings: NodeSettings,
         now_ns: Callable[[], int],
     ) -> None:
         self.topic = topic
