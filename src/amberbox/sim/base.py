@@ -27,6 +27,7 @@ _HEATING_K_PER_A2 = 0.01  # per second
 _STANDBY_K_S = 0.008
 _ENCODER_NOISE = 0.02
 _THIRD = 2.0 * math.pi / 3.0
+_BRAKE_NM, _BRAKE_NM_PER_RATE = 5.0, 1.2
 _DERATE_FROM_DEGC, _DERATE_TO_DEGC = 90.0, 120.0
 
 
@@ -56,6 +57,7 @@ class HubDrive:
         self.current_a = 0.0
         self.temperature_degc = ROOM_DEGC + noise.uniform(4.0, 8.0)
         self.current_limit_a = CURRENT_LIMIT_A
+        self.is_braked = False
         self._integral = 0.0
 
     def step(self, dt: float, setpoint: float, rate: float, powered: bool) -> float:
@@ -68,9 +70,11 @@ class HubDrive:
             )
             self.measured_angle += rate * self.encoder_scale * dt
         self.current_a = self._control(dt, setpoint - self.measured_rate) if powered else 0.0
-        if not powered:
+        if not powered or self.is_braked:
             self._integral = 0.0
         friction = (_FRICTION_NM + self.drag_nm) * math.tanh(2.0 * rate)
+        if self.is_braked:
+            friction += clamp(_BRAKE_NM_PER_RATE * rate, _BRAKE_NM)
         return self._motor_torque() - friction
 
     def warm(self, dt: float) -> None:
@@ -378,6 +382,11 @@ class MovingBase:
             moment += x * push_y - y * push_x
         self._move(dt, force_x, force_y, moment)
 
+    def brake(self, is_closed: bool) -> None:
+        """Close or open the parking brakes of the eight drives."""
+        for unit in self.units.values():
+            unit.drive_1.is_braked = unit.drive_2.is_braked = is_closed
+
     def halt(self) -> None:
         """Stand still at once, as against a wall."""
         self.twist = (0.0, 0.0, 0.0)
@@ -489,6 +498,7 @@ class BatteryPack:
         self.gauge = charge
         self.temperature_degc = 25.0 + noise.uniform(0.0, 3.0)
         self.current_a = 0.0
+        self.charge_a = 0.0
         self.is_charging = False
         self.voltage_v = sum(self._cells())
 
@@ -496,8 +506,8 @@ class BatteryPack:
         """Advance by ``dt`` with an electrical load."""
         draw_a = (load_w + BASE_LOAD_W + self.leak_w) / max(15.0, self.voltage_v)
         self.is_charging = at_charger and self.contact > 0.5
-        charge_a = self._charge_current() * self.contact if self.is_charging else 0.0
-        self.current_a = charge_a - draw_a
+        self.charge_a = self._charge_current() * self.contact if self.is_charging else 0.0
+        self.current_a = self.charge_a - draw_a
         moved = self.current_a * dt / 3600.0 / CAPACITY_AH
         self.charges = [min(1.0, max(0.0, charge + moved)) for charge in self.charges]
         bias = self.sensor_bias_a * dt / 3600.0 / CAPACITY_AH
