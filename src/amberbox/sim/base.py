@@ -27,7 +27,6 @@ _HEATING_K_PER_A2 = 0.01  # per second
 _STANDBY_K_S = 0.008
 _ENCODER_NOISE = 0.02
 _THIRD = 2.0 * math.pi / 3.0
-_BRAKE_NM, _BRAKE_NM_PER_RATE = 5.0, 1.2
 _DERATE_FROM_DEGC, _DERATE_TO_DEGC = 90.0, 120.0
 
 
@@ -57,7 +56,6 @@ class HubDrive:
         self.current_a = 0.0
         self.temperature_degc = ROOM_DEGC + noise.uniform(4.0, 8.0)
         self.current_limit_a = CURRENT_LIMIT_A
-        self.is_braked = False
         self._integral = 0.0
 
     def step(self, dt: float, setpoint: float, rate: float, powered: bool) -> float:
@@ -70,11 +68,9 @@ class HubDrive:
             )
             self.measured_angle += rate * self.encoder_scale * dt
         self.current_a = self._control(dt, setpoint - self.measured_rate) if powered else 0.0
-        if not powered or self.is_braked:
+        if not powered:
             self._integral = 0.0
         friction = (_FRICTION_NM + self.drag_nm) * math.tanh(2.0 * rate)
-        if self.is_braked:
-            friction += clamp(_BRAKE_NM_PER_RATE * rate, _BRAKE_NM)
         return self._motor_torque() - friction
 
     def warm(self, dt: float) -> None:
@@ -179,6 +175,7 @@ class WheelUnit:
         self.is_powered = False
         self.has_setpoint = True
         self.e_stop = False
+        self.is_braked = False
         self._turn_rate = 0.0
         self._spin = [0.0, 0.0]
         self._barometer = noise.normal(0.03)
@@ -280,8 +277,9 @@ class WheelUnit:
         rate_1 = (rolling - side) / radius + self._spin[0]
         rate_2 = (rolling + side) / radius + self._spin[1]
         wanted_1, wanted_2 = (ahead - wanted) / WHEEL_RADIUS_M, (ahead + wanted) / WHEEL_RADIUS_M
-        torque_1 = self.drive_1.step(dt, wanted_1, rate_1, self.is_powered)
-        torque_2 = -self.drive_2.step(dt, -wanted_2, -rate_2, self.is_powered)
+        powered = self.is_powered and not self.is_braked
+        torque_1 = self.drive_1.step(dt, wanted_1, rate_1, powered)
+        torque_2 = -self.drive_2.step(dt, -wanted_2, -rate_2, powered)
         push_1 = self._transmit(dt, 0, torque_1 / radius, radius)
         return push_1, self._transmit(dt, 1, torque_2 / radius, radius)
 
@@ -343,6 +341,8 @@ _PIVOTS = {"front_left": (0.3, 0.2), "front_right": (0.3, -0.2)} | {
     "rear_left": (-0.3, 0.2),
     "rear_right": (-0.3, -0.2),
 }
+_BRAKE_N = 750.0  # of all wheels; the floor takes 900 N
+_BRAKE_LEVER_M = 0.36
 _LEVER2 = sum(x * x + y * y for x, y in _PIVOTS.values())
 
 
@@ -361,6 +361,7 @@ class MovingBase:
         self.twist: Twist = (0.0, 0.0, 0.0)
         self.acceleration = (0.0, 0.0)
         self.has_cart = False
+        self.is_braked = False
         self._sway_phase = 0.0
 
     @property
@@ -383,9 +384,10 @@ class MovingBase:
         self._move(dt, force_x, force_y, moment)
 
     def brake(self, is_closed: bool) -> None:
-        """Close or open the parking brakes of the eight drives."""
+        """Close or open the brakes of the wheels; closed, the drives do not push."""
+        self.is_braked = is_closed
         for unit in self.units.values():
-            unit.drive_1.is_braked = unit.drive_2.is_braked = is_closed
+            unit.is_braked = is_closed
 
     def halt(self) -> None:
         """Stand still at once, as against a wall."""
@@ -404,6 +406,13 @@ class MovingBase:
             vy + (accel_y - yaw_rate * vx) * dt,
             (yaw_rate + moment / inertia * dt) * (1.0 - 0.5 * dt),
         )
+        if self.is_braked:
+            before_x, before_y, _ = self.twist
+            self.twist = _braked(
+                self.twist, _BRAKE_N * dt / mass, _BRAKE_N * _BRAKE_LEVER_M * dt / inertia
+            )
+            accel_x += (self.twist[0] - before_x) / dt
+            accel_y += (self.twist[1] - before_y) / dt
         self.acceleration = (accel_x, accel_y)
         for unit in self.units.values():
             unit.feel(self.acceleration, self.twist[2])
@@ -411,6 +420,15 @@ class MovingBase:
     def _sway(self, dt: float, vx: float) -> float:
         self._sway_phase += dt * 2 * math.pi * 1.7
         return self.sway_m_s2 * math.sin(self._sway_phase) * math.tanh(abs(vx) / 0.1)
+
+
+def _braked(twist: Twist, speed_loss: float, rate_loss: float) -> Twist:
+    """Return a twist after some speed (m/s) and turn rate (rad/s) were lost; it never reverses."""
+    vx, vy, yaw_rate = twist
+    speed = math.hypot(vx, vy)
+    keep = max(0.0, speed - speed_loss) / speed if speed > 0.0 else 0.0
+    turn = max(0.0, abs(yaw_rate) - rate_loss)
+    return vx * keep, vy * keep, math.copysign(turn, yaw_rate)
 
 
 class Odometry:

@@ -26,7 +26,7 @@ from amberbox.sim.maneuvers import (
 )
 from amberbox.sim.missions import Executor
 from amberbox.sim.navigation import CYCLE_S, OLD_SCAN_NS, Localisation, Navigation, free_ahead
-from amberbox.sim.noise import Pose2D, wrap
+from amberbox.sim.noise import wrap
 from amberbox.sim.requests import RobotRequest
 from amberbox.sim.sensors import Laser
 from amberbox.sim.software import INFO, WARNING, HostComputer, LogLine

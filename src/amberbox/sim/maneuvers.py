@@ -6,7 +6,7 @@ import math
 
 from amberbox.sim.navigation import STOP_AT_M, relative_motion
 from amberbox.sim.noise import Noise, Pose2D, clamp, wrap
-from amberbox.sim.world import CORRIDOR_Y, PLACES, HospitalPlace, Point, way_from
+from amberbox.sim.world import CORRIDOR_Y, PLACES, HospitalPlace, Point, route
 
 _BRAKING = 0.25  # m/s2 of the planned slowing down
 _YAW_BRAKING = 0.6
@@ -15,7 +15,7 @@ _ARRIVED_M, _ARRIVED_RAD = 0.012, 0.012
 _HOLD_HEADING = 1.6  # rad/s per rad
 _HOLD_LINE = 0.5  # rad/s per m, at 1 m/s
 _MAX_CORRECTION = 0.4
-_OFF_THE_WAY_M = 0.3
+_OFF_THE_WAY_M, _MIDDLE_M = 0.3, 0.6
 
 Wish = tuple[float, float]
 """Wanted speed ahead (m/s) and turn rate (rad/s)."""
@@ -119,11 +119,14 @@ def is_on_contacts(pose: Pose2D) -> bool:
 
 
 def way_to(pose: Pose2D, goal: HospitalPlace) -> list[Point]:
-    """Return waypoints from anywhere: back to the way of the room first, where it was left."""
+    """Return waypoints to a place from anywhere: first back to the way that the robot has left."""
     position = pose.x, pose.y
-    if 0.0 < pose.y < 2.0 * CORRIDOR_Y:
+    if abs(pose.y - CORRIDOR_Y) < _MIDDLE_M:
         return list(goal.way_in)
+    if 0.0 < pose.y < 2.0 * CORRIDOR_Y:
+        return [(pose.x, CORRIDOR_Y), *goal.way_in]
     nearest = min(PLACES.values(), key=lambda place: math.dist(place.spot, position))
-    way = way_from(position, goal)
-    beside = abs(pose.x - nearest.spot[0]) > _OFF_THE_WAY_M and nearest is not goal
-    return [(nearest.spot[0], pose.y), *way] if beside else way
+    if nearest is goal:
+        return [goal.spot]
+    is_beside = abs(pose.x - nearest.spot[0]) > _OFF_THE_WAY_M
+    return [*([(nearest.spot[0], pose.y)] if is_beside else []), *route(nearest, goal)]
