@@ -75,8 +75,9 @@ def publish(
 ) -> int:
     """Publish until the plan's end or ``stop``; return how many messages went out.
 
-    Requests that come by ``commands`` are answered between two ticks. The truth (topic, seq, stamp in ns) of each batch is written and flushed before the batch is
-    sent, so that it contains every message sent.
+    The truth (topic, seq, stamp in ns) of each batch is written and flushed before the batch is
+    sent, so that it contains every message sent. Requests of ``commands`` are answered between
+    two ticks.
     """
     encode = msgspec.json.Encoder().encode
     sent = 0

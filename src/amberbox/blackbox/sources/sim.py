@@ -119,6 +119,8 @@ class SimOptions:
             yield "times", "virtual goes with speed max only: other speeds follow the box's clock"
         if self.duration_s is not None and self.duration_s <= 0:
             yield "duration_s", "must be above 0"
+        if self.commands and not self.commands.startswith(("tcp://", "ipc://")):
+            yield "commands", "must be an address to bind, such as tcp://127.0.0.1:5557"
         for topic in self.topics:
             if topic.name not in TOPIC_BY_NAME:
                 near = did_you_mean(topic.name, TOPIC_BY_NAME)
