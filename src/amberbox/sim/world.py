@@ -135,7 +135,7 @@ class HospitalWorld:
     """The surroundings of the robot: walls, furniture and people."""
 
     def __init__(self, noise: Noise) -> None:
-        self._building = _building()
+        self.building = _building()
         self.people = [
             Pedestrian(noise.uniform(10, 20), 0.45, noise.uniform(0.5, 1.1)),
             Pedestrian(noise.uniform(28, 40), 2.5, -noise.uniform(0.5, 1.1)),
@@ -148,7 +148,7 @@ class HospitalWorld:
         for person in self.people:
             person.step(dt, robot)
             outlines += person.outline()
-        self.scene = LaserScene(np.concatenate([self._building, np.array(outlines)]))
+        self.scene = LaserScene(np.concatenate([self.building, np.array(outlines)]))
 
     def clearance(self, point: Point) -> float:
         """Return the distance from a point to whatever stands nearest, m."""
@@ -162,7 +162,7 @@ class HospitalWorld:
     def wall_ahead(self, origin: Point, direction_rad: float) -> float:
         """Return how far it is from a point to the next wall or furniture on the map, m."""
         beam = np.array([[*origin, direction_rad]])
-        return float(cast(LaserScene(self._building), beam, 1, _MAP_RANGE_M)[0, 0])
+        return float(cast(LaserScene(self.building), beam, 1, _MAP_RANGE_M)[0, 0])
 
 
 CIRCLE = 240  # beams in a full turn: one every 1.5 degrees
