@@ -281,7 +281,7 @@ def test_in_the_elevator_the_robot_waits_for_its_floor() -> None:
     assert (robot.executor.floor, status(robot)["control"]) == (goal.floor, "commands")
     assert robot.executor.floor_height == goal.floor, "not between two floors"
     assert status(robot)["standstill"]
-    assert (goal.floor, carry_out(robot, "unload", area="storage")["state"]) == (1, "done")
+    assert (goal.floor, carry_out(robot, "unload", area="kitchen")["state"]) == (1, "done")
     assert carry_out(robot, "dock")["reason"] == "the charging station is on floor 0"
 
 
@@ -422,11 +422,11 @@ def dockings(error_m: float, seeds: range) -> Counter[str]:
 
 def test_docking_misses_now_and_then_by_the_seed_and_often_with_a_poor_marker() -> None:
     missed = "docking missed: no charging current"
-    nominal, poor = dockings(0.0, range(12)), dockings(0.05, range(12))
+    nominal, poor = dockings(0.0, range(10)), dockings(0.05, range(10))
     assert set(nominal) | set(poor) <= {"", missed}
     assert nominal[missed] <= 2
-    assert 4 <= poor[missed] <= 11
-    assert dockings(0.05, range(3)) == dockings(0.05, range(3)), "the same seed, the same end"
+    assert 3 <= poor[missed] <= 9
+    assert dockings(0.05, range(2)) == dockings(0.05, range(2)), "the same seed, the same end"
 
 
 @pytest.mark.parametrize(

@@ -121,9 +121,11 @@ def is_on_contacts(pose: Pose2D) -> bool:
 def way_to(pose: Pose2D, goal: HospitalPlace) -> list[Point]:
     """Return waypoints to a place from anywhere: first back to the way that the robot has left."""
     position = pose.x, pose.y
-    if abs(pose.y - CORRIDOR_Y) < _MIDDLE_M:
-        return list(goal.way_in)
     if 0.0 < pose.y < 2.0 * CORRIDOR_Y:
+        if abs(pose.x - goal.spot[0]) < _OFF_THE_WAY_M:
+            return [goal.spot]
+        if abs(pose.y - CORRIDOR_Y) < _MIDDLE_M:
+            return list(goal.way_in)
         return [(pose.x, CORRIDOR_Y), *goal.way_in]
     nearest = min(PLACES.values(), key=lambda place: math.dist(place.spot, position))
     if nearest is goal:
