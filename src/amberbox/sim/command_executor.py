@@ -287,7 +287,10 @@ class CommandExecutor:
         }
 
     def _motion(self) -> dict[str, Any]:
-        return {"standstill": self.is_standing and self._stop_s is None, "stopped_after_s": self._stopped_after_s}
+        return {
+            "standstill": self.is_standing and self._stop_s is None,
+            "stopped_after_s": self._stopped_after_s,
+        }
 
     # -- what every command waits for ---------------------------------------------------------
 
