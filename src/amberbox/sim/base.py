@@ -408,7 +408,7 @@ class MovingBase:
         )
         if self.is_braked:
             before_x, before_y, _ = self.twist
-            self.twist = _braked(
+            self.twist = slower(
                 self.twist, _BRAKE_N * dt / mass, _BRAKE_N * _BRAKE_LEVER_M * dt / inertia
             )
             accel_x += (self.twist[0] - before_x) / dt
@@ -422,8 +422,8 @@ class MovingBase:
         return self.sway_m_s2 * math.sin(self._sway_phase) * math.tanh(abs(vx) / 0.1)
 
 
-def _braked(twist: Twist, speed_loss: float, rate_loss: float) -> Twist:
-    """Return a twist after some speed (m/s) and turn rate (rad/s) were lost; it never reverses."""
+def slower(twist: Twist, speed_loss: float, rate_loss: float) -> Twist:
+    """Return a twist after a loss of speed (m/s) and of turn rate (rad/s); it never reverses."""
     vx, vy, yaw_rate = twist
     speed = math.hypot(vx, vy)
     keep = max(0.0, speed - speed_loss) / speed if speed > 0.0 else 0.0

@@ -38,7 +38,7 @@ class CommandSocket:
             self._socket.close(0)
             what = f"cannot bind {endpoint} for commands: {error}"
             raise AmberboxError(what, "tcp://127.0.0.1:5557") from error
-        self.endpoint = self._socket.getsockopt(zmq.LAST_ENDPOINT).rstrip(b"\0").decode()
+        self.endpoint: str = self._socket.getsockopt(zmq.LAST_ENDPOINT).rstrip(b"\0").decode()
 
     def serve(self, robot: Robot) -> None:
         """Answer the motions that have ended, and what has come in."""

@@ -16,6 +16,7 @@ from amberbox.sim.base import (
     MovingBase,
     Odometry,
     SafetyLine,
+    slower,
     twist_fields,
 )
 from amberbox.sim.command_executor import CommandedParts, CommandExecutor
@@ -40,6 +41,7 @@ _FREED_AFTER_S = 30.0
 _HPA_PER_FLOOR = 0.42
 _LASERS_AND_SENSORS = ("laser_front", "laser_rear", "imu", "localisation")
 _PARTS = ("base", "bus", "battery", "wifi", "host", "safety", "docking", *_LASERS_AND_SENSORS)
+_STOP_M_S2, _STOP_RAD_S2 = 4.0, 8.0  # how fast the setpoints of the wheels fall at a stop
 _CART_BEHIND_M, _CART_RADIUS_M = 0.95, 0.3
 
 Message = tuple[str, int, dict[str, Any]]
@@ -80,6 +82,7 @@ class Robot:
         self._order = 0
         self._waiting: list[tuple[int, int, str, dict[str, Any]]] = []
         self._command = (0.0, 0.0, 0.0)
+        self._wanted = (0.0, 0.0, 0.0)
         self._command_ns = 0
         self._stuck_s = 0.0
         self._log: list[LogLine] = []
@@ -229,9 +232,12 @@ class Robot:
     def _move(self, dt: float) -> None:
         """Step drives and body, at 50 Hz."""
         has_command = self.now_ns - self._command_ns < _WATCHDOG_NS
-        has_command = has_command and not self.commands.is_braking
         controls = self.host.is_working("base_controller")
-        self.base.step(dt, self._command if has_command and controls else (0.0, 0.0, 0.0))
+        wanted = self._command if has_command and controls else (0.0, 0.0, 0.0)
+        if self.commands.is_braking:
+            wanted = slower(self._wanted, _STOP_M_S2 * dt, _STOP_RAD_S2 * dt)
+        self._wanted = wanted
+        self.base.step(dt, wanted)
         if self.safety.touches:
             self.base.halt()
         motions = self.bus.step(dt)
