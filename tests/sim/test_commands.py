@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from amberbox.core.errors import UsageError
+from amberbox.monitoring.plan import MonitoringPlan
 from amberbox.sim.command_executor import KEPT_COMMANDS
 from amberbox.sim.robot import Robot
 from amberbox.sim.topics import TOPIC_BY_NAME
@@ -27,6 +28,7 @@ from tests.sim.commanded import (
     standing,
     status,
 )
+from tests.sim.monitored import alarms, find, plan_of
 
 BEFORE = [
     ("transport", 3, 60.0, (), "c78a1853253eca42d0a07c43259ead858ef37623561fbf0520262a0c5a0b7026"),
@@ -465,6 +467,52 @@ def test_motion_is_published_on_the_topics_there_are() -> None:
     assert states[-1]["mode"] == "idle"
     for topic, _, message in messages:
         assert list(message) == TOPIC_BY_NAME[topic].shape()["required"]
+
+
+@pytest.fixture(scope="module")
+def plan(tmp_path_factory: pytest.TempPathFactory) -> MonitoringPlan:
+    loaded, problems = plan_of(tmp_path_factory.mktemp("robot") / "r")
+    assert problems == []
+    return loaded
+
+
+def test_motions_of_a_sound_robot_raise_no_alarm(plan: MonitoringPlan) -> None:
+    robot = Robot(3, scenario="standing")
+    messages = run_for(robot, 15.0)
+    for request in (
+        {"do": "linear", "distance_m": -1.0, "speed_m_s": 0.8},
+        {"do": "rotate", "angle_deg": 180},
+        {"do": "load", "area": "storage"},
+        {"do": "unload", "area": "ward_b"},
+        {"do": "dock"},
+        {"do": "undock"},
+    ):
+        command = robot.command(request)["id"]
+        while status(robot, command)["state"] == "running":
+            messages += run_for(robot, 0.5)
+        assert status(robot, command)["state"] == "done"
+    assert alarms(find(plan, messages, robot.now_s - 1.0)) == {}
+
+
+def test_a_stop_is_a_jerk_and_no_fault_of_wheels(plan: MonitoringPlan) -> None:
+    robot = Robot(3, scenario="standing")
+    messages = run_for(robot, 15.0)
+    for _ in range(2):
+        begin(robot, "go_to", area="storage")
+        messages += run_for(robot, 14.0)
+        robot.command({"do": "stop"})
+        messages += run_for(robot, 20.0)
+    assert set(alarms(find(plan, messages, robot.now_s - 1.0))) <= {"base"}
+
+
+def test_the_first_motion_comes_within_150_ms() -> None:
+    robot = standing()
+    for request in ({"do": "linear", "distance_m": 1.0}, {"do": "rotate", "angle_rad": 1.0}):
+        command, asked_s = robot.command(request)["id"], robot.now_s
+        while robot.commands.is_standing:
+            assert robot.now_s - asked_s < 0.15
+            run_for(robot, 0.01)
+        assert end(robot, command)["state"] == "done"
 
 
 def test_the_same_commands_give_the_same_bytes() -> None:
