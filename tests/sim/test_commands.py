@@ -147,7 +147,7 @@ def test_go_to_finds_back_from_beside_the_way() -> None:
     assert carry_out(robot, "go_to", area="kitchen")["state"] == "done", "from the corridor's edge"
 
 
-def test_a_cart_is_loaded_where_one_stands_and_makes_the_robot_heavier() -> None:
+def test_a_cart_is_loaded_where_one_stands_and_unloaded_where_there_is_none() -> None:
     robot = standing()
     answer = carry_out(robot, "load")
     assert (answer["state"], answer["result"]) == ("done", {"area": "ward_a"})
@@ -161,6 +161,22 @@ def test_a_cart_is_loaded_where_one_stands_and_makes_the_robot_heavier() -> None
     assert carry_out(robot, "load", area="ward_a")["reason"] == "no cart at ward_a"
     assert carry_out(robot, "load", area="storage")["state"] == "done"
     assert carry_out(robot, "unload", area="ward_b")["reason"] == "another cart stands at ward_b"
+
+
+def test_with_a_cart_it_is_heavier() -> None:
+    """The same brakes need a longer way."""
+    ways_m = []
+    for has_cart in (False, True):
+        robot = standing()
+        robot.base.has_cart = has_cart
+        carry_out(robot, "rotate", angle_deg=180)
+        begin(robot, "linear", distance_m=5, speed_m_s=0.8)
+        run_for(robot, 3.0)
+        before = place(robot)
+        robot.command({"do": "stop"})
+        run_for(robot, 1.0)
+        ways_m.append(distance_m(before, place(robot)))
+    assert ways_m[1] > 1.3 * ways_m[0] > 0.05
 
 
 def test_carts_are_nowhere_but_at_their_places() -> None:
