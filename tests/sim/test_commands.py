@@ -256,7 +256,8 @@ def test_stop_ends_a_turn_a_way_and_the_robots_own_task_too() -> None:
 def test_stop_may_be_said_twice_and_motion_goes_on_after_it() -> None:
     robot = standing()
     for _ in range(2):
-        assert robot.command({"do": "stop"})["ok"]
+        answer = robot.command({"do": "stop"})
+        assert (answer["ok"], answer["standstill"], answer["stopped_after_s"]) == (True, True, 0.0)
         run_for(robot, 0.5)
     assert carry_out(robot, "linear", distance_m=0.5)["state"] == "done"
 

@@ -262,6 +262,8 @@ class CommandExecutor:
         self._take_control()
         self._halt()
         self._stop_s, self._stopped_after_s = self._now_s, None
+        if self.is_standing:
+            self._stop_s, self._stopped_after_s = None, 0.0
         command = self._running
         if command is not None:
             self._end(command, "aborted", "stopped by command")
