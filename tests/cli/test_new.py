@@ -37,7 +37,7 @@ def test_the_simulated_robot_comes_with_its_monitors(
     place = tmp_path / "r"
     assert main(["new", str(place)]) == 0
     printed = capsys.readouterr().out
-    assert "wrote black_box.yaml and components and " in printed
+    assert "black_box.yaml and components and " in printed
     assert f"and beside it amberbox watch {place}" in printed
     assert (place / "components" / "laser_front" / "heartbeat.yaml").is_file()
     assert main(["check", str(place)]) == 0

@@ -17,6 +17,7 @@ from typing import Literal
 from amberbox.core.errors import AmberboxError, UsageError
 from amberbox.core.timestamps import parse_time
 from amberbox.core.units import parse_duration_s
+from amberbox.sim.command_socket import CommandSocket
 from amberbox.sim.faults import catalogue
 from amberbox.sim.live import LiveRun, listen, open_publisher, publish, wait_for_subscriber
 from amberbox.sim.missions import SCENARIOS
@@ -41,6 +42,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser("python -m amberbox.sim", description=__doc__)
     add = parser.add_argument
     add("--zmq", metavar="ENDPOINT", help="publish [topic, JSON] here, such as tcp://127.0.0.1:*")
+    add("--commands", metavar="ENDPOINT", help="take requests here, as tcp://127.0.0.1:5557")
     add("--seed", type=int, default=1, help="same seed, same robot (default 1)")
     add("--robot", default="ropod_001", help="name of the robot")
     add("--scenario", choices=list(SCENARIOS), default="transport")
@@ -63,6 +65,9 @@ def _run(options: argparse.Namespace) -> int:
     plan = LiveRun(_speed(options.speed), for_s, options.truth)
     faults = [parse_fault(text) for text in options.fault]
     publisher = open_publisher(options.zmq)
+    commands = CommandSocket(options.commands) if options.commands else None
+    if commands is not None:
+        print(f"commands on {commands.endpoint}", flush=True)
     stop = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: stop.set())
@@ -75,7 +80,9 @@ def _run(options: argparse.Namespace) -> int:
     robot = Robot(options.seed, options.robot, options.scenario, start_ns)
     for fault in faults:
         robot.inject(*fault)
-    sent = publish(robot, publisher, plan, orders, stop)
+    sent = publish(robot, publisher, plan, orders, stop, commands)
+    if commands is not None:
+        commands.close("the simulation has ended")
     publisher.close()
     print(f"published {sent} messages in {robot.now_s:.2f} s of robot time", flush=True)
     return 0

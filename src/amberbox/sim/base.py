@@ -175,6 +175,7 @@ class WheelUnit:
         self.is_powered = False
         self.has_setpoint = True
         self.e_stop = False
+        self.is_braked = False
         self._turn_rate = 0.0
         self._spin = [0.0, 0.0]
         self._barometer = noise.normal(0.03)
@@ -276,8 +277,9 @@ class WheelUnit:
         rate_1 = (rolling - side) / radius + self._spin[0]
         rate_2 = (rolling + side) / radius + self._spin[1]
         wanted_1, wanted_2 = (ahead - wanted) / WHEEL_RADIUS_M, (ahead + wanted) / WHEEL_RADIUS_M
-        torque_1 = self.drive_1.step(dt, wanted_1, rate_1, self.is_powered)
-        torque_2 = -self.drive_2.step(dt, -wanted_2, -rate_2, self.is_powered)
+        powered = self.is_powered and not self.is_braked
+        torque_1 = self.drive_1.step(dt, wanted_1, rate_1, powered)
+        torque_2 = -self.drive_2.step(dt, -wanted_2, -rate_2, powered)
         push_1 = self._transmit(dt, 0, torque_1 / radius, radius)
         return push_1, self._transmit(dt, 1, torque_2 / radius, radius)
 
@@ -339,6 +341,8 @@ _PIVOTS = {"front_left": (0.3, 0.2), "front_right": (0.3, -0.2)} | {
     "rear_left": (-0.3, 0.2),
     "rear_right": (-0.3, -0.2),
 }
+_BRAKE_N = 750.0  # of all wheels; the floor takes 900 N
+_BRAKE_LEVER_M = 0.36
 _LEVER2 = sum(x * x + y * y for x, y in _PIVOTS.values())
 
 
@@ -357,6 +361,7 @@ class MovingBase:
         self.twist: Twist = (0.0, 0.0, 0.0)
         self.acceleration = (0.0, 0.0)
         self.has_cart = False
+        self.is_braked = False
         self._sway_phase = 0.0
 
     @property
@@ -378,6 +383,12 @@ class MovingBase:
             moment += x * push_y - y * push_x
         self._move(dt, force_x, force_y, moment)
 
+    def brake(self, is_closed: bool) -> None:
+        """Close or open the brakes of the wheels; closed, the drives do not push."""
+        self.is_braked = is_closed
+        for unit in self.units.values():
+            unit.is_braked = is_closed
+
     def halt(self) -> None:
         """Stop at once, as at a wall."""
         self.twist = (0.0, 0.0, 0.0)
@@ -395,6 +406,13 @@ class MovingBase:
             vy + (accel_y - yaw_rate * vx) * dt,
             (yaw_rate + moment / inertia * dt) * (1.0 - 0.5 * dt),
         )
+        if self.is_braked:
+            before_x, before_y, _ = self.twist
+            self.twist = slower(
+                self.twist, _BRAKE_N * dt / mass, _BRAKE_N * _BRAKE_LEVER_M * dt / inertia
+            )
+            accel_x += (self.twist[0] - before_x) / dt
+            accel_y += (self.twist[1] - before_y) / dt
         self.acceleration = (accel_x, accel_y)
         for unit in self.units.values():
             unit.feel(self.acceleration, self.twist[2])
@@ -402,6 +420,15 @@ class MovingBase:
     def _sway(self, dt: float, vx: float) -> float:
         self._sway_phase += dt * 2 * math.pi * 1.7
         return self.sway_m_s2 * math.sin(self._sway_phase) * math.tanh(abs(vx) / 0.1)
+
+
+def slower(twist: Twist, speed_loss: float, rate_loss: float) -> Twist:
+    """Return a twist after a loss of speed (m/s) and of turn rate (rad/s); it never reverses."""
+    vx, vy, yaw_rate = twist
+    speed = math.hypot(vx, vy)
+    keep = max(0.0, speed - speed_loss) / speed if speed > 0.0 else 0.0
+    turn = max(0.0, abs(yaw_rate) - rate_loss)
+    return vx * keep, vy * keep, math.copysign(turn, yaw_rate)
 
 
 class Odometry:
@@ -489,6 +516,7 @@ class BatteryPack:
         self.gauge = charge
         self.temperature_degc = 25.0 + noise.uniform(0.0, 3.0)
         self.current_a = 0.0
+        self.charge_a = 0.0
         self.is_charging = False
         self.voltage_v = sum(self._cells())
 
@@ -496,8 +524,8 @@ class BatteryPack:
         """Advance by ``dt`` with an electrical load."""
         draw_a = (load_w + BASE_LOAD_W + self.leak_w) / max(15.0, self.voltage_v)
         self.is_charging = at_charger and self.contact > 0.5
-        charge_a = self._charge_current() * self.contact if self.is_charging else 0.0
-        self.current_a = charge_a - draw_a
+        self.charge_a = self._charge_current() * self.contact if self.is_charging else 0.0
+        self.current_a = self.charge_a - draw_a
         moved = self.current_a * dt / 3600.0 / CAPACITY_AH
         self.charges = [min(1.0, max(0.0, charge + moved)) for charge in self.charges]
         bias = self.sensor_bias_a * dt / 3600.0 / CAPACITY_AH

@@ -17,6 +17,7 @@ import msgspec
 
 from amberbox.core.clock import NS
 from amberbox.core.errors import AmberboxError, UsageError
+from amberbox.sim.command_socket import CommandSocket
 from amberbox.sim.robot import TICK_NS, Message, Robot
 
 
@@ -70,11 +71,13 @@ def publish(
     plan: LiveRun,
     orders: queue.SimpleQueue[str],
     stop: threading.Event,
+    commands: CommandSocket | None = None,
 ) -> int:
     """Publish until the plan's end or ``stop``; return how many messages were sent.
 
     The truth (topic, seq, stamp in ns) of each batch is written and flushed before the batch is
-    sent, so that it contains every message sent.
+    sent, so that it contains every message sent. Requests of ``commands`` are answered between
+    two ticks.
     """
     encode = msgspec.json.Encoder().encode
     sent = 0
@@ -82,7 +85,7 @@ def publish(
         contextlib.nullcontext() if plan.truth is None else plan.truth.open("w", encoding="utf-8")
     )
     with file as truth:
-        for batch in _batches(robot, plan, orders, stop):
+        for batch in _batches(robot, plan, orders, stop, commands):
             if truth is not None:
                 truth.write("".join(truth_line(topic, message) for topic, _, message in batch))
                 truth.flush()
@@ -122,13 +125,19 @@ def listen(lines: IO[str], orders: queue.SimpleQueue[str]) -> None:
 
 
 def _batches(
-    robot: Robot, plan: LiveRun, orders: queue.SimpleQueue[str], stop: threading.Event
+    robot: Robot,
+    plan: LiveRun,
+    orders: queue.SimpleQueue[str],
+    stop: threading.Event,
+    commands: CommandSocket | None,
 ) -> Iterator[list[Message]]:
     """Yield the messages of each tick when they are due."""
     began_ns, began_s = time.monotonic_ns(), robot.now_s
     while robot.now_s < plan.for_s and not stop.is_set():
         while not orders.empty():
             print(apply_order(robot, orders.get()), file=sys.stderr, flush=True)
+        if commands is not None:
+            commands.serve(robot)
         batch = list(robot.step_until(robot.now_s + TICK_NS / NS))
         if plan.speed != "max":
             due_ns = began_ns + (robot.now_s - began_s) * NS / plan.speed

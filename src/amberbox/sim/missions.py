@@ -8,7 +8,7 @@ from typing import Any, Protocol
 from amberbox.sim.navigation import Navigation
 from amberbox.sim.noise import Noise, Pose2D
 from amberbox.sim.software import ERROR, INFO, WARNING, LogLine
-from amberbox.sim.world import CART_PLACES, PLACES, way_from
+from amberbox.sim.world import CART_PLACES, CARTS_AT_START, PLACES, way_from
 
 FLOORS = (0, 1, 2)
 SCENARIOS: dict[str, dict[str, Any]] = {
@@ -44,6 +44,7 @@ class MissionTask:
     started_s: float
     stage_started_s: float = 0.0
     limit_s: float = field(default=0.0)
+    is_interrupted: bool = False
 
 
 class Planner:
@@ -150,6 +151,8 @@ class Executor:
         self.floor = 0
         self.floor_height = 0.0
         self.is_blocked = False
+        self.carts = set(CARTS_AT_START)
+        """Places where a cart stands. Tasks of the robot's own find one wherever they look."""
         self.events: list[dict[str, Any]] = []
         self.log: list[LogLine] = []
         self._held_up_s = 0.0
@@ -197,7 +200,22 @@ class Executor:
         self._event("aborted", now_s)
         self._log(ERROR, f"{self.task.id} given up: {why}")
         self.task = None
-        self._body.has_cart = False
+        if self._body.has_cart:
+            self._body.has_cart = False
+            self.carts.add("storage")  # a person brings it there
+
+    def hand_over(self, now_s: float) -> None:
+        """Abort the task because the robot is commanded; in the elevator it first rides on."""
+        if self.task is None:
+            return
+        if self.in_elevator:
+            self.task.is_interrupted = True
+            del self.task.stages[1:]
+            return
+        self._navigation.stop()
+        self._event("aborted", now_s)
+        self._log(WARNING, f"{self.task.id} interrupted: the robot is commanded")
+        self.task = None
 
     def fields(self, pose: Pose2D) -> dict[str, Any]:
         """Return the body of a ``state`` message."""
@@ -235,11 +253,13 @@ class Executor:
             return
         if stage.kind in ("dock", "undock"):
             self._body.has_cart = stage.kind == "dock"
+            move_cart = self.carts.discard if stage.kind == "dock" else self.carts.add
+            move_cart(stage.place)
         task.stages.pop(0)
         if task.stages:
             self._begin_stage(now_s, pose)
             return
-        self._event("finished", now_s)
+        self._event("aborted" if task.is_interrupted else "finished", now_s)
         self._log(INFO, f"{task.id} finished after {now_s - task.started_s:.0f} s")
         self.task = None
 

@@ -73,8 +73,8 @@ class Localisation:
         """Add the error of odometry since the last cycle; return the distance it measured, m."""
         now = Pose2D(true.x, true.y, true.yaw), Pose2D(odometry.x, odometry.y, odometry.yaw)
         before, self._before = self._before or now, now
-        ahead, left, turned = _relative(before[1], now[1])
-        true_ahead, true_left, true_turned = _relative(before[0], now[0])
+        ahead, left, turned = relative_motion(before[1], now[1])
+        true_ahead, true_left, true_turned = relative_motion(before[0], now[0])
         yaw = true.yaw + self.error.yaw
         off_ahead, off_left = ahead - true_ahead, left - true_left
         self.error.x += off_ahead * math.cos(yaw) - off_left * math.sin(yaw)
@@ -108,7 +108,7 @@ class Localisation:
         )
 
 
-def _relative(before: Pose2D, now: Pose2D) -> tuple[float, float, float]:
+def relative_motion(before: Pose2D, now: Pose2D) -> tuple[float, float, float]:
     """Return the motion between two poses, seen from the first."""
     dx, dy = now.x - before.x, now.y - before.y
     cos, sin = math.cos(before.yaw), math.sin(before.yaw)
@@ -121,8 +121,8 @@ _ACCELERATION, _YAW_ACCELERATION = 0.5, 1.5
 _LOOKAHEAD_M = 0.7
 _ARRIVED_M = 0.15
 _HALF_WIDTH_M = 0.36
-_STOP_AT_M = 0.35
-_OLD_SCAN_NS = 1_000_000_000
+STOP_AT_M = 0.35
+OLD_SCAN_NS = 1_000_000_000
 _ANGLES = np.linspace(-FIELD_RAD / 2, FIELD_RAD / 2, BEAMS)
 _AHEAD, _ASIDE = np.cos(_ANGLES), np.sin(_ANGLES)
 _MIDDLE = np.abs(_ANGLES) < math.radians(80)
@@ -160,7 +160,7 @@ class Navigation:
 
     def look(self, scan: Scan | None, now_ns: int) -> None:
         """Set the newest front scan; an old one counts as none."""
-        self.has_scan = scan is not None and now_ns - scan.stamp_ns < _OLD_SCAN_NS
+        self.has_scan = scan is not None and now_ns - scan.stamp_ns < OLD_SCAN_NS
         if scan is not None and self.has_scan:
             self.free_m = free_ahead(scan.ranges)
 
@@ -169,13 +169,13 @@ class Navigation:
         if self.path and self._remaining(pose) < _ARRIVED_M:
             self._from = self.path.pop(0)
         if not self.path:
-            self._ramp(0.0, 0.0)
+            self.ramp(0.0, 0.0)
             return
         target = self._target(pose)
         error = wrap(math.atan2(target[1] - pose.y, target[0] - pose.x) - pose.yaw)
         turn = clamp(1.6 * error, MAX_YAW_RATE)
         speed = 0.0 if abs(error) > 0.5 else self._speed(pose) * math.cos(error) ** 2
-        self._ramp(speed, turn if self.has_scan else 0.0)
+        self.ramp(speed, turn if self.has_scan else 0.0)
 
     def _remaining(self, pose: Pose2D) -> float:
         """Return the way to the current waypoint, measured along the segment."""
@@ -203,10 +203,11 @@ class Navigation:
         if not self.has_scan:
             return 0.0
         slow_down = 0.15 + 0.7 * max(0.0, self._remaining(pose) - _ARRIVED_M)
-        obstacle = max(0.0, 0.8 * (self.free_m - _STOP_AT_M))
+        obstacle = max(0.0, 0.8 * (self.free_m - STOP_AT_M))
         return min(MAX_SPEED, slow_down, obstacle)
 
-    def _ramp(self, speed: float, turn: float) -> None:
+    def ramp(self, speed: float, turn: float) -> None:
+        """Change the command towards a wanted speed and turn rate, as fast as the base may."""
         last_speed, _, last_turn = self.command
         braking = 2.0 * _ACCELERATION if speed < last_speed else _ACCELERATION
         self.command = (

@@ -3,18 +3,30 @@
 from __future__ import annotations
 
 import heapq
+import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from amberbox.core.clock import NS
 from amberbox.core.errors import UsageError
-from amberbox.sim.base import BatteryPack, MovingBase, Odometry, SafetyLine, twist_fields
+from amberbox.sim.base import (
+    CONTACT_M,
+    BatteryPack,
+    MovingBase,
+    Odometry,
+    SafetyLine,
+    slower,
+    twist_fields,
+)
+from amberbox.sim.command_executor import CommandedParts, CommandExecutor
 from amberbox.sim.faults import ActiveFault, Injector, SimulatedFault
 from amberbox.sim.fieldbus import Fieldbus
+from amberbox.sim.maneuvers import DockingMarker, is_on_contacts
 from amberbox.sim.missions import SCENARIOS, Executor, Planner
 from amberbox.sim.navigation import Localisation, Navigation
 from amberbox.sim.noise import Noise, Pose2D
+from amberbox.sim.requests import check_request
 from amberbox.sim.sensors import Imu, Laser, Wifi, cast_views
 from amberbox.sim.software import HostComputer, LogLine, SimulatedNode
 from amberbox.sim.topics import TOPICS, TopicSpec
@@ -28,7 +40,9 @@ _WATCHDOG_NS = 500_000_000
 _FREED_AFTER_S = 30.0
 _HPA_PER_FLOOR = 0.42
 _LASERS_AND_SENSORS = ("laser_front", "laser_rear", "imu", "localisation")
-_PARTS = ("base", "bus", "battery", "wifi", "host", "safety", *_LASERS_AND_SENSORS)
+_PARTS = ("base", "bus", "battery", "wifi", "host", "safety", "docking", *_LASERS_AND_SENSORS)
+_STOP_M_S2, _STOP_RAD_S2 = 4.0, 8.0  # how fast the setpoints of the wheels fall at a stop
+_CART_BEHIND_M, _CART_RADIUS_M = 0.95, 0.3
 
 Message = tuple[str, int, dict[str, Any]]
 Reading = tuple[int, dict[str, Any]]
@@ -68,6 +82,7 @@ class Robot:
         self._order = 0
         self._waiting: list[tuple[int, int, str, dict[str, Any]]] = []
         self._command = (0.0, 0.0, 0.0)
+        self._wanted = (0.0, 0.0, 0.0)
         self._command_ns = 0
         self._stuck_s = 0.0
         self._log: list[LogLine] = []
@@ -95,6 +110,22 @@ class Robot:
         self.safety = SafetyLine()
         self.navigation = Navigation()
         self.executor = Executor(Planner(scenario, noise("tasks")), self.navigation, self.base)
+        self.docking = DockingMarker(noise("docking"))
+        self.commands = CommandExecutor(
+            CommandedParts(
+                tasks=self.executor,
+                navigation=self.navigation,
+                localisation=self.localisation,
+                odometry=self.odometry,
+                base=self.base,
+                battery=self.battery,
+                safety=self.safety,
+                host=self.host,
+                laser_rear=self.laser_rear,
+                world=self.world,
+                marker=self.docking,
+            )
+        )
 
     def _noise(self, name: str) -> Noise:
         return Noise(self.seed, name)
@@ -146,6 +177,14 @@ class Robot:
         """End a fault now; UsageError if it was never injected."""
         self._injector.heal(fault_id, self.now_s)
 
+    def command(self, request: Mapping[str, Any]) -> dict[str, Any]:
+        """Take a request such as ``{"do": "linear", "distance_m": 1.0}``; return the answer now.
+
+        A motion answers ``running`` with its id; ``{"do": "status", "id": ...}`` tells later what
+        became of it. Raises UsageError for a request that is wrong.
+        """
+        return self.commands.request(self.now_s, check_request(dict(request)))
+
     def truth(self) -> dict[str, Any]:
         """Return the ground truth: pose, twist and the active faults. Never published."""
         pose = self.base.pose
@@ -194,7 +233,11 @@ class Robot:
         """Step drives and body, at 50 Hz."""
         has_command = self.now_ns - self._command_ns < _WATCHDOG_NS
         controls = self.host.is_working("base_controller")
-        self.base.step(dt, self._command if has_command and controls else (0.0, 0.0, 0.0))
+        wanted = self._command if has_command and controls else (0.0, 0.0, 0.0)
+        if self.commands.is_braking:
+            wanted = slower(self._wanted, _STOP_M_S2 * dt, _STOP_RAD_S2 * dt)
+        self._wanted = wanted
+        self.base.step(dt, wanted)
         if self.safety.touches:
             self.base.halt()
         motions = self.bus.step(dt)
@@ -207,29 +250,53 @@ class Robot:
         self.world.step(dt, (pose.x, pose.y))
         for unit in self.base.units.values():
             unit.supply(dt, self.battery.voltage_v, self.safety.is_stopped)
-        self.battery.step(dt, self.base.power_w, self.executor.is_charging_place)
+        at_charger = self.executor.is_charging_place
+        if self.commands.is_in_charge:
+            at_charger = is_on_contacts(pose)
+        self.battery.step(dt, self.base.power_w, at_charger)
         self._scan()
         if self._ticks % TICKS_PER_S == 0:
             self._log += self.host.step(1.0)
         if self.host.is_working("localisation"):
             lasers = [self.laser_front, self.laser_rear]
             self.localisation.step(pose, self.odometry.pose, lasers, self.now_ns)
-        if self.host.is_working("task_executor"):
-            estimate, gauge = self.localisation.estimate, self.battery.gauge
-            self.executor.step(dt, self.now_s, estimate, 100.0 * gauge)
+        if self.commands.is_in_charge:
+            self.commands.step(self.now_s, self.now_ns)
+        elif self.host.is_working("task_executor"):
+            self._work(dt)
         if self.host.is_working("navigation"):
-            self.navigation.look(self.laser_front.last, self.now_ns)
-            self.navigation.step(self.localisation.estimate)
-            self._command, self._command_ns = self.navigation.command, self.now_ns
+            self._navigate()
         self._free(dt)
 
     def _scan(self) -> None:
         lasers = {"laser_front": self.laser_front, "laser_rear": self.laser_rear}
         views = cast_views(list(lasers.values()), self.base.pose, self.world.scene)
-        self.safety.feel(*(float(view.expected.min()) for view in views))
+        front_m, rear_m = (float(view.expected.min()) for view in views)
+        if self.base.has_cart and self.commands.is_in_charge:
+            rear_m = min(rear_m, self._cart_clearance_m() + CONTACT_M)
+        self.safety.feel(front_m, rear_m)
         for (name, laser), view in zip(lasers.items(), views, strict=True):
             if self.host.is_working(name):
                 laser.turn(view, self.now_ns, self.base.has_cart and laser is self.laser_rear)
+
+    def _cart_clearance_m(self) -> float:
+        """Return how far the end of the cart is from the nearest obstacle, m."""
+        pose = self.base.pose
+        x = pose.x - _CART_BEHIND_M * math.cos(pose.yaw)
+        y = pose.y - _CART_BEHIND_M * math.sin(pose.yaw)
+        return self.world.clearance((x, y)) - _CART_RADIUS_M
+
+    def _work(self, dt: float) -> None:
+        estimate = self.localisation.estimate
+        self.executor.step(dt, self.now_s, estimate, 100.0 * self.battery.gauge)
+
+    def _navigate(self) -> None:
+        self.navigation.look(self.laser_front.last, self.now_ns)
+        if self.commands.wish is None:
+            self.navigation.step(self.localisation.estimate)
+        else:
+            self.navigation.ramp(*self.commands.wish)
+        self._command, self._command_ns = self.navigation.command, self.now_ns
 
     def _free(self, dt: float) -> None:
         """Move a robot that has been blocked by an obstacle for a while back to the corridor."""
@@ -306,6 +373,8 @@ class Robot:
         return self.now_ns, self.safety.fields()
 
     def _read_state(self) -> Reading:
+        if self.commands.is_in_charge:
+            return self.now_ns, self.commands.fields()
         return self.now_ns, self.executor.fields(self.localisation.estimate)
 
     def _read_wifi(self) -> Reading:

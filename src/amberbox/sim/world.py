@@ -14,6 +14,7 @@ from amberbox.sim.noise import Noise
 Array = NDArray[np.float64]
 Point = tuple[float, float]
 CORRIDOR_Y = 1.5
+_MAP_RANGE_M = 50.0
 
 # Each line is a chain of wall corners. The corridor runs along x from 0 to 48, 3 m wide.
 _WALLS: tuple[tuple[Point, ...], ...] = (
@@ -67,6 +68,7 @@ PLACES = {
     )
 }
 CART_PLACES = ("ward_a", "storage", "ward_b", "kitchen")
+CARTS_AT_START = ("ward_a", "storage")
 
 
 def route(start: HospitalPlace, goal: HospitalPlace) -> list[Point]:
@@ -133,7 +135,7 @@ class HospitalWorld:
     """The surroundings of the robot: walls, furniture and people."""
 
     def __init__(self, noise: Noise) -> None:
-        self._building = _building()
+        self.building = _building()
         self.people = [
             Pedestrian(noise.uniform(10, 20), 0.45, noise.uniform(0.5, 1.1)),
             Pedestrian(noise.uniform(28, 40), 2.5, -noise.uniform(0.5, 1.1)),
@@ -146,7 +148,21 @@ class HospitalWorld:
         for person in self.people:
             person.step(dt, robot)
             outlines += person.outline()
-        self.scene = LaserScene(np.concatenate([self._building, np.array(outlines)]))
+        self.scene = LaserScene(np.concatenate([self.building, np.array(outlines)]))
+
+    def clearance(self, point: Point) -> float:
+        """Return the distance from a point to whatever stands nearest, m."""
+        scene = self.scene
+        along_x, along_y = scene.x1 - scene.x0, scene.y1 - scene.y0
+        to_x, to_y = point[0] - scene.x0, point[1] - scene.y0
+        length2 = np.maximum(along_x**2 + along_y**2, 1e-12)
+        share = np.clip((to_x * along_x + to_y * along_y) / length2, 0.0, 1.0)
+        return float(np.hypot(to_x - share * along_x, to_y - share * along_y).min())
+
+    def wall_ahead(self, origin: Point, direction_rad: float) -> float:
+        """Return how far it is from a point to the next wall or furniture on the map, m."""
+        beam = np.array([[*origin, direction_rad]])
+        return float(cast(LaserScene(self.building), beam, 1, _MAP_RANGE_M)[0, 0])
 
 
 CIRCLE = 240  # beams in a full turn: one every 1.5 degrees

@@ -18,6 +18,7 @@ from amberbox.core.options import option
 from amberbox.core.source import Sink, TopicOptions
 from amberbox.core.timestamps import parse_time
 from amberbox.core.types import Topic
+from amberbox.sim.command_socket import CommandSocket
 from amberbox.sim.faults import catalogue
 from amberbox.sim.live import apply_order
 from amberbox.sim.missions import SCENARIOS
@@ -86,6 +87,9 @@ class SimOptions:
     duration_s: float | None = option(None, "end after this much robot time", unit="s")
     faults: Sequence[FaultOptions] = option((), "faults to inject")
     orders: str = option("", "file whose new lines are obeyed: fault ID [magnitude], or heal ID")
+    commands: str = option(
+        "", "ZeroMQ address where the robot takes requests to move; off if empty"
+    )
     topics: Sequence[TopicOptions] = option((), "topics to publish; all when absent")
 
     @property
@@ -115,6 +119,8 @@ class SimOptions:
             yield "times", "virtual goes with speed max only: other speeds follow the box's clock"
         if self.duration_s is not None and self.duration_s <= 0:
             yield "duration_s", "must be above 0"
+        if self.commands and not self.commands.startswith(("tcp://", "ipc://")):
+            yield "commands", "must be an address to bind, such as tcp://127.0.0.1:5557"
         for topic in self.topics:
             if topic.name not in TOPIC_BY_NAME:
                 near = did_you_mean(topic.name, TOPIC_BY_NAME)
@@ -156,15 +162,22 @@ class SimSource:
         streams = {spec.name: sink.topic(spec.topic()) for spec in _chosen(config)}
         for name in streams:
             sink.link_up(name, config.robot)
-        for topic, sent_ns, data in self._messages(robot, stop):
-            if topic in streams:
-                received_ns = sent_ns if config.is_virtual else sink.now_ns()
-                sink.message(streams[topic], data, received_ns)
+        commands = CommandSocket(config.commands) if config.commands else None
+        try:
+            for topic, sent_ns, data in self._messages(robot, stop, commands):
+                if topic in streams:
+                    received_ns = sent_ns if config.is_virtual else sink.now_ns()
+                    sink.message(streams[topic], data, received_ns)
+        finally:
+            if commands is not None:
+                commands.close("the simulation has ended")
         reason = "stopped" if stop.is_set() else "end of simulation"
         for topic in streams:
             sink.link_down(topic, config.robot, reason)
 
-    def _messages(self, robot: Robot, stop: threading.Event) -> Iterator[tuple[str, int, bytes]]:
+    def _messages(
+        self, robot: Robot, stop: threading.Event, commands: CommandSocket | None
+    ) -> Iterator[tuple[str, int, bytes]]:
         """Yield messages when they are due."""
         speed, end_s = self.config.speed, self.config.duration_s
         pace = None if speed == "max" else RealTimePacer(speed, robot.start_ns, stop)
@@ -177,6 +190,8 @@ class SimSource:
                 return
             for line in orders.new() if orders else ():
                 _log.info("%s", apply_order(robot, line))
+            if commands is not None:
+                commands.serve(robot)
             if end_s is not None:
                 self.progress = robot.now_s / end_s
             yield topic, sent_ns, encode(message)
