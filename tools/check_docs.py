@@ -23,6 +23,7 @@ INTERNAL = ("docs/develop/", "CONTRIBUTING.md", "CHANGELOG.md")
 
 MODES = ("amberbox.monitoring.modes", ("Config", "evaluate"))
 PROBES = ("amberbox.monitoring.probes", ("MEASURES", "SUBJECT", "measure"))
+ACTIONS = ("amberbox.experiments.actions", ("Config", "run"))
 MODES_PAGE = "docs/robot/modes.md"
 
 
@@ -73,7 +74,7 @@ def _to_document() -> Iterator[tuple[Finding, str]]:
         yield _undocumented(verb, f"command 'amberbox {name}'"), rf"\bamberbox {re.escape(name)}\b"
     for name, plugin in find("amberbox.blackbox.sources", defines=("Config", "Source")).items():
         yield _undocumented(plugin, f"source '{name}'"), _as_code(name)
-    for kind, (package, names) in {"monitor": MODES, "probe": PROBES}.items():
+    for kind, (package, names) in {"monitor": MODES, "probe": PROBES, "action": ACTIONS}.items():
         for name, plugin in find(package, defines=names).items():
             yield _undocumented(plugin, f"{kind} '{name}'"), rf"{_as_code(name)}|^## {name}$"
     for module, name, key in configuration_keys():

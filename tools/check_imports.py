@@ -45,6 +45,7 @@ MODES = f"{OURS}.monitoring.modes"
 PROBES = f"{OURS}.monitoring.probes"
 ROS1 = f"{OURS}.blackbox.sources.ros1"
 EVIDENCE = f"{OURS}.diagnosis.evidence"
+ACTIONS = f"{OURS}.experiments.actions"
 REASONING = tuple(
     f"{OURS}.diagnosis.{name}"
     for name in (
@@ -64,6 +65,7 @@ PLUGINS: Mapping[str, tuple[str, Sequence[str]]] = {
     MODES: ("mode", ()),
     PROBES: ("probe", (ROS1,)),
     EVIDENCE: ("provider of evidence", REASONING),
+    ACTIONS: ("action", (ROS1,)),
 }
 """Packages of plugins: what one is called, and what it may import besides ``core``."""
 

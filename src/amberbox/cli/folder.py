@@ -7,7 +7,7 @@ import json
 import shlex
 import shutil
 import textwrap
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,12 +23,14 @@ from amberbox.blackbox.robot_folder.folder import (
 )
 from amberbox.blackbox.robot_folder.robot_yaml import trigger_problems
 from amberbox.cli._output import in_columns, print_lines
+from amberbox.cli.action import action_rows
 from amberbox.consult.folder_knowledge import load_knowledge, monitor_addresses, rule_problems
 from amberbox.core.errors import ConfigurationError, Problem, UsageError
 from amberbox.core.names import derive_id
 from amberbox.core.plugins import get
 from amberbox.core.redaction import masked_values
 from amberbox.core.yaml_nodes import load_yaml
+from amberbox.experiments.action import DeclaredAction, read_actions
 from amberbox.monitoring.component_files import FOLDER as COMPONENTS
 from amberbox.monitoring.plan import (
     ComponentPlan,
@@ -149,12 +151,16 @@ def run_check(args: argparse.Namespace) -> int:
     plan = _monitors(folder, problems) if folder and Path(args.folder).is_dir() else None
     problems += _triggers(folder, items, plan) if folder else []
     problems += _not_judged(Path(args.folder)) if folder is None else []
+    actions, found = read_actions(Path(args.folder))
+    problems += found
     ok = not any(problem.is_error for problem in problems)
     if args.json:
         monitoring = {} if plan is None else {"monitoring": plan_data(plan)}
-        print(json.dumps(_check_json(folder, items, problems, ok) | monitoring, indent=2))
+        able = {"actions": [action.announced() for action in actions.values()]}
+        print(json.dumps(_check_json(folder, items, problems, ok) | monitoring | able, indent=2))
     else:
-        print_lines(_check_lines(args.folder, folder, items, problems, plan, args.modes))
+        lines = _action_lines(actions.values())
+        print_lines(_check_lines(args.folder, folder, items, problems, plan, lines, args.modes))
     return 0 if ok else ConfigurationError.exit_code
 
 
@@ -225,13 +231,15 @@ def _check_lines(
     items: Sequence[PlannedItem],
     problems: Sequence[Problem],
     plan: MonitoringPlan | None,
+    actions: Sequence[str],
     each_mode: bool = False,
 ) -> list[str]:
     errors = [str(problem) for problem in problems if problem.is_error]
     notes = [str(problem) for problem in problems if not problem.is_error]
     verdict = f"{_count_text(errors, 'error')}, {_count_text(notes, 'note')}" if errors else "fine"
     recorded = _recorded_lines(folder, items) if folder and (plan is not None or not errors) else []
-    return [*recorded, *_monitored(plan, each_mode), *notes, *errors, f"{name}: {verdict}"]
+    monitored = _monitored(plan, each_mode)
+    return [*recorded, *monitored, *actions, *notes, *errors, f"{name}: {verdict}"]
 
 
 def _monitored(plan: MonitoringPlan | None, each_mode: bool) -> list[str]:
@@ -243,6 +251,10 @@ def _monitored(plan: MonitoringPlan | None, each_mode: bool) -> list[str]:
     each_mode = each_mode or len(plan.modes()) <= _FEW_MODES
     table = in_full(plan, width) if each_mode else in_short(plan, width)
     return [f"would monitor: {plan_text(plan)}", *table, "", *shown]
+
+
+def _action_lines(actions: Collection[DeclaredAction]) -> list[str]:
+    return ["can do:", *in_columns(action_rows(actions)), ""] if actions else []
 
 
 def _count_text(of: Sequence[object], what: str) -> str:

@@ -49,6 +49,8 @@ _EVERYDAY = (
      "Run the fleet's server: robots send it what they recorded, people see all of it."),
 )  # fmt: skip
 _MORE = (
+    ("action", "action",
+     "List the actions of a robot; carry one out by hand, at the robot or simulated."),
     ("alarm", "alarm",
      "List the alarms of a robot; acknowledge one, or shelve it for some time."),
     ("demo", "demo",
@@ -85,7 +87,7 @@ _MORE = (
     ("mission", "mission",
      "List the missions of a record, begin and end one by hand, find them in old recordings."),
     ("plugins", "plugins",
-     "List the sources, monitor modes and probes that are there, or explain one of them."),
+     "List sources, monitor modes, probes and kinds of actions, or explain one of them."),
     ("probe", "probe",
      "Look at what only the robot's computer can see, and publish it for a box elsewhere."),
     ("rules", "rules",

@@ -1,4 +1,4 @@
-"""List the sources, monitor modes and probes that are there, or explain one of them."""
+"""List sources, monitor modes, probes and kinds of actions, or explain one of them."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from amberbox.cli._output import in_columns, print_lines
 from amberbox.core.errors import UsageError, did_you_mean
 from amberbox.core.options import OptionRow, describe
 from amberbox.core.plugins import Plugin, find, install_hint, missing_packages
+from amberbox.experiments.action import ACTIONS, DEFINES
 from amberbox.monitoring.component_files import MODE_DEFINES, MODES, PROBE_DEFINES, PROBES
 
 
@@ -33,13 +34,16 @@ KINDS = {
     "source": PluginKind(SOURCES, ("Config", "Source"), "each a block of black_box.yaml"),
     "mode": PluginKind(MODES, MODE_DEFINES, "named by 'monitor:' in a mode file"),
     "probe": PluginKind(PROBES, PROBE_DEFINES, "what modes ask the robot's computer for"),
+    "action": PluginKind(ACTIONS, DEFINES, "named by 'kind:' in actions/*.yaml"),
 }
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of this verb."""
     parser.add_argument(
-        "name", nargs="?", help="a source, mode or probe: show a sample and all its keys"
+        "name",
+        nargs="?",
+        help="a source, mode, probe or kind of action: show a sample and its keys",
     )
     parser.add_argument("--kind", choices=KINDS, help="only plugins of this kind")
     parser.add_argument("--json", action="store_true", help="print JSON")
@@ -146,8 +150,18 @@ def _with_unit(row: Mapping[str, Any], name: str) -> tuple[str, str, str]:
     return name, row["type"], f"{row['doc']} [{row['unit']}]" if row["unit"] else row["doc"]
 
 
-_DETAILS = {"source": _source_details, "mode": _mode_details, "probe": _probe_details}
-_SHOWN = {"source": _source_text, "mode": _mode_text, "probe": _probe_text}
+_DETAILS = {
+    "source": _source_details,
+    "mode": _mode_details,
+    "probe": _probe_details,
+    "action": _source_details,
+}
+_SHOWN = {
+    "source": _source_text,
+    "mode": _mode_text,
+    "probe": _probe_text,
+    "action": _source_text,
+}
 
 
 def _option_table(options: Sequence[Mapping[str, Any]]) -> Iterator[str]:

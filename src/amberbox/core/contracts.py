@@ -10,6 +10,7 @@ mode of a monitor      ``monitoring/modes``       ``core.mode``; ``ModeContract`
 probe                  ``monitoring/probes``      ``core.probe``
 publisher of statuses  ``monitoring/publishers``  ``Publisher``
 provider of evidence   ``diagnosis/evidence``     ``EvidenceProvider`` and what is named below
+action of a robot      ``experiments/actions``    ``Action`` and what is named below it
 =====================  =========================  ========================================
 
 The name of a provider of evidence is also that of the engine if it answers alone. It defines one
@@ -270,4 +271,51 @@ class Publisher(Protocol):
         """Return the messages that carry the statuses of a robot at one time.
 
         ``naming`` (``monitoring.plan.Naming``) has the names of components and modes.
+        """
+
+
+class ActionContext(Protocol):
+    """One run of an action, as its plugin sees it."""
+
+    @property
+    def parameters(self) -> Mapping[str, bool | int | float | str]:
+        """Return the checked values of all declared parameters."""
+
+    def stopped(self) -> bool:
+        """Return whether the run must end: aborted, lease lost, or out of time."""
+
+    def wait(self, seconds: float) -> bool:
+        """Wait, or until the run must end; return whether it must."""
+
+    def report(self, text: str) -> None:
+        """Report progress in one line; more than a few lines a second are dropped."""
+
+
+ConfigT = TypeVar("ConfigT", contravariant=True)
+
+
+class Action(Protocol[ConfigT]):
+    """A module that carries out one kind of action; ``Config`` is its class of options.
+
+    ``SAMPLE`` is a declaration that passes ``amberbox check``. The module may also define
+
+    - ``safe_stop(config, context)``: bring the robot to a safe state. It is called in the process
+      of the run or in a new one, perhaps twice, perhaps while ``run`` still hangs. Without it the
+      action cannot have the risk ``moves``. Its context is ``stopped`` when its time is up.
+    - ``simulated(config, context)``: the twin of ``run`` that needs no robot.
+    - ``problems(config, parameters)``: yield problems in the form of ``core.config.Finding``, seen
+      with the names of the declared parameters.
+
+    A declaration that leaves out an option ``safe_stop`` or ``simulated`` of ``Config`` has none.
+    ``Config.in_folder(folder)`` returns the same options seen from the robot folder.
+    """
+
+    Config: type[Any]
+    SAMPLE: str
+
+    def run(self, config: ConfigT, context: ActionContext) -> Mapping[str, Any] | None:
+        """Carry it out and return its result for JSON.
+
+        Raises AmberboxError if it failed, NotStartedError if the robot has not been told anything.
+        It polls ``context.stopped()`` at least every 0.1 s and returns soon after it is true.
         """

@@ -31,6 +31,10 @@ class UsageError(AmberboxError):
     exit_code = 2
 
 
+class NotStartedError(AmberboxError):
+    """An action failed before the robot was told anything: nothing has to be stopped."""
+
+
 @dataclass(frozen=True, slots=True)
 class Problem:
     """One finding about a file: ``file:line: where: what; did you mean ...``."""

@@ -1,0 +1,1 @@
+"""Experiments on robots: the actions that a robot can do."""
