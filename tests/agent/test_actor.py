@@ -336,11 +336,11 @@ def test_a_safe_stop_that_fails_and_one_that_dies(own: Own) -> None:
 @pytest.mark.parametrize(
     ("code", "reason"),
     [
-        ("raise ValueError('seven')", "ValueError: seven (own.py:12)"),
-        ("sys.exit('enough')", "SystemExit: enough (own.py:12)"),
-        ("raise KeyboardInterrupt", "KeyboardInterrupt (own.py:12)"),
-        ("x = 'x' * (4 << 30)", "MemoryError (own.py:12)"),
-        ("def f(): f()\n    f()", "RecursionError: maximum recursion depth exceeded (own.py:12)"),
+        ("raise ValueError('seven')", "ValueError: seven (own.py:11)"),
+        ("sys.exit('enough')", "SystemExit: enough (own.py:11)"),
+        ("raise KeyboardInterrupt", "KeyboardInterrupt (own.py:11)"),
+        ("x = 'x' * (4 << 30)", "MemoryError (own.py:11)"),
+        ("def f(): f()\n    f()", "RecursionError: maximum recursion depth exceeded (own.py:11)"),
         ("raise Exception('a\\n\\x1b[2Jb' * 1000)", "Exception: a \\u001b[2Jba"),
     ],
 )
@@ -378,7 +378,7 @@ def test_killed_before_it_began(folder: Path, robot: ZmqRobot) -> None:
     actor = SupervisedActor(drive(folder))
     os.kill(actor.pid, signal.SIGKILL)
     outcome = to_end(actor)
-    assert (outcome.state, outcome.reason[-14:]) == ("failed", "before it began")
+    assert (outcome.state, outcome.reason[-15:]) == ("failed", "before it began")
     assert robot.hears == []
 
 

@@ -1,4 +1,4 @@
-"""``amberbox plugins``: sources, modes and probes, what they lack, and all their keys."""
+"""``amberbox plugins``: sources, modes, probes, actions, what they lack, and all their keys."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from amberbox.core.yaml_nodes import parse_yaml
 ALL = sorted(find(SOURCES, defines=("Config", "Source")))
 MODES = sorted(verb.KINDS["mode"].plugins())
 PROBES = sorted(verb.KINDS["probe"].plugins())
+ACTIONS = sorted(verb.KINDS["action"].plugins())
 
 
 def test_list(capsys: pytest.CaptureFixture[str]) -> None:
@@ -27,7 +28,7 @@ def test_list(capsys: pytest.CaptureFixture[str]) -> None:
     assert "ROS 1: topics of a robot" in text
     assert main(["plugins", "--json"]) == 0
     rows = json.loads(capsys.readouterr().out)
-    assert [row["name"] for row in rows] == [*ALL, *MODES, *PROBES]
+    assert [row["name"] for row in rows] == [*ALL, *MODES, *PROBES, *ACTIONS]
     ros = next(row for row in rows if row["name"] == "ros")
     assert (ros["kind"], ros["missing"]) == ("source", [])
 

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from amberbox.core.errors import ConfigurationError, UsageError
 from amberbox.core.plugins import find
+from amberbox.core.safe_text import one_line
 from amberbox.experiments.action import (
     ACTIONS,
     DEFINES,
@@ -34,7 +35,7 @@ drive:
     distance_m: {unit: m, min: -2, max: 2}
     speed_m_s: {unit: m/s, min: 0.05, max: 0.3, default: 0.2}
     times: {type: int, min: 1, max: 3, default: 1}
-    slow: {type: bool, default: no}
+    slow: {type: bool, default: false}
     area: {choices: [hall, "1"], default: hall}
   risk: moves
   timeout: 1 min
@@ -60,7 +61,7 @@ def folder_of(place: Path, *texts: str) -> Path:
 
 def problems_of(place: Path, *texts: str) -> list[str]:
     """Return the problems of a folder, without their paths and hints."""
-    found, problems = read_actions(folder_of(place, *texts))
+    _, problems = read_actions(folder_of(place, *texts))
     assert all(problem.is_error for problem in problems)
     return [
         str(problem).split("\n")[0].removeprefix(f"{place}/actions/").replace(str(place), "HERE")
@@ -137,10 +138,10 @@ alarm.close: {kind: shell, command: [true], risk: record, timeout: 0}
     assert problems_of(tmp_path, text) == [
         "0.yaml:2: drive.kind: there is no kind of action 'zmq_reqest'; "
         "did you mean 'zmq_request'?",
-        "0.yaml:4: drive.timout: unknown key 'timout'; did you mean 'timeout'?",
+        "0.yaml:4: drive: unknown key 'timout'; did you mean 'timeout'?",
         "0.yaml:5: Turn: cannot be the name of an action",
         "0.yaml:5: Turn: the key 'endpoint' is missing",
-        "0.yaml:7: Turn.endpont: unknown key 'endpont'; did you mean 'endpoint'?",
+        "0.yaml:7: Turn: unknown key 'endpont'; did you mean 'endpoint'?",
         "0.yaml:10: Turn.parameters.angle.min: 5 is above max, 1",
         "0.yaml:10: Turn.parameters.angle.default: 9 is above the largest value, 1",
         "0.yaml:11: Turn.parameters.Angle.type: expected one of , bool, int, float, string, "
@@ -313,7 +314,7 @@ def test_any_text_gives_values_within_the_limits_or_an_error(
     try:
         values = check_parameters(speak, text)
     except UsageError as error:
-        assert error.what.isprintable(), error.what
+        assert one_line(error.what) == error.what
         return
     assert [*values] == ["text", "count", "share"]
     said, count, share = values.values()

@@ -18,6 +18,7 @@ from amberbox.core.safe_text import one_line
 
 TASK_BYTES = 60_000  # what fits into a pipe at once
 PRINTED_BYTES = 4096  # the end of what the action prints
+REASON = 1000  # characters
 LOAD_S = 30.0
 HEED_S = 1.0
 """How long an actor may take to say that it stops, before it is killed."""
@@ -179,7 +180,7 @@ class SupervisedActor:
 
     def _set(self, ended: Ended) -> None:
         printed = self._actor.printed.decode(errors="replace")
-        reason, hint = one_line(ended.reason), one_line(ended.hint)
+        reason, hint = one_line(ended.reason)[:REASON], one_line(ended.hint)[:REASON]
         self.outcome = Outcome(ended.state, reason, hint, ended.result, printed)
 
 

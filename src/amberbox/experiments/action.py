@@ -89,10 +89,12 @@ class ParameterOptions:
             yield from (("default", what) for what in _refused(self, self.default))
 
     @property
-    def kind(self) -> str:
-        """Return its type: bool, int, float or string."""
+    def kind(self) -> Literal["bool", "int", "float", "string"]:
+        """Return its type."""
+        if self.type:
+            return self.type
         is_text = any(isinstance(choice, str) for choice in self.choices)
-        return self.type or ("string" if is_text else "float")
+        return "string" if is_text else "float"
 
     def accept(self, value: object) -> Value:
         """Return a value in the parameter's type; raises ValueError with a sentence."""
@@ -308,9 +310,9 @@ def _declared(
     hook = getattr(config, "in_folder", None)
     config = config if hook is None else hook(folder)
     for finding in _combined(options, module, config):
-        key, what, *hint = ("", finding) if isinstance(finding, str) else finding
+        key, *texts = ("", finding) if isinstance(finding, str) else finding
         at = node.mapping.get(key, node)
-        problems.append(at.problem(f"{name}.{key}" if key else name, what, *hint))
+        problems.append(at.problem(f"{name}.{key}" if key else name, *texts))
     if any(problem.is_error for problem in problems):
         return None
     return DeclaredAction(name, options, config, module, node.file, node.line)

@@ -98,12 +98,14 @@ def simulated(config: Config, context: ActionContext) -> Mapping[str, Any] | Non
 
 def _call(file: str, name: str, context: ActionContext) -> Mapping[str, Any] | None:
     try:
-        function = getattr(_loaded(Path(file)), name)
+        function = getattr(_loaded(Path(file)), name, None)
     except AmberboxError as error:
         raise NotStartedError(error.what, error.hint) from error
     except Exception as error:  # a robot's own file may fail in any way
         what = f"{file} cannot be loaded: {type(error).__name__}: {error}"
         raise NotStartedError(what) from error
+    if not callable(function):
+        raise NotStartedError(f"{Path(file).name} has no function '{name}'")
     result = function(context)
     return result if result is None or isinstance(result, Mapping) else {"value": result}
 

@@ -123,7 +123,7 @@ def _ask(
     import zmq
 
     request = json.dumps(_placeholders.filled(template, context.parameters), allow_nan=False)
-    socket = zmq.Context.instance().socket(zmq.REQ)
+    socket: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.REQ)
     try:
         socket.setsockopt(zmq.LINGER, 0)
         socket.setsockopt(zmq.IMMEDIATE, 1)
