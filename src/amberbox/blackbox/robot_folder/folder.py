@@ -151,12 +151,15 @@ def _read_black_box(path: Path, sources: str, problems: list[Problem]) -> Blocks
 def _files(place: Path, robot: RobotConfig, blocks: Sequence[SourceBlock]) -> list[Path]:
     """Return the configuration files of a folder.
 
-    Left out are the store, hidden files, compiled Python, the key to the server, and files through
-    which sources keep state or get orders while they run (``state_files``).
+    Left out are the store, hidden files, compiled Python, the key to the server, the trust file
+    (``commands``), and files through which sources keep state or get orders while they run
+    (``state_files``).
     """
     store = (place / Path(robot.store.path).expanduser()).resolve()
     named = (name for block in blocks for name in getattr(block.config, "state_files", ()))
     left_out = {(place / KEY_FILE).resolve(), *(Path(name).resolve() for name in named)}
+    if robot.commands:
+        left_out.add((place / Path(robot.commands).expanduser()).resolve())
     found = ((path, path.resolve()) for path in _walk(place))
     return [p for p, at in found if at not in left_out and not at.is_relative_to(store)]
 
@@ -277,5 +280,7 @@ def declared_folder(place: Path, robot: str, config_hash: str) -> tuple[RobotFol
     path = place / ROBOT_FILE
     node = load_yaml(path, problems) if path.is_file() else None
     config = build(RobotConfig, node, problems) if node is not None else None
-    config = replace(config or RobotConfig(), id=robot, store=StoreOptions(), server=None)
+    config = replace(
+        config or RobotConfig(), id=robot, store=StoreOptions(), server=None, commands=""
+    )
     return RobotFolder(place, config, (), config_hash), problems

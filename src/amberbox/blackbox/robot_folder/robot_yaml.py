@@ -572,6 +572,7 @@ class RobotConfig:
     software_version: str = option("", "version of the robot's own software")
     store: StoreOptions = option(StoreOptions(), "where and how the record is kept")
     server: ServerOptions | None = option(None, "the fleet server this robot reports to")
+    commands: str = option("", "file of who may order what from the server; nobody without")
     triggers: Sequence[TriggerOptions] = option((), "what makes an incident")
     missions: Sequence[MissionOptions] = option((), "what begins and ends missions")
     incidents: IncidentOptions = option(IncidentOptions(), "limits of incidents")

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
 from amberbox.blackbox.store.store import Store
+from amberbox.core.ed25519 import is_signed
 from amberbox.core.errors import UsageError
 from amberbox.core.files import replace_file, write_private
 
@@ -183,12 +184,7 @@ def _refuse(text: str, why: str) -> NoReturn:
 
 def holds(public: str, signature: str, message: bytes) -> bool:
     """Return whether a signature (hex) was made with the private half of ``public`` (hex)."""
-    from cryptography.exceptions import InvalidSignature
-    from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
-
     try:
-        key = Ed25519PublicKey.from_public_bytes(bytes.fromhex(public))
-        key.verify(bytes.fromhex(signature), message)
-    except (InvalidSignature, ValueError):
+        return is_signed(bytes.fromhex(public), bytes.fromhex(signature), message)
+    except ValueError:
         return False
-    return True

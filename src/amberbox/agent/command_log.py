@@ -1,0 +1,366 @@
+"""The robot's command log: a file of answers that are on the disk before they count.
+
+One record a line, ``CRC JSON``: answers (``accepted`` is one), lease numbers, revocations, and how
+far the server has stored the answers. What was appended is synced before ``add`` returns, so an
+``accepted`` without an end was being carried out when the process or the power went. The newest
+100,000 ids are remembered, so that no command runs twice.
+
+The file replaces itself when most of it is no longer needed: the new one is complete and synced
+before it takes the name, so that a power cut leaves the old or the new one.
+"""
+
+from __future__ import annotations
+
+import os
+import zlib
+from collections.abc import Collection, Iterable, Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Protocol
+
+import msgspec
+from msgspec import Struct
+
+from amberbox.core.command import FINAL, CommandAnswer
+from amberbox.core.errors import AmberboxError
+
+MOST_IDS = 100_000
+# Results of so many answers are kept until the server has them
+RESULTS = 200
+TIDY_BYTES = 1 << 20
+_NUMBERS_LOST = 1000  # a damaged line may have held higher numbers than those that can be read
+_BLOCK = 1 << 20
+
+
+class CommandLogError(AmberboxError):
+    """The log could not be written or read; no command may run."""
+
+
+class FileSystem(Protocol):
+    """The system calls of the log; the module ``os`` has them, tests have a disk of their own."""
+
+    def open(self, path: str, flags: int, mode: int = ..., /) -> int: ...
+    def read(self, fd: int, size: int, /) -> bytes: ...
+    def write(self, fd: int, data: bytes, /) -> int: ...
+    def fsync(self, fd: int, /) -> None: ...
+    def ftruncate(self, fd: int, size: int, /) -> None: ...
+    def close(self, fd: int, /) -> None: ...
+    def replace(self, source: str, target: str, /) -> None: ...
+
+
+class _Answer(Struct, frozen=True, tag="answer"):
+    digest: str
+    answer: CommandAnswer
+
+
+class _Lease(Struct, frozen=True, tag="lease"):
+    number: int
+
+
+class _Revoked(Struct, frozen=True, tag="revoked"):
+    keys: list[str]
+
+
+class _Acknowledged(Struct, frozen=True, tag="acknowledged"):
+    number: int
+
+
+class _Counters(Struct, frozen=True, tag="counters"):
+    """The first line of a file that replaced another one."""
+
+    answers: int
+    acknowledged: int
+    lease: int
+
+
+_Record = _Answer | _Lease | _Revoked | _Acknowledged | _Counters
+_DECODER: msgspec.json.Decoder[_Record] = msgspec.json.Decoder(_Record)
+_ANSWERS: msgspec.json.Decoder[_Answer] = msgspec.json.Decoder(_Answer)
+
+
+class CommandLogFile:
+    """The log in a file; only one process may have it open.
+
+    ``notes`` says what was repaired at opening. Raises CommandLogError when the file cannot be
+    read, or not be repaired. A file of at most ``tidy_bytes`` is not worth replacing.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        system: FileSystem = os,
+        most_ids: int = MOST_IDS,
+        tidy_bytes: int = TIDY_BYTES,
+    ) -> None:
+        self._path, self._part = str(path), f"{path}.part"
+        self._folder, self._system, self._most = str(path.parent), system, most_ids
+        self._tidy_bytes = tidy_bytes
+        self.notes: list[str] = []
+        self.lease_number = 0
+        self._answers = self._acknowledged = 0
+        self._revoked: set[str] = set()
+        # of each id the newest answer, encoded and without its result; in the order of first sight
+        self._seen: dict[str, bytes] = {}
+        self._running: dict[str, CommandAnswer] = {}
+        self._unanswered: dict[str, CommandAnswer] = {}
+        self._results: dict[str, None] = {}
+        # what has to be repaired before the next record: a torn tail, a name not synced
+        self._is_torn, self._is_name_synced = False, False
+        try:
+            self._fd = system.open(self._path, os.O_RDWR | os.O_APPEND | os.O_CREAT, 0o640)
+        except OSError as error:
+            raise _failure(self._path, error) from error
+        try:
+            self._size = self._read()
+            self._repair()
+        except OSError as error:
+            self.close()
+            raise _failure(self._path, error) from error
+        self._replaced_size = self._size
+
+    def _read(self) -> int:
+        """Read the file; return the end of its last whole record."""
+        content = bytearray()
+        while block := self._system.read(self._fd, _BLOCK):
+            content += block
+        end = at = damaged = bad = 0
+        for line in content.splitlines(keepends=True):
+            at += len(line)
+            record = _decoded(bytes(line))
+            if record is None:
+                bad += 1
+                continue
+            self._apply(record)
+            end, damaged = at, bad
+        if damaged:
+            self._answers += _NUMBERS_LOST
+            self.lease_number += _NUMBERS_LOST
+            self.notes.append(f"{self._path}: {damaged} damaged lines were skipped")
+        if end < len(content):
+            self.notes.append(
+                f"{self._path}: the last {len(content) - end} bytes were torn and were cut off"
+            )
+        self._is_torn = end < len(content)
+        # numbers that were raised only here have to outlast the next line
+        self._must_replace = bool(damaged)
+        return end
+
+    def _repair(self) -> None:
+        """Cut what is no whole record off, and sync the file's name; raises OSError."""
+        if self._is_torn:
+            self._system.ftruncate(self._fd, self._size)
+            self._system.fsync(self._fd)
+            self._is_torn = False
+        if not self._is_name_synced:
+            self._system.fsync(self._fd)  # a killed process may have left records unsynced
+            self._sync_folder()
+            self._is_name_synced = True
+        if self._must_replace:
+            self._replace()
+
+    def _sync_folder(self) -> None:
+        fd = self._system.open(self._folder, os.O_RDONLY | os.O_DIRECTORY)
+        try:
+            self._system.fsync(fd)
+        finally:
+            self._system.close(fd)
+
+    # -- what is known
+
+    @property
+    def revoked(self) -> Collection[str]:
+        """Ids of the keys that were revoked."""
+        return self._revoked
+
+    def seen(self, command_id: str) -> tuple[str, CommandAnswer] | None:
+        """Return digest and newest answer of a command; None for one that is not known."""
+        known = self._seen.get(command_id)
+        if known is None:
+            return None
+        found = _ANSWERS.decode(known)
+        return found.digest, self._unanswered.get(command_id, found.answer)
+
+    def running(self) -> list[tuple[str, CommandAnswer]]:
+        """Return digest and answer of each command that was accepted and has not ended."""
+        return [found for found in map(self.seen, self._running) if found is not None]
+
+    def unanswered(self) -> list[CommandAnswer]:
+        """Return the answers that the server has not stored yet, of each command the newest."""
+        return sorted(self._unanswered.values(), key=lambda answer: answer.number)
+
+    # -- what is added
+
+    def add(self, answer: CommandAnswer, digest: str) -> CommandAnswer:
+        """Store an answer under the next number, and return it once it survives a power cut.
+
+        Raises CommandLogError, and then it does not count.
+        """
+        numbered = msgspec.structs.replace(answer, number=self._answers + 1)
+        self._append(_Answer(digest, numbered))
+        return numbered
+
+    def add_lease(self, number: int) -> None:
+        """Store the number of a lease that is about to be given; raises CommandLogError."""
+        self._append(_Lease(number))
+
+    def add_revoked(self, keys: Iterable[str]) -> None:
+        """Store ids of revoked keys; raises CommandLogError."""
+        self._append(_Revoked(sorted(keys)))
+
+    def acknowledge(self, number: int) -> None:
+        """Note that the server has stored all answers up to a number.
+
+        It is not synced: at worst answers are sent again. Raises CommandLogError.
+        """
+        number = min(number, self._answers)
+        if number > self._acknowledged:
+            self._append(_Acknowledged(number), is_synced=False)
+
+    def _append(self, record: _Record, *, is_synced: bool = True) -> None:
+        line = _line(record)
+        try:
+            self._repair()
+            self._is_torn = True
+            _write(self._system, self._fd, line)
+            if is_synced:
+                self._system.fsync(self._fd)
+        except OSError as error:
+            with suppress(OSError):  # else before the next record, or at the next opening
+                self._repair()
+            raise _failure(self._path, error) from error
+        self._is_torn = False
+        self._size += len(line)
+        self._apply(record)
+
+    def _apply(self, record: _Record) -> None:
+        match record:
+            case _Answer():
+                self._apply_answer(record.digest, record.answer)
+            case _Lease(number):
+                self.lease_number = max(self.lease_number, number)
+            case _Revoked(keys):
+                self._revoked.update(keys)
+            case _Acknowledged(number):
+                self._acknowledged = max(self._acknowledged, number)
+                kept = {i: a for i, a in self._unanswered.items() if a.number > number}
+                self._unanswered = kept
+                self._results = {i: None for i in self._results if i in kept}
+            case _Counters():
+                self._answers = max(self._answers, record.answers)
+                self._acknowledged = max(self._acknowledged, record.acknowledged)
+                self.lease_number = max(self.lease_number, record.lease)
+
+    def _apply_answer(self, digest: str, answer: CommandAnswer) -> None:
+        self._answers = max(self._answers, answer.number)
+        bare = msgspec.structs.replace(answer, result="")
+        self._seen[answer.id] = msgspec.json.encode(_Answer(digest, bare))
+        if answer.state in FINAL:
+            self._running.pop(answer.id, None)
+        else:
+            self._running[answer.id] = bare
+        if answer.number > self._acknowledged:
+            self._unanswered[answer.id] = answer
+            if answer.result:
+                self._results[answer.id] = None
+        if len(self._results) > RESULTS:
+            oldest = next(iter(self._results))
+            del self._results[oldest]
+            without = msgspec.structs.replace(self._unanswered[oldest], result="")
+            self._unanswered[oldest] = without
+        while len(self._seen) > self._most and self._forget_oldest():
+            pass
+
+    def _forget_oldest(self) -> bool:
+        """Forget the oldest id whose command is not running; return whether there was one."""
+        oldest = next((known for known in self._seen if known not in self._running), None)
+        if oldest is None:
+            return False
+        del self._seen[oldest]
+        self._unanswered.pop(oldest, None)
+        self._results.pop(oldest, None)
+        return True
+
+    # -- compaction
+
+    def tidy(self) -> None:
+        """Replace the file where at least half of it is no longer needed.
+
+        It takes as long as the disk needs for up to 40 MB, so call it while nothing runs. Without
+        room for the new file the old one goes on.
+        """
+        if self._size > max(self._tidy_bytes, 2 * self._replaced_size):
+            with suppress(OSError):
+                self._replaced_size = self._size  # not at once again where it fails
+                self._replace()
+
+    def _replace(self) -> None:
+        """Write what is known to a new file and give it the name of the old one."""
+        flags = os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_TRUNC
+        fd = self._system.open(self._part, flags, 0o640)
+        try:
+            size = 0
+            for data in _blocks(self._records()):
+                _write(self._system, fd, data)
+                size += len(data)
+            self._system.fsync(fd)
+            self._system.replace(self._part, self._path)
+        except BaseException:
+            self._system.close(fd)
+            raise
+        old, self._fd = self._fd, fd
+        self._size = self._replaced_size = size
+        self._is_torn, self._must_replace, self._is_name_synced = False, False, False
+        self._system.close(old)
+        self._sync_folder()
+        self._is_name_synced = True
+
+    def _records(self) -> Iterator[_Record]:
+        yield _Counters(self._answers, self._acknowledged, self.lease_number)
+        if self._revoked:
+            yield _Revoked(sorted(self._revoked))
+        for command_id, known in self._seen.items():
+            found = _ANSWERS.decode(known)
+            yield _Answer(found.digest, self._unanswered.get(command_id, found.answer))
+
+    def close(self) -> None:
+        """Close the file."""
+        self._system.close(self._fd)
+
+
+def _failure(path: str, error: OSError) -> CommandLogError:
+    why = error.strerror or str(error)
+    return CommandLogError(
+        f"the command log {path} cannot be used: {why}", "no command runs before that is repaired"
+    )
+
+
+def _line(record: _Record) -> bytes:
+    text = msgspec.json.encode(record)
+    return b"%08x %s\n" % (zlib.crc32(text), text)
+
+
+def _decoded(line: bytes) -> _Record | None:
+    """Return the record in a line; None if it is torn or damaged."""
+    checksum, _, text = line.removesuffix(b"\n").partition(b" ")
+    if not line.endswith(b"\n") or checksum != b"%08x" % zlib.crc32(text):
+        return None
+    try:
+        return _DECODER.decode(text)
+    except msgspec.MsgspecError:
+        return None
+
+
+def _blocks(records: Iterable[_Record]) -> Iterator[bytes]:
+    block = bytearray()
+    for record in records:
+        block += _line(record)
+        if len(block) >= _BLOCK:
+            yield bytes(block)
+            block.clear()
+    yield bytes(block)
+
+
+def _write(system: FileSystem, fd: int, data: bytes) -> None:
+    view = memoryview(data)
+    while view:
+        view = view[system.write(fd, bytes(view)) :]
