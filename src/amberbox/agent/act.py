@@ -369,7 +369,7 @@ class CommandProcess:
         """Write which actions run, so that they can be stopped if everything here is killed."""
         commands = [*(one.command for one in acting), *more]
         running = [CarriedOut(one.id, one.action, one.parameters) for one in commands]
-        replace_file(self._store.path / CARRIED_OUT, msgspec.json.encode(running))
+        replace_file(self._store.path / CARRIED_OUT, msgspec.json.encode(running).decode())
 
     def _stop_left_behind(self) -> None:
         """Stop, in fresh actors, what was being carried out when everything here was killed."""

@@ -28,7 +28,10 @@ from amberbox.core.files import keep_to_group
 from amberbox.core.safe_text import one_line
 
 _WATCH_S = 0.3
-_ACT_EXIT = "exit status: 0 after an orderly end, 1 the command log cannot be used, 2 wrong usage or configuration"
+_ACT_EXIT = (
+    "exit status: 0 after an orderly end, 1 the command log cannot be used, 2 wrong usage or "
+    "configuration"
+)
 _CONFIRM_EXIT = "exit status: 0 done, 1 nothing waits or no process answers, 2 wrong usage"
 
 
