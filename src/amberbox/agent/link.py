@@ -53,6 +53,8 @@ class LinkState:
     backlog: int
     copied: int
     at_ns: int
+    unknown_frames: int = 0
+    """Frames of the server that were ignored: this version does not know them."""
 
     def short(self) -> str:
         """Return a line on the connection."""
@@ -162,7 +164,7 @@ class LinkProcess:
         trouble = progress.trouble or self.loop.trouble or self._dock.problem
         return LinkState(
             self.options.url, progress.connected, trouble, progress.backlog,
-            self.loop.copied, self.client.clock.wall_ns(),
+            self.loop.copied, self.client.clock.wall_ns(), progress.unknown_frames,
         )  # fmt: skip
 
     async def _live(self) -> None:

@@ -27,6 +27,7 @@ from amberbox.core.pacing import Backoff, TokenBucket
 from amberbox.core.tls import PinError
 from amberbox.core.version import __version__
 from amberbox.link import limits
+from amberbox.link.command_port import CommandPort, NoCommands
 from amberbox.link.connection import (
     LinkConnection,
     LinkDownError,
@@ -38,9 +39,12 @@ from amberbox.link.connection import (
 )
 from amberbox.link.frames import (
     START,
+    AbortFrame,
     Ack,
+    AnsweredFrame,
     BeatFrame,
     Bye,
+    CommandsFrame,
     DurableFrame,
     FetchFrame,
     FrameError,
@@ -48,10 +52,14 @@ from amberbox.link.frames import (
     HeadsFrame,
     Hello,
     JournalPosition,
+    LeaseFrame,
     LiveFrame,
     Pong,
+    RevokedFrame,
     RobotFrame,
+    ServerCommandFrame,
     ServerFrame,
+    UnknownFrameError,
     WatchFrame,
     Welcome,
     WriterReach,
@@ -160,14 +168,16 @@ class LinkSession:
         welcome: Welcome,
         reach_reader: ReachReader,
         reaches: Mapping[str, WriterReach],
+        capabilities: Sequence[str] = (),
     ) -> None:
         self._client = client
         self._line = line
+        self._server_id = welcome.server_id
         self._reach_reader = reach_reader
         self._reaches = dict(reaches)
         self._end = RobotEnd()
         ends = {w: reaches[w].end if w in reaches else START for w in limits.WRITERS}
-        self._end.welcome(welcome, ends)
+        self._end.welcome(welcome, ends, capabilities)
         self._fresh: dict[str, RawRowTail] = {}
         self._old: dict[str, RawRowTail] = {}
         for writer in limits.WRITERS:
@@ -185,6 +195,9 @@ class LinkSession:
     async def run(self, stop: asyncio.Event) -> None:
         """Serve the connection; raises LinkDownError when it breaks."""
         works = [self._listen(), self._read(), self._send_rows(), self._beat(), self._send_live()]
+        if self._end.carries_commands:
+            self._client.port.begin(self._server_id)
+            works.append(self._send_reports())
         tasks = [asyncio.create_task(work) for work in works]
         stopping = asyncio.create_task(_set(stop))
         try:
@@ -198,6 +211,8 @@ class LinkSession:
             for task in [*tasks, stopping]:
                 task.cancel()
             await asyncio.gather(*tasks, stopping, return_exceptions=True)
+            if self._end.carries_commands:
+                self._client.port.end()
             await asyncio.to_thread(self._save_positions)
 
     async def _last(self, tasks: list[asyncio.Task[None]]) -> None:
@@ -221,7 +236,12 @@ class LinkSession:
                     data = await self._line.receive()
             except TimeoutError:
                 raise LinkDownError(f"nothing was heard for {limits.SILENT_S:g} s") from None
-            self._handle(from_server(data))
+            try:
+                frame = from_server(data)
+            except UnknownFrameError:
+                self._client.progress.unknown_frames += 1
+            else:
+                self._handle(frame)
 
     def _handle(self, frame: ServerFrame) -> None:
         if isinstance(frame, Ack):
@@ -240,6 +260,29 @@ class LinkSession:
             self._client.asked.fetch(frame)
         elif isinstance(frame, Bye):
             raise LinkDownError(f"the server says: {frame.reason}")
+        elif not isinstance(frame, Welcome):
+            self._handle_commands(frame)
+
+    def _handle_commands(self, frame: ServerCommandFrame) -> None:
+        """Pass a frame to the gate; without the capability it is one that is not known here."""
+        port = self._client.port
+        if not self._end.carries_commands:
+            self._client.progress.unknown_frames += 1
+        elif isinstance(frame, CommandsFrame):
+            port.commands(frame.commands)
+        elif isinstance(frame, AnsweredFrame):
+            port.answered(frame.number)
+        elif isinstance(frame, RevokedFrame):
+            port.revoked(frame.keys)
+        elif isinstance(frame, LeaseFrame):
+            port.lease(frame)
+        elif isinstance(frame, AbortFrame):
+            port.abort(frame)
+
+    async def _send_reports(self) -> None:
+        while True:
+            for frame in self._end.command_frames(await self._client.port.report()):
+                await self._send(frame)
 
     async def _read(self) -> None:
         """Read new rows first, then old ones, as far as the lanes have room."""
@@ -426,6 +469,8 @@ class LinkProgress:
     backlog_bytes: int = 0
     rows_sent: int = 0
     bytes_sent: int = 0
+    unknown_frames: int = 0
+    """Frames of the server that were ignored: this version does not know them."""
     offset: OffsetEstimate = field(default_factory=OffsetEstimate)
 
 
@@ -442,6 +487,7 @@ class LinkClient:
         options: LinkOptions,
         *,
         asked: ServerRequestHandlers | None = None,
+        port: CommandPort | None = None,
         clock: Clock | None = None,
         network: Callable[[], Network] = current_network,
         monitoring: MonitoringState = lambda store, clock: ("", 0.0),
@@ -451,6 +497,7 @@ class LinkClient:
         self.store = store
         self.options = options
         self.asked = asked or ServerRequestHandlers()
+        self.port: CommandPort = port or NoCommands()
         self.clock = clock or SystemClock()
         self.network = network
         self.monitoring = monitoring
@@ -516,16 +563,17 @@ class LinkClient:
         """Send Hello; raises LinkRefusedError when the server refuses the robot."""
         reaches = await asyncio.to_thread(self._reaches.state)
         self.announced_key = self.current_key()
+        capabilities = list(self.port.capabilities)
         hello = Hello(
             self.options.robot, self.store.id, self.clock.boot_id(), reaches,
             self.options.config_hash, self.clock.wall_ns(), self.clock.boot_ns(), __version__,
-            public_key=self.announced_key,
+            public_key=self.announced_key, capabilities=capabilities,
         )  # fmt: skip
         answer = await greet(line, hello)
         if answer.wants_folder:
             self.asked.folder(self.options.config_hash)
         self.watch_variables(answer.watch)
-        return LinkSession(self, line, answer, self._reaches, reaches)
+        return LinkSession(self, line, answer, self._reaches, reaches, capabilities)
 
     def watch_variables(self, variables: Sequence[str]) -> None:
         """Send the latest values of these variables from now on, if the folder allows it."""

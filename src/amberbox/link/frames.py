@@ -7,11 +7,19 @@ other; so each frame begins with the CRC-32 of its content, little-endian.
 from __future__ import annotations
 
 import zlib
-from typing import Annotated, NamedTuple, TypeAlias, TypeVar
+from collections.abc import Collection
+from typing import Annotated, Literal, NamedTuple, TypeAlias, TypeVar, get_args
 
 import msgspec
 from msgspec import Meta, Struct
 
+from amberbox.core.command import (
+    CHALLENGE_BYTES,
+    COMMAND_BYTES,
+    CommandAnswer,
+    KeyId,
+    LeaseState,
+)
 from amberbox.link import limits
 
 # Largest number that a robot may send: sums and ends of ranges still fit into 64 bits
@@ -78,10 +86,17 @@ Text = Annotated[str, Meta(max_length=limits.TEXT_BYTES)]
 Writers = Annotated[dict[Name, WriterReach], Meta(max_length=8)]
 Cursor: TypeAlias = dict[str, JournalPosition]
 Upto = Annotated[dict[Name, JournalPosition], Meta(max_length=8)]
+Capability = Annotated[str, Meta(max_length=limits.CAPABILITY_LENGTH)]
+Capabilities = Annotated[list[Capability], Meta(max_length=limits.CAPABILITIES)]
+EncodedCommand = Annotated[bytes, Meta(max_length=COMMAND_BYTES)]
 
 
 class FrameError(ValueError):
     """Invalid data instead of a frame: damaged, too large, or of another protocol."""
+
+
+class UnknownFrameError(FrameError):
+    """A sound frame with an unknown tag, as a newer version may send; it is ignored and counted."""
 
 
 class LinkRow(Struct, frozen=True, array_like=True):
@@ -101,7 +116,7 @@ class LinkRow(Struct, frozen=True, array_like=True):
 
 
 class Hello(Struct, frozen=True, tag="hello"):
-    """The robot's first frame: its id and store, and how far its journals reach."""
+    """The robot's first frame: its id and store, how far its journals reach, what it can do."""
 
     robot: Name
     store_id: Name
@@ -113,6 +128,7 @@ class Hello(Struct, frozen=True, tag="hello"):
     version: Name
     protocol: int = limits.PROTOCOL
     public_key: Name = ""
+    capabilities: Capabilities = []
 
 
 class RowsFrame(Struct, frozen=True, tag="rows"):
@@ -178,14 +194,45 @@ class HasFrame(Struct, frozen=True, tag="has"):
     id: Name = ""
 
 
+class ChallengeFrame(Struct, frozen=True, tag="challenge"):
+    """Random bytes that the robot has minted, for signatures of the next minute; its lease.
+
+    It is sent at the beginning, every 10 s, and whenever the lease changes.
+    """
+
+    epoch: Count
+    challenge: Annotated[bytes, Meta(min_length=CHALLENGE_BYTES, max_length=CHALLENGE_BYTES)]
+    lease: LeaseState = LeaseState()
+
+
+class ActionsFrame(Struct, frozen=True, tag="actions"):
+    """What the robot can do, as JSON: names, risks, parameters with their limits."""
+
+    epoch: Count
+    announcement: Annotated[bytes, Meta(max_length=limits.ACTIONS_BYTES)]
+
+
+class AnswersFrame(Struct, frozen=True, tag="answers"):
+    """What the robot says of commands, in the order of its answers; frames are counted from 1."""
+
+    epoch: Count
+    number: Count
+    answers: Annotated[list[CommandAnswer], Meta(max_length=limits.ANSWERS_COUNT)]
+
+
 class Welcome(Struct, frozen=True, tag="welcome"):
-    """The server's answer to Hello: the epoch, and the positions from which to send rows."""
+    """The server's answer to Hello: the epoch, and the positions from which to send rows.
+
+    ``server_id`` is the random id of the server; empty from a server before it had one.
+    """
 
     epoch: int
     cursor: Cursor
     server_wall_ns: int
     wants_folder: bool = False
     watch: list[str] = []
+    capabilities: Capabilities = []
+    server_id: Name = ""
 
 
 class Ack(Struct, frozen=True, tag="ack"):
@@ -217,6 +264,40 @@ class FetchFrame(Struct, frozen=True, tag="fetch"):
     to_ns: int
 
 
+class CommandsFrame(Struct, frozen=True, tag="commands"):
+    """Commands as they were encoded; each is sent again on later contacts until it is answered."""
+
+    commands: Annotated[list[EncodedCommand], Meta(max_length=limits.COMMANDS_COUNT)]
+
+
+class AnsweredFrame(Struct, frozen=True, tag="answered"):
+    """All answers of the robot up to ``number`` are stored; they are never needed again."""
+
+    number: Count
+
+
+class RevokedFrame(Struct, frozen=True, tag="revoked"):
+    """Persons' keys that are revoked for ever, by id, besides those of earlier frames."""
+
+    keys: Annotated[list[KeyId], Meta(max_length=limits.KEYS_COUNT)]
+
+
+class LeaseFrame(Struct, frozen=True, tag="lease"):
+    """A run takes, renews or releases the robot; ``number`` is that of the lease it has."""
+
+    do: Literal["take", "renew", "release"]
+    holder: Name
+    run: Name
+    number: Count = 0
+
+
+class AbortFrame(Struct, frozen=True, tag="abort"):
+    """Stop what a run or one command does, safely; of the two one is empty."""
+
+    run: Name = ""
+    command: Name = ""
+
+
 class Bye(Struct, frozen=True, tag="bye"):
     """Why the sender closes the link; ``for_good``: reconnecting is useless."""
 
@@ -224,15 +305,43 @@ class Bye(Struct, frozen=True, tag="bye"):
     for_good: bool = False
 
 
-RobotFrame: TypeAlias = (
-    Hello | RowsFrame | DurableFrame | LiveFrame | BeatFrame | HeadsFrame | HasFrame | Bye
+# Frames that need the capability limits.COMMANDS, said by both ends
+RobotCommandFrame: TypeAlias = ChallengeFrame | ActionsFrame | AnswersFrame
+ServerCommandFrame: TypeAlias = (
+    CommandsFrame | AnsweredFrame | RevokedFrame | LeaseFrame | AbortFrame
 )
-ServerFrame: TypeAlias = Welcome | Ack | Pong | WatchFrame | FetchFrame | Bye
+RobotFrame: TypeAlias = (
+    Hello
+    | RowsFrame
+    | DurableFrame
+    | LiveFrame
+    | BeatFrame
+    | HeadsFrame
+    | HasFrame
+    | Bye
+    | RobotCommandFrame
+)
+ServerFrame: TypeAlias = Welcome | Ack | Pong | WatchFrame | FetchFrame | Bye | ServerCommandFrame
 FrameT = TypeVar("FrameT")
+
+
+class _Tag(Struct):
+    """The tag of any frame."""
+
+    type: Capability
+
 
 _ENCODER = msgspec.msgpack.Encoder()
 _FROM_ROBOT: msgspec.msgpack.Decoder[RobotFrame] = msgspec.msgpack.Decoder(RobotFrame)
 _FROM_SERVER: msgspec.msgpack.Decoder[ServerFrame] = msgspec.msgpack.Decoder(ServerFrame)
+_TAG = msgspec.msgpack.Decoder(_Tag)
+
+
+def _tags(frames: object) -> frozenset[str]:
+    return frozenset(str(kind.__struct_config__.tag) for kind in get_args(frames))
+
+
+_TAGS_OF_ROBOTS, _TAGS_OF_SERVERS = _tags(RobotFrame), _tags(ServerFrame)
 
 
 def encode(frame: RobotFrame | ServerFrame) -> bytes:
@@ -244,16 +353,24 @@ def encode(frame: RobotFrame | ServerFrame) -> bytes:
 
 
 def from_robot(data: bytes) -> RobotFrame:
-    """Decode a frame from a robot; raises FrameError for invalid data."""
-    return _decoded(_FROM_ROBOT, data)
+    """Decode a frame from a robot.
+
+    Raises UnknownFrameError for a frame with an unknown tag, FrameError for invalid data.
+    """
+    return _decoded(_FROM_ROBOT, _TAGS_OF_ROBOTS, data)
 
 
 def from_server(data: bytes) -> ServerFrame:
-    """Decode a frame from a server; raises FrameError for invalid data."""
-    return _decoded(_FROM_SERVER, data)
+    """Decode a frame from a server.
+
+    Raises UnknownFrameError for a frame with an unknown tag, FrameError for invalid data.
+    """
+    return _decoded(_FROM_SERVER, _TAGS_OF_SERVERS, data)
 
 
-def _decoded(decoder: msgspec.msgpack.Decoder[FrameT], data: bytes) -> FrameT:
+def _decoded(
+    decoder: msgspec.msgpack.Decoder[FrameT], tags: Collection[str], data: bytes
+) -> FrameT:
     try:
         if not 4 < len(data) <= limits.FRAME_BYTES:
             raise FrameError(f"{len(data)} bytes")
@@ -262,4 +379,16 @@ def _decoded(decoder: msgspec.msgpack.Decoder[FrameT], data: bytes) -> FrameT:
             raise FrameError("the checksum does not fit")
         return decoder.decode(content)
     except (msgspec.DecodeError, ValueError, RecursionError) as error:
+        if isinstance(error, msgspec.ValidationError):
+            _refuse_unknown(content, tags)
         raise FrameError(f"no frame: {error}") from error
+
+
+def _refuse_unknown(content: memoryview, tags: Collection[str]) -> None:
+    """Raise UnknownFrameError if the content has a tag, and this is an unknown one."""
+    try:
+        tag = _TAG.decode(content).type
+    except (msgspec.DecodeError, ValueError, RecursionError):
+        return
+    if tag not in tags:
+        raise UnknownFrameError(f"no frame of this version: {tag!r}")

@@ -27,6 +27,21 @@ FILES = 2000
 # Longest reason or name in a frame
 TEXT_BYTES = 4096
 
+# The capability to carry commands: neither end sends a frame of commands unless both have said it
+COMMANDS = "commands1"
+# What an end may say that it can, and the longest name of a capability or of a frame
+CAPABILITIES = 64
+CAPABILITY_LENGTH = 64
+# Commands of one frame, and their approximate size
+COMMANDS_COUNT = 100
+COMMANDS_BYTES = 256 << 10
+# Largest size of what a robot announces that it can do
+ACTIONS_BYTES = 256 << 10
+# Answers in one frame
+ANSWERS_COUNT = 200
+# Revoked keys in one frame
+KEYS_COUNT = 1000
+
 BEAT_S = 1.0
 # An end that receives nothing for so long takes the link as dead, whatever TCP reports
 SILENT_S = 5.0

@@ -7,16 +7,24 @@ statuses, and the backlog written while there was no link.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
+import msgspec
+
+from amberbox.core.command import CommandAnswer
 from amberbox.link import limits
+from amberbox.link.command_port import ActionAnnouncement, GateReport, MintedChallenge
 from amberbox.link.frames import (
     START,
     Ack,
+    ActionsFrame,
+    AnswersFrame,
+    ChallengeFrame,
     JournalPosition,
     LinkRow,
+    RobotCommandFrame,
     RowsFrame,
     Welcome,
     WriterReach,
@@ -53,13 +61,27 @@ class RobotEnd:
     cursor: dict[str, JournalPosition] = field(default_factory=dict)
     next_number: int = 1
     acked: int = 0
+    next_answers: int = 1
+    """The number of the next frame of answers to commands."""
+    carries_commands: bool = False
+    """Whether both ends have said that they carry commands."""
     sent_upto: dict[str, JournalPosition] = field(default_factory=dict)
     _lanes: dict[Lane, deque[LinkRow]] = field(default_factory=lambda: {n: deque() for n in LANES})
     _reading: dict[str, _Reading] = field(default_factory=dict)
 
-    def welcome(self, frame: Welcome, ends: Mapping[str, JournalPosition]) -> None:
-        """Begin: ``ends`` are the present ends of the writers' journals; later rows are new."""
+    def welcome(
+        self,
+        frame: Welcome,
+        ends: Mapping[str, JournalPosition],
+        capabilities: Collection[str] = (),
+    ) -> None:
+        """Begin: ``ends`` are the present ends of the writers' journals; later rows are new.
+
+        ``capabilities`` are those that were said in Hello.
+        """
         self.epoch, self.next_number, self.acked = frame.epoch, 1, 0
+        self.next_answers = 1
+        self.carries_commands = limits.COMMANDS in {*capabilities} & {*frame.capabilities}
         self.cursor = dict(frame.cursor)
         self.sent_upto = dict(self.cursor)
         for lane in self._lanes.values():
@@ -164,9 +186,34 @@ class RobotEnd:
         for writer, at in frame.cursor.items():
             self.cursor[writer] = max(at, self.cursor.get(writer, START))
 
+    def command_frames(self, report: GateReport) -> Iterator[RobotCommandFrame]:
+        """Yield the frames that carry what the gate reports."""
+        if isinstance(report, MintedChallenge):
+            yield ChallengeFrame(self.epoch, report.challenge, report.lease)
+        elif isinstance(report, ActionAnnouncement):
+            yield ActionsFrame(self.epoch, report.actions)
+        else:
+            for answers in _fitting(report.answers):
+                yield AnswersFrame(self.epoch, self.next_answers, answers)
+                self.next_answers += 1
+
     def backlog(self, reaches: Mapping[str, WriterReach]) -> int:
         """Return the approximate number of positions between the acknowledged ones and the end."""
         return sum(_between(self.cursor.get(w, START), reach) for w, reach in reaches.items())
+
+
+def _fitting(answers: Sequence[CommandAnswer]) -> Iterator[list[CommandAnswer]]:
+    """Yield answers in portions that fit into a frame."""
+    portion, size = list[CommandAnswer](), 0
+    for answer in answers:
+        more = len(msgspec.msgpack.encode(answer))
+        if portion and (len(portion) == limits.ANSWERS_COUNT or size + more > limits.ROWS_BYTES):
+            yield portion
+            portion, size = [], 0
+        portion.append(answer)
+        size += more
+    if portion:
+        yield portion
 
 
 def _between(at: JournalPosition, reach: WriterReach) -> int:

@@ -10,11 +10,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TypeAlias
 
+import msgspec
+
 from amberbox.link import limits
 from amberbox.link.frames import (
     Ack,
+    ActionsFrame,
+    AnswersFrame,
     BeatFrame,
     Bye,
+    ChallengeFrame,
     DurableFrame,
     HasFrame,
     HeadsFrame,
@@ -23,6 +28,7 @@ from amberbox.link.frames import (
     LinkRow,
     LiveFrame,
     Pong,
+    RobotCommandFrame,
     RobotFrame,
     RowsFrame,
     ServerFrame,
@@ -62,8 +68,13 @@ class SendFrames:
     ends: bool = False
 
 
-ForwardedFrame: TypeAlias = LiveFrame | BeatFrame | HeadsFrame | HasFrame
-LinkAction: TypeAlias = AdmitRobot | StoreRows | SendFrames | ForwardedFrame
+@dataclass(frozen=True, slots=True)
+class IgnoreFrame:
+    """Count a frame with an unknown tag, or of a capability that was not said."""
+
+
+ForwardedFrame: TypeAlias = LiveFrame | BeatFrame | HeadsFrame | HasFrame | RobotCommandFrame
+LinkAction: TypeAlias = AdmitRobot | StoreRows | SendFrames | IgnoreFrame | ForwardedFrame
 
 
 @dataclass(slots=True)
@@ -75,7 +86,14 @@ class ServerEnd:
     hello: Hello | None = None
     closed: bool = False
     next_number: int = 1
+    next_answers: int = 1
+    """The number of the next frame of answers to commands."""
     reaches: dict[str, WriterReach] = field(default_factory=dict)
+
+    @property
+    def takes_commands(self) -> bool:
+        """Return whether both ends carry commands."""
+        return self.hello is not None and limits.COMMANDS in self.hello.capabilities
 
     def receive(self, frame: RobotFrame) -> list[LinkAction]:
         """Process a frame; return the actions, in order."""
@@ -93,16 +111,33 @@ class ServerEnd:
             return self._rows(frame)
         if isinstance(frame, DurableFrame):
             return self._durable(frame)
+        if isinstance(frame, ChallengeFrame | ActionsFrame | AnswersFrame):
+            return self._command_frame(frame)
         return [frame]
 
+    def receive_unknown(self) -> list[LinkAction]:
+        """Process a frame with an unknown tag; return the actions."""
+        if self.closed:
+            return []
+        return self._end("say hello first") if self.epoch is None else [IgnoreFrame()]
+
     def admitted(
-        self, admission: LinkAdmission, wall_ns: int, *, wants_folder: bool, watch: Sequence[str]
+        self,
+        admission: LinkAdmission,
+        wall_ns: int,
+        *,
+        wants_folder: bool,
+        watch: Sequence[str],
+        server_id: str = "",
     ) -> Welcome:
         """Begin the epoch; return the answer to Hello."""
         assert self.hello is not None
         self.epoch = admission.epoch
         self.reaches = dict(self.hello.writers)
-        return Welcome(admission.epoch, admission.cursor, wall_ns, wants_folder, list(watch))
+        return Welcome(
+            admission.epoch, admission.cursor, wall_ns, wants_folder, list(watch),
+            [limits.COMMANDS], server_id,
+        )  # fmt: skip
 
     def stored(self, number: int, stored: StoredRows) -> Ack:
         """Return the acknowledgement for rows that are durable."""
@@ -159,6 +194,22 @@ class ServerEnd:
                 self.reaches[writer] = reach
         return [self._keep(self.next_number - 1, (), {}, compare=True)]
 
+    def _command_frame(self, frame: RobotCommandFrame) -> list[LinkAction]:
+        if not self.takes_commands:
+            return [IgnoreFrame()]
+        if isinstance(frame, ActionsFrame) and not _is_json(frame.announcement):
+            return self._end("what it can do is no JSON")
+        if isinstance(frame, AnswersFrame):
+            if frame.number < self.next_answers:
+                return []  # a repeated frame: already processed
+            if frame.number > self.next_answers:
+                return self._end(f"frame {self.next_answers} of answers is missing")
+            numbers = [one.number for one in frame.answers if one.number]
+            if numbers != sorted(set(numbers)):
+                return self._end("answers out of order")
+            self.next_answers += 1
+        return [frame]
+
     def _keep(
         self,
         number: int,
@@ -174,6 +225,14 @@ class ServerEnd:
     def _end(self, reason: str, *, for_good: bool = False) -> list[LinkAction]:
         self.closed = True
         return [SendFrames((Bye(reason[: limits.TEXT_BYTES], for_good),), ends=True)]
+
+
+def _is_json(data: bytes) -> bool:
+    try:
+        msgspec.json.decode(data)
+    except (msgspec.DecodeError, ValueError, RecursionError):
+        return False
+    return True
 
 
 def _wrong(writers: dict[str, WriterReach]) -> str:

@@ -117,6 +117,7 @@ def make_services(
     robot_worker_pool = WorkerPool.for_robots(folder)
     folders = FolderService(folder, database, bus, clock, robot_worker_pool)
     links = LinkServer(database, _hooks(bus, folders), clock)
+    bus.on("command", lambda change: links.send_commands(change.robot))
     state = FleetState(database, archive, bus, links, folders, robot_worker_pool)
     upload_service = UploadService(
         folder,
@@ -185,6 +186,7 @@ def _hooks(bus: EventBus, folders: FolderService) -> LinkHooks:
             ServerChange("has", robot, {"store_id": store, "id": has.id, "files": has.files})
         ),
         wants_folder=folders.wants,
+        commands=lambda robot, ids: bus.publish(ServerChange("answered", robot, {"ids": ids})),
     )
 
 

@@ -819,3 +819,86 @@ JOB = Table(
 )
 """``owner`` is the person, also where a token of theirs asked. ``state``: queued, running, done,
 failed, cancelled, or expired (its file is gone). ``request`` and ``notes`` are JSON."""
+
+
+IDENTITY = Table(
+    "server_identity",
+    METADATA,
+    Column("one", Integer, primary_key=True, autoincrement=False),
+    Column("server_id", Id, nullable=False),
+    Column("made_ns", Time, nullable=False),
+)
+"""One row: the random id of this server, which commands are signed for; made once."""
+
+COMMAND = Table(
+    "command",
+    METADATA,
+    Column("number", Counted, primary_key=True),
+    Column("id", Id, nullable=False, unique=True),
+    Column("robot", Id, nullable=False),
+    Column("action", _Word, nullable=False),
+    Column("parameters", Text, nullable=False),
+    Column("issuer", _Who, nullable=False),
+    Column("run", _Word, nullable=False),
+    Column("step", _Word, nullable=False),
+    Column("risk", _Short, nullable=False),
+    Column("key_id", Id, nullable=False),
+    Column("created_ns", Time, nullable=False),
+    Column("expires_ns", Time, nullable=False),
+    Column("bytes", LargeBinary, nullable=False),
+    Column("state", _Short, nullable=False),
+    Column("reason", Text, nullable=False),
+    Column("epoch", BigInteger, nullable=True),
+    Column("sent_ns", Time, nullable=True),
+    Column("sends", BigInteger, nullable=False),
+    Column("answered_ns", Time, nullable=True),
+    Index(None, "robot", "state"),
+)
+"""What robots are to do. ``state``: waiting, sent, or what the robot answered; expired, with no
+``answered_ns``, where the server gave it up. ``bytes`` is sent as it is here; ``key_id`` is empty
+where it is not signed; ``epoch`` is that of the connection that sent it last."""
+
+COMMAND_ANSWER = Table(
+    "command_answer",
+    METADATA,
+    Column("robot", Id, primary_key=True),
+    Column("store_id", _Word, primary_key=True),
+    Column("command", Id, primary_key=True),
+    Column("number", BigInteger, primary_key=True, autoincrement=False),
+    Column("state", _Short, primary_key=True),
+    Column("reason", Text, nullable=False),
+    Column("result", Text, nullable=False),
+    Column("at_ns", BigInteger, nullable=False),
+    Column("boot", _Word, nullable=False),
+    Column("mono_ns", BigInteger, nullable=False),
+    Column("received_ns", Time, nullable=False),
+    Index(None, "command"),
+)
+"""All that robots said of commands, also of such that this server does not know. ``at_ns`` and
+``mono_ns`` are the robot's."""
+
+COMMAND_ROBOT = Table(
+    "command_robot",
+    METADATA,
+    Column("robot", Id, primary_key=True),
+    Column("store_id", _Word, nullable=False),
+    Column("answered", BigInteger, nullable=False),
+    Column("actions", Text, nullable=False),
+    Column("actions_ns", Time, nullable=True),
+    Column("lease", BigInteger, nullable=False),
+    Column("holder", _Word, nullable=False),
+    Column("run", _Word, nullable=False),
+    Column("lease_ns", Time, nullable=True),
+)
+"""Robots that take commands, as they said last: number of the newest answer that is stored,
+actions (JSON, unchecked), and the lease: its number, holder and run."""
+
+REVOKED_KEY = Table(
+    "command_revoked_key",
+    METADATA,
+    Column("key_id", Id, primary_key=True),
+    Column("who", _Who, nullable=False),
+    Column("reason", Text, nullable=False),
+    Column("at_ns", Time, nullable=False),
+)
+"""Keys of persons that sign nothing any more; rows are only added."""

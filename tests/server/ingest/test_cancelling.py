@@ -16,7 +16,7 @@ from amberbox.server.database import ServerDatabase
 from amberbox.server.ingest.link_server import LinkServer, SessionRevocation
 from amberbox.server.live.feed import Feed
 from tests.server.house import house
-from tests.server.ingest.test_link_server import FakeSocket
+from tests.support.sockets import FakeSocket
 
 TURNS = range(6)
 """How many turns of the event loop lie between what comes and the end."""

@@ -22,22 +22,18 @@ from amberbox.link.frames import (
     LinkRow,
     LiveFrame,
     Pong,
-    RobotFrame,
     RowsFrame,
     RunEnd,
-    ServerFrame,
     WatchFrame,
     Welcome,
     WriterReach,
-    encode,
-    from_server,
 )
 from amberbox.link.server_end import ServerEnd
 from amberbox.monitoring.current_state import WatcherHeartbeat
 from amberbox.server.database import ServerDatabase
 from amberbox.server.ingest import ledger
 from amberbox.server.ingest.ledger import GroupedWrites, RowBatch, drop_committed
-from amberbox.server.ingest.link_server import LinkHooks, LinkServer, SocketClosedError
+from amberbox.server.ingest.link_server import LinkHooks, LinkServer
 from amberbox.server.ingest.link_state import RobotPresence, current_statuses, presences
 from amberbox.server.live.records import (
     RetainedStatus,
@@ -48,6 +44,7 @@ from amberbox.server.live.records import (
 )
 from amberbox.server.schema import BOOT, EVENT, HEADS, ROW
 from amberbox.testing.clock import PATIENCE_S
+from tests.support.sockets import FakeSocket
 
 REACH = WriterReach(
     JournalPosition(1, 0),
@@ -63,37 +60,6 @@ def database(tmp_path: Path) -> Iterator[ServerDatabase]:
     found = ServerDatabase(tmp_path / "server.db")
     yield found
     found.close()
-
-
-class FakeSocket:
-    """Two queues that stand for a WebSocket."""
-
-    def __init__(self) -> None:
-        self.up: asyncio.Queue[bytes | None] = asyncio.Queue()
-        self.down: asyncio.Queue[bytes] = asyncio.Queue()
-        self.closed = False
-
-    async def receive(self) -> bytes:
-        data = await self.up.get()
-        if data is None:
-            raise SocketClosedError
-        return data
-
-    async def send(self, data: bytes) -> None:
-        if self.closed:
-            raise SocketClosedError
-        self.down.put_nowait(data)
-
-    async def close(self) -> None:
-        self.closed = True
-        self.up.put_nowait(None)
-
-    def say(self, *frames: RobotFrame) -> None:
-        for frame in frames:
-            self.up.put_nowait(encode(frame))
-
-    async def hear(self) -> ServerFrame:
-        return from_server(await asyncio.wait_for(self.down.get(), PATIENCE_S))
 
 
 def status(seq: int, component: str, level: str = "ok", log_ns: int = 0) -> LinkRow:

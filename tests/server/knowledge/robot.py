@@ -20,7 +20,7 @@ from amberbox.server.ingest import link_state
 from amberbox.server.ingest.link_server import RobotConnection
 from amberbox.server.schema import ROBOT, ROW
 from tests.server.house import House
-from tests.server.ingest.test_link_server import FakeSocket
+from tests.support.sockets import FakeSocket
 
 FOLDER = Path(sim.__file__).parent / "folder"
 HASH = "5eed" * 16

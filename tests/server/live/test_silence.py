@@ -15,8 +15,8 @@ from amberbox.server.ingest.link_server import QUIET_S, RobotConnection
 from amberbox.server.live.feed import SilenceMonitor, ages_data
 from amberbox.server.live.records import RetainedStatus, ServerNow, StatusRecord, format_moment
 from tests.server.house import house
-from tests.server.ingest.test_link_server import FakeSocket
 from tests.server.live.listening import ask, hear, stage
+from tests.support.sockets import FakeSocket
 
 SEEN_NS = 1_800_000_000 * NS
 

@@ -19,7 +19,7 @@ from amberbox.server.ingest import ledger, link_state
 from amberbox.server.ingest.link_server import RobotConnection
 from amberbox.server.schema import ALARM, ALARM_ROBOT
 from tests.server.house import House
-from tests.server.ingest.test_link_server import FakeSocket
+from tests.support.sockets import FakeSocket
 
 BOOT = "00c0ffee-0000-4000-8000-000000000000"
 HASH = "ab" * 32

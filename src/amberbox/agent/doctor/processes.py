@@ -220,4 +220,6 @@ def link_in_words(state: Mapping[str, Any], now_ns: int) -> str:
         return f"no link to {server}{f': {trouble}' if trouble else ''}"
     backlog = int(state.get("backlog", 0))
     waits = f", the newest {backlog} records are not acknowledged yet" if backlog else ""
-    return f"linked to {server}{waits}"
+    unknown = int(state.get("unknown_frames", 0))
+    ignored = f", {unknown} frames of its newer version were ignored" if unknown else ""
+    return f"linked to {server}{waits}{ignored}"

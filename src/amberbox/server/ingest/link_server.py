@@ -21,25 +21,40 @@ from amberbox.core.errors import AmberboxError
 from amberbox.link import limits
 from amberbox.link.folders import is_config_hash
 from amberbox.link.frames import (
+    AbortFrame,
+    ActionsFrame,
+    AnswersFrame,
     BeatFrame,
     Bye,
+    ChallengeFrame,
     FrameError,
     HasFrame,
     HeadsFrame,
     Hello,
+    LeaseFrame,
     LinkRow,
     LiveFrame,
     ServerFrame,
+    UnknownFrameError,
     WatchFrame,
     encode,
     from_robot,
 )
 from amberbox.link.ledger import LinkAdmission, StaleEpochError, StoredRows
-from amberbox.link.server_end import AdmitRobot, LinkAction, SendFrames, ServerEnd, StoreRows
+from amberbox.link.server_end import (
+    AdmitRobot,
+    IgnoreFrame,
+    LinkAction,
+    SendFrames,
+    ServerEnd,
+    StoreRows,
+)
 from amberbox.monitoring.current_state import WatcherHeartbeat
 from amberbox.server.bus import EventBus
+from amberbox.server.commands import server_id
 from amberbox.server.database import ServerDatabase
 from amberbox.server.ingest import ledger, link_state
+from amberbox.server.ingest.command_link import CommandLink, RobotContact
 from amberbox.server.ingest.ledger import GroupedWrites, RowBatch
 from amberbox.server.schema import ROBOT_KEYS, ROBOTS
 
@@ -130,6 +145,8 @@ class LinkHooks:
     """(robot, store id, which journals hold a window that was asked for)."""
     wants_folder: Callable[[str, str], bool] = lambda robot, config_hash: False
     """Whether the folder of a robot with this hash is not known yet."""
+    commands: Callable[[str, Sequence[str]], None] = _nothing
+    """(robot, ids of its commands that it has answered), once the answers are durable."""
 
 
 @dataclass(slots=True, eq=False)
@@ -146,6 +163,8 @@ class RobotConnection:
     backlog: int = 0
     monitoring: WatcherHeartbeat | None = None
     """How its watcher is doing; None where it has not said."""
+    contact: RobotContact | None = None
+    """What it said of commands; None where it takes none."""
     answers: asyncio.Queue[Answer | None] = field(default_factory=lambda: asyncio.Queue(_WAITING))
     last_received_s: float = field(default_factory=time.monotonic)
     """When something came last, by a clock that nobody sets."""
@@ -172,9 +191,13 @@ class LinkServer:
         self._silent_s = silent_s
         self._writes = GroupedWrites(database)
         self._watched: dict[str, tuple[str, ...]] = {}
+        self._commands = CommandLink(self._writes, self._clock, self._hooks.commands)
         self.robots: dict[str, RobotConnection] = {}
+        self.unknown_frames = 0
+        """Frames of robots that were ignored: this version does not know them."""
         with database.begin() as connection:
             link_state.reset_connections(connection)
+            self._server_id = server_id(connection, self._clock.wall_ns())
 
     def close(self) -> None:
         """Finish pending writes; all connections have ended before."""
@@ -219,13 +242,41 @@ class LinkServer:
         self._watched[robot] = tuple(_fitting(variables))
         await self.send(robot, WatchFrame(list(self._watched[robot])))
 
+    async def order(self, robot: str, frame: LeaseFrame | AbortFrame) -> bool:
+        """Send a frame now; return whether the robot takes commands, and received it in time.
+
+        Before its first challenge a robot may not have heard Welcome yet.
+        """
+        return bool(self.challenges(robot)) and await self.send(robot, frame)
+
+    def challenges(self, robot: str) -> list[bytes]:
+        """Return what a robot has minted in the last minute on its present connection.
+
+        May be called in any thread. The newest one is the last; there is none of a robot that is
+        away, or takes no commands.
+        """
+        one = self.robots.get(robot)
+        contact = None if one is None else one.contact
+        return [] if contact is None else contact.fresh(self._clock.boot_ns())
+
+    def send_commands(self, robot: str = "") -> None:
+        """Send revocations and what waits to a robot, or to all; called in the event loop.
+
+        Where too much waits to be sent already, this is done after the robot's next challenge.
+        """
+        for one in self.robots.values():
+            is_meant = not robot or one.robot == robot
+            is_there = one.contact is not None and one.contact.challenges
+            if is_meant and is_there and one.contact is not None and not one.answers.full():
+                one.answers.put_nowait(self._task(one, self._commands.send(one.contact)))
+
     async def _listen(self, one: RobotConnection) -> None:
         """Process frames until the connection ends, or nothing has arrived for too long."""
         while not one.end.closed:
             try:
                 async with asyncio.timeout(self._silent_s):
                     data = await one.socket.receive()
-                frame = from_robot(data)
+                deeds = self._received(one, data)
             except (TimeoutError, SocketClosedError):
                 return
             except FrameError as error:
@@ -233,8 +284,15 @@ class LinkServer:
                 await one.answers.put((Bye(str(error)[: limits.TEXT_BYTES]),))
                 return
             one.last_seen_ns, one.last_received_s = self._clock.wall_ns(), time.monotonic()
-            for deed in one.end.receive(frame):
+            for deed in deeds:
                 await self._do(one, deed)
+
+    def _received(self, one: RobotConnection, data: bytes) -> Sequence[LinkAction]:
+        """Return what to do after a frame; raises FrameError for one that ends the connection."""
+        try:
+            return one.end.receive(from_robot(data))
+        except UnknownFrameError:
+            return one.end.receive_unknown()
 
     async def _do(self, one: RobotConnection, deed: LinkAction) -> None:
         if isinstance(deed, AdmitRobot):
@@ -252,6 +310,11 @@ class LinkServer:
             await self._heads(one, deed)
         elif isinstance(deed, HasFrame):
             self._hooks.has(one.robot, _store_of(one), deed)
+        elif isinstance(deed, IgnoreFrame):
+            self.unknown_frames += 1
+        elif isinstance(deed, ChallengeFrame | ActionsFrame | AnswersFrame):
+            assert one.contact is not None
+            await one.answers.put(self._task(one, self._commands.receive(one.contact, deed)))
 
     async def _admit(self, one: RobotConnection, hello: Hello) -> None:
         """Admit a robot; from here on its older connection is closed and cannot write."""
@@ -263,9 +326,13 @@ class LinkServer:
         wants = self._wants_folder(hello)
         watch = self._watched.get(one.robot, ())
         welcome = one.end.admitted(
-            admission, self._clock.wall_ns(), wants_folder=wants, watch=watch
-        )
+            admission, self._clock.wall_ns(), wants_folder=wants, watch=watch,
+            server_id=self._server_id,
+        )  # fmt: skip
         await one.answers.put((welcome,))
+        if one.end.takes_commands:
+            one.contact = RobotContact(one.robot, admission.epoch, hello.store_id)
+            await one.answers.put(self._task(one, self._commands.begin(one.contact)))
         self._hooks.admitted(hello, admission)
         if known is not None:
             known.end.closed = True
@@ -283,6 +350,19 @@ class LinkServer:
         )  # fmt: skip
         stored = asyncio.wrap_future(self._writes.submit(work))
         return asyncio.create_task(self._kept(one, deed, stored))
+
+    def _task(
+        self, one: RobotConnection, frames: Awaitable[Sequence[ServerFrame]]
+    ) -> asyncio.Task[Sequence[ServerFrame]]:
+        return asyncio.create_task(self._once_true(one, frames))
+
+    async def _once_true(
+        self, one: RobotConnection, frames: Awaitable[Sequence[ServerFrame]]
+    ) -> Sequence[ServerFrame]:
+        try:
+            return await frames
+        except StaleEpochError:
+            return one.end.overtaken().frames
 
     async def _kept(
         self, one: RobotConnection, deed: StoreRows, stored: Awaitable[StoredRows]

@@ -141,6 +141,8 @@ def _robots(services: Services) -> Iterator[MetricFamily]:
     yield gauge("amberbox_rows_aside", "Rows that robots have no more.", aside)
     waiting = sum(one.answers.qsize() for one in online)
     yield gauge("amberbox_link_queue", "Frames of robots that are not answered yet.", waiting)
+    about = "Frames of robots that were ignored: this version does not know them."
+    yield counter("amberbox_link_unknown_frames_total", about, services.links.unknown_frames)
 
 
 def _levels(services: Services) -> Iterator[MetricFamily]:
