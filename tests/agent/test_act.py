@@ -10,6 +10,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import cast
 
 import msgspec
 import pytest
@@ -107,7 +108,7 @@ class Linked:
                 pass
             return next(filter(found, self.reports), None)
 
-        return wait_for(look, "a report")
+        return cast("FromGate", wait_for(look, "a report"))
 
     def answer(self, command_id: str, *states: str) -> str:
         """Wait for one of these answers to a command; return its reason."""
