@@ -16,6 +16,7 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from urllib.parse import urlsplit
 
+from amberbox.agent.command_socket import SocketPort
 from amberbox.agent.doctor.processes import LINK_STATE_FILE
 from amberbox.agent.folder_upload import send_folder
 from amberbox.blackbox.robot_folder.folder import RobotFolder
@@ -122,9 +123,11 @@ class LinkProcess:
         self._link_events = LinkEvents(store)
         self._dock = DockWatcher(store.path, self.options.docked)
         asked = ServerRequestHandlers(self._fetch, self._want_folder)
+        port = SocketPort(store.path) if folder.robot.commands else None
         self.client = LinkClient(
-            store, self.options, asked=asked, network=self._network, monitoring=read_heartbeat
-        )
+            store, self.options, asked=asked, port=port, network=self._network,
+            monitoring=read_heartbeat,
+        )  # fmt: skip
         self._sending = HttpTransport(self.options, self._context)
         copier = JournalCopier(
             store, self.options, self._sending, self._situation, self.client.bucket,

@@ -22,7 +22,7 @@ from amberbox.blackbox.store.store import Store, is_locked
 from amberbox.core.yaml_nodes import load_yaml
 from amberbox.monitoring.component_files import FOLDER as COMPONENTS
 
-RECORD, WATCH, LINK = "record", "watch", "link"
+RECORD, WATCH, LINK, ACT = "record", "watch", "link", "act"
 REFUSED = 2  # exit status of a process that refuses its configuration
 
 
@@ -69,7 +69,10 @@ def children_of(folder: Path, write_s: float, *, quiet: bool = True) -> list[Chi
         nice=5,
         follows=RECORD,
     )
-    return [recorder, watcher, linker]
+    actor = ChildProcess(
+        ACT, amberbox_command(ACT, *words, str(folder)), end_s=12.0, watchdog_s=20.0, follows=RECORD
+    )
+    return [recorder, watcher, linker, actor]
 
 
 def amberbox_command(*arguments: str) -> list[str]:
@@ -81,6 +84,8 @@ def is_wanted(child: ChildProcess, folder: Path) -> bool:
     """Return whether the present configuration of a folder needs a child."""
     if child.name == LINK:
         return has_server(folder)
+    if child.name == ACT:
+        return takes_commands(folder)
     return child.name != WATCH or has_components(folder)
 
 
@@ -90,6 +95,12 @@ def has_server(folder: Path) -> bool:
     server = (root.mapping or {}).get("server") if root is not None else None
     keys = (server.mapping or {}) if server is not None else {}
     return bool(keys) and ((folder / KEY_FILE).exists() or "token" in keys)
+
+
+def takes_commands(folder: Path) -> bool:
+    """Return whether a robot folder names a server, and a trust file for its commands."""
+    root = load_yaml(folder / ROBOT_FILE, []) if (folder / ROBOT_FILE).exists() else None
+    return has_server(folder) and "commands" in ((root.mapping if root else None) or {})
 
 
 def has_components(folder: Path) -> bool:
@@ -320,7 +331,7 @@ def command_of(child: ChildProcess) -> list[str]:
 
 
 # the lock that each child holds; its file contains the process id
-WRITER_OF = {WATCH: "watch", RECORD: "main", LINK: "link"}
+WRITER_OF = {WATCH: "watch", RECORD: "main", LINK: "link", ACT: "act"}
 _END_S = 10.0
 
 

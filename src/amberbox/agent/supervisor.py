@@ -27,6 +27,7 @@ from amberbox.agent.folder_changes import (
     recorder_config_hash,
 )
 from amberbox.agent.process import (
+    ACT,
     LINK,
     RECORD,
     REFUSED,
@@ -444,8 +445,8 @@ class ProcessSupervisor:
             text += "; the recorder goes on as it began, until a reload or a restart"
         self._log.log_event("configuration_changed", text)
         self._wanted = self._wanted_children()
-        self._restart(WATCH, now_s)
-        self._restart(LINK, now_s)
+        for name in (WATCH, LINK, ACT):
+            self._restart(name, now_s)
 
     def _restart(self, name: str, now_s: float) -> None:
         for lifecycle in self.lifecycles:

@@ -49,10 +49,14 @@ _EVERYDAY = (
      "Run the fleet's server: robots send it what they recorded, people see all of it."),
 )  # fmt: skip
 _MORE = (
+    ("act", "command",
+     "Take commands for a robot and carry them out, until it is stopped; 'run' keeps it going."),
     ("action", "action",
      "List the actions of a robot; carry one out by hand, at the robot or simulated."),
     ("alarm", "alarm",
      "List the alarms of a robot; acknowledge one, or shelve it for some time."),
+    ("confirm", "command",
+     "Confirm, at the robot, the motion that somebody has ordered; see what runs, and stop it."),
     ("demo", "demo",
      "Show it all: a server, three simulated robots in the browser, and a button that breaks "
      "them."),

@@ -21,6 +21,7 @@ STATUS = "amberbox/status"
 ALARM = "amberbox/alarm"
 SYMPTOM = "amberbox/symptom"
 DIAGNOSIS = "amberbox/diagnosis"
+COMMAND = "amberbox/command"
 # how far the writer of a derived journal had read others when it wrote the records beside it
 CURSOR = "amberbox/cursor"
 
@@ -180,6 +181,20 @@ _FIELDS: dict[str, dict[str, object]] = {
         "config_hash": _TEXT,
         "live_only": {"type": "boolean"},
         "make_safe": _TEXTS,
+    },
+    COMMAND: {
+        "robot": _TEXT,
+        "state": _TEXT,
+        "id": _TEXT,
+        "text": _TEXT,
+        "person": _TEXT,
+        "action": _TEXT,
+        "parameters": _TEXT,
+        "risk": _TEXT,
+        "issuer": _TEXT,
+        "run": _TEXT,
+        "step": _TEXT,
+        "result": _TEXT,
     },
     CURSOR: {"cursor": _TEXT, "reader": _TEXT, "state": _TEXT},
 }

@@ -42,7 +42,7 @@ from amberbox.blackbox.store.store import Store, is_locked, run_and_number
 from amberbox.core.files import replace_file, sync_file
 
 HEADS = "heads.json"
-SIGNED_WRITERS = ("main", "bulk", "keep", "kept", "watch")  # all writers but the ring
+SIGNED_WRITERS = ("main", "bulk", "keep", "kept", "watch", "act")  # all writers but the ring
 LOCKS = {"keep": "keeper", "kept": "keeper"}  # locks of the writers that are not called like these
 _LINE_BYTES = 1024  # more than a line with a signature has
 

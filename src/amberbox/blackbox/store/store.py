@@ -31,6 +31,7 @@ FOLDERS = {
     "watch": "watch",
     "keep": "keep",
     "kept": "kept",
+    "act": "act",
 }
 INCIDENTS = "incidents"
 IDENTITY = "store.json"
