@@ -255,13 +255,6 @@ def test_sql_prints_what_is_asked(store: str, capsys: pytest.CaptureFixture[str]
     ]
 
 
-class Terminal(io.StringIO):
-    """A stream that is a terminal."""
-
-    def isatty(self) -> bool:
-        return True
-
-
 @pytest.mark.parametrize("verb", ["query", "sql", "items"])
 def test_tables_fit_a_terminal(
     store: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], verb: str
@@ -323,7 +316,7 @@ def test_a_range_that_ends_before_it_begins_is_refused(
 def test_a_time_for_a_server_names_its_option(
     line: str, option: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The time is checked by the client: no request is sent to the server."""
+    """It is read here first: nothing is asked of the server."""
     assert main(line.replace("URL", "https://fleet.invalid/robots/r1").split()) == 2
     assert f"error: {option}: not a time: 'noon'" in capsys.readouterr().err
 

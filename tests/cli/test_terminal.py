@@ -19,13 +19,6 @@ from tests.cli.conftest import Terminal
 from tests.fuzzing import examples, fuzz
 
 
-class Terminal(io.StringIO):
-    """A stream that claims to be a terminal."""
-
-    def isatty(self) -> bool:
-        return True
-
-
 def test_errors_show_escapes_of_others_as_text(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["\x1b[2Jx\u202ey"]) == 2
     said = capsys.readouterr().err
@@ -72,7 +65,7 @@ def robot(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ],
 )  # fmt: skip
 def test_lines_fit_the_terminal(robot: Path, monkeypatch: pytest.MonkeyPatch, line: str) -> None:
-    """Texts are wrapped, tables cut; in a pipe lines keep their length."""
+    """Texts are folded, tables cut; in a pipe lines are as long as they are."""
     monkeypatch.setenv("COLUMNS", "60")
     monkeypatch.setenv("NO_COLOR", "1")
     terminal, pipe = Terminal(), io.StringIO()

@@ -1,4 +1,4 @@
-"""Actions that make the robot safe come before every test, and tests before uncertain repairs."""
+"""What makes safe comes before every test, and a test before what is mended in vain."""
 
 from __future__ import annotations
 
@@ -32,12 +32,6 @@ from tests.server.knowledge import robot as sim
 AT_NS = 1_795_305_600_000_000_000
 BATTERY = "battery#overheats"
 SWITCH_OFF = "switch off, let it cool outside"
-
-
-@cache
-def knowledge() -> Knowledge:
-    """Return the knowledge of the simulated robot."""
-    return read_declared_robot(sim.FOLDER, "ropod_001", sim.HASH).knowledge()
 
 
 def shown_by(modes: Iterable[str]) -> tuple[Symptom, ...]:

@@ -12,9 +12,8 @@ from collections.abc import Callable
 import pytest
 
 from amberbox.agent import folder_upload as robot_masking
-from amberbox.blackbox.columns import ros_definition
+from amberbox.blackbox.columns import ros1_text, ros_definition
 from amberbox.blackbox.formats import csv, mongodump, ulog
-from amberbox.blackbox.query import export
 from amberbox.blackbox.sources import zmq
 from amberbox.core.expressions.parser import tokens as expression_tokens
 from amberbox.core.expressions.tree import ExpressionFault
@@ -100,7 +99,7 @@ CASES: dict[str, tuple[Callable[[str], object], str, str, str]] = {
     "a definition: brackets": (mongodump._FIELD.findall, "", "a[1", ""),
     "a definition: constants": (ros_definition._CONSTANT.findall, "", "a b", ""),
     "a definition: separators": (ros_definition._SEPARATOR.findall, "=" * 80, " ", "x"),
-    "a definition: arrays": (export._ARRAY.search, "", "[1", ""),
+    "a definition: arrays": (ros1_text._ARRAY.search, "", "[1", ""),
     "a log: a field": (ulog._FIELD.fullmatch, "a", " ", "-"),
     "a table: a unit": (csv._unit_of, "", "_", "x"),
     "a table: numbers": (csv._PATTERNS["float"].fullmatch, "", " 1", "x"),

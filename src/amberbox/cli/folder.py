@@ -254,7 +254,8 @@ def _monitored(plan: MonitoringPlan | None, each_mode: bool) -> list[str]:
 
 def _action_lines(actions: Collection[DeclaredAction]) -> list[str]:
     width = shutil.get_terminal_size((_WIDTH, 0)).columns
-    return ["can do:", *_in_width(action_rows(actions), width, "  "), ""] if actions else []
+    entries = _entries(list(action_rows(actions)), width, "  ")
+    return ["can do:", *(line for entry in entries for line in entry), ""] if actions else []
 
 
 def _count_text(of: Sequence[object], what: str) -> str:

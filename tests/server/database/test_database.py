@@ -293,11 +293,9 @@ def test_every_table_compiles_for_postgresql() -> None:
             assert str(CreateIndex(index).compile(dialect=POSTGRESQL))
 
 
-@pytest.mark.parametrize("room", ["accounts/*.py", "audit.py"])
-def test_rooms_write_no_sql_by_hand(room: str) -> None:
-    """Statements made by SQLAlchemy are also compiled for PostgreSQL, in every test of the
-    folder.
-    """
+@pytest.mark.parametrize("pattern", ["accounts/*.py", "audit.py"])
+def test_modules_write_no_sql_by_hand(pattern: str) -> None:
+    """What is made by SQLAlchemy is compiled for PostgreSQL, too, in every test of them."""
     folder = Path(server.__path__[0])
     sources = {path.name: path.read_text() for path in folder.glob(pattern)}
     assert sources

@@ -66,7 +66,6 @@ def knowledge(robot: str = "ropod_001", hash_: str = HASH) -> Knowledge:
 
 def diagnosis(at_ns: int, *symptoms: Symptom) -> Diagnosis:
     """Return the diagnosis of these symptoms by the watcher's own engine."""
-    knowledge = read_declared_robot(FOLDER, "ropod_001", HASH).knowledge()
     situation = ObservedSituation(symptoms, watched=True)
     return answer(knowledge(), situation, DiagnosisId(DIAGNOSIS, 1, at_ns))
 

@@ -1,4 +1,4 @@
-"""The pages of alarms: their contents by role, their texts, and escaping."""
+"""The pages of alarms: what they list, to whom, in which words, and what is text in them."""
 
 from __future__ import annotations
 
@@ -179,8 +179,8 @@ def test_an_alarm_in_words(home: House) -> None:
 
 
 def explained_answer(revision: int, **answers: str) -> dict[str, Any]:
-    """Return the server's diagnosis of a silent laser after answers to tests."""
-    knowledge = read_declared_robot(sim.FOLDER, "ropod_001", sim.HASH).knowledge()
+    """Return what the server says of a silent laser after answers to tests."""
+    knowledge = sim.knowledge()
     silent = ObservedSituation(
         (sim.symptom(sim.NO_SCANS, sim.AT_NS),), watched=True, answers=answers
     )
