@@ -1,4 +1,4 @@
-"""``amberbox plugins``: sources, modes, probes and actions, their missing packages, and all their keys."""
+"""``amberbox plugins``: sources, modes, probes, actions, their missing packages, and all keys."""
 
 from __future__ import annotations
 

@@ -85,7 +85,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
         until(
             lambda: (
                 amberbox("incident", folder, "--before", "1s", "--after", "0s").status == 0
-                and list(folder.glob("store/incidents/*/*"))
+                and list(folder.glob("store/incidents/*/ring/*.mcap"))
             ),
             "there is an incident",
         )
