@@ -20,7 +20,8 @@ NO_MODULE = {
     "amberbox.service", "amberbox.org", "amberbox.table", "amberbox.yaml", "amberbox.broken",
     "amberbox.actions",
 }  # fmt: skip
-"""Words of the documentation that look like a module: a unit, metadata of a file, a folder, a group of entry points."""
+"""Words of the documentation that look like a module: a unit, metadata of a file, a folder, a
+group of entry points."""
 
 
 def listed() -> list[tuple[str, list[str]]]:
