@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+from amberbox.agent.command_trust import read_trust
 from amberbox.blackbox.robot_folder.black_box_yaml import LEGACY_KEYS, DefaultParameters
 from amberbox.blackbox.robot_folder.folder import load_folder
 from amberbox.blackbox.robot_folder.robot_yaml import RobotConfig
@@ -28,9 +29,14 @@ def test_every_key_is_documented() -> None:
 
 
 def test_examples_load(tmp_path: Path) -> None:
-    robot, black_box = re.findall(r"```yaml\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
+    robot, trust, black_box = re.findall(
+        r"```yaml\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL
+    )
     (tmp_path / "robot.yaml").write_text(robot)
     (tmp_path / "black_box.yaml").write_text(black_box)
+    (tmp_path / "trust.yaml").write_text(trust)
+    (tmp_path / "trust.yaml").chmod(0o600)
+    assert set(read_trust(tmp_path / "trust.yaml").people) == {"anna", "ben"}
     built = load_folder(tmp_path)
     assert {note.where for note in built.notes} == {"server"}
     assert ["no key" in note.what for note in built.notes] == [True]

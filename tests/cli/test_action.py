@@ -89,7 +89,8 @@ def test_nothing_and_what_is_wrong(
 def test_check(tmp_path: Path, folder: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["check", folder]) == 0
     text = capsys.readouterr().out
-    assert "can do:\n  drive  moves  distance_m -2 .. 2 m, slow bool, where string  Drive" in text
+    shown = " ".join(text.split())
+    assert "can do: drive moves Drive (distance_m -2 .. 2 m, slow bool, where string)" in shown
     assert main(["check", folder, "--json"]) == 0
     report = json.loads(capsys.readouterr().out)
     assert [action["name"] for action in report["actions"]] == ["drive", "list"]

@@ -254,7 +254,11 @@ def _monitored(plan: MonitoringPlan | None, each_mode: bool) -> list[str]:
 
 def _action_lines(actions: Collection[DeclaredAction]) -> list[str]:
     width = shutil.get_terminal_size((_WIDTH, 0)).columns
-    entries = _entries(list(action_rows(actions)), width, "  ")
+    rows = [
+        (name, risk, f"{description} ({parameters})" if parameters != "-" else description)
+        for name, risk, parameters, description in action_rows(actions)
+    ]
+    entries = _entries(rows, width, "  ")
     return ["can do:", *(line for entry in entries for line in entry), ""] if actions else []
 
 
