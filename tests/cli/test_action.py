@@ -90,7 +90,10 @@ def test_check(tmp_path: Path, folder: str, capsys: pytest.CaptureFixture[str]) 
     assert main(["check", folder]) == 0
     text = capsys.readouterr().out
     shown = " ".join(text.split())
-    assert "can do: drive moves Drive (distance_m -2 .. 2 m, slow bool, where string)" in shown
+    assert (
+        "can do: drive moves Drive straight ahead (distance_m -2 .. 2 m, slow bool, where string)"
+        in shown
+    )
     assert main(["check", folder, "--json"]) == 0
     report = json.loads(capsys.readouterr().out)
     assert [action["name"] for action in report["actions"]] == ["drive", "list"]

@@ -226,7 +226,7 @@ def _coverage(
     if args.json:
         print_json(coverage_json(found))
     else:
-        alike = [_alike_line(group) for group in found.ambiguous]
+        alike = [_similar_line(group) for group in found.ambiguous]
         print_lines(_coverage_lines(coverage_json(found), alike))
 
 
@@ -248,7 +248,7 @@ def _section(title: str, lines: Sequence[str]) -> Iterator[str]:
         yield from (f"  {line}" for line in lines)
 
 
-def _alike_line(group: AmbiguousModes) -> str:
+def _similar_line(group: AmbiguousModes) -> str:
     tests = f"told apart by {', '.join(group.tests)}" if group.tests else "no test tells them apart"
     left = [" = ".join(modes) for modes in group.left] if group.tests else []
     rest = f"; no test tells {' and '.join(left)}" if left else ""

@@ -125,7 +125,7 @@ class ConditionLookup:
         """Yield the joined spans in which it held, covering at least the given span."""
         blocks = range(first // _BLOCK_NS, (last - 1) // _BLOCK_NS + 1)
         missing = [block for block in blocks if block not in question.known]
-        for start, count in _stretches(missing):
+        for start, count in _intervals(missing):
             self._look(question, start, count)
         yield from join_spans(found for block in blocks for found in question.known[block])
 
@@ -188,7 +188,7 @@ def _true(values: Any) -> Any:
     return data & ~np.ma.getmaskarray(values)
 
 
-def _stretches(blocks: list[int]) -> Iterator[tuple[int, int]]:
+def _intervals(blocks: list[int]) -> Iterator[tuple[int, int]]:
     """Yield stretches of neighbouring blocks: the first, and how many."""
     start, count = 0, 0
     for block in blocks:

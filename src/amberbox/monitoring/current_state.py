@@ -279,7 +279,7 @@ class CurrentStateReader:
     def read(self, now_ns: int) -> CurrentState:
         """Return the state at a time of the wall clock."""
         written = newest_records(self._store, WRITER, {channels.STATUS}, _LOOKBACK_S)
-        alarms = self._standing_alarms()
+        alarms = self._open_alarms()
         monitoring = read_heartbeat(self._store)
         if not written:
             return CurrentState((), alarms, 0, self._silence("yet"), monitoring)
@@ -307,7 +307,7 @@ class CurrentStateReader:
         hangs = is_locked(self._store, WRITER)
         return f"the watcher has said nothing {since}{', though it runs' if hangs else ''}"
 
-    def _standing_alarms(self) -> list[AlarmChange]:
+    def _open_alarms(self) -> list[AlarmChange]:
         """Return the newest record of each alarm that has not healed."""
         for record in self._alarm_records.step():
             alarm = alarm_of(record.values)

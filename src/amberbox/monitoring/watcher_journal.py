@@ -281,15 +281,15 @@ def retained_findings(store: Store) -> RetainedFindings:
     journal = next((one for one in newest_first(store, "watch") if one.places), None)
     if journal is None:
         return RetainedFindings()
-    alarms = {a.id: a for a in map(alarm_of, _standing_records(journal, channels.ALARM))}
-    diagnoses = {d.id: d for d in map(diagnosis_of, _standing_records(journal, channels.DIAGNOSIS))}
+    alarms = {a.id: a for a in map(alarm_of, _retained_records(journal, channels.ALARM))}
+    diagnoses = {d.id: d for d in map(diagnosis_of, _retained_records(journal, channels.DIAGNOSIS))}
     return RetainedFindings(
         {key: alarm for key, alarm in alarms.items() if alarm.state != "healed"},
         {key: diagnosis for key, diagnosis in diagnoses.items() if diagnosis.state == "open"},
     )
 
 
-def _standing_records(journal: JournalFile, channel: str) -> Iterator[Any]:
+def _retained_records(journal: JournalFile, channel: str) -> Iterator[Any]:
     numbers = [n for n, s in journal.streams.items() if s.topic.name == channel]
     for chunk in sound_chunks(journal) if numbers else ():
         for message in chunk.messages(np.flatnonzero(np.isin(chunk.channel, numbers))):

@@ -30,7 +30,7 @@ from amberbox.server.ingest.link_state import short_boot_id
 from amberbox.server.schema import ASIDE, BOOT, JOURNALS, ROW, RUN
 
 # Store, writer, run, number: the identity of a record
-Place: TypeAlias = tuple[str, str, int, int]
+RecordKey: TypeAlias = tuple[str, str, int, int]
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +54,7 @@ class DerivedRecord:
     server_ns: int | None = None
 
     @property
-    def place(self) -> Place:
+    def place(self) -> RecordKey:
         """The identity of the record: store, writer, run, number."""
         return self.store_id, self.writer, self.run, self.seq
 
@@ -260,7 +260,9 @@ def from_link(
     return _entries(connection.execute(wanted.order_by(order).limit(limit)))
 
 
-def from_aside(connection: Connection, robot: str, channel: str, span: Span) -> list[DerivedRecord]:
+def conflict_records(
+    connection: Connection, robot: str, channel: str, span: Span
+) -> list[DerivedRecord]:
     """Return rows that the robot no longer has, with the reason."""
     wanted = select(ASIDE).where(*_in(ASIDE, robot, channel, span))
     return _entries(connection.execute(wanted))
@@ -352,7 +354,7 @@ def derived_records(
     # the link first: rows committed in between are then also found in the archive, not lost
     with services.database.reading() as connection:
         early = from_link(connection, robot, channel, span, limit, newest=newest)
-        lost = from_aside(connection, robot, channel, span) if aside else []
+        lost = conflict_records(connection, robot, channel, span) if aside else []
         ahead = offsets(connection, robot)
     late = _from_archive(services.archive, robot, channel, span, limit, newest=newest)
     known = {entry.place for entry in late}

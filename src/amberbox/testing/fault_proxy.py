@@ -52,12 +52,12 @@ class Mangler:
     def __init__(self, faults: FrameFaults, seed: int) -> None:
         self._faults = faults
         self._chance = random.Random(seed)
-        self._ways = {True: _Direction(), False: _Direction()}
+        self._causal_paths = {True: _Direction(), False: _Direction()}
         self.done: list[str] = []
 
     def pass_on(self, data: bytes, *, up: bool) -> bytes:
         """Add bytes of one direction; return those to forward now."""
-        way = self._ways[up]
+        way = self._causal_paths[up]
         if way.other:
             return data
         way.buffer += data

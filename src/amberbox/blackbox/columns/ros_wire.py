@@ -328,7 +328,7 @@ class WireTable:
 
 
 @dataclass(slots=True)
-class _Place:
+class _Alignment:
     """The known part of the current offset: it is ``rest`` modulo ``known``."""
 
     known: int
@@ -355,7 +355,7 @@ class _Fuser:
     next_slot: int = 0
     smallest: list[int] = field(default_factory=list)
 
-    def table(self, table: EntryTable, place: _Place) -> WireTable:
+    def table(self, table: EntryTable, place: _Alignment) -> WireTable:
         ops: list[Op] = []
         piece = _Piece(self, place)
         smallest = 0
@@ -378,12 +378,14 @@ class _Fuser:
             return 1
         return 4 if kind in ("time", "duration") else SIZES[kind]
 
-    def prefix(self, place: _Place) -> Padding:
+    def prefix(self, place: _Alignment) -> Padding:
         lead = place.lead(_PREFIX if self.cdr else 1)
         place.lose(_PREFIX if self.cdr else 1)
         return lead
 
-    def op(self, entry: TextEntry | NumbersEntry | TextsEntry | ChildrenEntry, place: _Place) -> Op:
+    def op(
+        self, entry: TextEntry | NumbersEntry | TextsEntry | ChildrenEntry, place: _Alignment
+    ) -> Op:
         if isinstance(entry, TextEntry):
             op: Op = TextOp(self.slot(2), self.prefix(place), entry.column.name, entry.wide)
             place.lose(_PREFIX if entry.wide and self.cdr else 1)
@@ -396,7 +398,7 @@ class _Fuser:
             return TextsOp(self.slot(3), lead, entry.column.name, entry.wide, entry.count)
         return self.children(entry, place)
 
-    def numbers(self, entry: NumbersEntry, place: _Place) -> NumbersOp:
+    def numbers(self, entry: NumbersEntry, place: _Alignment) -> NumbersOp:
         size, align = SIZES[entry.item], self.align(entry.item)
         if entry.count is None:
             lead = self.prefix(place)
@@ -408,7 +410,7 @@ class _Fuser:
         name = entry.column.name
         return NumbersOp(self.slot(2), lead, name, entry.item, align, entry.count, binary)
 
-    def children(self, entry: ChildrenEntry, place: _Place) -> ChildrenOp:
+    def children(self, entry: ChildrenEntry, place: _Alignment) -> ChildrenOp:
         lead = Padding() if entry.count is not None else self.prefix(place)
         place.lose()
         slot = self.slot(2)
@@ -430,7 +432,7 @@ class _Piece:
     """Neighbouring scalars gathered so far, which become one piece of fixed size."""
 
     fuser: _Fuser
-    place: _Place
+    place: _Alignment
     first: Padding | None = None
     size: int = 0
     runs: list[tuple[str, int, list[str]]] = field(default_factory=list)
@@ -488,7 +490,7 @@ class WirePlan:
 def plan(table: EntryTable, cdr: bool) -> WirePlan:
     """Compile the entries of a table for ROS 1 or CDR (offsets count from behind its header)."""
     fuser = _Fuser(cdr)
-    wire = fuser.table(table, _Place(8 if cdr else 1))
+    wire = fuser.table(table, _Alignment(8 if cdr else 1))
     return WirePlan(wire, fuser.next_slot, cdr)
 
 

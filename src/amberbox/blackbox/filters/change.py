@@ -67,7 +67,7 @@ class WatchedColumns:
 
 
 @dataclass(frozen=True, slots=True)
-class _Place:
+class _ColumnCell:
     """A column of a table; ``table`` is the path of child tables down to it."""
 
     table: tuple[str, ...]
@@ -98,7 +98,7 @@ def watched(schema: ItemSchema, options: ChangeOptions) -> tuple[WatchedColumns,
     names fits, since a misspelt name must not drop every message. A name, or a band, includes these
     fields, too.
     """
-    places = {place.path: place for place in _places(schema)}
+    places = {place.path: place for place in _column_cells(schema)}
     named, unknown = _select(places, options.variables) if options.variables else ((), ())
     watch = named or [path for path, place in places.items() if not place.is_stamp]
     bands = {
@@ -115,11 +115,11 @@ def watched(schema: ItemSchema, options: ChangeOptions) -> tuple[WatchedColumns,
     return _tree(places, bands, ()), (*unknown, *unfit)
 
 
-def _places(schema: ItemSchema, table: tuple[str, ...] = ()) -> Iterator[_Place]:
+def _column_cells(schema: ItemSchema, table: tuple[str, ...] = ()) -> Iterator[_ColumnCell]:
     for column in schema.columns:
-        yield _Place(table, column, _is_stamp(column.path, schema.stamp))
+        yield _ColumnCell(table, column, _is_stamp(column.path, schema.stamp))
     for path, child in schema.children.items():
-        yield from _places(child, (*table, path))
+        yield from _column_cells(child, (*table, path))
 
 
 def _is_stamp(path: str, stamp: str) -> bool:
@@ -128,7 +128,7 @@ def _is_stamp(path: str, stamp: str) -> bool:
 
 
 def _select(
-    places: Mapping[str, _Place], patterns: Sequence[str]
+    places: Mapping[str, _ColumnCell], patterns: Sequence[str]
 ) -> tuple[Sequence[str], Sequence[str]]:
     """Find paths by the rule for ``variable_names``, across child tables too."""
     columns = tuple(
@@ -142,7 +142,7 @@ def _select(
 
 
 def _tree(
-    places: Mapping[str, _Place], bands: Mapping[str, DeadBand], table: tuple[str, ...]
+    places: Mapping[str, _ColumnCell], bands: Mapping[str, DeadBand], table: tuple[str, ...]
 ) -> WatchedColumns:
     here = [path for path in bands if places[path].table == table]
     depth = len(table)
@@ -184,20 +184,20 @@ class ValueSeries:
 
     def of_rows(self, first: int, last: int) -> NDArray[Any]:
         """Return the lines of rows ``first`` to ``last - 1``, one after the other."""
-        return self.values[self._places(first, last)]
+        return self.values[self._column_cells(first, last)]
 
     def row(self, row: int) -> ValueSeries:
         """Return one row as a series of its own that holds nothing else in memory."""
-        part = self._places(row, row + 1)
+        part = self._column_cells(row, row + 1)
         nulls = None if self.nulls is None else self.nulls[part].copy()
         offsets = None if self.offsets is None else np.array([0, part.stop - part.start])
         return ValueSeries(self.values[part].copy(), nulls, offsets, self.bands)
 
     def lines(self) -> slice:
         """Return where the lines of all rows are."""
-        return slice(None) if self.offsets is None else self._places(0, -1)
+        return slice(None) if self.offsets is None else self._column_cells(0, -1)
 
-    def _places(self, first: int, last: int) -> slice:
+    def _column_cells(self, first: int, last: int) -> slice:
         if self.offsets is None:
             return slice(first, last)
         return slice(int(self.offsets[first]), int(self.offsets[last]))

@@ -28,14 +28,14 @@ from amberbox.core.clock import NS
 from amberbox.core.timestamps import format_time
 from amberbox.core.types import IntArray
 
-Place: TypeAlias = tuple[str, int, int]  # writer, run, and the first sequence number
+SequenceStart: TypeAlias = tuple[str, int, int]  # writer, run, and the first sequence number
 
 
 @dataclass(frozen=True, slots=True)
 class JournalShare:
     """The share of one journal in an item."""
 
-    place: Place
+    place: SequenceStart
     rows: int
     first_ns: int
     last_ns: int
@@ -44,7 +44,7 @@ class JournalShare:
     estimated: bool = False
 
 
-def rate_hz(shares: Iterable[JournalShare], holes: Iterable[Place]) -> float | None:
+def rate_hz(shares: Iterable[JournalShare], holes: Iterable[SequenceStart]) -> float | None:
     """Return the mean rate over all stretches that were recorded without a pause.
 
     A stretch is one run of one writer, or the time between two holes in it. None where no stretch
@@ -63,7 +63,7 @@ def rate_hz(shares: Iterable[JournalShare], holes: Iterable[Place]) -> float | N
     return round(steps * NS / span_ns, 3) if span_ns > 0 else None
 
 
-def deleted_positions(catalogue: StoreCatalogue) -> Iterator[Place]:
+def deleted_positions(catalogue: StoreCatalogue) -> Iterator[SequenceStart]:
     """Yield where whole journals were deleted, columns and all."""
     for stone in catalogue.manifest.tombstones:
         if stone.what != "raw" and not set(stone.journals) & set(catalogue.existing):
@@ -128,7 +128,7 @@ def overview(catalogue: StoreCatalogue) -> list[ItemInfo]:
     return sorted(known, key=lambda info: info.source == channels.SOURCE)
 
 
-def _info(catalogue: StoreCatalogue, table: str, holes: Sequence[Place]) -> ItemInfo | None:
+def _info(catalogue: StoreCatalogue, table: str, holes: Sequence[SequenceStart]) -> ItemInfo | None:
     shares = list(_shares(catalogue, table))
     rows, estimated = sum(share.rows for share in shares), any(share.estimated for share in shares)
     if not rows and not estimated:

@@ -640,7 +640,7 @@ def _request(
     path = submit(store, KIND, {**values, "boot_id": SystemClock().boot_id()})
     until = time.monotonic() + patience_s
     while path.exists():
-        if with_keeper_lock(store, lambda keeper: keeper.step()):
+        if with_retention_lock(store, lambda keeper: keeper.step()):
             continue
         if time.monotonic() > until:
             path.unlink(missing_ok=True)
@@ -658,7 +658,7 @@ def _request(
     return found
 
 
-def with_keeper_lock(store: Store, work: Callable[[MissionService], object]) -> bool:
+def with_retention_lock(store: Store, work: Callable[[MissionService], object]) -> bool:
     """Run ``work`` under the maintenance lock; False if another process holds it."""
     try:
         lock = WriterLock(store, "keeper")
@@ -681,7 +681,7 @@ def write(store: Store, missions: list[RecordedMission]) -> None:
             began = replace(mission, end=None, outcome="", failed=False)
             keeper.note([began] if mission.end is None else [began, mission])
 
-    if missions and not with_keeper_lock(store, add):
+    if missions and not with_retention_lock(store, add):
         raise AmberboxError(
             "a keeper runs on this store", "stop the recorder first, or put the rules in robot.yaml"
         )

@@ -346,10 +346,10 @@ def _ends_at(checked: CheckedJournal, byte: int) -> bool:
     return byte > 0 and byte == checked.tail_from and checked.finished
 
 
-Place = tuple[int, int]  # run and number of a file
+JournalNumber = tuple[int, int]  # run and number of a file
 
 
-def place_of(name: str) -> Place:
+def journal_number(name: str) -> JournalNumber:
     """Read run and number from a journal's name."""
     return run_and_number(Path(PurePosixPath(name).name))
 
@@ -360,11 +360,11 @@ class DeletedFiles:
     def __init__(self, tombstones: Iterable[Tombstone]) -> None:
         self._raw = [t for t in tombstones if t.what != "columns" and t.journals]
 
-    def holds(self, writer: str, place: Place) -> bool:
+    def holds(self, writer: str, place: JournalNumber) -> bool:
         """Return whether the file at a place was deleted on purpose."""
         return any(
             stone.writer == writer
-            and place_of(stone.journals[0]) <= place <= place_of(stone.journals[-1])
+            and journal_number(stone.journals[0]) <= place <= journal_number(stone.journals[-1])
             for stone in self._raw
         )
 
@@ -383,11 +383,11 @@ def check_continuity(
 
     ``files`` are those on the disk in the order in which they were written.
     """
-    on_disk = {place_of(checked.target.name) for checked in files}
+    on_disk = {journal_number(checked.target.name) for checked in files}
     of_writer = [entry for entry in sealed.values() if entry.writer == writer]
     known = set(on_disk)
     for entry in of_writer:
-        place = place_of(entry.journal)
+        place = journal_number(entry.journal)
         if place not in on_disk and not graves.holds(writer, place):
             known.add(place)
             text = f"is gone: {entry.bytes} bytes, {entry.end_seq - entry.first_seq} messages"
@@ -407,7 +407,7 @@ def check_continuity(
         before = checked
 
 
-def _holes(known: set[Place]) -> Iterator[Place]:
+def _holes(known: set[JournalNumber]) -> Iterator[JournalNumber]:
     """Yield the numbers that a run has skipped; it counts its files from 0 on."""
     for run in {run for run, _ in known}:
         numbers = {number for of_run, number in known if of_run == run}
@@ -415,10 +415,13 @@ def _holes(known: set[Place]) -> Iterator[Place]:
 
 
 def _goes_on(
-    checked: CheckedJournal, before: CheckedJournal | None, ends: set[str], holes: Sequence[Place]
+    checked: CheckedJournal,
+    before: CheckedJournal | None,
+    ends: set[str],
+    holes: Sequence[JournalNumber],
 ) -> bool:
     """Return whether a file continues the chain of another one."""
-    start, place = checked.start_chain, place_of(checked.target.name)
+    start, place = checked.start_chain, journal_number(checked.target.name)
     if start in ends or not start:
         return True
     if any(hole[0] == place[0] and hole < place for hole in holes):
@@ -559,7 +562,7 @@ def _check_reach(
 ) -> Iterator[VerifyFinding]:
     checked = known.files.get(reach.file)
     if checked is None:
-        graves = known.graves.holds(writer, place_of(reach.file))
+        graves = known.graves.holds(writer, journal_number(reach.file))
         if not graves and reach.file not in known.sealed:  # else its seal has named it
             text = f"is gone: run {reach.run} of {writer} reached position {reach.next_seq}"
             yield VerifyFinding("missing", reach.file, text, None, 0, reach.bytes, to_ns=at_ns)

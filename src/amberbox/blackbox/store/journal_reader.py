@@ -473,7 +473,7 @@ def last_message(store: Path, item: str) -> bytes | None:
 
 
 # Run of a file and its number within the run: the order in which files were written
-Place = tuple[int, int]
+JournalNumber = tuple[int, int]
 
 
 def previous_chain(store: Store, writer: str) -> str:
@@ -499,7 +499,7 @@ def _last_link(path: Path) -> str:
         return ""
 
 
-def _buried(store: Store, writer: str) -> Iterator[tuple[Place, str]]:
+def _buried(store: Store, writer: str) -> Iterator[tuple[JournalNumber, str]]:
     for stone in manifest.read(store.path).tombstones:
         if stone.writer == writer and stone.what != "columns" and stone.chain:
             yield (

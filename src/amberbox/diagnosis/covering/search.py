@@ -706,7 +706,7 @@ class _Search:
     def list_from(self, best: FaultCounts | _Members, score: float) -> None:
         """List the best set of a state, or the next best."""
         if isinstance(best, FaultCounts):
-            ways = _ways(self.problem.groups, best.counts, self.most)
+            ways = _causal_paths(self.problem.groups, best.counts, self.most)
             first = next(ways)
             best = _Members(first, ways, score - first[0])
         self.list_best(best)
@@ -784,7 +784,7 @@ def search(problem: CoveringProblem, max_sets: int, mass: float, budget: Budget)
 _Way = tuple[float, tuple[int, ...]]
 
 
-def _ways(
+def _causal_paths(
     groups: Sequence[ModeGroup], counts: Sequence[tuple[int, int]], most: int
 ) -> Iterator[_Way]:
     """Yield which members may be meant, at most ``most`` ways, the best first."""

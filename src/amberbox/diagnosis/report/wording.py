@@ -244,7 +244,7 @@ class FaultNames:
         if not faults:
             return FALSE_ALARM
         texts = [self.mode(fault) for fault in sort_modes(self.active(faults))]
-        return f"{join_with_and(texts)}{together_text(len(texts))}"
+        return f"{join_with_and(texts)}{common_onset_text(len(texts))}"
 
     def active(self, faults: Collection[str]) -> Collection[str]:
         """Return those of some failure modes that show still; all if none does."""
@@ -272,7 +272,7 @@ class FaultNames:
         )
 
 
-def together_text(number: int) -> str:
+def common_onset_text(number: int) -> str:
     """Return the text that several faults are present at once."""
     if number < 2:
         return ""

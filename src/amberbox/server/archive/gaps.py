@@ -45,7 +45,7 @@ class RefusedFile:
 
 
 @dataclass(frozen=True, slots=True)
-class _Stretch:
+class _SeqRange:
     """A range of rows that exist or whose absence is explained; ``number`` is their file's."""
 
     from_seq: int
@@ -59,7 +59,7 @@ class _Stretch:
 class _Run:
     """The known ranges of one run of a writer; ``lost`` are refused files without positions."""
 
-    stretches: list[_Stretch] = field(default_factory=list)
+    seq_ranges: list[_SeqRange] = field(default_factory=list)
     lost: list[RefusedFile] = field(default_factory=list)
 
 
@@ -85,9 +85,9 @@ def holes(
     """Yield the gaps between known ranges of rows, run by run."""
     runs = _runs(rows, missing, files)
     for (writer, number), run in runs.items():
-        run.stretches.sort(key=lambda s: (s.from_seq, s.to_seq))
+        run.seq_ranges.sort(key=lambda s: (s.from_seq, s.to_seq))
         later = [r for (w, n), r in runs.items() if w == writer and n > number] if run.lost else []
-        next_ns = min((s.from_ns for r in later for s in r.stretches), default=None)
+        next_ns = min((s.from_ns for r in later for s in r.seq_ranges), default=None)
         for gap in (*_between(run), *_behind(run, next_ns)):
             yield replace(gap, writer=writer, run=number)
 
@@ -99,35 +99,35 @@ def _runs(
     runs: dict[tuple[str, int], _Run] = {}
     for row in rows:
         _, number = run_and_number(Path(row.file))
-        stretch = _Stretch(row.first_seq, row.end_seq, row.start_ns, row.end_ns, number)
-        runs.setdefault((row.writer, row.run), _Run()).stretches.append(stretch)
+        seq_range = _SeqRange(row.first_seq, row.end_seq, row.start_ns, row.end_ns, number)
+        runs.setdefault((row.writer, row.run), _Run()).seq_ranges.append(seq_range)
     for one in missing:
-        stretch = _Stretch(one.from_seq, one.to_seq, one.from_ns, one.to_ns)
-        runs.setdefault((one.writer, one.run), _Run()).stretches.append(stretch)
+        seq_range = _SeqRange(one.from_seq, one.to_seq, one.from_ns, one.to_ns)
+        runs.setdefault((one.writer, one.run), _Run()).seq_ranges.append(seq_range)
     for file in files:
         run = runs.setdefault((file.writer, file.run), _Run())
         if file.is_known:
-            stretch = _Stretch(file.from_seq, file.to_seq, file.from_ns, file.to_ns, file.number)
-            run.stretches.append(stretch)
+            seq_range = _SeqRange(file.from_seq, file.to_seq, file.from_ns, file.to_ns, file.number)
+            run.seq_ranges.append(seq_range)
         else:
             run.lost.append(file)
-    return {name: run for name, run in runs.items() if run.stretches}
+    return {name: run for name, run in runs.items() if run.seq_ranges}
 
 
 def _between(run: _Run) -> Iterator[Gap]:
-    reached, since_ns, last = 0, run.stretches[0].from_ns, -1
-    for n, stretch in enumerate(run.stretches):
-        if stretch.from_seq > reached:
-            end_ns = max(stretch.from_ns, since_ns + 1)
-            numbers = (s.number for s in run.stretches[n:] if s.number is not None)
+    reached, since_ns, last = 0, run.seq_ranges[0].from_ns, -1
+    for n, seq_range in enumerate(run.seq_ranges):
+        if seq_range.from_seq > reached:
+            end_ns = max(seq_range.from_ns, since_ns + 1)
+            numbers = (s.number for s in run.seq_ranges[n:] if s.number is not None)
             next_number = next(numbers, float("inf"))
             lost = [one for one in run.lost if last < one.number < next_number]
-            hole = Gap("", 0, since_ns, end_ns, TO_COME, "", stretch.from_seq - reached, reached,
-                       stretch.from_seq)  # fmt: skip
+            hole = Gap("", 0, since_ns, end_ns, TO_COME, "", seq_range.from_seq - reached, reached,
+                       seq_range.from_seq)  # fmt: skip
             yield from _explained(hole, lost, next_number - last - 1)
-        if stretch.to_seq > reached:
-            reached, since_ns = stretch.to_seq, stretch.to_ns
-        last = max(last, -1 if stretch.number is None else stretch.number)
+        if seq_range.to_seq > reached:
+            reached, since_ns = seq_range.to_seq, seq_range.to_ns
+        last = max(last, -1 if seq_range.number is None else seq_range.number)
 
 
 def _explained(hole: Gap, lost: Sequence[RefusedFile], files: float) -> Iterator[Gap]:
@@ -147,11 +147,11 @@ def _explained(hole: Gap, lost: Sequence[RefusedFile], files: float) -> Iterator
 
 def _behind(run: _Run, next_ns: int | None) -> Iterator[Gap]:
     """Yield the gap of refused files after the last row, up to the next run or their arrival."""
-    last = max((s.number for s in run.stretches if s.number is not None), default=-1)
+    last = max((s.number for s in run.seq_ranges if s.number is not None), default=-1)
     lost = [one for one in run.lost if one.number > last]
     if not lost:
         return
-    since_ns = max(stretch.to_ns for stretch in run.stretches)
+    since_ns = max(seq_range.to_ns for seq_range in run.seq_ranges)
     came_ns = max(one.came_ns for one in lost)
     end_ns = came_ns if next_ns is None else min(came_ns, next_ns)
     yield Gap("", 0, since_ns, max(end_ns, since_ns + 1), refusal_text(lost), "", None)

@@ -271,7 +271,7 @@ def coverage(
     ground = element(
         "rect", class_="ground", x=0, y=0.5, width="100%", height=COVERAGE_BAR - 1, rx=3
     )
-    parts = (_coverage_stretch(stretch, axis, name, words) for stretch in shown)
+    parts = (_coverage_interval(stretch, axis, name, words) for stretch in shown)
     return fluid(
         "coverage", COVERAGE_BAR + STRIP + 2, label, (_coverage_patterns(name), ground, *parts)
     )
@@ -295,7 +295,7 @@ def _coverage_patterns(name: str) -> SvgElement:
     )
 
 
-def _coverage_stretch(
+def _coverage_interval(
     stretch: CoverageInterval, axis: TimeAxis, name: str, words: DrawingTexts
 ) -> SvgElement:
     kind_word = _coverage_word(stretch.kind, words)

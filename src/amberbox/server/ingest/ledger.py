@@ -153,7 +153,7 @@ class _Ledgers:
         conflicts = store.conflicts(reaches, is_hello=is_hello)
         if conflicts:
             self.write()
-            moved = sum(_set_aside(self.connection, keys, one, now_ns) for one in conflicts)
+            moved = sum(_store_conflict(self.connection, keys, one, now_ns) for one in conflicts)
             for one in conflicts:
                 store.cut(one)
             for why in {one.why for one in conflicts if moved or one.why == OTHER}:
@@ -321,7 +321,7 @@ def _conflict_text(why: str, found: Sequence[RowConflict], moved: int) -> str:
     return f"the robot's record is another one than before ({places}): was an old image restored?"
 
 
-def _set_aside(connection: Connection, keys: Keys, one: RowConflict, now_ns: int) -> int:
+def _store_conflict(connection: Connection, keys: Keys, one: RowConflict, now_ns: int) -> int:
     """Set the rows of a run aside from a position on; return how many."""
     run = one.writer, one.run
     where = and_(_of(ROW, keys, run), ROW.c.seq >= one.from_seq)

@@ -51,7 +51,7 @@ from amberbox.server.schema import STATUS
 
 AGES_S = 1.0
 # Ages that differ by less are sent as one
-_ALIKE_NS = NS
+_SIMILAR_NS = NS
 
 
 def ages_data(
@@ -64,7 +64,7 @@ def ages_data(
     ages = {key: when.age_ns(status) for key, status in statuses.items()}
     newest = min(ages.values())
     older = [
-        (*key, round(age / NS, 1)) for key, age in ages.items() if age > newest + _ALIKE_NS
+        (*key, round(age / NS, 1)) for key, age in ages.items() if age > newest + _SIMILAR_NS
     ]  # fmt: skip
     return {"age_s": round(newest / NS, 2), "older": older}
 
@@ -141,7 +141,7 @@ class RetainedStatuses:
             standing = RetainedStatus(record, row.log_ns, now_ns)
             self._enter(robot, _KnownStatus(store_id, row.run, row.seq, standing))
             if before is None or not _is_same(before.record, record):
-                is_news = before is None or not _is_alike(before.record, record)
+                is_news = before is None or not _is_similar(before.record, record)
                 found[key] = StatusChange(record, is_news or (key in found and found[key].is_news))
         return found
 
@@ -164,7 +164,7 @@ def _is_same(one: StatusRecord, other: StatusRecord) -> bool:
     )
 
 
-def _is_alike(one: StatusRecord, other: StatusRecord) -> bool:
+def _is_similar(one: StatusRecord, other: StatusRecord) -> bool:
     """Return whether statuses differ in values only, as numbers in reasons change all the time."""
     return (
         (one.level, one.state) == (other.level, other.state)

@@ -78,7 +78,7 @@ def timeline(
     for key in sorted({*inside, *after, *now}):
         intervals = _intervals(span, inside.get(key, ()), after.get(key, ()), now.get(key))
         if intervals and component in ("", key[0]):
-            stretches = [_stretch(one) for one in shortened(intervals, span, points)]
+            stretches = [_interval_answer(one) for one in shortened(intervals, span, points)]
             lanes.append(Lane(component=key[0], mode=key[1], stretches=stretches))
     return Timeline(
         from_=format_time(span[0]),
@@ -166,7 +166,7 @@ def _before(
     return next((transition.before for _, transition in (*inside[:1], *after[:1])), None)
 
 
-def _stretch(one: TimelineInterval) -> Stretch:
+def _interval_answer(one: TimelineInterval) -> Stretch:
     return Stretch(
         from_=format_time(one.from_ns), to=format_time(one.to_ns), level=one.level,
         state=one.state, reason=one.reason, changes=one.changes,

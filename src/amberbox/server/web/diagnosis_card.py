@@ -18,11 +18,11 @@ from amberbox.diagnosis.fmea.loader import FILE
 from amberbox.diagnosis.report.explain import OWN_SHARE
 from amberbox.diagnosis.report.wording import (
     capitalize,
+    common_onset_text,
     join_with_and,
     merge_texts,
     readable,
     sentence,
-    together_text,
 )
 from amberbox.server.alarms.alarm import kind_of
 from amberbox.server.knowledge import explanations
@@ -269,7 +269,7 @@ def _lasting(cause: CardCause, over: Mapping[str, str]) -> CardCause:
     left = [(id_, text) for id_, text in cause.parts if id_ not in over]
     if not left:
         return cause
-    text = f"{join_with_and([text for _, text in left])}{together_text(len(left))}"
+    text = f"{join_with_and([text for _, text in left])}{common_onset_text(len(left))}"
     kind = kind_of([id_ for id_, _ in left])
     return replace(cause, text=capitalize(text), kind=kind)
 
@@ -542,7 +542,7 @@ def look(fleet: Services, robot: str, diagnosis: str = "") -> DiagnosisView:
         if known is None:
             raise HTTPException(404, "this robot has no such diagnosis")
     return (
-        _with_remarks(fleet, DiagnosisView(robot, known, is_newest))
+        _with_annotations(fleet, DiagnosisView(robot, known, is_newest))
         if known
         else DiagnosisView(robot)
     )
@@ -563,7 +563,9 @@ def view_diagnosis_at(
         revision = max(early, default=whole.revisions[0].revision)
     known = whole.until(revision) if revision else whole
     later = next((one.at_ns for one in whole.revisions if one.revision > known.last.revision), None)
-    return _with_remarks(fleet, DiagnosisView(robot, known, is_newest=False, is_past=True), later)
+    return _with_annotations(
+        fleet, DiagnosisView(robot, known, is_newest=False, is_past=True), later
+    )
 
 
 def card_now(fleet: Services, seen: DiagnosisView, now: Now | None = None) -> DiagnosisCard:
@@ -623,7 +625,7 @@ def leading_faults(fleet: Services, seen: DiagnosisView) -> list[str]:
     return [fault for entry in found for fault in entry["faults"]]
 
 
-def _with_remarks(
+def _with_annotations(
     fleet: Services, seen: DiagnosisView, before_ns: int | None = None
 ) -> DiagnosisView:
     """Add answers and causes (answers only before a later revision), and intervals of symptoms."""

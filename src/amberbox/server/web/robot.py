@@ -148,7 +148,7 @@ def _ago(seconds: int) -> str:
 def _lane(robot: str, lane: Lane, names: Mapping[str, str]) -> drawing.TimelineLane:
     stretches = tuple(
         drawing.StateInterval(
-            ns_of(one.from_), ns_of(one.to), one.level, _stretch_text(one), _data(robot, one)
+            ns_of(one.from_), ns_of(one.to), one.level, _interval_text(one), _data(robot, one)
         )
         for one in lane.stretches
     )
@@ -161,7 +161,7 @@ def _name(lane: Lane, names: Mapping[str, str]) -> str:
     return names.get(lane.component) or called(lane.component)
 
 
-def _stretch_text(one: Stretch) -> str:
+def _interval_text(one: Stretch) -> str:
     words_ = [one.reason or readable(one.state)]
     if one.changes:
         words_.append(catalogue().text("robot.time.changes", n=one.changes))
