@@ -188,10 +188,10 @@ class CommandLogFile:
     def acknowledge(self, number: int) -> None:
         """Note that the server has stored all answers up to a number.
 
-        It is not synced: at worst answers are sent again. Raises CommandLogError.
+        A number that was never given is of another history, and means nothing. It is not synced:
+        at worst answers are sent again. Raises CommandLogError.
         """
-        number = min(number, self._answers)
-        if number > self._acknowledged:
+        if self._acknowledged < number <= self._answers:
             self._append(_Acknowledged(number), is_synced=False)
 
     def _append(self, record: _Record, *, is_synced: bool = True) -> None:
