@@ -62,12 +62,12 @@ class MissingRows:
 
 @dataclass(frozen=True, slots=True)
 class Retention:
-    """How long data are kept, in seconds since their arrival; None is for ever.
+    """How long data are kept, in seconds since they came; None is for ever.
 
-    ``robot`` and ``keeping`` (``main``, ``bulk``, ``ring``, ``watch``, ``keep``, ``kept``) select
-    the data; ``*`` is every robot, or the classes ``main``, ``bulk`` and ``ring``. The box's own
-    records are deleted only by a rule for ``own``, journals of ``watch``, ``keep`` and ``kept``
-    only by a rule that names them. Data of a pinned incident stay.
+    ``robot`` and ``keeping`` (``main``, ``bulk``, ``ring``, ``watch``, ``keep``, ``kept``) choose;
+    ``*`` is every robot, or the classes ``main``, ``bulk`` and ``ring``. What the box itself says
+    goes only by a rule for ``own``, journals of ``watch``, ``keep`` and ``kept`` only by a rule
+    that names them. What a pinned incident covers stays.
     """
 
     robot: str = "*"
@@ -78,7 +78,7 @@ class Retention:
 
 @dataclass(frozen=True, slots=True)
 class PutResult:
-    """The result of ``put``: whether the journal is new, and its path."""
+    """The result of ``put``: whether the journal is new here, and its path."""
 
     is_new: bool
     path: Path

@@ -27,9 +27,9 @@ def _check_output(output: str) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Excuse:
-    """A status that excuses the absence of a robot: an output, and its value.
+    """A robot that said so last is not missed: an output of a status, and its value.
 
-    ``output`` is ``component/mode/output``; ``*`` in a place matches any name.
+    ``output`` is ``component/mode/output``; ``*`` in a place fits whatever stands there.
     """
 
     output: str
@@ -56,12 +56,11 @@ class Shared:
 class AlarmSettings:
     """When alarms open, and when they are over; times in seconds.
 
-    A robot that is offline for ``offline_after_s`` raises an alarm, 0 is never;
-    ``offline_after_of`` sets other times for a robot or a group. Robots lost within ``together_s``
-    are one alarm. A new alarm waits ``settle_s`` for the alarm that it follows from before
-    notifications are sent. It is over when it has been inactive for ``quiet_s``, and the same alarm
-    again when it comes back within ``reopen_s``. A record that reaches the server more than
-    ``late_s`` after the event is late.
+    A robot that is away for ``offline_after_s`` is missed, 0 is never; ``offline_after_of`` says
+    otherwise for a robot or a group. Robots lost within ``together_s`` are one alarm. A new alarm
+    waits ``settle_s`` for what it follows from before anybody is told. It is over when it has been
+    quiet for ``quiet_s``, and the same alarm again when it comes back within ``reopen_s``. What
+    reaches the server more than ``late_s`` after it happened is late.
     """
 
     offline_after_s: float = 120.0
@@ -141,7 +140,7 @@ class Alarm:
 
 @dataclass(frozen=True, slots=True)
 class AlarmPart:
-    """An alarm as reported by a robot (``source`` is its id there), all or part of an ``Alarm``."""
+    """An alarm as a robot reports it (``source`` is its id there), all or part of an ``Alarm``."""
 
     robot: str
     source: str

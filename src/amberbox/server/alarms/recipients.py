@@ -56,9 +56,7 @@ class Smtp:
 
 
 class Quiet(msgspec.Struct, frozen=True, rename={"from_": "from"}):
-    """Hours of the day in which only ``but`` and worse severities are sent; the others are sent
-    afterwards.
-    """
+    """Hours of the day in which only ``but`` and what is worse is told; the rest comes after."""
 
     from_: str
     to: str
@@ -89,9 +87,9 @@ class Quiet(msgspec.Struct, frozen=True, rename={"from_": "from"}):
 
 @dataclass(frozen=True, slots=True)
 class Email:
-    """Recipients of mails about alarms of ``groups`` (none: all) from the severity ``least`` on.
+    """Somebody who gets mails about alarms of ``groups`` (none: all) from ``least`` on.
 
-    ``also`` requests messages when such an alarm is acknowledged or resolved.
+    ``also`` asks for messages when such an alarm is acknowledged or resolved.
     """
 
     name: str
@@ -114,9 +112,7 @@ class Email:
 
 @dataclass(frozen=True, slots=True)
 class Webhook:
-    """A program that is notified by HTTP; ``secret`` signs the messages, and is never
-    shown again.
-    """
+    """A program that is told by HTTP; ``secret`` signs what it gets, and is never shown again."""
 
     name: str
     url: str
@@ -140,9 +136,7 @@ Destination: TypeAlias = Email | Webhook
 
 @dataclass(frozen=True, slots=True)
 class Notifications:
-    """The destinations. Above ``digest_above`` messages in ``digest_s`` further ones are sent as a
-    digest.
-    """
+    """Who is told. Above ``digest_above`` messages in ``digest_s`` the rest comes as one."""
 
     smtp: Smtp | None = None
     emails: tuple[Email, ...] = ()
