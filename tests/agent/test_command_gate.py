@@ -64,7 +64,7 @@ class Robot:
         made = msgspec.structs.replace(
             order(number, action, risk), run=str(options.pop("run", "run 1"))
         )
-        return signed(made, person, self.challenge, **options)  # type: ignore[arg-type]
+        return signed(made, person, self.challenge, **options)  # type: ignore[arg-type]  # by name
 
     def give(self, command: Command) -> list[Decision]:
         return self.gate.receive(encode_command(command))

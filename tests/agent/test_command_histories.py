@@ -518,7 +518,7 @@ class World:
         if chosen in self.running:
             self.ending[chosen] = state
             del self.running[chosen]
-        self.act(f"{chosen[-3:]} ends", lambda: self.gate.ended(chosen, state, "", "{}"))  # type: ignore[arg-type]
+        self.act(f"{chosen[-3:]} ends", lambda: self.gate.ended(chosen, state, "", "{}"))  # type: ignore[arg-type]  # a literal
 
     def abort(self) -> None:
         ids = [*self.running, *([self.asked.command.id] if self.asked else [])]
@@ -651,7 +651,7 @@ class World:
         for command_id in list(self.running):
             self.ending[command_id] = "done"
             del self.running[command_id]
-            self.act("ends", lambda i=command_id: self.gate.ended(i, "done"))  # type: ignore[misc]
+            self.act("ends", lambda i=command_id: self.gate.ended(i, "done"))  # type: ignore[misc]  # bound
         assert not self.ending
         for command_id in self.started:
             seen = self.log.seen(command_id)

@@ -50,8 +50,8 @@ from amberbox.core.command import Command, CommandAnswer, LeaseState, Risk
 from amberbox.core.errors import UsageError
 from amberbox.core.files import replace_file
 from amberbox.core.systemd import Notifier
-from amberbox.experiments import action as declared_actions
 from amberbox.experiments.action import (
+    FOLDER,
     DeclaredAction,
     announcement,
     check_parameters,
@@ -85,7 +85,7 @@ class FolderActions:
 
     def changed(self) -> bool:
         """Read them if the files have changed; return whether they have."""
-        stamp = sorted(_stamps(self._folder / declared_actions.FOLDER))
+        stamp = sorted(_stamps(self._folder / FOLDER))
         if stamp == self._stamp:
             return False
         self._stamp, self._actions = stamp, read_actions(self._folder)[0]
@@ -434,7 +434,7 @@ class CommandProcess:
     def _record(self, state: str, **values: str) -> None:
         """Write a record on ``amberbox/command``; without the disk only the log has it."""
         if values.get("text"):
-            self._out(f"{state}: {values['text']}")
+            self._out(values["text"] if state == "note" else f"{state}: {values['text']}")
         record = {"robot": self._folder.robot.id, "state": state, **values}
         row = EncodedRecord(channels.COMMAND, msgspec.json.encode(record))
         with suppress(OSError):

@@ -203,7 +203,7 @@ def test_a_registration_that_comes_through_after_the_end_is_taken_back(master: R
         go_on.wait(PATIENCE_S)
         announce(topic, node, uri)
 
-    master.register = slow  # type: ignore[method-assign]
+    master.register = slow  # type: ignore[method-assign]  # its double
     with node(master) as publisher, pytest.raises(RosStoppedError):
         publisher.advertise(offered(), Deadline.within(PATIENCE_S, registering.is_set))
     go_on.set()
